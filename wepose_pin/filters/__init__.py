@@ -1,0 +1,106 @@
+"""Orientation filters: one file each, one protocol (`base.OrientationFilter`).
+
+``METHODS`` names them; `estimate_orientation` runs one on an array, from the still phase to the orientations.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .. import so3
+from ..errors import BadData, BadOption, BadPhase, one_of
+from ..noise import SensorNoise, noise_of
+from ..static import StaticDetector, StaticTest
+from .base import FilterRun, OrientationFilter
+from .gdc import Gdc, GdcParams
+from .ncf import Ncf, NcfParams
+from .smekf import Smekf, SmekfParams
+
+__all__ = [
+    "METHODS",
+    "FilterRun",
+    "Gdc",
+    "GdcParams",
+    "Ncf",
+    "NcfParams",
+    "Orientation",
+    "OrientationFilter",
+    "Smekf",
+    "SmekfParams",
+    "check_method",
+    "estimate_orientation",
+]
+
+METHODS: dict[str, type] = {"smekf": Smekf, "ncf": Ncf, "gdc": Gdc}
+
+
+class Orientation(NamedTuple):
+    """Orientation of one sensor over time, in a world of its own: z up, zero heading at the start."""
+
+    quat_WS: np.ndarray  # (n, 4) xyzw
+    gyro_bias: np.ndarray  # (n, 3) [rad/s]
+    static: np.ndarray  # (n,) bool
+    attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²], error on the right, in S; None where the filter has none
+    noise: SensorNoise  # what the still phase said
+
+
+def check_method(method: str) -> str:
+    """`method`, if there is one of that name.
+
+    Raises
+    ------
+    BadOption
+        There is none.
+    """
+    if method not in METHODS:
+        raise BadOption(f"method '{method}' is not known; {one_of(METHODS, method)}")
+    return method
+
+
+def estimate_orientation(
+    gyro_S: np.ndarray,
+    accel_S: np.ndarray,
+    rate_hz: float,
+    *,
+    method: str = "smekf",
+    still: tuple[float, float],
+    params: Any = None,
+    static_test: StaticTest | None = None,
+) -> Orientation:
+    """Orientation of a sensor from its gyroscope and accelerometer.
+
+    Parameters
+    ----------
+    gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample
+    accel_S : (n, 3) [m/s²], specific force, +g up at rest
+    rate_hz : samples a second, uniform
+    method : a key of `METHODS`
+    still : from, to [s] after the first sample: the sensor rests; noise and bias are measured there
+    params : the filter's own frozen parameters; None for its defaults
+    static_test : when the sensor counts as still; None for the paper's values
+
+    The start has zero heading and the tilt of the accelerometer, averaged over the first window of `static_test`.
+
+    Raises
+    ------
+    BadOption, BadData, BadPhase
+        An unknown method; arrays that do not fit each other; a still phase outside the data.
+    """
+    make = METHODS[check_method(method)]
+    gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
+    if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
+        raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
+    if not np.isfinite(gyro).all() or not np.isfinite(accel).all():
+        raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
+    first, last = round(still[0] * rate_hz), round(still[1] * rate_hz) + 1
+    if not 0 <= first < last <= len(gyro) + 1:
+        raise BadPhase(f"still = {still} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
+    noise = noise_of(gyro[first:last], accel[first:last])
+    test = static_test or StaticTest()
+    static = StaticDetector(noise, rate_hz, test).run(gyro, accel)
+    start = accel[: test.samples(rate_hz)].mean(axis=0)
+    filter_ = make(noise, rate_hz, so3.tilt(start), params)
+    quat, bias, cov = filter_.run(gyro, accel, static)
+    return Orientation(quat, bias, static, cov, noise)

@@ -1,0 +1,44 @@
+"""What every orientation filter is: frozen parameters, a state apart from them, one compiled step for one and many."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from ..noise import SensorNoise
+
+
+class FilterRun(NamedTuple):
+    """What a run gives, one row a sample."""
+
+    quat_WS: np.ndarray  # (n, 4) xyzw, orientation after the sample
+    gyro_bias: np.ndarray  # (n, 3) [rad/s]
+    attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²] of the error on the right, in S; None: the filter has none
+
+
+class OrientationFilter(Protocol):
+    """A filter made for one sensor: ``Filter(noise, rate_hz, quat_WS, params)``.
+
+    The world W is the sensor's own: z up, heading as in the `quat_WS` it starts from. `update` and `run` go through
+    the same compiled code, so a run, the same run cut in two, and a run sample by sample give the same bits.
+    """
+
+    def __init__(self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray) -> None: ...
+
+    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
+        """Take one sample, `gyro_S` (3,) [rad/s], `accel_S` (3,) [m/s²]; gives `quat_WS` (4,) xyzw after it."""
+        ...
+
+    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray) -> FilterRun:
+        """Take samples (n, 3), (n, 3), `static` (n,) bool; the state goes on from where it was."""
+        ...
+
+
+def samples(
+    gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One sample or many as the contiguous arrays that the compiled steps take: (n, 3), (n, 3), (n,)."""
+    gyro = np.ascontiguousarray(np.reshape(gyro_S, (-1, 3)), dtype=float)
+    accel = np.ascontiguousarray(np.reshape(accel_S, (-1, 3)), dtype=float)
+    return gyro, accel, np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)

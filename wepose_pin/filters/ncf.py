@@ -1,0 +1,75 @@
+"""NCF: the nonlinear (explicit) complementary filter with integral term (Mahony, Hamel, Pflimlin 2008, IEEE TAC 53(5)).
+
+Their equation (32) with gravity as the only measured direction: e = a × R_WSᵀ e_z with a the unit accelerometer
+direction, ω = gyro − b + k_P e, ḃ = −k_I e.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from ..noise import SensorNoise
+from ..so3 import rotate_by_vector, up_in_sensor
+from .base import FilterRun, samples
+
+
+@dataclass(frozen=True)
+class NcfParams:
+    """Gains as tuned on many recordings by Laidig and Seel 2023 (VQF, Information Fusion 91, the Mahony baseline)."""
+
+    proportional: float = 0.74  # [1/s] k_P
+    integral: float = 0.0012  # [1/s²] k_I
+
+
+@dataclass
+class NcfState:
+    quat_WS: np.ndarray  # (4,) xyzw
+    gyro_bias: np.ndarray  # (3,) [rad/s]
+
+
+class Ncf:
+    """NCF of one sensor; the bias starts at the still phase's mean."""
+
+    def __init__(
+        self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: NcfParams | None = None
+    ) -> None:
+        self.params = params or NcfParams()
+        self.rate_hz = rate_hz
+        self.state = NcfState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
+
+    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
+        gyro, accel, _ = samples(gyro_S, accel_S, static)
+        quat, bias = np.empty((len(gyro), 4)), np.empty((len(gyro), 3))
+        gains = self.params.proportional, self.params.integral
+        _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, *gains, quat, bias)
+        return FilterRun(quat, bias, None)
+
+    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
+        return self.run(gyro_S, accel_S, static).quat_WS[0]
+
+
+@njit(cache=True)
+def _run(quat, bias, gyro_S, accel_S, dt, proportional, integral, out_quat, out_bias):  # type: ignore[no-untyped-def]
+    for k in range(len(gyro_S)):
+        ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
+        norm = np.sqrt(ax * ax + ay * ay + az * az)
+        ex = ey = ez = 0.0
+        if norm > 0.0:  # in free fall there is no direction to follow
+            ux, uy, uz = up_in_sensor(quat)
+            ex = (ay * uz - az * uy) / norm
+            ey = (az * ux - ax * uz) / norm
+            ez = (ax * uy - ay * ux) / norm
+        rotate_by_vector(
+            quat,
+            (gyro_S[k, 0] - bias[0] + proportional * ex) * dt,
+            (gyro_S[k, 1] - bias[1] + proportional * ey) * dt,
+            (gyro_S[k, 2] - bias[2] + proportional * ez) * dt,
+        )
+        bias[0] -= integral * ex * dt
+        bias[1] -= integral * ey * dt
+        bias[2] -= integral * ez * dt
+        out_quat[k] = quat
+        out_bias[k] = bias

@@ -1,0 +1,89 @@
+"""Sensor noise and bias from a phase in which the sensor lies still (Lisini Baldi 2019, the Σ̂ of the static test)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .errors import BadPhase
+from .recording import Recording
+
+# A quantised signal can stand still to the last bit; below these standard deviations no MEMS sensor is believed, and
+# the covariances stay invertible.
+GYRO_FLOOR = 1e-5  # [rad/s]
+ACCEL_FLOOR = 1e-5  # [g]
+
+# Without stated phases: the quietest stretch of this length within the beginning is taken.
+QUIET_S = 2.0
+BEGINNING_S = 20.0
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """What a still phase says of one sensor.
+
+    Parameters
+    ----------
+    gyro_bias : (3,) mean of gyro [rad/s]
+    gyro_cov : (3, 3) Σ̂_ω, sample covariance of gyro [rad²/s²]
+    accel_cov : (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
+    bias_step_cov : (3, 3) Σ_b, covariance of the first differences of gyro [rad²/s²], as in the authors' software
+    gravity : mean norm of accel [m/s²]: the gravity scale
+    samples : how many samples stand behind it
+    """
+
+    gyro_bias: np.ndarray
+    gyro_cov: np.ndarray
+    accel_cov: np.ndarray
+    bias_step_cov: np.ndarray
+    gravity: float
+    samples: int
+
+
+def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray) -> SensorNoise:
+    """Noise and bias from samples at rest: `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²].
+
+    Raises
+    ------
+    BadPhase
+        Fewer than 10 samples, or no gravity in them.
+    """
+    if len(gyro_S) < 10:
+        raise BadPhase(f"the still phase holds {len(gyro_S)} samples; at least 10 are needed to measure noise")
+    gravity = float(np.linalg.norm(accel_S, axis=1).mean())
+    if not gravity > 0.0:
+        raise BadPhase("the still phase holds no gravity: accel is zero; the filter needs specific force, +g up at rest")
+    return SensorNoise(
+        gyro_bias=gyro_S.mean(axis=0),
+        gyro_cov=_floored(np.cov(gyro_S.T), GYRO_FLOOR),
+        accel_cov=_floored(np.cov(accel_S.T / gravity), ACCEL_FLOOR),
+        bias_step_cov=_floored(np.cov(np.diff(gyro_S, axis=0).T), GYRO_FLOOR),
+        gravity=gravity,
+        samples=len(gyro_S),
+    )
+
+
+def _floored(cov: np.ndarray, std: float) -> np.ndarray:
+    return cov if np.linalg.eigvalsh(cov)[0] >= std**2 else cov + std**2 * np.eye(3)
+
+
+def quietest(recording: Recording) -> tuple[float, float]:
+    """Interval [s] of `QUIET_S` within the first `BEGINNING_S` in which all sensors together move least."""
+    time, rate_hz = recording.time, recording.rate_hz
+    n = int(np.searchsorted(time, time[0] + BEGINNING_S, side="right"))
+    window = min(max(int(round(QUIET_S * rate_hz)), 10), n)
+    motion = np.zeros(n - window + 1)
+    for sensor in recording.sensors.values():
+        if sensor.gyro_S is not None:
+            signal = sensor.gyro_S[:n]
+        else:
+            assert sensor.quat_WS is not None
+            # 2 (q[k] − q[k−1]) is the rotation between samples, with the signs made to agree.
+            quat = sensor.quat_WS[:n]
+            flips = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))[:, None]
+            signal = 2.0 * rate_hz * np.concatenate([np.zeros((1, 4)), quat[1:] - flips * quat[:-1]])
+        windows = np.lib.stride_tricks.sliding_window_view(signal, window, axis=0)
+        motion += windows.var(axis=-1).sum(axis=-1)
+    first = int(np.argmin(motion))
+    return float(time[first]), float(time[first + window - 1])

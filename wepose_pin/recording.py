@@ -1,0 +1,169 @@
+"""`Recording`: what the sensors measured, checked once; everything after this room trusts it.
+
+SI units, one time base, sensors named by the segment they are strapped on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from .errors import BadData, BadPhase, one_of
+
+SEGMENTS = (
+    "torso",
+    "left_upper_arm",
+    "left_forearm",
+    "right_upper_arm",
+    "right_forearm",
+    "pelvis",
+    "head",
+    "left_hand",
+    "right_hand",
+)
+START_POSES = ("n_pose",)
+
+Intervals = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One sensor: either `gyro_S` and `accel_S`, or `quat_WS` from a device that fuses by itself.
+
+    Parameters
+    ----------
+    gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample; None for ready orientations
+    accel_S : (n, 3) [m/s²], specific force, +g up at rest; None for ready orientations
+    quat_WS : (n, 4) xyzw, sensor to a world of its own whose z points up; None for raw sensors
+    stated_quat_LS : (4,) xyzw, the mount as the session states it, sensor to segment; None where it says nothing
+    """
+
+    gyro_S: np.ndarray | None = None
+    accel_S: np.ndarray | None = None
+    quat_WS: np.ndarray | None = None
+    stated_quat_LS: np.ndarray | None = None
+
+    @property
+    def ready(self) -> bool:
+        """The sensor came with orientations."""
+        return self.quat_WS is not None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Sensors on one uniform time base.
+
+    Parameters
+    ----------
+    time : (n,) [s], uniform at `rate_hz` to within the clock's jitter
+    sensors : one a segment
+    phases : name → intervals [s] on `time`; `start` is the start pose, `still` sensors at rest
+    strapping : "as_calibrated" or "new": whether a subject's calibrated mounts hold here
+    source : the file it was read from, for messages
+    truth : file with the reference, where there is one
+    notes : what was assumed or mended while reading, for the summary
+    """
+
+    name: str
+    time: np.ndarray
+    rate_hz: float
+    sensors: Mapping[str, Sensor]
+    phases: Mapping[str, Intervals] = field(default_factory=dict)
+    start_pose: str = "n_pose"
+    strapping: str = "as_calibrated"
+    source: Path | None = None
+    truth: Path | None = None
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def where(self) -> str:
+        """Beginning of an error's text: the file, or the recording's name."""
+        return self.source.name if self.source else self.name
+
+    def span(self, interval: tuple[float, float]) -> slice:
+        """Samples within the interval [s], both ends included."""
+        first, last = np.searchsorted(self.time, [interval[0] - 1e-9, interval[1] + 1e-9])
+        return slice(int(first), int(last))
+
+    def phase(self, name: str) -> Intervals:
+        """Intervals of a phase that must be there.
+
+        Raises
+        ------
+        BadPhase
+            The recording has no such phase.
+        """
+        intervals = self.phases.get(name, ())
+        if not intervals:
+            raise BadPhase(
+                f"{self.where()}: phases.{name} is needed here and missing; add [phases] {name} = "
+                f"[[from, to]] in seconds; {one_of(self.phases, name)}"
+            )
+        return intervals
+
+
+def check(recording: Recording) -> Recording:
+    """The same recording, if it can be one.
+
+    Raises
+    ------
+    BadData
+        Shapes that differ, too few samples, numbers that are not finite, time that stands still or goes back.
+    BadPhase
+        A phase that is empty or outside the recording.
+    """
+    where, time = recording.where(), recording.time
+    if not recording.sensors:
+        raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}")
+    if len(time) < 2:
+        raise BadData(f"{where}: {len(time)} samples; a recording has at least 2")
+    _check_time(where, time)
+    for segment, sensor in recording.sensors.items():
+        for name, values, width in (
+            ("gyro", sensor.gyro_S, 3),
+            ("accel", sensor.accel_S, 3),
+            ("orientation", sensor.quat_WS, 4),
+        ):
+            if values is None:
+                continue
+            place = f"{where}: sensors.{segment}.{name}"
+            if values.shape != (len(time), width):
+                raise BadData(f"{place}: shape {values.shape} beside {len(time)} times; expected {(len(time), width)}")
+            bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+            if bad.size:
+                raise BadData(
+                    f"{place}: not a finite number at {time[bad[0]]:.3f} s (row {bad[0] + 1}, {bad.size} rows in all); "
+                    f"fill or cut the gap first"
+                )
+        if (sensor.gyro_S is None) != (sensor.accel_S is None) or (sensor.gyro_S is None) == (sensor.quat_WS is None):
+            raise BadData(f"{where}: sensors.{segment} has neither gyro and accel nor orientation")
+    _check_phases(where, time, recording.phases)
+    return recording
+
+
+def _check_time(where: str, time: np.ndarray) -> None:
+    bad = np.flatnonzero(~np.isfinite(time))
+    if bad.size:
+        raise BadData(f"{where}: time: not a finite number in row {bad[0] + 1}; every row needs its time in seconds")
+    back = np.flatnonzero(np.diff(time) <= 0.0)
+    if back.size:
+        k = int(back[0])
+        how = "stands still" if time[k + 1] == time[k] else "goes back"
+        raise BadData(
+            f"{where}: time {how} in row {k + 2}: {time[k + 1]:.6g} s after {time[k]:.6g} s; it must grow in every row"
+        )
+
+
+def _check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    for name, intervals in phases.items():
+        for first, last in intervals:
+            place = f"{where}: phases.{name}: [{first:g}, {last:g}]"
+            if not first < last:
+                raise BadPhase(f"{place} is empty; the first number is the earlier one, in seconds")
+            if first < time[0] - 1e-6 or last > time[-1] + 1e-6:
+                raise BadPhase(f"{place} is outside the recording, which runs from {time[0]:g} to {time[-1]:g} s")

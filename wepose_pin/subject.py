@@ -1,0 +1,201 @@
+"""`Subject`: a person's lengths and sensor mounts with their joint covariance, and the file they live in."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from .assets import asset
+from .errors import BadOption, BadSubject, MissingFile, one_of
+
+LENGTHS = (
+    "trunk",
+    "shoulder_width",
+    "left_upper_arm",
+    "left_forearm",
+    "left_hand",
+    "right_upper_arm",
+    "right_forearm",
+    "right_hand",
+)
+SEXES = ("f", "m")
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A person as far as known.
+
+    Parameters
+    ----------
+    lengths : name → [m], every one of `LENGTHS`
+    order : what the rows of `covariance` are: names of lengths [m], then ``mounts.<segment>.x`` … [rad]
+    covariance : (k, k)
+    mounts : segment → `quat_LS` (4,) xyzw, the calibrated mounts; empty where none are calibrated
+    note : where the numbers come from, in a few words
+    """
+
+    name: str
+    lengths: Mapping[str, float]
+    order: tuple[str, ...]
+    covariance: np.ndarray
+    mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
+    note: str = ""
+
+    def std(self, name: str) -> float:
+        """One standard deviation of a length [m], or of a mount's axis [rad]; NaN where nothing is known."""
+        if name not in self.order:
+            return float("nan")
+        k = self.order.index(name)
+        return float(np.sqrt(self.covariance[k, k]))
+
+    def lengths_covariance(self, names: Iterable[str] = LENGTHS) -> np.ndarray:
+        """Covariance (n, n) [m²] of the named lengths."""
+        rows = [self.order.index(name) for name in names]
+        return self.covariance[np.ix_(rows, rows)]
+
+    def draw(self, rng: np.random.Generator) -> Subject:
+        """A random person from this one's distribution of lengths, for simulation."""
+        mean = np.array([self.lengths[name] for name in LENGTHS])
+        drawn = rng.multivariate_normal(mean, self.lengths_covariance())
+        # A length three times off is no person; this only guards the far tails.
+        drawn = np.clip(drawn, 0.7 * mean, 1.3 * mean)
+        return replace(
+            self,
+            name="drawn",
+            lengths=dict(zip(LENGTHS, drawn.tolist(), strict=True)),
+            covariance=np.zeros_like(self.covariance),
+            note="drawn at random",
+        )
+
+
+def average_subject(stature: float | None = None, sex: str | None = None) -> Subject:
+    """The anthropometric prior: mean lengths and their covariance over people.
+
+    Lengths share the stature's spread where it is not given, left and right share the person's shape; numbers and
+    sources stand in ``calibration/anthropometry.toml``.
+
+    Parameters
+    ----------
+    stature : body height [m]; None: 1.75 with the spread of adults
+    sex : "f", "m", or None for the mean of both
+
+    Raises
+    ------
+    BadOption
+        A stature outside 1.0 to 2.5 m, or another sex.
+    """
+    if stature is not None and not 1.0 <= stature <= 2.5:
+        raise BadOption(f"stature {stature:g} is not a body height in metres; between 1.0 and 2.5")
+    if sex is not None and sex not in SEXES:
+        raise BadOption(f"sex '{sex}' is not known; {one_of(SEXES)}")
+    table = tomllib.loads(asset("calibration", "anthropometry.toml").read_text(encoding="utf-8"))
+    height = stature if stature is not None else table["stature"]["mean"]
+    height_std = 0.0 if stature is not None else table["stature"]["std"] / table["stature"]["mean"]
+    shares = [table[{"f": "female", "m": "male"}[s]] for s in ([sex] if sex else SEXES)]
+
+    part = [name.removeprefix("left_").removeprefix("right_") for name in LENGTHS]
+    mean = np.array([height * np.mean([share[p] for share in shares]) for p in part])
+    # Relative errors: one of stature common to all, one of shape common to left and right, one of each side.
+    shape = np.array([table["shape_std"][p] for p in part])
+    same = np.array([[a == b for a in part] for b in part], dtype=float)
+    sided = np.array([p != name for p, name in zip(part, LENGTHS, strict=True)], dtype=float)
+    relative = height_std**2 + same * np.outer(shape, shape) + np.diag(sided * table["asymmetry_std"]["all"] ** 2)
+    known = ", ".join([f"stature {height:g} m" + ("" if stature else " assumed"), f"sex {sex or 'not given'}"])
+    return Subject(
+        name="average",
+        lengths=dict(zip(LENGTHS, mean.tolist(), strict=True)),
+        order=LENGTHS,
+        covariance=np.outer(mean, mean) * relative,
+        note=f"anthropometric average ({known})",
+    )
+
+
+def subject_toml(subject: Subject) -> str:
+    """The text of ``subject.toml``."""
+    lines = [f"format = {FORMAT}", f"name = {json.dumps(subject.name)}"]
+    if subject.note:
+        lines.append(f"note = {json.dumps(subject.note)}")
+    lines += ["", "[lengths]       # m", *(f"{k} = {v:.6f}" for k, v in subject.lengths.items())]
+    lines += ["", "[lengths_std]   # m, one standard deviation"]
+    lines += [f"{k} = {subject.std(k):.6f}" for k in subject.lengths if k in subject.order]
+    for segment, quat in subject.mounts.items():
+        lines += ["", f"[mounts.{segment}]   # R_LS, sensor to segment"]
+        lines += [f"{key} = {value:.9f}" for key, value in zip(("qx", "qy", "qz", "qw"), quat, strict=True)]
+        std = [subject.std(f"mounts.{segment}.{axis}") for axis in "xyz"]
+        if np.isfinite(std).all():
+            lines.append(f"std_deg = {np.degrees(np.sqrt(np.mean(np.square(std)))):.3f}")
+    if subject.order:
+        lines += ["", "[covariance]    # of lengths [m] and mount errors [rad], jointly"]
+        lines.append(f"order = {json.dumps(list(subject.order))}")
+        lines.append("matrix = [")
+        lines += ["    [" + ", ".join(f"{v:.9e}" for v in row) + "]," for row in subject.covariance]
+        lines.append("]")
+    return "\n".join(lines) + "\n"
+
+
+def load_subject(path: str | Path) -> Subject:
+    """Read ``subject.toml`` (or the folder that holds it).
+
+    Raises
+    ------
+    MissingFile, BadSubject
+        Not there; a length missing, not positive, unknown; a covariance that does not fit.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "subject.toml"
+    if not path.is_file():
+        raise MissingFile(f"{path}: no such file; `wepose calibrate` writes one")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadSubject(f"{path}: not valid TOML: {error}") from error
+    if table.get("format") != FORMAT:
+        raise BadSubject(f"{path}: format = {table.get('format')!r}; this version reads format = {FORMAT}")
+    lengths = table.get("lengths", {})
+    for name in lengths:
+        if name not in LENGTHS:
+            raise BadSubject(f"{path}: lengths.{name} is not a length; {one_of(LENGTHS, name)}")
+    for name in LENGTHS:
+        value = lengths.get(name)
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 < value < 3.0:
+            raise BadSubject(f"{path}: lengths.{name} = {value!r}; a number in metres is needed, above 0")
+    order, matrix = _covariance(path, table.get("covariance", {}), table.get("lengths_std", {}))
+    return Subject(
+        name=str(table.get("name", path.parent.name)),
+        lengths={name: float(lengths[name]) for name in LENGTHS},
+        order=order,
+        covariance=matrix,
+        mounts={segment: _mount(path, segment, mount) for segment, mount in table.get("mounts", {}).items()},
+        note=str(table.get("note", "")),
+    )
+
+
+def _covariance(path: Path, table: Mapping, std: Mapping) -> tuple[tuple[str, ...], np.ndarray]:
+    if not table:
+        order = tuple(name for name in LENGTHS if name in std)
+        return order, np.diag([float(std[name]) ** 2 for name in order])
+    order = tuple(table.get("order", ()))
+    try:
+        matrix = np.array(table.get("matrix"), dtype=float)
+    except (TypeError, ValueError):
+        raise BadSubject(f"{path}: covariance.matrix holds something that is no number, or rows that differ") from None
+    if matrix.shape != (len(order), len(order)):
+        raise BadSubject(f"{path}: covariance.matrix is {matrix.shape}; {len(order)} names in order need as many rows")
+    if not np.allclose(matrix, matrix.T, atol=1e-12) or np.linalg.eigvalsh(matrix)[0] < -1e-9:
+        raise BadSubject(f"{path}: covariance.matrix is not symmetric and positive semidefinite")
+    return order, matrix
+
+
+def _mount(path: Path, segment: str, table: Mapping) -> np.ndarray:
+    quat = np.array([table.get(key, np.nan) for key in ("qx", "qy", "qz", "qw")], dtype=float)
+    norm = np.linalg.norm(quat)
+    if not abs(norm - 1.0) < 1e-3:
+        raise BadSubject(f"{path}: mounts.{segment} is no unit quaternion; it needs qx, qy, qz, qw of length 1")
+    return quat / norm

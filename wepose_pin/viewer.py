@@ -1,0 +1,253 @@
+"""The motion as one HTML page on meshcat that opens offline, from a file, without a server.
+
+meshcat's own server listens on every interface, so none is started: meshcat writes its commands into a list, and the
+page hands them to the viewer that it carries inside. The motion is not meshcat's animation but a table that a small
+player in `viewer_page.html` reads, as a recording of minutes would be tens of megabytes of keyframes.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.model import Visual
+
+BACKGROUND_TOP = (0.985, 0.99, 0.995)
+BACKGROUND_BOTTOM = (0.89, 0.91, 0.935)
+GRID_COLOUR = (0.70, 0.74, 0.79)
+GRID_CELL = 0.25                    # [m]
+GRID_RADIUS = 3.0                   # [m] where the grid has faded away
+CAMERA_FROM = (2.1, 1.25, 0.55)     # direction from the person to the camera in W: front-left, slightly above
+FIELD_OF_VIEW_DEG = 28.0            # a long lens: near hands do not look larger than they are
+LIGHTS = (                          # meshcat's own; positions in W [m]
+    ("AmbientLight", 0.62, None),
+    ("FillLight", 0.10, None),
+    ("PointLightNegativeX", 0.34, (2.5, 2.0, 2.6)),
+    ("PointLightPositiveX", 0.12, (1.0, -3.0, 1.0)),
+)
+LEFT_COLOUR, RIGHT_COLOUR, OTHER_COLOUR = "#e8743b", "#2a7fb8", "#5b6b7d"
+
+
+class CommandList:
+    """Stands where meshcat expects its window and keeps every command instead of sending it."""
+
+    def __init__(self) -> None:
+        self.commands: list[bytes] = []
+
+    def send(self, command: Any) -> None:
+        import umsgpack
+
+        self.commands.append(umsgpack.packb(command.lower()))
+
+
+def view_html(
+    visuals: Sequence[Visual],
+    time: np.ndarray,
+    placements: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    *,
+    trails: Mapping[str, np.ndarray] | None = None,
+    phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    title: str = "",
+    fps: float = 30.0,
+    floor_z: float = -0.93,
+) -> str:
+    """The page that plays a motion; write it to a file and open it in any browser.
+
+    `#t=12.3` at the end of its address opens it paused at that time, `#t=12.3&play` plays on from there.
+
+    Parameters
+    ----------
+    visuals
+        What the body looks like. A link without a placement is not drawn, nor is a visual of kind ``"mesh"``.
+    time
+        (n,) [s], n >= 1, rising.
+    placements
+        Link -> (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]). A link is hidden while its placement is NaN.
+    trails
+        Point -> (n, 3) [m] in W, may hold NaN: the last seconds are drawn behind the point. A name that begins with
+        left or right takes the colour of that arm.
+    phases
+        Name -> spans (begin, end) [s] on the same time axis as `time`.
+    title
+        Plain text; shown, and the name of the window.
+    fps
+        Frames a second in the page. The nearest samples are taken, never made up; a slower recording stays as it is.
+    floor_z
+        Height [m] of the ground grid in W, whose origin is between the hips.
+
+    Returns
+    -------
+    str
+        The whole page; equal arguments give equal text.
+    """
+    time = np.asarray(time, dtype=float)
+    frames = frame_indices(time, fps)
+    trails = {name: np.asarray(points, dtype=float)[frames] for name, points in (trails or {}).items()}
+    drawn = [v for v in visuals if v.link in placements and v.kind != "mesh"]
+    links = list(dict.fromkeys(v.link for v in drawn))
+    motion = np.empty((len(links), len(frames), 7), dtype="<f4")     # quat_WL xyzw, p_WL
+    for k, link in enumerate(links):
+        quat_WL, p_WL = placements[link]
+        motion[k, :, :4], motion[k, :, 4:] = np.asarray(quat_WL)[frames], np.asarray(p_WL)[frames]
+
+    data = {
+        "begin": float(time[0]),
+        "end": float(time[-1]),
+        "offsets": _base64(time[frames] - time[0]),      # float32 holds an offset, not seconds since 1970
+        "links": links,
+        "motion": _base64(motion),
+        "trails": [
+            {"name": name, "colour": _trail_colour(name, visuals), "points": _base64(points)}
+            for name, points in trails.items()
+        ],
+        "phases": [
+            {"name": name, "spans": [[float(a), float(b)] for a, b in spans]} for name, spans in (phases or {}).items()
+        ],
+        "view": _view(drawn, links, motion, list(trails.values())),
+        "commands": [base64.b64encode(c).decode("ascii") for c in _scene(drawn, links, floor_z)],
+    }
+    parts = {
+        "title": html.escape(title),
+        "window_title": html.escape(title or "wepose"),
+        "meshcat": _meshcat_source(),
+        "data": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+    }
+    page = Path(__file__).with_name("viewer_page.html").read_text(encoding="utf-8")
+    return re.sub(r"@@(\w+)@@", lambda found: parts[found[1]], page)     # one pass: a title cannot name a part
+
+
+def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
+    """(m,) int, rising: the samples nearest to a clock of `fps` frames a second, the first and the last among them."""
+    clock = np.append(np.arange(time[0], time[-1], 1.0 / fps), time[-1])
+    nearest_changes = 0.5 * (time[:-1] + time[1:])
+    return np.unique(np.searchsorted(nearest_changes, clock))
+
+
+def _scene(drawn: Sequence[Visual], links: Sequence[str], floor_z: float) -> list[bytes]:
+    """meshcat's commands for everything that is not the motion; `links` are groups the player moves."""
+    import meshcat
+    import meshcat.geometry as g
+
+    window = CommandList()
+    scene = meshcat.Visualizer(window=window)
+    scene["/Background"].set_property("top_color", list(BACKGROUND_TOP))
+    scene["/Background"].set_property("bottom_color", list(BACKGROUND_BOTTOM))
+    scene["/Axes"].set_property("visible", False)
+    scene["/Grid"].set_property("visible", False)
+    scene["/Cameras/default/rotated/<object>"].set_property("fov", FIELD_OF_VIEW_DEG)
+    for light, intensity, position in LIGHTS:
+        scene[f"/Lights/{light}"].set_property("visible", True)
+        scene[f"/Lights/{light}/<object>"].set_property("intensity", intensity)
+        if position is not None:
+            scene[f"/Lights/{light}/<object>"].set_property("position", list(position))
+
+    points, colours = _grid(floor_z)
+    grid = g.LineSegments(g.PointsGeometry(points, colours), g.LineBasicMaterial(vertexColors=True))
+    scene["ground"].set_object(_named(grid, "ground"))
+    for k, visual in enumerate(drawn):
+        path = f"body/{links.index(visual.link)}/{k}"      # numbers: a link's name may hold a slash
+        part = scene[path]
+        part.set_object(_named(g.Mesh(_geometry(visual), _material(visual.rgba)), path))
+        part.set_transform(_transform(visual))
+    return window.commands
+
+
+def _named(thing: Any, path: str) -> Any:
+    """Names in place of meshcat's random ones, which hold the machine's network address and differ in every run."""
+    thing.uuid, thing.geometry.uuid, thing.material.uuid = (f"{path}-{part}" for part in ("object", "shape", "skin"))
+    return thing
+
+
+def _geometry(visual: Visual) -> Any:
+    import meshcat.geometry as g
+
+    if visual.kind == "box":
+        return g.Box([float(x) for x in visual.size])
+    if visual.kind == "cylinder":
+        return g.Cylinder(height=float(visual.size[1]), radius=float(visual.size[0]))
+    return g.Sphere(float(visual.size[0]))
+
+
+def _material(rgba: tuple[float, float, float, float]) -> Any:
+    import meshcat.geometry as g
+
+    red, green, blue = (round(255 * min(max(c, 0.0), 1.0)) for c in rgba[:3])
+    return g.MeshPhongMaterial(
+        color=(red << 16) + (green << 8) + blue, opacity=float(rgba[3]), side=0, specular=0x1C1C1C, shininess=24
+    )
+
+
+def _transform(visual: Visual) -> np.ndarray:
+    """(4, 4): where the viewer's shape stands in its link. three.js lays a cylinder along y, URDF along z."""
+    T_LV = np.eye(4)
+    T_LV[:3, :3] = Rotation.from_quat(visual.quat_LV).as_matrix()
+    T_LV[:3, 3] = visual.p_LV
+    if visual.kind == "cylinder":
+        T_LV[:3, :3] = T_LV[:3, :3] @ Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
+    return T_LV
+
+
+def _grid(floor_z: float) -> tuple[np.ndarray, np.ndarray]:
+    """The ends of the ground's line pieces and their colours, each (3, m) float32; it fades into the background."""
+    ticks = np.arange(-GRID_RADIUS, GRID_RADIUS + GRID_CELL / 2, GRID_CELL)
+    x, y = np.meshgrid(ticks, ticks[:-1], indexing="ij")
+    start, end = np.stack([x, y]).reshape(2, -1), np.stack([x, y + GRID_CELL]).reshape(2, -1)
+    along_y = np.stack([start, end], axis=2).reshape(2, -1)        # start, end, start, end, …
+    xy = np.concatenate([along_y, along_y[::-1]], axis=1)
+    points = np.vstack([xy, np.full(xy.shape[1], floor_z)])
+    fade = np.clip(np.hypot(*xy) / GRID_RADIUS, 0.0, 1.0)
+    near, far = np.array(GRID_COLOUR)[:, None], np.array(BACKGROUND_BOTTOM)[:, None]
+    return points.astype(np.float32), (near + fade * (far - near)).astype(np.float32)
+
+
+def _view(visuals: Sequence[Visual], links: Sequence[str], motion: np.ndarray, trails: Sequence[np.ndarray]) -> dict[str, Any]:
+    """The camera's axes in W and, along them, the box [m] that the body and its trails never leave."""
+    toward = np.array(CAMERA_FROM) / np.linalg.norm(CAMERA_FROM)
+    right = np.cross([0.0, 0.0, 1.0], toward)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(toward, right), toward])         # rows
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    motion = motion[:, :: max(1, motion.shape[1] // 300)].astype(float)
+    for visual in visuals:
+        placed = motion[links.index(visual.link)]
+        placed = placed[np.isfinite(placed).all(axis=1)]
+        if len(placed):
+            seen = (Rotation.from_quat(placed[:, :4]).apply(visual.p_LV) + placed[:, 4:]) @ axes.T
+            reach = max(visual.size) / (1.0 if visual.kind == "sphere" else 2.0)
+            low, high = np.minimum(low, seen.min(axis=0) - reach), np.maximum(high, seen.max(axis=0) + reach)
+    for points in trails:
+        seen = points[np.isfinite(points).all(axis=1)] @ axes.T
+        low, high = np.minimum(low, seen.min(axis=0, initial=np.inf)), np.maximum(high, seen.max(axis=0, initial=-np.inf))
+    if not np.isfinite([low, high]).all():                            # nothing to see: where a person would be
+        low, high = np.array([-0.5, -0.2, -0.5]), np.array([0.5, 0.9, 0.5])
+    return {"axes": axes.tolist(), "low": low.tolist(), "high": high.tolist()}
+
+
+def _trail_colour(point: str, visuals: Sequence[Visual]) -> str:
+    """The colour that most of that arm's visuals have."""
+    for side, otherwise in (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)):
+        if point.lower().startswith(side):
+            arm = Counter(v.rgba for v in visuals if v.link.lower().startswith(side) and "arm" in v.link.lower())
+            return "#" + "".join(f"{round(255 * c):02x}" for c in arm.most_common(1)[0][0][:3]) if arm else otherwise
+    return OTHER_COLOUR
+
+
+def _meshcat_source() -> str:
+    """meshcat's viewer, safe inside a script element."""
+    import meshcat
+
+    source = Path(meshcat.__file__).with_name("viewer") / "dist" / "main.min.js"
+    return source.read_text(encoding="utf-8").replace("</script", "<\\/script").replace("<!--", "<\\!--")
+
+
+def _base64(values: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
