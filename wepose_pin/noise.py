@@ -14,6 +14,9 @@ from .recording import Recording
 GYRO_FLOOR = 1e-5  # [rad/s]
 ACCEL_FLOOR = 1e-5  # [g]
 
+# Blocks for the covariance of the mean: long against the sensor's noise, short against a person's sway.
+BLOCK_S = 0.5
+
 # Without stated phases: the quietest stretch of this length within the beginning is taken.
 QUIET_S = 2.0
 BEGINNING_S = 20.0
@@ -26,6 +29,7 @@ class SensorNoise:
     Parameters
     ----------
     gyro_bias : (3,) mean of gyro [rad/s]
+    gyro_bias_cov : (3, 3) covariance of that mean [rad²/s²], slow motion in the phase included (a person sways)
     gyro_cov : (3, 3) Σ̂_ω, sample covariance of gyro [rad²/s²]
     accel_cov : (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
     bias_step_cov : (3, 3) Σ_b, covariance of the first differences of gyro [rad²/s²], as in the authors' software
@@ -34,6 +38,7 @@ class SensorNoise:
     """
 
     gyro_bias: np.ndarray
+    gyro_bias_cov: np.ndarray
     gyro_cov: np.ndarray
     accel_cov: np.ndarray
     bias_step_cov: np.ndarray
@@ -41,7 +46,7 @@ class SensorNoise:
     samples: int
 
 
-def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray) -> SensorNoise:
+def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> SensorNoise:
     """Noise and bias from samples at rest: `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²].
 
     Raises
@@ -53,15 +58,29 @@ def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray) -> SensorNoise:
         raise BadPhase(f"the still phase holds {len(gyro_S)} samples; at least 10 are needed to measure noise")
     gravity = float(np.linalg.norm(accel_S, axis=1).mean())
     if not gravity > 0.0:
-        raise BadPhase("the still phase holds no gravity: accel is zero; the filter needs specific force, +g up at rest")
+        raise BadPhase(
+            "the still phase holds no gravity: accel is zero; the filter needs specific force, +g up at rest"
+        )
     return SensorNoise(
         gyro_bias=gyro_S.mean(axis=0),
+        gyro_bias_cov=_cov_of_mean(gyro_S, rate_hz),
         gyro_cov=_floored(np.cov(gyro_S.T), GYRO_FLOOR),
         accel_cov=_floored(np.cov(accel_S.T / gravity), ACCEL_FLOOR),
         bias_step_cov=_floored(np.cov(np.diff(gyro_S, axis=0).T), GYRO_FLOOR),
         gravity=gravity,
         samples=len(gyro_S),
     )
+
+
+def _cov_of_mean(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Covariance of the mean from the means of blocks: white noise averages out in them, sway stays and is counted."""
+    size = max(1, round(BLOCK_S * rate_hz))
+    blocks = len(gyro_S) // size
+    white = np.cov(gyro_S.T) / len(gyro_S)
+    if blocks < 4:  # too short to see sway: the white part is all that can be said
+        return _floored(white, GYRO_FLOOR)
+    means = gyro_S[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
+    return _floored(white + np.cov(means.T) / blocks, GYRO_FLOOR)
 
 
 def _floored(cov: np.ndarray, std: float) -> np.ndarray:
@@ -72,7 +91,7 @@ def quietest(recording: Recording) -> tuple[float, float]:
     """Interval [s] of `QUIET_S` within the first `BEGINNING_S` in which all sensors together move least."""
     time, rate_hz = recording.time, recording.rate_hz
     n = int(np.searchsorted(time, time[0] + BEGINNING_S, side="right"))
-    window = min(max(int(round(QUIET_S * rate_hz)), 10), n)
+    window = min(max(round(QUIET_S * rate_hz), 10), n)
     motion = np.zeros(n - window + 1)
     for sensor in recording.sensors.values():
         if sensor.gyro_S is not None:

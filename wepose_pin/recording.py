@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from .errors import BadData, BadPhase, one_of
 
@@ -26,7 +27,26 @@ SEGMENTS = (
 )
 START_POSES = ("n_pose",)
 
+# The sensor axes that a mount can be stated with.
+AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) for k, axis in enumerate("xyz")}
+
 Intervals = tuple[tuple[float, float], ...]
+
+
+def mount_from_axes(up: str, forward: str) -> np.ndarray:
+    """`quat_LS` (4,) xyzw of the sensor axes that point up and forward in the start pose, as in ``"+x", "-z"``.
+
+    The rows of R_LS are the segment's axes in the sensor.
+    """
+    up_S, forward_S = AXES[up], AXES[forward]
+    return Rotation.from_matrix([forward_S, np.cross(up_S, forward_S), up_S]).as_quat()
+
+
+def axes_from_mount(quat_LS: np.ndarray) -> tuple[str, str]:
+    """The two axis names, up and forward, that `mount_from_axes` gives this mount for, or the nearest."""
+    rows = Rotation.from_quat(quat_LS).as_matrix()
+    up, forward = (list(AXES)[int(np.argmax([axis @ row for axis in AXES.values()]))] for row in (rows[2], rows[0]))
+    return up, forward
 
 
 @dataclass(frozen=True)

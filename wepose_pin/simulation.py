@@ -1,12 +1,11 @@
 """A subject with known truth and the IMU data that its motion gives.
 
-The motion is a closed form of continuous time, so that it is known exactly between the samples as well, and it
-shares no code with the model room: what the tests compare against is written here and nowhere else. Frames as
-everywhere: W is z up, x forward, y left, origin at the root of the trunk; each segment frame equals W in the
-N-pose; the arm runs along -z. The torso frame T shares its origin with W: the torso turns
-about the root.
+The motion is a closed form of continuous time, so that it is known exactly between the samples as well, and
+it shares no code with the model room: what the tests compare against is written here and nowhere else. Frames
+as everywhere: W is z up, x forward, y left, origin at the root of the trunk; each segment frame equals W in
+the N-pose; the arm runs along -z. The torso frame T shares its origin with W: the torso turns about it.
 
-A perfect world: no soft tissue, an exact N-pose, palms that coincide in the clasp, a hand at rest quite still.
+A perfect world: no soft tissue, an exact N-pose, palms that coincide in the clasp, a hand still at rest.
 """
 
 from collections.abc import Mapping
@@ -17,11 +16,14 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from .pose import Pose
+from .recording import Recording, Sensor, check, mount_from_axes
+from .subject import LENGTHS, SEXES, Subject, average_subject
+
 GRAVITY = 9.81  # [m/s^2]
 SIDES = {"left": 1.0, "right": -1.0}  # y of the side in W
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 ARM = ("upper_arm", "forearm", "hand")
-LENGTHS = ("trunk", "shoulder_width", *(f"{side}_{part}" for side in SIDES for part in ARM))
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, but for the tilt of the strap
 
 _E_Z = np.array((0.0, 0.0, 1.0))
@@ -32,19 +34,20 @@ _REST_S = (2.5, 2.0)  # first rest on the table, each later one
 _LIFT_S = 1.5  # table to circle, circle to table
 _MARGIN_S = 0.1  # the stated phases keep this distance from the motion beside them
 _FLEXION = np.deg2rad((8.0, 140.0))  # of the elbow while the hand is led to a point
-_STENCIL_S = 1e-3  # truncation of p_ddot about 1e-6 m/s^2, rounding about 1e-9
+_STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
 
 
 @dataclass(frozen=True)
 class ImuNoise:
     """Noise of an IMU; the defaults are those of the Xsens MTi-3.
 
-    Densities and in-run stabilities: MTi 1-series data sheet (0.007 deg/s/sqrt(Hz), 10 deg/h; 120 ug/sqrt(Hz),
-    0.03 mg). It gives no turn-on bias that is comparable: 0.2 deg/s and 3 mg are assumptions.
+    Densities and in-run stabilities: MTi 1-series data sheet (0.007 deg/s/sqrt(Hz), 10 deg/h; 120
+    ug/sqrt(Hz), 0.03 mg). It gives no turn-on bias that is comparable: 0.2 deg/s and 3 mg are assumptions.
 
-    White noise has the standard deviation density * sqrt(rate) at each sample, the convention of angle and velocity
-    random walk. The bias is the turn-on bias, constant over the recording, plus a first-order Gauss-Markov process
-    whose standard deviation is the in-run stability and whose correlation time is an assumption as well.
+    White noise has the standard deviation density * sqrt(rate) at each sample, the convention of angle and
+    velocity random walk. The bias is the turn-on bias, constant over the recording, plus a first-order
+    Gauss-Markov process whose standard deviation is the in-run stability and whose correlation time is an
+    assumption as well.
     """
 
     gyro_density: float = np.deg2rad(0.007)  # [rad/s/sqrt(Hz)]
@@ -64,28 +67,43 @@ PERFECT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 class Simulation:
     """What `simulate` gives: exact motion, IMU data, and what the session file would state.
 
-    The mounts: `quat_LS` is R_LS = Swing @ N, where N takes the axes of `stated_mount` to z (up) and x (forward) of
-    the segment and Swing turns by 2 to 10 deg about a horizontal axis. So the stated axes and gravity as measured in
+    `quat_LS` is R_LS = Swing @ N, where N takes the axes of `stated_mount` to z (up) and x (forward) of the
+    segment and Swing turns by 2 to 10 deg about a horizontal axis. So the stated axes and gravity measured in
     the start pose give the mount exactly: Swing is the least rotation from N @ (up in S) to e_z.
     """
 
     time: np.ndarray  # (n,) [s], from 0
     rate_hz: float
-    quat_WL: dict[str, np.ndarray]  # segment -> (n, 4) xyzw, exact, sign without jumps
+    quat_WL: dict[str, np.ndarray]  # segment -> (n, 4) xyzw, exact
     points: dict[str, np.ndarray]  # point -> (n, 3) [m] in W, exact
     gyro_S: dict[str, np.ndarray]  # sensor (named by its segment) -> (n, 3) [rad/s], over (k-1, k]
     accel_S: dict[str, np.ndarray]  # sensor -> (n, 3) [m/s^2], specific force at time[k]
     quat_LS: dict[str, np.ndarray]  # sensor -> (4,) xyzw, exact mount, sensor to segment
     p_LS: dict[str, np.ndarray]  # sensor -> (3,) [m] in L, from hips, shoulder or elbow to the sensor
-    stated_mount: dict[
-        str, tuple[str, str]
-    ]  # sensor -> sensor axis that points up, forward in the start pose
+    stated_mount: dict[str, tuple[str, str]]  # sensor -> its axes that point up, forward in the start pose
     gyro_bias: dict[str, np.ndarray]  # sensor -> (n, 3) [rad/s], exact
     accel_bias: dict[str, np.ndarray]  # sensor -> (n, 3) [m/s^2], exact
     lengths: dict[str, float]  # [m]
     phases: dict[str, list[tuple[float, float]]]
     """[s]. "start": still in the N-pose; "clasp": palms together; "circles": first lift off the table to last
     return; "rest": each rest of the right hand on the table, all sensors still."""
+
+    def recording(self, name: str = "simulated") -> Recording:
+        """What a user would have recorded of it: sensors, stated mounts and phases, no truth."""
+        sensors = {
+            segment: Sensor(
+                gyro_S=self.gyro_S[segment],
+                accel_S=self.accel_S[segment],
+                stated_quat_LS=mount_from_axes(*self.stated_mount[segment]),
+            )
+            for segment in self.gyro_S
+        }
+        phases = {phase: tuple(spans) for phase, spans in self.phases.items() if spans}
+        return check(Recording(name, self.time, self.rate_hz, sensors, phases))
+
+    def truth(self) -> Pose:
+        """The exact pose."""
+        return Pose(self.time, self.quat_WL, self.points)
 
 
 class _Pose(NamedTuple):
@@ -139,29 +157,23 @@ class _Circle:
     def offset_W(self, t: np.ndarray, table_W: np.ndarray) -> np.ndarray:
         """From the table point to the hand: (n, 3) [m]."""
         angle = 2.0 * np.pi * self.sense * _step(t, self.start + _LIFT_S - 0.5, self.duration)
-        circle_W = (
-            self.centre_W + np.cos(angle)[:, None] * self.axes_W[0] + np.sin(angle)[:, None] * self.axes_W[1]
-        )
+        circle_W = self.centre_W + np.cos(angle)[:, None] * self.axes_W[0] + np.sin(angle)[:, None] * self.axes_W[1]
         return _pulse(t, self.start, self.stop, _LIFT_S)[:, None] * (circle_W - table_W)
 
 
 class _Motion:
     """The subject's motion as a function of continuous time."""
 
-    def __init__(
-        self, lengths: Mapping[str, float], rng: np.random.Generator, clasp_s: float, circles: int
-    ) -> None:
+    def __init__(self, lengths: Mapping[str, float], rng: np.random.Generator, clasp_s: float, circles: int) -> None:
         self.lengths = lengths
         self.half_width = 0.5 * lengths["shoulder_width"]
-        self.arm = {
-            s: (lengths[f"{s}_upper_arm"], lengths[f"{s}_forearm"] + lengths[f"{s}_hand"]) for s in SIDES
-        }
+        self.arm = {s: (lengths[f"{s}_upper_arm"], lengths[f"{s}_forearm"] + lengths[f"{s}_hand"]) for s in SIDES}
         self.reach = min(sum(arm) for arm in self.arm.values())
         self.clasp = (_STAND_S + _BLEND_S, _STAND_S + _BLEND_S + clasp_s)
         names = ("azimuth", "elevation", "radius", "roll", "pitch", "yaw")
         arm_names = (f"{side}_{angle}" for side in SIDES for angle in ("swivel", "pronation"))
         self.wander = {name: _Wander(rng) for name in (*names, *arm_names)}
-        # As fractions of the reach, from the right shoulder: a table above the hips, circles before the chest.
+        # In units of the reach, from the right shoulder: table above the hips, circles before the chest.
         shoulder_W = np.array((0.0, -self.half_width, lengths["trunk"]))
         self.table_W = shoulder_W + self.reach * np.array((0.52, 0.03, -0.6))
         t = self.clasp[1] + _BLEND_S
@@ -175,9 +187,7 @@ class _Motion:
             tilt, turn, first = rng.uniform(-1.0, 1.0, 3) * np.array((0.5, 0.5, np.pi))  # mostly frontal
             plane = Rotation.from_euler("ZYX", [turn, tilt, first])
             axes_W = radius * plane.apply([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-            circle = _Circle(
-                self.rest[-1][1], rng.uniform(3.0, 4.0), centre_W, axes_W, rng.choice((-1.0, 1.0))
-            )
+            circle = _Circle(self.rest[-1][1], rng.uniform(3.0, 4.0), centre_W, axes_W, rng.choice((-1.0, 1.0)))
             self.circles.append(circle)
             self.rest.append((circle.stop, circle.stop + _REST_S[1]))
 
@@ -194,7 +204,7 @@ class _Motion:
             [[np.sqrt(a * a + b * b + 2 * a * b * np.cos(f)) for f in _FLEXION] for a, b in self.arm.values()]
         )
         longest, shortest = span[:, 0].min(), span[:, 1].max()
-        # The far shoulder limits the radius from above, the near one from below; the smooth |y| is on the safe side.
+        # The far shoulder limits the radius from above, the near one from below; the smooth |y| is safe.
         side = self.half_width * np.sqrt(ray[:, 1] ** 2 + 0.01)
         upper = np.sqrt(side**2 + longest**2 - self.half_width**2) - side
         lower = np.sqrt(side**2 + max(shortest**2 - self.half_width**2, 0.0)) + side
@@ -203,10 +213,11 @@ class _Motion:
         return (lower + fraction * (upper - lower))[:, None] * ray
 
     def _arm(self, side: str, palm_T: np.ndarray, swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:
-        """Upper arm in T and elbow flexion [rad] that bring the palm to `palm_T` (n, 3) [m], seen from the shoulder.
+        """Upper arm in T and elbow flexion [rad] to bring the palm to `palm_T` (n, 3) [m], from the shoulder.
 
-        `swivel` (n,) [rad] turns the elbow about the line from shoulder to palm, from below outwards. The elbow is
-        a hinge: the forearm is the upper arm turned by flexion about -y, then by pronation about its own z.
+        `swivel` (n,) [rad] turns the elbow about the line from shoulder to palm, from below outwards. The
+        elbow is a hinge: the forearm is the upper arm turned by flexion about -y, then by pronation about its
+        own z.
         """
         upper, lower = self.arm[side]
         distance = np.linalg.norm(palm_T, axis=1)
@@ -237,9 +248,7 @@ class _Motion:
         lean *= np.deg2rad(15.0 * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
         R_WT = Rotation.from_euler("ZYX", lean)
         clasp_T = self._clasp_point(t, moving) + self.lengths["trunk"] * _E_Z
-        hand_W = self.table_W + sum(
-            (c.offset_W(t, self.table_W) for c in self.circles), np.zeros((len(t), 3))
-        )
+        hand_W = self.table_W + sum((c.offset_W(t, self.table_W) for c in self.circles), np.zeros((len(t), 3)))
         palm_T = {
             "left": clasp_T,
             "right": clasp_T + table[:, None] * (R_WT.inv().apply(hand_W) - clasp_T),
@@ -271,7 +280,7 @@ class _Motion:
 
 
 def _sensor_places(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """Where each sensor sits in its segment frame: on the sternum, half-way on the outer side of each arm segment."""
+    """Where each sensor sits in L [m]: on the sternum, half-way along the outer side of the arm segments."""
     places = {"torso": np.array((0.11, 0.0, 0.8 * lengths["trunk"]))}
     for side, y in SIDES.items():
         places[f"{side}_upper_arm"] = np.array((0.0, 0.045 * y, -0.5 * lengths[f"{side}_upper_arm"]))
@@ -288,9 +297,7 @@ def _sensor_position(pose: _Pose, segment: str, p_LS: np.ndarray) -> np.ndarray:
     return p_W + pose.points[f"{side}_shoulder" if part == "upper_arm" else f"{side}_elbow"]
 
 
-def _bias(
-    rng: np.random.Generator, shape: tuple[int, int], turn_on: float, in_run: float, decay: float
-) -> np.ndarray:
+def _bias(rng: np.random.Generator, shape: tuple[int, int], turn_on: float, in_run: float, decay: float) -> np.ndarray:
     """Turn-on bias plus Gauss-Markov process of standard deviation `in_run`, which keeps `decay` a sample."""
     white = rng.standard_normal(shape) * np.sqrt(1.0 - decay**2)
     white[0] /= np.sqrt(1.0 - decay**2)  # stationary from the first sample
@@ -308,15 +315,16 @@ def simulate(
 ) -> Simulation:
     """A recording of the paper's upper-body experiment with known truth.
 
-    0 to 5 s still in the N-pose; 2.5 s to the clasp; `clasp_s` of free motion with the palms together while the
-    torso leans and twists; 2.5 s in which the left arm returns to hang and the right hand goes to a table; then
-    `circles` circles in the air (Lisini Baldi 2019, upper-body experiment), a rest on the table before and after each.
+    0 to 5 s still in the N-pose; 2.5 s to the clasp; `clasp_s` of free motion with the palms together while
+    the torso leans and twists; 2.5 s in which the left arm returns to hang and the right hand goes to a
+    table; then `circles` circles in the air (Lisini Baldi 2019, upper-body experiment), a rest on the table
+    before and after each.
 
     Parameters
     ----------
     lengths : segment lengths [m]: trunk, shoulder_width, and upper_arm, forearm, hand of left_ and right_.
-    seed : the same seed gives the same bits. Motion, mounts and noise draw from streams of their own: noise and rate
-        change neither motion nor mounts, and noise of twice the density is the same noise twice as large.
+    seed : the same seed gives the same bits. Motion, mounts and noise draw from streams of their own: noise
+        and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
     rate_hz : samples a second.
     noise : of gyroscope and accelerometer; `PERFECT` for none.
     clasp_s : how long the palms stay together [s], at least 5.
@@ -325,8 +333,8 @@ def simulate(
     Returns
     -------
     Simulation
-        gyro_S[k] is log(R_WS[k-1]^T R_WS[k]) * rate, so that multiplying up exp(gyro_S / rate) gives the orientation
-        back exactly; accel_S[k] is R_WS[k]^T (p_ddot + g e_z), p_ddot by fourth-order central differences.
+        gyro_S[k] is log(R_WS[k-1]^T R_WS[k]) * rate, so that multiplying up exp(gyro_S / rate) gives the
+        orientation back exactly; accel_S[k] is R_WS[k]^T (p_ddot + g e_z), p_ddot by central differences.
 
     Raises
     ------
@@ -366,18 +374,13 @@ def simulate(
         p_ddot = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
 
         gyro_bias[segment] = _bias(noise_rng, (n, 3), noise.gyro_bias_std, noise.gyro_bias_instability, decay)
-        accel_bias[segment] = _bias(
-            noise_rng, (n, 3), noise.accel_bias_std, noise.accel_bias_instability, decay
-        )
+        accel_bias[segment] = _bias(noise_rng, (n, 3), noise.accel_bias_std, noise.accel_bias_instability, decay)
         white = noise_rng.standard_normal((2, n, 3)) * np.sqrt(rate_hz)
         rate_S = np.vstack((np.zeros(3), rotvec * rate_hz))  # still before the first sample
         force_S = R_WS.inv().apply(p_ddot + GRAVITY * _E_Z)
         gyro_S[segment] = rate_S + gyro_bias[segment] + noise.gyro_density * white[0]
         accel_S[segment] = force_S + accel_bias[segment] + noise.accel_density * white[1]
-        quat = pose.R_WL[segment].as_quat()
-        flip = np.cumprod(np.where(np.einsum("ni,ni->n", quat[:-1], quat[1:]) < 0.0, -1.0, 1.0))
-        quat[1:] *= flip[:, None]
-        quat_WL[segment], quat_LS[segment] = quat, R_LS.as_quat()
+        quat_WL[segment], quat_LS[segment] = pose.R_WL[segment].as_quat(), R_LS.as_quat()
 
     phases = {
         "start": [(0.5, _STAND_S - 0.5)],
@@ -400,3 +403,26 @@ def simulate(
         lengths=lengths,
         phases=phases,
     )
+
+
+class Person(NamedTuple):
+    """A random person, and what a user with a tape would know of them."""
+
+    lengths: dict[str, float]  # [m], true
+    stature: float  # [m]
+    sex: str  # "f" or "m"
+    taped: dict[str, float]  # [m], measured lengths, each off by a draw of `taped_std`
+    taped_std: float  # [m]
+    average: Subject  # the average person of that stature and sex
+
+
+def simulated_person(seed: int, taped_std: float = 0.003) -> Person:
+    """A person drawn from the anthropometric distribution; the shoulder width is taped."""
+    rng = np.random.default_rng([seed, 7])
+    sex = SEXES[int(rng.integers(2))]
+    mean, std = {"f": (1.63, 0.064), "m": (1.756, 0.069)}[sex]  # [m], ANSUR II (Gordon et al. 2014)
+    stature = float(np.clip(rng.normal(mean, std), 1.45, 2.0))
+    average = average_subject(round(stature, 2), sex)
+    lengths = dict(average_subject(stature, sex).draw(rng).lengths)
+    taped = {"shoulder_width": lengths["shoulder_width"] + float(rng.normal(0.0, taped_std))}
+    return Person(lengths, stature, sex, taped, taped_std, average)

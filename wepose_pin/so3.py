@@ -110,7 +110,7 @@ def up_in_sensor(quat):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def integrate(rotvec):  # type: ignore[no-untyped-def]
-    """Orientations (n + 1, 4) xyzw from the identity on, each turned by the next of the rotation vectors (n, 3) [rad]."""
+    """Orientations (n + 1, 4) xyzw from the identity on, each turned by the next of `rotvec` (n, 3) [rad]."""
     quat = np.array([0.0, 0.0, 0.0, 1.0])
     out = np.empty((len(rotvec) + 1, 4))
     out[0] = quat

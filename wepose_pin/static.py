@@ -17,7 +17,7 @@ _MOMENTS = 13
 
 @dataclass(frozen=True)
 class StaticTest:
-    """When a sensor counts as still; the defaults are the paper's, the window lies within the authors' 20 to 100 samples.
+    """When a sensor counts as still; the defaults are the paper's, with a window of the authors' software.
 
     The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite.
     """

@@ -1,8 +1,8 @@
 """The motion as one HTML page on meshcat that opens offline, from a file, without a server.
 
-meshcat's own server listens on every interface, so none is started: meshcat writes its commands into a list, and the
-page hands them to the viewer that it carries inside. The motion is not meshcat's animation but a table that a small
-player in `viewer_page.html` reads, as a recording of minutes would be tens of megabytes of keyframes.
+meshcat's own server listens on every interface, so none is started: meshcat writes its commands into a list,
+and the page hands them to the viewer that it carries inside. The motion is not meshcat's animation but a
+table that a small player in `viewer_page.html` reads: as keyframes, minutes would be tens of megabytes.
 """
 
 from __future__ import annotations
@@ -13,26 +13,28 @@ import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.model import Visual
+from .model import BodyModel, Visual
+from .pose import Pose, configuration, known_links, placements
 
 BACKGROUND_TOP = (0.985, 0.99, 0.995)
 BACKGROUND_BOTTOM = (0.89, 0.91, 0.935)
 GRID_COLOUR = (0.70, 0.74, 0.79)
-GRID_CELL = 0.25                    # [m]
-GRID_RADIUS = 3.0                   # [m] where the grid has faded away
-CAMERA_FROM = (2.1, 1.25, 0.55)     # direction from the person to the camera in W: front-left, slightly above
-FIELD_OF_VIEW_DEG = 28.0            # a long lens: near hands do not look larger than they are
-LIGHTS = (                          # meshcat's own; positions in W [m]
-    ("AmbientLight", 0.62, None),
-    ("FillLight", 0.10, None),
-    ("PointLightNegativeX", 0.34, (2.5, 2.0, 2.6)),
-    ("PointLightPositiveX", 0.12, (1.0, -3.0, 1.0)),
+GRID_CELL = 0.25  # [m]
+GRID_RADIUS = 3.0  # [m] where the grid has faded away
+CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
+FIELD_OF_VIEW_DEG = 28.0  # a long lens: near hands do not look larger than they are
+LIGHTS = (  # meshcat's own; positions in W [m]
+    ("AmbientLight", 0.66, None),
+    ("FillLight", 0.20, None),
+    ("PointLightNegativeX", 0.50, (2.5, 2.0, 2.6)),
+    ("PointLightPositiveX", 0.16, (1.0, -3.0, 1.0)),
 )
 LEFT_COLOUR, RIGHT_COLOUR, OTHER_COLOUR = "#e8743b", "#2a7fb8", "#5b6b7d"
 
@@ -46,7 +48,38 @@ class CommandList:
     def send(self, command: Any) -> None:
         import umsgpack
 
-        self.commands.append(umsgpack.packb(command.lower()))
+        lowered = command.lower()
+        for shape in lowered.get("object", {}).get("geometries", []):
+            if shape["type"] == "SphereGeometry":  # meshcat's 20 x 20 shows on a head
+                shape.update(widthSegments=40, heightSegments=28)
+        self.commands.append(umsgpack.packb(lowered))
+
+
+def pose_html(
+    model: BodyModel,
+    pose: Pose,
+    *,
+    phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    title: str = "",
+    fps: float = 30.0,
+) -> str:
+    """The page that plays `pose` on `model`, with trails of the hands; parameters as `view_html`.
+
+    Segments that no sensor measured are drawn rigid with the one above where that is the rule for points too (a hand),
+    or where nothing hangs on it (head, pelvis); what is not known is not drawn.
+    """
+    frames = frame_indices(pose.time, fps)
+    q = configuration(model, {segment: quat_WL[frames] for segment, quat_WL in pose.quat_WL.items()})
+    visuals = [visual for visual in model.visuals if visual.link in known_links(model, pose.quat_WL)]
+    return view_html(
+        visuals,
+        pose.time[frames],
+        placements(model, q, dict.fromkeys(visual.link for visual in visuals)),
+        trails={name: pose.points[name][frames] for name in ("left_hand", "right_hand") if name in pose.points},
+        phases=phases,
+        title=title,
+        fps=fps,
+    )
 
 
 def view_html(
@@ -73,14 +106,14 @@ def view_html(
     placements
         Link -> (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]). A link is hidden while its placement is NaN.
     trails
-        Point -> (n, 3) [m] in W, may hold NaN: the last seconds are drawn behind the point. A name that begins with
-        left or right takes the colour of that arm.
+        Point -> (n, 3) [m] in W, may hold NaN: the last seconds are drawn behind the point. A name that
+        begins with left or right takes the colour of that arm.
     phases
         Name -> spans (begin, end) [s] on the same time axis as `time`.
     title
         Plain text; shown, and the name of the window.
     fps
-        Frames a second in the page. The nearest samples are taken, never made up; a slower recording stays as it is.
+        Frames a second in the page: the nearest samples, none made up; a slower recording stays as it is.
     floor_z
         Height [m] of the ground grid in W, whose origin is between the hips.
 
@@ -94,7 +127,7 @@ def view_html(
     trails = {name: np.asarray(points, dtype=float)[frames] for name, points in (trails or {}).items()}
     drawn = [v for v in visuals if v.link in placements and v.kind != "mesh"]
     links = list(dict.fromkeys(v.link for v in drawn))
-    motion = np.empty((len(links), len(frames), 7), dtype="<f4")     # quat_WL xyzw, p_WL
+    motion = np.empty((len(links), len(frames), 7), dtype="<f4")  # quat_WL xyzw, p_WL
     for k, link in enumerate(links):
         quat_WL, p_WL = placements[link]
         motion[k, :, :4], motion[k, :, 4:] = np.asarray(quat_WL)[frames], np.asarray(p_WL)[frames]
@@ -102,7 +135,7 @@ def view_html(
     data = {
         "begin": float(time[0]),
         "end": float(time[-1]),
-        "offsets": _base64(time[frames] - time[0]),      # float32 holds an offset, not seconds since 1970
+        "offsets": _base64(time[frames] - time[0]),  # float32 holds an offset, not seconds since 1970
         "links": links,
         "motion": _base64(motion),
         "trails": [
@@ -110,7 +143,8 @@ def view_html(
             for name, points in trails.items()
         ],
         "phases": [
-            {"name": name, "spans": [[float(a), float(b)] for a, b in spans]} for name, spans in (phases or {}).items()
+            {"name": name, "spans": [[float(begin), float(end)] for begin, end in spans]}
+            for name, spans in (phases or {}).items()
         ],
         "view": _view(drawn, links, motion, list(trails.values())),
         "commands": [base64.b64encode(c).decode("ascii") for c in _scene(drawn, links, floor_z)],
@@ -122,11 +156,11 @@ def view_html(
         "data": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
     }
     page = Path(__file__).with_name("viewer_page.html").read_text(encoding="utf-8")
-    return re.sub(r"@@(\w+)@@", lambda found: parts[found[1]], page)     # one pass: a title cannot name a part
+    return re.sub(r"@@(\w+)@@", lambda found: parts[found[1]], page)  # one pass: a title cannot name a part
 
 
 def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
-    """(m,) int, rising: the samples nearest to a clock of `fps` frames a second, the first and the last among them."""
+    """(m,) int, rising: the samples nearest to a clock of `fps` a second, with the first and the last."""
     clock = np.append(np.arange(time[0], time[-1], 1.0 / fps), time[-1])
     nearest_changes = 0.5 * (time[:-1] + time[1:])
     return np.unique(np.searchsorted(nearest_changes, clock))
@@ -154,7 +188,7 @@ def _scene(drawn: Sequence[Visual], links: Sequence[str], floor_z: float) -> lis
     grid = g.LineSegments(g.PointsGeometry(points, colours), g.LineBasicMaterial(vertexColors=True))
     scene["ground"].set_object(_named(grid, "ground"))
     for k, visual in enumerate(drawn):
-        path = f"body/{links.index(visual.link)}/{k}"      # numbers: a link's name may hold a slash
+        path = f"body/{links.index(visual.link)}/{k}"  # numbers: a link's name may hold a slash
         part = scene[path]
         part.set_object(_named(g.Mesh(_geometry(visual), _material(visual.rgba)), path))
         part.set_transform(_transform(visual))
@@ -162,8 +196,8 @@ def _scene(drawn: Sequence[Visual], links: Sequence[str], floor_z: float) -> lis
 
 
 def _named(thing: Any, path: str) -> Any:
-    """Names in place of meshcat's random ones, which hold the machine's network address and differ in every run."""
-    thing.uuid, thing.geometry.uuid, thing.material.uuid = (f"{path}-{part}" for part in ("object", "shape", "skin"))
+    """Names in place of meshcat's, which hold the machine's network address and differ in every run."""
+    thing.uuid, thing.geometry.uuid, thing.material.uuid = f"{path}-mesh", f"{path}-shape", f"{path}-skin"
     return thing
 
 
@@ -181,9 +215,8 @@ def _material(rgba: tuple[float, float, float, float]) -> Any:
     import meshcat.geometry as g
 
     red, green, blue = (round(255 * min(max(c, 0.0), 1.0)) for c in rgba[:3])
-    return g.MeshPhongMaterial(
-        color=(red << 16) + (green << 8) + blue, opacity=float(rgba[3]), side=0, specular=0x1C1C1C, shininess=24
-    )
+    colour = (red << 16) + (green << 8) + blue
+    return g.MeshPhongMaterial(color=colour, opacity=float(rgba[3]), side=0, specular=0x1C1C1C, shininess=24)
 
 
 def _transform(visual: Visual) -> np.ndarray:
@@ -197,11 +230,11 @@ def _transform(visual: Visual) -> np.ndarray:
 
 
 def _grid(floor_z: float) -> tuple[np.ndarray, np.ndarray]:
-    """The ends of the ground's line pieces and their colours, each (3, m) float32; it fades into the background."""
+    """The ends of the ground's line pieces and their colours, each (3, m); it fades into the background."""
     ticks = np.arange(-GRID_RADIUS, GRID_RADIUS + GRID_CELL / 2, GRID_CELL)
     x, y = np.meshgrid(ticks, ticks[:-1], indexing="ij")
     start, end = np.stack([x, y]).reshape(2, -1), np.stack([x, y + GRID_CELL]).reshape(2, -1)
-    along_y = np.stack([start, end], axis=2).reshape(2, -1)        # start, end, start, end, …
+    along_y = np.stack([start, end], axis=2).reshape(2, -1)  # start, end, start, end, …
     xy = np.concatenate([along_y, along_y[::-1]], axis=1)
     points = np.vstack([xy, np.full(xy.shape[1], floor_z)])
     fade = np.clip(np.hypot(*xy) / GRID_RADIUS, 0.0, 1.0)
@@ -209,35 +242,47 @@ def _grid(floor_z: float) -> tuple[np.ndarray, np.ndarray]:
     return points.astype(np.float32), (near + fade * (far - near)).astype(np.float32)
 
 
-def _view(visuals: Sequence[Visual], links: Sequence[str], motion: np.ndarray, trails: Sequence[np.ndarray]) -> dict[str, Any]:
-    """The camera's axes in W and, along them, the box [m] that the body and its trails never leave."""
+def _view(
+    visuals: Sequence[Visual], links: Sequence[str], motion: np.ndarray, trails: Sequence[np.ndarray]
+) -> dict[str, Any]:
+    """The camera's axes in W (right, up, toward it) and, along them, the motion's outermost points [m]."""
     toward = np.array(CAMERA_FROM) / np.linalg.norm(CAMERA_FROM)
     right = np.cross([0.0, 0.0, 1.0], toward)
     right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(toward, right), toward])         # rows
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    motion = motion[:, :: max(1, motion.shape[1] // 300)].astype(float)
+    R_WC = np.stack([right, np.cross(toward, right), toward], axis=1)
+    motion = motion[:, :: max(1, motion.shape[1] // 150)].astype(float)
+    seen_W = [np.array([[0.0, 0.0, 0.0]]), *trails]
     for visual in visuals:
         placed = motion[links.index(visual.link)]
         placed = placed[np.isfinite(placed).all(axis=1)]
+        corners_V = np.array(list(product((-1.0, 1.0), repeat=3))) * _half_edges(visual)
+        corners_L = Rotation.from_quat(visual.quat_LV).apply(corners_V) + visual.p_LV
         if len(placed):
-            seen = (Rotation.from_quat(placed[:, :4]).apply(visual.p_LV) + placed[:, 4:]) @ axes.T
-            reach = max(visual.size) / (1.0 if visual.kind == "sphere" else 2.0)
-            low, high = np.minimum(low, seen.min(axis=0) - reach), np.maximum(high, seen.max(axis=0) + reach)
-    for points in trails:
-        seen = points[np.isfinite(points).all(axis=1)] @ axes.T
-        low, high = np.minimum(low, seen.min(axis=0, initial=np.inf)), np.maximum(high, seen.max(axis=0, initial=-np.inf))
-    if not np.isfinite([low, high]).all():                            # nothing to see: where a person would be
-        low, high = np.array([-0.5, -0.2, -0.5]), np.array([0.5, 0.9, 0.5])
-    return {"axes": axes.tolist(), "low": low.tolist(), "high": high.tolist()}
+            R_WL = Rotation.from_quat(placed[:, :4]).as_matrix()
+            seen_W.append(((R_WL @ corners_L.T).swapaxes(1, 2) + placed[:, None, 4:]).reshape(-1, 3))
+    seen_C = np.concatenate(seen_W) @ R_WC
+    seen_C = seen_C[np.isfinite(seen_C).all(axis=1)]
+    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    fan = np.stack([np.cos(angle), np.sin(angle)])
+    outermost = np.unique([np.argmax(seen_C[:, plane] @ fan, axis=0) for plane in ([0, 2], [1, 2])])
+    return {"axes": R_WC.T.tolist(), "points": np.round(seen_C[outermost], 4).tolist()}
+
+
+def _half_edges(visual: Visual) -> np.ndarray:
+    """(3,) [m] of the box around a visual."""
+    if visual.kind == "box":
+        return np.array(visual.size) / 2.0
+    radius = visual.size[0]
+    return np.array([radius, radius, visual.size[1] / 2.0 if visual.kind == "cylinder" else radius])
 
 
 def _trail_colour(point: str, visuals: Sequence[Visual]) -> str:
     """The colour that most of that arm's visuals have."""
     for side, otherwise in (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)):
         if point.lower().startswith(side):
-            arm = Counter(v.rgba for v in visuals if v.link.lower().startswith(side) and "arm" in v.link.lower())
-            return "#" + "".join(f"{round(255 * c):02x}" for c in arm.most_common(1)[0][0][:3]) if arm else otherwise
+            arm = [v for v in visuals if v.link.lower().startswith(side) and "arm" in v.link.lower()]
+            most = Counter(v.rgba[:3] for v in arm).most_common(1)
+            return "#" + "".join(f"{round(255 * c):02x}" for c in most[0][0]) if most else otherwise
     return OTHER_COLOUR
 
 

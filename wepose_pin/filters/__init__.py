@@ -16,7 +16,7 @@ from ..static import StaticDetector, StaticTest
 from .base import FilterRun, OrientationFilter
 from .gdc import Gdc, GdcParams
 from .ncf import Ncf, NcfParams
-from .smekf import Smekf, SmekfParams
+from .smekf import Smekf, SmekfParams, starting_params
 
 __all__ = [
     "METHODS",
@@ -31,6 +31,7 @@ __all__ = [
     "SmekfParams",
     "check_method",
     "estimate_orientation",
+    "run_filter",
 ]
 
 METHODS: dict[str, type] = {"smekf": Smekf, "ncf": Ncf, "gdc": Gdc}
@@ -88,7 +89,7 @@ def estimate_orientation(
     BadOption, BadData, BadPhase
         An unknown method; arrays that do not fit each other; a still phase outside the data.
     """
-    make = METHODS[check_method(method)]
+    check_method(method)
     gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
     if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
@@ -97,10 +98,37 @@ def estimate_orientation(
     first, last = round(still[0] * rate_hz), round(still[1] * rate_hz) + 1
     if not 0 <= first < last <= len(gyro) + 1:
         raise BadPhase(f"still = {still} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
-    noise = noise_of(gyro[first:last], accel[first:last])
+    return run_filter(
+        gyro,
+        accel,
+        rate_hz,
+        noise_of(gyro[first:last], accel[first:last], rate_hz),
+        method,
+        params,
+        static_test,
+    )
+
+
+def run_filter(
+    gyro_S: np.ndarray,
+    accel_S: np.ndarray,
+    rate_hz: float,
+    noise: SensorNoise,
+    method: str,
+    params: Any = None,
+    static_test: StaticTest | None = None,
+    measured_start: bool = False,
+) -> Orientation:
+    """`estimate_orientation` once the noise is known and the arrays are checked.
+
+    `measured_start`: without `params`, smekf takes P₀ from `noise` in place of the paper's (`smekf.starting_params`).
+    """
     test = static_test or StaticTest()
-    static = StaticDetector(noise, rate_hz, test).run(gyro, accel)
-    start = accel[: test.samples(rate_hz)].mean(axis=0)
-    filter_ = make(noise, rate_hz, so3.tilt(start), params)
-    quat, bias, cov = filter_.run(gyro, accel, static)
-    return Orientation(quat, bias, static, cov, noise)
+    static = StaticDetector(noise, rate_hz, test).run(gyro_S, accel_S)
+    window = test.samples(rate_hz)
+    quat_start = so3.tilt(accel_S[:window].mean(axis=0))
+    if measured_start and params is None and method == "smekf":
+        params = starting_params(noise, quat_start, still_start=bool(static[window - 1 : window].any()))
+    filter_ = METHODS[method](noise, rate_hz, quat_start, params)
+    quat_WS, bias, cov = filter_.run(gyro_S, accel_S, static)
+    return Orientation(quat_WS, bias, static, cov, noise)

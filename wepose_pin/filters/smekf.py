@@ -15,13 +15,41 @@ from ..noise import SensorNoise
 from ..so3 import rotate_by_vector, up_in_sensor
 from .base import FilterRun, samples
 
+ACCEL_BIAS_STD = 0.005  # [rad] tilt error that a MEMS accelerometer's bias makes (5 mg)
+MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
+HEADING_FLOOR = 1e-5  # [rad] keeps P₀ positive definite about the vertical
+
 
 @dataclass(frozen=True)
 class SmekfParams:
-    """P₀ as in the authors' published software: the same number for rad² and rad²/s²."""
+    """P₀ and Σ_b; the defaults are those of the authors' published software.
 
-    attitude_var0: float = 1e-3  # [rad²]
-    bias_var0: float = 1e-3  # [rad²/s²]
+    Their P₀ gives the heading, which nothing measures, a standard deviation of 1.8 deg. With the first-order F of the
+    algorithm this leaks into the tilt over a minute of motion at 100 Hz and comes back as jumps of the heading by
+    several degrees at the next rest; `starting_params` says what a still start is really worth. Their Σ_b is some
+    2 Σ_ω, orders above the drift of a real bias, so every rest forgets the ones before.
+    """
+
+    attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
+    bias_cov0: float | np.ndarray = 1e-3  # [rad²/s²], a number or (3, 3)
+    bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the still phase's first differences
+
+
+def starting_params(noise: SensorNoise, quat_WS: np.ndarray, still_start: bool) -> SmekfParams:
+    """P₀ from what the still phase says: the tilt as good as the accelerometer, the heading exact by definition.
+
+    Parameters
+    ----------
+    quat_WS : (4,) xyzw, the orientation the filter starts from
+    still_start : the recording begins at rest; if not, the first tilt may be off by tens of degrees
+    """
+    up_S = np.array(up_in_sensor(quat_WS))
+    tilt_std = ACCEL_BIAS_STD if still_start else MOVING_TILT_STD
+    across = np.eye(3) - np.outer(up_S, up_S)
+    return SmekfParams(
+        attitude_cov0=tilt_std**2 * across + noise.accel_cov * bool(still_start) + HEADING_FLOOR**2 * np.eye(3),
+        bias_cov0=noise.gyro_bias_cov,
+    )
 
 
 @dataclass
@@ -40,8 +68,12 @@ class Smekf:
         self.params = params or SmekfParams()
         self.noise = noise
         self.rate_hz = rate_hz
-        p0 = np.repeat([self.params.attitude_var0, self.params.bias_var0], 3)
-        self.state = SmekfState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy(), np.diag(p0))
+        P = np.zeros((6, 6))
+        P[:3, :3] = _matrix(self.params.attitude_cov0)
+        P[3:, 3:] = _matrix(self.params.bias_cov0)
+        step = self.params.bias_step_cov
+        self._bias_step_cov = noise.bias_step_cov if step is None else np.asarray(step, dtype=float)
+        self.state = SmekfState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy(), P)
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
         gyro, accel, at_rest = samples(gyro_S, accel_S, static)
@@ -57,7 +89,7 @@ class Smekf:
             1.0 / self.rate_hz,
             noise.gravity,
             noise.gyro_cov,
-            noise.bias_step_cov,
+            self._bias_step_cov,
             noise.accel_cov,
             *out,
         )
@@ -65,6 +97,12 @@ class Smekf:
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
         return self.run(gyro_S, accel_S, static).quat_WS[0]
+
+
+def _matrix(cov: float | np.ndarray) -> np.ndarray:
+    """A covariance (3, 3) that may be given as one variance."""
+    given = np.asarray(cov, dtype=float)
+    return given if given.ndim == 2 else given * np.eye(3)
 
 
 @njit(cache=True)

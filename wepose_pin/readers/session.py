@@ -13,13 +13,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from .. import so3
 from ..errors import BadData, BadSession, MissingFile, one_of
-from ..recording import SEGMENTS, START_POSES, Intervals, Recording, Sensor, check
+from ..recording import AXES, SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, mount_from_axes
 from .tables import columns, read_table
 
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "g": 9.80665}
 STRAPPINGS = ("as_calibrated", "new")
-AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) for k, axis in enumerate("xyz")}
 
 # A sample later than this after its neighbour is a gap, which nobody may fill in silence.
 LONGEST_GAP_S = 0.05
@@ -50,7 +49,9 @@ def load_session(path: str | Path) -> Recording:
     for segment in tables.values:
         clocks[segment], sensors[segment] = _read_sensor(path, data, tables.table(segment))
     if not sensors:
-        raise BadSession(f"{path.name}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}")
+        raise BadSession(
+            f"{path.name}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}"
+        )
     time, notes = _common_time(path.name, clocks)
     truth = data.text("truth", None)
     recording = Recording(
@@ -149,7 +150,9 @@ def _read_sensor(path: Path, data: _Keys, keys: _Keys) -> tuple[np.ndarray, Sens
     name = clock_keys.text("time", None)
     rate_hz = clock_keys.number("rate_hz", None, positive=True)
     if (name is None) == (rate_hz is None):
-        raise BadSession(f"{clock_keys.at('time')} or rate_hz is needed, one of the two: a column in seconds, or a rate")
+        raise BadSession(
+            f"{clock_keys.at('time')} or rate_hz is needed, one of the two: a column in seconds, or a rate"
+        )
     if name is not None:
         clock = columns(table, [name], file, clock_keys.at("time"))[:, 0]
     else:
@@ -180,20 +183,21 @@ def _read_sensor(path: Path, data: _Keys, keys: _Keys) -> tuple[np.ndarray, Sens
 
 
 def _mount(keys: _Keys) -> np.ndarray:
-    """`quat_LS` (4,) of the stated axes: the rows of R_LS are the segment's axes in the sensor."""
     keys.allow("up", "forward")
-    up_S = AXES[keys.choice("up", AXES)]
-    forward_S = AXES[keys.choice("forward", AXES)]
-    if abs(up_S @ forward_S) > 0.5:
-        raise BadSession(f"{keys.at('forward')} is parallel to up; name two different sensor axes")
-    return Rotation.from_matrix([forward_S, np.cross(up_S, forward_S), up_S]).as_quat()
+    up, forward = keys.choice("up", AXES), keys.choice("forward", AXES)
+    if abs(AXES[up] @ AXES[forward]) > 0.5:
+        raise BadSession(
+            f"{keys.at('forward')} = '{forward}' is parallel to up = '{up}'; name two different sensor axes"
+        )
+    return mount_from_axes(up, forward)
 
 
 def _phases(keys: _Keys) -> dict[str, Intervals]:
     phases: dict[str, Intervals] = {}
     for name, value in keys.values.items():
         well = isinstance(value, list) and all(
-            isinstance(pair, list) and len(pair) == 2 and all(isinstance(v, int | float) for v in pair) for pair in value
+            isinstance(pair, list) and len(pair) == 2 and all(isinstance(v, int | float) for v in pair)
+            for pair in value
         )
         if not well:
             raise BadSession(f"{keys.at(name)} = {value!r} is not a list of intervals; write [[from, to]] in seconds")

@@ -1,0 +1,350 @@
+"""The simulator against what shares no code with it: integrals, splines, geometry of the points."""
+
+from dataclasses import replace
+from itertools import pairwise
+from time import perf_counter
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.simulation import LENGTHS, PERFECT, SEGMENTS, ImuNoise, Simulation, simulate
+
+G = 9.81
+SIDES = ("left", "right")
+# Left and right differ, so that a swap shows.
+SUBJECT = {
+    "trunk": 0.50,
+    "shoulder_width": 0.385,
+    "left_upper_arm": 0.301,
+    "left_forearm": 0.252,
+    "left_hand": 0.081,
+    "right_upper_arm": 0.309,
+    "right_forearm": 0.247,
+    "right_hand": 0.078,
+}
+
+
+@pytest.fixture(scope="module")
+def perfect() -> Simulation:
+    return simulate(SUBJECT, seed=3, noise=PERFECT)
+
+
+@pytest.fixture(scope="module")
+def fast() -> Simulation:
+    return simulate(SUBJECT, seed=4, rate_hz=1000.0, noise=PERFECT, clasp_s=10.0, circles=1)
+
+
+def rotation_WS(sim: Simulation, segment: str) -> Rotation:
+    return Rotation.from_quat(sim.quat_WL[segment]) * Rotation.from_quat(sim.quat_LS[segment])
+
+
+def position_WS(sim: Simulation, segment: str) -> np.ndarray:
+    """Where the sensor is in W, from the recorded points."""
+    side, _, part = segment.partition("_")
+    origin = {
+        "": 0.0,
+        "upper_arm": sim.points.get(f"{side}_shoulder"),
+        "forearm": sim.points.get(f"{side}_elbow"),
+    }
+    return origin[part] + Rotation.from_quat(sim.quat_WL[segment]).apply(sim.p_LS[segment])
+
+
+def within(sim: Simulation, *phases: str) -> np.ndarray:
+    spans = [span for phase in phases for span in sim.phases[phase]]
+    return np.any([(sim.time >= a) & (sim.time <= b) for a, b in spans], axis=0)
+
+
+def flexion(sim: Simulation, side: str) -> np.ndarray:
+    """Angle between upper arm and forearm, from the points [rad]."""
+    shoulder, elbow, wrist = (sim.points[f"{side}_{p}"] for p in ("shoulder", "elbow", "wrist"))
+    upper, lower = elbow - shoulder, wrist - elbow
+    sine = np.linalg.norm(np.cross(upper, lower), axis=1)
+    return np.arctan2(sine, np.sum(upper * lower, axis=1))
+
+
+@pytest.mark.parametrize("segment", SEGMENTS)
+def test_gyro_integrates_to_the_orientation(perfect: Simulation, segment: str) -> None:
+    n = 6001  # 60 s
+    truth = rotation_WS(perfect, segment)
+    q = truth[0]
+    for k in range(1, n):
+        q = q * Rotation.from_rotvec(perfect.gyro_S[segment][k] / perfect.rate_hz)
+        if k % 500 == 0:
+            assert (q.inv() * truth[k]).magnitude() < 1e-6
+
+
+@pytest.mark.parametrize("segment", SEGMENTS)
+def test_accel_integrates_to_the_position(fast: Simulation, segment: str) -> None:
+    k = (fast.time >= 4.5) & (fast.time <= 14.5)  # from rest through the transition into the clasp
+    t = fast.time[k]
+    accel_W = rotation_WS(fast, segment)[k].apply(fast.accel_S[segment][k]) - [0.0, 0.0, G]
+    truth = position_WS(fast, segment)[k]
+    position = truth[0] + CubicSpline(t, accel_W).antiderivative(2)(t)
+    assert np.abs(position - truth).max() < 1e-3
+    assert np.ptp(truth, axis=0).max() > 0.1  # it did move
+
+
+@pytest.mark.parametrize("segment", SEGMENTS)
+def test_accel_is_the_second_derivative_of_the_position(fast: Simulation, segment: str) -> None:
+    accel_W = rotation_WS(fast, segment).apply(fast.accel_S[segment]) - [0.0, 0.0, G]
+    # The spline of the sampled positions errs by h^2/12 of the fourth derivative, largest in the blends.
+    spline = CubicSpline(fast.time, position_WS(fast, segment)).derivative(2)(fast.time)
+    assert np.abs(accel_W - spline)[10:-10].max() < 2e-3
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize(
+    ("part", "start", "end"),
+    [("upper_arm", "shoulder", "elbow"), ("forearm", "elbow", "wrist"), ("hand", "wrist", "hand")],
+)
+def test_segments_keep_their_length(perfect: Simulation, side: str, part: str, start: str, end: str) -> None:
+    p_W = perfect.points[f"{side}_{end}"] - perfect.points[f"{side}_{start}"]
+    np.testing.assert_allclose(np.linalg.norm(p_W, axis=1), SUBJECT[f"{side}_{part}"], rtol=0, atol=1e-12)
+    # and lie along -z of their segment; the hand is rigid with the forearm
+    segment = f"{side}_{'forearm' if part == 'hand' else part}"
+    p_L = Rotation.from_quat(perfect.quat_WL[segment]).inv().apply(p_W)
+    assert np.abs(p_L - [0.0, 0.0, -SUBJECT[f"{side}_{part}"]]).max() < 1e-12
+
+
+def test_shoulders_are_carried_by_the_torso(perfect: Simulation) -> None:
+    left, right = perfect.points["left_shoulder"], perfect.points["right_shoulder"]
+    np.testing.assert_allclose(np.linalg.norm(left - right, axis=1), SUBJECT["shoulder_width"], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(left + right, axis=1), 2 * SUBJECT["trunk"], atol=1e-12)
+    across = Rotation.from_quat(perfect.quat_WL["torso"]).apply([0.0, SUBJECT["shoulder_width"], 0.0])
+    np.testing.assert_allclose(left - right, across, atol=1e-12)
+
+
+def test_n_pose(perfect: Simulation) -> None:
+    start = within(perfect, "start")
+    for segment in SEGMENTS:
+        assert np.array_equal(perfect.quat_WL[segment][start], np.tile([0.0, 0.0, 0.0, 1.0], (start.sum(), 1)))
+    arm = sum(SUBJECT[f"left_{part}"] for part in ("upper_arm", "forearm", "hand"))
+    hand = [0.0, SUBJECT["shoulder_width"] / 2, SUBJECT["trunk"] - arm]
+    np.testing.assert_allclose(perfect.points["left_hand"][0], hand, atol=1e-15)
+    assert perfect.phases["start"] == [(0.5, 4.5)]
+
+
+def test_palms_coincide_in_the_clasp(perfect: Simulation) -> None:
+    clasp = within(perfect, "clasp")
+    palm = perfect.points["left_hand"][clasp]
+    assert np.abs(palm - perfect.points["right_hand"][clasp]).max() < 1e-9
+    assert clasp.sum() > 5900
+    # a large region before the body: belly to above the head, in and out, left and right
+    p_T = Rotation.from_quat(perfect.quat_WL["torso"][clasp]).inv().apply(palm) - [0.0, 0.0, SUBJECT["trunk"]]
+    assert (np.ptp(p_T, axis=0) > [0.3, 0.4, 0.5]).all()
+    assert p_T[:, 0].min() > 0.15
+    turn = np.rad2deg(Rotation.from_quat(perfect.quat_WL["torso"][clasp]).as_euler("ZYX"))
+    assert (np.ptp(turn, axis=0) > 20).all()
+    assert np.abs(turn).max() < 15
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_elbow_is_a_hinge_about_minus_y(perfect: Simulation, side: str) -> None:
+    R_WU = Rotation.from_quat(perfect.quat_WL[f"{side}_upper_arm"])
+    R_WF = Rotation.from_quat(perfect.quat_WL[f"{side}_forearm"])
+    forearm_U = R_WU.inv().apply(R_WF.apply([0.0, 0.0, -1.0]))
+    assert np.abs(forearm_U[:, 1]).max() < 1e-12  # no carrying angle
+    angle = np.arctan2(forearm_U[:, 0], -forearm_U[:, 2])
+    np.testing.assert_allclose(angle, flexion(perfect, side), atol=1e-7)  # forwards, never hyperextended
+    pronation = (Rotation.from_rotvec(np.outer(angle, [0.0, 1.0, 0.0])) * R_WU.inv() * R_WF).as_rotvec()
+    assert np.abs(pronation[:, :2]).max() < 1e-9
+    assert 40 < np.rad2deg(np.abs(pronation[:, 2])).max() < 60
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_elbow_range(perfect: Simulation, side: str) -> None:
+    angle = np.rad2deg(flexion(perfect, side))[within(perfect, "clasp")]
+    assert 8 < angle.min() < 60
+    assert 120 < angle.max() < 140
+    assert np.ptp(angle) > 60
+
+
+def test_elbows_point_down_and_outwards(perfect: Simulation) -> None:
+    clasp = within(perfect, "clasp")
+    R_TW = Rotation.from_quat(perfect.quat_WL["torso"][clasp]).inv()
+    for side, y in (("left", 1.0), ("right", -1.0)):
+        shoulder, elbow, hand = (perfect.points[f"{side}_{p}"][clasp] for p in ("shoulder", "elbow", "hand"))
+        line = hand - shoulder
+        along = np.sum((elbow - shoulder) * line, axis=1) / np.sum(line * line, axis=1)
+        off_T = R_TW.apply(elbow - shoulder - along[:, None] * line)
+        assert off_T[:, 2].max() < 0
+        assert (y * off_T[:, 1]).mean() > 0
+
+
+def test_rests_and_start_are_exactly_still(perfect: Simulation) -> None:
+    still = within(perfect, "start", "rest")
+    assert len(perfect.phases["rest"]) == 7
+    for segment in SEGMENTS:
+        assert np.abs(perfect.gyro_S[segment][still]).max() < 1e-12
+        np.testing.assert_allclose(np.linalg.norm(perfect.accel_S[segment][still], axis=1), G, rtol=0, atol=1e-12)
+    hand = perfect.points["right_hand"][within(perfect, "rest")]
+    assert np.abs(hand - hand[0]).max() < 1e-12  # always the same point of the table
+
+
+def test_six_circles_between_the_rests(perfect: Simulation) -> None:
+    (lift, back), rests = perfect.phases["circles"][0], perfect.phases["rest"]
+    table = perfect.points["right_hand"][within(perfect, "rest")][0]
+    away = np.linalg.norm(perfect.points["right_hand"] - table, axis=1)
+    t = perfect.time
+    assert away[(t > rests[0][0]) & (t <= lift)].max() < 1e-12
+    assert away[t >= back].max() < 1e-12
+    for (_, a), (b, _) in pairwise(rests):
+        assert away[(t > a) & (t < b)].max() > 0.2
+        # The turn itself lies in a plane and at one distance from its centre.
+        turn = perfect.points["right_hand"][(t > a + 1.7) & (t < b - 1.7)]
+        centre = turn.mean(axis=0)
+        assert np.linalg.svd(turn - centre)[1][2] < 1e-9
+        fit = np.linalg.lstsq(
+            np.column_stack((2 * (turn - centre), np.ones(len(turn)))),
+            np.sum((turn - centre) ** 2, axis=1),
+            rcond=1e-9,
+        )[0]
+        radius = np.linalg.norm(turn - centre - fit[:3], axis=1)
+        assert np.ptp(radius) < 1e-9
+        assert 0.12 < radius[0] < 0.2
+
+
+def test_stated_axes_and_gravity_give_the_mount(perfect: Simulation) -> None:
+    axes = {f"{sign}{name}": (1 if sign == "+" else -1) * np.eye(3)[i] for i, name in enumerate("xyz") for sign in "+-"}
+    for segment in SEGMENTS:
+        up, forward = (axes[a] for a in perfect.stated_mount[segment])
+        N = np.column_stack((forward, np.cross(up, forward), up)).T  # sensor to segment, as stated
+        measured = N @ perfect.accel_S[segment][100] / G
+        swing = Rotation.align_vectors([0.0, 0.0, 1.0], measured)[0]  # the least rotation of one vector to another
+        error = swing * Rotation.from_matrix(N) * Rotation.from_quat(perfect.quat_LS[segment]).inv()
+        assert error.magnitude() < 1e-7
+        assert 1.9 < np.rad2deg(swing.magnitude()) < 10.1
+
+
+def test_gyro_and_accel_are_of_human_size() -> None:
+    for seed in range(12):
+        sim = simulate(SUBJECT, seed=seed, rate_hz=50.0, noise=PERFECT)
+        for segment in SEGMENTS:
+            assert np.linalg.norm(sim.gyro_S[segment], axis=1).max() < 15
+            assert np.linalg.norm(sim.accel_S[segment], axis=1).max() < 40
+        assert np.linalg.norm(sim.gyro_S["left_forearm"], axis=1).max() > 2
+
+
+def test_motion_is_smooth(fast: Simulation) -> None:
+    for segment in SEGMENTS:
+        for signal, jump in ((fast.gyro_S[segment], 0.1), (fast.accel_S[segment], 0.3)):
+            assert np.abs(np.diff(signal, axis=0)).max() < jump  # in 1 ms
+        dots = np.sum(fast.quat_WL[segment][1:] * fast.quat_WL[segment][:-1], axis=1)
+        assert dots.min() > 0.999
+
+
+def test_same_seed_same_bits() -> None:
+    one, same, other = (simulate(SUBJECT, seed=s, clasp_s=5.0, circles=1) for s in (7, 7, 8))
+    for segment in SEGMENTS:
+        for field in ("quat_WL", "gyro_S", "accel_S", "quat_LS", "gyro_bias", "accel_bias"):
+            assert np.array_equal(getattr(one, field)[segment], getattr(same, field)[segment])
+        for field in ("gyro_S", "accel_S", "quat_LS"):
+            a, b = getattr(one, field)[segment], getattr(other, field)[segment]
+            assert not np.allclose(a[:500], b[:500], atol=1e-6)
+
+
+def test_noise_and_rate_leave_motion_and_mounts_alone() -> None:
+    slow, quick = (
+        simulate(SUBJECT, seed=9, rate_hz=r, noise=n, clasp_s=5.0, circles=2)
+        for r, n in ((100.0, PERFECT), (400.0, ImuNoise()))
+    )
+    n = len(slow.time)
+    for segment in SEGMENTS:
+        assert np.array_equal(slow.quat_LS[segment], quick.quat_LS[segment])
+        np.testing.assert_allclose(slow.quat_WL[segment], quick.quat_WL[segment][::4][:n], atol=1e-12)
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 400.0])
+def test_white_noise_has_the_stated_density(rate_hz: float) -> None:
+    noise = ImuNoise(gyro_bias_std=0.0, gyro_bias_instability=0.0, accel_bias_std=0.0, accel_bias_instability=0.0)
+    options = {"seed": 2, "rate_hz": rate_hz, "clasp_s": 20.0, "circles": 1}
+    noisy, clean = simulate(SUBJECT, noise=noise, **options), simulate(SUBJECT, noise=PERFECT, **options)
+    for segment in SEGMENTS:
+        gyro = noisy.gyro_S[segment] - clean.gyro_S[segment]
+        accel = noisy.accel_S[segment] - clean.accel_S[segment]
+        # data sheet: 0.007 deg/s/sqrt(Hz), 120 ug/sqrt(Hz)
+        np.testing.assert_allclose(gyro.std(axis=0), np.deg2rad(0.007) * np.sqrt(rate_hz), rtol=0.06)
+        np.testing.assert_allclose(accel.std(axis=0), 120e-6 * G * np.sqrt(rate_hz), rtol=0.06)
+        white = np.corrcoef(np.column_stack((gyro, accel)).T) - np.eye(6)
+        assert np.abs(white).max() < 0.1
+        assert np.abs(np.sum(gyro[1:] * gyro[:-1], axis=0) / np.sum(gyro**2, axis=0)).max() < 0.1
+
+
+def test_bias_is_what_remains_of_the_noise() -> None:
+    noise = replace(ImuNoise(), gyro_density=0.0, accel_density=0.0)
+    options = {"seed": 5, "clasp_s": 5.0, "circles": 0}
+    biased, clean = simulate(SUBJECT, noise=noise, **options), simulate(SUBJECT, noise=PERFECT, **options)
+    for segment in SEGMENTS:
+        np.testing.assert_allclose(
+            biased.gyro_S[segment] - clean.gyro_S[segment], biased.gyro_bias[segment], atol=1e-14
+        )
+        np.testing.assert_allclose(
+            biased.accel_S[segment] - clean.accel_S[segment], biased.accel_bias[segment], atol=1e-13
+        )
+        assert not clean.gyro_bias[segment].any()
+        assert np.ptp(biased.gyro_bias[segment], axis=0).max() < 4 * noise.gyro_bias_instability
+
+
+def test_bias_statistics() -> None:
+    short = {"rate_hz": 20.0, "clasp_s": 5.0, "circles": 0}
+    noise = ImuNoise(
+        gyro_bias_std=0.0,
+        gyro_bias_instability=1.0,
+        accel_bias_std=1.0,
+        accel_bias_instability=0.0,
+        correlation_s=2.0,
+    )
+    runs = [simulate(SUBJECT, seed=s, noise=noise, **short) for s in range(60)]
+    in_run = np.stack([run.gyro_bias[s] for run in runs for s in SEGMENTS])  # (300, n, 3)
+    assert abs(in_run[:, 0].std() - 1) < 0.1  # stationary: the same at the start as at the end
+    assert abs(in_run[:, -1].std() - 1) < 0.1
+    lag = int(2.0 * 20.0)  # one correlation time
+    assert abs(np.mean(in_run[:, lag:] * in_run[:, :-lag]) - np.exp(-1)) < 0.1
+    turn_on = np.stack([run.accel_bias[s] for run in runs for s in SEGMENTS])
+    assert np.ptp(turn_on, axis=1).max() == 0
+    assert abs(turn_on[:, 0].std() - 1) < 0.1
+
+
+def test_fields_and_phases() -> None:
+    sim = simulate(SUBJECT, seed=1, clasp_s=12.0, circles=0)
+    n = len(sim.time)
+    assert sim.time[0] == 0.0
+    np.testing.assert_allclose(np.diff(sim.time), 0.01)
+    assert set(sim.quat_WL) == set(sim.gyro_S) == set(sim.accel_S) == set(sim.stated_mount) == set(SEGMENTS)
+    assert set(sim.points) == {f"{s}_{p}" for s in SIDES for p in ("shoulder", "elbow", "wrist", "hand")}
+    for segment in SEGMENTS:
+        assert sim.quat_WL[segment].shape == (n, 4)
+        assert sim.gyro_S[segment].shape == sim.accel_S[segment].shape == sim.gyro_bias[segment].shape == (n, 3)
+        assert np.isfinite(sim.gyro_S[segment]).all()
+        np.testing.assert_allclose(np.linalg.norm(sim.quat_WL[segment], axis=1), 1.0, atol=1e-12)
+    assert sim.phases["circles"] == []
+    assert sim.phases["clasp"] == [(pytest.approx(7.6), pytest.approx(19.4))]
+    assert sim.lengths == SUBJECT
+    assert sim.phases["rest"][-1][1] <= sim.time[-1]
+
+
+@pytest.mark.parametrize("scale", [0.6, 0.85, 1.2])
+def test_bodies_of_other_sizes(scale: float) -> None:
+    sim = simulate({k: scale * v for k, v in SUBJECT.items()}, seed=6, rate_hz=50.0, clasp_s=20.0)
+    clasp = within(sim, "clasp")
+    assert np.abs(sim.points["left_hand"] - sim.points["right_hand"])[clasp].max() < 1e-9
+
+
+def test_wrong_input_is_named() -> None:
+    with pytest.raises(ValueError, match="left_hand"):
+        simulate({k: SUBJECT[k] for k in LENGTHS if k != "left_hand"}, seed=0)
+    with pytest.raises(ValueError, match=r"trunk.*-0\.5"):
+        simulate({**SUBJECT, "trunk": -0.5}, seed=0)
+    with pytest.raises(ValueError, match=r"clasp_s 1\.0"):
+        simulate(SUBJECT, seed=0, clasp_s=1.0)
+    with pytest.raises(ValueError, match="does not reach"):
+        simulate({**SUBJECT, "left_upper_arm": 0.1, "left_forearm": 0.1, "left_hand": 0.02}, seed=0)
+
+
+def test_two_minutes_take_under_three_seconds() -> None:
+    start = perf_counter()
+    sim = simulate(SUBJECT, seed=0)
+    assert perf_counter() - start < 3.0
+    assert sim.time[-1] > 110

@@ -1,0 +1,154 @@
+"""Sensors to segments: orientations in sensor worlds, mounts and headings from the start pose, segment orientations.
+
+A sensor's filter knows the vertical and not the heading: its world V differs from W by a turn about z, the heading ψ.
+In the N-pose every segment frame equals W, so the mount is R_LS = R_WS = Rz(ψ) R_VS(start): the tilt of it is measured
+by gravity, and ψ is what makes it nearest to the mount as stated (or as calibrated).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from . import so3
+from .errors import BadPhase, BadSession, WeposeError
+from .filters import Orientation, check_method, run_filter
+from .noise import noise_of, quietest
+from .recording import Recording
+from .static import StaticTest
+from .subject import Subject
+
+# The stated axes are by hand; further off than this they are no longer what was meant.
+STATED_LIMIT_DEG = 60.0
+STATED_WARNING_DEG = 35.0
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Orientation of each measured segment.
+
+    Parameters
+    ----------
+    time : (n,) [s]
+    quat_WL : segment → (n, 4) xyzw
+    quat_LS : segment → (4,) xyzw, the mount used
+    heading : segment → ψ [rad], from the sensor's world to W
+    orientation : segment → what the filter gave; none for ready orientations
+    start, still : intervals [s] used for headings, and for noise and bias
+    warnings : what the user should know
+    """
+
+    time: np.ndarray
+    quat_WL: Mapping[str, np.ndarray]
+    quat_LS: Mapping[str, np.ndarray]
+    heading: Mapping[str, float]
+    orientation: Mapping[str, Orientation]
+    start: tuple[float, float]
+    still: tuple[float, float]
+    warnings: tuple[str, ...]
+
+
+def segment_orientations(
+    recording: Recording,
+    subject: Subject | None = None,
+    *,
+    method: str = "smekf",
+    static_test: StaticTest | None = None,
+) -> Segments:
+    """Filter every sensor, then align it with its segment by the start pose.
+
+    A calibrated mount of the subject is taken before a stated one, unless the strapping is new.
+
+    Raises
+    ------
+    WeposeError
+        No mount is known for a sensor; a start phase in which there are too few samples; an unknown method.
+    """
+    check_method(method)
+    start, still, warnings = _phases(recording)
+    quat_WL, quat_LS, heading, orientation = {}, {}, {}, {}
+    for segment, sensor in recording.sensors.items():
+        nominal = _nominal_mount(recording, segment, subject)
+        if sensor.quat_WS is not None:
+            quat_VS = sensor.quat_WS
+        else:
+            assert sensor.gyro_S is not None
+            assert sensor.accel_S is not None
+            at_rest = recording.span(still)
+            try:
+                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], recording.rate_hz)
+            except WeposeError as error:
+                raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
+            orientation[segment] = run_filter(
+                sensor.gyro_S,
+                sensor.accel_S,
+                recording.rate_hz,
+                noise,
+                method,
+                static_test=static_test,
+                measured_start=True,
+            )
+            quat_VS = orientation[segment].quat_WS
+        R_VS = Rotation.from_quat(quat_VS)
+        at_start = R_VS[recording.span(start)].mean()
+        R_stated = Rotation.from_quat(nominal)
+        psi = heading_to(at_start, R_stated)
+        turn = Rotation.from_rotvec([0.0, 0.0, psi])
+        R_LS = turn * at_start
+        off = np.degrees((R_LS * R_stated.inv()).magnitude())
+        if off > STATED_LIMIT_DEG:
+            raise BadSession(
+                f"{recording.where()}: sensors.{segment}.mount is {off:.0f} deg off gravity in the start pose "
+                f"({start[0]:g} to {start[1]:g} s); check which sensor axis points up and which forward"
+            )
+        if off > STATED_WARNING_DEG:
+            warnings.append(f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose")
+        quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
+        quat_LS[segment] = R_LS.as_quat()
+        heading[segment] = psi
+    return Segments(recording.time, quat_WL, quat_LS, heading, orientation, start, still, tuple(warnings))
+
+
+def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
+    """ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
+    return float(so3.heading((R_WS * R_VS.inv()).as_quat()))
+
+
+def _nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray:
+    if subject is not None and segment in subject.mounts and recording.strapping != "new":
+        return subject.mounts[segment]
+    stated = recording.sensors[segment].stated_quat_LS
+    if stated is not None:
+        return stated
+    if recording.sensors[segment].ready:
+        return np.array([0.0, 0.0, 0.0, 1.0])  # orientations of segments, from a device that aligned them itself
+    raise BadSession(
+        f'{recording.where()}: sensors.{segment}.mount is not known: state it, as in mount = {{ up = "+x", '
+        f'forward = "-z" }}, or give a subject with calibrated mounts'
+    )
+
+
+def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[str]]:
+    """The start pose's interval, the interval that noise and bias come from, and what to tell the user of them."""
+    notes = list(recording.notes)
+    if recording.phases.get("start"):
+        start = recording.phases["start"][0]
+        if len(recording.phases["start"]) > 1:
+            notes.append(f"phases.start holds several intervals; the first, {start[0]:g} to {start[1]:g} s, is used")
+    else:
+        start = quietest(recording)
+        notes.append(
+            f"no phases.start: the quietest window, {start[0]:g} to {start[1]:g} s, is taken for the start pose"
+        )
+    still = recording.phases.get("still", ())
+    for interval in (start, *still[:1]):
+        samples = len(recording.time[recording.span(interval)])
+        if samples < 10:
+            raise BadPhase(
+                f"{recording.where()}: {interval[0]:g} to {interval[1]:g} s holds {samples} samples; the start and "
+                f"still phases need at least 10, better two seconds"
+            )
+    return start, still[0] if still else start, notes

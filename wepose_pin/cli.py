@@ -1,0 +1,495 @@
+"""The command line: ``wepose COMMAND``.
+
+Heavy rooms load inside the commands, so that ``wepose --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from .errors import BadOption, ExistingOutput, WeposeError, one_of
+
+if TYPE_CHECKING:
+    from .subject import Subject
+
+Method = Literal["smekf", "ncf", "gdc"]
+Session = Annotated[Positional[Path], arg(metavar="SESSION")]
+Result = Annotated[Positional[Path], arg(metavar="RESULT")]
+OptionalPath = Annotated[Path | None, arg(metavar="PATH")]
+Out = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
+
+
+def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) -> None:
+    """The whole chain on a recording that it makes itself: simulate, calibrate, track, evaluate, view.
+
+    A person of random size stands in the N-pose, moves the joined hands for a minute, then draws six circles in the
+    air with rests on a table; five Xsens MTi-3 watch.
+
+    Example: wepose demo -o demo
+
+    Args:
+        out: Folder for session, subject, result and view.html.
+        seed: Another number is another person and another motion.
+        force: Replace files of an earlier run.
+    """
+    import json
+    from dataclasses import asdict
+
+    from .calibration import calibrate_lengths
+    from .evaluation import evaluate as compare
+    from .filters import METHODS
+    from .simulation import simulate as make
+    from .simulation import simulated_person
+    from .tracking import track as follow
+    from .viewer import pose_html
+    from .writers import whole_folder, write_result, write_session
+    from .writers.result import as_json, write_subject
+
+    with whole_folder(out, force) as folder, _steps(2 + 2 * len(METHODS)) as step:
+        step("simulating a person")
+        person = simulated_person(seed)
+        simulation = make(person.lengths, seed=seed)
+        recording, truth = simulation.recording(f"demo-{seed}"), simulation.truth()
+        (folder / "session").mkdir()
+        write_session(folder / "session", recording, truth)
+        circles = simulation.phases["circles"][0]
+
+        found, errors = {}, {}
+        for method in METHODS:
+            step(f"calibrating by {method}")
+            found[method] = calibrate_lengths(
+                recording, gauge=person.taped, prior=person.average, method=method, gauge_std=person.taped_std
+            )
+            step(f"tracking by {method}")
+            pose = follow(recording, found[method].subject, method=method)
+            errors[method] = compare(pose, truth, circles)
+            if method == "smekf":
+                (folder / "subject").mkdir()
+                (folder / "result").mkdir()
+                assert pose.model is not None
+                write_subject(folder / "subject", found[method].subject, pose.model)
+                write_result(folder / "result", pose)
+                best = pose
+        step("making the page")
+        assert best.model is not None
+        page = pose_html(best.model, best, phases=recording.phases, title=f"wepose demo, person {seed}")
+        (folder / "result" / "view.html").write_text(page, encoding="utf-8")
+        report = {
+            "seed": seed,
+            "lengths": {
+                name: {
+                    "true": value,
+                    "estimated": found["smekf"].subject.lengths[name],
+                    "std": found["smekf"].subject.std(name),
+                }
+                for name, value in person.lengths.items()
+            },
+            "errors": {method: asdict(error) for method, error in errors.items()},
+        }
+        (folder / "demo.json").write_text(json.dumps(as_json(report), indent=2) + "\n", encoding="utf-8")
+    _lengths_table(found["smekf"].subject, person.average, person.lengths, tuple(person.taped))
+    _print_table(
+        "Right hand while drawing six circles: distance to the truth [mm], mean ± std",
+        ("filter", "from the shoulders", "from the root"),
+        [
+            (
+                method,
+                _mean_std(error.position_from_shoulders["right_hand"]),
+                _mean_std(error.position["right_hand"]),
+            )
+            for method, error in errors.items()
+        ],
+    )
+    _say("From the root, an error of the trunk's length adds: hands together do not show it, tape it if it matters.")
+    _say(f"Motion to look at:  {out / 'result' / 'view.html'}")
+    _say(f"Session, subject, result, figures:  {out}/session  {out}/subject  {out}/result  {out}/demo.json")
+
+
+def track(
+    session: Session,
+    /,
+    *,
+    out: Out,
+    subject: OptionalPath = None,
+    model: OptionalPath = None,
+    method: Method = "smekf",
+    force: bool = False,
+) -> None:
+    """Recording to pose: orientations, points, a summary, and a page to look at.
+
+    Example: wepose track session.toml --subject anna/subject.toml -o result
+
+    Args:
+        session: session.toml, or the folder that holds it.
+        out: Folder for pose.parquet, subject.toml, subject.urdf, summary.json, view.html.
+        subject: subject.toml of `wepose calibrate`, or its folder; without it lengths are an average person's.
+        model: A body's URDF whose links are named after the segments; without it ours.
+        method: The orientation filter.
+        force: Replace files of an earlier run.
+    """
+    from .model import load_model
+    from .readers import load_session
+    from .subject import load_subject
+    from .tracking import track as follow
+    from .viewer import pose_html
+    from .writers import whole_folder, write_result
+
+    with whole_folder(out, force) as folder, _steps(3) as step:
+        step("reading")
+        recording = load_session(session)
+        who = load_subject(subject) if subject else None
+        body = load_model(model) if model else None
+        step(f"tracking by {method}")
+        pose = follow(recording, who, method=method, model=body)
+        write_result(folder, pose)
+        step("making the page")
+        assert pose.model is not None
+        page = pose_html(pose.model, pose, phases=recording.phases, title=recording.name)
+        (folder / "view.html").write_text(page, encoding="utf-8")
+    summary = pose.summary()
+    _warn(summary["warnings"])
+    _print_table(
+        f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {method}, "
+        f"lengths: {summary['subject']['note'] or summary['subject']['name']}",
+        ("sensor", "at rest", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
+        [
+            (
+                segment,
+                f"{100 * about['static_share']:.0f} %",
+                f"{_norm(about['gyro_bias_start_deg_s']):.3f} → {_norm(about['gyro_bias_end_deg_s']):.3f}",
+                f"{about['gravity_m_s2']:.3f}",
+            )
+            if "static_share" in about
+            else (segment, "", "orientations from the recording", "")
+            for segment, about in summary["sensors"].items()
+        ],
+    )
+    _say(f"Motion to look at:  {out / 'view.html'}")
+    _say(f"Pose: {out / 'pose.parquet'}  ({len(pose.quat_WL)} segments, {len(pose.points)} points)")
+
+
+def calibrate(
+    session: Session,
+    /,
+    *,
+    out: Out,
+    protocol: Literal["clasp"] = "clasp",
+    gauge: Annotated[tuple[str, ...], arg(metavar="NAME=METRES …")] = (),
+    stature: Annotated[float | None, arg(metavar="METRES")] = None,
+    sex: Annotated[Literal["f", "m"] | None, arg(metavar="{f,m}")] = None,
+    method: Method = "smekf",
+    force: bool = False,
+) -> None:
+    """Hands-together recording to subject: the lengths of the arms with their standard deviations.
+
+    Hands together fix the proportions of the arms and not their scale: tape one length (the shoulder width serves) and
+    give it as gauge. Without one the scale is that of the average person, and the output says how uncertain that is.
+
+    Example: wepose calibrate session.toml --gauge shoulder_width=0.385 --stature 1.78 --sex f -o anna
+
+    Args:
+        session: session.toml with a phase in which the palms are held together.
+        out: Folder for subject.toml and subject.urdf.
+        protocol: The phase of the session that is used.
+        gauge: Lengths measured with a tape, in metres, such as shoulder_width=0.385.
+        stature: Body height in metres; narrows the average person.
+        sex: Narrows the average person.
+        method: The orientation filter.
+        force: Replace files of an earlier run.
+    """
+    from .calibration import calibrate_lengths
+    from .model import load_model
+    from .readers import load_session
+    from .subject import average_subject
+    from .writers import whole_folder
+    from .writers.result import write_subject
+
+    taped = _gauges(gauge)
+    with whole_folder(out, force) as folder, _steps(2) as step:
+        step("reading")
+        average = average_subject(stature, sex)
+        recording = load_session(session)
+        step("calibrating")
+        found = calibrate_lengths(recording, gauge=taped, prior=average, protocol=protocol, method=method)
+        write_subject(folder, found.subject, load_model(lengths=found.subject.lengths))
+    _warn(found.warnings)
+    _lengths_table(found.subject, average, None, tuple(taped))
+    _say(
+        f"Palm-to-palm gap: {1e3 * found.rms_gap:.1f} mm rms, {1e3 * found.prior_rms_gap:.1f} mm with the average "
+        f"person's lengths; worth {found.independent:.0f} independent looks"
+    )
+    _say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}")
+
+
+def evaluate(
+    result: Result,
+    truth: Annotated[Positional[Path], arg(metavar="TRUTH")],
+    /,
+    *,
+    interval: Annotated[tuple[float, float] | None, arg(metavar="FROM TO")] = None,
+) -> None:
+    """Errors against a reference: roll, pitch, yaw as the paper reports them, and positions.
+
+    Example: wepose evaluate result truth.parquet --interval 72 115
+
+    Args:
+        result: Folder that `wepose track` wrote.
+        truth: Table (.parquet or .csv) with columns as in pose.parquet.
+        interval: Only from this to this time, in seconds.
+    """
+    from .evaluation import evaluate as compare
+    from .pose import pose_from_table
+    from .readers.tables import read_table
+    from .writers import read_result
+
+    pose, _, _ = read_result(result)
+    errors = compare(pose, pose_from_table(read_table(truth), str(truth)), interval)
+    _say(f"{errors.samples} samples from {errors.interval[0]:g} to {errors.interval[1]:g} s")
+    if errors.attitude:
+        _print_table(
+            "Attitude error [deg], mean ± std of the absolute",
+            ("segment", "roll", "pitch", "yaw", "total rmse"),
+            [
+                (name, *(f"{m:.2f} ± {s:.2f}" for m, s in (e.roll, e.pitch, e.yaw)), f"{e.total_rmse:.2f}")
+                for name, e in errors.attitude.items()
+            ],
+        )
+    if errors.position:
+        shoulders = errors.position_from_shoulders
+        _print_table(
+            "Position error [mm], mean ± std",
+            ("point", "from the root", "from the shoulders"),
+            [
+                (name, _mean_std(e), _mean_std(shoulders[name]) if name in shoulders else "")
+                for name, e in errors.position.items()
+            ],
+        )
+
+
+def simulate(*, out: Out, seed: int = 1, rate_hz: float = 100.0, force: bool = False) -> None:
+    """A subject with known truth: session file, recording, and truth.parquet as pose.parquet.
+
+    Example: wepose simulate -o made --seed 7
+
+    Args:
+        out: Folder for session.toml, recording.parquet, truth.parquet, subject.toml (the true lengths).
+        seed: Another number is another person and another motion.
+        rate_hz: Samples a second.
+        force: Replace files of an earlier run.
+    """
+    from dataclasses import replace
+
+    from .simulation import simulate as make
+    from .simulation import simulated_person
+    from .subject import LENGTHS, subject_toml
+    from .writers import whole_folder, write_session
+
+    if not 20.0 <= rate_hz <= 2000.0:
+        raise BadOption(f"--rate-hz {rate_hz:g}: between 20 and 2000 samples a second")
+    with whole_folder(out, force) as folder, _steps(1) as step:
+        step("simulating a person")
+        person = simulated_person(seed)
+        simulation = make(person.lengths, seed=seed, rate_hz=rate_hz)
+        write_session(folder, simulation.recording(f"simulated-{seed}"), simulation.truth())
+        true = replace(person.average, name="truth", lengths=person.lengths, note="simulated: the true lengths")
+        true = replace(true, covariance=0.0 * person.average.covariance, order=LENGTHS)
+        (folder / "subject.toml").write_text(subject_toml(true), encoding="utf-8")
+    taped = " ".join(f"{name}={value:.4f}" for name, value in person.taped.items())
+    _say(f"Session: {out / 'session.toml'}  (taped: {taped}, stature {person.stature:.2f} m, sex {person.sex})")
+    _say(f"Truth: {out / 'truth.parquet'}  {out / 'subject.toml'}")
+
+
+def view(
+    result: Result,
+    /,
+    *,
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None,
+    no_open: bool = False,
+) -> None:
+    """The motion of a result as one HTML page that opens offline.
+
+    Example: wepose view result
+
+    Args:
+        result: Folder that `wepose track` wrote.
+        out: The page; without it view.html in the result's folder.
+        no_open: Only write the page, do not open it in the browser.
+    """
+    import webbrowser
+
+    from .viewer import pose_html
+    from .writers import read_result
+
+    pose, model, summary = read_result(result)
+    phases = {name: [tuple(span)] for name, span in summary.get("phases", {}).items()}
+    page = out or result / "view.html"
+    if page.is_dir() or not page.absolute().parent.is_dir():
+        raise ExistingOutput(f"{page}: not a file that can be written; -o names an HTML file in an existing folder")
+    text = pose_html(model, pose, phases=phases, title=summary.get("recording", result.name))
+    page.write_text(text, encoding="utf-8")
+    _say(f"Motion to look at:  {page}")
+    if not no_open:
+        webbrowser.open(page.absolute().as_uri())
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": demo,
+    "track": track,
+    "calibrate": calibrate,
+    "evaluate": evaluate,
+    "simulate": simulate,
+    "view": view,
+}
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point of ``wepose``; ends by `SystemExit`: 0, or 2 after one line on what was wrong."""
+    argv = sys.argv[1:] if argv is None else argv
+    if argv in (["--version"], ["-V"]):
+        from . import __version__
+
+        print(f"wepose-pin {__version__}")
+        sys.exit(0)
+    try:
+        _parse_and_run(argv)
+    except WeposeError as error:
+        print(f"wepose: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("wepose: stopped; nothing was written", file=sys.stderr)
+        sys.exit(130)
+    sys.exit(0)
+
+
+def _parse_and_run(argv: list[str]) -> None:
+    """Parse with tyro, then run; tyro's panels on wrong usage become one line."""
+    chosen: list[Callable[[], None]] = []
+
+    def later(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def keep(*args: Any, **options: Any) -> None:
+            chosen.append(lambda: command(*args, **options))
+
+        if argv[:1] in ([], ["--help"], ["-h"]):  # the list of commands: a line each
+            keep.__doc__ = (command.__doc__ or "").splitlines()[0]
+        return keep
+
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            tyro.extras.subcommand_cli_from_dict(
+                {name: later(command) for name, command in COMMANDS.items()},
+                prog="wepose",
+                description="Upper-body pose from wearable IMUs without magnetometers. `wepose demo` shows all of it.",
+                args=argv or ["--help"],
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        lines = [re.sub(r"[│╭╮╰╯─]+", " ", line).strip() for line in complaint.getvalue().splitlines()]
+        text = " ".join(line for line in lines[1:] if line)  # the first line is the panel's title
+        raise BadOption(text.replace(" For full helptext, run", "; see").removesuffix(":")) from None
+    chosen[0]()
+
+
+def _gauges(gauge: tuple[str, ...]) -> dict[str, float]:
+    from .subject import LENGTHS
+
+    taped: dict[str, float] = {}
+    for text in gauge:
+        name, _, value = text.partition("=")
+        if name not in LENGTHS:
+            raise BadOption(f"--gauge {text}: '{name}' is not a length; {one_of(LENGTHS, name)}")
+        try:
+            taped[name] = float(value)
+        except ValueError:
+            raise BadOption(f"--gauge {text}: '{value}' is not a number of metres, as in {name}=0.385") from None
+    return taped
+
+
+# What the user sees ------------------------------------------------------------------------------------------------
+
+
+def _say(text: str) -> None:
+    print(text)
+
+
+def _warn(warnings: Any) -> None:
+    for warning in warnings:
+        print(f"note: {warning}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _steps(total: int) -> Iterator[Callable[[str], None]]:
+    """A progress bar over named steps; none when not on a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    parts = TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn()
+    with Progress(*parts, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=total)
+        done = -1
+
+        def step(text: str) -> None:
+            nonlocal done
+            done += 1
+            progress.update(task, description=text, completed=done)
+
+        yield step
+
+
+def _print_table(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=escape(title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    for k, name in enumerate(header):
+        table.add_column(escape(name), justify="left" if k == 0 else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    # Piped output is not cut to 80 columns.
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
+
+
+def _lengths_table(
+    subject: Subject, average: Subject, true: Mapping[str, float] | None, taped: tuple[str, ...]
+) -> None:
+    rows = []
+    for name, value in subject.lengths.items():
+        row = [name, f"{1e3 * true[name]:.1f}"] if true is not None else [name]
+        row += [f"{1e3 * value:.1f}", f"± {1e3 * subject.std(name):.1f}"]
+        row.append(f"{1e3 * average.lengths[name]:.1f} ± {1e3 * average.std(name):.1f}")
+        rows.append((*row, "taped" if name in taped else ""))
+    header = (
+        "length [mm]",
+        *(["true"] if true is not None else []),
+        "estimated",
+        "std",
+        "average person",
+        "",
+    )
+    _print_table("Lengths from the joined hands", header, rows)
+
+
+def _mean_std(error: Any) -> str:
+    return f"{error.mean:.1f} ± {error.std:.1f}"
+
+
+def _norm(values: list[float]) -> float:
+    return sum(v * v for v in values) ** 0.5

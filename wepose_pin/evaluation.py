@@ -1,0 +1,142 @@
+"""How wrong a pose is against a reference: attitude, positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from .errors import BadData
+from .pose import Pose
+
+
+class AttitudeError(NamedTuple):
+    """Error of one segment [deg], mean and standard deviation of absolute values over time, as the paper reports it.
+
+    Roll, pitch, yaw are those of the error rotation R_WL,estimated R_WL,trueᵀ (about the axes x, y, z of W), so that
+    they mean the same at any pose; yaw is the heading error.
+    """
+
+    roll: tuple[float, float]
+    pitch: tuple[float, float]
+    yaw: tuple[float, float]
+    total_rmse: float
+
+
+class PositionError(NamedTuple):
+    """Error of one point [mm]: the distance to the truth."""
+
+    mean: float
+    std: float
+    rmse: float
+    worst: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Errors over the time that pose and reference share."""
+
+    attitude: dict[str, AttitudeError]
+    position: dict[str, PositionError]  # relative to the root of the trunk
+    position_from_shoulders: dict[
+        str, PositionError
+    ]  # relative to the middle of the shoulders: without trunk and torso
+    interval: tuple[float, float]
+    samples: int
+
+
+def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = None) -> Evaluation:
+    """Errors of `pose` against `truth`, which is brought to the pose's times (rotations on the rotation).
+
+    Parameters
+    ----------
+    interval : from, to [s]; None for all of the time both have. Samples whose truth is missing are left out.
+
+    Raises
+    ------
+    BadData
+        No time in common, or nothing to compare.
+    """
+    first = max(pose.time[0], truth.time[0], interval[0] if interval else -np.inf)
+    last = min(pose.time[-1], truth.time[-1], interval[1] if interval else np.inf)
+    inside = (pose.time >= first - 1e-9) & (pose.time <= last + 1e-9)
+    if not np.any(inside):
+        raise BadData(
+            f"pose ({pose.time[0]:g} to {pose.time[-1]:g} s) and reference ({truth.time[0]:g} to {truth.time[-1]:g} s) "
+            f"have no time in common" + (f" within {interval[0]:g} to {interval[1]:g} s" if interval else "")
+        )
+    time = np.clip(pose.time[inside], truth.time[0], truth.time[-1])
+    attitude, position = {}, {}
+    for segment in [s for s in pose.quat_WL if s in truth.quat_WL]:
+        finite = np.isfinite(truth.quat_WL[segment]).all(axis=1)
+        if finite.sum() < 2:
+            continue
+        known = _near(time, truth.time[finite])
+        reference = Slerp(truth.time[finite], Rotation.from_quat(truth.quat_WL[segment][finite]))
+        clipped = np.clip(time[known], truth.time[finite][0], truth.time[finite][-1])
+        if known.any():
+            estimated = Rotation.from_quat(pose.quat_WL[segment][inside][known])
+            attitude[segment] = attitude_error(estimated, reference(clipped))
+    middle = _shoulders(pose), _shoulders(truth)
+    from_shoulders = {}
+    for point in [p for p in pose.points if p in truth.points]:
+        finite = np.isfinite(truth.points[point]).all(axis=1)
+        known = _near(time, truth.time[finite])
+        if not known.any():
+            continue
+        difference = pose.points[point][inside][known] - _at(time[known], truth.time, truth.points[point], finite)
+        position[point] = position_error(difference)
+        if middle[0] is not None and middle[1] is not None and "shoulder" not in point:
+            shift = middle[0][inside][known] - _at(time[known], truth.time, middle[1], finite)
+            from_shoulders[point] = position_error(difference - shift)
+    if not attitude and not position:
+        raise BadData(
+            "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
+        )
+    return Evaluation(attitude, position, from_shoulders, (float(time[0]), float(time[-1])), int(inside.sum()))
+
+
+def _shoulders(pose: Pose) -> np.ndarray | None:
+    """Middle of the shoulders (n, 3) [m]; None where a shoulder is not known."""
+    ends = [pose.points.get(f"{side}_shoulder") for side in ("left", "right")]
+    return None if ends[0] is None or ends[1] is None else (ends[0] + ends[1]) / 2.0
+
+
+def _at(time: np.ndarray, known: np.ndarray, points: np.ndarray, finite: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.interp(time, known[finite], axis) for axis in points[finite].T])
+
+
+def _near(time: np.ndarray, known: np.ndarray, reach_s: float = 0.1) -> np.ndarray:
+    """Which times lie between two known ones not further apart than `reach_s`, or on one: no error within a gap."""
+    if not len(known):
+        return np.zeros(len(time), dtype=bool)
+    after = np.clip(np.searchsorted(known, time - 1e-9), 0, len(known) - 1)
+    before = np.clip(np.searchsorted(known, time + 1e-9, side="right") - 1, 0, len(known) - 1)
+    spanned = (known[before] <= time + 1e-9) & (known[after] >= time - 1e-9)
+    return spanned & (known[after] - known[before] <= max(reach_s, 2.0 * float(np.median(np.diff(known)))))
+
+
+def attitude_error(estimated: Rotation, true: Rotation) -> AttitudeError:
+    """Attitude error of n orientations in W."""
+    error = estimated * true.inv()
+    yaw, pitch, roll = np.abs(error.as_euler("ZYX", degrees=True)).T
+    total = np.degrees(error.magnitude())
+    return AttitudeError(
+        roll=(float(roll.mean()), float(roll.std())),
+        pitch=(float(pitch.mean()), float(pitch.std())),
+        yaw=(float(yaw.mean()), float(yaw.std())),
+        total_rmse=float(np.sqrt(np.mean(total**2))),
+    )
+
+
+def position_error(difference: np.ndarray) -> PositionError:
+    """Position error of differences (n, 3) [m]."""
+    distance = 1e3 * np.linalg.norm(difference, axis=1)
+    return PositionError(
+        mean=float(distance.mean()),
+        std=float(distance.std()),
+        rmse=float(np.sqrt(np.mean(distance**2))),
+        worst=float(distance.max()),
+    )

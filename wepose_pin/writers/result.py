@@ -1,0 +1,74 @@
+"""The result folder: ``pose.parquet``, ``subject.toml``, ``subject.urdf``, ``summary.json``."""
+
+from __future__ import annotations
+
+import json
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..errors import MissingFile
+from ..model import BodyModel, load_model
+from ..pose import Pose, pose_from_table, pose_table
+from ..readers.tables import read_table
+from ..subject import Subject, subject_toml
+from ..tracking import TrackedPose
+
+
+def write_result(folder: Path, pose: TrackedPose) -> None:
+    """Write what `track` gave into an existing folder."""
+    assert pose.model is not None
+    assert pose.subject is not None
+    pose_table(pose).write_parquet(folder / "pose.parquet")
+    write_subject(folder, pose.subject, pose.model)
+    summary = pose.summary() | {"versions": versions()}
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
+    """``subject.toml``, and ``subject.urdf``: the body with the subject's lengths."""
+    (folder / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
+    (folder / "subject.urdf").write_text(model.urdf(), encoding="utf-8")
+
+
+def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
+    """Pose, body and summary of a result folder.
+
+    Raises
+    ------
+    WeposeError
+        It is no result folder, or its files are damaged.
+    """
+    if not (folder / "pose.parquet").is_file():
+        raise MissingFile(f"{folder}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
+    pose = pose_from_table(read_table(folder / "pose.parquet"), str(folder / "pose.parquet"))
+    summary_file = folder / "summary.json"
+    summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.is_file() else {}
+    return pose, load_model(folder / "subject.urdf"), summary
+
+
+def versions() -> dict[str, str]:
+    """What a result was made with."""
+    packages = ("pin", "casadi", "numpy", "scipy", "numba", "polars")
+    return {
+        "wepose-pin": __version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in packages},
+    }
+
+
+def as_json(value: Any) -> Any:
+    """Named tuples and arrays as what JSON holds."""
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return {key: as_json(item) for key, item in value._asdict().items()}
+    if isinstance(value, dict):
+        return {key: as_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return value

@@ -1,0 +1,47 @@
+"""A recording as a session file with its data beside it, and its truth where there is one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import polars as pl
+
+from ..pose import Pose, pose_table
+from ..recording import Recording, axes_from_mount
+
+
+def write_session(folder: Path, recording: Recording, truth: Pose | None = None) -> None:
+    """``session.toml``, ``recording.parquet`` and, with a truth, ``truth.parquet`` into an existing folder."""
+    table = {"time": recording.time}
+    lines = [
+        f"name = {json.dumps(recording.name)}",
+        f'start_pose = "{recording.start_pose}"',
+        "",
+        "[data]",
+        'file = "recording.parquet"',
+        'time = "time"',
+        'gyro_unit = "rad/s"',
+        'accel_unit = "m/s^2"',
+        *(['truth = "truth.parquet"'] if truth is not None else []),
+        "",
+        "[phases]   # seconds on the time column",
+    ]
+    for name, spans in recording.phases.items():
+        lines.append(f"{name} = [{', '.join(f'[{first:.3f}, {last:.3f}]' for first, last in spans)}]")
+    for segment, sensor in recording.sensors.items():
+        lines += ["", f"[sensors.{segment}]"]
+        signals = {"gyr": sensor.gyro_S, "acc": sensor.accel_S} if not sensor.ready else {"q": sensor.quat_WS}
+        keys = {"gyr": "gyro", "acc": "accel", "q": "orientation"}
+        for short, values in signals.items():
+            assert values is not None
+            names = [f"{segment}_q{c}" if short == "q" else f"{segment}_{short}_{c}" for c in "xyzw"[: values.shape[1]]]
+            table |= {name: values[:, k] for k, name in enumerate(names)}
+            lines.append(f"{keys[short]} = {json.dumps(names)}")
+        if sensor.stated_quat_LS is not None:
+            up, forward = axes_from_mount(sensor.stated_quat_LS)
+            lines.append(f'mount = {{ up = "{up}", forward = "{forward}" }}')
+    pl.DataFrame(table).write_parquet(folder / "recording.parquet")
+    if truth is not None:
+        pose_table(truth).write_parquet(folder / "truth.parquet")
+    (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
