@@ -7,14 +7,19 @@ While the palms are held together the chain shoulder–arm–palm–palm–arm�
 is zero. It is linear and homogeneous in the lengths ℓ, and that decides the form of the problem:
 
 - Nothing in g fixes the scale: ℓ = 0 closes the chain perfectly. Errors of the orientations even favour it, since they
-  add to ‖g‖² in proportion to ‖ℓ‖². So the residual is the gap over its own standard deviation, which is as
-  homogeneous as the gap, and the quotient no longer changes with the scale (total instead of ordinary least squares).
+  add to ‖g‖² in proportion to ‖ℓ‖². So the residual is the gap whitened by the covariance that errors of the
+  orientations give it, which is as homogeneous as the gap: the quotient no longer changes with the scale (total
+  instead of ordinary least squares).
 - The scale comes from outside: a gauge (a measured length), else the anthropometric prior; the result says which.
 - What the gap does not see keeps the prior: `trunk` cancels, and of a hand without a sensor only the sum forearm + hand
   is seen, the prior splits it.
+- Without a magnetometer every sensor's heading is a little off and drifts, and its tilt is off by the accelerometer's
+  bias. That is no noise that averages out over the phase, so a turn in W and a drift of the heading are unknowns of
+  each sensor beside the lengths, with priors of their own; they are not handed on, but the lengths' covariance holds
+  what they cost.
 
 The weight of the data is measured, not assumed: the residual's own mean square sets its variance and its
-autocorrelation the number of independent samples, in two rounds of Gauss–Newton.
+autocorrelation the number of independent samples, in a few rounds of Gauss-Newton.
 """
 
 from __future__ import annotations
@@ -22,13 +27,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from .alignment import Segments, segment_orientations
-from .errors import BadOption, BadSession, one_of
+from .errors import BadOption, BadSession, NoSolution, one_of
 from .recording import Recording
 from .subject import LENGTHS, Subject, average_subject
 
@@ -38,11 +43,16 @@ ARMS = tuple(f"{side}_{part}" for side in ("left", "right") for part in ("upper_
 # One standard deviation [m] of a length taped over the skin, where the user gives none.
 GAUGE_STD = 0.003
 # The gap is looked at this often [Hz]; more only repeats what the motion's own slowness correlates anyway.
-LOOK_RATE_HZ = 20.0
-# Spread [rad] of a segment's orientation about the truth (filter, mount, soft tissue), before the data say better; only
-# the shares of the segments in the gap's variance hang on it, and here all have the same.
+LOOK_RATE_HZ = 8.0
+# Errors of a segment's orientation [rad] before the data say better; only its share in the gap's covariance hangs on it.
 ATTITUDE_STD = 0.035
-ROUNDS = 3
+# Prior of each sensor's heading in the start pose, and of its drift since: the mounts are taken as known.
+HEADING_STD = np.deg2rad(2.0)  # [rad]
+TILT_STD = np.deg2rad(0.5)  # [rad] of the start pose's tilt: the accelerometer's bias, about x and y of W
+DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
+# Residual variance, in units of ATTITUDE_STD², that no person's hands stay below (0.02 deg, a fraction of a millimetre).
+LEAST_VARIANCE = 1e-4
+ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -79,12 +89,16 @@ def palm_gap(lengths: Any, quat_WL: Mapping[str, Any]) -> Any:
     lengths : (8,) CasADi, in the order of `LENGTHS` [m]
     quat_WL : segment → (4,) CasADi xyzw, for the torso and both upper arms, forearms, hands
     """
-    sided = {"left": 1.0, "right": -1.0}
-    gap = rotate(quat_WL["torso"], ca.vertcat(0.0, lengths[LENGTHS.index("shoulder_width")], 0.0))
+    return sum(links(lengths, quat_WL).values(), start=ca.SX.zeros(3))
+
+
+def links(lengths: Any, quat_WL: Mapping[str, Any]) -> dict[str, Any]:
+    """Segment → its part (3,) [m] of the way from the right palm to the left one, in W."""
+    found = {"torso": rotate(quat_WL["torso"], ca.vertcat(0.0, lengths[LENGTHS.index("shoulder_width")], 0.0))}
     for name in ARMS:
-        side, _ = name.split("_", 1)
-        gap += sided[side] * rotate(quat_WL[name], ca.vertcat(0.0, 0.0, -lengths[LENGTHS.index(name)]))
-    return gap
+        down = -lengths[LENGTHS.index(name)] if name.startswith("left") else lengths[LENGTHS.index(name)]
+        found[name] = rotate(quat_WL[name], ca.vertcat(0.0, 0.0, down))
+    return found
 
 
 def rotate(quat: Any, v: Any) -> Any:
@@ -171,31 +185,39 @@ def _solve(
     quats = _chain_quats(segments.quat_WL, looks)
     warnings = list(segments.warnings)
 
+    problem = _problem(len(looks), tuple(name for name in CHAIN if name in segments.quat_WL))
+    since = recording.time[looks] - segments.start[1]
+    data = np.vstack([_chain_quats(segments.quat_WL, looks), since])
+
+    # Prior and gauge as one Gaussian over [lengths, turns, drifts]: the start of the solver, and all of the scale.
+    k = len(LENGTHS)
     mean = np.array([prior.lengths[name] for name in LENGTHS])
-    information = np.linalg.inv(prior.lengths_covariance())
-    target = information @ mean
+    turn_std = np.tile([TILT_STD, TILT_STD, HEADING_STD], problem.sensors)
+    drift_std = np.full(problem.sensors, DRIFT_STD)
+    information = np.diag(np.concatenate([np.zeros(k), turn_std**-2, drift_std**-2]))
+    information[:k, :k] = np.linalg.inv(prior.lengths_covariance())
+    target = information[:, :k] @ mean
     for name, value in gauge.items():
-        k = LENGTHS.index(name)
-        information[k, k] += 1.0 / gauge_std**2
-        target[k] += value / gauge_std**2
-    # Prior and gauge as one Gaussian: the start of the solver, and all there is of the scale.
+        i = LENGTHS.index(name)
+        information[i, i] += 1.0 / gauge_std**2
+        target[i] += value / gauge_std**2
     center = np.linalg.solve(information, target)
 
-    residual = _residuals(len(looks))
-    lengths, weight, independent = center, 1.0, float(len(looks))
+    x, weight, independent = center, 1.0, float(len(looks))
     for _ in range(ROUNDS):
-        lengths = _gauss_newton(len(looks), quats, center, information, weight, lengths)
-        r = np.asarray(residual(lengths, quats)).T  # (n, 3), of unit variance if ATTITUDE_STD were right
+        x = problem.solve(data, center, information, weight, x)
+        r = np.asarray(problem.residuals(x, data)).T  # (n, 3), of unit variance if ATTITUDE_STD were right
         independent = len(r) / _correlation_time(r)
         freedom = max(r.size - 5.0, 1.0)
-        weight = float(independent / len(r) / (np.sum(r**2) / freedom))
-    J = np.asarray(_jacobian(len(looks))(lengths, quats))
+        weight = float(independent / len(r) / max(np.sum(r**2) / freedom, LEAST_VARIANCE))
+    J = np.asarray(problem.jacobian(x, data))
     data_information = weight * J.T @ J
-    covariance = np.linalg.inv(data_information + information)
+    covariance = np.linalg.inv(data_information + information)[:k, :k]
     covariance = (covariance + covariance.T) / 2.0
+    lengths = x[:k]
 
-    gaps = np.asarray(_gaps(len(looks))(lengths, quats))
-    gaps_before = np.asarray(_gaps(len(looks))(mean, quats))
+    gaps = np.asarray(problem.gaps(x, data))
+    gaps_before = np.asarray(problem.gaps(np.concatenate([mean, np.zeros(4 * problem.sensors)]), data))
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1)
     if not gauge:
         warnings.append(
@@ -210,7 +232,7 @@ def _solve(
                 f"{name} = {lengths[k]:.3f} m lies {abs(z):.1f} standard deviations from the average; "
                 f"check mounts and phases"
             )
-    if not np.any(np.linalg.eigvalsh(data_information) > 10.0 * np.min(np.linalg.eigvalsh(information))):
+    if covariance[1, 1] > 0:
         warnings.append(
             "the hands hardly moved: the lengths are the prior's; move the joined hands through the whole reach"
         )
@@ -251,83 +273,97 @@ def _chain_quats(quat_WL: Mapping[str, np.ndarray], looks: np.ndarray) -> np.nda
     return np.concatenate(rows)
 
 
-@cache
-def _frame_gap() -> Any:
-    lengths, quats = ca.SX.sym("lengths", len(LENGTHS)), ca.SX.sym("quats", 4 * len(CHAIN))
-    parts = {segment: quats[4 * k : 4 * k + 4] for k, segment in enumerate(CHAIN)}
-    return ca.Function("gap", [lengths, quats], [palm_gap(lengths, parts)])
+class _Problem(NamedTuple):
+    """CasADi functions of n looks at the gap; x is [lengths, turns, drifts], a column of data is [quats, since]."""
+
+    sensors: int  # each has a turn in W (3) [rad] and a drift of its heading [rad/s]
+    gaps: Any  # (x, data) → (3, n) [m]
+    residuals: Any  # (x, data) → (3, n), whitened
+    jacobian: Any  # (x, data) → (3 n, len(x)) of the residuals
+    solver: Any
+
+    def solve(
+        self, data: np.ndarray, center: np.ndarray, information: np.ndarray, weight: float, start: np.ndarray
+    ) -> np.ndarray:
+        """Minimiser x of ½ weight ‖r(x)‖² + ½ (x − c)ᵀ Λ (x − c) with positive lengths.
+
+        Raises
+        ------
+        NoSolution
+            It did not converge.
+        """
+        k = len(LENGTHS)
+        low = np.full(len(start), -np.inf)
+        low[:k] = 0.01
+        p = np.concatenate([data.ravel(order="F"), center, information.ravel(order="F"), [weight]])
+        x = np.asarray(self.solver(x0=start, p=p, lbx=low)["x"]).ravel()
+        # IPOPT's own verdict hangs on the scale of the cost; what counts is the step still to go, in standard
+        # deviations, of those lengths that are free.
+        J = np.asarray(self.jacobian(x, data))
+        r = np.asarray(self.residuals(x, data)).ravel(order="F")
+        free = x > low + 1e-6
+        gradient = (weight * J.T @ r + information @ (x - center))[free]
+        hessian = (weight * J.T @ J + information)[np.ix_(free, free)]
+        to_go = float(np.sqrt(gradient @ np.linalg.solve(hessian, gradient)))
+        if not to_go < 0.05:
+            raise NoSolution(
+                f"the lengths did not converge ({to_go:.2g} standard deviations to go); check that the palms touch in "
+                f"the phase and that the mounts are right"
+            )
+        return x
 
 
 @cache
-def _frame_residual() -> Any:
-    """The gap over its own standard deviation.
+def _problem(n: int, sensors: tuple[str, ...]) -> _Problem:
+    k, s = len(LENGTHS), len(sensors)
+    m = k + 4 * s
+    x, data = ca.SX.sym("x", m), ca.SX.sym("data", 4 * len(CHAIN) + 1)
+    quats = {segment: data[4 * i : 4 * i + 4] for i, segment in enumerate(CHAIN)}
+    # A link without a sensor of its own, a hand, is rigid with the forearm and shares its errors.
+    carrier = {name: name if name in sensors else name.replace("hand", "forearm") for name in CHAIN}
+    moved = {sensor: ca.SX.zeros(3) for sensor in sensors}
+    for name, vector in links(x[:k], quats).items():
+        moved[carrier[name]] += vector
+    gap, covariance = ca.SX.zeros(3), ca.SX.zeros(3, 3)
+    for i, v in enumerate(moved.values()):
+        turn = x[k + 3 * i : k + 3 * i + 3]
+        turn[2] += x[k + 3 * s + i] * data[-1]
+        gap += v + ca.cross(turn, v)
+        # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ).
+        covariance += ATTITUDE_STD**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
+    whitened = ca.solve(ca.chol(covariance).T, gap)
+    gaps = ca.Function("gap", [x, data], [gap]).map("gaps", "serial", n, [0], [])
+    residuals = ca.Function("residual", [x, data], [whitened]).map("residuals", "serial", n, [0], [])
 
-    An orientation error of variance σ² about each axis moves the end of a link ℓ d by a vector of covariance
-    σ² ℓ² (1 − d dᵀ); averaged over directions that is ⅔ σ² ℓ² in each component.
-    """
-    lengths, quats = ca.SX.sym("lengths", len(LENGTHS)), ca.SX.sym("quats", 4 * len(CHAIN))
-    spread = lengths[LENGTHS.index("shoulder_width")] ** 2 + sum(
-        (lengths[LENGTHS.index(name)] ** 2 for name in ARMS), start=ca.SX(0)
-    )
-    std = ATTITUDE_STD * ca.sqrt(2.0 / 3.0 * spread)
-    return ca.Function("residual", [lengths, quats], [_frame_gap()(lengths, quats) / std])
-
-
-@cache
-def _gaps(n: int) -> Any:
-    return _frame_gap().map("gaps", "serial", n, [0], [])
-
-
-@cache
-def _residuals(n: int) -> Any:
-    return _frame_residual().map("residuals", "serial", n, [0], [])
-
-
-@cache
-def _jacobian(n: int) -> Any:
-    lengths, quats = ca.MX.sym("lengths", len(LENGTHS)), ca.MX.sym("quats", 4 * len(CHAIN), n)
-    return ca.Function("jacobian", [lengths, quats], [ca.jacobian(ca.vec(_residuals(n)(lengths, quats)), lengths)])
-
-
-@cache
-def _solver(n: int) -> Any:
-    """IPOPT on ½ weight ‖r(ℓ)‖² + ½ (ℓ − c)ᵀ Λ (ℓ − c), with the Gauss–Newton Hessian in place of the exact one."""
-    k, m = len(LENGTHS), 4 * len(CHAIN)
-    lengths, p = ca.MX.sym("lengths", k), ca.MX.sym("p", m * n + k + k * k + 1)
-    quats, center, information, weight = ca.vertsplit(p, [0, m * n, m * n + k, m * n + k + k * k, p.numel()])
-    information = ca.reshape(information, k, k)
-    r = ca.vec(_residuals(n)(lengths, ca.reshape(quats, m, n)))
-    off = lengths - center
-    cost = 0.5 * weight * ca.sumsqr(r) + 0.5 * ca.bilin(information, off, off)
-    J = ca.jacobian(r, lengths)
+    # IPOPT, with the Gauss-Newton Hessian in place of the exact one: the exact one costs fifty times as much.
+    X = ca.MX.sym("X", m)
+    P = ca.MX.sym("P", data.numel() * n + m + m * m + 1)
+    at = np.cumsum([0, data.numel() * n, m, m * m, 1]).tolist()
+    D, center, information, weight = ca.vertsplit(P, at)
+    D, information = ca.reshape(D, data.numel(), n), ca.reshape(information, m, m)
+    r = ca.vec(residuals(X, D))
+    J = ca.jacobian(r, X)
+    cost = 0.5 * weight * ca.sumsqr(r) + 0.5 * ca.bilin(information, X - center, X - center)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
-    lagged = ca.Function(
+    gauss_newton = ca.Function(
         "nlp_hess_l",
-        [lengths, p, lam_f, lam_g],
+        [X, P, lam_f, lam_g],
         [lam_f * ca.triu(weight * (J.T @ J) + information)],
         ["x", "p", "lam_f", "lam_g"],
         ["triu_hess_gamma_x_x"],
     )
-    options = {
+    options: dict[str, Any] = {
         "print_time": False,
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
         "ipopt.tol": 1e-9,
-        "hess_lag": lagged,
+        "ipopt.nlp_scaling_method": "none",
+        "hess_lag": gauss_newton,
     }
-    problem: dict[str, Any] = {"x": lengths, "p": p, "f": cost}
-    return ca.nlpsol("lengths", "ipopt", problem, options)
-
-
-def _gauss_newton(
-    n: int, quats: np.ndarray, center: np.ndarray, information: np.ndarray, weight: float, start: np.ndarray
-) -> np.ndarray:
-    solver = _solver(n)
-    p = np.concatenate([quats.ravel(order="F"), center, information.ravel(order="F"), [weight]])
-    solution = solver(x0=start, p=p, lbx=0.01, ubx=2.0)
-    if not solver.stats()["success"]:
-        raise RuntimeError(f"the length problem did not converge: {solver.stats()['return_status']}")
-    return np.asarray(solution["x"]).ravel()
+    solver = ca.nlpsol("lengths", "ipopt", {"x": X, "p": P, "f": cost}, options)
+    data_n = ca.MX.sym("data", data.numel(), n)
+    jacobian = ca.Function("jacobian", [X, data_n], [ca.jacobian(ca.vec(residuals(X, data_n)), X)])
+    return _Problem(s, gaps, residuals, jacobian, solver)
 
 
 def _correlation_time(r: np.ndarray) -> float:

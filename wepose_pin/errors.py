@@ -50,6 +50,10 @@ class BadOption(WeposeError):
     """An option's value is outside what it may be."""
 
 
+class NoSolution(WeposeError):
+    """A problem that was well posed by its form has no solution on these data."""
+
+
 def one_of(names: Iterable[str], found: str | None = None, most: int = 12) -> str:
     """The choices for an error's end: ``a, b, c`` with the closest to `found` named first."""
     choices = list(names)

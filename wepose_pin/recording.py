@@ -59,12 +59,14 @@ class Sensor:
     accel_S : (n, 3) [m/s²], specific force, +g up at rest; None for ready orientations
     quat_WS : (n, 4) xyzw, sensor to a world of its own whose z points up; None for raw sensors
     stated_quat_LS : (4,) xyzw, the mount as the session states it, sensor to segment; None where it says nothing
+    gap : (n,) bool, true where samples were lost for longer than is bridged in silence; None where that is not allowed
     """
 
     gyro_S: np.ndarray | None = None
     accel_S: np.ndarray | None = None
     quat_WS: np.ndarray | None = None
     stated_quat_LS: np.ndarray | None = None
+    gap: np.ndarray | None = None
 
     @property
     def ready(self) -> bool:
@@ -142,7 +144,7 @@ def check(recording: Recording) -> Recording:
         raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}")
     if len(time) < 2:
         raise BadData(f"{where}: {len(time)} samples; a recording has at least 2")
-    _check_time(where, time)
+    check_time(where, time)
     for segment, sensor in recording.sensors.items():
         for name, values, width in (
             ("gyro", sensor.gyro_S, 3),
@@ -157,16 +159,20 @@ def check(recording: Recording) -> Recording:
             bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
             if bad.size:
                 raise BadData(
-                    f"{place}: not a finite number at {time[bad[0]]:.3f} s (row {bad[0] + 1}, {bad.size} rows in all); "
+                    f"{place}: not a finite number at {time[bad[0]]:.3f} s (sample {bad[0] + 1}, {bad.size} in all); "
                     f"fill or cut the gap first"
                 )
+            if name == "orientation" and np.any(np.abs(np.linalg.norm(values, axis=1) - 1.0) > 1e-6):
+                k = int(np.argmax(np.abs(np.linalg.norm(values, axis=1) - 1.0)))
+                raise BadData(f"{place}: no unit quaternion at {time[k]:.3f} s: length {np.linalg.norm(values[k]):.6g}")
         if (sensor.gyro_S is None) != (sensor.accel_S is None) or (sensor.gyro_S is None) == (sensor.quat_WS is None):
             raise BadData(f"{where}: sensors.{segment} has neither gyro and accel nor orientation")
-    _check_phases(where, time, recording.phases)
+    check_phases(where, time, recording.phases)
     return recording
 
 
-def _check_time(where: str, time: np.ndarray) -> None:
+def check_time(where: str, time: np.ndarray) -> None:
+    """Every time (n,) [s] is finite and later than the one before; `where` begins the error's text."""
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
         raise BadData(f"{where}: time: not a finite number in row {bad[0] + 1}; every row needs its time in seconds")
@@ -179,7 +185,8 @@ def _check_time(where: str, time: np.ndarray) -> None:
         )
 
 
-def _check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    """Every interval [s] has a length and lies in the recording."""
     for name, intervals in phases.items():
         for first, last in intervals:
             place = f"{where}: phases.{name}: [{first:g}, {last:g}]"

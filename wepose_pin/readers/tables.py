@@ -1,8 +1,12 @@
-"""Tables of numbers: CSV and Parquet into polars, columns into float arrays."""
+"""Tables of numbers: CSV and Parquet into polars, whole or by rows, and their columns into float arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,52 +15,222 @@ import polars as pl
 from ..errors import BadData, MissingFile, UnknownColumn, one_of
 
 FORMATS = (".csv", ".parquet")
+NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
+# Lines of a CSV that are parsed at once where it is read in pieces.
+BLOCK_ROWS = 50_000
+# What a line without any value consists of.
+EMPTY = b", \t\r\n"
 
 
 def read_table(path: Path) -> pl.DataFrame:
-    """The table in a ``.csv`` or ``.parquet`` file.
+    """The table in a ``.csv`` or ``.parquet`` file. Lines of a CSV that begin with ``#`` are comments.
 
     Raises
     ------
     MissingFile
-        Not there, or of another format.
+        Not there, a folder, or of another format.
     BadData
-        Not readable as what its ending says.
+        Not readable as what its ending says: damaged, separated by something else than commas, rows of unlike length.
     """
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file")
-    if path.suffix.lower() not in FORMATS:
-        raise MissingFile(f"{path}: '{path.suffix}' is not a known format; {one_of(FORMATS)}")
-    try:
-        if path.suffix.lower() == ".parquet":
+    _must_be_table(path)
+    if _is_parquet(path):
+        with _polars_errors(path):
             return pl.read_parquet(path)
-        # Columns are typed over the whole file, so that text deep down is found as text and can be named below.
-        return pl.read_csv(path, infer_schema_length=None, null_values=["", "nan", "NaN", "NA"])
-    except (pl.exceptions.PolarsError, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise BadData(f"{path}: cannot be read as a table: {reason}") from error
+    names = _header(path)
+    # Columns are typed over the whole file, so that text deep down is found as text and can be named.
+    table = _parsed(path, path, names)
+    return table.head(table.height - _empty_end(path)) if table.height else table
 
 
-def columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str) -> np.ndarray:
+def columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str, first_row: int = 0) -> np.ndarray:
     """Columns of numbers as a C-contiguous float array (n, len(names)); empty cells are NaN.
 
-    `file` and `place` (such as ``sensors.torso.gyro``) begin the error's text.
+    `file` and `place` (such as ``sensors.torso.gyro``) begin the error's text; `first_row` is the row of the file that
+    the table begins with.
 
     Raises
     ------
     UnknownColumn
         A name is not in the table.
     BadData
-        A column holds text.
+        A column holds something else than numbers, or its name stands twice in the file.
     """
-    for name in names:
-        if name not in table.columns:
-            raise UnknownColumn(f"{place}: no column '{name}' in {file}; {one_of(table.columns, name)}")
-        series = table[name]
-        if not series.dtype.is_numeric() and series.dtype != pl.Null:
-            text = series.cast(pl.String)
-            bad = text.str.strip_chars().cast(pl.Float64, strict=False).is_null() & text.is_not_null()
+    numbers = [_numbers(table, name, file, place, first_row) for name in names]
+    return np.ascontiguousarray(pl.DataFrame(numbers).to_numpy().reshape(table.height, len(names)))
+
+
+def _numbers(table: pl.DataFrame, name: str, file: str, place: str, first_row: int) -> pl.Series:
+    if name not in table.columns:
+        raise UnknownColumn(f"{place}: no column '{name}' in {file}; {one_of(table.columns, name)}")
+    if f"{name}_duplicated_0" in table.columns:
+        raise BadData(f"{file}: column '{name}' stands there more than once; each column needs a name of its own")
+    series = table[name]
+    if series.dtype == pl.String:
+        stripped = series.str.strip_chars()
+        series = stripped.cast(pl.Float64, strict=False)
+        bad = series.is_null() & stripped.is_not_null() & ~stripped.is_in(NO_VALUE)
+        if bad.any():
             row = int(bad.arg_max() or 0)
-            raise BadData(f"{file}: column '{name}' holds text in row {row + 1}: '{text[row]}'; it must be a number")
-    selected = table.select(pl.col(names).cast(pl.Float64).fill_null(float("nan")))
-    return np.ascontiguousarray(selected.to_numpy())
+            text = stripped[row]
+            numeric = text.replace(",", ".", 1).replace("-", "").replace(".", "", 1).isdigit()
+            right = f"write decimals with a point: {text.replace(',', '.', 1)}" if numeric else "it must be a number"
+            raise BadData(f"{file}: column '{name}' holds text in row {first_row + row + 1}: '{text[:40]}'; {right}")
+    elif not series.dtype.is_numeric() and series.dtype != pl.Null:
+        found = "true and false" if series.dtype == pl.Boolean else f"values of type {series.dtype}"
+        raise BadData(f"{file}: column '{name}' holds {found}; it must hold numbers")
+    return series.cast(pl.Float64).fill_null(float("nan")).rename(name)
+
+
+# By rows -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Rows:
+    """A table of which stretches of rows are asked for, each beginning no earlier than the one before.
+
+    Holds what was asked for and one block of a CSV, or the row groups that a stretch of a Parquet file touches.
+    """
+
+    path: Path
+
+    def __post_init__(self) -> None:
+        _must_be_table(self.path)
+        self.names = _parquet_names(self.path) if _is_parquet(self.path) else _header(self.path)
+        self._blocks = iter(()) if _is_parquet(self.path) else _csv_blocks(self.path, self.names)
+        self._held = pl.DataFrame()
+        self._first = 0
+
+    def __getitem__(self, rows: slice) -> pl.DataFrame:
+        if _is_parquet(self.path):
+            with _polars_errors(self.path):
+                return pl.scan_parquet(self.path).slice(rows.start, rows.stop - rows.start).collect()
+        if rows.start < self._first:
+            raise ValueError(f"row {rows.start} asked for after row {self._first}")
+        while self._first + self._held.height < rows.stop and (block := next(self._blocks, None)) is not None:
+            kept = self._held.slice(max(0, rows.start - self._first))
+            self._first += self._held.height - kept.height
+            self._held = pl.concat([kept, block], how="vertical_relaxed") if kept.height else block
+        return self._held.slice(rows.start - self._first, rows.stop - rows.start)
+
+
+def one_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.ndarray, int]:
+    """A column (n,) of a table that is not held as a whole, and the number of rows; without a name an empty array."""
+    _must_be_table(path)
+    if _is_parquet(path):
+        if name is not None and name in (names := _parquet_names(path)):
+            names = [name]
+        with _polars_errors(path):
+            height = int(pl.scan_parquet(path).select(pl.len()).collect().item())
+            table = pl.scan_parquet(path).select(names).collect() if name is not None else None
+        return (columns(table, [name], file, place)[:, 0] if table is not None and name else np.empty(0)), height
+    parts, height = [np.empty(0)], 0
+    for block in _csv_blocks(path, _header(path)):
+        if name is not None:
+            parts.append(columns(block, [name], file, place, height)[:, 0])
+        height += block.height
+    return np.concatenate(parts), height
+
+
+def _parquet_names(path: Path) -> list[str]:
+    with _polars_errors(path):
+        return pl.scan_parquet(path).collect_schema().names()
+
+
+def _csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
+    with path.open("rb") as lines:
+        rows = (line for line in lines if not line.startswith(b"#"))
+        header = next(line for line in rows if line.strip())
+        empty: list[bytes] = []  # kept back until something follows them
+        while new := list(itertools.islice(rows, BLOCK_ROWS)):
+            block, empty = empty[::-1] + new, []
+            while block and not block[-1].strip(EMPTY):
+                empty.append(block.pop())
+            if not block:
+                continue
+            table = _parsed(path, io.BytesIO(b"".join([header, *block])), names)
+            # A column of whole numbers in one block and of decimals in the next is one column.
+            yield table.with_columns(pl.col(pl.Int64, pl.Null).cast(pl.Float64))
+
+
+# What a file can be wrong in ---------------------------------------------------------------------------------------
+
+
+def _is_parquet(path: Path) -> bool:
+    return path.suffix.lower() == ".parquet"
+
+
+def _must_be_table(path: Path) -> None:
+    if path.is_dir():
+        raise MissingFile(f"{path}: is a folder; a {' or '.join(FORMATS)} file is wanted here")
+    if path.suffix.lower() not in FORMATS:
+        raise MissingFile(f"{path}: '{path.suffix}' is not a known format; {one_of(FORMATS)}")
+    if not path.is_file():
+        beside = [p.name for p in path.parent.iterdir() if p.suffix.lower() in FORMATS] if path.parent.is_dir() else []
+        raise MissingFile(f"{path}: no such file; {one_of(sorted(beside), path.name)}")
+
+
+class _polars_errors:
+    """polars' own errors as one line of ours."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, pl.exceptions.PolarsError | OSError):
+            what = "Parquet file" if _is_parquet(self.path) else "table"
+            reason = " ".join(str(error).split("\n")[0].split())
+            raise BadData(f"{self.path}: cannot be read as a {what}: {reason}") from error
+
+
+def _header(path: Path) -> list[str]:
+    """Column names of a CSV, as they stand there."""
+    try:
+        with path.open("rb") as lines:
+            first = next((line for line in lines if line.strip() and not line.startswith(b"#")), b"")
+        if b"\0" in first:
+            raise BadData(f"{path}: is not a CSV in UTF-8: there are zero bytes in its first line; save it as UTF-8")
+        header = first.decode("utf-8-sig", errors="replace").rstrip("\r\n")
+    except OSError as error:
+        raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
+    if not header:
+        raise BadData(f"{path}: is empty; a line with the names of the columns and then numbers are needed")
+    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+        if header.count(separator) > header.count(","):
+            raise BadData(f"{path}: columns are separated by {name}; commas, and points in decimals, are needed")
+    return next(csv.reader([header]))
+
+
+def _parsed(path: Path, source: Path | io.BytesIO, names: list[str]) -> pl.DataFrame:
+    try:
+        table = pl.read_csv(source, infer_schema_length=None, null_values=NO_VALUE, comment_prefix="#")
+    except (pl.exceptions.PolarsError, OSError) as error:
+        if "more fields" in str(error):
+            _find_ragged(path, len(names))
+        if "utf-8" in str(error):
+            raise BadData(f"{path}: is not UTF-8 text; save it as CSV in UTF-8") from error
+        with _polars_errors(path):
+            raise
+    # polars fills short rows in silence.
+    if table.width > 1 and table[table.columns[-1]].null_count():
+        _find_ragged(path, len(names))
+    return table
+
+
+def _empty_end(path: Path) -> int:
+    """How many lines without any value a CSV ends with, as editors and spreadsheets leave them."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 2**16))
+        lines = file.read().splitlines()
+    return len(lines) - next((k for k in range(len(lines), 0, -1) if lines[k - 1].strip(EMPTY)), 0)
+
+
+def _find_ragged(path: Path, width: int) -> None:
+    """Raise an error on the first row of a CSV that has not `width` fields; empty lines pass as rows without values."""
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as lines:
+        rows = csv.reader(line for line in lines if not line.startswith("#"))
+        for k, fields in enumerate(rows):
+            if fields and len(fields) != width:
+                raise BadData(f"{path}: row {k} has {len(fields)} fields, the line of names has {width}; mend the row")

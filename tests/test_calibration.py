@@ -1,0 +1,192 @@
+"""Closed-chain calibration: the CasADi chain against Pinocchio, the physics of the gauge, honest deviations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.calibration import ARMS, CHAIN, calibrate, calibrate_lengths, palm_gap, rotate
+from wepose_pin.errors import BadOption, BadPhase, BadSession
+from wepose_pin.model import load_model
+from wepose_pin.pose import pose_of
+from wepose_pin.recording import Recording, Sensor
+from wepose_pin.simulation import PERFECT, Person, Simulation, simulate, simulated_person
+from wepose_pin.subject import LENGTHS, average_subject
+
+
+def ready(simulation: Simulation) -> Recording:
+    """The simulated person with exact orientations in place of sensors: what is left is the calibration alone."""
+    sensors = {segment: Sensor(quat_WS=quat) for segment, quat in simulation.quat_WL.items()}
+    return replace(simulation.recording("exact"), sensors=sensors)
+
+
+@pytest.fixture(scope="module")
+def exact() -> tuple[Person, Recording]:
+    person = simulated_person(11)
+    return person, ready(simulate(person.lengths, seed=11, noise=PERFECT, clasp_s=30.0, circles=0))
+
+
+def test_the_casadi_chain_is_pinocchios() -> None:
+    rng = np.random.default_rng(0)
+    values = np.array([0.5, 0.4, 0.3, 0.25, 0.07, 0.31, 0.24, 0.08]) * rng.uniform(0.9, 1.1, 8)
+    model = load_model(lengths=dict(zip(LENGTHS, values, strict=True)))
+    lengths = ca.SX.sym("l", len(LENGTHS))
+    quats = {segment: ca.SX.sym(segment, 4) for segment in CHAIN}
+    gap = ca.Function("gap", [lengths, *quats.values()], [palm_gap(lengths, quats)])
+    drawn = {segment: Rotation.random(20, random_state=rng).as_quat() for segment in CHAIN}
+    points = pose_of(model, np.arange(20.0), drawn).points
+    for k in range(20):
+        found = np.asarray(gap(values, *(drawn[segment][k] for segment in CHAIN))).ravel()
+        np.testing.assert_allclose(found, (points["left_hand"] - points["right_hand"])[k], atol=1e-14)
+
+
+def test_rotate_in_casadi_is_scipys() -> None:
+    rotation = Rotation.random(random_state=1)
+    v = np.array([0.2, -1.0, 0.7])
+    np.testing.assert_allclose(
+        np.asarray(rotate(ca.DM(rotation.as_quat()), ca.DM(v))).ravel(), rotation.apply(v), atol=1e-15
+    )
+
+
+def test_exact_orientations_and_a_gauge_give_the_lengths_back(exact: tuple[Person, Recording]) -> None:
+    person, recording = exact
+    gauge = {"shoulder_width": person.lengths["shoulder_width"]}
+    found = calibrate_lengths(recording, gauge=gauge, gauge_std=1e-5)
+    for name in ("shoulder_width", "left_upper_arm", "right_upper_arm"):
+        assert found.subject.lengths[name] == pytest.approx(person.lengths[name], abs=2e-4)
+    for side in ("left", "right"):
+        # Without a sensor on the hand only the sum is seen.
+        names = f"{side}_forearm", f"{side}_hand"
+        assert sum(found.subject.lengths[n] for n in names) == pytest.approx(
+            sum(person.lengths[n] for n in names), abs=2e-4
+        )
+    assert found.rms_gap < 2e-4
+    assert found.prior_rms_gap > 5e-3
+
+
+def test_without_a_gauge_the_proportions_are_right_and_the_scale_is_the_priors(exact: tuple[Person, Recording]) -> None:
+    person, recording = exact
+    found = calibrate_lengths(recording)
+    seen = ("shoulder_width", "left_upper_arm", "right_upper_arm")
+    ratio = [found.subject.lengths[name] / person.lengths[name] for name in seen]
+    assert np.ptp(ratio) < 2e-3
+    assert abs(np.mean(ratio) - 1) < 4 * found.scale_std
+    assert 0.02 < found.scale_std < 0.1
+    assert found.gauge == {}
+    assert any(warning.startswith("no gauge") for warning in found.warnings)
+    # Nothing drifts to zero: another prior, ten per cent larger, gives everything ten per cent larger.
+    average = average_subject()
+    larger = replace(
+        average, lengths={k: 1.1 * v for k, v in average.lengths.items()}, covariance=1.21 * average.covariance
+    )
+    again = calibrate_lengths(recording, prior=larger)
+    for name in LENGTHS:
+        assert again.subject.lengths[name] == pytest.approx(1.1 * found.subject.lengths[name], rel=1e-3)
+
+
+def test_noise_in_the_orientations_does_not_shrink_the_person(exact: tuple[Person, Recording]) -> None:
+    """Least squares of the bare gap would: noise adds to it in proportion to the lengths."""
+    person, recording = exact
+    rng = np.random.default_rng(2)
+    noisy = {
+        name: Sensor(
+            quat_WS=(
+                Rotation.from_quat(s.quat_WS) * Rotation.from_rotvec(rng.normal(scale=0.06, size=(len(recording), 3)))
+            ).as_quat()
+        )
+        for name, s in recording.sensors.items()
+    }
+    tight = {"shoulder_width": person.lengths["shoulder_width"]}
+    found = calibrate_lengths(replace(recording, sensors=noisy), gauge=tight, gauge_std=1e-4)
+    arm = np.mean([found.subject.lengths[n] / person.lengths[n] for n in ("left_upper_arm", "right_upper_arm")])
+    assert arm == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_hand_with_a_sensor_is_seen_by_itself(exact: tuple[Person, Recording]) -> None:
+    """The wrists bend: forearm and hand then turn apart, and the closure tells one from the other."""
+    person, recording = exact
+    length = person.lengths
+    time = recording.time
+    sensors = dict(recording.sensors)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        bend = Rotation.from_rotvec(np.outer(np.sin(2 * np.pi * 0.37 * sign * time + sign), [0.0, 0.5, 0.0]))
+        quat = sensors[f"{side}_forearm"].quat_WS
+        assert quat is not None
+        # Turn the forearm such that wrist bend and all, the palm stays where it was: the chain stays closed.
+        forearm = Rotation.from_quat(quat)
+        together = forearm.apply([0, 0, -(length[f"{side}_forearm"] + length[f"{side}_hand"])])
+        bent = np.array([0, 0, -length[f"{side}_forearm"]]) + bend.apply([0, 0, -length[f"{side}_hand"]])
+        # The bend shortens the reach a little; the palm point of the model moves with it, so only open what is left.
+        turn, _ = zip(
+            *(Rotation.align_vectors(t[None], b[None]) for t, b in zip(together, bent, strict=True)), strict=True
+        )
+        turned = Rotation.concatenate(list(turn))
+        sensors[f"{side}_forearm"] = Sensor(quat_WS=turned.as_quat())
+        sensors[f"{side}_hand"] = Sensor(quat_WS=(turned * bend).as_quat())
+    clasp = [recording.phases["clasp"][0]]
+    bent_recording = replace(
+        recording, sensors=sensors, phases={"start": recording.phases["start"], "clasp": tuple(clasp)}
+    )
+    without = calibrate_lengths(recording, gauge={"shoulder_width": length["shoulder_width"]})
+    found = calibrate_lengths(bent_recording, gauge={"shoulder_width": length["shoulder_width"]})
+    assert found.subject.std("left_hand") < 0.5 * without.subject.std("left_hand")
+
+
+def test_the_standard_deviations_are_honest() -> None:
+    """MTi-3 noise, real filtering, a taped shoulder width: errors over their standard deviations, 12 people."""
+    z, chi2 = [], []
+    for seed in range(12):
+        person = simulated_person(100 + seed)
+        simulation = simulate(person.lengths, seed=seed, circles=0)
+        subject = calibrate(
+            simulation.recording(), gauge=person.taped, prior=person.average, gauge_std=person.taped_std
+        )
+        names = [name for name in LENGTHS if name != "trunk"]
+        error = np.array([subject.lengths[name] - person.lengths[name] for name in names])
+        z.append(error / [subject.std(name) for name in names])
+        chi2.append(error @ np.linalg.solve(subject.lengths_covariance(names), error))
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    print("chi2 of 7 lengths jointly:", np.round(chi2, 1))
+    print("rms of error/std:", dict(zip(names, rms.round(2), strict=True)))
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.5
+
+
+def test_hands_that_do_not_move_say_so(exact: tuple[Person, Recording]) -> None:
+    _, recording = exact
+    first = recording.phases["clasp"][0][0]
+    still = replace(recording, phases={**recording.phases, "clasp": ((first, first + 0.4),)})
+    found = calibrate_lengths(still, gauge={"shoulder_width": 0.38})
+    average = average_subject()
+    assert found.subject.std("left_upper_arm") > 0.1 * average.std("left_upper_arm")
+
+
+def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
+    person, recording = exact
+    found = calibrate(recording, prior=person.average)
+    assert found.lengths["trunk"] == pytest.approx(person.average.lengths["trunk"], rel=1e-6)
+    assert found.std("trunk") == pytest.approx(person.average.std("trunk"), rel=1e-3)
+    taped = calibrate(recording, prior=person.average, gauge={"trunk": 0.5, "shoulder_width": 0.38})
+    assert taped.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
+
+
+def test_wrong_requests_are_named(exact: tuple[Person, Recording]) -> None:
+    _, recording = exact
+    with pytest.raises(BadOption, match="gauge sholder_width: not a length; did you mean 'shoulder_width'"):
+        calibrate(recording, gauge={"sholder_width": 0.38})
+    with pytest.raises(BadOption, match=r"gauge shoulder_width=38: a length in metres"):
+        calibrate(recording, gauge={"shoulder_width": 38.0})
+    with pytest.raises(BadOption, match="protocol 'bow' is not known"):
+        calibrate(recording, protocol="bow")
+    with pytest.raises(BadPhase, match=r"phases\.clasp is needed"):
+        calibrate(replace(recording, phases={"start": recording.phases["start"]}))
+    fewer = {name: sensor for name, sensor in recording.sensors.items() if name != "left_forearm"}
+    with pytest.raises(BadSession, match="no sensor on left_forearm"):
+        calibrate(replace(recording, sensors=fewer))
+
+
+def test_arms_are_in_the_order_of_the_lengths() -> None:
+    assert set(ARMS) < set(LENGTHS)

@@ -1,0 +1,386 @@
+"""Orientation filters: against plain transcriptions of their papers, against physics, against themselves cut in two."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import BadData, BadOption, BadPhase
+from wepose_pin.filters import METHODS, Gdc, GdcParams, Ncf, Smekf, SmekfParams, estimate_orientation, run_filter
+from wepose_pin.filters.smekf import starting_params
+from wepose_pin.noise import SensorNoise, noise_of
+from wepose_pin.static import StaticTest
+
+RATE = 100.0
+GRAVITY = 9.81
+
+
+def cross_matrix(v: np.ndarray) -> np.ndarray:
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def quat_product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Hamilton product of xyzw quaternions, by its definition on scalar and vector part."""
+    vector = p[3] * q[:3] + q[3] * p[:3] + np.cross(p[:3], q[:3])
+    return np.append(vector, p[3] * q[3] - p[:3] @ q[:3])
+
+
+def quat_exp(v: np.ndarray) -> np.ndarray:
+    angle = np.linalg.norm(v)
+    return np.append(np.sinc(angle / 2 / np.pi) * v / 2, np.cos(angle / 2))
+
+
+def matrix(quat: np.ndarray) -> np.ndarray:
+    w = quat[3]
+    return np.eye(3) + 2 * w * cross_matrix(quat[:3]) + 2 * cross_matrix(quat[:3]) @ cross_matrix(quat[:3])
+
+
+def smekf_by_the_book(
+    noise: SensorNoise, quat: np.ndarray, gyro: np.ndarray, accel: np.ndarray, static: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Algorithm 1 as the paper writes it, with full matrices."""
+    q, b, P = quat.copy(), noise.gyro_bias.copy(), 1e-3 * np.eye(6)
+    Q = np.block([[noise.gyro_cov, np.zeros((3, 3))], [np.zeros((3, 3)), noise.bias_step_cov]])
+    R = np.block([[noise.accel_cov, np.zeros((3, 3))], [np.zeros((3, 3)), noise.gyro_cov]])
+    G = dt * np.diag([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    quats, biases, covs = [], [], []
+    for k in range(len(gyro)):
+        omega = gyro[k] - b
+        q = quat_product(q, quat_exp(omega * dt))
+        F = np.eye(6) + dt * np.block([[-cross_matrix(omega), -np.eye(3)], [np.zeros((3, 6))]])
+        P = F @ P @ F.T + G @ Q @ G.T
+        if static[k]:
+            up = matrix(q).T @ [0, 0, 1]
+            H = np.block([[cross_matrix(up), np.zeros((3, 3))], [np.zeros((3, 3)), np.eye(3)]])
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+            innovation = np.concatenate([accel[k] / noise.gravity - up, gyro[k] - b])
+            x = np.concatenate([np.zeros(3), b]) + K @ innovation
+            P = (np.eye(6) - K @ H) @ P
+            q, b = quat_product(q, quat_exp(x[:3])), x[3:]
+        quats.append(q)
+        biases.append(b)
+        covs.append(P[:3, :3])
+    return np.array(quats), np.array(biases), np.array(covs)
+
+
+def measured(
+    rng: np.random.Generator, seconds: float, *, bias: Any = (0.0, 0.0, 0.0), tilt: float = 1.2
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gyro, accel, true quaternions, and where it truly rests: 2 s of rest at the start and in every 10 s.
+
+    The heading swings by 1.5 rad, roll and pitch by `tilt` [rad]; the noise is an MTi-3's.
+    """
+    n = round(seconds * RATE)
+    time = np.arange(n + 1) / RATE
+    # The speed of the motion is zero in the rests and rises and falls smoothly in between.
+    within = time % 10.0
+    speed = np.sin(0.5 * np.pi * np.clip(np.minimum(within - 2.0, 10.0 - within), 0.0, 1.0)) ** 2
+    progress = np.cumsum(speed) / RATE
+    swing = [np.sin(2 * np.pi * f * progress + p) for f, p in rng.uniform([0.2, 0], [0.5, 6.3], size=(3, 2))]
+    rotation = Rotation.from_euler("ZYX", np.column_stack([1.5 * swing[0], tilt * swing[1], tilt * swing[2]]))
+    true = rotation[1:]
+    linear_W = 2.0 * speed[1:, None] * np.column_stack(swing[::-1])[1:]  # any smooth thing that rests with it
+    gyro = (rotation[:-1].inv() * true).as_rotvec() * RATE + np.asarray(bias)
+    gyro += rng.normal(scale=np.deg2rad(0.007) * np.sqrt(RATE), size=(n, 3))
+    accel = true.inv().apply(linear_W + [0, 0, GRAVITY])
+    accel += rng.normal(scale=120e-6 * 9.81 * np.sqrt(RATE), size=(n, 3))
+    return gyro, accel, true.as_quat(), speed[1:] == 0.0
+
+
+def heading_error_deg(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
+    error = (Rotation.from_quat(estimated) * Rotation.from_quat(true).inv()).as_euler("ZYX", degrees=True)[:, 0]
+    return np.unwrap(error, period=360.0)
+
+
+# sMEKF -------------------------------------------------------------------------------------------------------------
+
+
+def test_smekf_is_algorithm_1() -> None:
+    gyro, accel, _, rest = measured(np.random.default_rng(0), 30.0, bias=(0.01, -0.02, 0.005))
+    noise = noise_of(gyro[:180], accel[:180], RATE)
+    start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
+    quat, bias, cov = smekf_by_the_book(noise, start, gyro, accel, rest, 1 / RATE)
+    run = Smekf(noise, RATE, start).run(gyro, accel, rest)
+    turned = (Rotation.from_quat(run.quat_WS).inv() * Rotation.from_quat(quat)).magnitude()
+    assert turned.max() < 1e-10
+    np.testing.assert_allclose(run.gyro_bias, bias, atol=1e-12)
+    np.testing.assert_allclose(run.attitude_cov, cov, rtol=1e-7, atol=1e-15)
+
+
+def error_state(quat: np.ndarray, bias: np.ndarray, of_quat: np.ndarray, of_bias: np.ndarray) -> np.ndarray:
+    """[a; b] that takes the nominal `of_…` to the given state."""
+    a = (Rotation.from_quat(of_quat).inv() * Rotation.from_quat(quat)).as_rotvec()
+    return np.concatenate([a, bias - of_bias])
+
+
+@pytest.mark.parametrize("omega", [(0.0, 0.0, 0.0), (1.0, -2.0, 0.5), (0.0, 0.0, 9.0)])
+def test_F_is_the_derivative_of_the_prediction(omega: tuple[float, float, float]) -> None:
+    """To first order in δt, as the algorithm states it: at 10 kHz the second order is below the tolerance."""
+    dt, eps = 1e-4, 1e-5
+    quat, bias = Rotation.from_rotvec([0.2, 0.1, -0.7]).as_quat(), np.array([0.01, 0.02, -0.03])
+    gyro = np.array(omega) + bias
+
+    def predicted(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        q = (Rotation.from_quat(quat) * Rotation.from_rotvec(error[:3])).as_quat()
+        b = bias + error[3:]
+        return quat_product(q, quat_exp((gyro - b) * dt)), b
+
+    nominal = predicted(np.zeros(6))
+    numeric = np.column_stack(
+        [
+            (error_state(*predicted(eps * e), *nominal) - error_state(*predicted(-eps * e), *nominal)) / (2 * eps)
+            for e in np.eye(6)
+        ]
+    )
+    F = np.eye(6) + dt * np.block([[-cross_matrix(gyro - bias), -np.eye(3)], [np.zeros((3, 6))]])
+    np.testing.assert_allclose(numeric, F, atol=1e-6)
+    # And the compiled prediction uses that F: with Q = 0, P becomes F P Fᵀ.
+    P0 = np.diag([1e-3, 2e-3, 3e-3, 1e-5, 2e-5, 3e-5])
+    filter_ = Smekf(without_noise(), 1 / dt, quat, SmekfParams(P0[:3, :3], P0[3:, 3:]))
+    filter_.state.gyro_bias[:] = bias
+    filter_.run(gyro[None], np.zeros((1, 3)), np.array([False]))
+    np.testing.assert_allclose(filter_.state.P, F @ P0 @ F.T, rtol=1e-9, atol=1e-18)
+
+
+def without_noise() -> SensorNoise:
+    zero = np.zeros((3, 3))
+    return SensorNoise(np.zeros(3), zero, zero, zero, zero, GRAVITY, 100)
+
+
+def test_H_is_the_derivative_of_the_measurement() -> None:
+    eps = 1e-6
+    quat, bias = Rotation.from_rotvec([0.2, 1.1, -0.7]).as_quat(), np.array([0.01, 0.02, -0.03])
+
+    def predicted(error: np.ndarray) -> np.ndarray:
+        """[accel/g; gyro] at rest."""
+        R = matrix(quat_product(quat, quat_exp(error[:3])))
+        return np.concatenate([R.T @ [0, 0, 1], bias + error[3:]])
+
+    numeric = np.column_stack([(predicted(eps * e) - predicted(-eps * e)) / (2 * eps) for e in np.eye(6)])
+    up = matrix(quat).T @ [0, 0, 1]
+    H = np.block([[cross_matrix(up), np.zeros((3, 3))], [np.zeros((3, 3)), np.eye(3)]])
+    np.testing.assert_allclose(numeric, H, atol=1e-9)
+
+
+def test_correction_brings_the_bias_home_and_stops_the_heading() -> None:
+    """Recordings hardly show it: 60 s, a rest of 2 s in every 10 s, the bias at the start wrong by 0.3 deg/s."""
+    rows = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        gyro, accel, true, _ = measured(rng, 60.0, tilt=0.15)
+        noise = noise_of(gyro[:180], accel[:180], RATE)
+        noise = replace(noise, gyro_bias=np.deg2rad([0.0, 0.0, 0.3]))
+        row = []
+        for first, test in ((200, StaticTest()), (0, StaticTest(alpha=0.0))):
+            out = run_filter(gyro, accel, RATE, noise, "smekf", static_test=test)
+            drift = heading_error_deg(out.quat_WS, true)
+            row += [np.rad2deg(np.abs(out.gyro_bias[-1]).max()), np.abs(drift[first:] - drift[first]).max()]
+        rows.append(row)
+    bias, drift, bias_without, drift_without = np.array(rows).T
+    print(f"corrected: bias within {bias.max():.4f} deg/s, heading after the first rest within {drift.max():.2f} deg")
+    print(
+        f"not: bias {bias_without.min():.2f} deg/s, heading {drift_without.min():.1f} to {drift_without.max():.1f} deg"
+    )
+    assert bias.max() < 0.02
+    assert drift.max() < 2.0
+    assert bias_without.min() > 0.29
+    assert drift_without.min() > 17.0
+
+
+def test_a_measured_start_keeps_the_heading_through_wild_motion() -> None:
+    """What P₀ is worth at 100 Hz: the paper's gives the heading jumps of degrees at rests, a measured one none."""
+    worst: dict[bool, list[float]] = {False: [], True: []}
+    for seed in range(8):
+        gyro, accel, true, _ = measured(np.random.default_rng(seed), 120.0, tilt=1.2)
+        noise = noise_of(gyro[:180], accel[:180], RATE)
+        for measured_start, found in worst.items():
+            out = run_filter(gyro, accel, RATE, noise, "smekf", measured_start=measured_start)
+            error = heading_error_deg(out.quat_WS, true)
+            found.append(float(np.abs(error - error[100]).max()))
+    mean = {start: float(np.mean(found)) for start, found in worst.items()}
+    print(
+        f"largest heading error, mean of 8: {mean[False]:.2f} deg from the paper's P0, {mean[True]:.2f} from a measured"
+    )
+    assert mean[True] < 0.7
+    assert mean[True] < 0.6 * mean[False]
+
+
+def true_vertical(quat: np.ndarray) -> np.ndarray:
+    return matrix(quat).T @ [0, 0, 1]
+
+
+def test_nees_is_right_when_the_filter_is_told_the_truth() -> None:
+    """Data from the filter's own model, P₀ as drawn: the normalised attitude error averages to its three states."""
+    rng = np.random.default_rng(7)
+    rate, dt, n = 200.0, 1 / 200.0, 1200
+    gyro_std, step_std, accel_std, bias0_std, tilt0_std = 2e-3, 2e-4, 5e-3, 1e-3, 5e-3
+    noise = SensorNoise(
+        np.zeros(3),
+        np.eye(3) * bias0_std**2,
+        np.eye(3) * gyro_std**2,
+        np.eye(3) * accel_std**2,
+        np.eye(3) * step_std**2,
+        GRAVITY,
+        1,
+    )
+    omega = 0.8 * np.sin(np.linspace(0, 9, n))[:, None] * [1.0, -0.6, 0.4]
+    static = np.zeros(n, dtype=bool)
+    static[400:500] = static[900:1000] = True
+    omega[static] = 0.0
+    nees = []
+    for _ in range(60):
+        start = Rotation.from_rotvec([0.2, 0.4, 0.0])
+        rotation = start * Rotation.from_rotvec(rng.normal(scale=tilt0_std, size=3))
+        bias = rng.normal(scale=bias0_std, size=3)
+        gyro, accel, true = np.empty((n, 3)), np.empty((n, 3)), []
+        for k in range(n):
+            rotation = rotation * Rotation.from_rotvec(omega[k] * dt)
+            bias = bias + dt * rng.normal(scale=step_std, size=3)
+            gyro[k] = omega[k] + bias + rng.normal(scale=gyro_std, size=3)
+            accel[k] = GRAVITY * (rotation.as_matrix()[2] + rng.normal(scale=accel_std, size=3))
+            true.append(rotation.as_quat())
+        params = SmekfParams(tilt0_std**2, bias0_std**2)
+        run = Smekf(noise, rate, start.as_quat(), params).run(gyro, accel, static)
+        error = (Rotation.from_quat(run.quat_WS).inv() * Rotation.from_quat(np.array(true))).as_rotvec()
+        assert run.attitude_cov is not None
+        nees.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(run.attitude_cov), error))
+    average = float(np.mean(nees))
+    print(f"NEES {average:.3f} (3 is right)")
+    assert abs(average - 3) < 0.3
+
+
+# The other two -----------------------------------------------------------------------------------------------------
+
+
+def test_ncf_is_mahonys_equations() -> None:
+    gyro, accel, _, rest = measured(np.random.default_rng(1), 10.0, bias=(0.02, 0.0, -0.01))
+    noise = noise_of(gyro[:180], accel[:180], RATE)
+    start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
+    filter_ = Ncf(noise, RATE, start)
+    run = filter_.run(gyro, accel, rest)
+    q, b = start.copy(), noise.gyro_bias.copy()
+    for k in range(len(gyro)):
+        e = np.cross(accel[k] / np.linalg.norm(accel[k]), matrix(q).T @ [0, 0, 1])
+        q = quat_product(q, quat_exp((gyro[k] - b + filter_.params.proportional * e) / RATE))
+        b = b - filter_.params.integral * e / RATE
+    np.testing.assert_allclose(run.quat_WS[-1] * np.sign(run.quat_WS[-1] @ q), q, atol=1e-11)
+    np.testing.assert_allclose(run.gyro_bias[-1], b, atol=1e-13)
+
+
+def test_gdc_is_madgwicks_equations() -> None:
+    """f and its Jacobian in the paper's order q1 … q4 = w x y z, eq. (25), (26), (33)."""
+    gyro, accel, _, rest = measured(np.random.default_rng(2), 10.0, bias=(0.02, 0.0, -0.01))
+    noise = noise_of(gyro[:180], accel[:180], RATE)
+    start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
+    run = Gdc(noise, RATE, start, GdcParams(0.1)).run(gyro, accel, rest)
+    q = np.roll(start, 1)
+    for k in range(len(gyro)):
+        q1, q2, q3, q4 = q
+        a = accel[k] / np.linalg.norm(accel[k])
+        f = np.array([2 * (q2 * q4 - q1 * q3), 2 * (q1 * q2 + q3 * q4), 2 * (0.5 - q2**2 - q3**2)]) - a
+        J = np.array([[-2 * q3, 2 * q4, -2 * q1, 2 * q2], [2 * q2, 2 * q1, 2 * q4, 2 * q3], [0, -4 * q2, -4 * q3, 0]])
+        step = J.T @ f
+        rate = np.roll(quat_product(np.roll(q, -1), np.append(gyro[k] - noise.gyro_bias, 0.0)), 1) / 2
+        q = q + (rate - 0.1 * step / np.linalg.norm(step)) / RATE
+        q /= np.linalg.norm(q)
+    found = np.roll(run.quat_WS[-1], 1)
+    np.testing.assert_allclose(found * np.sign(found @ q), q, atol=1e-11)
+
+
+# All ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("cut", [1, 333, 999])
+def test_a_run_cut_in_two_and_one_by_one_give_the_same_bits(method: str, cut: int) -> None:
+    gyro, accel, _, rest = measured(np.random.default_rng(3), 10.0, bias=(0.02, 0.0, -0.01))
+    noise = noise_of(gyro[:180], accel[:180], RATE)
+    start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
+    whole = METHODS[method](noise, RATE, start).run(gyro, accel, rest)
+    filter_ = METHODS[method](noise, RATE, start)
+    parts = [filter_.run(gyro[:cut], accel[:cut], rest[:cut]), filter_.run(gyro[cut:], accel[cut:], rest[cut:])]
+    for k, name in enumerate(whole._fields):
+        if whole[k] is not None:
+            np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), whole[k], err_msg=name)
+    filter_ = METHODS[method](noise, RATE, start)
+    single = [filter_.update(g, a, s) for g, a, s in zip(gyro, accel, rest, strict=True)]
+    np.testing.assert_array_equal(single, whole.quat_WS)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_filter_follows_a_motion_with_rests(method: str) -> None:
+    gyro, accel, true, _ = measured(np.random.default_rng(4), 30.0, bias=(0.01, 0.02, -0.01))
+    out = estimate_orientation(gyro, accel, RATE, method=method, still=(0.0, 1.8))
+    error = Rotation.from_quat(out.quat_WS) * Rotation.from_quat(true).inv()
+    aligned = error[:150].mean().inv() * error
+    assert np.degrees(aligned.magnitude()).mean() < 3.0
+    np.testing.assert_allclose(np.linalg.norm(out.quat_WS, axis=1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_start_has_the_tilt_of_the_accelerometer_and_no_heading(method: str) -> None:
+    accel = np.tile(GRAVITY * Rotation.from_rotvec([0.7, -0.4, 0.0]).as_matrix()[2], (100, 1))
+    rng = np.random.default_rng(5)
+    accel = accel + rng.normal(scale=1e-3, size=accel.shape)
+    out = estimate_orientation(rng.normal(scale=1e-4, size=(100, 3)), accel, RATE, method=method, still=(0.0, 0.9))
+    first = Rotation.from_quat(out.quat_WS[0])
+    assert np.degrees((first * Rotation.from_rotvec([0.7, -0.4, 0.0]).inv()).magnitude()) < 0.1
+
+
+def test_the_input_is_left_as_it_was() -> None:
+    gyro, accel, _, _ = measured(np.random.default_rng(6), 5.0)
+    before = gyro.copy(), accel.copy()
+    for method in METHODS:
+        estimate_orientation(gyro, accel, RATE, method=method, still=(0.0, 1.8))
+    np.testing.assert_array_equal(gyro, before[0])
+    np.testing.assert_array_equal(accel, before[1])
+
+
+def test_wrong_input_is_named() -> None:
+    gyro = np.zeros((100, 3))
+    with pytest.raises(BadOption, match="did you mean 'smekf'"):
+        estimate_orientation(gyro, gyro, RATE, method="smekv", still=(0, 0.5))
+    with pytest.raises(BadData, match=r"must both be \(n, 3\)"):
+        estimate_orientation(gyro, gyro[:50], RATE, still=(0, 0.5))
+    with pytest.raises(BadData, match="finite"):
+        estimate_orientation(gyro * np.nan, gyro, RATE, still=(0, 0.5))
+    with pytest.raises(BadPhase, match=r"which lasts 1\.000 s"):
+        estimate_orientation(gyro, gyro, RATE, still=(0, 5))
+    with pytest.raises(BadPhase, match="no gravity"):
+        estimate_orientation(gyro, gyro, RATE, still=(0, 0.9))
+
+
+def test_starting_params_trust_tilt_and_heading_as_far_as_known() -> None:
+    gyro, accel, _, _ = measured(np.random.default_rng(8), 2.0)
+    noise = noise_of(gyro, accel, RATE)
+    quat = Rotation.from_rotvec([0.3, -0.5, 0.0]).as_quat()
+    up_S = true_vertical(quat)
+    still, moving = (starting_params(noise, quat, still).attitude_cov0 for still in (True, False))
+    assert isinstance(still, np.ndarray)
+    assert isinstance(moving, np.ndarray)
+    assert np.sqrt(up_S @ moving @ up_S) < 1e-4  # the heading is zero by definition
+    across = np.linalg.svd(np.eye(3) - np.outer(up_S, up_S))[0][:, 0]
+    assert 0.003 < np.sqrt(across @ still @ across) < 0.02
+    assert np.sqrt(across @ moving @ across) > 0.1
+
+
+# A real recording --------------------------------------------------------------------------------------------------
+
+
+def test_the_authors_own_trial_against_vicon(data: Any) -> None:
+    """1 kHz, aligned on the world side at the first Vicon sample: VQF 2.1.2 gets 1.94 deg mean angle."""
+    lines = (data / "wepose_hr" / "prova_HR.txt").read_text().splitlines()
+    table = np.array([line.replace(";", "").split() for line in lines if line.strip()], dtype=float)
+    vicon = table[:, 14:18]
+    seen = np.linalg.norm(vicon, axis=1) > 0.5
+    for method, limit in (("smekf", 2.2), ("ncf", 2.5), ("gdc", 2.5)):
+        out = estimate_orientation(table[:, 1:4], table[:, 4:7], 1000.0, method=method, still=(0.05, 0.9))
+        true, found = Rotation.from_quat(vicon[seen]), Rotation.from_quat(out.quat_WS[seen])
+        aligned = (true[0] * found[0].inv()) * found
+        angle = np.degrees((true.inv() * aligned).magnitude())
+        print(f"{method}: mean angle {angle.mean():.3f} deg, largest {angle.max():.2f} deg")
+        assert angle.mean() < limit

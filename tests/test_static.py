@@ -1,0 +1,117 @@
+"""The static detector against a plain two-pass transcription of conditions (1) to (4)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wepose_pin.noise import SensorNoise, noise_of
+from wepose_pin.static import StaticDetector, StaticTest
+
+RATE = 100.0
+
+
+def by_the_book(gyro: np.ndarray, accel: np.ndarray, noise: SensorNoise, test: StaticTest, rate: float) -> np.ndarray:
+    """Each window by itself: mean and covariance in two passes, matrix inequalities by eigenvalues."""
+    n = test.samples(rate)
+    static = np.zeros(len(gyro), dtype=bool)
+    scaled = accel / noise.gravity
+    norm = np.linalg.norm(scaled, axis=1)
+    for k in range(n - 1, len(gyro)):
+        window = slice(k - n + 1, k + 1)
+        one = np.linalg.eigvalsh(test.alpha * noise.gyro_cov - np.cov(gyro[window].T))[0] >= 0
+        two = np.linalg.eigvalsh(test.beta * noise.accel_cov - np.cov(scaled[window].T))[0] >= 0
+        three = abs(norm[window].mean() - 1) <= test.gamma1
+        four = norm[window].var(ddof=1) <= test.gamma2
+        static[k] = one and two and three and four
+    return static
+
+
+def stop_and_go(rng: np.random.Generator, n: int = 3000) -> tuple[np.ndarray, np.ndarray]:
+    """Noise of a real sensor with bursts of motion of all strengths in between."""
+    gyro = rng.normal(scale=2e-3, size=(n, 3)) @ np.array([[1, 0.3, 0], [0, 1, -0.2], [0, 0, 0.6]]) + [0.01, -0.02, 0.0]
+    accel = rng.normal(scale=0.02, size=(n, 3)) + np.array([0.3, -0.2, 9.78])
+    for start in range(600, n - 200, 300):
+        strength = 10.0 ** rng.uniform(-4, 0)
+        gyro[start : start + 150] += strength * np.sin(np.linspace(0, 12, 150))[:, None] * rng.normal(size=3)
+        accel[start : start + 150] += 3 * strength * np.sin(np.linspace(0, 9, 150))[:, None] * rng.normal(size=3)
+    return gyro, accel
+
+
+@pytest.mark.parametrize(
+    "test", [StaticTest(), StaticTest(window_s=0.2), StaticTest(alpha=1.2, beta=5.0), StaticTest(window_s=5.0)]
+)
+def test_it_is_what_the_four_conditions_say(test: StaticTest) -> None:
+    gyro, accel = stop_and_go(np.random.default_rng(0))
+    noise = noise_of(gyro[:500], accel[:500], RATE)
+    expected = by_the_book(gyro, accel, noise, test, RATE)
+    found = StaticDetector(noise, RATE, test).run(gyro, accel)
+    assert 0.05 < expected.mean() < 0.95
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("condition", [1, 2, 3, 4])
+def test_each_condition_alone_can_say_no(condition: int) -> None:
+    rng = np.random.default_rng(1)
+    gyro, accel = rng.normal(scale=2e-3, size=(1000, 3)), rng.normal(scale=0.02, size=(1000, 3)) + [0, 0, 9.8]
+    noise = noise_of(gyro, accel, RATE)
+    tests = {
+        1: StaticTest(alpha=0.01, beta=9, gamma1=1, gamma2=1),
+        2: StaticTest(alpha=9, beta=0.01, gamma1=1, gamma2=1),
+        3: StaticTest(alpha=9, beta=9, gamma1=1e-9, gamma2=1),
+        4: StaticTest(alpha=9, beta=9, gamma1=1, gamma2=1e-9),
+    }
+    assert StaticDetector(noise, RATE, StaticTest(alpha=9, beta=9, gamma1=1, gamma2=1)).run(gyro, accel)[100:].all()
+    assert not StaticDetector(noise, RATE, tests[condition]).run(gyro, accel).any()
+
+
+def test_the_inequalities_are_of_matrices() -> None:
+    """Motion along the diagonal of two axes whose noise is anticorrelated: each axis alone is within its bound."""
+    rng = np.random.default_rng(2)
+    mix = np.array([[1.0, -0.95, 0], [-0.95, 1.0, 0], [0, 0, 1]])
+    still = rng.multivariate_normal(np.zeros(3), 1e-6 * mix, size=2000)
+    accel = rng.normal(scale=0.02, size=(2000, 3)) + [0, 0, 9.8]
+    noise = noise_of(still, accel, RATE)
+    moving = rng.multivariate_normal(np.zeros(3), 1e-6 * np.abs(mix), size=2000)
+    assert (np.var(moving, axis=0) < 2 * np.diag(noise.gyro_cov)).all()
+    assert StaticDetector(noise, RATE).run(still, accel)[100:].mean() > 0.9
+    assert not StaticDetector(noise, RATE).run(moving, accel).any()
+
+
+@pytest.mark.parametrize("cut", [1, 37, 49, 50, 51, 1234])
+def test_a_run_cut_in_two_and_one_by_one_give_the_same(cut: int) -> None:
+    gyro, accel = stop_and_go(np.random.default_rng(3))
+    noise = noise_of(gyro[:500], accel[:500], RATE)
+    whole = StaticDetector(noise, RATE).run(gyro, accel)
+    detector = StaticDetector(noise, RATE)
+    halves = [detector.run(gyro[:cut], accel[:cut]), detector.run(gyro[cut:], accel[cut:])]
+    np.testing.assert_array_equal(np.concatenate(halves), whole)
+    detector = StaticDetector(noise, RATE)
+    assert [detector.update(g, a) for g, a in zip(gyro[:400], accel[:400], strict=True)] == list(whole[:400])
+
+
+def test_no_window_before_the_first_is_full() -> None:
+    rng = np.random.default_rng(4)
+    gyro, accel = rng.normal(scale=2e-3, size=(200, 3)), rng.normal(scale=0.02, size=(200, 3)) + [0, 0, 9.8]
+    static = StaticDetector(noise_of(gyro, accel, RATE), RATE, StaticTest(alpha=9, beta=9)).run(gyro, accel)
+    assert not static[:49].any()
+    assert static[49:].all()
+
+
+def test_ten_million_samples_lose_no_precision() -> None:
+    """Variance conditions set within 1e-9 of the truth on either side: running sums of squares with an offset of 9.81
+    would be off by far more after so long."""
+    rng = np.random.default_rng(5)
+    n, window = 10_000_000, 50
+    accel = np.zeros((n, 3))
+    accel[:, 2] = 9.81
+    accel += rng.normal(scale=1e-3, size=(n, 1)) * [0.0, 0.0, 1.0]
+    gyro = np.zeros((n, 3))
+    noise = SensorNoise(np.zeros(3), np.eye(3), np.eye(3), np.eye(3), np.eye(3), 1.0, 100)
+    last = accel[-window:, 2]
+    variance = float(np.var(last, ddof=1))
+    huge = {"alpha": 1e9, "beta": 1e9, "gamma1": 1e9, "window_s": window / RATE}
+    above = StaticDetector(noise, RATE, StaticTest(gamma2=variance * (1 + 1e-9), **huge)).run(gyro, accel)
+    below = StaticDetector(noise, RATE, StaticTest(gamma2=variance * (1 - 1e-9), **huge)).run(gyro, accel)
+    assert above[-1]
+    assert not below[-1]
