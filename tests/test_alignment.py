@@ -1,0 +1,116 @@
+"""Sensors to segments: mounts and headings from the start pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.alignment import heading_to, segment_orientations
+from wepose_pin.errors import BadPhase, BadSession
+from wepose_pin.recording import Recording, Sensor, axes_from_mount, mount_from_axes
+from wepose_pin.simulation import Simulation
+from wepose_pin.subject import Subject, average_subject
+
+
+@pytest.mark.parametrize(("up", "forward"), [("+x", "-z"), ("-y", "+x"), ("+z", "+x"), ("-z", "-y")])
+def test_stated_axes_are_what_they_say(up: str, forward: str) -> None:
+    R_LS = Rotation.from_quat(mount_from_axes(up, forward)).as_matrix()
+    axis = {"x": 0, "y": 1, "z": 2}
+    for name, segment_axis in ((up, [0, 0, 1]), (forward, [1, 0, 0])):
+        in_sensor = np.eye(3)[axis[name[1]]] * (1 if name[0] == "+" else -1)
+        np.testing.assert_allclose(R_LS @ in_sensor, segment_axis, atol=1e-15)
+    assert np.linalg.det(R_LS) == pytest.approx(1.0)
+    assert axes_from_mount(mount_from_axes(up, forward)) == (up, forward)
+
+
+def test_a_mount_tilted_from_its_stated_axes_is_found_by_gravity(simulation: Simulation) -> None:
+    segments = segment_orientations(simulation.recording())
+    for name, true in simulation.quat_LS.items():
+        off = Rotation.from_quat(true).inv() * Rotation.from_quat(segments.quat_LS[name])
+        # What is left is the accelerometer's bias: 3 mg on each axis.
+        assert np.degrees(off.magnitude()) < 0.8
+        stated = Rotation.from_quat(true).inv() * Rotation.from_quat(mount_from_axes(*simulation.stated_mount[name]))
+        assert np.degrees(stated.magnitude()) > 1.5
+        early = simulation.time < 30.0
+        error = Rotation.from_quat(segments.quat_WL[name]) * Rotation.from_quat(simulation.quat_WL[name]).inv()
+        assert np.degrees(error[early].magnitude()).max() < 1.5
+
+
+def ready_recording(headings: dict[str, float], mounts: dict[str, Rotation]) -> tuple[Recording, dict[str, Rotation]]:
+    """Ready orientations in worlds that each have a heading of their own; the true segment orientations beside."""
+    time = np.arange(500) / 100.0
+    moving = np.clip(time - 2.0, 0.0, None)[:, None]
+    true = {name: Rotation.from_rotvec(moving * np.array([0.3, -0.8, 0.2 * k])) for k, name in enumerate(headings)}
+    sensors = {
+        name: Sensor(quat_WS=(Rotation.from_rotvec([0, 0, -psi]) * true[name] * mounts[name]).as_quat())
+        for name, psi in headings.items()
+    }
+    return Recording("ready", time, 100.0, sensors, {"start": ((0.0, 1.9),)}), true
+
+
+def test_calibrated_mounts_give_headings_of_any_size() -> None:
+    rng = np.random.default_rng(0)
+    headings = {"torso": 2.9, "left_upper_arm": -1.7, "left_forearm": 0.4}
+    mounts = {name: Rotation.random(random_state=rng) for name in headings}
+    recording, true = ready_recording(headings, mounts)
+    subject = replace(average_subject(), mounts={name: mount.as_quat() for name, mount in mounts.items()})
+    segments = segment_orientations(recording, subject)
+    for name, psi in headings.items():
+        assert segments.heading[name] == pytest.approx(psi, abs=1e-9)
+        assert (Rotation.from_quat(segments.quat_WL[name]) * true[name].inv()).magnitude().max() < 1e-9
+
+
+def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
+    headings = {"torso": 0.2, "left_upper_arm": -0.1}
+    stated = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    recording, _ = ready_recording(headings, dict.fromkeys(headings, stated))
+    sensors = {name: replace(s, stated_quat_LS=stated.as_quat()) for name, s in recording.sensors.items()}
+    wrong = (Rotation.from_rotvec([0, 0, 1.0]) * stated).as_quat()
+    subject: Subject = replace(average_subject(), mounts=dict.fromkeys(headings, wrong))
+    kept = segment_orientations(replace(recording, sensors=sensors), subject)
+    new = segment_orientations(replace(recording, sensors=sensors, strapping="new"), subject)
+    for name in headings:
+        assert new.heading[name] == pytest.approx(headings[name], abs=1e-9)
+        assert kept.heading[name] == pytest.approx(headings[name] + 1.0, abs=1e-9)
+
+
+def test_ready_orientations_need_no_mount() -> None:
+    headings = {"torso": 0.0, "left_upper_arm": 0.0}
+    recording, true = ready_recording(headings, dict.fromkeys(headings, Rotation.identity()))
+    segments = segment_orientations(recording)
+    assert (Rotation.from_quat(segments.quat_WL["torso"]) * true["torso"].inv()).magnitude().max() < 1e-9
+    assert not segments.orientation
+
+
+def test_heading_is_the_nearest_turn() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        R_WS = Rotation.random(random_state=rng)
+        tilted = Rotation.from_rotvec([0.1, -0.2, 0.0]) * R_WS
+        psi = heading_to(Rotation.from_rotvec([0, 0, -0.7]) * tilted, R_WS)
+        others = [
+            (Rotation.from_rotvec([0, 0, p - 0.7]) * tilted * R_WS.inv()).magnitude() for p in np.arange(0, 6.28, 0.01)
+        ]
+        mine = (Rotation.from_rotvec([0, 0, psi - 0.7]) * tilted * R_WS.inv()).magnitude()
+        assert mine <= min(others) + 1e-12
+
+
+def test_a_mount_that_contradicts_gravity_and_one_that_is_missing(simulation: Simulation) -> None:
+    recording = simulation.recording()
+    wrong = replace(recording.sensors["torso"], stated_quat_LS=mount_from_axes("-x", "+z"))
+    with pytest.raises(BadSession, match=r"sensors\.torso\.mount is \d+ deg off gravity"):
+        segment_orientations(replace(recording, sensors={**recording.sensors, "torso": wrong}))
+    without = replace(recording.sensors["torso"], stated_quat_LS=None)
+    with pytest.raises(BadSession, match=r"sensors\.torso\.mount is not known: state it"):
+        segment_orientations(replace(recording, sensors={**recording.sensors, "torso": without}))
+
+
+def test_without_phases_the_quietest_window_is_taken_and_said(simulation: Simulation) -> None:
+    segments = segment_orientations(replace(simulation.recording(), phases={}))
+    assert 0.0 <= segments.start[0] < segments.start[1] <= 5.1
+    assert any("quietest window" in warning for warning in segments.warnings)
+    with pytest.raises(BadPhase, match="holds 2 samples"):
+        segment_orientations(replace(simulation.recording(), phases={"start": ((1.0, 1.01),)}))

@@ -1,0 +1,127 @@
+"""The commands as a user types them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from wepose_pin import __version__
+from wepose_pin.cli import COMMANDS, main
+from wepose_pin.simulation import Simulation
+from wepose_pin.writers import write_session
+
+
+def run(*words: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in words])
+    return int(stop.value.code or 0)
+
+
+@pytest.fixture
+def session(simulation: Simulation, tmp_path: Path) -> Path:
+    write_session(tmp_path, simulation.recording("made"), simulation.truth())
+    return tmp_path / "session.toml"
+
+
+def test_help_of_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--help") == 0
+    text = capsys.readouterr().out
+    for command in COMMANDS:
+        assert command in text
+        assert run(command, "--help") == 0
+        assert f"Example: wepose {command}" in capsys.readouterr().out
+    assert run("--version") == 0
+    assert __version__ in capsys.readouterr().out
+
+
+def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("demo", "-o", tmp_path / "demo", "--seed", 2) == 0
+    text = capsys.readouterr().out
+    for word in ("left_forearm", "smekf", "ncf", "gdc", "taped", "view.html"):
+        assert word in text
+    for name in (
+        "session/session.toml",
+        "subject/subject.toml",
+        "result/pose.parquet",
+        "result/view.html",
+        "demo.json",
+    ):
+        assert (tmp_path / "demo" / name).is_file()
+    report = json.loads((tmp_path / "demo" / "demo.json").read_text())
+    for about in report["lengths"].values():
+        assert abs(about["estimated"] - about["true"]) < 4 * about["std"]
+    for method in ("smekf", "ncf", "gdc"):
+        assert report["errors"][method]["position_from_shoulders"]["right_hand"]["mean"] < 25.0
+
+
+def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("calibrate", session, "--gauge", "shoulder_width=0.4", "--stature", 1.7, "-o", tmp_path / "subject") == 0
+    assert "Palm-to-palm gap" in capsys.readouterr().out
+    assert run("track", session, "--subject", tmp_path / "subject", "-o", tmp_path / "result") == 0
+    assert "at rest" in capsys.readouterr().out
+    assert run("evaluate", tmp_path / "result", tmp_path / "truth.parquet", "--interval", 72, 100) == 0
+    assert "right_forearm" in capsys.readouterr().out
+    assert run("view", tmp_path / "result", "-o", tmp_path / "page.html", "--no-open") == 0
+    assert (tmp_path / "page.html").read_text().startswith("<!")
+    # The truth as CSV, and against itself.
+    pl.read_parquet(tmp_path / "truth.parquet").write_csv(tmp_path / "truth.csv")
+    assert run("evaluate", tmp_path / "result", tmp_path / "truth.csv") == 0
+
+
+def test_without_a_gauge_it_says_whose_scale_it_is(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("calibrate", session, "-o", tmp_path / "subject") == 0
+    assert "note: no gauge" in capsys.readouterr().err
+
+
+def test_simulate_is_seeded(tmp_path: Path) -> None:
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        assert run("simulate", "-o", tmp_path / name, "--seed", seed) == 0
+    a, b, c = (pl.read_parquet(tmp_path / name / "recording.parquet") for name in "abc")
+    assert a.equals(b)
+    assert not a.equals(c)
+
+
+def test_nothing_is_overwritten_without_force(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("track", session, "-o", tmp_path / "result") == 0
+    before = {path.name: path.read_bytes() for path in (tmp_path / "result").iterdir()}
+    capsys.readouterr()
+    assert run("track", session, "-o", tmp_path / "result") == 2
+    assert "--force" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in (tmp_path / "result").iterdir()} == before
+    assert run("track", session, "-o", tmp_path / "result", "--force") == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["nope"], "Unrecognized options: nope"),
+        (["track"], "Missing from wepose track"),
+        (["track", "s.toml"], "-o"),
+        (["track", "s.toml", "-o", "OUT", "--method", "ekf"], "'smekf'"),
+        (["track", "nowhere.toml", "-o", "OUT"], "nowhere.toml: no such file"),
+        (["calibrate", "s.toml", "-o", "OUT", "--gauge", "shoulder=0.4"], "did you mean 'shoulder_width'"),
+        (["calibrate", "s.toml", "-o", "OUT", "--gauge", "shoulder_width=wide"], "'wide' is not a number of metres"),
+        (["calibrate", "s.toml", "-o", "OUT", "--stature", "175"], "stature 175 is not a body height"),
+        (["evaluate", "nowhere", "truth.csv"], "no pose.parquet in it"),
+        (["view", "nowhere"], "no pose.parquet in it"),
+        (["simulate", "-o", "OUT", "--rate-hz", "5"], "between 20 and 2000"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_2(
+    words: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(*words) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("wepose: ")
+    assert said.err.count("\n") == 1
+    assert says in said.err
+    assert said.out == ""
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,96 @@
+"""Error metrics on hand-made cases with known answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import BadData
+from wepose_pin.evaluation import evaluate
+from wepose_pin.pose import Pose
+
+TIME = np.arange(101) / 10.0
+
+
+def pose(turn_deg: tuple[float, float, float] = (0, 0, 0), shift: tuple[float, float, float] = (0, 0, 0)) -> Pose:
+    """A torso that turns, shoulders and a hand that move; off by a turn about W's axes x, y, z and a shift [m]."""
+    torso = Rotation.from_rotvec(np.outer(TIME, [0.1, 0.2, -0.3]))
+    off = Rotation.from_euler("ZYX", [turn_deg[2], turn_deg[1], turn_deg[0]], degrees=True)
+    hand = np.column_stack([np.sin(TIME), np.cos(TIME), TIME]) + shift
+    points = {
+        "left_shoulder": np.tile([0.0, 0.2, 0.5], (101, 1)),
+        "right_shoulder": np.tile([0.0, -0.2, 0.5], (101, 1)),
+        "left_hand": hand,
+    }
+    return Pose(TIME, {"torso": (off * torso).as_quat()}, points)
+
+
+def test_a_known_turn_and_shift_come_out() -> None:
+    errors = evaluate(pose((1.0, -2.0, 3.0), (0.003, 0.0, -0.004)), pose())
+    attitude = errors.attitude["torso"]
+    assert attitude.roll == pytest.approx((1.0, 0.0), abs=1e-9)
+    assert attitude.pitch == pytest.approx((2.0, 0.0), abs=1e-9)
+    assert attitude.yaw == pytest.approx((3.0, 0.0), abs=1e-9)
+    assert attitude.total_rmse == pytest.approx(
+        np.degrees(Rotation.from_euler("ZYX", [3, -2, 1], degrees=True).magnitude())
+    )
+    assert errors.position["left_hand"] == pytest.approx((5.0, 0.0, 5.0, 5.0), abs=1e-9)
+    assert errors.samples == 101
+
+
+def test_mean_and_std_are_of_the_absolute() -> None:
+    off = pose()
+    sign = np.where(np.arange(101) % 2, 1.0, -1.0)
+    off.points["left_hand"][:, 0] += 0.01 * sign + 0.002  # type: ignore[index]
+    error = evaluate(off, pose()).position["left_hand"]
+    distance = 1e3 * np.abs(0.01 * sign + 0.002)
+    assert error == pytest.approx((distance.mean(), distance.std(), np.sqrt((distance**2).mean()), distance.max()))
+
+
+def test_a_trunk_of_another_length_is_not_seen_from_the_shoulders() -> None:
+    off = pose()
+    for points in off.points.values():
+        points[:, 2] += 0.02
+    errors = evaluate(off, pose())
+    assert errors.position["left_hand"].mean == pytest.approx(20.0)
+    assert errors.position_from_shoulders["left_hand"].mean == pytest.approx(0.0, abs=1e-9)
+    assert "left_shoulder" not in errors.position_from_shoulders
+
+
+def test_the_reference_is_brought_to_the_poses_times_on_the_rotation() -> None:
+    whole = pose()
+    every_third = replace(
+        whole,
+        time=TIME[::3],
+        quat_WL={"torso": whole.quat_WL["torso"][::3]},
+        points={name: p[::3] for name, p in whole.points.items()},
+    )
+    errors = evaluate(whole, every_third)
+    assert errors.attitude["torso"].total_rmse < 1e-9  # a constant rate about one axis: slerp is exact
+    assert errors.interval == pytest.approx((0.0, 9.9))
+
+
+def test_only_the_interval_counts() -> None:
+    off = pose()
+    off.points["left_hand"][:50] += 1.0  # type: ignore[index]
+    assert evaluate(off, pose(), (5.0, 10.0)).position["left_hand"].mean == pytest.approx(0.0, abs=1e-9)
+    assert evaluate(off, pose(), (0.0, 4.0)).position["left_hand"].mean == pytest.approx(1e3 * np.sqrt(3))
+
+
+def test_no_error_is_taken_within_a_gap_of_the_truth() -> None:
+    truth, off = pose(), pose()
+    off.points["left_hand"][40:60] += 1.0  # type: ignore[index]
+    truth.points["left_hand"][38:62] = np.nan  # type: ignore[index]
+    assert evaluate(off, truth).position["left_hand"].worst == pytest.approx(0.0, abs=1e-9)
+
+
+def test_nothing_in_common_is_named() -> None:
+    with pytest.raises(BadData, match="no time in common"):
+        evaluate(pose(), replace(pose(), time=TIME + 100.0))
+    with pytest.raises(BadData, match="no time in common within 20 to 30 s"):
+        evaluate(pose(), pose(), (20.0, 30.0))
+    with pytest.raises(BadData, match="no segment and no point in common"):
+        evaluate(pose(), Pose(TIME, {"head": pose().quat_WL["torso"]}, {}))

@@ -1,0 +1,74 @@
+"""Noise and bias of a still phase, and the quietest window."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import BadPhase
+from wepose_pin.noise import ACCEL_FLOOR, GYRO_FLOOR, QUIET_S, noise_of, quietest
+from wepose_pin.recording import Recording, Sensor
+
+RATE = 100.0
+
+
+def test_moments_are_the_samples() -> None:
+    rng = np.random.default_rng(0)
+    gyro = rng.normal(scale=1e-2, size=(4000, 3)) + [0.01, 0.02, -0.03]
+    accel = rng.normal(scale=0.05, size=(4000, 3)) + [0.0, 0.0, 9.7]
+    noise = noise_of(gyro, accel, RATE)
+    np.testing.assert_allclose(noise.gyro_bias, gyro.mean(axis=0))
+    np.testing.assert_allclose(noise.gyro_cov, np.cov(gyro.T))
+    assert noise.gravity == pytest.approx(np.linalg.norm(accel, axis=1).mean())
+    np.testing.assert_allclose(noise.accel_cov, np.cov(accel.T) / noise.gravity**2)
+    # Of white noise the first differences have twice the covariance, and the mean has 1/n of it.
+    np.testing.assert_allclose(noise.bias_step_cov, 2 * noise.gyro_cov, atol=2e-5)
+    assert np.sqrt(np.trace(noise.gyro_bias_cov) / 3) == pytest.approx(1e-2 * np.sqrt(2 / 4000), rel=0.3)
+
+
+def test_sway_makes_the_bias_uncertain() -> None:
+    """A sway of 0.1 deg/s read as bias would be six degrees of heading a minute: it must count."""
+    time = np.arange(400) / RATE
+    rng = np.random.default_rng(1)
+    sway = np.deg2rad(0.1) * np.outer(np.sin(2 * np.pi * 0.3 * time + 1.0), [0.0, 1.0, 0.0])
+    white = rng.normal(scale=1e-4, size=(400, 3))
+    accel = rng.normal(scale=0.01, size=(400, 3)) + [0, 0, 9.8]
+    still, swaying = noise_of(white, accel, RATE), noise_of(white + sway, accel, RATE)
+    assert np.sqrt(swaying.gyro_bias_cov[1, 1]) > 5 * np.sqrt(still.gyro_bias_cov[1, 1])
+    error = abs(swaying.gyro_bias[1] - white[:, 1].mean())
+    assert error < 4 * np.sqrt(swaying.gyro_bias_cov[1, 1])
+
+
+def test_a_quantised_signal_leaves_invertible_covariances() -> None:
+    noise = noise_of(np.zeros((50, 3)), np.tile([0.0, 0.0, 9.8], (50, 1)), RATE)
+    assert np.linalg.eigvalsh(noise.gyro_cov)[0] >= 0.99 * GYRO_FLOOR**2
+    assert np.linalg.eigvalsh(noise.accel_cov)[0] >= 0.99 * ACCEL_FLOOR**2
+
+
+def test_too_little_and_weightless_are_named() -> None:
+    with pytest.raises(BadPhase, match="holds 5 samples"):
+        noise_of(np.zeros((5, 3)), np.ones((5, 3)), RATE)
+    with pytest.raises(BadPhase, match="no gravity"):
+        noise_of(np.zeros((50, 3)), np.zeros((50, 3)), RATE)
+
+
+@pytest.mark.parametrize("ready", [False, True])
+def test_the_quietest_window_is_found(ready: bool) -> None:
+    rng = np.random.default_rng(2)
+    time = 100.0 + np.arange(3000) / RATE
+    gyro = rng.normal(scale=0.3, size=(3000, 3))
+    calm = slice(700, 950)
+    gyro[calm] *= 0.01
+    if ready:
+        turned = np.concatenate([Rotation.from_rotvec(g / RATE).as_quat()[None] for g in gyro])
+        rotation = [Rotation.identity()]
+        for quat in turned:
+            rotation.append(rotation[-1] * Rotation.from_quat(quat))
+        sensor = Sensor(quat_WS=Rotation.concatenate(rotation[1:]).as_quat())
+    else:
+        sensor = Sensor(gyro_S=gyro, accel_S=np.tile([0, 0, 9.8], (3000, 1)))
+    first, last = quietest(Recording("r", time, RATE, {"torso": sensor}))
+    assert first >= 106.95
+    assert last <= 109.55
+    assert last - first == pytest.approx(QUIET_S, abs=0.02)

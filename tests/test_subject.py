@@ -1,0 +1,102 @@
+"""Subjects: the anthropometric prior, the file, what is wrong in one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wepose_pin.errors import BadOption, BadSubject, MissingFile
+from wepose_pin.subject import LENGTHS, Subject, average_subject, load_subject, subject_toml
+
+
+def test_the_average_man_of_de_leva() -> None:
+    """Joint to joint, male, 1.741 m (de Leva 1996, Table 4)."""
+    lengths = average_subject(1.741, "m").lengths
+    expected = {"trunk": 0.5155, "left_upper_arm": 0.2817, "right_forearm": 0.2689, "left_hand": 0.0681}
+    for name, value in expected.items():
+        assert lengths[name] == pytest.approx(value, abs=5e-4)
+    woman = average_subject(1.735, "f").lengths
+    assert woman["left_upper_arm"] == pytest.approx(0.2751, abs=5e-4)
+    between = average_subject(1.74).lengths["left_upper_arm"]
+    assert woman["left_upper_arm"] < between < lengths["left_upper_arm"]
+
+
+def test_stature_narrows_the_prior_and_left_follows_right() -> None:
+    wide, narrow = average_subject(), average_subject(1.75)
+    assert wide.std("left_upper_arm") > 1.3 * narrow.std("left_upper_arm")
+    cov = wide.lengths_covariance(("left_upper_arm", "right_upper_arm"))
+    difference = np.sqrt(cov[0, 0] + cov[1, 1] - 2 * cov[0, 1])
+    assert difference == pytest.approx(np.sqrt(2) * 0.01 * wide.lengths["left_upper_arm"], rel=1e-6)
+    assert np.linalg.eigvalsh(wide.lengths_covariance())[0] > 0
+
+
+def test_people_drawn_have_the_priors_spread() -> None:
+    average, rng = average_subject(), np.random.default_rng(0)
+    drawn = np.array([[average.draw(rng).lengths[name] for name in LENGTHS] for _ in range(2000)])
+    np.testing.assert_allclose(drawn.mean(axis=0), [average.lengths[name] for name in LENGTHS], rtol=0.01)
+    np.testing.assert_allclose(drawn.std(axis=0), [average.std(name) for name in LENGTHS], rtol=0.06)
+
+
+def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    average = average_subject(1.8, "f")
+    order = (*LENGTHS, "mounts.torso.x", "mounts.torso.y", "mounts.torso.z")
+    root = rng.normal(scale=0.01, size=(len(order), len(order)))
+    subject = Subject(
+        'Ann "A" Ö', average.lengths, order, root @ root.T, {"torso": np.array([0.5, -0.5, 0.5, 0.5])}, "by hand"
+    )
+    (tmp_path / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
+    for path in (tmp_path, tmp_path / "subject.toml"):
+        again = load_subject(path)
+        assert again.name == subject.name
+        assert again.lengths == pytest.approx(dict(subject.lengths), abs=1e-6)
+        assert again.order == order
+        np.testing.assert_allclose(again.covariance, subject.covariance, rtol=1e-8)
+        np.testing.assert_allclose(again.mounts["torso"], subject.mounts["torso"], atol=1e-9)
+    assert np.isnan(again.std("left_palm"))
+
+
+def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
+    lines = ["format = 1", "[lengths]", *(f"{name} = 0.3" for name in LENGTHS), "[lengths_std]", "trunk = 0.02"]
+    (tmp_path / "subject.toml").write_text("\n".join(lines), encoding="utf-8")
+    subject = load_subject(tmp_path)
+    assert subject.std("trunk") == pytest.approx(0.02)
+    assert subject.mounts == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("format = 2", "this version reads format = 1"),
+        ("format = 1\n[lengths]\nleft_uper_arm = 0.3", "did you mean 'left_upper_arm'"),
+        ("format = 1\n[lengths]\ntrunk = 'long'", "lengths.trunk = 'long'; a number in metres"),
+        ("format = 1\n[lengths]\ntrunk = -0.5", "lengths.trunk = -0.5"),
+        ("format = 1\n[lengths]\ntrunk = 0.5", "lengths.shoulder_width = None"),
+        ("format 1", "not valid TOML"),
+        ("ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0", "mounts.torso is no unit quaternion"),
+        ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [[1.0, 2.0]]", "covariance.matrix is (1, 2)"),
+        ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [['a']]", "holds something that is no number"),
+        (
+            "ALL\n[covariance]\norder = ['trunk', 'left_hand']\nmatrix = [[1.0, 2.0], [2.0, 1.0]]",
+            "positive semidefinite",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, text: str, says: str) -> None:
+    every = "format = 1\n[lengths]\n" + "\n".join(f"{name} = 0.3" for name in LENGTHS)
+    (tmp_path / "subject.toml").write_text(text.replace("ALL", every), encoding="utf-8")
+    with pytest.raises(BadSubject) as caught:
+        load_subject(tmp_path)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_files_and_people_that_are_none() -> None:
+    with pytest.raises(MissingFile, match="no such file"):
+        load_subject("nowhere/subject.toml")
+    with pytest.raises(BadOption, match="stature 175 is not a body height in metres"):
+        average_subject(175.0)
+    with pytest.raises(BadOption, match="sex 'x' is not known"):
+        average_subject(1.7, "x")

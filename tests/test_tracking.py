@@ -1,0 +1,82 @@
+"""The whole chain on the simulated person, and on the real one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.evaluation import evaluate
+from wepose_pin.filters import METHODS
+from wepose_pin.readers import load_session
+from wepose_pin.simulation import PERFECT, Person, Simulation, simulate
+from wepose_pin.subject import average_subject
+from wepose_pin.tracking import track
+
+
+def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
+    """1 kHz, no noise, the true lengths: what is left is the filter's and the alignment's own error."""
+    simulation = simulate(person.lengths, seed=5, rate_hz=1000.0, noise=PERFECT, clasp_s=10.0, circles=1)
+    subject = replace(average_subject(), lengths=person.lengths)
+    errors = evaluate(track(simulation.recording(), subject), simulation.truth())
+    for name, error in errors.position.items():
+        assert error.worst < 1.0, name
+    for name, attitude in errors.attitude.items():
+        assert attitude.total_rmse < 0.05, name
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_noisy_world_is_tracked_by_every_filter(simulation: Simulation, person: Person, method: str) -> None:
+    subject = replace(average_subject(), lengths=person.lengths)
+    pose = track(simulation.recording(), subject, method=method)
+    errors = evaluate(pose, simulation.truth(), simulation.phases["circles"][0])
+    assert errors.position["right_hand"].mean < 20.0
+    summary = pose.summary()
+    assert summary["method"] == method
+    assert set(summary["sensors"]) == set(simulation.gyro_S)
+
+
+def test_sensors_that_are_missing_leave_out_what_cannot_be_known(simulation: Simulation) -> None:
+    recording = simulation.recording()
+    fewer = {name: s for name, s in recording.sensors.items() if name not in ("left_forearm", "right_upper_arm")}
+    pose = track(replace(recording, sensors=fewer))
+    assert set(pose.quat_WL) == set(fewer)
+    assert set(pose.points) == {"left_shoulder", "left_elbow", "right_shoulder"}
+    assert pose.summary()["points"] == sorted(pose.points)
+    only_arm = {"left_upper_arm": recording.sensors["left_upper_arm"]}
+    assert track(replace(recording, sensors=only_arm)).points == {}
+
+
+def test_the_subject_gives_the_lengths(simulation: Simulation, person: Person) -> None:
+    subject = replace(average_subject(), lengths=person.lengths)
+    pose = track(simulation.recording(), subject)
+    upper_arm = np.linalg.norm(pose.points["left_elbow"] - pose.points["left_shoulder"], axis=1)
+    np.testing.assert_allclose(upper_arm, person.lengths["left_upper_arm"], atol=1e-12)
+
+
+def test_the_real_person_hangs_the_arms_again(data: Path) -> None:
+    """Second standing phase, 86.6 to 88.0 s, after half a minute of work: the tilt agrees with the accelerometers'."""
+    recording = load_session(data / "upper_body" / "session.toml")
+    pose = track(recording)
+    assert pose.segments is not None
+    standing = recording.span((86.6, 88.0))
+    for segment in ("torso", "left_forearm", "right_forearm"):
+        R_LS = Rotation.from_quat(pose.segments.quat_LS[segment])
+        accel_S = recording.sensors[segment].accel_S
+        assert accel_S is not None
+        up_said = R_LS.apply(accel_S[standing]).mean(axis=0)
+        up_found = Rotation.from_quat(pose.quat_WL[segment][standing]).mean().as_matrix()[2]
+        off = np.degrees(np.arccos(up_found @ up_said / np.linalg.norm(up_said)))
+        print(f"{segment}: tilt {off:.2f} deg off what the accelerometer says")
+        assert off < 4.0
+    # In the N-pose all is where it should be: arms down, facing forward.
+    start = recording.span((40.2, 44.4))
+    for side, y in (("left", 1.0), ("right", -1.0)):
+        hand = pose.points[f"{side}_hand"][start].mean(axis=0)
+        shoulder = pose.points[f"{side}_shoulder"][start].mean(axis=0)
+        np.testing.assert_allclose(hand[:2], shoulder[:2], atol=0.02)
+        assert shoulder[1] * y > 0.15
+        assert shoulder[2] - hand[2] > 0.55

@@ -1,0 +1,112 @@
+"""Folders that appear whole or not at all; sessions and results that read back as they were."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from wepose_pin.errors import BadData, ExistingOutput, MissingFile
+from wepose_pin.pose import pose_from_table, pose_table
+from wepose_pin.readers import load_session
+from wepose_pin.simulation import Simulation
+from wepose_pin.tracking import track
+from wepose_pin.writers import read_result, whole_folder, write_result, write_session
+
+
+def test_a_folder_appears_when_all_of_it_is_there(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "out"
+    with whole_folder(out) as folder:
+        (folder / "deep").mkdir()
+        (folder / "deep" / "a").write_text("1")
+        assert not out.exists()
+    assert (out / "deep" / "a").read_text() == "1"
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+
+
+def test_nothing_is_left_of_a_failure(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), whole_folder(tmp_path / "out") as folder:  # noqa: PT012
+        (folder / "a").write_text("1")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_overwritten_without_force_and_nothing_else_with_it(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a").write_text("old")
+    (tmp_path / "out" / "mine").write_text("keep")
+    with pytest.raises(ExistingOutput, match="--force"), whole_folder(tmp_path / "out"):
+        pass
+    with whole_folder(tmp_path / "out", force=True) as folder:
+        (folder / "a").write_text("new")
+    assert (tmp_path / "out" / "a").read_text() == "new"
+    assert (tmp_path / "out" / "mine").read_text() == "keep"
+    with pytest.raises(ExistingOutput, match="is a file"), whole_folder(tmp_path / "out" / "a", force=True):
+        pass
+
+
+def test_a_session_reads_back_to_the_bit(simulation: Simulation, tmp_path: Path) -> None:
+    recording = simulation.recording("made")
+    write_session(tmp_path, recording, simulation.truth())
+    again = load_session(tmp_path / "session.toml")
+    assert again.name == "made"
+    np.testing.assert_array_equal(again.time, recording.time)
+    for name, sensor in recording.sensors.items():
+        np.testing.assert_array_equal(again.sensors[name].gyro_S, sensor.gyro_S)
+        np.testing.assert_array_equal(again.sensors[name].accel_S, sensor.accel_S)
+        np.testing.assert_allclose(again.sensors[name].stated_quat_LS, sensor.stated_quat_LS, atol=1e-15)
+    for name, spans in recording.phases.items():
+        np.testing.assert_allclose(again.phases[name], spans, atol=1e-3)
+    assert again.truth == tmp_path / "truth.parquet"
+    truth = pose_from_table(pl.read_parquet(again.truth), "truth.parquet")
+    np.testing.assert_array_equal(truth.points["left_hand"], simulation.points["left_hand"])
+
+
+def test_ready_orientations_are_written_too(simulation: Simulation, tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from wepose_pin.recording import Sensor
+
+    ready = {name: Sensor(quat_WS=quat) for name, quat in simulation.quat_WL.items()}
+    write_session(tmp_path, replace(simulation.recording(), sensors=ready))
+    again = load_session(tmp_path)
+    np.testing.assert_allclose(again.sensors["torso"].quat_WS, simulation.quat_WL["torso"], atol=1e-15)
+    assert again.truth is None
+
+
+def test_a_result_reads_back(simulation: Simulation, tmp_path: Path) -> None:
+    pose = track(simulation.recording("made"))
+    write_result(tmp_path, pose)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "pose.parquet",
+        "subject.toml",
+        "subject.urdf",
+        "summary.json",
+    ]
+    again, model, summary = read_result(tmp_path)
+    np.testing.assert_array_equal(again.points["right_hand"], pose.points["right_hand"])
+    np.testing.assert_allclose(again.quat_WL["torso"], pose.quat_WL["torso"], atol=1e-15)
+    assert pose.subject is not None
+    assert model.lengths == pytest.approx(dict(pose.subject.lengths), abs=1e-12)
+    assert summary == json.loads((tmp_path / "summary.json").read_text())
+    assert summary["versions"]["wepose-pin"]
+
+
+def test_a_folder_that_is_no_result_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MissingFile, match=r"no pose\.parquet in it"):
+        read_result(tmp_path)
+
+
+def test_tables_that_are_no_pose_are_named(simulation: Simulation) -> None:
+    table = pose_table(simulation.truth())
+    with pytest.raises(BadData, match="no column 'time'"):
+        pose_from_table(table.drop("time"), "t.csv")
+    with pytest.raises(BadData, match="neither orientations nor points"):
+        pose_from_table(table.select("time"), "t.csv")
+    with pytest.raises(BadData, match="torso_qx … _qw is no unit quaternion in row"):
+        pose_from_table(table.with_columns(pl.lit(2.0).alias("torso_qw")), "t.csv")
+    with pytest.raises(BadData, match="holds text"):
+        pose_from_table(table.with_columns(pl.lit("a").alias("torso_qw")), "t.csv")
