@@ -33,7 +33,7 @@ import casadi as ca
 import numpy as np
 
 from .alignment import Segments, segment_orientations
-from .errors import BadOption, BadSession, NoSolution, one_of
+from .errors import BadOption, BadSession, BadSubject, NoSolution, one_of
 from .recording import Recording
 from .subject import LENGTHS, Subject, average_subject
 
@@ -44,13 +44,13 @@ ARMS = tuple(f"{side}_{part}" for side in ("left", "right") for part in ("upper_
 GAUGE_STD = 0.003
 # The gap is looked at this often [Hz]; more only repeats what the motion's own slowness correlates anyway.
 LOOK_RATE_HZ = 8.0
-# Errors of a segment's orientation [rad] before the data say better; only its share in the gap's covariance hangs on it.
+# Errors of a segment's orientation [rad] before the data say better: what hangs on it is the weights' start.
 ATTITUDE_STD = 0.035
 # Prior of each sensor's heading in the start pose, and of its drift since: the mounts are taken as known.
 HEADING_STD = np.deg2rad(2.0)  # [rad]
 TILT_STD = np.deg2rad(0.5)  # [rad] of the start pose's tilt: the accelerometer's bias, about x and y of W
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
-# Residual variance, in units of ATTITUDE_STD², that no person's hands stay below (0.02 deg, a fraction of a millimetre).
+# Residual variance, in units of ATTITUDE_STD², that no person's hands stay below (a fraction of a millimetre).
 LEAST_VARIANCE = 1e-4
 ROUNDS = 4
 
@@ -182,26 +182,12 @@ def _solve(
 ) -> Calibration:
     stride = max(1, round(recording.rate_hz / LOOK_RATE_HZ))
     looks = np.concatenate([np.arange(len(recording))[recording.span(i)][::stride] for i in intervals])
-    quats = _chain_quats(segments.quat_WL, looks)
-    warnings = list(segments.warnings)
-
     problem = _problem(len(looks), tuple(name for name in CHAIN if name in segments.quat_WL))
     since = recording.time[looks] - segments.start[1]
     data = np.vstack([_chain_quats(segments.quat_WL, looks), since])
-
-    # Prior and gauge as one Gaussian over [lengths, turns, drifts]: the start of the solver, and all of the scale.
+    center, information = _before(prior, gauge, gauge_std, problem.sensors)
     k = len(LENGTHS)
     mean = np.array([prior.lengths[name] for name in LENGTHS])
-    turn_std = np.tile([TILT_STD, TILT_STD, HEADING_STD], problem.sensors)
-    drift_std = np.full(problem.sensors, DRIFT_STD)
-    information = np.diag(np.concatenate([np.zeros(k), turn_std**-2, drift_std**-2]))
-    information[:k, :k] = np.linalg.inv(prior.lengths_covariance())
-    target = information[:, :k] @ mean
-    for name, value in gauge.items():
-        i = LENGTHS.index(name)
-        information[i, i] += 1.0 / gauge_std**2
-        target[i] += value / gauge_std**2
-    center = np.linalg.solve(information, target)
 
     x, weight, independent = center, 1.0, float(len(looks))
     for _ in range(ROUNDS):
@@ -219,23 +205,8 @@ def _solve(
     gaps = np.asarray(problem.gaps(x, data))
     gaps_before = np.asarray(problem.gaps(np.concatenate([mean, np.zeros(4 * problem.sensors)]), data))
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1)
-    if not gauge:
-        warnings.append(
-            f"no gauge: the hands together fix the proportions, not the scale, which is the prior's "
-            f"({prior.note or prior.name}): all lengths may be off together by {100 * scale_std:.1f} %; tape one, "
-            f"as in --gauge shoulder_width=0.385"
-        )
-    for k, name in enumerate(LENGTHS):
-        z = (lengths[k] - mean[k]) / prior.std(name)
-        if abs(z) > 4.0:
-            warnings.append(
-                f"{name} = {lengths[k]:.3f} m lies {abs(z):.1f} standard deviations from the average; "
-                f"check mounts and phases"
-            )
-    if covariance[1, 1] > 0:
-        warnings.append(
-            "the hands hardly moved: the lengths are the prior's; move the joined hands through the whole reach"
-        )
+    without_data = np.linalg.inv(information)[:k, :k]
+    warnings = _remarks(lengths, covariance, without_data, prior, None if gauge else scale_std)
     subject = replace(
         prior,
         name=recording.name,
@@ -253,8 +224,58 @@ def _solve(
         independent=independent,
         gauge=gauge,
         scale_std=scale_std,
-        warnings=tuple(warnings),
+        warnings=(*segments.warnings, *warnings),
     )
+
+
+def _before(
+    prior: Subject, gauge: Mapping[str, float], gauge_std: float, sensors: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Prior and gauge as one Gaussian over [lengths, turns, drifts]: centre and information."""
+    k = len(LENGTHS)
+    turn_std = np.tile([TILT_STD, TILT_STD, HEADING_STD], sensors)
+    drift_std = np.full(sensors, DRIFT_STD)
+    information = np.diag(np.concatenate([np.zeros(k), turn_std**-2, drift_std**-2]))
+    if not set(LENGTHS) <= set(prior.order) or np.linalg.eigvalsh(prior.lengths_covariance())[0] <= 0.0:
+        raise BadSubject(f"prior '{prior.name}': its lengths need a covariance that is positive definite, all of them")
+    information[:k, :k] = np.linalg.inv(prior.lengths_covariance())
+    target = information[:, :k] @ [prior.lengths[name] for name in LENGTHS]
+    for name, value in gauge.items():
+        i = LENGTHS.index(name)
+        information[i, i] += 1.0 / gauge_std**2
+        target[i] += value / gauge_std**2
+    return np.linalg.solve(information, target), information
+
+
+def _remarks(
+    lengths: np.ndarray,
+    covariance: np.ndarray,
+    without_data: np.ndarray,
+    prior: Subject,
+    free_scale_std: float | None,
+) -> list[str]:
+    """What the user should know of the result; `free_scale_std`: relative, where no gauge fixes the scale."""
+    remarks = []
+    if free_scale_std is not None:
+        remarks.append(
+            f"no gauge: the hands together fix the proportions, not the scale, which is the prior's "
+            f"({prior.note or prior.name}): all lengths may be off together by {100 * free_scale_std:.1f} %; tape one, "
+            f"as in --gauge shoulder_width=0.385"
+        )
+    for name, length in zip(LENGTHS, lengths, strict=True):
+        z = (length - prior.lengths[name]) / prior.std(name)
+        if abs(z) > 4.0:
+            remarks.append(
+                f"{name} = {length:.3f} m lies {abs(z):.1f} standard deviations from the average; "
+                f"check mounts and phases"
+            )
+    arm = [LENGTHS.index(name) for name in ("left_upper_arm", "right_upper_arm")]
+    if np.any(np.diag(covariance)[arm] > 0.5 * np.diag(without_data)[arm]):
+        remarks.append(
+            "the joined hands moved too little to tell the lengths, which are mostly the average person's: move them "
+            "through the whole reach"
+        )
+    return remarks
 
 
 def _rms(gaps: np.ndarray) -> float:
