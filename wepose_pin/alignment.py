@@ -25,6 +25,11 @@ from .subject import Subject
 STATED_LIMIT_DEG = 60.0
 STATED_WARNING_DEG = 35.0
 
+# Turning in the start pose: root mean square of the rate, and largest turn from its mean. A person who stands sways
+# below 3 deg/s and 3 deg; at the limits the mean pose is no longer the pose that was meant.
+MOVES_DEG_S, MOVES_DEG = 20.0, 15.0
+SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
+
 
 @dataclass(frozen=True)
 class Segments:
@@ -71,6 +76,9 @@ def segment_orientations(
     start, still, warnings = _phases(recording)
     quat_WL, quat_LS, heading, orientation = {}, {}, {}, {}
     for segment, sensor in recording.sensors.items():
+        warnings += _motion(recording, segment, start, "start")
+        if still != start:
+            warnings += _motion(recording, segment, still, "still")
         nominal = _nominal_mount(recording, segment, subject)
         if sensor.quat_WS is not None:
             quat_VS = sensor.quat_WS
@@ -152,3 +160,32 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
                 f"still phases need at least 10, better two seconds"
             )
     return start, still[0] if still else start, notes
+
+
+def _motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[str]:
+    """A note if the sensor sways in the phase, an error if it moves.
+
+    The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
+    """
+    sensor, span = recording.sensors[segment], recording.span(interval)
+    if sensor.quat_WS is not None:
+        R = Rotation.from_quat(sensor.quat_WS[span])
+        rate = (R[:-1].inv() * R[1:]).as_rotvec() * recording.rate_hz
+    else:
+        assert sensor.gyro_S is not None
+        rate = sensor.gyro_S[span]
+        R = Rotation.from_quat(so3.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
+    rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
+    turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
+    found = (
+        f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in phases.{phase} "
+        f"({interval[0]:g} to {interval[1]:g} s)"
+    )
+    if rms > MOVES_DEG_S or turn > MOVES_DEG:
+        raise BadPhase(
+            f"{recording.where()}: {found}; name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "
+            f"{MOVES_DEG:g} deg"
+        )
+    if rms > SWAYS_DEG_S or turn > SWAYS_DEG:
+        return [f"{found}: mounts and headings are uncertain by as much"]
+    return []

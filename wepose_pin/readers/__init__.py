@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from .session import load_session
+from .session import iter_session, load_session
 
-__all__ = ["load_session"]
+__all__ = ["iter_session", "load_session"]

@@ -23,6 +23,8 @@ UNEVEN = 0.5
 # A rate that differs by this share from its mean over a second or ten, a sample's jitter aside, is no longer one rate:
 # as much is the scale error of a gyroscope.
 DRIFT = 0.003
+# A clock is regular, and a longer step in it a lost row, where three quarters of its steps are as usual to this share.
+REGULAR = 0.2
 # Clocks that agree to this share of a step are one clock.
 SAME = 0.01
 # No body sensor measures more slowly [s]: the times are in another unit.
@@ -50,8 +52,8 @@ class Clock:
     step: float
 
     @property
-    def shortest_gap(self) -> float:
-        """Lost time [s] beyond which it is no longer bridged: one sample always is."""
+    def longest_bridge(self) -> float:
+        """Lost time [s] that is still bridged: one sample always is."""
         return max(LONGEST_GAP_S, self.step) * (1.0 + 1e-6)
 
 
@@ -73,6 +75,9 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
         guess = f"; looks like {fits[0]}" if fits else ""
         raise BadData(f"{place}: time grows by {step:g} from row to row; it must be in seconds{guess}")
     lost = np.where(steps > (1.0 + UNEVEN) * step, np.round(steps / step) - 1.0, 0.0)
+    if np.quantile(np.abs(steps / step - 1.0), 0.75) > REGULAR:
+        # No rate to tell lost rows by: up to a long gap, a sample's rate is that of its whole step.
+        lost[lost * step <= max(LONGEST_GAP_S, step)] = 0.0
     if lost.sum() > 10 * len(time) + 1000:
         k = int(np.argmax(steps))
         raise BadData(
@@ -108,7 +113,7 @@ def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tu
         return first.time, ()
     begin = max(float(clock.time[0]) for clock in clocks.values())
     end = min(float(clock.time[-1]) for clock in clocks.values())
-    usual = max(clock.step for clock in clocks.values())
+    usual = max(float(clock.time[-1] - clock.time[0]) / (len(clock.time) - 1) for clock in clocks.values())
     if end - begin < 2.0 * usual:
         spans = ", ".join(f"{name} {c.time[0]:g} to {c.time[-1]:g} s" for name, c in clocks.items())
         raise BadData(
@@ -155,7 +160,7 @@ def lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
     """`GOOD`, `BRIDGED` or `LONG` for every sample (n,), of the runs that are not `good` (n,)."""
     marks = np.zeros(len(good), dtype=np.int8)
     for first, last in runs(~good):
-        marks[first:last] = LONG if (last - first) * clock.step > clock.shortest_gap else BRIDGED
+        marks[first:last] = LONG if (last - first) * clock.step > clock.longest_bridge else BRIDGED
     return marks
 
 

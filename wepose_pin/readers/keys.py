@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import BadSession, MissingFile, one_of
 
 
@@ -107,7 +105,7 @@ class Keys:
 
 def is_number(value: Any) -> bool:
     """A finite int or float; a boolean is none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 def _toml(value: Any) -> str:

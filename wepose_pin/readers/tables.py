@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -36,9 +38,7 @@ def read_table(path: Path) -> pl.DataFrame:
     if _is_parquet(path):
         with _polars_errors(path):
             return pl.read_parquet(path)
-    names = _header(path)
-    # Columns are typed over the whole file, so that text deep down is found as text and can be named.
-    table = _parsed(path, path, names)
+    table = _parsed(path, _header(path))
     return table.head(table.height - _empty_end(path)) if table.height else table
 
 
@@ -78,7 +78,11 @@ def _numbers(table: pl.DataFrame, name: str, file: str, place: str, first_row: i
     elif not series.dtype.is_numeric() and series.dtype != pl.Null:
         found = "true and false" if series.dtype == pl.Boolean else f"values of type {series.dtype}"
         raise BadData(f"{file}: column '{name}' holds {found}; it must hold numbers")
-    return series.cast(pl.Float64).fill_null(float("nan")).rename(name)
+    numbers = series.cast(pl.Float64)
+    if numbers.is_infinite().any():
+        row = int(numbers.is_infinite().arg_max() or 0)
+        raise BadData(f"{file}: column '{name}' holds inf in row {first_row + row + 1}; it must be a number")
+    return numbers.fill_null(float("nan")).rename(name)
 
 
 # By rows -----------------------------------------------------------------------------------------------------------
@@ -140,6 +144,7 @@ def _csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
     with path.open("rb") as lines:
         rows = (line for line in lines if not line.startswith(b"#"))
         header = next(line for line in rows if line.strip())
+        done = 0
         empty: list[bytes] = []  # kept back until something follows them
         while new := list(itertools.islice(rows, BLOCK_ROWS)):
             block, empty = empty[::-1] + new, []
@@ -147,7 +152,8 @@ def _csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
                 empty.append(block.pop())
             if not block:
                 continue
-            table = _parsed(path, io.BytesIO(b"".join([header, *block])), names)
+            table = _parsed(path, names, b"".join([header, *block]), done)
+            done += table.height
             # A column of whole numbers in one block and of decimals in the next is one column.
             yield table.with_columns(pl.col(pl.Int64, pl.Null).cast(pl.Float64))
 
@@ -203,19 +209,30 @@ def _header(path: Path) -> list[str]:
     return next(csv.reader([header]))
 
 
-def _parsed(path: Path, source: Path | io.BytesIO, names: list[str]) -> pl.DataFrame:
+def _parsed(path: Path, names: list[str], part: bytes = b"", first_row: int = 0) -> pl.DataFrame:
+    """A CSV, or a `part` of it that begins with the line of names and goes on with `first_row`."""
+    source: Path | bytes = part or path
+    options: dict[str, Any] = {"null_values": NO_VALUE, "comment_prefix": "#"}
+    numbers: dict[str, Any] = dict.fromkeys(names, pl.Float64)
+    table = None
+    if len(numbers) == len(names):
+        # Most tables hold numbers and nothing else. What does not is read with care below.
+        with contextlib.suppress(pl.exceptions.PolarsError):
+            table = pl.read_csv(source, schema=numbers, **options)
     try:
-        table = pl.read_csv(source, infer_schema_length=None, null_values=NO_VALUE, comment_prefix="#")
+        if table is None:
+            # Columns are typed over the whole file, so that text deep down is found as text and can be named.
+            table = pl.read_csv(source, infer_schema_length=None, **options)
     except (pl.exceptions.PolarsError, OSError) as error:
         if "more fields" in str(error):
-            _find_ragged(path, len(names))
+            _find_ragged(path, len(names), part, first_row)
         if "utf-8" in str(error):
             raise BadData(f"{path}: is not UTF-8 text; save it as CSV in UTF-8") from error
         with _polars_errors(path):
             raise
     # polars fills short rows in silence.
     if table.width > 1 and table[table.columns[-1]].null_count():
-        _find_ragged(path, len(names))
+        _find_ragged(path, len(names), part, first_row)
     return table
 
 
@@ -227,10 +244,11 @@ def _empty_end(path: Path) -> int:
     return len(lines) - next((k for k in range(len(lines), 0, -1) if lines[k - 1].strip(EMPTY)), 0)
 
 
-def _find_ragged(path: Path, width: int) -> None:
+def _find_ragged(path: Path, width: int, part: bytes, first_row: int) -> None:
     """Raise an error on the first row of a CSV that has not `width` fields; empty lines pass as rows without values."""
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as lines:
-        rows = csv.reader(line for line in lines if not line.startswith("#"))
-        for k, fields in enumerate(rows):
+    with io.BytesIO(part) if part else path.open("rb") as lines:
+        text = io.TextIOWrapper(lines, encoding="utf-8-sig", errors="replace", newline="")
+        rows = csv.reader(line for line in text if not line.startswith("#"))
+        for k, fields in enumerate(rows, first_row):
             if fields and len(fields) != width:
                 raise BadData(f"{path}: row {k} has {len(fields)} fields, the line of names has {width}; mend the row")

@@ -1,0 +1,361 @@
+"""What a user's files can be wrong in: told in one line that names the place, what is there and what would be right.
+
+All of it runs through the command line: exit code 2, one line on stderr, nothing written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from wepose_pin.cli import main
+
+RATE = 100.0
+SESSION = """
+[data]
+file = "arm.csv"
+time = "time"
+gyro_unit = "rad/s"
+accel_unit = "m/s^2"
+[phases]
+start = [[0.5, 2.5]]
+[sensors.torso]
+gyro = ["gx", "gy", "gz"]
+accel = ["ax", "ay", "az"]
+mount = { up = "+z", forward = "+x" }
+"""
+QUATS = SESSION.replace(
+    'gyro = ["gx", "gy", "gz"]\naccel = ["ax", "ay", "az"]', 'orientation = ["qx", "qy", "qz", "qw"]'
+)
+
+
+def good_table() -> pl.DataFrame:
+    """Three seconds of standing, then a turn by 90 deg about y and back, with a little noise."""
+    rng = np.random.default_rng(0)
+    time = np.arange(900) / RATE
+    angle = np.deg2rad(90.0) * np.sin(np.pi * np.clip((time - 3.0) / 5.0, 0.0, 1.0)) ** 2
+    rate = np.diff(angle, prepend=0.0) * RATE
+    noise = 0.002 * rng.standard_normal((900, 6))
+    return pl.DataFrame(
+        {
+            "time": time,
+            "gx": noise[:, 0],
+            "gy": rate + noise[:, 1],
+            "gz": noise[:, 2],
+            "ax": -9.81 * np.sin(angle) + noise[:, 3],
+            "ay": noise[:, 4],
+            "az": 9.81 * np.cos(angle) + noise[:, 5],
+            "qx": np.zeros(900),
+            "qy": np.sin(angle / 2.0),
+            "qz": np.zeros(900),
+            "qw": np.cos(angle / 2.0),
+        }
+    )
+
+
+@dataclass
+class Files:
+    """A session that is well, for each case to spoil."""
+
+    folder: Path
+    table: pl.DataFrame
+    session: str = SESSION
+
+    def write(self) -> Path:
+        path = self.folder / "session.toml"
+        path.write_text(self.session, encoding="utf-8")
+        if not (self.folder / "arm.csv").exists():
+            self.table.write_csv(self.folder / "arm.csv")
+        return path
+
+    def say(self, old: str, new: str) -> None:
+        assert old in self.session
+        self.session = self.session.replace(old, new)
+
+    def raw(self, change: Callable[[str], str | bytes]) -> None:
+        text = change(self.table.write_csv())
+        (self.folder / "arm.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+
+    def put(self, column: str, rows: slice, value: object) -> None:
+        values = self.table[column].to_list()
+        values[rows] = [value] * len(values[rows])
+        self.table = self.table.with_columns(pl.Series(column, values, strict=False))
+
+    def scale(self, names: str, factor: float) -> None:
+        self.table = self.table.with_columns(pl.col(names.split()) * factor)
+
+    def parquet(self) -> None:
+        self.say("arm.csv", "arm.parquet")
+        self.table.write_parquet(self.folder / "arm.parquet")
+
+
+CASES: dict[str, tuple[Callable[[Files], object], str]] = {
+    # the session file
+    "broken TOML": (lambda f: f.say("[phases]", "[phases"), "session.toml: not valid TOML: Expected"),
+    "a table without an ending": (lambda f: f.say("arm.csv", "x"), "x: '' is not a known format; there is: .csv"),
+    "unknown key at the top": (lambda f: f.say("\n[data]", "\nnme = 'x'\n[data]"), "session.toml: nme is not a known"),
+    "unknown key in data": (
+        lambda f: f.say("gyro_unit", "gyr_unit"),
+        "session.toml: data.gyr_unit is not a known key; did you mean 'gyro_unit'?",
+    ),
+    "unknown key in a sensor": (lambda f: f.say("accel =", "acc ="), "sensors.torso.acc is not a known key"),
+    "missing unit": (
+        lambda f: f.say('gyro_unit = "rad/s"\n', ""),
+        "session.toml: data.gyro_unit is missing; there is: rad/s, deg/s",
+    ),
+    "unknown unit": (
+        lambda f: f.say('"m/s^2"', '"m/s2"'),
+        "data.accel_unit = 'm/s2' is not known; did you mean 'm/s^2'?",
+    ),
+    "unknown segment": (
+        lambda f: f.say("sensors.torso", "sensors.torsoo"),
+        "sensors.torsoo is not a segment; did you mean 'torso'?",
+    ),
+    "no sensors": (lambda f: setattr(f, "session", f.session.split("[sensors")[0]), "session.toml: no sensors; one"),
+    "a sensor that is no table": (
+        lambda f: setattr(f, "session", f.session.split("[sensors")[0] + "[sensors]\ntorso = 3"),
+        "sensors.torso = 3 is not a table; write [sensors.torso]",
+    ),
+    "no data": (lambda f: f.say("[data]", "[sensors.head]"), "session.toml: data is missing; a table [data]"),
+    "no file": (lambda f: f.say('file = "arm.csv"\n', ""), "session.toml: data.file is missing"),
+    "gyro without accel": (lambda f: f.say('accel = ["ax", "ay", "az"]\n', ""), "sensors.torso.accel is missing"),
+    "two columns for three": (
+        lambda f: f.say('["gx", "gy", "gz"]', '["gx", "gy"]'),
+        "sensors.torso.gyro is ['gx', 'gy']; a list of 3 column names is needed",
+    ),
+    "a column twice in a sensor": (
+        lambda f: f.say('"gy", "gz"', '"gy", "gy"'),
+        "sensors.torso.gyro names a column twice",
+    ),
+    "a boolean for a number": (
+        lambda f: f.say('time = "time"', "rate_hz = true"),
+        "data.rate_hz = true is not a number",
+    ),
+    "a negative rate": (lambda f: f.say('time = "time"', "rate_hz = -100.0"), "data.rate_hz = -100.0 must be greater"),
+    "an infinite rate": (lambda f: f.say('time = "time"', "rate_hz = inf"), "data.rate_hz = inf is not a number"),
+    "time and rate": (lambda f: f.say('time = "time"', 'time = "time"\nrate_hz = 100'), "one of the two, and both is"),
+    "neither time nor rate": (lambda f: f.say('time = "time"\n', ""), "one of the two, and neither is there"),
+    "parallel mount axes": (
+        lambda f: f.say('forward = "+x"', 'forward = "-z"'),
+        "mount.forward = '-z' is parallel to up = '+z'",
+    ),
+    "an axis that is none": (lambda f: f.say('"+x"', '"x"'), "mount.forward = 'x' is not known; did you mean '"),
+    "orientation beside gyro": (
+        lambda f: f.say("accel =", 'orientation = ["qx", "qy", "qz", "qw"]\naccel ='),
+        "sensors.torso.orientation stands beside gyro or accel",
+    ),
+    "an unknown start pose": (
+        lambda f: f.say("\n[data]", "\nstart_pose = 'npose'\n[data]"),
+        "start_pose = 'npose' is not known; did you mean 'n_pose'?",
+    ),
+    "a truth that is not there": (
+        lambda f: f.say('file = "arm.csv"', 'file = "arm.csv"\ntruth = "t.parquet"'),
+        "session.toml: data.truth: no such file 't.parquet'",
+    ),
+    # phases
+    "a phase outside": (
+        lambda f: f.say("[[0.5, 2.5]]", "[[0.5, 25.0]]"),
+        "session.toml: phases.start: [0.5, 25] is outside the recording, which runs from 0 to 8.99 s",
+    ),
+    "an empty phase": (lambda f: f.say("[[0.5, 2.5]]", "[[2.5, 0.5]]"), "phases.start: [2.5, 0.5] is empty"),
+    "a phase in words": (lambda f: f.say("[[0.5, 2.5]]", '"begin"'), "phases.start = 'begin' is not a list of interv"),
+    "a phase of booleans": (lambda f: f.say("[[0.5, 2.5]]", "[[false, true]]"), "is not a list of intervals"),
+    "a phase of nan": (lambda f: f.say("[[0.5, 2.5]]", "[[nan, 2.0]]"), "is not a list of intervals"),
+    "a phase with few samples": (lambda f: f.say("[[0.5, 2.5]]", "[[0.5, 0.55]]"), "0.5 to 0.55 s holds 6 samples"),
+    "a start phase in motion": (
+        lambda f: f.say("[[0.5, 2.5]]", "[[4.0, 6.0]]"),
+        "session.toml: sensors.torso turns by ",
+    ),
+    "a ready sensor in motion": (
+        lambda f: (setattr(f, "session", QUATS), f.say("[[0.5, 2.5]]", "[[4.0, 6.0]]")),
+        "deg/s rms in phases.start (4 to 6 s); name seconds in which it keeps still",
+    ),
+    # the table
+    "a missing table": (lambda f: f.say("arm.csv", "amr.csv"), "amr.csv: no such file; did you mean 'arm.csv'?"),
+    "a folder for a table": (lambda f: (f.folder / "arm.csv").mkdir(), "arm.csv: is a folder; a .csv or .parquet file"),
+    "an unknown format": (
+        lambda f: (f.say("arm.csv", "arm.xlsx"), (f.folder / "arm.xlsx").write_bytes(b"PK")),
+        "'.xlsx' is not a known format; there is: .csv, .parquet",
+    ),
+    "an unreadable Parquet": (
+        lambda f: (f.say("arm.csv", "arm.parquet"), (f.folder / "arm.parquet").write_bytes(b"no parquet at all")),
+        "arm.parquet: cannot be read as a Parquet file",
+    ),
+    "an empty file": (lambda f: f.raw(lambda _: ""), "arm.csv: is empty"),
+    "a table without rows": (lambda f: setattr(f, "table", f.table.head(0)), "arm.csv: 0 samples; a recording has at"),
+    "a single sample": (lambda f: setattr(f, "table", f.table.head(1)), "arm.csv: 1 samples; a recording has at least"),
+    "semicolons": (lambda f: f.raw(lambda t: t.replace(",", ";")), "arm.csv: columns are separated by semicolons"),
+    "semicolons and decimal commas": (
+        lambda f: f.raw(lambda t: t.replace(",", ";").replace(".", ",")),
+        "arm.csv: columns are separated by semicolons; commas, and points in decimals, are needed",
+    ),
+    "decimal commas": (
+        lambda f: f.put("gy", slice(40, 41), "0,125"),
+        "arm.csv: column 'gy' holds text in row 41: '0,125'; write decimals with a point: 0.125",
+    ),
+    "text in a number": (
+        lambda f: f.put("ax", slice(6, 7), "n.v."),
+        "arm.csv: column 'ax' holds text in row 7: 'n.v.'; it must be a number",
+    ),
+    "a missing column": (
+        lambda f: f.say('"gz"', '"gyr_z"'),
+        "session.toml: sensors.torso.gyro: no column 'gyr_z' in arm.csv; there is: time, gx",
+    ),
+    "a missing time column": (
+        lambda f: f.say('time = "time"', 'time = "Time"'),
+        "session.toml: data.time: no column 'Time' in arm.csv; did you mean 'time'?",
+    ),
+    "a column that stands twice": (
+        lambda f: f.raw(lambda t: t.replace("gz", "gy", 1)),
+        "arm.csv: column 'gy' stands there more than once",
+    ),
+    "a row with too many fields": (
+        lambda f: f.raw(lambda t: t.replace("\n0.05,", "\n0.05,1,")),
+        "arm.csv: row 6 has 12 fields, the line of names has 11",
+    ),
+    "a row that breaks off": (
+        lambda f: f.raw(lambda t: t[: t.rindex(",")]),
+        "arm.csv: row 900 has 10 fields, the line of names has 11",
+    ),
+    "UTF-16": (lambda f: f.raw(lambda t: t.encode("utf-16")), "arm.csv: is not a CSV in UTF-8"),
+    "true and false": (
+        lambda f: (setattr(f, "table", f.table.with_columns(gx=pl.col("gx") > 0)), f.parquet()),
+        "arm.parquet: column 'gx' holds true and false; it must hold numbers",
+    ),
+    "dates for time": (
+        lambda f: (setattr(f, "table", f.table.with_columns(time=pl.from_epoch(pl.col("time")))), f.parquet()),
+        "arm.parquet: column 'time' holds values of type Datetime",
+    ),
+    "infinity": (
+        lambda f: f.put("az", slice(70, 71), float("inf")),
+        "arm.csv: column 'az' holds inf in row 71; it must be a number",
+    ),
+    "a column without numbers": (lambda f: f.put("gx", slice(None), None), "sensors.torso.gyro: no numbers from 0 to"),
+    # time
+    "time that stands still": (
+        lambda f: f.put("time", slice(100, 101), 0.99),
+        "arm.csv: time stands still in row 101: 0.99 s after 0.99 s",
+    ),
+    "time that goes back": (lambda f: f.put("time", slice(100, 101), 0.5), "arm.csv: time goes back in row 101: 0.5 s"),
+    "time without a number": (
+        lambda f: f.put("time", slice(3, 4), None),
+        "arm.csv: time: not a finite number in row 4",
+    ),
+    "time in milliseconds": (
+        lambda f: f.scale("time", 1000.0),
+        "arm.csv: time grows by 10 from row to row; it must be in seconds; looks like milliseconds",
+    ),
+    "a jump in time": (
+        lambda f: setattr(f, "table", f.table.with_columns(time=pl.col("time") + 1e6 * (pl.col("time") > 5))),
+        "arm.csv: time jumps from 5 to 1.00001e+06 s in row 502",
+    ),
+    "missing rows": (
+        lambda f: setattr(f, "table", pl.concat([f.table.head(300), f.table.slice(307)])),
+        "arm.csv: rows are missing after row 300: time steps by 0.080 s at 2.990 s; up to 50 ms are bridged",
+    ),
+    "a long gap in gyro": (
+        lambda f: f.put("gy", slice(400, 406), None),
+        "arm.csv: sensors.torso.gyro: 6 samples without numbers, 0.060 s from 4.000 s; up to 50 ms",
+    ),
+    "a long gap in accel": (
+        lambda f: f.put("ax", slice(10, 20), float("nan")),
+        "sensors.torso.accel: 10 samples without",
+    ),
+    "a gap at the end": (
+        lambda f: f.put("gx", slice(880, 900), None),
+        "20 samples without numbers, 0.200 s from 8.800",
+    ),
+    "clocks that do not overlap": (
+        lambda f: setattr(
+            f,
+            "session",
+            f.session + f.session[f.session.index("[sensors") :].replace("torso", "head") + "offset_s = 99",
+        ),
+        "session.toml: the sensors' clocks do not overlap (torso 0 to 8.99 s, head 99 to 107.99 s)",
+    ),
+    # values
+    "a quaternion that is no unit": (
+        lambda f: (setattr(f, "session", QUATS), f.put("qw", slice(4, 5), 0.5)),
+        "arm.csv: sensors.torso.orientation has length 0.5 in row 5; a unit quaternion is needed",
+    ),
+    "accel in g": (
+        lambda f: f.scale("ax ay az", 1 / 9.81),
+        "sensors.torso.accel: norm 1 m/s^2 in phases.start (0.5 to 2.5 s), where gravity's 9.81 is expected; "
+        'data.accel_unit = "g" would fit',
+    ),
+    "accel not in g": (lambda f: f.say('"m/s^2"', '"g"'), "norm 96.2 m/s^2 in phases.start (0.5 to 2.5 s), where grav"),
+    "accel in mg": (lambda f: f.scale("ax ay az", 1000 / 9.81), "the values look like thousandths of g"),
+    "accel without gravity": (lambda f: f.scale("ax ay az", 0.001), "gravity seems to have been taken out"),
+    "accel in g without phases": (
+        lambda f: (f.scale("ax ay az", 1 / 9.81), f.say("start = [[0.5, 2.5]]", "")),
+        "norm 1 m/s^2 in its quietest second",
+    ),
+    "gyro in deg/s": (lambda f: f.scale("gx gy gz", 57.29578), 'data.gyro_unit = "deg/s" would fit'),
+    "gyro not in deg/s": (
+        lambda f: f.say('"rad/s"', '"deg/s"'),
+        'data.gyro_unit = "rad/s" would fit, or the gyroscope does not measure',
+    ),
+    "a number for a missing value": (
+        lambda f: f.put("gz", slice(50, 51), -9999.0),
+        "sensors.torso.gyro: -9999 rad/s on z at 0.500 s, no sensor measures above 80",
+    ),
+    "an overflow": (lambda f: f.put("ax", slice(700, 701), 2**63), "sensors.torso.accel: 9.22337e+18 m/s^2 on x at 7."),
+    "no mount": (lambda f: f.say('mount = { up = "+z", forward = "+x" }', ""), "sensors.torso.mount is not known"),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_bad_input_is_told_in_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spoil, message = CASES[name]
+    files = Files(tmp_path / "in", good_table())
+    files.folder.mkdir()
+    spoil(files)
+    line = refused(["track", str(files.write()), "-o", str(tmp_path / "out")], capsys)
+    assert message in line
+    assert not (tmp_path / "out").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+def refused(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main(argv)
+    printed = capsys.readouterr()
+    assert stop.value.code == 2
+    assert printed.out == ""
+    lines = printed.err.splitlines()
+    assert len(lines) == 1, printed.err
+    return lines[0].removeprefix("wepose: ")
+
+
+def test_the_unspoilt_files_pass(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["track", str(Files(tmp_path, good_table()).write()), "-o", str(tmp_path / "out")])
+    assert stop.value.code == 0
+    assert capsys.readouterr().err == ""
+    assert (tmp_path / "out" / "pose.parquet").is_file()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("nothing.toml", None, "nothing.toml: no such file; a session file is wanted here"),
+        ("data.csv", b"time,gx\n", "data.csv: is a table of data by its name; a session file is wanted here"),
+        ("bytes.toml", b"\xff\xfe\x00", "bytes.toml: is not UTF-8 text (byte 0)"),
+        ("empty.toml", b"", "empty.toml: data is missing; a table [data] is needed"),
+    ],
+)
+def test_what_is_no_session(
+    name: str, content: bytes | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    assert message in refused(["track", str(tmp_path / name), "-o", str(tmp_path / "out")], capsys)
+
+
+def test_a_folder_without_a_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "session.toml: no such file" in refused(["track", str(tmp_path), "-o", str(tmp_path / "out")], capsys)

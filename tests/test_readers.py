@@ -1,0 +1,545 @@
+"""Reading sessions: tables, clocks, gaps, resampling, plausibility, pieces."""
+
+from __future__ import annotations
+
+import csv
+import json
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.io import loadmat
+from scipy.spatial.transform import Rotation
+
+from wepose_pin import load_session, so3
+from wepose_pin.cli import main
+from wepose_pin.errors import BadData, BadOption
+from wepose_pin.readers import iter_session
+from wepose_pin.readers.clocks import BRIDGED, LONG, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time
+from wepose_pin.readers.plausibility import sensor_notes
+from wepose_pin.readers.tables import Rows, one_column, read_table
+from wepose_pin.recording import Recording, Sensor, check
+
+SIGNALS = {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"], "orientation": ["qx", "qy", "qz", "qw"]}
+RAW = [*SIGNALS["gyro"], *SIGNALS["accel"]]
+
+
+def true_orientation(time: np.ndarray) -> Rotation:
+    """A hand that turns about changing axes, at up to 300 deg/s."""
+    angles = np.column_stack([1.2 * np.sin(2.1 * time), 0.9 * np.sin(3.3 * time + 0.4), 1.5 * np.sin(1.3 * time)])
+    return Rotation.from_euler("ZYX", angles * np.sin(0.5 * np.pi * np.clip(time - 2.0, 0.0, 1.0))[:, None] ** 2)
+
+
+def table_at(time: np.ndarray, noise: float = 0.0) -> pl.DataFrame:
+    """The table of a perfect sensor (no speed, so that accel is gravity) sampled at these times."""
+    R = true_orientation(time)
+    rate = (R[:-1].inv() * R[1:]).as_rotvec() / np.diff(time)[:, None]
+    gyro = np.concatenate([rate[:1], rate])
+    accel = R.inv().apply([0.0, 0.0, 9.81])
+    values = np.column_stack([gyro, accel]) + noise * np.random.default_rng(0).standard_normal((len(time), 6))
+    names = ["time", *RAW, *SIGNALS["orientation"]]
+    return pl.DataFrame(np.column_stack([time, values, R.as_quat()]), schema=names)
+
+
+def write(
+    folder: Path,
+    table: pl.DataFrame,
+    *,
+    file: str = "hand.csv",
+    sensor: str = "",
+    ready: bool = False,
+    data: str = 'time = "time"',
+    **other: pl.DataFrame,
+) -> Path:
+    """A session with the torso in `file`, and one sensor more for each of `other`, in a CSV of its own."""
+
+    def columns(ready: bool) -> str:
+        return "\n".join(f"{k} = {json.dumps(v)}" for k, v in SIGNALS.items() if ready == (k == "orientation"))
+
+    table.write_parquet(folder / file) if file.endswith("parquet") else table.write_csv(folder / file)
+    text = (
+        f'[data]\nfile = "{file}"\n{data}\ngyro_unit = "rad/s"\naccel_unit = "m/s^2"\n[phases]\nstart = [[0.5, 1.9]]\n'
+    )
+    text += f'[sensors.torso]\n{columns(ready)}\nmount = {{ up = "+z", forward = "+x" }}\n'
+    for name, its_own in other.items():
+        its_own.write_csv(folder / f"{name}.csv")
+        own_time = "" if "rate_hz" in sensor else 'time = "time"\n'
+        text += f'[sensors.{name}]\nfile = "{name}.csv"\n{own_time}{sensor}\n{columns(False)}\n'
+    (folder / "session.toml").write_text(text, encoding="utf-8")
+    return folder / "session.toml"
+
+
+def rotation_error_deg(sensor: Sensor, time: np.ndarray) -> np.ndarray:
+    """Angle between the integrated gyroscope and the truth, at each time."""
+    assert sensor.gyro_S is not None
+    turned = Rotation.from_quat(so3.integrate(sensor.gyro_S[1:] * np.diff(time)[:, None]))
+    truth = true_orientation(time)
+    return np.degrees(((truth[0] * turned).inv() * truth).magnitude())
+
+
+def where(mask: np.ndarray) -> pl.Expr:
+    return pl.lit(pl.Series(mask))
+
+
+def same(a: Recording, b: Recording) -> bool:
+    return np.array_equal(a.time, b.time) and all(
+        np.array_equal(getattr(a.sensors[s], name), getattr(b.sensors[s], name))
+        for s in a.sensors
+        for name in ("gyro_S", "accel_S", "quat_WS")
+        if getattr(a.sensors[s], name) is not None
+    )
+
+
+# Tables ------------------------------------------------------------------------------------------------------------
+
+
+def test_values_come_through_untouched_and_in_si(tmp_path: Path) -> None:
+    table = table_at(np.arange(800) / 100.0, 0.01)
+    path = write(tmp_path, table.with_columns(pl.col("gx", "gy", "gz").degrees(), pl.col("ax", "ay", "az") / 9.80665))
+    path.write_text(path.read_text().replace("rad/s", "deg/s").replace("m/s^2", "g"))
+    recording = load_session(path)
+    np.testing.assert_array_equal(recording.time, table["time"])
+    np.testing.assert_allclose(recording.sensors["torso"].gyro_S, table[SIGNALS["gyro"]], atol=1e-13)
+    np.testing.assert_allclose(recording.sensors["torso"].accel_S, table[SIGNALS["accel"]], atol=1e-13)
+    assert recording.rate_hz == pytest.approx(100.0)
+    assert recording.notes == ()
+    assert recording.name == tmp_path.name
+    assert same(load_session(tmp_path), recording)
+
+
+@pytest.mark.parametrize("file", ["hand.csv", "hand.parquet"])
+def test_several_sensors_in_one_file_keep_every_bit(file: str, tmp_path: Path) -> None:
+    table = table_at(np.arange(800) / 100.0, 0.01)
+    path = write(tmp_path, table, file=file)
+    sensor = path.read_text()[path.read_text().index("[sensors") :]
+    path.write_text(path.read_text() + sensor.replace("torso", "head") + "offset_s = 0.0\n")
+    recording = load_session(path)
+    for segment in ("torso", "head"):
+        np.testing.assert_array_equal(recording.sensors[segment].gyro_S, table[SIGNALS["gyro"]])
+
+
+def test_float32_integer_and_nullable_columns_load(tmp_path: Path) -> None:
+    table = table_at(np.arange(800) / 100.0).with_columns(
+        pl.col("gx", "gy").cast(pl.Float32),
+        pl.when(pl.col("time") == 4.0).then(None).otherwise(pl.col("gz")).alias("gz"),
+        pl.lit(0).cast(pl.Int16).alias("ay"),
+        pl.lit(10).cast(pl.UInt8).alias("az"),
+        pl.lit(0.0).cast(pl.Decimal(10, 2)).alias("ax"),
+    )
+    table = table.with_columns(pl.col("gx", "gy", "gz") * 0.05)
+    expected = table["gx"].cast(pl.Float64).to_numpy().copy()
+    expected[400] = (expected[399] + expected[401]) / 2.0  # gz is missing there, and all three are bridged
+    torso = load_session(write(tmp_path, table, file="hand.parquet")).sensors["torso"]
+    assert torso.gyro_S is not None
+    assert torso.gyro_S.dtype == np.float64
+    np.testing.assert_allclose(torso.gyro_S[:, 0], expected, rtol=1e-12)
+    np.testing.assert_array_equal(torso.accel_S, np.tile([0.0, 0.0, 10.0], (800, 1)))
+    assert np.isfinite(torso.gyro_S).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: "\ufeff" + text,
+        lambda text: "# made by a logger\n# rate: 100\n" + text,
+        lambda text: text.replace("\n", "\r\n"),
+        lambda text: text + "\n\n",
+        lambda text: text + ",,,,,,,,,,\n",
+        lambda text: text.replace(",", ", ").replace(", ", ",", 10),
+    ],
+    ids=["BOM", "comments", "CRLF", "empty lines at the end", "empty cells at the end", "blanks before numbers"],
+)
+def test_csv_as_programs_write_it(change, tmp_path: Path) -> None:
+    table = table_at(np.arange(800) / 100.0)
+    path = write(tmp_path, table)
+    (tmp_path / "hand.csv").write_bytes(change(table.write_csv()).encode())
+    assert same(load_session(path), load_session(write(tmp_path, table, file="hand.parquet")))
+    (path := write(tmp_path, table)).touch()
+    (tmp_path / "hand.csv").write_bytes(change(table.write_csv()).encode())
+    assert sum(len(piece) for piece in iter_session(path, 1.7)) == 800
+
+
+def test_rows_of_a_csv_are_those_of_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wepose_pin.readers.tables.BLOCK_ROWS", 7)
+    lines = [[k, k if k < 40 else k + 0.5, "" if k % 9 == 0 else -k] for k in range(100)]
+    with (tmp_path / "t.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["a", "b", "c"], *lines, *([["", "", ""]] * 20)])
+    whole = read_table(tmp_path / "t.csv")
+    assert whole.height == 100
+    rows = Rows(tmp_path / "t.csv")
+    for first, last in ((0, 3), (2, 20), (20, 21), (60, 100)):
+        part = rows[first:last]
+        assert part.cast(pl.Float64).equals(whole[first:last].cast(pl.Float64))
+    values, height = one_column(tmp_path / "t.csv", "b", "t.csv", "x")
+    assert height == 100
+    np.testing.assert_array_equal(values, whole["b"])
+
+
+# Lost samples ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lost", ["cells", "rows"])
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_short_gaps_are_bridged_on_the_rotation(lost: str, count: int, tmp_path: Path) -> None:
+    time = np.arange(1000) / 100.0
+    table = table_at(time)
+    holes = [(k, k + count) for k in range(300, 900, 60)]
+    gone = np.zeros(1000, dtype=bool)
+    for first, last in holes:
+        gone[first:last] = True
+    if lost == "rows":
+        path = write(tmp_path, table.filter(~gone))
+    else:
+        path = write(tmp_path, table.with_columns(pl.when(where(~gone)).then(pl.col(RAW)).name.keep()))
+    recording = load_session(path)
+    np.testing.assert_allclose(recording.time, time, atol=1e-9)
+    error = rotation_error_deg(recording.sensors["torso"], time)
+    assert error[:300].max() < 1e-6
+    assert error.max() < {1: 0.01, 3: 0.07, 5: 0.13}[count] * len(holes)  # [deg], at up to 260 deg/s
+    accel = recording.sensors["torso"].accel_S
+    assert np.abs(accel - table[SIGNALS["accel"]].to_numpy()).max() < 0.02 * count**2
+    assert f"{len(holes)} short gaps bridged: {count * len(holes)} samples, the longest {10 * count} ms" in str(
+        recording.notes
+    )
+    assert recording.sensors["torso"].gap is None
+
+
+def test_ready_orientations_are_bridged_along_the_rotation(tmp_path: Path) -> None:
+    time = np.arange(1000) / 100.0
+    table = table_at(time)
+    zeros = (pl.col("time") >= 5.0) & (pl.col("time") < 5.05)
+    table = table.with_columns(pl.when(zeros).then(0.0).otherwise(pl.col(SIGNALS["orientation"])).name.keep())
+    quat = load_session(write(tmp_path, table, ready=True)).sensors["torso"].quat_WS
+    assert quat is not None
+    np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-12)
+    assert np.degrees((Rotation.from_quat(quat).inv() * true_orientation(time)).magnitude()).max() < 0.3
+
+
+def test_gaps_at_both_ends_keep_the_nearest_value() -> None:
+    clock = clock_of(np.arange(10) / 100.0, "x")
+    values = np.arange(10.0)[:, None]
+    good = np.ones(10, dtype=bool)
+    good[[0, 1, 9]] = False
+    marks = lost_samples(clock, good)
+    assert marks.tolist() == [BRIDGED] * 2 + [0] * 7 + [BRIDGED]
+    assert bridge(values, marks, clock)[:, 0].tolist() == [2.0, 2.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 8.0]
+    quat = so3.exp(values * [0.0, 0.0, 0.1])
+    np.testing.assert_array_equal(bridge_quat(quat, marks, clock)[[0, 1, 9]], quat[[2, 2, 8]])
+
+
+@pytest.mark.parametrize("step", [0.001, 0.01, 0.1])
+def test_fifty_milliseconds_are_bridged_and_one_sample_more_is_not(step: float) -> None:
+    clock = clock_of(np.arange(1000) * step, "x")
+    most = max(1, round(0.05 / step))
+    for count, mark in ((most, BRIDGED), (most + 1, LONG)):
+        good = np.ones(1000, dtype=bool)
+        good[200 : 200 + count] = False
+        assert set(lost_samples(clock, good)[~good]) == {mark}
+
+
+def test_in_a_long_gap_the_rate_falls_to_the_bias() -> None:
+    clock = clock_of(np.arange(1000) / 100.0, "x")
+    bias = np.array([0.01, -0.02, 0.03])
+    rate = np.tile(bias, (1000, 1))
+    rate[400:] += 2.0 * np.sin(np.arange(600) / 7.0)[:, None]
+    good = np.ones(1000, dtype=bool)
+    good[500:700] = False
+    filled = bridge(np.where(good[:, None], rate, np.nan), lost_samples(clock, good), clock, rate=True)
+    np.testing.assert_allclose(filled[515:685], np.tile(bias, (170, 1)), atol=1e-12)
+    assert np.abs(np.diff(filled[498:702], axis=0)).max() < 0.35
+    assert np.abs(filled[500:700]).max() <= np.abs(rate).max()
+
+
+def test_accepted_gaps_are_marked_and_counted_in_the_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = table_at(np.arange(1000) / 100.0, 0.005)
+    gone = (pl.col("time") > 5.0) & (pl.col("time") < 5.5)
+    rows = (pl.col("time") < 7.0) | (pl.col("time") > 7.205)
+    table = table.with_columns(pl.when(~gone).then(pl.col("gy"))).filter(rows)
+    (tmp_path / "in").mkdir()
+    path = write(tmp_path / "in", table)
+    with pytest.raises(BadData, match=r"rows are missing after row 700: time steps by 0.220 s at 6.990 s"):
+        load_session(path)
+    recording = load_session(path, gaps=True)
+    gap = recording.sensors["torso"].gap
+    assert gap is not None
+    assert len(recording) == 1000
+    assert np.flatnonzero(gap).tolist() == [*range(501, 550), *range(700, 721)]
+    with pytest.raises(SystemExit) as stop:
+        main(["track", str(path), "--gaps", "-o", str(tmp_path / "out")])
+    assert stop.value.code == 0
+    assert "note: sensors.torso: 2 long gaps accepted, bridged and marked: 70 samples" in capsys.readouterr().err
+    np.testing.assert_array_equal(pl.read_parquet(tmp_path / "out" / "pose.parquet")["torso_gap"], gap)
+    torso = json.loads((tmp_path / "out" / "summary.json").read_text())["sensors"]["torso"]
+    assert (torso["gaps"], torso["gap_s"]) == (2, 0.7)
+
+
+def test_without_a_gap_nothing_is_marked_though_gaps_are_accepted(tmp_path: Path) -> None:
+    path = write(tmp_path, table_at(np.arange(500) / 100.0))
+    gap = load_session(path, gaps=True).sensors["torso"].gap
+    assert gap is not None
+    assert not gap.any()
+    assert load_session(path).sensors["torso"].gap is None
+
+
+# Clocks ------------------------------------------------------------------------------------------------------------
+
+
+def jittered(seed: int, count: int, spread: float) -> np.ndarray:
+    """Steps of 10 ms with an even spread of this share."""
+    steps = 0.01 * (1.0 + spread * np.random.default_rng(seed).uniform(-1.0, 1.0, count - 1))
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+@pytest.mark.parametrize("spread", [0.7, 0.45])
+def test_an_uneven_rate_is_resampled_on_the_rotation(spread: float, tmp_path: Path) -> None:
+    recording = load_session(write(tmp_path, table_at(jittered(1, 1000, spread))))
+    np.testing.assert_allclose(np.diff(recording.time), np.diff(recording.time)[0])
+    error = rotation_error_deg(recording.sensors["torso"], recording.time)
+    assert error.max() < 0.05
+    assert "resampled to" in recording.notes[0]
+    assert "(steps between" in recording.notes[0]
+
+
+def test_resampling_beats_taking_the_rate_for_even(tmp_path: Path) -> None:
+    """A rate that swings by 40 % within two seconds: taken for even, the rotation would be off by degrees."""
+    k = np.arange(1200)
+    time = 0.01 * k + 0.4 * 0.01 * np.cumsum(np.sin(2.0 * np.pi * k / 200.0))
+    table = table_at(time)
+    recording = load_session(write(tmp_path, table))
+    assert "the rate changes by up to" in recording.notes[0]
+    assert rotation_error_deg(recording.sensors["torso"], recording.time).max() < 0.1
+    even = Sensor(gyro_S=table[SIGNALS["gyro"]].to_numpy(), accel_S=table[SIGNALS["accel"]].to_numpy())
+    taken = Rotation.from_quat(so3.integrate(even.gyro_S[1:] * np.diff(time).mean()))
+    assert np.degrees((taken.inv() * true_orientation(time)).magnitude()).max() > 10.0
+
+
+def test_jitter_of_a_clock_is_left_alone(tmp_path: Path) -> None:
+    """As `prova_HR.txt`: a step in 500 is 11 instead of 10."""
+    steps = np.full(3000, 0.001)
+    steps[::500] = 0.0011
+    table = table_at(np.concatenate([[0.0], np.cumsum(steps)]))
+    recording = load_session(write(tmp_path, table))
+    assert recording.notes == ()
+    np.testing.assert_array_equal(recording.sensors["torso"].gyro_S, table[SIGNALS["gyro"]])
+
+
+@pytest.mark.parametrize(
+    ("own_rate", "sensor"), [(100.0, "offset_s = 0.25"), (97.3, ""), (1000.0, ""), (400.0, "rate_hz = 400.0")]
+)
+def test_sensors_with_clocks_of_their_own_come_to_one_time(own_rate: float, sensor: str, tmp_path: Path) -> None:
+    """The torso at 100 Hz from 0 s, the head at its own rate on a clock that runs behind by `offset_s`."""
+    offset = 0.25 if "offset" in sensor else 0.0
+    its_own = np.arange(0.0, 9.0, 1.0 / own_rate) + (0.003 if "rate_hz" not in sensor else 0.0)
+    head = table_at(its_own).with_columns(pl.col("time") - offset)
+    path = write(tmp_path, table_at(np.arange(1000) / 100.0), sensor=sensor, head=head)
+    recording = load_session(path)
+    time = recording.time
+    assert recording.rate_hz == pytest.approx(min(100.0, own_rate), rel=1e-5)
+    assert time[0] >= its_own[0] - 1e-9
+    assert time[-1] <= its_own[-1] + 1e-9
+    for segment in ("torso", "head"):
+        error = rotation_error_deg(recording.sensors[segment], time)
+        assert error.max() < 0.02
+        accel = recording.sensors[segment].accel_S
+        assert np.abs(accel - true_orientation(time).inv().apply([0.0, 0.0, 9.81])).max() < 0.05
+    assert "the sensors' clocks differ" in recording.notes[0]
+
+
+def test_a_faster_sensor_is_averaged_so_that_its_noise_does_not_fold_down() -> None:
+    rng = np.random.default_rng(0)
+    clock = np.arange(20000) / 1000.0
+    noisy = Sensor(gyro_S=0.1 * rng.standard_normal((20000, 3)), accel_S=rng.standard_normal((20000, 3)))
+    slow = on_time(noisy, clock, np.arange(1900) / 100.0)
+    assert slow.accel_S is not None
+    assert slow.gyro_S is not None
+    np.testing.assert_allclose(slow.accel_S.std(), 1.0 / np.sqrt(10.0), rtol=0.05)
+    np.testing.assert_allclose(slow.gyro_S.std(), 0.1 / np.sqrt(10.0), rtol=0.05)
+
+
+def test_the_same_clock_in_two_files_is_not_resampled(tmp_path: Path) -> None:
+    table = table_at(np.arange(1000) / 100.0, 0.01)
+    recording = load_session(write(tmp_path, table, head=table.with_columns(pl.col("time") + 1e-7)))
+    assert recording.notes == ()
+    np.testing.assert_array_equal(recording.sensors["head"].gyro_S, table[SIGNALS["gyro"]])
+
+
+def test_a_gap_is_marked_on_the_common_time(tmp_path: Path) -> None:
+    time = np.arange(1000) / 100.0
+    head = table_at(time + 0.004).with_columns(
+        pl.when(where((time < 5.0) | (time > 6.0))).then(pl.col(RAW)).name.keep()
+    )
+    recording = load_session(write(tmp_path, table_at(time), head=head), gaps=True)
+    gap = recording.sensors["head"].gap
+    assert gap is not None
+    marked = recording.time[gap]
+    assert marked.min() == pytest.approx(5.004, abs=0.011)
+    assert marked.max() == pytest.approx(6.004, abs=0.011)
+    assert 99 <= gap.sum() <= 103
+    assert not recording.sensors["torso"].gap.any()
+
+
+def test_lost_rows_are_put_back_at_their_times() -> None:
+    time = np.delete(np.arange(20) / 100.0, [3, 10, 11, 12])
+    clock = clock_of(time, "x")
+    np.testing.assert_allclose(clock.time, np.arange(20) / 100.0)
+    assert clock.row.tolist() == [0, 1, 2, -1, 3, 4, 5, 6, 7, 8, -1, -1, -1, *range(9, 16)]
+    base, notes = common_time("x", {"torso": clock})
+    assert base is clock.time
+    assert notes == ()
+
+
+# Pieces ------------------------------------------------------------------------------------------------------------
+
+
+def joined(pieces: list[Recording], segment: str, name: str) -> np.ndarray:
+    return np.concatenate([getattr(piece.sensors[segment], name) for piece in pieces])
+
+
+@pytest.mark.parametrize("file", ["hand.csv", "hand.parquet"])
+@pytest.mark.parametrize("seconds", [0.02, 0.37, 3.0, 100.0])
+def test_pieces_put_together_are_the_whole(file: str, seconds: float, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("wepose_pin.readers.tables.BLOCK_ROWS", 101)
+    time = np.arange(1000) / 100.0
+    table = table_at(time, 0.01)
+    holes = (np.arange(1000) % 37 < 4) & (time > 0.5)
+    table = table.with_columns(pl.when(where(~holes)).then(pl.col("gx", "az")).name.keep()).filter(
+        np.arange(1000) % 53 != 5
+    )
+    path = write(tmp_path, table, file=file)
+    whole = load_session(path)
+    pieces = list(iter_session(path, seconds))
+    assert all(check(piece) is piece for piece in pieces)
+    assert all(piece.rate_hz == whole.rate_hz for piece in pieces)
+    np.testing.assert_array_equal(np.concatenate([piece.time for piece in pieces]), whole.time)
+    for name in ("gyro_S", "accel_S"):
+        np.testing.assert_array_equal(joined(pieces, "torso", name), getattr(whole.sensors["torso"], name))
+    assert len(pieces) == pytest.approx(max(1, 10.0 / seconds), abs=1)
+    spans = [span for piece in pieces for span in piece.phases.get("start", ())]
+    assert spans[0][0] == 0.5
+    assert spans[-1][1] == pytest.approx(1.9, abs=0.011)
+
+
+@pytest.mark.parametrize("ready", [False, True])
+def test_pieces_of_sensors_with_own_clocks_agree_to_rounding(ready: bool, tmp_path: Path) -> None:
+    head = table_at(np.arange(0.05, 9.0, 1.0 / 333.0))
+    path = write(tmp_path, table_at(np.arange(1000) / 100.0), ready=ready, head=head)
+    whole, pieces = load_session(path), list(iter_session(path, 1.3))
+    np.testing.assert_array_equal(np.concatenate([piece.time for piece in pieces]), whole.time)
+    for segment, sensor in whole.sensors.items():
+        for name in ("quat_WS",) if sensor.ready else ("gyro_S", "accel_S"):
+            np.testing.assert_allclose(joined(pieces, segment, name), getattr(sensor, name), atol=1e-9)
+
+
+def test_pieces_find_what_the_whole_finds(tmp_path: Path) -> None:
+    time = np.arange(1000) / 100.0
+    table = table_at(time).with_columns(pl.when(where((time < 7.0) | (time > 7.2))).then(pl.col("gx")))
+    pieces = iter_session(write(tmp_path, table), 1.0)
+    for _ in range(6):
+        next(pieces)
+    with pytest.raises(BadData, match=r"sensors\.torso\.gyro: \d+ samples without numbers"):
+        list(pieces)
+    text = table.with_columns(gx=pl.col("gx").cast(pl.String).replace(table["gx"][900], "x")).write_csv()
+    (tmp_path / "hand.csv").write_text(text)
+    with pytest.raises(BadData, match="column 'gx' holds text in row 901: 'x'"):
+        load_session(tmp_path)
+    (tmp_path / "hand.csv").write_text(text.replace(",,", ",0.0,"))
+    with pytest.raises(BadData, match="column 'gx' holds text in row 901: 'x'"):
+        list(iter_session(tmp_path, 1.0))
+    with pytest.raises(BadOption, match="seconds=0"):
+        next(iter_session(tmp_path, 0))
+
+
+# Plausibility ------------------------------------------------------------------------------------------------------
+
+
+def test_saturation_is_counted(tmp_path: Path) -> None:
+    table = table_at(np.arange(1000) / 100.0, 0.005).with_columns(pl.col("gx", "gy").clip(-2.5, 2.5))
+    notes = load_session(write(tmp_path, table)).notes
+    for axis in "xy":
+        count = int((table[f"g{axis}"].abs() == 2.5).sum())
+        note = next(note for note in notes if f"samples on {axis} stand at" in note)
+        assert note.startswith("sensors.torso.gyro: ")
+        assert abs(int(note.split()[1]) - count) <= 4  # single and double samples at the limit do not count
+    assert len(notes) == 2
+
+
+def test_a_slow_peak_of_a_coarse_sensor_is_no_saturation() -> None:
+    time = np.arange(8000) / 1000.0
+    gyro_S = np.zeros((8000, 3))
+    gyro_S[:, 1] = np.round(3.0 * np.sin(2.0 * time), 3)
+    quat = so3.integrate(gyro_S[1:] / 1000.0)
+    sensor = Sensor(gyro_S=gyro_S, accel_S=Rotation.from_quat(quat).inv().apply([0.0, 0.0, 9.81]))
+    assert sensor_notes(Recording("r", time, 1000.0, {"torso": sensor})) == ()
+
+
+def test_a_scale_that_is_off_is_noted(tmp_path: Path) -> None:
+    table = table_at(np.arange(1000) / 100.0).with_columns(pl.col(SIGNALS["accel"]) * 1.1)
+    (note,) = load_session(write(tmp_path, table)).notes
+    assert "sensors.torso.accel: norm 10.79 m/s^2 in phases.start (0.5 to 1.9 s)" in note
+
+
+def real_sensors(data: Path) -> dict[str, tuple[float, np.ndarray, np.ndarray]]:
+    """Every raw sensor of the real recordings: rate, gyro [rad/s], accel [m/s²]."""
+    found = {}
+    for path in sorted((data / "broad").glob("*.mat")):
+        trial = loadmat(path)
+        found[path.stem] = (2000.0 / 7.0, trial["imu_gyr"], trial["imu_acc"])
+    for path in sorted((data / "ur5" / "imu").glob("*/*.csv")):
+        table = read_table(path)
+        found[f"{path.parent.name} {path.stem}"] = (
+            125.0,
+            table.select(r"gyr_x", "gyr_y", "gyr_z").to_numpy(),
+            table.select("acc_x", "acc_y", "acc_z").to_numpy(),
+        )
+    for path in sorted((data / "ring" / "trial1").glob("imu*.csv")):
+        table = read_table(path)
+        for k in range(1, 6):
+            gyro, accel = ([f"seg{k}_{name}_{axis}" for axis in "xyz"] for name in ("gyr", "acc"))
+            found[f"{path.stem} {k}"] = (40.0, table[gyro].to_numpy(), table[accel].to_numpy())
+    prova = np.loadtxt(data / "wepose_hr" / "prova_HR.txt", usecols=range(7), comments=";")
+    found["prova"] = (1000.0, prova[:, 1:4], prova[:, 4:7])
+    upper = load_session(data / "upper_body")
+    for segment, sensor in upper.sensors.items():
+        found[segment] = (upper.rate_hz, sensor.gyro_S, sensor.accel_S)
+    return {name: value for name, value in found.items() if all(np.isfinite(v).all() for v in value[1:])}
+
+
+def test_real_recordings_raise_no_alarm_and_their_units_are_told_apart(data: Path) -> None:
+    sensors = real_sensors(data)
+    assert len(sensors) > 40
+    caught = dict.fromkeys(("deg/s", "rad/s"), 0)
+    for name, (rate_hz, gyro, accel) in sensors.items():
+        time = np.arange(len(gyro)) / rate_hz
+
+        def notes(gyro: np.ndarray, accel: np.ndarray, time=time, rate_hz=rate_hz) -> tuple[str, ...]:
+            return sensor_notes(Recording("r", time, rate_hz, {"torso": Sensor(gyro_S=gyro, accel_S=accel)}))
+
+        assert notes(gyro, accel) == (), name
+        with pytest.raises(BadData, match='accel_unit = "g" would fit'):
+            notes(gyro, accel / 9.81)
+        with pytest.raises(BadData, match=r'accel_unit = "m/s\^2" would fit'):
+            notes(gyro, accel * 9.81)
+        for factor, unit in ((180.0 / np.pi, "deg/s"), (np.pi / 180.0, "rad/s")):
+            with suppress(BadData):
+                notes(gyro * factor, accel)
+                continue
+            with pytest.raises(BadData, match=f'gyro_unit = "{unit}" would fit'):
+                notes(gyro * factor, accel)
+            caught[unit] += 1
+    # The arm of the UR5 hardly turns about horizontal axes, and some trials of BROAD only move along.
+    assert caught["deg/s"] >= len(sensors) - 5
+    assert caught["rad/s"] >= len(sensors) // 2
+
+
+def test_the_upper_body_session_reads_without_a_note(data: Path) -> None:
+    recording = load_session(data / "upper_body")
+    assert recording.notes == ()
+    table = read_table(data / "upper_body" / "upper_body.csv")
+    for segment, sensor in recording.sensors.items():
+        np.testing.assert_array_equal(sensor.gyro_S, table[[f"{segment}_gyr_{axis}" for axis in "xyz"]])
+    assert same(recording, recording)
+    for segment in recording.sensors:
+        pieces = list(iter_session(data / "upper_body", 7.0))
+        np.testing.assert_array_equal(joined(pieces, segment, "accel_S"), recording.sensors[segment].accel_S)

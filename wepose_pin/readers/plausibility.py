@@ -1,0 +1,198 @@
+"""Whether the sensors' values can be what the session says they are: units, ranges, saturation.
+
+The rules are physics and not habits, so that they hold for any sensor that is strapped on anything:
+
+- at rest an accelerometer shows gravity;
+- turned by the gyroscope's own rotation, specific force averages to gravity over seconds, as speed stays bounded;
+- a sensor that was tilted has turned at least by as much.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .. import so3
+from ..errors import BadData
+from ..recording import Recording, Sensor
+from .clocks import runs
+
+GRAVITY = 9.80665
+# Mean of ‖accel‖ at rest over gravity: what no sensor is off by, and what is worth a word.
+GRAVITY_OFF, GRAVITY_NOTE = 0.2, 0.06
+# No body sensor measures more; beyond is a wrong unit or a number that stands for a missing value.
+MOST_GYRO = 80.0  # [rad/s]
+MOST_ACCEL = 4000.0  # [m/s²]
+
+WINDOW_S = 2.0  # over which specific force averages to gravity
+WINDOWS = 40  # those with most motion
+FEWEST_WINDOWS = 3
+# Coherence is the norm of the mean of turned specific force over the mean of its norm. Taking deg/s for rad/s makes it
+# tumble: it falls below one of these shares of that of rates a factor 57.3 smaller. By stretches of three windows or
+# more of 41 real sensors, the first is met by none, the second by none that turns so fast.
+TUMBLES, COHERENT = 0.6, 0.8  # the share, where the smaller rates themselves are coherent at least so
+TUMBLES_FAST, FAST = 0.85, 8.0  # the share, where the mean rate is above this [rad/s]
+STIFF = 0.93  # the share of the coherence of rates a factor 57.3 larger, where these are coherent so
+TILTED = np.deg2rad(20.0)  # between two windows, from which the gyroscope must have seen it
+UNSEEN = 0.25  # share of that tilt which the gyroscope has seen at most, where its unit is too small
+
+# Below the smallest ranges that are built (±125 deg/s, ±2 g) nothing saturates.
+SATURATED_GYRO = 2.0  # [rad/s]
+SATURATED_ACCEL = 15.0  # [m/s²]
+PLATEAU = 3  # samples
+
+
+def sensor_notes(recording: Recording, *, whole: bool = True) -> tuple[str, ...]:
+    """What the user should know of the values; a piece that is not the `whole` knows rest only from stated phases.
+
+    Raises
+    ------
+    BadData
+        Values that cannot be: of another unit, or out of every sensor's range.
+    """
+    notes: list[str] = []
+    for segment, sensor in recording.sensors.items():
+        if sensor.gyro_S is None or sensor.accel_S is None:
+            continue
+        place = f"{recording.where()}: sensors.{segment}"
+        notes += _gravity(recording, sensor, place, whole)
+        _gyro_unit(sensor.gyro_S, sensor.accel_S, recording.rate_hz, place)
+        _range(recording.time, sensor.gyro_S, MOST_GYRO, "rad/s", f"{place}.gyro")
+        _range(recording.time, sensor.accel_S, MOST_ACCEL, "m/s^2", f"{place}.accel")
+        for name, values, least in (
+            ("gyro", sensor.gyro_S, SATURATED_GYRO),
+            ("accel", sensor.accel_S, SATURATED_ACCEL),
+        ):
+            notes += _saturation(values, least, f"sensors.{segment}.{name}")
+    return tuple(notes)
+
+
+def _gravity(recording: Recording, sensor: Sensor, place: str, whole: bool) -> list[str]:
+    assert sensor.accel_S is not None
+    name = next((name for name in ("still", "start") if recording.phases.get(name)), "")
+    if name:
+        first, last = recording.phases[name][0]
+        at_rest, when = recording.span((first, last)), f"in phases.{name}"
+    elif whole:
+        at_rest, when = _quiet_second(recording, sensor), "in its quietest second"
+    else:
+        return []
+    if at_rest.stop - at_rest.start < 2:
+        return []
+    when += f" ({recording.time[at_rest.start]:g} to {recording.time[at_rest.stop - 1]:g} s)"
+    norm = float(np.linalg.norm(sensor.accel_S[at_rest], axis=1).mean())
+    off = abs(norm / GRAVITY - 1.0)
+    found = f"norm {norm:.4g} m/s^2 {when}, where gravity's {GRAVITY:.3g} is expected"
+    if off > GRAVITY_OFF:
+        raise BadData(f"{place}.accel: {found}; {_accel_unit(norm)}")
+    return [f"{place.split(': ')[-1]}.accel: {found}: the scale is taken from it"] if off > GRAVITY_NOTE else []
+
+
+def _accel_unit(norm: float) -> str:
+    """Which unit makes gravity of a norm that is not."""
+    for factor, unit in ((GRAVITY, '"g"'), (1.0 / GRAVITY, '"m/s^2"')):
+        if abs(norm * factor / GRAVITY - 1.0) < GRAVITY_OFF:
+            return f"data.accel_unit = {unit} would fit"
+    for factor in (1e-3, 1e-3 * GRAVITY):
+        if abs(norm * factor / GRAVITY - 1.0) < GRAVITY_OFF:
+            return 'the values look like thousandths of g (mg); divide them by 1000 and state accel_unit = "g"'
+    if norm < 0.5:
+        return "gravity seems to have been taken out; specific force is needed, +g up at rest"
+    return "check data.accel_unit and the sensor's calibration, and that it rests there"
+
+
+def _quiet_second(recording: Recording, sensor: Sensor) -> slice:
+    """Samples of the second in which the rate varies least."""
+    assert sensor.gyro_S is not None
+    n = len(recording)
+    size = min(n, max(2, round(recording.rate_hz)))
+    blocks = sensor.gyro_S[: n // size * size].reshape(-1, size, 3)
+    first = int(np.argmin(blocks.var(axis=1).sum(axis=1))) * size
+    return slice(first, first + size)
+
+
+def _gyro_unit(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, place: str) -> None:
+    size = round(WINDOW_S * rate_hz)
+    count = len(gyro_S) // size
+    if count < FEWEST_WINDOWS:
+        return
+    gyro, accel = gyro_S[: count * size].reshape(count, size, 3), accel_S[: count * size].reshape(count, size, 3)
+    speed = np.linalg.norm(gyro, axis=2).mean(axis=1)
+    moving = np.argsort(-speed, kind="stable")[:WINDOWS]
+    as_stated, smaller, larger = (
+        np.mean([_coherence(scale * gyro[k], accel[k], rate_hz) for k in moving])
+        for scale in (1.0, np.pi / 180.0, 180.0 / np.pi)
+    )
+    tumbles = as_stated < TUMBLES * smaller and smaller > COHERENT
+    if tumbles or (as_stated < TUMBLES_FAST * smaller and speed[moving].mean() > FAST):
+        peak = float(np.max(np.abs(gyro_S)))
+        raise BadData(
+            f"{place}.gyro: with rates up to {peak:.3g} rad/s gravity would tumble, and accel shows that it does not; "
+            f'data.gyro_unit = "deg/s" would fit'
+        )
+    if as_stated < STIFF * larger and larger > COHERENT:
+        raise BadData(
+            f"{place}.gyro: with rates up to {float(np.max(np.abs(gyro_S))):.3g} rad/s the sensor turns too little for "
+            f'what accel shows; data.gyro_unit = "rad/s" would fit'
+        )
+    mean = accel.mean(axis=1)
+    norm = np.linalg.norm(mean, axis=1)
+    up = mean / np.maximum(norm, 1e-9)[:, None]
+    tilt = np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0))
+    steady = np.abs(norm / GRAVITY - 1.0) < 0.1
+    tilt[~(steady[1:] & steady[:-1])] = 0.0
+    path = WINDOW_S * speed
+    unseen = (tilt > TILTED) & (path[1:] + path[:-1] < UNSEEN * tilt)
+    if unseen.any():
+        k = int(np.argmax(np.where(unseen, tilt, 0.0)))
+        raise BadData(
+            f"{place}.gyro: accel shows a tilt by {np.degrees(tilt[k]):.0f} deg between {k * size / rate_hz:g} and "
+            f"{(k + 2) * size / rate_hz:g} s from the beginning, gyro turns by {np.degrees(path[k] + path[k + 1]):.2g} "
+            f'deg; data.gyro_unit = "rad/s" would fit, or the gyroscope does not measure'
+        )
+
+
+def _coherence(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
+    """Norm of the mean of specific force, turned by the gyroscope's rotation, over the mean of its norm."""
+    turned = Rotation.from_quat(so3.integrate(gyro_S[1:] / rate_hz)).apply(accel_S)
+    return float(np.linalg.norm(turned.mean(axis=0)) / max(np.linalg.norm(accel_S, axis=1).mean(), 1e-9))
+
+
+def _range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: str) -> None:
+    size = np.abs(values)
+    if size.max() > most:
+        k, axis = np.unravel_index(int(np.argmax(size)), size.shape)
+        raise BadData(
+            f"{place}: {values[k, axis]:.6g} {unit} on {'xyz'[axis]} at {time[k]:.3f} s, no sensor measures above "
+            f"{most:g}; check the unit, and leave cells of lost samples empty"
+        )
+
+
+def _saturation(values: np.ndarray, least: float, place: str) -> list[str]:
+    """A note for each axis that stays at its extreme value as if cut off there."""
+    notes = []
+    for axis, name in enumerate("xyz"):
+        x = values[:, axis]
+        cut = 0
+        for extreme in (float(x.max()), float(x.min())):
+            if abs(extreme) < least:
+                continue
+            same = 1e-9 * abs(extreme)
+            plateaus = [(a, b) for a, b in runs(np.abs(x - extreme) <= same) if PLATEAU <= b - a < len(x)]
+            if not plateaus:
+                continue
+            # A slow signal rests on its peak too, a quantum below on both sides; one that is cut off comes steeply.
+            steps = np.abs(np.diff(x))
+            quantum = float(steps[steps > same].min())
+            steep = [
+                (a, b) for a, b in plateaus if max(*steps[max(a - 1, 0) : a], *steps[b - 1 : b], 0.0) > 3 * quantum
+            ]
+            cut += sum(b - a for a, b in steep)
+            if steep:
+                reached = extreme
+        if cut:
+            notes.append(
+                f"{place}: {cut} samples on {name} stand at {reached:.4g}, as if cut off by the sensor's range; "
+                f"choose a larger range"
+            )
+    return notes
