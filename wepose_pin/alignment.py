@@ -42,6 +42,8 @@ class Segments:
     quat_LS : segment → (4,) xyzw, the mount used
     heading : segment → ψ [rad], from the sensor's world to W
     orientation : segment → what the filter gave; none for ready orientations
+    covariance_W : segment → (n, 3, 3) [rad²], of the error on the left of `quat_WL`, in W: the filter's, and that of a
+        calibrated mount. A stated mount counts as exact. Only where the filter has one
     start, still : intervals [s] used for headings, and for noise and bias
     warnings : what the user should know
     """
@@ -51,6 +53,7 @@ class Segments:
     quat_LS: Mapping[str, np.ndarray]
     heading: Mapping[str, float]
     orientation: Mapping[str, Orientation]
+    covariance_W: Mapping[str, np.ndarray]
     start: tuple[float, float]
     still: tuple[float, float]
     warnings: tuple[str, ...]
@@ -74,7 +77,7 @@ def segment_orientations(
     """
     check_method(method)
     start, still, warnings = _phases(recording)
-    quat_WL, quat_LS, heading, orientation = {}, {}, {}, {}
+    quat_WL, quat_LS, heading, orientation, covariance_W = {}, {}, {}, {}, {}
     for segment, sensor in recording.sensors.items():
         warnings += _motion(recording, segment, start, "start")
         if still != start:
@@ -117,7 +120,9 @@ def segment_orientations(
         quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
         quat_LS[segment] = R_LS.as_quat()
         heading[segment] = psi
-    return Segments(recording.time, quat_WL, quat_LS, heading, orientation, start, still, tuple(warnings))
+        if segment in orientation and orientation[segment].attitude_cov is not None:
+            covariance_W[segment] = _covariance_W(recording, segment, subject, turn * R_VS, R_LS, orientation[segment])
+    return Segments(recording.time, quat_WL, quat_LS, heading, orientation, covariance_W, start, still, tuple(warnings))
 
 
 def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
@@ -137,6 +142,25 @@ def _nominal_mount(recording: Recording, segment: str, subject: Subject | None) 
         f'{recording.where()}: sensors.{segment}.mount is not known: state it, as in mount = {{ up = "+x", '
         f'forward = "-z" }}, or give a subject with calibrated mounts'
     )
+
+
+def _covariance_W(
+    recording: Recording,
+    segment: str,
+    subject: Subject | None,
+    R_WS: Rotation,
+    R_LS: Rotation,
+    orientation: Orientation,
+) -> np.ndarray:
+    R = R_WS.as_matrix()
+    assert orientation.attitude_cov is not None
+    cov_W = R @ orientation.attitude_cov @ R.swapaxes(1, 2)
+    axes = [f"mounts.{segment}.{axis}" for axis in "xyz"]
+    if subject is not None and recording.strapping != "new" and set(axes) <= set(subject.order):
+        rows = [subject.order.index(axis) for axis in axes]
+        R = (R_WS * R_LS.inv()).as_matrix()
+        cov_W = cov_W + R @ subject.covariance[np.ix_(rows, rows)] @ R.swapaxes(1, 2)
+    return cov_W
 
 
 def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[str]]:

@@ -123,6 +123,8 @@ def track(
     subject: OptionalPath = None,
     model: OptionalPath = None,
     method: Method = "smekf",
+    gaps: bool = False,
+    covariance: bool = False,
     force: bool = False,
 ) -> None:
     """Recording to pose: orientations, points, a summary, and a page to look at.
@@ -133,8 +135,10 @@ def track(
         session: session.toml, or the folder that holds it.
         out: Folder for pose.parquet, subject.toml, subject.urdf, summary.json, view.html.
         subject: subject.toml of `wepose calibrate`, or its folder; without it lengths are an average person's.
-        model: A body's URDF whose links are named after the segments; without it ours.
+        model: A body's URDF, or a TOML that names it and its links (docs/models.md); without it ours.
         method: The orientation filter.
+        gaps: Accept lost samples for longer than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap).
+        covariance: Write the covariances of orientations and points, not only their standard deviations.
         force: Replace files of an earlier run.
     """
     from .model import load_model
@@ -146,12 +150,12 @@ def track(
 
     with whole_folder(out, force) as folder, _steps(3) as step:
         step("reading")
-        recording = load_session(session)
+        recording = load_session(session, gaps=gaps)
         who = load_subject(subject) if subject else None
         body = load_model(model) if model else None
         step(f"tracking by {method}")
         pose = follow(recording, who, method=method, model=body)
-        write_result(folder, pose)
+        write_result(folder, pose, covariance)
         step("making the page")
         assert pose.model is not None
         page = pose_html(pose.model, pose, phases=recording.phases, title=recording.name)

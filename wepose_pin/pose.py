@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from . import so3
 from .errors import BadData, BadModel, one_of
-from .model import POINTS, BodyModel
+from .model import POINTS, BodyModel, chains
+from .model.chains import about, axis_in_joint, conjugate, multiply, solve
 from .recording import SEGMENTS
+from .subject import LENGTHS
 
 
 @dataclass(frozen=True)
@@ -27,20 +29,26 @@ class Pose:
     points : point → (n, 3) [m] in W; only points that are known
     q : (n, nq) configuration of the Pinocchio model; unmeasured segments are rigid with the one above; None where the
         pose came from a table
+    segment_cov : segment → (n, 3, 3) [rad²], covariance of the orientation's error in W (on the left of `quat_WL`)
+    point_cov : point → (n, 3, 3) [m²], in W
+    gap : segment → (n,) bool, true where its sensor gave nothing and a long gap was bridged; empty where that was not
+        allowed
     """
 
     time: np.ndarray
     quat_WL: Mapping[str, np.ndarray]
     points: Mapping[str, np.ndarray]
     q: np.ndarray | None = None
+    segment_cov: Mapping[str, np.ndarray] = field(default_factory=dict)
+    point_cov: Mapping[str, np.ndarray] = field(default_factory=dict)
+    gap: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def pose_of(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
     """The pose of `model` with measured segment orientations `quat_WL`, segment → (n, 4) xyzw."""
     q = configuration(model, quat_WL)
-    known = known_points(quat_WL)
-    frames = [link for point, link in POINTS.items() if point in known]
-    _, p_W = forward_kinematics(model, q, frames, rotations=False)
+    known = [point for point in known_points(quat_WL) if model.pin.existFrame(POINTS[point])]
+    _, p_W = forward_kinematics(model, q, [POINTS[point] for point in known], rotations=False)
     points = {point: p_W[:, k] for k, point in enumerate(known)}
     return Pose(time, {name: so3.continuous(quat) for name, quat in quat_WL.items()}, points, q)
 
@@ -69,46 +77,78 @@ def known_links(model: BodyModel, segments: Iterable[str]) -> list[str]:
     without one is not known, and what hangs on it neither.
     """
     have = set(segments)
-    spherical = {joint: link for link, joint in model.joints.items()}
+    guessed = {
+        joint
+        for segment, chain in chains(model.pin).items()
+        if segment not in have and not segment.endswith(("hand", "head", "pelvis"))
+        for joint in chain.joints
+    }
     known_joint = {0: True}
     for joint in range(1, model.pin.njoints):
-        link = spherical.get(joint, "")
-        guessed = link in SEGMENTS and not link.endswith(("hand", "head", "pelvis"))
-        known_joint[joint] = known_joint[model.pin.parents[joint]] and (link in have or not guessed)
+        known_joint[joint] = known_joint[model.pin.parents[joint]] and joint not in guessed
     return [frame.name for frame in model.pin.frames[1:] if known_joint[frame.parentJoint]]
 
 
 def configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Configuration `q` (n, nq): at each spherical joint the quaternion of its link relative to the link above.
+    """Configuration `q` (n, nq) in which the segments have their measured orientations, or come nearest to them.
 
-    Segments without an orientation are rigid with the segment above; other joints are at zero.
+    A segment behind a spherical joint has its orientation exactly; behind fewer axes the one at the smallest angle
+    from it, which `deviation` gives. Each is brought there from where the one above really stands, so that what one
+    misses is not handed on. `wepose_pin.model.chains` says which joints move. Segments without an orientation are rigid
+    with the one above.
 
     Raises
     ------
     BadModel
-        A measured segment is no link of the model, or does not hang on a spherical joint.
+        The model has no link for a measured segment.
     """
     n = len(next(iter(quat_WL.values())))
+    found = chains(model.pin)
     for segment in quat_WL:
-        if segment not in model.joints:
-            raise BadModel(
-                f"{model.pin.name}: segment '{segment}' hangs on no spherical joint of this model; "
-                f"{one_of(model.joints, segment)}"
-            )
-    link_of = {joint: link for link, joint in model.joints.items()}
+        if segment not in found:
+            raise BadModel(f"{model.pin.name}: the model has no link for segment '{segment}'; {one_of(found, segment)}")
+    begins = {chain.joints[0]: segment for segment, chain in found.items() if chain.joints and segment in quat_WL}
     q = np.tile(pin.neutral(model.pin), (n, 1))
-    world: list[Rotation] = [Rotation.identity(n)]  # orientation in W of each joint's moving frame
+    identity = np.array([0.0, 0.0, 0.0, 1.0])
+    world = [identity]  # orientation in W of each joint's moving frame, (n, 4) or (4,)
+    turns: dict[int, np.ndarray] = {}  # joint → its own rotation, the same
     for joint in range(1, model.pin.njoints):
-        above = world[model.pin.parents[joint]] * Rotation.from_matrix(model.pin.jointPlacements[joint].rotation)
-        link = link_of.get(joint, "")
-        if link not in quat_WL:
-            world.append(above)
-            continue
-        # The moving frame of a spherical joint is its link's frame.
-        world.append(Rotation.from_quat(quat_WL[link]))
-        first = model.pin.idx_qs[joint]
-        q[:, first : first + 4] = so3.continuous((above.inv() * world[-1]).as_quat())
+        above = model.pin.parents[joint]
+        if joint in begins:
+            chain = found[begins[joint]]
+            values = solve(chain, multiply(conjugate(world[chain.above]), quat_WL[begins[joint]]))
+            for moved, value in zip(chain.joints, values, strict=True):
+                turns[moved] = _set(model, q, moved, value)
+        placement = pin.Quaternion(model.pin.jointPlacements[joint].rotation).coeffs()
+        world.append(multiply(world[above], multiply(placement, turns.get(joint, identity))))
     return q
+
+
+def _set(model: BodyModel, q: np.ndarray, joint: int, value: np.ndarray) -> np.ndarray:
+    """Write a joint's value into `q`: an angle (n,) [rad] or a rotation (n, 4); gives its rotation."""
+    first = model.pin.idx_qs[joint]
+    if value.ndim == 2:
+        value = so3.continuous(value / np.linalg.norm(value, axis=1)[:, None])
+        q[:, first : first + 4] = value
+        return value
+    if model.pin.nqs[joint] == 1:
+        q[:, first] = value
+    else:  # without limits: cosine and sine
+        q[:, first], q[:, first + 1] = np.cos(value), np.sin(value)
+    axis = axis_in_joint(model.pin, joint)
+    assert axis is not None
+    return about(axis, value)
+
+
+def deviation(model: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Segment → angle (n,) [rad] by which the model in `q` misses its measured orientation.
+
+    Only segments that cannot follow every orientation: behind one or two axes, or rigid with another.
+    """
+    lame = [segment for segment, chain in chains(model.pin).items() if segment in quat_WL and not chain.exact]
+    R_WL, _ = forward_kinematics(model, q, lame)
+    is_at = {segment: Rotation.from_matrix(R_WL[:, k]) for k, segment in enumerate(lame)}
+    return {segment: (is_at[segment].inv() * Rotation.from_quat(quat_WL[segment])).magnitude() for segment in lame}
 
 
 def forward_kinematics(
@@ -139,17 +179,103 @@ def placements(model: BodyModel, q: np.ndarray, links: Iterable[str]) -> dict[st
     return {link: (so3.continuous(quat[:, k]), p[:, k]) for k, link in enumerate(links)}
 
 
+# Confidence --------------------------------------------------------------------------------------------------------
+
+
+def point_covariance(
+    points: Mapping[str, np.ndarray],
+    quat_WL: Mapping[str, np.ndarray],
+    segment_cov: Mapping[str, np.ndarray],
+    lengths_cov: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Covariance (n, 3, 3) [m²] in W of each point whose way from the root has covariances all along.
+
+    The way to a point is a sum of vectors v that are turned by segments: an error δ of a segment's orientation moves
+    the point by δ × v, errors of different sensors are independent, errors of the lengths act along the vectors.
+
+    Parameters
+    ----------
+    points : point → (n, 3) [m], with all points on the way
+    segment_cov : segment → (n, 3, 3) [rad²] in W
+    lengths_cov : (8, 8) [m²] in the order of `LENGTHS`; zeros: known exactly
+    """
+    found: dict[str, np.ndarray] = {}
+    if "torso" not in segment_cov:
+        return found
+    R_torso = Rotation.from_quat(quat_WL["torso"]).as_matrix()
+    for side, sign in (("left", 0.5), ("right", -0.5)):
+        hand = f"{side}_hand" if f"{side}_hand" in quat_WL else f"{side}_forearm"
+        way = (  # point, the segment that turns the last vector, the length along it
+            ("shoulder", "torso", ""),
+            ("elbow", f"{side}_upper_arm", f"{side}_upper_arm"),
+            ("wrist", f"{side}_forearm", f"{side}_forearm"),
+            ("hand", hand, f"{side}_hand"),
+        )
+        vectors: dict[str, np.ndarray] = {}
+        along = np.zeros((len(R_torso), 3, len(LENGTHS)))
+        before = np.zeros((len(R_torso), 3))
+        for point, segment, length in way:
+            p = points.get(f"{side}_{point}")
+            if p is None or segment not in segment_cov:
+                break
+            v = p - before
+            vectors[segment] = vectors.get(segment, 0.0) + v
+            if length:
+                along[:, :, LENGTHS.index(length)] = v / np.linalg.norm(v, axis=1, keepdims=True)
+            else:
+                along[:, :, LENGTHS.index("trunk")] = R_torso[:, :, 2]
+                along[:, :, LENGTHS.index("shoulder_width")] = sign * R_torso[:, :, 1]
+            cov = along @ lengths_cov @ along.swapaxes(1, 2)
+            for mover, vector in vectors.items():
+                lever = _hats(vector)
+                cov = cov + lever @ segment_cov[mover] @ lever.swapaxes(1, 2)
+            found[f"{side}_{point}"] = cov
+            before = p
+    return found
+
+
+def _hats(v: np.ndarray) -> np.ndarray:
+    """[v]× (n, 3, 3) of vectors (n, 3)."""
+    out = np.zeros((len(v), 3, 3))
+    out[:, 2, 1], out[:, 0, 2], out[:, 1, 0] = v.T
+    return out - out.swapaxes(1, 2)
+
+
+def spread(cov: np.ndarray) -> np.ndarray:
+    """One standard deviation (n,) of covariances (n, 3, 3): the root of the mean variance of the three axes."""
+    return np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3.0)
+
+
 # The table of pose.parquet and truth.parquet -----------------------------------------------------------------------
 
 
-def pose_table(pose: Pose) -> pl.DataFrame:
-    """Columns ``time``, ``<segment>_qx,_qy,_qz,_qw`` (`quat_WL`), ``<point>_x,_y,_z`` [m] in W."""
+def pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
+    """The columns of ``pose.parquet``.
+
+    ``time``; ``<segment>_qx,_qy,_qz,_qw`` (`quat_WL`) and ``<segment>_std`` [rad]; ``<point>_x,_y,_z`` [m] in W and
+    ``<point>_std`` [m]; with `covariance` ``<name>_cov_xx,_xy,_xz,_yy,_yz,_zz`` of each as well; ``<segment>_gap``.
+    The hands are segments and points of one name: as segments they have ``left_hand_q_std``, ``left_hand_q_cov_xx``.
+    A standard deviation is that of one axis, the mean over the three (`spread`).
+    """
     table = {"time": pose.time}
     for segment, quat in pose.quat_WL.items():
         table |= {f"{segment}_{c}": quat[:, k] for k, c in enumerate(("qx", "qy", "qz", "qw"))}
+        if segment in pose.segment_cov:
+            name = f"{segment}_q" if segment in POINTS else segment
+            table |= _confidence_columns(name, pose.segment_cov[segment], covariance)
     for point, p in pose.points.items():
         table |= {f"{point}_{c}": p[:, k] for k, c in enumerate("xyz")}
+        if point in pose.point_cov:
+            table |= _confidence_columns(point, pose.point_cov[point], covariance)
+    table |= {f"{segment}_gap": gap for segment, gap in pose.gap.items()}
     return pl.DataFrame(table)
+
+
+def _confidence_columns(name: str, cov: np.ndarray, entries: bool) -> dict[str, np.ndarray]:
+    columns = {f"{name}_std": spread(cov)}
+    if entries:
+        columns |= {f"{name}_cov_{'xyz'[i]}{'xyz'[j]}": cov[:, i, j] for i in range(3) for j in range(i, 3)}
+    return columns
 
 
 def pose_from_table(table: pl.DataFrame, file: str) -> Pose:
@@ -181,4 +307,5 @@ def pose_from_table(table: pl.DataFrame, file: str) -> Pose:
             points[point] = np.column_stack([numbers[name] for name in names])
     if not quat_WL and not points:
         raise BadData(f"{file}: neither orientations nor points; columns as torso_qx … or left_hand_x … are needed")
-    return Pose(numbers["time"], quat_WL, points)
+    gap = {name: numbers[f"{name}_gap"] > 0.0 for name in SEGMENTS if f"{name}_gap" in numbers}
+    return Pose(numbers["time"], quat_WL, points, gap=gap)

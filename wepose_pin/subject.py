@@ -55,9 +55,13 @@ class Subject:
         return float(np.sqrt(self.covariance[k, k]))
 
     def lengths_covariance(self, names: Iterable[str] = LENGTHS) -> np.ndarray:
-        """Covariance (n, n) [m²] of the named lengths."""
-        rows = [self.order.index(name) for name in names]
-        return self.covariance[np.ix_(rows, rows)]
+        """Covariance (n, n) [m²] of the named lengths; zero where nothing is known of a length's error."""
+        names = list(names)
+        known = [k for k, name in enumerate(names) if name in self.order]
+        rows = [self.order.index(names[k]) for k in known]
+        found = np.zeros((len(names), len(names)))
+        found[np.ix_(known, known)] = self.covariance[np.ix_(rows, rows)]
+        return found
 
     def draw(self, rng: np.random.Generator) -> Subject:
         """A random person from this one's distribution of lengths, for simulation."""

@@ -9,10 +9,12 @@ import numpy as np
 
 from .alignment import Segments, segment_orientations
 from .model import BodyModel, load_model
-from .pose import Pose, pose_of
+from .pose import Pose, deviation, point_covariance, pose_of
 from .recording import Recording
 from .static import StaticTest
 from .subject import Subject, average_subject
+
+_WORTH_A_WARNING_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,17 @@ class TrackedPose(Pose):
                 about["gyro_bias_start_deg_s"] = np.degrees(orientation.noise.gyro_bias).round(5).tolist()
                 about["gyro_bias_end_deg_s"] = np.degrees(orientation.gyro_bias[-1]).round(5).tolist()
                 about["gravity_m_s2"] = round(orientation.noise.gravity, 4)
+            if segment in self.gap:
+                lost = self.gap[segment]
+                about["gaps"] = int(np.count_nonzero(np.diff(lost, prepend=False) & lost))
+                about["gap_s"] = round(float(np.count_nonzero(lost)) / self.recording.rate_hz, 3)
             sensors[segment] = about
+        missed = self._not_followed()
+        lame = [
+            f"{segment}: the model's joints are too few for its orientation, they miss it by {angle:.3g} deg (rms)"
+            for segment, angle in missed.items()
+            if angle > _WORTH_A_WARNING_DEG
+        ]
         return {
             "recording": self.recording.name,
             "method": self.method,
@@ -52,8 +64,16 @@ class TrackedPose(Pose):
             "phases": {"start": list(self.segments.start), "still": list(self.segments.still)},
             "sensors": sensors,
             "points": sorted(self.points),
-            "warnings": list(self.segments.warnings),
+            "not_followed_rms_deg": missed,
+            "warnings": [*self.segments.warnings, *lame],
         }
+
+    def _not_followed(self) -> dict[str, float]:
+        """Segment → rms angle [deg] between its measured orientation and the model's, where joints are too few."""
+        if self.model is None or self.q is None:
+            return {}
+        missed = deviation(self.model, self.q, self.quat_WL)
+        return {name: round(float(np.degrees(np.sqrt(np.mean(angle**2)))), 3) for name, angle in missed.items()}
 
 
 def track(
@@ -88,6 +108,9 @@ def track(
         pose.quat_WL,
         pose.points,
         pose.q,
+        segment_cov=segments.covariance_W,
+        point_cov=point_covariance(pose.points, pose.quat_WL, segments.covariance_W, who.lengths_covariance()),
+        gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         recording=recording,
         subject=who,
         model=body,

@@ -19,11 +19,11 @@ from ..subject import Subject, subject_toml
 from ..tracking import TrackedPose
 
 
-def write_result(folder: Path, pose: TrackedPose) -> None:
-    """Write what `track` gave into an existing folder."""
+def write_result(folder: Path, pose: TrackedPose, covariance: bool = False) -> None:
+    """Write what `track` gave into an existing folder; with `covariance` its entries as well, not only deviations."""
     assert pose.model is not None
     assert pose.subject is not None
-    pose_table(pose).write_parquet(folder / "pose.parquet")
+    pose_table(pose, covariance).write_parquet(folder / "pose.parquet")
     write_subject(folder, pose.subject, pose.model)
     summary = pose.summary() | {"versions": versions()}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

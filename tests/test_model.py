@@ -1,0 +1,659 @@
+"""The body model, against Pinocchio's own reading of the same URDF, the XML itself, and models of others."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import yourdfpy
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import BadModel, MissingFile
+from wepose_pin.model import POINTS, BodyModel, SegmentLink, chains, load_model
+
+OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"
+SEGMENTS = ["torso", "pelvis", "head"] + [
+    f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm", "hand")
+]
+GAZEBO = {"48": "humanSubject01_48dof.urdf", "66": "humanSubject01_66dof.urdf"}
+
+
+def example_robot_data_human() -> Path:
+    try:
+        files = importlib.metadata.distribution("example-robot-data").files or []
+    except importlib.metadata.PackageNotFoundError:
+        pytest.skip("example-robot-data is not installed")
+    return Path(next(file for file in files if str(file).endswith("human_description/robots/human.urdf")).locate())
+
+
+@pytest.fixture(params=["ours", "48", "66", "human"])
+def urdf(request: pytest.FixtureRequest) -> Path:
+    """Each of the models we know."""
+    if request.param == "ours":
+        return OURS
+    if request.param == "human":
+        return example_robot_data_human()
+    return request.getfixturevalue("data") / "human_urdf" / GAZEBO[request.param]
+
+
+@pytest.fixture(params=["48", "66"])
+def gazebo(request: pytest.FixtureRequest, data: Path) -> Path:
+    return data / "human_urdf" / GAZEBO[request.param]
+
+
+# An independent way from one configuration to the other -----------------------------------------------------------
+
+
+def joints_above(root: ET.Element) -> dict[str, ET.Element]:
+    return {joint.find("child").get("link"): joint for joint in root.findall("joint")}
+
+
+def configurations(text: str, body: BodyModel, rng: np.random.Generator) -> tuple[pin.Model, np.ndarray, np.ndarray]:
+    """Pinocchio's own model of a URDF, a random configuration of it, and the same of `body`."""
+    raw = pin.buildModelFromXML(text)
+    angles = rng.uniform(-2.5, 2.5, raw.nv)
+    q_raw = pin.integrate(raw, pin.neutral(raw), angles)
+    data = raw.createData()
+    pin.forwardKinematics(raw, data, q_raw)
+    above = joints_above(ET.fromstring(text.encode()))
+    q = pin.neutral(body.pin)
+    for k, name in enumerate(body.pin.names):
+        first = body.pin.idx_qs[k]
+        if name not in body.joints:
+            if k:
+                there = raw.idx_qs[raw.getJointId(name)]
+                q[first : first + body.pin.nqs[k]] = q_raw[there : there + body.pin.nqs[k]]
+            continue
+        link, names = name, []
+        for _ in range(3):
+            names.append(above[link].get("name"))
+            link = above[link].find("parent").get("link")
+        ids = [raw.getJointId(joint) for joint in names[::-1]]
+        at_zero = raw.jointPlacements[ids[0]] * raw.jointPlacements[ids[1]] * raw.jointPlacements[ids[2]]
+        moved = data.oMi[raw.parents[ids[0]]].actInv(data.oMi[ids[2]])
+        q[first : first + 4] = pin.Quaternion(at_zero.rotation.T @ moved.rotation).coeffs()
+    return raw, q_raw, q
+
+
+def link_placements(model: pin.Model, q: np.ndarray) -> dict[str, np.ndarray]:
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return {f.name: data.oMf[k].homogeneous for k, f in enumerate(model.frames) if f.type == pin.FrameType.BODY}
+
+
+def largest_difference(text: str, body: BodyModel, seed: int = 0, n: int = 10) -> tuple[float, int]:
+    """Largest difference of link placements between `body` and Pinocchio's model of the text; and how many links.
+
+    The URDF's root link may stand anywhere in W.
+    """
+    rng = np.random.default_rng(seed)
+    worst, links = 0.0, 0
+    for _ in range(n):
+        raw, q_raw, q = configurations(text, body, rng)
+        theirs, ours = link_placements(raw, q_raw), link_placements(body.pin, q)
+        # A link that had to give way to one of our names is called <name>_link.
+        ours |= {name[:-5]: M for name, M in ours.items() if name.endswith("_link") and name not in theirs}
+        root = raw.frames[1].name
+        M_WM = ours[root] @ np.linalg.inv(theirs[root])
+        both = set(ours) & set(theirs)
+        worst = max(worst, *(np.abs(M_WM @ theirs[name] - ours[name]).max() for name in both))
+        links = len(both)
+    return worst, links
+
+
+def xml_mass(text: str) -> float:
+    return sum(float(m.get("value")) for m in ET.fromstring(text.encode()).iter("mass"))
+
+
+# Ours -------------------------------------------------------------------------------------------------------------
+
+
+def test_our_model_has_nine_spherical_joints() -> None:
+    body = load_model()
+    assert set(body.joints) == set(SEGMENTS) == set(body.limits)
+    assert (body.pin.nq, body.pin.nv) == (36, 27)
+    assert all(body.pin.joints[k].shortname() == "JointModelSpherical" for k in body.joints.values())
+    assert all(chain.exact for chain in chains(body.pin).values())
+
+
+def test_our_lengths_are_those_that_the_urdf_states() -> None:
+    stated = {"trunk": 0.518, "shoulder_width": 0.385, "upper_arm": 0.283, "forearm": 0.270, "hand": 0.068}
+    for name, length in load_model().lengths.items():
+        assert length == pytest.approx(stated[name.removeprefix("left_").removeprefix("right_")], abs=1e-12)
+
+
+def test_our_segment_frames_equal_w_in_the_n_pose() -> None:
+    body = load_model()
+    at = link_placements(body.pin, pin.neutral(body.pin))
+    for segment in SEGMENTS:
+        np.testing.assert_allclose(at[segment][:3, :3], np.eye(3), atol=1e-15)
+
+
+def test_our_limits_are_the_urdfs() -> None:
+    joints = {joint.get("name"): joint for joint in ET.parse(OURS).getroot().findall("joint")}
+    for segment, limits in load_model().limits.items():
+        for k, axis in enumerate("xyz"):
+            limit = joints[f"{segment}_{axis}"].find("limit")
+            assert limits.lower[k] == float(limit.get("lower"))
+            assert limits.upper[k] == float(limit.get("upper"))
+            np.testing.assert_array_equal(limits.axes[k], np.eye(3)[k])
+
+
+# All that we know -------------------------------------------------------------------------------------------------
+
+
+def test_it_moves_as_pinocchios_own_model_does(urdf: Path) -> None:
+    text = urdf.read_text(encoding="utf-8")
+    worst, links = largest_difference(text, load_model(urdf))
+    assert links > 10
+    assert worst < 1e-12
+
+
+def test_mass_and_centre_of_mass_are_kept(urdf: Path) -> None:
+    text = urdf.read_text(encoding="utf-8")
+    body = load_model(urdf)
+    assert sum(inertia.mass for inertia in body.pin.inertias) == pytest.approx(xml_mass(text), rel=1e-12)
+    raw, q_raw, q = configurations(text, body, np.random.default_rng(1))
+    root = link_placements(body.pin, q)
+    of_root = root.get(raw.frames[1].name, root.get(f"{raw.frames[1].name}_link"))
+    com = of_root[:3, :3] @ pin.centerOfMass(raw, raw.createData(), q_raw) + of_root[:3, 3]
+    np.testing.assert_allclose(pin.centerOfMass(body.pin, body.pin.createData(), q), com, atol=1e-12)
+
+
+def test_joints_stand_depth_first_as_the_mass_matrix_needs(urdf: Path) -> None:
+    model = load_model(urdf).pin
+    q = pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
+    v = np.random.default_rng(2).normal(size=model.nv)
+    M = pin.crba(model, model.createData(), q)
+    M = np.triu(M) + np.triu(M, 1).T
+    assert 0.5 * v @ M @ v == pytest.approx(pin.computeKineticEnergy(model, model.createData(), q, v), rel=1e-10)
+
+
+def test_limits_of_single_joints_are_the_urdfs(urdf: Path) -> None:
+    body = load_model(urdf)
+    joints = {joint.get("name"): joint for joint in ET.parse(urdf).getroot().findall("joint")}
+    for k, name in enumerate(body.pin.names):
+        if body.pin.nqs[k] == 1:
+            first = body.pin.idx_qs[k]
+            assert body.pin.lowerPositionLimit[first] == float(joints[name].find("limit").get("lower"))
+            assert body.pin.upperPositionLimit[first] == float(joints[name].find("limit").get("upper"))
+
+
+def test_lengths_are_set_and_read_back(urdf: Path) -> None:
+    body = load_model(urdf)
+    rng = np.random.default_rng(3)
+    wanted = {name: value * rng.uniform(0.8, 1.25) for name, value in body.lengths.items()}
+    got = body.with_lengths(wanted).lengths
+    assert got.keys() == wanted.keys() >= {"trunk", "shoulder_width", "left_upper_arm", "right_forearm", "left_hand"}
+    for name, value in wanted.items():
+        assert got[name] == pytest.approx(value, abs=1e-12)
+    np.testing.assert_allclose(list(body.with_lengths(body.lengths).lengths.values()), list(body.lengths.values()))
+
+
+def test_one_length_leaves_the_others_and_the_directions_alone(urdf: Path) -> None:
+    body = load_model(urdf)
+    before = link_placements(body.pin, pin.neutral(body.pin))
+    for name, value in body.lengths.items():
+        longer = body.with_lengths({name: 1.3 * value})
+        for other, same in body.lengths.items():
+            assert longer.lengths[other] == pytest.approx(1.3 * same if other == name else same, abs=1e-12)
+        after = link_placements(longer.pin, pin.neutral(longer.pin))
+        for link, M in before.items():
+            np.testing.assert_allclose(after[link][:3, :3], M[:3, :3], atol=1e-12)
+        d = {k: after[f"left_{k}"][:3, 3] - before[f"left_{k}"][:3, 3] for k in ("upper_arm", "forearm", "hand")}
+        if name == "left_forearm":
+            np.testing.assert_allclose(d["forearm"], 0.0, atol=1e-12)
+            along = before["left_hand"][:3, 3] - before["left_forearm"][:3, 3]
+            np.testing.assert_allclose(d["hand"], 0.3 * along, atol=1e-12)
+
+
+def test_a_longer_segment_is_heavier_by_its_volume_and_its_inertia_stretches() -> None:
+    body = load_model()
+    longer = body.with_lengths({"left_upper_arm": 1.5 * body.lengths["left_upper_arm"]})
+    k = body.joints["left_upper_arm"]
+    before, after = body.pin.inertias[k], longer.pin.inertias[k]
+    assert after.mass == pytest.approx(1.5 * before.mass)
+    np.testing.assert_allclose(after.lever, before.lever * [1.0, 1.0, 1.5])
+    # ∫z² dm grows by 1.5³, ∫x² dm with the mass
+    second = [0.5 * np.trace(i) * np.eye(3) - i for i in (before.inertia, after.inertia)]
+    np.testing.assert_allclose(np.diag(second[1]), np.diag(second[0]) * [1.5, 1.5, 1.5**3], rtol=1e-9)
+
+
+def test_the_written_urdf_reads_the_same_everywhere(urdf: Path, tmp_path: Path) -> None:
+    body = load_model(urdf)
+    rng = np.random.default_rng(4)
+    body = body.with_lengths({name: value * rng.uniform(0.8, 1.25) for name, value in body.lengths.items()})
+    text = body.urdf()
+    worst, links = largest_difference(text, body)
+    assert links >= len(SEGMENTS)
+    assert worst < 1e-12
+
+    file = tmp_path / "subject.urdf"
+    file.write_text(text, encoding="utf-8")
+    again = load_model(file)  # bears our names now: no table is needed
+    assert again.pin.names.tolist() == body.pin.names.tolist()
+    q = pin.randomConfiguration(body.pin, -np.ones(body.pin.nq), np.ones(body.pin.nq))
+    ours, theirs = link_placements(body.pin, q), link_placements(again.pin, q)
+    assert max(np.abs(ours[name] - theirs[name]).max() for name in ours) < 1e-12
+    for name, value in body.lengths.items():
+        assert again.lengths[name] == pytest.approx(value, abs=1e-12)
+
+    raw, q_raw, q = configurations(text, body, rng)
+    other = yourdfpy.URDF.load(str(file), load_meshes=False)
+    other.update_cfg(
+        {name: q_raw[raw.idx_qs[raw.getJointId(name)]] for name in raw.names[1:] if name in other.actuated_joint_names}
+    )
+    ours = link_placements(body.pin, q)
+    assert max(np.abs(other.get_transform(name) - ours[name]).max() for name in SEGMENTS) < 1e-12
+
+
+# Models of others -------------------------------------------------------------------------------------------------
+
+
+def test_human_gazebo_loads_as_it_is(gazebo: Path) -> None:
+    body = load_model(gazebo)
+    assert body.pin.nv == int(gazebo.stem[-5:-3])
+    assert body.lengths["left_upper_arm"] == pytest.approx(0.270, abs=5e-4)
+    assert body.lengths["right_forearm"] == pytest.approx(0.222, abs=5e-4)
+    spherical = {
+        "T8",
+        "Neck",
+        "LeftUpperArm",
+        "RightUpperArm",
+        "LeftUpperLeg",
+        "RightUpperLeg",
+        "LeftFoot",
+        "RightFoot",
+    }
+    assert spherical <= set(body.joints)
+    assert len(body.joints) == (8 if body.pin.nv == 48 else 22)
+    assert body.pin.nq == 48 + 8 if body.pin.nv == 48 else 66 + 22
+    if body.pin.nv == 48:
+        assert {"jRightElbow_roty", "jRightElbow_rotz", "jLeftBallFoot_roty"} <= set(body.pin.names)
+
+
+def test_human_gazebo_stands_in_the_t_pose_at_zero(gazebo: Path) -> None:
+    body = load_model(gazebo)
+    at = link_placements(body.pin, pin.neutral(body.pin))
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        R_WL = Rotation.from_rotvec([sign * np.pi / 2.0, 0.0, 0.0]).as_matrix()  # lifted sideways, palms down
+        for part in ("upper_arm", "forearm", "hand"):
+            # Its wrist lies a few tenths of a millimetre off the line.
+            np.testing.assert_allclose(at[f"{side}_{part}"][:3, :3], R_WL, atol=2e-3)
+    for segment in ("torso", "pelvis", "head"):
+        np.testing.assert_allclose(at[segment][:3, :3], np.eye(3), atol=1e-12)
+    # A segment frame is where its link is, and moves with it.
+    np.testing.assert_array_equal(at["left_forearm"][:3, 3], at["LeftForeArm"][:3, 3])
+    np.testing.assert_array_equal(at["left_palm"][:3, 3], at["LeftHandCOM"][:3, 3])
+
+
+def test_the_human_of_example_robot_data_stands_in_the_n_pose_with_z_up() -> None:
+    body = load_model(example_robot_data_human())
+    at = link_placements(body.pin, pin.neutral(body.pin))
+    assert body.pin.nv == 36
+    assert set(body.joints) == {f"{side}_{part}" for side in ("left", "right") for part in ("upperarm", "upperleg")} | {
+        "middle_thorax",
+        "middle_head",
+    }
+    for segment in SEGMENTS:
+        np.testing.assert_allclose(at[segment][:3, :3], np.eye(3), atol=1e-12)
+    hips = (at["left_upperleg"][:3, 3] + at["right_upperleg"][:3, 3]) / 2.0
+    np.testing.assert_allclose(hips, 0.0, atol=1e-12)
+    assert at["left_upper_arm"][1, 3] == pytest.approx(0.21)
+    assert at["left_upper_arm"][2, 3] == pytest.approx(0.324 + 0.1, abs=1e-3)
+    assert body.lengths["left_upper_arm"] == pytest.approx(0.276)
+    assert body.lengths["left_forearm"] == pytest.approx(0.287)
+
+
+def test_the_neutral_poses_beside_pinocchios(urdf: Path) -> None:
+    """Printed with -s: what was found in each model, and where its points are at zero in both readings."""
+    body = load_model(urdf)
+    raw = pin.buildModelFromUrdf(str(urdf))
+    theirs, ours = link_placements(raw, pin.neutral(raw)), link_placements(body.pin, pin.neutral(body.pin))
+    root = raw.frames[1].name
+    singles = sum(1 for k in range(1, body.pin.njoints) if body.pin.nvs[k] == 1)
+    print(f"\n{urdf.name}: {body.pin.nv} dof, {len(body.joints)} spherical joints, {singles} of one axis")
+    robot = {joint.child: joint.parent for joint in body.robot.joints}
+    M_WM = ours[root] @ np.linalg.inv(theirs[root])
+    renamed = {name[:-5] for name in ours if name.endswith("_link") and name not in theirs}
+    for point, link in POINTS.items():
+        on = link if link in theirs and link not in renamed else robot[link].removesuffix("_link")  # their link
+        M = M_WM @ theirs[on]
+        np.testing.assert_allclose(ours[f"{on}_link" if on in renamed else on], M, atol=1e-12)
+        here, there = (" ".join(f"{v:8.4f}" for v in at[:3, 3]) for at in (ours[link], M))
+        print(f"  {point:15s} in W {here}    {on:16s} by Pinocchio {there}")
+        if "palm" not in link:
+            np.testing.assert_allclose(ours[link][:3, 3], M[:3, 3], atol=1e-12)
+
+
+# Small bodies, to see one thing at a time -------------------------------------------------------------------------
+
+ARMS = {"left": 0.2, "right": -0.2}
+TRIPLE = ("1 0 0", "0 1 0", "0 0 1")
+
+
+def triple(
+    parent: str, child: str, at: str, axes: tuple[str, ...] = TRIPLE, rpy: tuple[str, ...] = ("0 0 0",) * 3
+) -> str:
+    links = [f"{child}_{k}" for k in range(len(axes) - 1)] + [child]
+    text = "".join(f'<link name="{link}"/>' for link in links[:-1])
+    for k, (axis, turn) in enumerate(zip(axes, rpy, strict=True)):
+        text += (
+            f'<joint name="{child}_j{k}" type="revolute"><parent link="{([parent, *links])[k]}"/>'
+            f'<child link="{links[k]}"/><origin xyz="{at if k == 0 else "0 0 0"}" rpy="{turn}"/><axis xyz="{axis}"/>'
+            f'<limit lower="-{k + 1}" upper="{k + 1}" effort="1" velocity="1"/></joint>'
+        )
+    return text
+
+
+def fixed(parent: str, child: str, at: str, kind: str = "fixed") -> str:
+    return (
+        f'<joint name="{child}_{kind}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{at}"/></joint>'
+    )
+
+
+def small(torso: str | None = None, elbow: str | None = None, more: str = "") -> str:
+    """A body of triples without inertias; `torso` and `elbow` (left) in place of the usual joints."""
+    text = '<link name="root"/><link name="torso"/>' + (torso or triple("root", "torso", "0 0 0"))
+    for side, y in ARMS.items():
+        a, f, h, p = (f"{side}_{part}" for part in ("upper_arm", "forearm", "hand", "palm"))
+        text += "".join(f'<link name="{link}"/>' for link in (a, f, h, p))
+        text += triple("torso", a, f"0 {y} 0.5") + triple(f, h, "0 0 -0.25") + fixed(h, p, "0 0 -0.07")
+        text += elbow if elbow and side == "left" else triple(a, f, "0 0 -0.3")
+    return f'<robot name="small">{text}{more}</robot>'
+
+
+def written(tmp_path: Path, text: str, name: str = "small.urdf") -> Path:
+    file = tmp_path / name
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize(
+    ("axes", "rpy"),
+    [
+        (("0 0 1", "1 0 0", "0 1 0"), ("0 0 0", "0 0 0", "0 0 0")),
+        (("0 0 -1", "1 0 0", "0 1 0"), ("0 0 0", "0 0 0", "0 0 0")),  # left-handed
+        (("0 1 0", "0 0 1", "1 0 0"), ("0.3 -0.2 0.5", "0 0 0", "0 0 0")),
+        (("1 0 0", "1 0 0", "1 0 0"), ("0 0 0", "0 0 1.5707963267948966", "0 -1.5707963267948966 0.4")),
+        (("2 0 0", "0 3 0", "0 0 4"), ("0 0 0", "0 0 0", "0 0 0")),  # axes of any length
+    ],
+)
+def test_three_orthogonal_axes_in_any_order_are_one_spherical_joint(
+    axes: tuple[str, ...], rpy: tuple[str, ...], tmp_path: Path
+) -> None:
+    text = small(elbow=triple("left_upper_arm", "left_forearm", "0 0 -0.3", axes, rpy))
+    file = written(tmp_path, text)
+    body = load_model(file)
+    assert "left_forearm" in body.joints
+    worst, _ = largest_difference(text, body)
+    assert worst < 1e-12
+    limits = body.limits["left_forearm"]
+    np.testing.assert_array_equal(limits.upper, [1.0, 2.0, 3.0])
+    # Each axis, turned alone, is the rotation about the axis that `limits` states.
+    raw = pin.buildModelFromXML(text)
+    for k in range(3):
+        angles = pin.neutral(raw)
+        angles[raw.idx_qs[raw.getJointId(f"left_forearm_j{k}")]] = 0.5
+        zero, turned = (link_placements(raw, q)["left_forearm"][:3, :3] for q in (pin.neutral(raw), angles))
+        np.testing.assert_allclose(Rotation.from_matrix(zero.T @ turned).as_rotvec(), 0.5 * limits.axes[k], atol=1e-12)
+
+
+@pytest.mark.parametrize("what", ["oblique", "apart", "heavy", "seen", "branched", "two", "prismatic"])
+def test_what_is_no_spherical_joint_stays_as_it_is(what: str, tmp_path: Path) -> None:
+    elbow = triple("left_upper_arm", "left_forearm", "0 0 -0.3")
+    more = ""
+    if what == "oblique":
+        elbow = elbow.replace('axis xyz="0 1 0"', 'axis xyz="0.1 1 0"')
+    elif what == "apart":
+        elbow = elbow.replace('xyz="0 0 0" rpy', 'xyz="0 0 -0.01" rpy', 1)
+    elif what == "heavy":
+        inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+        heavy = f'<link name="left_forearm_1"><inertial><mass value="0.1"/>{inertia}</inertial></link>'
+        elbow = elbow.replace('<link name="left_forearm_1"/>', heavy)
+    elif what == "seen":
+        ball = "<visual><geometry><sphere radius='0.1'/></geometry></visual>"
+        elbow = elbow.replace('<link name="left_forearm_0"/>', f'<link name="left_forearm_0">{ball}</link>')
+    elif what == "branched":
+        more = '<link name="mark"/>' + fixed("left_forearm_0", "mark", "0 0 0.1")
+    elif what == "two":
+        elbow = triple("left_upper_arm", "left_forearm", "0 0 -0.3", TRIPLE[:2], ("0 0 0",) * 2)
+    elif what == "prismatic":
+        elbow = elbow.replace('name="left_forearm_j2" type="revolute"', 'name="left_forearm_j2" type="prismatic"')
+    text = small(elbow=elbow, more=more)
+    body = load_model(written(tmp_path, text))
+    assert "left_forearm" not in body.joints
+    assert {"left_forearm_j0", "left_forearm_j1"} <= set(body.pin.names)
+    worst, _ = largest_difference(text, body)
+    assert worst < 1e-12
+
+
+def test_a_urdf_without_inertias_has_no_mass(tmp_path: Path) -> None:
+    body = load_model(written(tmp_path, small()))
+    assert pin.computeTotalMass(body.pin) == 0.0
+    assert body.with_lengths({"left_forearm": 0.3}).lengths["left_forearm"] == pytest.approx(0.3)
+
+
+def test_a_floating_base_is_spherical(tmp_path: Path) -> None:
+    body = load_model(written(tmp_path, small(torso=fixed("root", "torso", "0 0 0.1", kind="floating"))))
+    assert "torso" in body.joints
+    assert "torso" not in body.limits
+    assert body.lengths["trunk"] == pytest.approx(0.6)
+
+
+def test_meshes_are_named_and_not_read(tmp_path: Path) -> None:
+    mesh = (
+        '<visual><geometry><mesh filename="package://nowhere/arm.stl" scale="0.001 0.001 0.001"/></geometry></visual>'
+    )
+    text = small().replace('<link name="left_upper_arm"/>', f'<link name="left_upper_arm">{mesh}</link>')
+    body = load_model(written(tmp_path, text)).with_lengths({"left_upper_arm": 0.6})
+    (visual,) = body.visuals
+    assert (visual.kind, visual.file) == ("mesh", "package://nowhere/arm.stl")
+    np.testing.assert_allclose(visual.size, [0.001, 0.001, 0.002])
+    assert "package://nowhere/arm.stl" in body.urdf()
+
+
+def test_continuous_joints_turn_without_end(tmp_path: Path) -> None:
+    elbow = triple("left_upper_arm", "left_forearm", "0 0 -0.3", TRIPLE[1:], ("0 0 0",) * 2)
+    elbow = elbow.replace('name="left_forearm_j1" type="revolute"', 'name="left_forearm_j1" type="continuous"')
+    text = small(elbow=elbow)
+    body = load_model(written(tmp_path, text))
+    assert body.pin.nqs[body.pin.getJointId("left_forearm_j1")] == 2
+    worst, _ = largest_difference(text, body)
+    assert worst < 1e-12
+
+
+def finger(leader: str, name: str = "finger", parent: str = "left_hand") -> str:
+    return (
+        f'<link name="{name}"/><joint name="{name}_j" type="revolute"><parent link="{parent}"/><child link="{name}"/>'
+        f'<origin xyz="0 0 -0.1"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/>'
+        + (f'<mimic joint="{leader}" multiplier="2" offset="0.1"/>' if leader else "")
+        + "</joint>"
+    )
+
+
+def test_a_mimic_joint_follows(tmp_path: Path) -> None:
+    text = small(more=finger("") + finger("finger_j", "tip", "finger"))
+    body = load_model(written(tmp_path, text))
+    raw = pin.buildModelFromXML(text, mimic=True)
+    assert body.pin.nv == load_model(written(tmp_path, small())).pin.nv + 1
+    q, q_raw = pin.neutral(body.pin), pin.neutral(raw)
+    q[body.pin.idx_qs[body.pin.getJointId("finger_j")]] = 0.4
+    q_raw[raw.idx_qs[raw.getJointId("finger_j")]] = 0.4
+    np.testing.assert_allclose(link_placements(body.pin, q)["tip"], link_placements(raw, q_raw)["tip"], atol=1e-12)
+
+
+HINGE = triple("left_upper_arm", "left_forearm", "0 0 -0.3", ("0 1 0",), ("0 0 0",))
+MIMIC_HINGE = HINGE.replace("</joint>", '<mimic joint="finger_j"/></joint>')
+WRONG = {
+    "no xml": ("no robot", "cannot be read as a URDF"),
+    "loop": (small(more=fixed("left_palm", "right_palm", "0 0 0", "floating")), "right_palm' hangs on two joints"),
+    "ring": (
+        small(more='<link name="a"/><link name="b"/>' + fixed("a", "b", "0 0 0") + fixed("b", "a", "0 0 0")),
+        "'a' hangs in a loop",
+    ),
+    "two roots": (small(more='<link name="table"/>'), "2 links without a joint above them (root, table)"),
+    "no such link": (small(more=fixed("nowhere", "torso", "0 0 0")), "'nowhere' that is not there"),
+    "twice": (small(more='<link name="torso"/>'), "link 'torso' occurs 2 times"),
+    "planar": (small(more='<link name="x"/>' + fixed("torso", "x", "0 0 0", "planar")), "of type 'planar'"),
+    "zero axis": (small(elbow=HINGE.replace("0 1 0", "0 0 0")), "axis of zero length"),
+    "mimics nothing": (small(more=finger("thumb_j")), "'finger_j' mimics 'thumb_j'"),
+    "mimics what comes later": (small(elbow=MIMIC_HINGE, more=finger("")), "must be a joint before it"),
+    "mimic in an arm": (
+        small(torso=finger("", parent="root") + triple("root", "torso", "0 0 0"), elbow=MIMIC_HINGE),
+        "carries 'left_forearm'",
+    ),
+    "other names": (small().replace("left_forearm", "ulna"), "no link 'left_forearm'; name the segments' links"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_the_wrong_model_says_so_in_one_line(case: str, tmp_path: Path) -> None:
+    text, message = WRONG[case]
+    with pytest.raises(BadModel) as raised:
+        load_model(written(tmp_path, text))
+    assert message in str(raised.value)
+    assert "small" in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_file_that_is_not_there_and_lengths_that_cannot_be(tmp_path: Path) -> None:
+    with pytest.raises(MissingFile, match=r"none\.urdf"):
+        load_model(tmp_path / "none.urdf")
+    with pytest.raises(MissingFile, match=r"none\.toml"):
+        load_model(tmp_path / "none.toml")
+    with pytest.raises(BadModel, match="did you mean 'left_forearm'"):
+        load_model(lengths={"left_forarm": 0.2})
+    with pytest.raises(BadModel, match="greater than 0 m"):
+        load_model(lengths={"left_forearm": -0.2})
+    with pytest.raises(BadModel, match="greater than 0 m"):
+        load_model(lengths={"left_forearm": float("nan")})
+
+
+# The table --------------------------------------------------------------------------------------------------------
+
+OTHER = {name: f"L_{name}" for name in SEGMENTS if name not in ("head", "pelvis")}
+
+
+def other_names(text: str) -> str:
+    root = ET.fromstring(text)
+    for element in root.iter():
+        for key in ("name", "link"):
+            if element.get(key) in OTHER and element.tag in ("link", "parent", "child"):
+                element.set(key, OTHER[element.get(key)])
+    return ET.tostring(root, encoding="unicode")
+
+
+def table_toml(up: str = "+z", forward: str = "+x", more: str = "") -> str:
+    rows = "\n".join(f'{segment} = "{link}"' for segment, link in OTHER.items())
+    return f'urdf = "small.urdf"\nup = "{up}"\nforward = "{forward}"\n[segments]\n{rows}\n{more}'
+
+
+PALMS = '[points]\nleft_hand = "left_palm"\nright_hand = {link = "L_right_hand", at = [0, 0, -0.07]}'
+
+
+def test_the_table_as_keywords_and_as_files(tmp_path: Path) -> None:
+    file = written(tmp_path, other_names(small()))
+    points = {"left_hand": "left_palm", "right_hand": {"link": "L_right_hand", "at": [0.0, 0.0, -0.07]}}
+    by_keywords = load_model(file, segments=OTHER | {"torso": SegmentLink("L_torso")}, points=points)
+    by_table = load_model(written(tmp_path, table_toml(more=PALMS), "any.toml"))
+    written(tmp_path, table_toml(more=PALMS), "model.toml")
+    found = load_model(file)
+    plain = load_model(written(tmp_path, small(), "plain.urdf"))
+    for body in (by_keywords, by_table, found):
+        assert body.lengths == pytest.approx(plain.lengths, abs=1e-12)
+        assert set(body.joints) == {OTHER.get(name, name) for name in plain.joints}
+    again = load_model(written(tmp_path, found.urdf(), "again.urdf"))  # beside a table for another file
+    assert again.lengths == pytest.approx(plain.lengths, abs=1e-12)
+
+
+def test_a_link_that_bears_our_name_in_another_frame_gives_way(tmp_path: Path) -> None:
+    text = small()
+    own = {name: name for name in OTHER}
+    turned = load_model(
+        written(tmp_path, text),
+        segments=own | {"left_forearm": {"link": "left_forearm", "up": "+x", "forward": "+y"}},
+    )
+    at = link_placements(turned.pin, pin.neutral(turned.pin))
+    R_WL = at["left_forearm"][:3, :3]
+    np.testing.assert_allclose(R_WL @ [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], atol=1e-12)  # up of the segment: x of the link
+    np.testing.assert_allclose(R_WL @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)  # forward: y
+    np.testing.assert_allclose(at["left_forearm_link"], load_at_zero(written(tmp_path, text), "left_forearm"))
+    assert "left_forearm_link" in turned.joints
+
+
+def load_at_zero(file: Path, link: str) -> np.ndarray:
+    model = pin.buildModelFromUrdf(str(file))
+    return link_placements(model, pin.neutral(model))[link]
+
+
+def test_a_body_without_hands_has_wrists(tmp_path: Path) -> None:
+    segments = {name: link for name, link in OTHER.items() if "hand" not in name}
+    wrists = {"left_wrist": "L_left_hand", "right_wrist": "L_right_hand"}
+    body = load_model(
+        written(tmp_path, other_names(small()).replace("_palm", "_mark")), segments=segments, points=wrists
+    )
+    assert body.lengths["left_forearm"] == pytest.approx(0.25)
+    assert "left_hand" not in body.lengths
+
+
+def test_up_and_forward_turn_the_body_upright(tmp_path: Path) -> None:
+    text = other_names(small()).replace('<link name="root" />', '<link name="base"/><link name="root"/>')
+    text = text.replace("</robot>", fixed("base", "root", "0 0 0").replace("0 0 0", '0 0 0" rpy="0 0 0') + "</robot>")
+    body = load_model(written(tmp_path, text), segments=OTHER, up="+z", forward="-y")
+    at = link_placements(body.pin, pin.neutral(body.pin))
+    np.testing.assert_allclose(at["base"][:3, :3] @ [0.0, -1.0, 0.0], [1.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(at["torso"][:3, :3], np.eye(3), atol=1e-12)
+
+
+BAD_TABLES = {
+    "no toml": ("segments = [", "is no TOML"),
+    "no urdf": ("[segments]\n", "names no URDF"),
+    "unknown key": (table_toml().replace("forward", "foreward"), "did you mean 'forward'"),
+    "unknown segment": (table_toml().replace("left_forearm =", "left_forarm ="), "did you mean 'left_forearm'"),
+    "unknown link": (table_toml().replace("L_left_forearm", "L_left_foreram"), "did you mean 'L_left_forearm'"),
+    "unknown point": (table_toml(more='[points]\nleft_thumb = "torso"'), "points.left_thumb: no such point"),
+    "unknown axis": (table_toml(up="z"), "up = 'z'"),
+    "parallel axes": (table_toml(up="+x"), "is parallel to up"),
+    "no number": (table_toml(more='[points]\nleft_hand = {link = "torso", at = [1, 2]}'), "three numbers [m]"),
+    "no name": (table_toml(more="[points]\nleft_hand = 3"), "a link's name is wanted"),
+    "missing": (table_toml().replace('left_forearm = "L_left_forearm"', ""), "no link for segment 'left_forearm'"),
+    "no wrist": (table_toml().replace('left_hand = "L_left_hand"', ""), "no wrist"),
+    "half": (table_toml().replace('"L_torso"', '{link = "L_torso", up = "+z"}'), "up and forward go together"),
+    "root": ('root = "hips"\n' + table_toml(), "root: no link 'hips'"),
+    "one place": (table_toml(more='[points]\nleft_elbow = "L_left_upper_arm"'), "lie in one place"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TABLES)
+def test_a_wrong_table_says_so_in_one_line(case: str, tmp_path: Path) -> None:
+    text, message = BAD_TABLES[case]
+    written(tmp_path, other_names(small()))
+    with pytest.raises(BadModel) as raised:
+        load_model(written(tmp_path, text, "table.toml"))
+    assert message in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_arms_that_point_up_need_their_axes(tmp_path: Path) -> None:
+    text = other_names(small()).replace("0 0 -0.3", "0 0 0.3").replace("0 0 -0.25", "0 0 0.25")
+    file = written(tmp_path, text)
+    with pytest.raises(BadModel, match="points straight up; state its up and forward"):
+        load_model(file, segments=OTHER)
+    down = {
+        name: {"link": link, "up": "-z", "forward": "+x"} if "arm" in name or "hand" in name else link
+        for name, link in OTHER.items()
+    }
+    body = load_model(file, segments=down)
+    at = link_placements(body.pin, pin.neutral(body.pin))
+    np.testing.assert_allclose(at["left_forearm"][:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
+
+
+def test_parts_of_a_table_without_segments_are_refused() -> None:
+    with pytest.raises(BadModel, match="give segments with them"):
+        load_model(up="+y", forward="+x")

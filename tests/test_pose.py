@@ -1,0 +1,332 @@
+"""Orientations to configuration to points, against the closed form p = Σ R l and brute force."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import BadModel
+from wepose_pin.model import POINTS, BodyModel, load_model
+from wepose_pin.pose import (
+    configuration,
+    deviation,
+    forward_kinematics,
+    known_links,
+    known_points,
+    placements,
+    pose_of,
+)
+from wepose_pin.simulation import Simulation
+from wepose_pin.tracking import track
+
+CORE = ["torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"]
+SEGMENTS = [*CORE, "pelvis", "head", "left_hand", "right_hand"]
+N = 40
+
+
+def orientations(segments: list[str], seed: int = 0, n: int = N) -> dict[str, np.ndarray]:
+    """Any orientation for each segment; signs of the quaternions at random."""
+    rng = np.random.default_rng(seed)
+    return {s: Rotation.random(n, random_state=rng).as_quat() * rng.choice([-1, 1], (n, 1)) for s in segments}
+
+
+def angle(quat_a: np.ndarray, quat_b: np.ndarray) -> np.ndarray:
+    return (Rotation.from_quat(quat_a).inv() * Rotation.from_quat(quat_b)).magnitude()
+
+
+def gazebo(data: Path, dof: int) -> BodyModel:
+    return load_model(data / "human_urdf" / f"humanSubject01_{dof}dof.urdf")
+
+
+# Ours -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hands", [True, False])
+def test_points_are_the_sum_of_turned_lengths(hands: bool) -> None:
+    lengths = {"trunk": 0.5, "shoulder_width": 0.4, "left_upper_arm": 0.31, "right_hand": 0.08}
+    body = load_model(lengths=lengths)
+    L = body.lengths
+    quat_WL = orientations(SEGMENTS if hands else CORE)
+    pose = pose_of(body, np.arange(N) / 100.0, quat_WL)
+    R = {segment: Rotation.from_quat(quat) for segment, quat in quat_WL.items()}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        p = R["torso"].apply([0.0, sign * L["shoulder_width"] / 2.0, L["trunk"]])
+        np.testing.assert_allclose(pose.points[f"{side}_shoulder"], p, atol=1e-12)
+        for segment, point in (("upper_arm", "elbow"), ("forearm", "wrist"), ("hand", "hand")):
+            turned = R.get(f"{side}_{segment}", R[f"{side}_forearm"])  # a hand without a sensor is rigid
+            p = p + turned.apply([0.0, 0.0, -L[f"{side}_{segment}"]])
+            np.testing.assert_allclose(pose.points[f"{side}_{point}"], p, atol=1e-12)
+    assert set(pose.points) == set(POINTS)
+
+
+def test_links_have_the_orientations_given() -> None:
+    body = load_model()
+    quat_WL = orientations(SEGMENTS)
+    q = configuration(body, quat_WL)
+    assert q.shape == (N, 36)
+    np.testing.assert_allclose(np.linalg.norm(q.reshape(N, 9, 4), axis=2), 1.0, atol=1e-14)
+    R, _ = forward_kinematics(body, q, SEGMENTS)
+    for k, segment in enumerate(SEGMENTS):
+        np.testing.assert_allclose(R[:, k], Rotation.from_quat(quat_WL[segment]).as_matrix(), atol=1e-12)
+    assert deviation(body, q, quat_WL) == {}
+
+
+def test_the_configuration_does_not_jump() -> None:
+    t = np.linspace(0.0, 20.0, 2000)
+    turns = {s: Rotation.from_rotvec(np.outer(t, np.roll([1.0, 0.3, -0.5], k))) for k, s in enumerate(SEGMENTS)}
+    q = configuration(
+        load_model(), {s: R.as_quat() * np.where(np.sin(7.0 * t) < 0.0, -1.0, 1.0)[:, None] for s, R in turns.items()}
+    )
+    assert np.abs(np.diff(q, axis=0)).max() < 0.05
+
+
+def test_the_unmeasured_is_rigid_with_what_is_above() -> None:
+    body = load_model()
+    quat_WL = orientations(CORE)
+    at = placements(body, configuration(body, quat_WL), ["left_hand", "head", "pelvis"])
+    for segment, above in (("left_hand", "left_forearm"), ("head", "torso"), ("pelvis", "torso")):
+        assert angle(at[segment][0], quat_WL[above]).max() < 1e-7
+        assert at[segment][1].shape == (N, 3)
+
+
+def test_a_single_frame_and_one_segment() -> None:
+    pose = pose_of(load_model(), np.zeros(1), {"torso": np.array([[0.0, 0.0, 1.0, 0.0]])})
+    assert set(pose.points) == {"left_shoulder", "right_shoulder"}
+    assert pose.points["left_shoulder"][0, 1] < 0.0  # turned round
+
+
+def test_what_is_known() -> None:
+    every = [f"{side}_{p}" for side in ("left", "right") for p in ("shoulder", "elbow", "wrist", "hand")]
+    assert known_points(CORE) == known_points(SEGMENTS) == every
+    assert known_points(["torso", "left_upper_arm"]) == ["left_shoulder", "left_elbow", "right_shoulder"]
+    assert known_points(["left_upper_arm", "left_forearm"]) == []
+
+    body = load_model()
+    assert {"head", "pelvis", "left_palm", "right_hand"} <= set(known_links(body, CORE))
+    known = set(known_links(body, ["torso", "left_upper_arm", "right_forearm"]))
+    assert {"root", "torso", "head", "left_upper_arm"} <= known
+    assert not known & {"left_forearm", "left_hand", "left_palm", "right_upper_arm", "right_forearm", "right_hand"}
+    assert known_links(body, []) == ["root"]
+
+
+def test_a_segment_that_the_model_lacks() -> None:
+    with pytest.raises(BadModel, match="no link for segment 'left_foot'"):
+        configuration(load_model(), orientations(["torso", "left_foot"]))
+
+
+def test_ten_minutes_at_100_hz_take_less_than_a_second() -> None:
+    body = load_model()
+    quat_WL = orientations(SEGMENTS, n=60_000)
+    q = configuration(body, quat_WL)
+    links = list(POINTS.values())
+    forward_kinematics(body, q[:10], links)
+    start = time.process_time()
+    forward_kinematics(body, q, links)
+    assert time.process_time() - start < 1.0
+    start = time.process_time()
+    pose_of(body, np.arange(60_000) / 100.0, quat_WL)
+    assert time.process_time() - start < 1.0
+
+
+# Models of others -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dof", [48, 66])
+def test_what_hangs_on_spherical_joints_follows_exactly(data: Path, dof: int) -> None:
+    body = gazebo(data, dof)
+    exact = ["torso", "left_upper_arm", "right_upper_arm", "head"]
+    if dof == 66:
+        exact += ["left_forearm", "right_forearm", "left_hand", "right_hand"]
+    quat_WL = orientations(SEGMENTS)
+    q = configuration(body, quat_WL)
+    R, _ = forward_kinematics(body, q, exact)
+    for k, segment in enumerate(exact):
+        np.testing.assert_allclose(R[:, k], Rotation.from_quat(quat_WL[segment]).as_matrix(), atol=1e-12)
+    assert set(deviation(body, q, quat_WL)) == set(SEGMENTS) - set(exact)
+    for k in body.joints.values():
+        first = body.pin.idx_qs[k]
+        np.testing.assert_allclose(np.linalg.norm(q[:, first : first + 4], axis=1), 1.0, atol=1e-14)
+
+
+def test_arms_on_66_degrees_of_freedom_are_the_sum_of_turned_lengths(data: Path) -> None:
+    body = gazebo(data, 66).with_lengths({"left_upper_arm": 0.31, "left_forearm": 0.25, "left_hand": 0.07})
+    quat_WL = orientations([*CORE, "left_hand"])
+    points = pose_of(body, np.arange(N) / 100.0, quat_WL).points
+    p = points["left_shoulder"]
+    for segment, point, length in (("upper_arm", "elbow", 0.31), ("forearm", "wrist", 0.25), ("hand", "hand", 0.07)):
+        p = p + Rotation.from_quat(quat_WL[f"left_{segment}"]).apply([0.0, 0.0, -length])
+        np.testing.assert_allclose(points[f"left_{point}"], p, atol=1e-12)
+
+
+@pytest.mark.parametrize("dof", [48, 66])
+def test_our_n_pose_hangs_its_arms(data: Path, dof: int) -> None:
+    body = gazebo(data, dof)
+    pose = pose_of(body, np.zeros(1), {segment: np.array([[0.0, 0.0, 0.0, 1.0]]) for segment in CORE})
+    for side in ("left", "right"):
+        drop = pose.points[f"{side}_wrist"] - pose.points[f"{side}_shoulder"]
+        length = body.lengths[f"{side}_upper_arm"] + body.lengths[f"{side}_forearm"]
+        np.testing.assert_allclose(drop, [[0.0, 0.0, -length]], atol=1e-3)
+
+
+def test_two_axes_come_as_near_as_they_can(data: Path) -> None:
+    """Beside a search over both angles of the elbow and the wrist."""
+    body = gazebo(data, 48)
+    rng = np.random.default_rng(5)
+    quat_WL = orientations(SEGMENTS, 5, n=12)
+    q = configuration(body, quat_WL)
+    missed = deviation(body, q, quat_WL)
+    grid = np.linspace(-np.pi, np.pi, 61)
+    for segment, joints in (
+        ("left_forearm", ("jLeftElbow_roty", "jLeftElbow_rotz")),
+        ("right_hand", ("jRightWrist_rotx", "jRightWrist_rotz")),
+    ):
+        at = [body.pin.idx_qs[body.pin.getJointId(name)] for name in joints]
+        for k in range(4):
+            tried = np.repeat(q[k : k + 1], len(grid) ** 2 + 500, axis=0)
+            tried[: len(grid) ** 2, at] = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+            tried[len(grid) ** 2 :, at] += rng.normal(scale=0.02, size=(500, 2))  # and close by
+            R, _ = forward_kinematics(body, tried, [segment])
+            left = (Rotation.from_matrix(R[:, 0]).inv() * Rotation.from_quat(quat_WL[segment][k])).magnitude()
+            assert left.min() > missed[segment][k] - 1e-9
+            assert left.min() < missed[segment][k] + 0.1
+
+
+def test_what_two_axes_can_do_they_do_exactly(data: Path) -> None:
+    body = gazebo(data, 48)
+    rng = np.random.default_rng(6)
+    q = np.tile(pin.neutral(body.pin), (N, 1))
+    names = [f"j{side}{joint}" for side in ("Left", "Right") for joint in ("Elbow_roty", "Elbow_rotz", "Wrist_rotx")]
+    for name in names:
+        q[:, body.pin.idx_qs[body.pin.getJointId(name)]] = rng.uniform(-3.0, 3.0, N)
+    at = placements(body, q, SEGMENTS)
+    quat_WL = {segment: at[segment][0] for segment in SEGMENTS}
+    found = configuration(body, quat_WL)
+    assert max(missed.max() for missed in deviation(body, found, quat_WL).values()) < 1e-7
+    at_hinges = [body.pin.idx_qs[body.pin.getJointId(name)] for name in names]
+    np.testing.assert_allclose(found[:, at_hinges], q[:, at_hinges], atol=1e-7)
+
+
+def test_a_spine_bends_evenly_and_does_not_twist_when_the_person_turns_round(data: Path) -> None:
+    for dof in (48, 66):
+        body = gazebo(data, dof)
+        bend, turn = Rotation.from_euler("y", 60.0, degrees=True), Rotation.from_euler("z", 179.0, degrees=True)
+        for heading in (Rotation.identity(), turn, turn * turn):
+            q = configuration(body, {"torso": (heading * bend).as_quat()[None]})
+            at = placements(body, q, ["L5", "L3", "T12", "T8", "left_upper_arm", "right_upper_arm"])
+            for k, link in enumerate(("L5", "L3", "T12"), 1):
+                R = heading * Rotation.from_euler("y", 15.0 * k, degrees=True)
+                up = Rotation.from_quat(at[link][0][0]).apply([0.0, 0.0, 1.0])
+                np.testing.assert_allclose(up, R.apply([0.0, 0.0, 1.0]), atol=0.01)
+            middle = (at["left_upper_arm"][1] + at["right_upper_arm"][1])[0] / 2.0
+            forward = heading.apply([1.0, 0.0, 0.0])
+            assert middle @ forward > 0.15  # it leans where it faces
+            np.testing.assert_allclose(middle - (middle @ forward) * forward, [0.0, 0.0, middle[2]], atol=0.01)
+
+
+def test_clavicles_rest(data: Path) -> None:
+    body = gazebo(data, 48)
+    q = configuration(body, orientations(CORE))
+    for name in ("jLeftC7Shoulder_rotx", "jRightC7Shoulder_rotx"):
+        np.testing.assert_array_equal(q[:, body.pin.idx_qs[body.pin.getJointId(name)]], 0.0)
+    known = set(known_links(body, ["torso", "left_upper_arm"]))
+    assert {"T8", "L5", "LeftShoulder", "RightShoulder", "LeftUpperArm", "LeftToe", "Head"} <= known
+    assert not known & {"LeftForeArm", "LeftHand", "RightUpperArm", "RightHandCOM"}
+
+
+def test_a_pelvis_that_cannot_move_says_by_how_much(data: Path) -> None:
+    body = gazebo(data, 66)
+    quat_WL = orientations(CORE) | {"pelvis": np.tile(Rotation.from_euler("z", 0.3).as_quat(), (N, 1))}
+    missed = deviation(body, configuration(body, quat_WL), quat_WL)
+    assert set(missed) == {"pelvis"}
+    np.testing.assert_allclose(missed["pelvis"], 0.3)
+
+
+def test_the_summary_says_what_was_not_followed(data: Path, simulation: Simulation) -> None:
+    recording = simulation.recording()
+    summary = track(recording, model=gazebo(data, 48)).summary()
+    assert summary["not_followed_rms_deg"]["left_forearm"] > 1.0
+    assert any(text.startswith("left_forearm: the model's joints are too few") for text in summary["warnings"])
+    assert track(recording, model=gazebo(data, 66)).summary()["not_followed_rms_deg"] == {}
+    assert track(recording).summary()["not_followed_rms_deg"] == {}
+
+
+def arm(elbow: list[tuple[str, str]]) -> str:
+    """A body whose left elbow is hinges (axis, place) with masses between, so no spherical joint."""
+    links, joints = ['<link name="root"/>'], []
+
+    def hinge(name: str, parent: str, child: str, axis: str, at: str, kind: str = "revolute") -> None:
+        mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+        links.append(f'<link name="{child}">{mass}</link>')
+        joints.append(
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{at}"/><axis xyz="{axis}"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
+        )
+
+    hinge("spine", "root", "torso", "0 0 1", "0 0 0", "floating")
+    for side, y in (("left", 0.2), ("right", -0.2)):
+        hinge(f"{side}_s", "torso", f"{side}_upper_arm", "1 0 0", f"0 {y} 0.5", "floating")
+        parent = f"{side}_upper_arm"
+        bend = elbow if side == "left" else [("0 1 0", "0 0 -0.3")]
+        for k, (axis, at) in enumerate(bend):
+            child = f"{side}_forearm" if k == len(bend) - 1 else f"{side}_e{k}_link"
+            hinge(f"{side}_e{k}", parent, child, axis, at)
+            parent = child
+        hinge(f"{side}_w", parent, f"{side}_hand", "1 0 0", "0 0 -0.25", "continuous")
+    return f'<robot name="arm">{"".join(links + joints)}</robot>'
+
+
+def load_text(tmp_path: Path, text: str) -> BodyModel:
+    file = tmp_path / "arm.urdf"
+    file.write_text(text, encoding="utf-8")
+    return load_model(file)
+
+
+@pytest.mark.parametrize("apart", ["0 0 0", "0.01 0 -0.02"])
+def test_three_hinges_follow_what_they_reach(apart: str, tmp_path: Path) -> None:
+    body = load_text(tmp_path, arm([("1 0 0", "0 0 -0.3"), ("0 1 0", apart), ("0 0 1", apart)]))
+    assert "left_forearm" not in body.joints
+    rng = np.random.default_rng(8)
+    quat_WL = orientations(CORE, 8, n=300)
+    bent = Rotation.from_euler("XYZ", rng.uniform([-2.5, -1.4, -2.5], [2.5, 1.4, 2.5], (300, 3)))
+    quat_WL["left_forearm"] = (Rotation.from_quat(quat_WL["left_upper_arm"]) * bent).as_quat()
+    missed = deviation(body, configuration(body, quat_WL), quat_WL)
+    assert missed["left_forearm"].max() < 1e-7
+    quat_WL = orientations(CORE, 9, n=300)  # anything
+    missed = deviation(body, configuration(body, quat_WL), quat_WL)
+    assert missed["left_forearm"].max() < 1e-3
+
+
+def test_four_hinges_share_with_small_angles(tmp_path: Path) -> None:
+    body = load_text(
+        tmp_path, arm([("0 1 0", "0 0 -0.3"), ("0 1 0", "0 0 -0.01"), ("1 0 0", "0 0 0"), ("0 0 1", "0 0 0")])
+    )
+    quat_WL = {s: np.tile([0.0, 0.0, 0.0, 1.0], (1, 1)) for s in CORE}
+    quat_WL["left_forearm"] = Rotation.from_euler("y", [-1.2]).as_quat()
+    q = configuration(body, quat_WL)
+    # The nearest joints that make three axes: the first one rests.
+    found = [q[0, body.pin.idx_qs[body.pin.getJointId(f"left_e{k}")]] for k in range(4)]
+    np.testing.assert_allclose(found, [0.0, -1.2, 0.0, 0.0], atol=1e-9)
+
+
+def test_one_hinge_takes_its_twist_and_a_continuous_one_has_no_end(tmp_path: Path) -> None:
+    body = load_text(tmp_path, arm([("0 0.6 0.8", "0 0 -0.3")]))
+    rng = np.random.default_rng(10)
+    quat_WL = orientations(SEGMENTS[:5] + ["left_hand"], 10)
+    turned = rng.uniform(-np.pi, np.pi, N)
+    above = Rotation.from_quat(quat_WL["left_upper_arm"])
+    forearm = above * Rotation.from_rotvec(np.outer(turned, [0.0, 0.6, 0.8]))
+    hand = forearm * Rotation.from_rotvec(np.outer(2.0 * turned, [1.0, 0.0, 0.0]))
+    quat_WL |= {"left_forearm": forearm.as_quat(), "left_hand": hand.as_quat()}
+    q = configuration(body, quat_WL)
+    missed = deviation(body, q, quat_WL)
+    assert missed["left_forearm"].max() < 1e-7
+    assert missed["left_hand"].max() < 1e-7
+    np.testing.assert_allclose(q[:, body.pin.idx_qs[body.pin.getJointId("left_e0")]], turned, atol=1e-9)
+    first = body.pin.idx_qs[body.pin.getJointId("left_w")]
+    np.testing.assert_allclose(q[:, first], np.cos(2.0 * turned), atol=1e-9)
+    np.testing.assert_allclose(q[:, first + 1], np.sin(2.0 * turned), atol=1e-9)

@@ -1,0 +1,251 @@
+"""The joints of a URDF: checked to be one tree, and built into a `pin.Model` with spherical joints."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from ..errors import BadModel
+
+_TURNS = ("revolute", "continuous")
+_PARALLEL_TOLERANCE = 1e-6
+_MEET_TOLERANCE = 1e-9  # [m]
+
+
+class AxisLimits(NamedTuple):
+    """What the three axes that were joined into a spherical joint may do, in their order."""
+
+    axes: np.ndarray  # (3, 3), a row an axis, in the joint's frame at zero
+    lower: np.ndarray  # (3,) [rad]
+    upper: np.ndarray  # (3,) [rad]
+
+
+class Tree(NamedTuple):
+    """The joints of a URDF by the links they join."""
+
+    root: str
+    above: Mapping[str, Any]  # link → the joint that moves it; without the root
+    below: Mapping[str, list[Any]]  # link → joints that hang on it
+
+    def path(self, link: str) -> list[Any]:
+        """Joints from the root down to `link`."""
+        joints: list[Any] = []
+        while link != self.root:
+            joints.append(self.above[link])
+            link = joints[-1].parent
+        return joints[::-1]
+
+    def body(self, link: str) -> str:
+        """The uppermost link that is rigid with `link`."""
+        while link != self.root and self.above[link].type == "fixed":
+            link = self.above[link].parent
+        return link
+
+    def neutral(self, link: str) -> np.ndarray:
+        """Placement (4, 4) of `link` in the root link, all joints at zero."""
+        M = np.eye(4)
+        for joint in self.path(link):
+            M = M @ origin_of(joint)
+        return M
+
+
+class Built(NamedTuple):
+    """`pin.Model` and what `BodyModel` says of its spherical joints."""
+
+    pin: pin.Model
+    joints: dict[str, int]
+    limits: dict[str, AxisLimits]
+
+
+def tree_of(robot: Any, where: str) -> Tree:
+    """The tree that the joints of `robot` (yourdfpy) form.
+
+    Raises
+    ------
+    BadModel
+        Names that occur twice, joints on links that are not there, two roots, a loop.
+    """
+    for kind, items in (("link", robot.links), ("joint", robot.joints)):
+        name, times = next(iter(Counter(item.name for item in items).most_common(1)), ("", 0))
+        if times > 1:
+            raise BadModel(f"{where}: {kind} '{name}' occurs {times} times; a name stands for one {kind}")
+    below: dict[str, list[Any]] = {link.name: [] for link in robot.links}
+    above: dict[str, Any] = {}
+    for joint in robot.joints:
+        for link in (joint.parent, joint.child):
+            if link not in below:
+                raise BadModel(f"{where}: joint '{joint.name}' names a link '{link}' that is not there")
+        if joint.child in above:
+            raise BadModel(
+                f"{where}: link '{joint.child}' hangs on two joints, '{above[joint.child].name}' and '{joint.name}'; "
+                f"a body is a tree"
+            )
+        above[joint.child] = joint
+        below[joint.parent].append(joint)
+    roots = [name for name in below if name not in above]
+    if len(roots) != 1:
+        found = ", ".join(roots) if roots else "none"
+        raise BadModel(f"{where}: {len(roots)} links without a joint above them ({found}); a body has one root")
+    reached, to_do = set(), [roots[0]]
+    while to_do:
+        reached.add(link := to_do.pop())
+        to_do += [joint.child for joint in below[link]]
+    lost = [name for name in below if name not in reached]
+    if lost:
+        raise BadModel(f"{where}: link '{lost[0]}' hangs in a loop of joints, apart from the root; a body is a tree")
+    return Tree(roots[0], above, below)
+
+
+def build(robot: Any, where: str) -> Built:
+    """The Pinocchio model, depth first as Pinocchio's algorithms want it; one frame a link.
+
+    A mimic joint follows the joint it mimics. The limits of joints that stay as they are are the URDF's.
+
+    Raises
+    ------
+    BadModel
+        No tree; a type of joint that is not known; an axis of zero; a mimic joint that cannot follow.
+    """
+    tree = tree_of(robot, where)
+    links = {link.name: link for link in robot.links}
+    mimicked = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
+    model = pin.Model()
+    model.name = robot.name or "body"
+    joints: dict[str, int] = {}
+    limits: dict[str, AxisLimits] = {}
+
+    def grow(link: str, parent: int, M_JL: pin.SE3) -> None:
+        """Add `link`, placed at `M_JL` on Pinocchio's joint `parent`, and what hangs on it."""
+        model.addFrame(pin.Frame(link, parent, 0, M_JL, pin.FrameType.BODY), False)
+        inertial = links[link].inertial
+        if inertial is not None and inertial.mass:
+            model.appendBodyToJoint(parent, _inertia(inertial), M_JL)
+        for first in tree.below[link]:
+            M_Jc = M_JL * pin.SE3(origin_of(first))
+            if first.type == "fixed":
+                grow(first.child, parent, M_Jc)
+                continue
+            triple = _triple(first, tree, links, mimicked)
+            if triple is None and first.type != "floating":
+                grow(first.child, *_add_single(model, parent, M_Jc, first, where))
+                continue
+            child = first.child
+            if triple is not None:
+                child = triple[-1].child
+                limits[child] = _limits(triple)
+                for joint in triple[1:]:
+                    M_Jc = M_Jc * pin.SE3(origin_of(joint))
+            joints[child] = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
+            grow(child, joints[child], pin.SE3.Identity())
+
+    grow(tree.root, 0, pin.SE3.Identity())
+    for joint in robot.joints:
+        if joint.mimic is not None:
+            model = _mimicking(model, joint, where)
+    return Built(model, joints, limits)
+
+
+def origin_of(joint: Any) -> np.ndarray:
+    """Placement (4, 4) of a joint, and so of its child at zero, in its parent link."""
+    return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float)
+
+
+def axis_of(joint: Any) -> np.ndarray:
+    """Unit axis (3,) of a joint in its own frame; URDF's default is x."""
+    axis = np.asarray(joint.axis if joint.axis is not None else (1.0, 0.0, 0.0), dtype=float)
+    norm = np.linalg.norm(axis)
+    return axis / norm if norm > 1e-9 else np.zeros(3)
+
+
+def _triple(first: Any, tree: Tree, links: Mapping[str, Any], mimicked: set[str]) -> tuple[Any, Any, Any] | None:
+    """The three revolute joints that begin with `first` and together are a spherical joint, if they are."""
+    chain = [first]
+    while len(chain) < 3:
+        below, link = tree.below[chain[-1].child], links[chain[-1].child]
+        if len(below) != 1 or link.visuals or link.collisions or (link.inertial is not None and link.inertial.mass):
+            return None
+        chain.append(below[0])
+    if any(joint.type not in _TURNS or joint.mimic is not None or joint.name in mimicked for joint in chain):
+        return None
+    if any(np.linalg.norm(origin_of(joint)[:3, 3]) > _MEET_TOLERANCE for joint in chain[1:]):
+        return None
+    axes = _axes(chain)
+    if np.abs(axes @ axes.T - np.eye(3)).max() > _PARALLEL_TOLERANCE:
+        return None
+    return chain[0], chain[1], chain[2]
+
+
+def _axes(chain: Any) -> np.ndarray:
+    """Axes (3, 3), a row each, in the frame of the last joint's child, all joints at zero."""
+    rows = []
+    for k, joint in enumerate(chain):
+        axis = axis_of(joint)
+        for later in chain[k + 1 :]:
+            axis = origin_of(later)[:3, :3].T @ axis
+        rows.append(axis)
+    return np.array(rows)
+
+
+def _limits(triple: tuple[Any, Any, Any]) -> AxisLimits:
+    low, high = np.array([_bounds(joint, np.pi) for joint in triple]).T
+    return AxisLimits(_axes(triple), low, high)
+
+
+def _bounds(joint: Any, unbounded: float) -> tuple[float, float]:
+    """Lower and upper limit of a joint [rad or m]."""
+    if joint.type == "continuous" or joint.limit is None:
+        return -unbounded, unbounded
+    low, high = joint.limit.lower, joint.limit.upper
+    return (-unbounded if low is None else float(low)), (unbounded if high is None else float(high))
+
+
+def _add_single(model: pin.Model, parent: int, M: pin.SE3, joint: Any, where: str) -> tuple[int, pin.SE3]:
+    """Add a joint of one axis with its limits; gives it, and the placement of the child link on it."""
+    if joint.type not in ("revolute", "continuous", "prismatic"):
+        raise BadModel(
+            f"{where}: joint '{joint.name}' is of type '{joint.type}'; known are fixed, revolute, continuous, "
+            f"prismatic, floating, and spherical as three revolute joints"
+        )
+    axis = axis_of(joint)
+    if not axis.any():
+        raise BadModel(f"{where}: joint '{joint.name}' has an axis of zero length; three numbers as 0 0 1 are wanted")
+    limit = joint.limit
+    effort = np.inf if limit is None or limit.effort is None else float(limit.effort)
+    velocity = np.inf if limit is None or limit.velocity is None else float(limit.velocity)
+    of_rate = np.array([effort]), np.array([velocity])
+    if joint.type == "continuous":
+        # Python cannot give Pinocchio's unbounded joint an axis: its own z is turned onto ours. q: cosine and sine.
+        turn = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix(), np.zeros(3))
+        bounds = np.full(2, -1.01), np.full(2, 1.01)
+        return model.addJoint(parent, pin.JointModelRUBZ(), M * turn, joint.name, *of_rate, *bounds), turn.inverse()
+    kind = pin.JointModelRevoluteUnaligned if joint.type == "revolute" else pin.JointModelPrismaticUnaligned
+    low, high = _bounds(joint, np.inf)
+    added = model.addJoint(parent, kind(axis), M, joint.name, *of_rate, np.array([low]), np.array([high]))
+    return added, pin.SE3.Identity()
+
+
+def _mimicking(model: pin.Model, joint: Any, where: str) -> pin.Model:
+    """The model in which `joint` follows the one it mimics."""
+    leader = joint.mimic.joint
+    if not model.existJointName(joint.name) or not model.existJointName(leader) or leader == joint.name:
+        raise BadModel(f"{where}: joint '{joint.name}' mimics '{leader}', which is no joint that it could follow")
+    of, to = model.getJointId(leader), model.getJointId(joint.name)
+    if to < of or model.nvs[to] != 1 or model.nvs[of] != 1:
+        raise BadModel(f"{where}: joint '{joint.name}' mimics '{leader}', which must be a joint before it, of one axis")
+    ratio = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
+    offset = 0.0 if joint.mimic.offset is None else float(joint.mimic.offset)
+    try:
+        return pin.transformJointIntoMimic(model, of, to, ratio, offset)
+    except Exception as error:  # what C++ throws
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BadModel(f"{where}: joint '{joint.name}' cannot mimic '{leader}': {reason}") from error
+
+
+def _inertia(inertial: Any) -> pin.Inertia:
+    placement = pin.SE3.Identity() if inertial.origin is None else pin.SE3(np.asarray(inertial.origin, dtype=float))
+    inertia = inertial.inertia if inertial.inertia is not None else np.zeros((3, 3))
+    return pin.Inertia(inertial.mass, placement.translation, placement.rotation @ inertia @ placement.rotation.T)
