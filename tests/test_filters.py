@@ -253,6 +253,31 @@ def test_nees_is_right_when_the_filter_is_told_the_truth() -> None:
     assert abs(average - 3) < 0.3
 
 
+def test_where_the_papers_start_and_bias_noise_are_wrong() -> None:
+    """The figures in the docstring of `SmekfParams`."""
+    # A bias that drifts by 10 deg/h over 100 s, as a random walk: what Σ_b stands for in G Q Gᵀ = δt² Σ_b.
+    real_step = np.eye(3) * (np.deg2rad(10.0 / 3600.0) * np.sqrt(2.0 / 100.0 * RATE)) ** 2 * 1e-2
+    rows: dict[str, list[tuple[float, float]]] = {"paper": [], "measured P0": [], "measured P0, real bias": []}
+    for seed in range(16):
+        gyro, accel, true, _ = measured(np.random.default_rng(seed), 120.0, bias=(0.01, -0.02, 0.015), tilt=0.8)
+        noise = noise_of(gyro[:180], accel[:180], RATE)
+        for name, found in rows.items():
+            told = replace(noise, bias_step_cov=real_step) if name.endswith("bias") else noise
+            out = run_filter(gyro, accel, RATE, told, "smekf", measured_start=name != "paper")
+            heading = heading_error_deg(out.quat_WS, true)
+            aligned = Rotation.from_rotvec([0, 0, np.deg2rad(heading[100])]) * Rotation.from_quat(true)
+            error = (Rotation.from_quat(out.quat_WS).inv() * aligned).as_rotvec()
+            assert out.attitude_cov is not None
+            nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(out.attitude_cov), error)
+            found.append((nees[3000:].mean(), np.sqrt(np.mean((heading[3000:] - heading[100]) ** 2))))
+    mean = {name: np.mean(found, axis=0) for name, found in rows.items()}
+    for name, (nees, rms) in mean.items():
+        print(f"{name:24s} NEES {nees:.1f}, heading {rms:.2f} deg rms")
+    np.testing.assert_allclose(mean["paper"], (1.9, 0.57), rtol=0.1)
+    np.testing.assert_allclose(mean["measured P0"], (1.1, 0.10), rtol=0.1)
+    np.testing.assert_allclose(mean["measured P0, real bias"], (2.4, 0.11), rtol=0.1)
+
+
 # The other two -----------------------------------------------------------------------------------------------------
 
 

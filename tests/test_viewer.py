@@ -4,7 +4,6 @@ import base64
 import html.parser
 import json
 import re
-import shutil
 import socket
 import subprocess
 
@@ -182,45 +181,3 @@ def test_shortest_recordings_and_nothing_to_see(n):
     assert floats(data_of(view_html([], time, {}))["offsets"], -1).shape == (n,)
     unknown = {"torso": (np.full((n, 4), np.nan), np.full((n, 3), np.nan))}
     assert data_of(view_html(VISUALS, time, unknown))["links"] == ["torso"]
-
-
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-
-
-@pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome")
-def test_browser_shows_the_page_at_the_time_in_its_address(recording, tmp_path):
-    time, placements = recording
-    page = view_html(
-        VISUALS,
-        time,
-        placements,
-        trails={"left_hand": placements["left_forearm"][1]},
-        phases={"circles": [(time[10], time[200])]},
-        title="circles",
-    )
-    (tmp_path / "view.html").write_text(page, encoding="utf-8")
-    dump = subprocess.run(
-        [
-            BROWSER,
-            "--headless",
-            "--no-sandbox",
-            "--disable-quic",
-            "--no-first-run",
-            "--use-gl=angle",
-            "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader",
-            f"--user-data-dir={tmp_path / 'profile'}",
-            "--window-size=500,400",
-            "--virtual-time-budget=2000",
-            "--dump-dom",
-            f"{(tmp_path / 'view.html').as_uri()}#t={time[0] + 1.25}",
-        ],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    ).stdout
-    shown = Page(dump)
-    assert next(a for tag, a in shown.elements if tag == "html").get("data-wepose-ready") == "true"
-    assert float(shown.text["now"]) == pytest.approx(time[0] + 1.25, abs=0.011)
-    assert "circles" in shown.text["span"]
