@@ -31,7 +31,7 @@ class SmekfParams:
 
     By how much, over two minutes of simulated motion with rests (`tests/test_filters.py` measures it; a NEES of 3 is
     right, below is a covariance too large): NEES 1.9 and 0.57 deg of heading (rms) with the paper's P₀ and Σ_b, 1.1 and
-    0.10 deg with a measured P₀, 2.4 and 0.11 deg with a measured P₀ and the Σ_b of a bias that drifts by 10 deg/h.
+    0.10 deg with a measured P₀, 2.1 and 0.10 deg with a measured P₀ and the Σ_b of a bias that drifts by 10 deg/h.
     """
 
     attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
