@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -369,6 +370,13 @@ def main(argv: list[str] | None = None) -> None:
     except WeposeError as error:
         print(f"wepose: {error}", file=sys.stderr)
         sys.exit(2)
+    except BrokenPipeError:
+        # Whoever read our output has seen enough; Python would complain once more on its way out.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        print(f"wepose: {error.filename or 'output'}: {error.strerror or error}; nothing was written", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         print("wepose: stopped; nothing was written", file=sys.stderr)
         sys.exit(130)
@@ -462,13 +470,15 @@ def _print_table(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title=escape(title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    table = Table(box=box.SIMPLE_HEAD)
     for k, name in enumerate(header):
         table.add_column(escape(name), justify="left" if k == 0 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     # Piped output is not cut to 80 columns.
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    console.print(escape(title), style="bold", highlight=False)
+    console.print(table)
 
 
 def _lengths_table(
