@@ -63,17 +63,23 @@ def test_the_whole_chain_is_honest() -> None:
     """Calibrated on MTi-3 data, tracked through six circles: the normalised error of the hand averages to three."""
     from wepose_pin.calibration import calibrate
 
-    hand = []
+    hand, segments = [], []
     for seed in range(8):
         person = simulated_person(200 + seed)
-        simulation = simulate(person.lengths, seed=seed, noise=ImuNoise(accel_bias_std=0.0))
+        simulation = simulate(person.lengths, seed=seed, noise=ImuNoise())
         recording = simulation.recording()
         pose = track(recording, calibrate(recording, gauge=person.taped, prior=person.average))
         during = recording.span(simulation.phases["circles"][0])
+        for name in simulation.quat_WL:
+            true, found = (Rotation.from_quat(p.quat_WL[name][during]) for p in (simulation.truth(), pose))
+            turn = (true * found.inv()).as_rotvec()
+            segments.append(np.einsum("ni,nij,nj->n", turn, np.linalg.inv(pose.segment_cov[name][during]), turn).mean())
         error = (simulation.points["right_hand"] - pose.points["right_hand"])[during]
         hand.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(pose.point_cov["right_hand"][during]), error).mean())
     print("NEES of the right hand, 8 people:", np.round(hand, 2), "mean", np.mean(hand).round(2))
+    print("NEES of the segments, 8 people:", np.round(segments, 2), "mean", np.mean(segments).round(2))
     assert 1.0 < np.mean(hand) < 6.0
+    assert 0.7 < np.mean(segments) < 4.5
 
 
 def test_the_columns_of_the_result(tmp_path: Path) -> None:

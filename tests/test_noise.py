@@ -24,7 +24,7 @@ def test_moments_are_the_samples() -> None:
     np.testing.assert_allclose(noise.accel_cov, np.cov(accel.T) / noise.gravity**2)
     # Of white noise the first differences have twice the covariance, and the mean has 1/n of it.
     np.testing.assert_allclose(noise.bias_step_cov, 2 * noise.gyro_cov, atol=2e-5)
-    assert np.sqrt(np.trace(noise.gyro_bias_cov) / 3) == pytest.approx(1e-2 * np.sqrt(2 / 4000), rel=0.3)
+    assert np.sqrt(np.trace(noise.gyro_bias_cov) / 3) == pytest.approx(1e-2 * np.sqrt(1 / 4000), rel=0.25)
 
 
 def test_sway_makes_the_bias_uncertain() -> None:

@@ -14,10 +14,14 @@ ANGLES = np.concatenate(
 )
 
 
+def cross_matrix(v: np.ndarray) -> np.ndarray:
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
 @pytest.mark.parametrize("angle", ANGLES)
 def test_exp_is_the_matrix_exponential(angle: float) -> None:
     axis = np.array([0.36, -0.48, 0.8])
-    matrix = expm(so3.hat(angle * axis))
+    matrix = expm(cross_matrix(angle * axis))
     np.testing.assert_allclose(Rotation.from_quat(so3.exp(angle * axis)).as_matrix(), matrix, atol=1e-14)
     quat = np.array([0.0, 0.0, 0.0, 1.0])
     so3.rotate_by_vector(quat, *(angle * axis))
@@ -85,12 +89,6 @@ def test_continuous_changes_signs_and_nothing_else() -> None:
     smooth = so3.continuous(flipped)
     np.testing.assert_array_equal(np.abs(smooth), np.abs(flipped))
     assert np.abs(np.diff(smooth, axis=0)).max() < 0.02
-
-
-def test_mean_is_blind_to_signs() -> None:
-    quat = Rotation.from_rotvec([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.1, 0], [0, -0.1, 0]]).as_quat()
-    quat[1] *= -1.0
-    assert Rotation.from_quat(so3.mean_quat(quat)).magnitude() < 1e-12
 
 
 def test_integrate_turns_step_by_step() -> None:

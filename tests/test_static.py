@@ -107,7 +107,7 @@ def test_ten_million_samples_lose_no_precision() -> None:
     accel[:, 2] = 9.81
     accel += rng.normal(scale=1e-3, size=(n, 1)) * [0.0, 0.0, 1.0]
     gyro = np.zeros((n, 3))
-    noise = SensorNoise(np.zeros(3), np.eye(3), np.eye(3), np.eye(3), np.eye(3), 1.0, 100)
+    noise = SensorNoise(np.zeros(3), np.eye(3), np.eye(3), np.eye(3), np.eye(3), 1.0)
     last = accel[-window:, 2]
     variance = float(np.var(last, ddof=1))
     huge = {"alpha": 1e9, "beta": 1e9, "gamma1": 1e9, "window_s": window / RATE}

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from . import so3
 from .errors import BadPhase, BadSession, WeposeError
 from .filters import Orientation, check_method, run_filter
+from .filters.smekf import ACCEL_BIAS_STD
 from .noise import noise_of, quietest
 from .recording import Recording
 from .static import StaticTest
@@ -42,8 +43,9 @@ class Segments:
     quat_LS : segment → (4,) xyzw, the mount used
     heading : segment → ψ [rad], from the sensor's world to W
     orientation : segment → what the filter gave; none for ready orientations
-    covariance_W : segment → (n, 3, 3) [rad²], of the error on the left of `quat_WL`, in W: the filter's, and that of a
-        calibrated mount. A stated mount counts as exact. Only where the filter has one
+    covariance_W : segment → (n, 3, 3) [rad²], of the error on the left of `quat_WL`, in W: the filter's, the
+        accelerometer's bias, and the heading of a calibrated mount. A stated mount counts as
+        exact. Only where the filter has a covariance
     start, still : intervals [s] used for headings, and for noise and bias
     warnings : what the user should know
     """
@@ -155,11 +157,14 @@ def _covariance_W(
     R = R_WS.as_matrix()
     assert orientation.attitude_cov is not None
     cov_W = R @ orientation.attitude_cov @ R.swapaxes(1, 2)
-    axes = [f"mounts.{segment}.{axis}" for axis in "xyz"]
-    if subject is not None and recording.strapping != "new" and set(axes) <= set(subject.order):
-        rows = [subject.order.index(axis) for axis in axes]
-        R = (R_WS * R_LS.inv()).as_matrix()
-        cov_W = cov_W + R @ subject.covariance[np.ix_(rows, rows)] @ R.swapaxes(1, 2)
+    # Each rest measures the tilt anew with the same accelerometer bias, which averaging does not take away.
+    cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
+    if subject is not None and segment in subject.mounts and recording.strapping != "new":
+        # Of a mount's error only the heading counts, the tilt is measured anew: it turns R_WL into
+        # Rz(δ) R_WL Rz(δ)ᵀ, which is nothing in the start pose and grows as the segment turns away from it.
+        lever = np.array([0.0, 0.0, 1.0]) - (R_WS * R_LS.inv()).as_matrix()[:, :, 2]
+        heading_var = np.nan_to_num(subject.std(f"mounts.{segment}.z") ** 2)
+        cov_W += heading_var * lever[:, :, None] * lever[:, None, :]
     return cov_W
 
 
@@ -170,12 +175,19 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
         start = recording.phases["start"][0]
         if len(recording.phases["start"]) > 1:
             notes.append(f"phases.start holds several intervals; the first, {start[0]:g} to {start[1]:g} s, is used")
+    elif recording.phases.get("still"):
+        raise BadPhase(
+            f"{recording.where()}: phases.still without phases.start; name the seconds of the start pose, "
+            f"start = [[from, to]]"
+        )
     else:
         start = quietest(recording)
         notes.append(
             f"no phases.start: the quietest window, {start[0]:g} to {start[1]:g} s, is taken for the start pose"
         )
     still = recording.phases.get("still", ())
+    if len(still) > 1:
+        notes.append(f"phases.still holds several intervals; the first, {still[0][0]:g} to {still[0][1]:g} s, is used")
     for interval in (start, *still[:1]):
         samples = len(recording.time[recording.span(interval)])
         if samples < 10:

@@ -26,14 +26,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from .alignment import Segments, segment_orientations
-from .errors import BadOption, BadSession, BadSubject, NoSolution, one_of
+from .errors import BadOption, BadPhase, BadSession, BadSubject, NoSolution, one_of
 from .recording import Recording
 from .subject import LENGTHS, Subject, average_subject
 
@@ -52,6 +52,10 @@ TILT_STD = np.deg2rad(0.5)  # [rad] of the start pose's tilt: the accelerometer'
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
 # Residual variance, in units of ATTITUDE_STD², that no person's hands stay below (a fraction of a millimetre).
 LEAST_VARIANCE = 1e-4
+# Errors of orientations are slow: two looks closer than this [s] are never independent, however white the residual
+# looks in one phase. Found on simulated people, whose joint errors it brings within what the covariance says.
+LEAST_CORRELATION_S = 8.0
+LEAST_LOOKS = 10
 ROUNDS = 4
 
 
@@ -67,7 +71,7 @@ class Calibration:
     prior_rms_gap : the same with the prior's lengths
     independent : how many independent looks at the gap the phase is worth
     gauge : the measured lengths [m]; empty: the scale is the prior's
-    scale_std : relative standard deviation of the overall scale
+    scale_std : relative standard deviation of the overall scale, the proportions taken as found
     warnings : what the user should know
     """
 
@@ -182,6 +186,11 @@ def _solve(
 ) -> Calibration:
     stride = max(1, round(recording.rate_hz / LOOK_RATE_HZ))
     looks = np.concatenate([np.arange(len(recording))[recording.span(i)][::stride] for i in intervals])
+    if len(looks) < LEAST_LOOKS:
+        raise BadPhase(
+            f"{recording.where()}: phases.clasp holds {len(looks)} looks at {LOOK_RATE_HZ:g} a second; at least "
+            f"{LEAST_LOOKS} are needed, better a minute"
+        )
     problem = _problem(len(looks), tuple(name for name in CHAIN if name in segments.quat_WL))
     since = recording.time[looks] - segments.start[1]
     data = np.vstack([_chain_quats(segments.quat_WL, looks), since])
@@ -193,7 +202,7 @@ def _solve(
     for _ in range(ROUNDS):
         x = problem.solve(data, center, information, weight, x)
         r = np.asarray(problem.residuals(x, data)).T  # (n, 3), of unit variance if ATTITUDE_STD were right
-        independent = len(r) / _correlation_time(r)
+        independent = len(r) / max(_correlation_time(r), LEAST_CORRELATION_S * LOOK_RATE_HZ)
         freedom = max(r.size - 5.0, 1.0)
         weight = float(independent / len(r) / max(np.sum(r**2) / freedom, LEAST_VARIANCE))
     J = np.asarray(problem.jacobian(x, data))
@@ -334,7 +343,7 @@ class _Problem(NamedTuple):
         return x
 
 
-@cache
+@lru_cache(maxsize=1)
 def _problem(n: int, sensors: tuple[str, ...]) -> _Problem:
     k, s = len(LENGTHS), len(sensors)
     m = k + 4 * s

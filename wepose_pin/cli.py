@@ -56,6 +56,8 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
     from .writers import whole_folder, write_result, write_session
     from .writers.result import as_json, write_subject
 
+    if seed < 0:
+        raise BadOption(f"--seed {seed}: a whole number from 0 on")
     with whole_folder(out, force) as folder, _steps(2 + 2 * len(METHODS)) as step:
         step("simulating a person")
         person = simulated_person(seed)
@@ -299,6 +301,8 @@ def simulate(*, out: Out, seed: int = 1, rate_hz: float = 100.0, force: bool = F
     from .subject import LENGTHS, subject_toml
     from .writers import whole_folder, write_session
 
+    if seed < 0:
+        raise BadOption(f"--seed {seed}: a whole number from 0 on")
     if not 20.0 <= rate_hz <= 2000.0:
         raise BadOption(f"--rate-hz {rate_hz:g}: between 20 and 2000 samples a second")
     with whole_folder(out, force) as folder, _steps(1) as step:

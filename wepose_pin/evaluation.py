@@ -89,8 +89,11 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         difference = pose.points[point][inside][known] - _at(time[known], truth.time, truth.points[point], finite)
         position[point] = position_error(difference)
         if middle[0] is not None and middle[1] is not None and "shoulder" not in point:
-            shift = middle[0][inside][known] - _at(time[known], truth.time, middle[1], finite)
-            from_shoulders[point] = position_error(difference - shift)
+            there = np.isfinite(middle[1]).all(axis=1)
+            both = _near(time[known], truth.time[there])
+            shift = middle[0][inside][known] - _at(time[known], truth.time, middle[1], there)
+            if both.any():
+                from_shoulders[point] = position_error((difference - shift)[both])
     if not attitude and not position:
         raise BadData(
             "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
@@ -110,7 +113,7 @@ def _at(time: np.ndarray, known: np.ndarray, points: np.ndarray, finite: np.ndar
 
 def _near(time: np.ndarray, known: np.ndarray, reach_s: float = 0.1) -> np.ndarray:
     """Which times lie between two known ones not further apart than `reach_s`, or on one: no error within a gap."""
-    if not len(known):
+    if len(known) < 2:
         return np.zeros(len(time), dtype=bool)
     after = np.clip(np.searchsorted(known, time - 1e-9), 0, len(known) - 1)
     before = np.clip(np.searchsorted(known, time + 1e-9, side="right") - 1, 0, len(known) - 1)

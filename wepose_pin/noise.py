@@ -13,6 +13,7 @@ from .recording import Recording
 # the covariances stay invertible.
 GYRO_FLOOR = 1e-5  # [rad/s]
 ACCEL_FLOOR = 1e-5  # [g]
+BIAS_FLOOR = 1e-6  # [rad/s] of the bias itself, that is 0.2 deg/h
 
 # Blocks for the covariance of the mean: long against the sensor's noise, short against a person's sway.
 BLOCK_S = 0.5
@@ -34,7 +35,6 @@ class SensorNoise:
     accel_cov : (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
     bias_step_cov : (3, 3) Σ_b, covariance of the first differences of gyro [rad²/s²], as in the authors' software
     gravity : mean norm of accel [m/s²]: the gravity scale
-    samples : how many samples stand behind it
     """
 
     gyro_bias: np.ndarray
@@ -43,7 +43,6 @@ class SensorNoise:
     accel_cov: np.ndarray
     bias_step_cov: np.ndarray
     gravity: float
-    samples: int
 
 
 def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> SensorNoise:
@@ -68,7 +67,6 @@ def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> SensorN
         accel_cov=_floored(np.cov(accel_S.T / gravity), ACCEL_FLOOR),
         bias_step_cov=_floored(np.cov(np.diff(gyro_S, axis=0).T), GYRO_FLOOR),
         gravity=gravity,
-        samples=len(gyro_S),
     )
 
 
@@ -76,11 +74,10 @@ def _cov_of_mean(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray:
     """Covariance of the mean from the means of blocks: white noise averages out in them, sway stays and is counted."""
     size = max(1, round(BLOCK_S * rate_hz))
     blocks = len(gyro_S) // size
-    white = np.cov(gyro_S.T) / len(gyro_S)
     if blocks < 4:  # too short to see sway: the white part is all that can be said
-        return _floored(white, GYRO_FLOOR)
+        return _floored(np.cov(gyro_S.T) / len(gyro_S), BIAS_FLOOR)
     means = gyro_S[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
-    return _floored(white + np.cov(means.T) / blocks, GYRO_FLOOR)
+    return _floored(np.cov(means.T) / blocks, BIAS_FLOOR)
 
 
 def _floored(cov: np.ndarray, std: float) -> np.ndarray:
@@ -92,7 +89,8 @@ def quietest(recording: Recording) -> tuple[float, float]:
     time, rate_hz = recording.time, recording.rate_hz
     n = int(np.searchsorted(time, time[0] + BEGINNING_S, side="right"))
     window = min(max(round(QUIET_S * rate_hz), 10), n)
-    motion = np.zeros(n - window + 1)
+    stride = max(1, window // 40)  # the windows need not begin at every sample
+    motion = np.zeros(len(range(0, n - window + 1, stride)))
     for sensor in recording.sensors.values():
         if sensor.gyro_S is not None:
             signal = sensor.gyro_S[:n]
@@ -102,7 +100,7 @@ def quietest(recording: Recording) -> tuple[float, float]:
             quat = sensor.quat_WS[:n]
             flips = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))[:, None]
             signal = 2.0 * rate_hz * np.concatenate([np.zeros((1, 4)), quat[1:] - flips * quat[:-1]])
-        windows = np.lib.stride_tricks.sliding_window_view(signal, window, axis=0)
+        windows = np.lib.stride_tricks.sliding_window_view(signal, window, axis=0)[::stride]
         motion += windows.var(axis=-1).sum(axis=-1)
-    first = int(np.argmin(motion))
+    first = int(np.argmin(motion)) * stride
     return float(time[first]), float(time[first + window - 1])

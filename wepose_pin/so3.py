@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-# Below this angle [rad] the half-angle series replaces sin(x)/x; its first left-out term is under 1e-18 there.
+# Below this angle [rad] the half-angle series replaces sin(x)/x; its first left-out term is under 1e-17 there.
 SMALL_ANGLE = 1e-4
 
 
@@ -33,12 +33,6 @@ def exp(rotvec: ArrayLike) -> np.ndarray:
 def log(quat: ArrayLike) -> np.ndarray:
     """Rotation vector (..., 3) [rad], at most pi long, of the quaternion (..., 4) xyzw."""
     return Rotation.from_quat(np.asarray(quat, dtype=float)).as_rotvec()
-
-
-def hat(v: ArrayLike) -> np.ndarray:
-    """Matrix [v]× with ``hat(v) @ w == cross(v, w)``."""
-    x, y, z = np.asarray(v, dtype=float)
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def tilt(accel_S: ArrayLike) -> np.ndarray:
@@ -64,14 +58,9 @@ def tilt(accel_S: ArrayLike) -> np.ndarray:
 
 
 def heading(quat_WV: ArrayLike) -> np.ndarray:
-    """Twist [rad] of rotations (..., 4) about the vertical, in (−pi, pi]: what is left when the tilt is taken off."""
+    """Twist [rad] of rotations (..., 4) about the vertical, in [−pi, pi]: what is left when the tilt is taken off."""
     quat = np.asarray(quat_WV, dtype=float)
     return np.angle(np.exp(2j * np.arctan2(quat[..., 2], quat[..., 3])))
-
-
-def mean_quat(quat: np.ndarray) -> np.ndarray:
-    """Chordal mean (4,) of quaternions (n, 4), blind to their signs."""
-    return Rotation.from_quat(quat).mean().as_quat()
 
 
 def continuous(quat: np.ndarray) -> np.ndarray:

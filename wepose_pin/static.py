@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from .errors import BadData
 from .noise import SensorNoise
 
 # A sample is gyro (3), accel/g (3) and the norm of accel/g; its statistics are their means and the co-moments
@@ -17,7 +18,7 @@ _MOMENTS = 13
 
 @dataclass(frozen=True)
 class StaticTest:
-    """When a sensor counts as still; the defaults are the paper's, with a window of the authors' software.
+    """When a sensor counts as still; the defaults are the paper's; it leaves the window open.
 
     The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite.
     """
@@ -64,6 +65,8 @@ class StaticDetector:
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """`static` (n,) bool for `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²]."""
+        if len(gyro_S) != len(accel_S):  # the compiled step would read beyond an array's end
+            raise BadData(f"{len(gyro_S)} rows of gyro_S and {len(accel_S)} of accel_S: not as many each")
         static = np.empty(len(gyro_S), dtype=np.bool_)
         _run(
             self._block,

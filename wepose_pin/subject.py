@@ -7,11 +7,13 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .assets import asset
 from .errors import BadOption, BadSubject, MissingFile, one_of
+from .recording import SEGMENTS
 
 LENGTHS = (
     "trunk",
@@ -34,7 +36,8 @@ class Subject:
     Parameters
     ----------
     lengths : name → [m], every one of `LENGTHS`
-    order : what the rows of `covariance` are: names of lengths [m], then ``mounts.<segment>.x`` … [rad]
+    order : what the rows of `covariance` are: names of lengths [m], then ``mounts.<segment>.x``, ``.y``, ``.z``
+        [rad], the error of a mount as a small turn about the segment's axes
     covariance : (k, k)
     mounts : segment → `quat_LS` (4,) xyzw, the calibrated mounts; empty where none are calibrated
     note : where the numbers come from, in a few words
@@ -122,9 +125,9 @@ def average_subject(stature: float | None = None, sex: str | None = None) -> Sub
 
 def subject_toml(subject: Subject) -> str:
     """The text of ``subject.toml``."""
-    lines = [f"format = {FORMAT}", f"name = {json.dumps(subject.name)}"]
+    lines = [f"format = {FORMAT}", f"name = {json.dumps(subject.name, ensure_ascii=False)}"]
     if subject.note:
-        lines.append(f"note = {json.dumps(subject.note)}")
+        lines.append(f"note = {json.dumps(subject.note, ensure_ascii=False)}")
     lines += ["", "[lengths]       # m", *(f"{k} = {v:.6f}" for k, v in subject.lengths.items())]
     lines += ["", "[lengths_std]   # m, one standard deviation"]
     lines += [f"{k} = {subject.std(k):.6f}" for k in subject.lengths if k in subject.order]
@@ -162,10 +165,13 @@ def load_subject(path: str | Path) -> Subject:
         raise BadSubject(f"{path}: not valid TOML: {error}") from error
     if table.get("format") != FORMAT:
         raise BadSubject(f"{path}: format = {table.get('format')!r}; this version reads format = {FORMAT}")
+    for key in ("lengths", "lengths_std", "mounts", "covariance"):
+        if not isinstance(table.get(key, {}), dict):
+            raise BadSubject(f"{path}: {key} = {table[key]!r} is not a table; write [{key}]")
     lengths = table.get("lengths", {})
-    for name in lengths:
+    for name in [*lengths, *table.get("lengths_std", {})]:
         if name not in LENGTHS:
-            raise BadSubject(f"{path}: lengths.{name} is not a length; {one_of(LENGTHS, name)}")
+            raise BadSubject(f"{path}: '{name}' is not a length; {one_of(LENGTHS, name)}")
     for name in LENGTHS:
         value = lengths.get(name)
         if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 < value < 3.0:
@@ -182,23 +188,42 @@ def load_subject(path: str | Path) -> Subject:
 
 
 def _covariance(path: Path, table: Mapping, std: Mapping) -> tuple[tuple[str, ...], np.ndarray]:
+    for name, value in std.items():
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < 1.0:
+            raise BadSubject(f"{path}: lengths_std.{name} = {value!r}; a standard deviation in metres is needed")
     if not table:
         order = tuple(name for name in LENGTHS if name in std)
         return order, np.diag([float(std[name]) ** 2 for name in order])
-    order = tuple(table.get("order", ()))
+    known = (*LENGTHS, *(f"mounts.{segment}.{axis}" for segment in SEGMENTS for axis in "xyz"))
+    order = table.get("order", ())
+    if not isinstance(order, list | tuple) or len(set(map(str, order))) != len(order):
+        raise BadSubject(f"{path}: covariance.order = {order!r}; a list of names is needed, each once")
+    for name in order:
+        if name not in known:
+            raise BadSubject(f"{path}: covariance.order: {name!r} is not known; {one_of(known, str(name))}")
+    order = tuple(order)
     try:
         matrix = np.array(table.get("matrix"), dtype=float)
     except (TypeError, ValueError):
         raise BadSubject(f"{path}: covariance.matrix holds something that is no number, or rows that differ") from None
     if matrix.shape != (len(order), len(order)):
         raise BadSubject(f"{path}: covariance.matrix is {matrix.shape}; {len(order)} names in order need as many rows")
-    if not np.allclose(matrix, matrix.T, atol=1e-12) or np.linalg.eigvalsh(matrix)[0] < -1e-9:
+    if (
+        not np.isfinite(matrix).all()
+        or not np.allclose(matrix, matrix.T, atol=1e-12)
+        or np.linalg.eigvalsh(matrix)[0] < -1e-9
+    ):
         raise BadSubject(f"{path}: covariance.matrix is not symmetric and positive semidefinite")
     return order, matrix
 
 
-def _mount(path: Path, segment: str, table: Mapping) -> np.ndarray:
-    quat = np.array([table.get(key, np.nan) for key in ("qx", "qy", "qz", "qw")], dtype=float)
+def _mount(path: Path, segment: str, table: Any) -> np.ndarray:
+    if segment not in SEGMENTS:
+        raise BadSubject(f"{path}: mounts.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
+    parts = [table.get(key) for key in ("qx", "qy", "qz", "qw")] if isinstance(table, dict) else [None]
+    if not all(isinstance(part, int | float) for part in parts):
+        raise BadSubject(f"{path}: mounts.{segment} needs four numbers, qx, qy, qz, qw")
+    quat = np.array(parts, dtype=float)
     norm = np.linalg.norm(quat)
     if not abs(norm - 1.0) < 1e-3:
         raise BadSubject(f"{path}: mounts.{segment} is no unit quaternion; it needs qx, qy, qz, qw of length 1")

@@ -90,7 +90,12 @@ def estimate_orientation(
         An unknown method; arrays that do not fit each other; a still phase outside the data.
     """
     check_method(method)
-    gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
+    try:
+        gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise BadData(f"gyro_S and accel_S must be arrays of numbers (n, 3): {error}") from None
+    if not (np.isfinite(rate_hz) and rate_hz > 0.0 and np.isfinite(still).all()):
+        raise BadOption(f"rate_hz = {rate_hz} and still = {still}: finite numbers, samples a second and seconds")
     if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
     if not np.isfinite(gyro).all() or not np.isfinite(accel).all():
@@ -126,7 +131,12 @@ def run_filter(
     test = static_test or StaticTest()
     static = StaticDetector(noise, rate_hz, test).run(gyro_S, accel_S)
     window = test.samples(rate_hz)
-    quat_start = so3.tilt(accel_S[:window].mean(axis=0))
+    first_accel = accel_S[:window].mean(axis=0)
+    if not np.linalg.norm(first_accel) > 0.0:
+        raise BadData(
+            f"accel is zero in the first {test.window_s:g} s; the filter starts from the direction of gravity"
+        )
+    quat_start = so3.tilt(first_accel)
     if measured_start and params is None and method == "smekf":
         params = starting_params(noise, quat_start, still_start=bool(static[window - 1 : window].any()))
     filter_ = METHODS[method](noise, rate_hz, quat_start, params)

@@ -6,6 +6,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from ..errors import BadData
 from ..noise import SensorNoise
 
 
@@ -41,4 +42,9 @@ def samples(
     """One sample or many as the contiguous arrays that the compiled steps take: (n, 3), (n, 3), (n,)."""
     gyro = np.ascontiguousarray(np.reshape(gyro_S, (-1, 3)), dtype=float)
     accel = np.ascontiguousarray(np.reshape(accel_S, (-1, 3)), dtype=float)
-    return gyro, accel, np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
+    at_rest = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
+    if not len(gyro) == len(accel) == len(at_rest):  # the compiled steps would read beyond an array's end
+        raise BadData(
+            f"{len(gyro)} rows of gyro_S, {len(accel)} of accel_S, {len(at_rest)} of static: not as many each"
+        )
+    return gyro, accel, at_rest

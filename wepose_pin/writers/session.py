@@ -15,7 +15,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     """``session.toml``, ``recording.parquet`` and, with a truth, ``truth.parquet`` into an existing folder."""
     table = {"time": recording.time}
     lines = [
-        f"name = {json.dumps(recording.name)}",
+        f"name = {json.dumps(recording.name, ensure_ascii=False)}",
         f'start_pose = "{recording.start_pose}"',
         "",
         "[data]",
