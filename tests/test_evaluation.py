@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadData
-from wepose_pin.evaluation import evaluate
-from wepose_pin.pose import Pose
+from wepose_pin.evaluation import evaluate, uncertainty
+from wepose_pin.pose import Pose, pose_from_table, pose_table
 
 TIME = np.arange(101) / 10.0
 
@@ -85,6 +85,42 @@ def test_no_error_is_taken_within_a_gap_of_the_truth() -> None:
     off.points["left_hand"][40:60] += 1.0  # type: ignore[index]
     truth.points["left_hand"][38:62] = np.nan  # type: ignore[index]
     assert evaluate(off, truth).position["left_hand"].worst == pytest.approx(0.0, abs=1e-9)
+
+
+def test_heading_inclination_and_drift() -> None:
+    truth = pose()
+    drifting = Rotation.from_rotvec(np.outer(TIME, [0.0, 0.0, np.deg2rad(0.1)]))  # 0.1 deg/s
+    tilted = Rotation.from_rotvec([np.deg2rad(2.0), 0.0, 0.0])
+    off = replace(truth, quat_WL={"torso": (drifting * tilted * Rotation.from_quat(truth.quat_WL["torso"])).as_quat()})
+    error = evaluate(off, truth).attitude["torso"]
+    assert error.drift_deg_min == pytest.approx(6.0, abs=1e-6)
+    assert error.inclination_rmse == pytest.approx(2.0, abs=1e-6)
+    assert error.heading_rmse == pytest.approx(0.1 * np.sqrt(np.mean(TIME**2)), abs=1e-6)
+    assert error.total_rmse == pytest.approx(np.hypot(error.inclination_rmse, error.heading_rmse), rel=1e-3)
+
+
+def test_stated_uncertainty_is_judged() -> None:
+    rng = np.random.default_rng(0)
+    n = 20000
+    cov = np.diag([1.0, 4.0, 9.0]) + 0.5
+    draws = rng.multivariate_normal(np.zeros(3), cov, n)
+    right = uncertainty(draws, np.tile(cov, (n, 1, 1)))
+    assert right.nees == pytest.approx(3.0, abs=0.1)
+    assert right.within_1 == pytest.approx(0.683, abs=0.01)
+    assert right.within_2 == pytest.approx(0.954, abs=0.01)
+    assert uncertainty(draws, np.tile(cov / 4, (n, 1, 1))).nees == pytest.approx(12.0, abs=0.4)
+
+
+def test_uncertainty_goes_through_the_table() -> None:
+    cov = np.tile(np.diag([1e-4, 4e-4, 9e-4]), (101, 1, 1))
+    stated = replace(pose((0.5, 0.5, 0.5), (0.01, 0.0, 0.0)), segment_cov={"torso": cov}, point_cov={"left_hand": cov})
+    whole = evaluate(pose_from_table(pose_table(stated, covariance=True), "t"), pose())
+    assert whole.position_uncertainty["left_hand"].nees == pytest.approx(1.0)
+    direct = evaluate(stated, pose()).attitude_uncertainty["torso"]
+    assert whole.attitude_uncertainty["torso"] == pytest.approx(direct)
+    rough = evaluate(pose_from_table(pose_table(stated), "t"), pose())
+    assert rough.position_uncertainty["left_hand"].nees == pytest.approx(1e-4 / (14e-4 / 3))
+    assert evaluate(pose(), pose()).position_uncertainty == {}
 
 
 def test_nothing_in_common_is_named() -> None:

@@ -245,29 +245,40 @@ def evaluate(
     *,
     interval: Annotated[tuple[float, float] | None, arg(metavar="FROM TO")] = None,
 ) -> None:
-    """Errors against a reference: roll, pitch, yaw as the paper reports them, and positions.
+    """Errors against a reference: attitude, drift, positions, and how far the stated uncertainty is right.
 
     Example: wepose evaluate result truth.parquet --interval 72 115
 
     Args:
         result: Folder that `wepose track` wrote.
-        truth: Table (.parquet or .csv) with columns as in pose.parquet.
+        truth: Table (.parquet or .csv) with columns as in pose.parquet, or a session file that names one.
         interval: Only from this to this time, in seconds.
     """
     from .evaluation import evaluate as compare
     from .pose import pose_from_table
+    from .readers import load_session
     from .readers.tables import read_table
     from .writers import read_result
 
     pose, _, _ = read_result(result)
+    if truth.suffix == ".toml" or truth.is_dir():
+        named = load_session(truth).truth
+        if named is None:
+            raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
+        truth = named
     errors = compare(pose, pose_from_table(read_table(truth), str(truth)), interval)
     _say(f"{errors.samples} samples from {errors.interval[0]:g} to {errors.interval[1]:g} s")
     if errors.attitude:
         _print_table(
-            "Attitude error [deg], mean ± std of the absolute",
-            ("segment", "roll", "pitch", "yaw", "total rmse"),
+            "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
+            ("segment", "roll", "pitch", "yaw", "inclination", "heading", "total", "drift"),
             [
-                (name, *(f"{m:.2f} ± {s:.2f}" for m, s in (e.roll, e.pitch, e.yaw)), f"{e.total_rmse:.2f}")
+                (
+                    name,
+                    *(f"{mean:.2f} ± {std:.2f}" for mean, std in (e.roll, e.pitch, e.yaw)),
+                    *(f"{rmse:.2f}" for rmse in (e.inclination_rmse, e.heading_rmse, e.total_rmse)),
+                    f"{e.drift_deg_min:+.2f}",
+                )
                 for name, e in errors.attitude.items()
             ],
         )
@@ -280,6 +291,13 @@ def evaluate(
                 (name, _mean_std(e), _mean_std(shoulders[name]) if name in shoulders else "")
                 for name, e in errors.position.items()
             ],
+        )
+    stated = {**errors.attitude_uncertainty, **{f"{k} (point)": v for k, v in errors.position_uncertainty.items()}}
+    if stated:
+        _print_table(
+            "Stated uncertainty: right are a normalised squared error of 3, and 68 % and 95 % of the errors within",
+            ("of", "normalised", "within 1 std", "within 2 std"),
+            [(k, f"{u.nees:.2f}", f"{100 * u.within_1:.0f} %", f"{100 * u.within_2:.0f} %") for k, u in stated.items()],
         )
 
 

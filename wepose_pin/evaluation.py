@@ -1,4 +1,4 @@
-"""How wrong a pose is against a reference: attitude, positions."""
+"""How wrong a pose is against a reference: attitude, positions, and how far its stated uncertainty is right."""
 
 from __future__ import annotations
 
@@ -8,21 +8,25 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from . import so3
 from .errors import BadData
 from .pose import Pose
 
 
 class AttitudeError(NamedTuple):
-    """Error of one segment [deg], mean and standard deviation of absolute values over time, as the paper reports it.
+    """Error of one segment [deg].
 
-    Roll, pitch, yaw are those of the error rotation R_WL,estimated R_WL,trueᵀ (about the axes x, y, z of W), so that
-    they mean the same at any pose; yaw is the heading error.
+    Roll, pitch, yaw as the paper reports them: mean and standard deviation over time of the absolute angles of the
+    error rotation R_WL,estimated R_WL,trueᵀ about the axes x, y, z of W, so that they mean the same at any pose.
     """
 
     roll: tuple[float, float]
     pitch: tuple[float, float]
     yaw: tuple[float, float]
+    inclination_rmse: float  # angle between the verticals
+    heading_rmse: float  # twist of the error about the vertical
     total_rmse: float
+    drift_deg_min: float  # slope of a line through the heading error [deg/min]
 
 
 class PositionError(NamedTuple):
@@ -34,15 +38,26 @@ class PositionError(NamedTuple):
     worst: float
 
 
+class Uncertainty(NamedTuple):
+    """How far stated standard deviations are right, over time and axes of W.
+
+    The errors of one recording are slow: over a minute they are a few draws, not thousands. Judge many recordings.
+    """
+
+    nees: float  # mean normalised squared error; 3 is right, above it the deviations are too small
+    within_1: float  # share of errors within one standard deviation; 0.683 is right
+    within_2: float  # 0.954 is right
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """Errors over the time that pose and reference share."""
 
     attitude: dict[str, AttitudeError]
     position: dict[str, PositionError]  # relative to the root of the trunk
-    position_from_shoulders: dict[
-        str, PositionError
-    ]  # relative to the middle of the shoulders: without trunk and torso
+    position_from_shoulders: dict[str, PositionError]  # relative to the middle of the shoulders: without the trunk
+    attitude_uncertainty: dict[str, Uncertainty]  # where the pose has covariances
+    position_uncertainty: dict[str, Uncertainty]
     interval: tuple[float, float]
     samples: int
 
@@ -69,6 +84,7 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         )
     time = np.clip(pose.time[inside], truth.time[0], truth.time[-1])
     attitude, position = {}, {}
+    attitude_uncertainty, position_uncertainty = {}, {}
     for segment in [s for s in pose.quat_WL if s in truth.quat_WL]:
         finite = np.isfinite(truth.quat_WL[segment]).all(axis=1)
         if finite.sum() < 2:
@@ -78,7 +94,11 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         clipped = np.clip(time[known], truth.time[finite][0], truth.time[finite][-1])
         if known.any():
             estimated = Rotation.from_quat(pose.quat_WL[segment][inside][known])
-            attitude[segment] = attitude_error(estimated, reference(clipped))
+            true = reference(clipped)
+            attitude[segment] = attitude_error(estimated, true, clipped)
+            if segment in pose.segment_cov:
+                turn = (true * estimated.inv()).as_rotvec()
+                attitude_uncertainty[segment] = uncertainty(turn, pose.segment_cov[segment][inside][known])
     middle = _shoulders(pose), _shoulders(truth)
     from_shoulders = {}
     for point in [p for p in pose.points if p in truth.points]:
@@ -88,6 +108,8 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
             continue
         difference = pose.points[point][inside][known] - _at(time[known], truth.time, truth.points[point], finite)
         position[point] = position_error(difference)
+        if point in pose.point_cov:
+            position_uncertainty[point] = uncertainty(difference, pose.point_cov[point][inside][known])
         if middle[0] is not None and middle[1] is not None and "shoulder" not in point:
             there = np.isfinite(middle[1]).all(axis=1)
             both = _near(time[known], truth.time[there])
@@ -98,7 +120,15 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         raise BadData(
             "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
         )
-    return Evaluation(attitude, position, from_shoulders, (float(time[0]), float(time[-1])), int(inside.sum()))
+    return Evaluation(
+        attitude,
+        position,
+        from_shoulders,
+        attitude_uncertainty,
+        position_uncertainty,
+        (float(time[0]), float(time[-1])),
+        int(inside.sum()),
+    )
 
 
 def _shoulders(pose: Pose) -> np.ndarray | None:
@@ -121,16 +151,35 @@ def _near(time: np.ndarray, known: np.ndarray, reach_s: float = 0.1) -> np.ndarr
     return spanned & (known[after] - known[before] <= max(reach_s, 2.0 * float(np.median(np.diff(known)))))
 
 
-def attitude_error(estimated: Rotation, true: Rotation) -> AttitudeError:
-    """Attitude error of n orientations in W."""
+def attitude_error(estimated: Rotation, true: Rotation, time: np.ndarray) -> AttitudeError:
+    """Attitude error of n orientations in W at `time` (n,) [s]."""
     error = estimated * true.inv()
     yaw, pitch, roll = np.abs(error.as_euler("ZYX", degrees=True)).T
-    total = np.degrees(error.magnitude())
+    heading = np.degrees(np.unwrap(so3.heading(error.as_quat())))
+    inclination = np.degrees(np.arccos(np.clip(error.as_matrix()[:, 2, 2], -1.0, 1.0)))
+    slope = np.polyfit(time - time[0], heading, 1)[0] if np.ptp(time) > 0.0 else 0.0
     return AttitudeError(
         roll=(float(roll.mean()), float(roll.std())),
         pitch=(float(pitch.mean()), float(pitch.std())),
         yaw=(float(yaw.mean()), float(yaw.std())),
-        total_rmse=float(np.sqrt(np.mean(total**2))),
+        inclination_rmse=_rms(inclination),
+        heading_rmse=_rms(heading),
+        total_rmse=_rms(np.degrees(error.magnitude())),
+        drift_deg_min=60.0 * float(slope),
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
+    """Errors (n, 3) against their stated covariances (n, 3, 3)."""
+    normalised = error / np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    return Uncertainty(
+        nees=float(np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0]))),
+        within_1=float(np.mean(np.abs(normalised) <= 1.0)),
+        within_2=float(np.mean(np.abs(normalised) <= 2.0)),
     )
 
 
@@ -140,6 +189,6 @@ def position_error(difference: np.ndarray) -> PositionError:
     return PositionError(
         mean=float(distance.mean()),
         std=float(distance.std()),
-        rmse=float(np.sqrt(np.mean(distance**2))),
+        rmse=_rms(distance),
         worst=float(distance.max()),
     )

@@ -307,5 +307,27 @@ def pose_from_table(table: pl.DataFrame, file: str) -> Pose:
             points[point] = np.column_stack([numbers[name] for name in names])
     if not quat_WL and not points:
         raise BadData(f"{file}: neither orientations nor points; columns as torso_qx … or left_hand_x … are needed")
+    segment_cov = {name: _covariances(numbers, f"{name}_q" if name in POINTS else name) for name in quat_WL}
+    point_cov = {name: _covariances(numbers, name) for name in points}
     gap = {name: numbers[f"{name}_gap"] > 0.0 for name in SEGMENTS if f"{name}_gap" in numbers}
-    return Pose(numbers["time"], quat_WL, points, gap=gap)
+    return Pose(
+        numbers["time"],
+        quat_WL,
+        points,
+        segment_cov={name: cov for name, cov in segment_cov.items() if cov is not None},
+        point_cov={name: cov for name, cov in point_cov.items() if cov is not None},
+        gap=gap,
+    )
+
+
+def _covariances(numbers: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
+    """Covariances (n, 3, 3) from a table: its entries, else those of the standard deviation, the same on all axes."""
+    entries = {(i, j): f"{name}_cov_{'xyz'[i]}{'xyz'[j]}" for i in range(3) for j in range(i, 3)}
+    if all(column in numbers for column in entries.values()):
+        cov = np.empty((len(numbers["time"]), 3, 3))
+        for (i, j), column in entries.items():
+            cov[:, i, j] = cov[:, j, i] = numbers[column]
+        return cov
+    if f"{name}_std" in numbers:
+        return numbers[f"{name}_std"][:, None, None] ** 2 * np.eye(3)
+    return None
