@@ -9,6 +9,8 @@ import sys
 
 import wepose_pin as wp
 
+if len(sys.argv) == 2:
+    sys.exit("the taped shoulder width in metres is missing, as in: calibrate_subject.py session.toml 0.385")
 if len(sys.argv) > 2:
     recording, taped, true = wp.load_session(sys.argv[1]), float(sys.argv[2]), None
 else:

@@ -12,7 +12,9 @@ import pytest
 # numba's cache does not see a change in a function of another file that was compiled into a caller: the tests keep one
 # cache for each state of the sources. Set before anything imports numba.
 _SOURCES = sorted((Path(__file__).resolve().parent.parent / "wepose_pin").rglob("*.py"))
-_STATE = hashlib.sha256(b"".join(path.read_bytes() for path in _SOURCES if b"njit" in path.read_bytes())).hexdigest()
+_STATE = hashlib.sha256(
+    b"".join(path.read_bytes() for path in _SOURCES if b"compiled" in path.read_bytes())
+).hexdigest()
 os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"wepose-pin-numba-{_STATE[:16]}")
 
 from wepose_pin.simulation import Person, Simulation, simulate, simulated_person  # noqa: E402

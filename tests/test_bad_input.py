@@ -336,7 +336,9 @@ def test_the_unspoilt_files_pass(tmp_path: Path, capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit) as stop:
         main(["track", str(Files(tmp_path, good_table()).write()), "-o", str(tmp_path / "out")])
     assert stop.value.code == 0
-    assert capsys.readouterr().err == ""
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].startswith("note: no sensor on left_upper_arm")  # the files hold a torso alone
     assert (tmp_path / "out" / "pose.parquet").is_file()
 
 

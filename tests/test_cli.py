@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -98,10 +103,60 @@ def test_nothing_is_overwritten_without_force(
     assert run("track", session, "-o", tmp_path / "result", "--force") == 0
 
 
+def test_gauges_add_up_and_none_is_given_twice(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    two = ["--gauge", "shoulder_width=0.39", "--gauge", "trunk=0.51"]
+    assert run("calibrate", session, *two, "-o", tmp_path / "subject") == 0
+    subject = (tmp_path / "subject" / "subject.toml").read_text()
+    assert "taped: shoulder_width, trunk" in subject
+    assert run("calibrate", session, *two, "--gauge", "trunk=0.6", "-o", tmp_path / "again") == 2
+    assert "'trunk' is given twice" in capsys.readouterr().err
+
+
+def test_view_replaces_nothing_that_is_there(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("track", session, "-o", tmp_path / "result") == 0
+    mine = tmp_path / "mine.html"
+    mine.write_text("keep")
+    assert run("view", tmp_path / "result", "-o", mine, "--no-open") == 2
+    assert "--force replaces it" in capsys.readouterr().err
+    assert mine.read_text() == "keep"
+    assert run("view", tmp_path / "result", "-o", mine, "--no-open", "--force") == 0
+    assert mine.read_text().startswith("<!")
+
+
+def test_a_session_that_lacks_sensors_says_what_is_not_known(
+    simulation: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = simulation.recording()
+    fewer = {name: sensor for name, sensor in recording.sensors.items() if name != "right_forearm"}
+    write_session(tmp_path, replace(recording, sensors=fewer))
+    assert run("track", tmp_path, "-o", tmp_path / "result") == 0
+    assert "no sensor on right_forearm: not known and not written: right_wrist, right_hand" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seconds", [0.8, 1.6, 2.4])
+def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: float) -> None:
+    """Ctrl-C, and the SIGTERM of a cluster, at any time: exit 130 and no trace, or done before it came."""
+    command = [sys.executable, "-m", "wepose_pin.cli", "calibrate", str(session), "-o", str(tmp_path / "subject")]
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+        time.sleep(seconds)
+        process.send_signal(number)
+        _, said = process.communicate(timeout=60)
+        left = {path.name for path in tmp_path.iterdir()} - {"session.toml", "recording.parquet", "truth.parquet"}
+        if process.returncode == 130:
+            assert left == set()
+            assert said.count("Traceback") == 0
+        else:
+            assert left <= {"subject"}
+            break
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["nope"], "Unrecognized options: nope"),
+        (["trak"], "did you mean 'track'?"),
         (["track"], "Missing from wepose track"),
         (["track", "s.toml"], "-o"),
         (["track", "s.toml", "-o", "OUT", "--method", "ekf"], "'smekf'"),

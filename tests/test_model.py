@@ -12,6 +12,7 @@ import pytest
 import yourdfpy
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.assets import asset
 from wepose_pin.errors import BadModel, MissingFile
 from wepose_pin.model import POINTS, BodyModel, SegmentLink, chains, load_model
 
@@ -491,7 +492,7 @@ def test_a_mimic_joint_follows(tmp_path: Path) -> None:
 HINGE = triple("left_upper_arm", "left_forearm", "0 0 -0.3", ("0 1 0",), ("0 0 0",))
 MIMIC_HINGE = HINGE.replace("</joint>", '<mimic joint="finger_j"/></joint>')
 WRONG = {
-    "no xml": ("no robot", "cannot be read as a URDF"),
+    "no xml": ("no robot", "is no whole XML file"),
     "loop": (small(more=fixed("left_palm", "right_palm", "0 0 0", "floating")), "right_palm' hangs on two joints"),
     "ring": (
         small(more='<link name="a"/><link name="b"/>' + fixed("a", "b", "0 0 0") + fixed("b", "a", "0 0 0")),
@@ -657,3 +658,11 @@ def test_arms_that_point_up_need_their_axes(tmp_path: Path) -> None:
 def test_parts_of_a_table_without_segments_are_refused() -> None:
     with pytest.raises(BadModel, match="give segments with them"):
         load_model(up="+y", forward="+x")
+
+
+def test_half_a_file_is_no_body(tmp_path: Path) -> None:
+    """The parser behind yourdfpy mends broken XML in silence."""
+    text = asset("urdf", "upper_body.urdf").read_bytes()
+    (tmp_path / "half.urdf").write_bytes(text[: int(0.9 * len(text))])
+    with pytest.raises(BadModel, match="is no whole XML file"):
+        load_model(tmp_path / "half.urdf")

@@ -48,6 +48,26 @@ def test_nothing_is_overwritten_without_force_and_nothing_else_with_it(tmp_path:
         pass
 
 
+def test_what_is_in_the_way_is_named_before_anything_moves(tmp_path: Path) -> None:
+    (tmp_path / "out" / "b").mkdir(parents=True)
+    with pytest.raises(ExistingOutput, match="is in the way"), whole_folder(tmp_path / "out", force=True) as folder:  # noqa: PT012
+        (folder / "a").write_text("new")
+        (folder / "b").write_text("new")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["b"]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ExistingOutput, match="is a file"), whole_folder(tmp_path / "file" / "out"):
+        pass
+
+
+def test_two_runs_at_once_do_not_mix(tmp_path: Path) -> None:
+    with pytest.raises(ExistingOutput, match="not empty"), whole_folder(tmp_path / "out") as first:  # noqa: PT012
+        (first / "a").write_text("first")
+        with whole_folder(tmp_path / "out") as second:
+            (second / "a").write_text("second")
+    assert (tmp_path / "out" / "a").read_text() == "second"
+    assert len(list(tmp_path.rglob("*"))) == 2
+
+
 def test_a_session_reads_back_to_the_bit(simulation: Simulation, tmp_path: Path) -> None:
     recording = simulation.recording("made")
     write_session(tmp_path, recording, simulation.truth())

@@ -278,8 +278,14 @@ def _remarks(
                 f"{name} = {length:.3f} m lies {abs(z):.1f} standard deviations from the average; "
                 f"check mounts and phases"
             )
-    arm = [LENGTHS.index(name) for name in ("left_upper_arm", "right_upper_arm")]
-    if np.any(np.diag(covariance)[arm] > 0.5 * np.diag(without_data)[arm]):
+    # The hands tell the proportions: those must be known better than from the average person and the tape.
+    width = LENGTHS.index("shoulder_width")
+    for arm in (LENGTHS.index("left_upper_arm"), LENGTHS.index("right_upper_arm")):
+        share = np.zeros(len(LENGTHS))
+        share[arm], share[width] = 1.0 / lengths[arm], -1.0 / lengths[width]
+        if share @ covariance @ share < 0.5 * share @ without_data @ share:
+            break
+    else:
         remarks.append(
             "the joined hands moved too little to tell the lengths, which are mostly the average person's: move them "
             "through the whole reach"

@@ -10,6 +10,7 @@ import functools
 import io
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from .errors import BadOption, ExistingOutput, WeposeError, one_of
+from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of
 
 if TYPE_CHECKING:
     from .subject import Subject
@@ -113,7 +114,8 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
             for method, error in errors.items()
         ],
     )
-    _say("From the root, an error of the trunk's length adds: hands together do not show it, tape it if it matters.")
+    _say("One person, one motion: the order of the filters changes with both, see --seed. Each filter tracks with the")
+    _say("lengths that it calibrated. From the root the trunk counts too, whose length joined hands do not show.")
     _say(f"Motion to look at:  {out / 'result' / 'view.html'}")
     _say(f"Session, subject, result, figures:  {out}/session  {out}/subject  {out}/result  {out}/demo.json")
 
@@ -191,7 +193,7 @@ def calibrate(
     *,
     out: Out,
     protocol: Literal["clasp"] = "clasp",
-    gauge: Annotated[tuple[str, ...], arg(metavar="NAME=METRES …")] = (),
+    gauge: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(metavar="NAME=METRES")] = (),
     stature: Annotated[float | None, arg(metavar="METRES")] = None,
     sex: Annotated[Literal["f", "m"] | None, arg(metavar="{f,m}")] = None,
     method: Method = "smekf",
@@ -208,7 +210,7 @@ def calibrate(
         session: session.toml with a phase in which the palms are held together.
         out: Folder for subject.toml and subject.urdf.
         protocol: The phase of the session that is used.
-        gauge: Lengths measured with a tape, in metres, such as shoulder_width=0.385.
+        gauge: A length measured with a tape, such as shoulder_width=0.385; may be given several times.
         stature: Body height in metres; narrows the average person.
         sex: Narrows the average person.
         method: The orientation filter.
@@ -260,6 +262,8 @@ def evaluate(
     from .readers.tables import read_table
     from .writers import read_result
 
+    if interval is not None and not interval[0] < interval[1]:
+        raise BadOption(f"--interval {interval[0]:g} {interval[1]:g}: the first number is the earlier one, in seconds")
     pose, _, _ = read_result(result)
     if truth.suffix == ".toml" or truth.is_dir():
         named = load_session(truth).truth
@@ -342,6 +346,7 @@ def view(
     *,
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None,
     no_open: bool = False,
+    force: bool = False,
 ) -> None:
     """The motion of a result as one HTML page that opens offline.
 
@@ -349,24 +354,35 @@ def view(
 
     Args:
         result: Folder that `wepose track` wrote.
-        out: The page; without it view.html in the result's folder.
-        no_open: Only write the page, do not open it in the browser.
+        out: Write the page there; without it view.html in the result's folder is opened, and made if it is missing.
+        no_open: Do not open the page in the browser.
+        force: Replace an existing page.
     """
     import webbrowser
 
     from .viewer import pose_html
     from .writers import read_result
 
-    pose, model, summary = read_result(result)
-    phases = {name: [tuple(span)] for name, span in summary.get("phases", {}).items()}
     page = out or result / "view.html"
+    if not (result / "pose.parquet").is_file():
+        raise MissingFile(f"{result}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
+    if out is not None and out.exists() and not force:
+        raise ExistingOutput(f"{out}: exists; --force replaces it, -o names another file")
     if page.is_dir() or not page.absolute().parent.is_dir():
         raise ExistingOutput(f"{page}: not a file that can be written; -o names an HTML file in an existing folder")
-    text = pose_html(model, pose, phases=phases, title=summary.get("recording", result.name))
-    page.write_text(text, encoding="utf-8")
+    if out is not None or force or not page.is_file():
+        pose, model, summary = read_result(result)
+        phases = {name: [tuple(span)] for name, span in summary.get("phases", {}).items()}
+        text = pose_html(model, pose, phases=phases, title=summary.get("recording", result.name))
+        partial = page.with_name(f".{page.name}.partial")
+        try:
+            partial.write_text(text, encoding="utf-8")
+            partial.replace(page)
+        finally:
+            partial.unlink(missing_ok=True)
     _say(f"Motion to look at:  {page}")
-    if not no_open:
-        webbrowser.open(page.absolute().as_uri())
+    if not no_open and not webbrowser.open(page.absolute().as_uri()):
+        _warn(["no browser could be started; open the page by hand"])
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -381,32 +397,53 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of ``wepose``; ends by `SystemExit`: 0, or 2 after one line on what was wrong."""
-    argv = sys.argv[1:] if argv is None else argv
+    if argv is None:
+        argv = sys.argv[1:]
+        signal.signal(signal.SIGINT, _stop)
+        signal.signal(signal.SIGTERM, _stop)
     if argv in (["--version"], ["-V"]):
         from . import __version__
 
         print(f"wepose-pin {__version__}")
         sys.exit(0)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that knows no ± still shows the rest
     try:
         _parse_and_run(argv)
-    except WeposeError as error:
-        print(f"wepose: {error}", file=sys.stderr)
-        sys.exit(2)
     except BrokenPipeError:
         # Whoever read our output has seen enough; Python would complain once more on its way out.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
-    except OSError as error:
-        print(f"wepose: {error.filename or 'output'}: {error.strerror or error}; nothing was written", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("wepose: stopped; nothing was written", file=sys.stderr)
-        sys.exit(130)
+    except (KeyboardInterrupt, Exception) as error:
+        # A library may turn the interrupt into an error of its own.
+        if _stopped or isinstance(error, KeyboardInterrupt):
+            print("wepose: stopped; nothing was written", file=sys.stderr)
+            sys.exit(130)
+        if isinstance(error, WeposeError):
+            print(f"wepose: {error}", file=sys.stderr)
+            sys.exit(2)
+        if isinstance(error, OSError):
+            where = error.filename or "output"
+            print(f"wepose: {where}: {error.strerror or error}; nothing was written", file=sys.stderr)
+            sys.exit(2)
+        raise
     sys.exit(0)
+
+
+_stopped: list[int] = []
+
+
+def _stop(number: int, _frame: Any) -> None:
+    """Remember the signal: libraries that call back into Python swallow the exception."""
+    _stopped.append(number)
+    raise KeyboardInterrupt
 
 
 def _parse_and_run(argv: list[str]) -> None:
     """Parse with tyro, then run; tyro's panels on wrong usage become one line."""
+    if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
+        raise BadOption(f"'{argv[0]}' is not a command; {one_of(COMMANDS, argv[0])}")
     chosen: list[Callable[[], None]] = []
 
     def later(command: Callable[..., None]) -> Callable[..., None]:
@@ -433,6 +470,7 @@ def _parse_and_run(argv: list[str]) -> None:
             raise
         lines = [re.sub(r"[│╭╮╰╯─]+", " ", line).strip() for line in complaint.getvalue().splitlines()]
         text = " ".join(line for line in lines[1:] if line)  # the first line is the panel's title
+        text = re.sub(r"\[/?bold\]|\{None\}\||Argument helptext:.*?(?=For full)", "", text)
         raise BadOption(text.replace(" For full helptext, run", "; see").removesuffix(":")) from None
     chosen[0]()
 
@@ -443,6 +481,8 @@ def _gauges(gauge: tuple[str, ...]) -> dict[str, float]:
     taped: dict[str, float] = {}
     for text in gauge:
         name, _, value = text.partition("=")
+        if name in taped:
+            raise BadOption(f"--gauge {text}: '{name}' is given twice; give the mean of both")
         if name not in LENGTHS:
             raise BadOption(f"--gauge {text}: '{name}' is not a length; {one_of(LENGTHS, name)}")
         try:
@@ -467,8 +507,14 @@ def _warn(warnings: Any) -> None:
 @contextlib.contextmanager
 def _steps(total: int) -> Iterator[Callable[[str], None]]:
     """A progress bar over named steps; none when not on a terminal."""
+
+    def check() -> None:
+        if _stopped:
+            raise KeyboardInterrupt
+
     if not sys.stderr.isatty():
-        yield lambda _: None
+        yield lambda _: check()
+        check()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -480,10 +526,12 @@ def _steps(total: int) -> Iterator[Callable[[str], None]]:
 
         def step(text: str) -> None:
             nonlocal done
+            check()
             done += 1
             progress.update(task, description=text, completed=done)
 
         yield step
+        check()
 
 
 def _print_table(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
@@ -529,3 +577,7 @@ def _mean_std(error: Any) -> str:
 
 def _norm(values: list[float]) -> float:
     return sum(v * v for v in values) ** 0.5
+
+
+if __name__ == "__main__":
+    main()

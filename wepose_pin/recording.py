@@ -105,7 +105,7 @@ class Recording:
 
     def where(self) -> str:
         """Beginning of an error's text: the file, or the recording's name."""
-        return self.source.name if self.source else self.name
+        return str(self.source) if self.source else self.name
 
     def span(self, interval: tuple[float, float]) -> slice:
         """Samples within the interval [s], both ends included."""

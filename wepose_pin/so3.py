@@ -6,10 +6,22 @@ functions compiled with numba are the per-sample steps of the filters, which can
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function compiled by numba, and kept for the next start where there is a place to keep it."""
+    try:
+        return njit(cache=True)(function)
+    except RuntimeError:  # neither the package's folder nor a home can be written to
+        return njit(function)
+
 
 # Below this angle [rad] the half-angle series replaces sin(x)/x; its first left-out term is under 1e-17 there.
 SMALL_ANGLE = 1e-4
@@ -70,7 +82,7 @@ def continuous(quat: np.ndarray) -> np.ndarray:
     return quat * np.concatenate([[1.0], np.cumprod(jumps)])[:, None]
 
 
-@njit(cache=True)
+@compiled
 def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised. `quat` (4,) xyzw, vector [rad]."""
     half = 0.5 * np.sqrt(x * x + y * y + z * z)
@@ -90,14 +102,14 @@ def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     quat[0], quat[1], quat[2], quat[3] = rx / norm, ry / norm, rz / norm, rw / norm
 
 
-@njit(cache=True)
+@compiled
 def up_in_sensor(quat):  # type: ignore[no-untyped-def]
     """``R_WSᵀ e_z``: the vertical in sensor coordinates, as three floats."""
     x, y, z, w = quat[0], quat[1], quat[2], quat[3]
     return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
 
 
-@njit(cache=True)
+@compiled
 def integrate(rotvec):  # type: ignore[no-untyped-def]
     """Orientations (n + 1, 4) xyzw from the identity on, each turned by the next of `rotvec` (n, 3) [rad]."""
     quat = np.array([0.0, 0.0, 0.0, 1.0])

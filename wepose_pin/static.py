@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from .errors import BadData
 from .noise import SensorNoise
+from .so3 import compiled
 
 # A sample is gyro (3), accel/g (3) and the norm of accel/g; its statistics are their means and the co-moments
 # Σ (x − mean)(y − mean): gyro xx xy xz yy yz zz, the same of accel, and the norm's.
@@ -88,7 +88,7 @@ class StaticDetector:
         return bool(self.run(np.reshape(gyro_S, (1, 3)), np.reshape(accel_S, (1, 3)))[0])
 
 
-@njit(cache=True)
+@compiled
 def _add(mean, moment, count, sample):  # type: ignore[no-untyped-def]
     """Welford: take one more sample into the statistics of `count` samples."""
     weight = count / (count + 1.0)
@@ -105,7 +105,7 @@ def _add(mean, moment, count, sample):  # type: ignore[no-untyped-def]
         mean[i] += (sample[i] - mean[i]) / (count + 1.0)
 
 
-@njit(cache=True)
+@compiled
 def _semidefinite(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
     """A symmetric 3×3 matrix is positive semidefinite if and only if no principal minor is negative."""
     if xx < 0.0 or yy < 0.0 or zz < 0.0:
@@ -115,7 +115,7 @@ def _semidefinite(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
     return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz) >= 0.0
 
 
-@njit(cache=True)
+@compiled
 def _holds(limits, offset, moment, n):  # type: ignore[no-untyped-def]
     """Conditions (1) and (2): limit − S is positive semidefinite, S from the co-moments of n samples."""
     r = np.empty(6)
@@ -124,7 +124,7 @@ def _holds(limits, offset, moment, n):  # type: ignore[no-untyped-def]
     return _semidefinite(r[0], r[1], r[2], r[3], r[4], r[5])
 
 
-@njit(cache=True)
+@compiled
 def _run(  # type: ignore[no-untyped-def]
     block, tail_mean, tail_moment, head_mean, head_moment, count, limits, gravity, gyro_S, accel_S, static
 ):

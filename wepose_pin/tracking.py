@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from .alignment import Segments, segment_orientations
-from .model import BodyModel, load_model
+from .model import POINTS, BodyModel, load_model
 from .pose import Pose, deviation, point_covariance, pose_of
-from .recording import Recording
+from .recording import SEGMENTS, Recording
 from .static import StaticTest
 from .subject import Subject, average_subject
 
@@ -56,7 +56,9 @@ class TrackedPose(Pose):
         ]
         return {
             "recording": self.recording.name,
-            "method": self.method,
+            "session": str(self.recording.source) if self.recording.source else None,
+            "method": self.method if self.segments.orientation else "ready orientations",
+            "model": self.model.robot.name if self.model else None,
             "subject": {"name": self.subject.name, "note": self.subject.note},
             "samples": len(self.time),
             "rate_hz": round(self.recording.rate_hz, 4),
@@ -65,8 +67,16 @@ class TrackedPose(Pose):
             "sensors": sensors,
             "points": sorted(self.points),
             "not_followed_rms_deg": missed,
-            "warnings": [*self.segments.warnings, *lame],
+            "warnings": [*self.segments.warnings, *self._not_known(), *lame],
         }
+
+    def _not_known(self) -> list[str]:
+        """A line on the points that have no place for want of a sensor."""
+        missing = [point for point in POINTS if point not in self.points]
+        lacking = [name for name in SEGMENTS[:5] if name not in self.quat_WL]
+        if not missing or not lacking:
+            return []
+        return [f"no sensor on {', '.join(lacking)}: not known and not written: {', '.join(missing)}"]
 
     def _not_followed(self) -> dict[str, float]:
         """Segment → rms angle [deg] between its measured orientation and the model's, where joints are too few."""
@@ -90,7 +100,7 @@ def track(
     ----------
     subject : lengths and mounts; None for the anthropometric average and the session's stated mounts
     method : the orientation filter, a key of `wepose_pin.filters.METHODS`
-    model : a body; None for ours. It gets the subject's lengths
+    model : a body; None for ours. It gets the subject's lengths; without a subject its own stand
 
     Raises
     ------
@@ -101,6 +111,9 @@ def track(
     who = subject or average_subject()
     body = model or load_model()
     own = body.lengths
+    if subject is None and model is not None:
+        # A model that somebody chose has that person's lengths; what it lacks stays the average person's.
+        who = replace(who, name=body.robot.name, lengths={**who.lengths, **own}, note="lengths of the model")
     body = body.with_lengths({name: value for name, value in who.lengths.items() if name in own})
     pose = pose_of(body, recording.time, segments.quat_WL)
     return TrackedPose(

@@ -277,12 +277,15 @@ def _half_edges(visual: Visual) -> np.ndarray:
 
 
 def _trail_colour(point: str, visuals: Sequence[Visual]) -> str:
-    """The colour that most of that arm's visuals have."""
+    """The colour that most of that arm's visuals have, where the other arm has another; else one of ours."""
+    most = {}
+    for side in ("left", "right"):
+        arm = [v for v in visuals if v.link.lower().startswith(side) and "arm" in v.link.lower()]
+        most[side] = [colour for colour, _ in Counter(v.rgba[:3] for v in arm).most_common(1)]
     for side, otherwise in (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)):
         if point.lower().startswith(side):
-            arm = [v for v in visuals if v.link.lower().startswith(side) and "arm" in v.link.lower()]
-            most = Counter(v.rgba[:3] for v in arm).most_common(1)
-            return "#" + "".join(f"{round(255 * c):02x}" for c in most[0][0]) if most else otherwise
+            own = most[side] and most["left"] != most["right"]
+            return "#" + "".join(f"{round(255 * c):02x}" for c in most[side][0]) if own else otherwise
     return OTHER_COLOUR
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from ..noise import SensorNoise
+from ..so3 import compiled
 from .base import FilterRun, samples
 
 
@@ -48,7 +48,7 @@ class Gdc:
         return self.run(gyro_S, accel_S, static).quat_WS[0]
 
 
-@njit(cache=True)
+@compiled
 def _run(quat, bias, gyro_S, accel_S, dt, gain, out_quat):  # type: ignore[no-untyped-def]
     for k in range(len(gyro_S)):
         x, y, z, w = quat[0], quat[1], quat[2], quat[3]

@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from ..noise import SensorNoise
-from ..so3 import rotate_by_vector, up_in_sensor
+from ..so3 import compiled, rotate_by_vector, up_in_sensor
 from .base import FilterRun, samples
 
 
@@ -51,7 +50,7 @@ class Ncf:
         return self.run(gyro_S, accel_S, static).quat_WS[0]
 
 
-@njit(cache=True)
+@compiled
 def _run(quat, bias, gyro_S, accel_S, dt, proportional, integral, out_quat, out_bias):  # type: ignore[no-untyped-def]
     for k in range(len(gyro_S)):
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]

@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from ..noise import SensorNoise
-from ..so3 import rotate_by_vector, up_in_sensor
+from ..so3 import compiled, rotate_by_vector, up_in_sensor
 from .base import FilterRun, samples
 
 ACCEL_BIAS_STD = 0.003  # [rad] tilt error that a calibrated MEMS accelerometer's bias makes (3 mg: our assumption)
@@ -110,7 +109,7 @@ def _matrix(cov: float | np.ndarray) -> np.ndarray:
     return given if given.ndim == 2 else given * np.eye(3)
 
 
-@njit(cache=True)
+@compiled
 def predict(quat, bias, P, gyro, dt, gyro_cov, bias_step_cov):  # type: ignore[no-untyped-def]
     """Algorithm 1, prediction: q ← q ⊗ exp((gyro − b) δt), P ← F P Fᵀ + G Q Gᵀ, block by block.
 
@@ -151,7 +150,7 @@ def predict(quat, bias, P, gyro, dt, gyro_cov, bias_step_cov):  # type: ignore[n
             P[3 + i, 3 + j] += dt * dt * bias_step_cov[i, j]
 
 
-@njit(cache=True)
+@compiled
 def correct(quat, bias, P, gyro, accel, gravity, gyro_cov, accel_cov):  # type: ignore[no-untyped-def]
     """Algorithm 1, correction at rest: y = [accel/g; gyro], h = [R_WSᵀ e_z; b̂], H = [[[R_WSᵀ e_z]×, 0], [0, I]]."""
     ux, uy, uz = up_in_sensor(quat)
@@ -215,7 +214,7 @@ def correct(quat, bias, P, gyro, accel, gravity, gyro_cov, accel_cov):  # type: 
         bias[i] += x[3 + i]
 
 
-@njit(cache=True)
+@compiled
 def _run(  # type: ignore[no-untyped-def]
     quat,
     bias,

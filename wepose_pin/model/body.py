@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pinocchio as pin
 
@@ -140,6 +141,11 @@ def _read(path: Path) -> Any:
 
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a URDF is wanted here")
+    try:
+        # yourdfpy's parser mends broken XML in silence: half a body would be read as a body.
+        ElementTree.parse(path)
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise BadModel(f"{path}: is no whole XML file, as a URDF is: {error}") from error
     try:
         return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # yourdfpy and lxml raise many kinds

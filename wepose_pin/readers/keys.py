@@ -32,7 +32,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise MissingFile(f"{path}: is not UTF-8 text (byte {error.start}); {what} is wanted here") from error
     except tomllib.TOMLDecodeError as error:
-        raise BadSession(f"{path.name}: not valid TOML: {' '.join(str(error).split())}") from error
+        raise BadSession(f"{path}: not valid TOML: {' '.join(str(error).split())}") from error
 
 
 @dataclass(frozen=True)

@@ -92,16 +92,16 @@ class SessionReader:
         path = Path(path)
         self.path = path / "session.toml" if path.is_dir() else path
         self.gaps = gaps
-        top = Keys(read_toml(self.path, "a session file"), self.path.name)
+        top = Keys(read_toml(self.path, "a session file"), str(self.path))
         top.allow("name", "start_pose", "strapping", "data", "phases", "sensors")
         data, sensors = top.table("data"), top.table("sensors", {})
         data.allow("file", "time", "rate_hz", "gyro_unit", "accel_unit", "truth")
         for segment in sensors.values:
             if segment not in SEGMENTS:
-                raise BadSession(f"{self.path.name}: sensors.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
+                raise BadSession(f"{self.path}: sensors.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
         if not sensors.values:
             raise BadSession(
-                f"{self.path.name}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}"
+                f"{self.path}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}"
             )
         self._head = Recording(
             name=top.text("name", None) or self.path.absolute().parent.name or self.path.stem,
@@ -128,15 +128,15 @@ class SessionReader:
             for segment, (signals, mount) in keys.items()
         }
         clocks = {segment: plan.clock for segment, plan in self._plans.items()}
-        self.time, self._notes = common_time(self.path.name, clocks)
+        self.time, self._notes = common_time(str(self.path), clocks)
         self._resampled = bool(self._notes)
         self.rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
-        check_phases(self.path.name, self.time, self._head.phases)
+        check_phases(str(self.path), self.time, self._head.phases)
 
     def _plan(self, keys: Keys, data: Keys, signals: Mapping[str, list[str]], mount: np.ndarray | None) -> _Plan:
         file = (keys if "file" in keys else data).text("file", None)
         if file is None:
-            raise BadSession(f"{data.at('file')} is missing; the .csv or .parquet file beside {self.path.name}")
+            raise BadSession(f"{data.at('file')} is missing; the .csv or .parquet file beside {self.path}")
         path = self.path.parent / file
         # A file of its own has a clock of its own.
         own = keys if any(key in keys for key in ("file", "time", "rate_hz")) else data
@@ -154,18 +154,18 @@ class SessionReader:
         if key not in self._clocks:
             table, place = self._tables[path], own.at("time")
             if isinstance(table, Rows):
-                time, height = one_column(path, name, path.name, place)
+                time, height = one_column(path, name, str(path), place)
             else:
-                time = columns(table, [name], path.name, place)[:, 0] if name is not None else np.empty(0)
+                time = columns(table, [name], str(path), place)[:, 0] if name is not None else np.empty(0)
                 height = table.height
             if rate_hz is not None:
                 time = np.arange(height) / rate_hz
-            self._clocks[key] = clock = clock_of(time + offset, path.name)
+            self._clocks[key] = clock = clock_of(time + offset, str(path))
             lost = runs(lost_samples(clock, clock.row >= 0) == LONG)
             if lost and not self.gaps:
                 before, after = lost[0][0] - 1, lost[0][1]
                 raise BadData(
-                    f"{path.name}: rows are missing after row {clock.row[before] + 1}: time steps by "
+                    f"{path}: rows are missing after row {clock.row[before] + 1}: time steps by "
                     f"{clock.time[after] - clock.time[before]:.3f} s at {clock.time[before]:.3f} s; {_too_long(clock)}"
                 )
         return _Plan(keys.place.rstrip("."), path, signals, self._clocks[key], mount)
@@ -228,7 +228,7 @@ class SessionReader:
         }  # (values, good) each
         marks = {}
         for name, (_, good) in found.items():
-            place = f"{plan.path.name}: {plan.place}.{name}"
+            place = f"{plan.path}: {plan.place}.{name}"
             if not good.any():
                 columns_ = ", ".join(plan.signals[name])
                 raise BadData(f"{place}: no numbers from {clock.time[0]:g} to {clock.time[-1]:g} s in {columns_}")
@@ -252,8 +252,8 @@ class SessionReader:
         self, plan: _Plan, name: str, clock: Clock, table: pl.DataFrame, first_row: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Values (n, k) in SI on the clock, and which of them are there (n,)."""
-        place = f"{self.path.name}: {plan.place}.{name}"
-        read = columns(table, plan.signals[name], plan.path.name, place, first_row)
+        place = f"{self.path}: {plan.place}.{name}"
+        read = columns(table, plan.signals[name], str(plan.path), place, first_row)
         there = clock.row >= 0
         if there.all() and len(read) == len(clock.row):
             values = read
@@ -268,7 +268,7 @@ class SessionReader:
         odd = np.flatnonzero(good & (np.abs(norm - 1.0) > NORM_OFF))
         if odd.size:
             raise BadData(
-                f"{plan.path.name}: {plan.place}.orientation has length {norm[odd[0]]:.3g} in row "
+                f"{plan.path}: {plan.place}.orientation has length {norm[odd[0]]:.3g} in row "
                 f"{clock.row[odd[0]] + 1}; a unit quaternion is needed, columns in the order x, y, z, w"
             )
         return values / np.where(good, norm, np.nan)[:, None], good

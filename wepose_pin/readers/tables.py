@@ -61,7 +61,7 @@ def columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str, fi
 
 def _numbers(table: pl.DataFrame, name: str, file: str, place: str, first_row: int) -> pl.Series:
     if name not in table.columns:
-        raise UnknownColumn(f"{place}: no column '{name}' in {file}; {one_of(table.columns, name)}")
+        raise UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(table.columns, name)}")
     if f"{name}_duplicated_0" in table.columns:
         raise BadData(f"{file}: column '{name}' stands there more than once; each column needs a name of its own")
     series = table[name]

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from .. import __version__
-from ..errors import MissingFile
+from ..errors import BadData, ExistingOutput, MissingFile
 from ..model import BodyModel, load_model
 from ..pose import Pose, pose_from_table, pose_table
 from ..readers.tables import read_table
@@ -23,10 +24,25 @@ def write_result(folder: Path, pose: TrackedPose, covariance: bool = False) -> N
     """Write what `track` gave into an existing folder; with `covariance` its entries as well, not only deviations."""
     assert pose.model is not None
     assert pose.subject is not None
-    pose_table(pose, covariance).write_parquet(folder / "pose.parquet")
+    write_table(folder / "pose.parquet", pose_table(pose, covariance))
     write_subject(folder, pose.subject, pose.model)
     summary = pose.summary() | {"versions": versions()}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def write_table(path: Path, table: pl.DataFrame) -> None:
+    """A Parquet file.
+
+    Raises
+    ------
+    ExistingOutput
+        It cannot be written: a full disk, say.
+    """
+    try:
+        table.write_parquet(path)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise ExistingOutput(f"{path.name}: cannot be written: {reason}; nothing was written") from error
 
 
 def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
@@ -47,7 +63,10 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
         raise MissingFile(f"{folder}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
     pose = pose_from_table(read_table(folder / "pose.parquet"), str(folder / "pose.parquet"))
     summary_file = folder / "summary.json"
-    summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.is_file() else {}
+    try:
+        summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.is_file() else {}
+    except ValueError as error:
+        raise BadData(f"{summary_file}: is damaged, no JSON: {error}") from error
     return pose, load_model(folder / "subject.urdf"), summary
 
 

@@ -9,6 +9,7 @@ import polars as pl
 
 from ..pose import Pose, pose_table
 from ..recording import Recording, axes_from_mount
+from .result import write_table
 
 
 def write_session(folder: Path, recording: Recording, truth: Pose | None = None) -> None:
@@ -41,7 +42,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
         if sensor.stated_quat_LS is not None:
             up, forward = axes_from_mount(sensor.stated_quat_LS)
             lines.append(f'mount = {{ up = "{up}", forward = "{forward}" }}')
-    pl.DataFrame(table).write_parquet(folder / "recording.parquet")
+    write_table(folder / "recording.parquet", pl.DataFrame(table))
     if truth is not None:
-        pose_table(truth).write_parquet(folder / "truth.parquet")
+        write_table(folder / "truth.parquet", pose_table(truth))
     (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")

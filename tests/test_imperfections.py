@@ -1,0 +1,580 @@
+"""Imperfections of the simulated subject and its sensors: sizes as documented, physics kept, switches independent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import BadSession
+from wepose_pin.readers import load_session
+from wepose_pin.recording import Recording, Sensor, mount_from_axes
+from wepose_pin.simulation import (
+    PERFECT,
+    PERFECT_WORLD,
+    REALISTIC,
+    SEGMENTS,
+    Device,
+    Imperfections,
+    ImuNoise,
+    Simulation,
+    SingleSensor,
+    paper_drift,
+    paper_dynamic,
+    simulate,
+    simulated_person,
+)
+from wepose_pin.simulation.imu import lost
+from wepose_pin.simulation.motion import Flaws, Sway
+from wepose_pin.simulation.subject import _STREAMS
+from wepose_pin.subject import average_subject
+from wepose_pin.tracking import track
+from wepose_pin.writers import write_session
+
+G = 9.81
+SIDES = ("left", "right")
+LENGTHS = {
+    "trunk": 0.50,
+    "shoulder_width": 0.385,
+    "left_upper_arm": 0.301,
+    "left_forearm": 0.252,
+    "left_hand": 0.081,
+    "right_upper_arm": 0.309,
+    "right_forearm": 0.247,
+    "right_hand": 0.078,
+}
+# The subject's own imperfections, with perfect sensors.
+BODY = Imperfections(
+    soft_tissue_deg=1.5,
+    palm_slip=0.008,
+    shoulder_wander=0.004,
+    start_elbow_deg=5.0,
+    start_segment_deg=1.5,
+    sway_deg_s=0.1,
+)
+IN_BODY = ("soft_tissue_deg", "palm_slip", "shoulder_wander", "start_elbow_deg", "start_segment_deg", "sway_deg_s")
+SHORT = {"rate_hz": 50.0, "clasp_s": 5.0, "circles": 0, "noise": PERFECT}
+
+
+@pytest.fixture(scope="module")
+def body() -> Simulation:
+    return simulate(LENGTHS, seed=3, noise=PERFECT, imperfections=BODY)
+
+
+@pytest.fixture(scope="module")
+def fast() -> Simulation:
+    return simulate(LENGTHS, seed=4, rate_hz=1000.0, noise=PERFECT, imperfections=BODY, clasp_s=10.0, circles=1)
+
+
+@pytest.fixture(scope="module")
+def realistic() -> Simulation:
+    return simulate(LENGTHS, seed=5, imperfections=REALISTIC, clasp_s=20.0, circles=2)
+
+
+def within(sim: Simulation, phase: str) -> np.ndarray:
+    return np.any([(sim.time >= a) & (sim.time <= b) for a, b in sim.phases[phase]], axis=0)
+
+
+def rms(vectors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=-1))))
+
+
+def product(rotvecs: np.ndarray) -> Rotation:
+    """exp of the first times exp of the second …, of rotation vectors (n, 3), pair by pair."""
+    R = Rotation.from_rotvec(rotvecs)
+    while len(R) > 1:
+        if len(R) % 2:
+            R = Rotation.concatenate((R, Rotation.identity(1)))
+        R = R[0::2] * R[1::2]
+    return R[0]
+
+
+def in_torso(sim: Simulation, vectors: np.ndarray) -> np.ndarray:
+    return Rotation.from_quat(sim.quat_WL["torso"]).inv().apply(vectors)
+
+
+# Presets and the perfect world -----------------------------------------------------------------------------------
+
+
+def test_presets() -> None:
+    assert Imperfections() == PERFECT_WORLD
+    for field in fields(Imperfections):
+        if field.name != "mount":
+            off, on = getattr(PERFECT_WORLD, field.name), getattr(REALISTIC, field.name)
+            assert off in (0, np.inf), field.name
+            assert 0 < on < np.inf, field.name
+    assert REALISTIC.mount == PERFECT_WORLD.mount == "stated"
+
+
+def test_the_perfect_world_is_the_default_and_what_it_was() -> None:
+    one, same = (simulate(LENGTHS, seed=1, clasp_s=5.0, circles=1, **k) for k in ({}, {"imperfections": PERFECT_WORLD}))
+    for segment in SEGMENTS:
+        assert np.array_equal(one.gyro_S[segment], same.gyro_S[segment])
+        assert not one.soft_tissue[segment].any()
+        assert np.array_equal(one.sample_time[segment], one.time)
+    # Figures of the version before there were imperfections.
+    np.testing.assert_allclose(
+        one.gyro_S["left_forearm"][1000], [-2.5231894176101046, -0.03430702840236642, -0.5154195102494267], rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        one.accel_S["left_forearm"][1000], [-9.588895243009967, 1.2926217306950627, -0.23232891197459637], rtol=1e-8
+    )
+    np.testing.assert_allclose(
+        one.points["right_hand"][1000], [0.22785801289839924, 0.12204711584032252, 0.6425385723237393], rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"palm_slip": -0.001}, r"palm_slip -0\.001"),
+        ({"mount": "some"}, "mount 'some'"),
+        ({"bits": 16}, "bits 16 need a finite"),
+        ({"gyro_range_deg_s": 0.0}, "gyro_range_deg_s"),
+        ({"dropped": 0.5}, r"dropped 0\.5"),
+        ({"sway_deg_s": np.nan}, "sway_deg_s nan"),
+    ],
+)
+def test_wrong_sizes_are_named(wrong: dict, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        Imperfections(**wrong)
+
+
+def test_too_much_jitter_is_named() -> None:
+    with pytest.raises(ValueError, match="clock_jitter"):
+        simulate(LENGTHS, seed=0, imperfections=Imperfections(clock_jitter=0.01), clasp_s=5.0, circles=0)
+
+
+# Physics stays whole ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("segment", SEGMENTS)
+def test_gyro_integrates_to_the_sensors_own_orientation(body: Simulation, segment: str) -> None:
+    truth = Rotation.from_quat(body.quat_WS[segment])
+    q = truth[0]
+    for k in range(1, 6001):  # 60 s
+        q = q * Rotation.from_rotvec(body.gyro_S[segment][k] / body.rate_hz)
+    assert (q.inv() * truth[6000]).magnitude() < 1e-6
+    skeleton = Rotation.from_quat(body.quat_WL[segment]) * Rotation.from_quat(body.quat_LS[segment])
+    assert np.rad2deg((truth.inv() * skeleton).magnitude()).max() > 2.5  # which is not the segment's
+    # The first rate is that of the sway as well, not a step.
+    assert rms(body.gyro_S[segment][:1] - body.gyro_S[segment][1:2]) < np.deg2rad(0.05)
+
+
+@pytest.mark.parametrize("segment", SEGMENTS)
+def test_accel_integrates_to_the_position(fast: Simulation, segment: str) -> None:
+    side, _, part = segment.partition("_")
+    origin = {"": 0.0, "upper_arm": fast.points.get(f"{side}_shoulder"), "forearm": fast.points.get(f"{side}_elbow")}
+    position = origin[part] + Rotation.from_quat(fast.quat_WL[segment]).apply(fast.p_LS[segment])
+    truth = CubicSpline(fast.time, position)
+    k = (fast.time >= 4.5) & (fast.time <= 14.5)
+    t = fast.time[k]
+    accel_W = Rotation.from_quat(fast.quat_WS[segment]).apply(fast.accel_S[segment])[k] - [0.0, 0.0, G]
+    found = truth(t[0]) + truth(t[0], 1) * (t - t[0])[:, None] + CubicSpline(t, accel_W).antiderivative(2)(t)
+    assert np.abs(found - position[k]).max() < 1e-3
+    assert np.ptp(position[k], axis=0).max() > 0.1
+
+
+def test_segments_keep_their_length(body: Simulation) -> None:
+    for side in SIDES:
+        for part, a, b in (
+            ("upper_arm", "shoulder", "elbow"),
+            ("forearm", "elbow", "wrist"),
+            ("hand", "wrist", "hand"),
+        ):
+            p_W = body.points[f"{side}_{b}"] - body.points[f"{side}_{a}"]
+            segment = f"{side}_{'forearm' if part == 'hand' else part}"
+            along = Rotation.from_quat(body.quat_WL[segment]).apply([0.0, 0.0, -LENGTHS[f"{side}_{part}"]])
+            np.testing.assert_allclose(p_W, along, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [0.6, 0.85, 1.2])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_arms_reach_also_when_imperfect(seed: int, scale: float) -> None:
+    lengths = {k: scale * v for k, v in LENGTHS.items()}
+    sim = simulate(lengths, seed=seed, rate_hz=50.0, noise=PERFECT, imperfections=BODY, clasp_s=30.0, circles=2)
+    for segment in SEGMENTS:  # of human size still
+        assert np.linalg.norm(sim.gyro_S[segment], axis=1).max() < 15
+        assert np.linalg.norm(sim.accel_S[segment], axis=1).max() < 40
+
+
+# Sizes as documented ---------------------------------------------------------------------------------------------
+
+
+def test_soft_tissue_has_its_rms(body: Simulation) -> None:
+    moving = body.time >= body.phases["clasp"][0][0]
+    for segment in SEGMENTS:
+        soft_deg = np.rad2deg(body.soft_tissue[segment])
+        assert rms(soft_deg[moving]) == pytest.approx(1.5, rel=0.1)
+        np.testing.assert_allclose(np.sqrt(np.mean(soft_deg[moving] ** 2, axis=0)), 0.87, rtol=0.12)
+        assert rms(soft_deg[within(body, "start")]) < 0.3  # the strap's place is that of the start pose
+        R_WS = Rotation.from_quat(body.quat_WL[segment]) * Rotation.from_rotvec(body.soft_tissue[segment])
+        R_WS = R_WS * Rotation.from_quat(body.quat_LS[segment])
+        assert (R_WS.inv() * Rotation.from_quat(body.quat_WS[segment])).magnitude().max() < 1e-9
+        assert np.abs(np.diff(soft_deg, axis=0)).max() < 0.5  # smooth: 50 deg/s at the very most
+
+
+def test_soft_tissue_follows_the_movement_and_is_still_at_rest() -> None:
+    """Half of it is a fixed mixture of force and rate: a regression on them finds that half and no more."""
+    sim = simulate(LENGTHS, seed=6, noise=PERFECT, imperfections=Imperfections(soft_tissue_deg=1.5))
+    moving = sim.time >= sim.phases["clasp"][0][0]
+    explained = []
+    for segment in SEGMENTS:
+        R_WL = Rotation.from_quat(sim.quat_WL[segment])
+        force_L = R_WL.inv().apply(Rotation.from_quat(sim.quat_WS[segment]).apply(sim.accel_S[segment]))
+        rate_L = np.vstack((np.zeros(3), (R_WL[:-1].inv() * R_WL[1:]).as_rotvec() * sim.rate_hz))
+        X = np.column_stack((force_L - [0.0, 0.0, G], rate_L))[moving]
+        y = sim.soft_tissue[segment][moving]
+        residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+        explained.append(1.0 - np.sum(residual**2) / np.sum(y**2))
+        for phase in ("start", "rest"):
+            assert np.abs(sim.gyro_S[segment][within(sim, phase)]).max() < 1e-9
+    assert 0.4 < np.mean(explained) < 0.75
+    # The same at another rate: it is a function of time.
+    slow = simulate(LENGTHS, seed=6, rate_hz=50.0, noise=PERFECT, imperfections=Imperfections(soft_tissue_deg=1.5))
+    for segment in SEGMENTS:
+        n = len(slow.time)
+        np.testing.assert_allclose(slow.soft_tissue[segment], sim.soft_tissue[segment][::2][:n], atol=1e-9)
+
+
+def test_palms_slip_by_as_much_as_stated(body: Simulation) -> None:
+    clasp = within(body, "clasp")
+    slip_mm = 1e3 * in_torso(body, body.points["left_hand"] - body.points["right_hand"])[clasp]
+    assert rms(slip_mm) == pytest.approx(8.0, rel=0.1)
+    np.testing.assert_allclose(np.sqrt(np.mean(slip_mm**2, axis=0)), 8.0 / np.sqrt(3.0), rtol=0.1)
+    assert np.linalg.norm(np.diff(slip_mm, axis=0), axis=1).max() * body.rate_hz < 60.0  # [mm/s]
+    assert np.linalg.norm(slip_mm[[0, -1]], axis=1).max() < 0.1
+
+
+def test_shoulders_wander_with_elevation(body: Simulation) -> None:
+    for side, y in (("left", 1.0), ("right", -1.0)):
+        mean_T = np.array((0.0, y * LENGTHS["shoulder_width"] / 2, LENGTHS["trunk"]))
+        off_T = in_torso(body, body.points[f"{side}_shoulder"]) - mean_T
+        along_T = in_torso(body, body.points[f"{side}_elbow"] - body.points[f"{side}_shoulder"])
+        one_less_cos = 1.0 + along_T[:, 2] / LENGTHS[f"{side}_upper_arm"]
+        np.testing.assert_allclose(np.linalg.norm(off_T, axis=1), 0.004 * one_less_cos, atol=2e-4)
+        raised = one_less_cos > 0.5
+        assert raised.sum() > 500
+        assert (off_T[raised, 2] > 0).all()  # up
+        assert np.linalg.norm(off_T[within(body, "start")], axis=1).max() < 2e-5
+
+
+def test_start_pose_is_off_as_stated() -> None:
+    sizes = Imperfections(start_elbow_deg=5.0)
+    elbows = []
+    for seed in range(20):
+        sim = simulate(LENGTHS, seed=seed, imperfections=sizes, **SHORT)
+        for side in SIDES:
+            bend = Rotation.from_quat(sim.quat_WL[f"{side}_forearm"][100]).as_rotvec(degrees=True)
+            np.testing.assert_allclose(bend[[0, 2]], 0.0, atol=1e-9)
+            elbows.append(-bend[1])
+    assert np.mean(elbows) == pytest.approx(5.0, rel=0.1)
+    assert 0.5 < np.std(elbows) < 1.5
+    assert min(elbows) > 0.0
+
+    turns = []
+    for seed in range(40):
+        sim = simulate(LENGTHS, seed=seed, imperfections=Imperfections(start_segment_deg=1.5), **SHORT)
+        at = {name: Rotation.from_quat(quat[100]) for name, quat in sim.quat_WL.items()}
+        assert at["torso"].magnitude() < 1e-12
+        for side in SIDES:
+            upper = at[f"{side}_upper_arm"]
+            turns += [upper.as_rotvec(degrees=True), (upper.inv() * at[f"{side}_forearm"]).as_rotvec(degrees=True)]
+    assert rms(np.array(turns)) == pytest.approx(1.5, rel=0.12)
+
+
+def test_a_standing_person_sways() -> None:
+    for seed in range(5):
+        sway = Sway(np.random.default_rng(seed))
+        assert (sway.omega / (2.0 * np.pi) >= 0.3).all()
+        assert (sway.omega / (2.0 * np.pi) <= 0.5).all()
+        t = np.arange(0.0, 400.0, 0.02)
+        assert rms(np.gradient(sway(t), t, axis=0)) == pytest.approx(1.0, rel=0.05)
+    sizes = Imperfections(sway_deg_s=0.1)
+    torso, arms = [], []
+    for seed in range(25):
+        sim = simulate(LENGTHS, seed=seed, imperfections=sizes, **SHORT)
+        start = within(sim, "start")
+        R_WT = Rotation.from_quat(sim.quat_WL["torso"][start])
+        torso.append((R_WT[:-1].inv() * R_WT[1:]).as_rotvec() * sim.rate_hz)
+        for side in SIDES:
+            R_TU = R_WT.inv() * Rotation.from_quat(sim.quat_WL[f"{side}_upper_arm"][start])
+            arms.append((R_TU[:-1].inv() * R_TU[1:]).as_rotvec() * sim.rate_hz)
+    assert np.rad2deg(rms(np.concatenate(torso))) == pytest.approx(0.1, rel=0.15)
+    assert np.rad2deg(rms(np.concatenate(arms))) == pytest.approx(0.1, rel=0.15)
+
+
+# Sensors ---------------------------------------------------------------------------------------------------------
+
+
+def test_devices_err_as_stated() -> None:
+    rng = np.random.default_rng(0)
+    devices = [Device.draw(rng, REALISTIC) for _ in range(400)]
+    gyro, accel = (
+        np.stack([getattr(d, name) for d in devices]) - np.eye(3) for name in ("gyro_matrix", "accel_matrix")
+    )
+    diagonal = np.eye(3, dtype=bool)
+    assert gyro[:, diagonal].std() == pytest.approx(0.001, rel=0.1)
+    assert accel[:, diagonal].std() == pytest.approx(0.005, rel=0.1)
+    for matrix in (gyro, accel):
+        assert np.rad2deg(matrix[:, ~diagonal].std()) == pytest.approx(0.05, rel=0.1)
+    assert np.rad2deg(np.stack([d.g_matrix for d in devices]).std()) * G == pytest.approx(0.001, rel=0.1)
+
+
+def test_data_are_the_device_times_the_truth() -> None:
+    options = {"seed": 2, "noise": PERFECT, "clasp_s": 10.0, "circles": 1}
+    clean = simulate(LENGTHS, **options)
+    sizes = replace(PERFECT_WORLD, gyro_scale=0.01, accel_scale=0.02, misalignment_deg=1.0, g_sensitivity_deg_s=0.1)
+    sim = simulate(LENGTHS, imperfections=sizes, **options)
+    for segment, device in sim.device.items():
+        accel_S = clean.accel_S[segment]
+        gyro_S = clean.gyro_S[segment] @ device.gyro_matrix.T + accel_S @ device.g_matrix.T
+        np.testing.assert_allclose(sim.gyro_S[segment], gyro_S, atol=1e-12)
+        np.testing.assert_allclose(sim.accel_S[segment], accel_S @ device.accel_matrix.T, atol=1e-12)
+        assert np.abs(sim.accel_S[segment] - accel_S).max() > 0.05
+
+
+def test_quantisation_and_range() -> None:
+    options = {"seed": 2, "clasp_s": 10.0, "circles": 1}
+    clean = simulate(LENGTHS, **options)
+    digital = simulate(
+        LENGTHS, imperfections=Imperfections(gyro_range_deg_s=2000.0, accel_range_g=16.0, bits=16), **options
+    )
+    cut = simulate(LENGTHS, imperfections=Imperfections(gyro_range_deg_s=90.0, accel_range_g=1.05), **options)
+    gyro_step, accel_step = np.deg2rad(2000.0) / 2**15, 16.0 * G / 2**15
+    for segment in SEGMENTS:
+        for name, step in (("gyro_S", gyro_step), ("accel_S", accel_step)):
+            counts = getattr(digital, name)[segment] / step
+            np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
+            error = getattr(digital, name)[segment] - getattr(clean, name)[segment]
+            assert np.abs(error).max() <= 0.5 * step * (1 + 1e-9)
+            assert error.std() == pytest.approx(step / np.sqrt(12.0), rel=0.1)
+        for name, limit in (("gyro_S", np.deg2rad(90.0)), ("accel_S", 1.05 * G)):
+            expected = np.clip(getattr(clean, name)[segment], -limit, limit)
+            assert np.array_equal(getattr(cut, name)[segment], expected)
+    assert np.sum(np.abs(cut.gyro_S["left_forearm"]) == np.deg2rad(90.0)) > 10
+    # the largest number of 16 bits is one step below the full scale
+    device = Device.draw(np.random.default_rng(0), PERFECT_WORLD)
+    full = np.array([[1e3, -1e3, 0.0]])
+    readings = device.measure(full, full, 100.0, PERFECT, digital.imperfections, np.random.default_rng(0))
+    np.testing.assert_allclose(readings.gyro_S, [[(2**15 - 1) * gyro_step, -np.deg2rad(2000.0), 0.0]])
+
+
+def test_clocks_shift_the_samples_in_the_data() -> None:
+    options = {"seed": 2, "noise": PERFECT, "clasp_s": 10.0, "circles": 1, "rate_hz": 200.0}
+    clean = simulate(LENGTHS, **options)
+    sizes = Imperfections(clock_jitter=2e-4, clock_offset=5e-3)
+    sim = simulate(LENGTHS, imperfections=sizes, **options)
+    offsets = []
+    for segment in SEGMENTS:
+        late = sim.sample_time[segment] - sim.time
+        offsets.append(late.mean())
+        assert late.std() == pytest.approx(2e-4, rel=0.1)
+        expected = CubicSpline(clean.time, clean.accel_S[segment])(sim.sample_time[segment])
+        assert np.abs(sim.accel_S[segment] - expected)[20:-20].max() < 5e-3
+        # a rate times the time that it was measured over is the rotation
+        R_WS = Rotation.from_quat(sim.quat_WS[segment])
+        turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(sim.sample_time[segment])[:, None]
+        np.testing.assert_allclose(sim.gyro_S[segment][1:], turned, atol=1e-12)
+    assert np.ptp(offsets) > 2e-3
+    recorded = sim.recording()
+    assert np.array_equal(recorded.time, sim.time)
+    assert np.array_equal(recorded.sensors["torso"].gyro_S, sim.gyro_S["torso"])
+
+
+def runs_of(mask: np.ndarray) -> Iterator[int]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int))).reshape(-1, 2)
+    yield from (int(b - a) for a, b in edges)
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 100.0, 1000.0])
+@pytest.mark.parametrize("share", [0.002, 0.05])
+def test_lost_samples(rate_hz: float, share: float) -> None:
+    masks = [lost(np.random.default_rng(seed), 200000, rate_hz, share) for seed in range(5)]
+    assert np.mean(masks) == pytest.approx(share, rel=0.15)
+    longest = max(max(runs_of(mask)) for mask in masks)
+    assert longest == max(1, round(0.05 * rate_hz))
+    assert not any(mask[[0, -1]].any() for mask in masks)
+
+
+def test_lost_samples_are_bridged_as_in_a_users_file(realistic: Simulation, tmp_path: Path) -> None:
+    recorded = realistic.recording()
+    raw = {
+        segment: Sensor(realistic.gyro_S[segment], realistic.accel_S[segment], stated_quat_LS=mount_from_axes(*mount))
+        for segment, mount in realistic.stated_mount.items()
+        if mount is not None
+    }
+    assert sum(np.isnan(sensor.gyro_S[:, 0]).sum() for sensor in raw.values() if sensor.gyro_S is not None) > 10
+    write_session(tmp_path, Recording("raw", recorded.time, recorded.rate_hz, raw, recorded.phases))
+    read = load_session(tmp_path)
+    assert any("bridged" in note for note in read.notes)
+    for segment, sensor in recorded.sensors.items():
+        np.testing.assert_allclose(read.sensors[segment].gyro_S, sensor.gyro_S, rtol=1e-12)
+        np.testing.assert_allclose(read.sensors[segment].accel_S, sensor.accel_S, rtol=1e-12)
+        assert not np.array_equal(sensor.gyro_S, realistic.gyro_S[segment])
+
+
+def test_mounts_at_any_rotation_need_a_subject() -> None:
+    sizes = Imperfections(mount="any")
+    mounts = []
+    for seed in range(30):
+        sim = simulate(LENGTHS, seed=seed, imperfections=sizes, **SHORT)
+        assert set(sim.stated_mount.values()) == {None}
+        mounts += list(sim.quat_LS.values())
+    # 150 uniform rotations: each entry of the mean matrix has the standard deviation sqrt(1/3/150)
+    assert np.abs(Rotation.from_quat(mounts).as_matrix().mean(axis=0)).max() < 4 * np.sqrt(1 / 450)
+    with pytest.raises(BadSession, match="mount is not known"):
+        track(sim.recording())
+    sim = simulate(LENGTHS, seed=1, imperfections=sizes, clasp_s=5.0, circles=1)
+    pose = track(sim.recording(), replace(average_subject(), lengths=LENGTHS, mounts=sim.quat_LS))
+    assert np.linalg.norm(pose.points["right_hand"] - sim.points["right_hand"], axis=1).mean() < 0.02
+
+
+# Noise -----------------------------------------------------------------------------------------------------------
+
+
+def allan_deviation(rates: np.ndarray, rate_hz: float, m: int) -> np.ndarray:
+    """Overlapping Allan deviation of rates (n, k) at clusters of m samples (IEEE Std 952, annex C)."""
+    theta = np.vstack((np.zeros(rates.shape[1]), np.cumsum(rates, axis=0))) / rate_hz
+    second = theta[2 * m :] - 2.0 * theta[m:-m] + theta[: -2 * m]
+    return np.sqrt(np.mean(second**2, axis=0) / 2.0) * rate_hz / m
+
+
+def test_allan_deviation_gives_the_densities_back() -> None:
+    noisy, clean = (simulate(LENGTHS, seed=2, noise=noise) for noise in (ImuNoise(), PERFECT))
+    for name, density in (("gyro_S", np.deg2rad(0.007)), ("accel_S", 120e-6 * G)):
+        noise = np.hstack([getattr(noisy, name)[s] - getattr(clean, name)[s] for s in SEGMENTS])
+        for tau in (0.05, 0.2, 1.0):
+            found = allan_deviation(noise, 100.0, round(tau * 100.0)) * np.sqrt(tau)
+            assert np.sqrt(np.mean(found**2)) == pytest.approx(density, rel=0.1)
+
+
+# Switches --------------------------------------------------------------------------------------------------------
+
+
+def off(name: str) -> Imperfections:
+    if name.endswith(("range_deg_s", "range_g")):  # bits need a range
+        return replace(REALISTIC, **{name: np.inf, "bits": 0})
+    return replace(REALISTIC, **{name: getattr(PERFECT_WORLD, name)})
+
+
+def subject_draws(sizes: Imperfections, seed: int = 5) -> dict[str, np.ndarray]:
+    children = np.random.default_rng(seed).spawn(3 + len(_STREAMS))[3:]
+    flaws = Flaws(sizes, dict(zip(_STREAMS, children, strict=True)))
+    return {
+        "palm_slip": np.array([wander.phase for wander in flaws.slip]),
+        "shoulder_wander": np.array(list(flaws.shoulder.values())),
+        "start_elbow_deg": np.array(list(flaws.elbow.values())),
+        "start_segment_deg": np.array(list(flaws.start.values())),
+        "sway_deg_s": np.array([sway.phase for sway in flaws.sway.values()]),
+    }
+
+
+def sensor_draws(sim: Simulation) -> dict[str, np.ndarray]:
+    eye = np.eye(3, dtype=bool)
+    gyro, accel = (np.stack([getattr(d, f"{n}_matrix") for d in sim.device.values()]) for n in ("gyro", "accel"))
+    clock = np.stack(list(sim.sample_time.values())) - sim.time
+    return {
+        "noise": np.stack([*sim.gyro_bias.values(), *sim.accel_bias.values()]),
+        "mount": np.stack(list(sim.quat_LS.values())),
+        "gyro_scale": gyro[:, eye],
+        "accel_scale": accel[:, eye],
+        "misalignment_deg": np.stack((gyro[:, ~eye], accel[:, ~eye])),
+        "g_sensitivity_deg_s": np.stack([d.g_matrix for d in sim.device.values()]),
+        "clock_jitter": np.diff(clock, axis=1).round(12),
+        "clock_offset": clock.mean(axis=1).round(4),
+        "dropped": np.stack([np.isnan(v) for v in sim.gyro_S.values()]),
+    }
+
+
+@pytest.mark.parametrize("name", [f.name for f in fields(Imperfections) if f.name != "mount"])
+def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, name: str) -> None:
+    without = simulate(LENGTHS, seed=5, imperfections=off(name), clasp_s=20.0, circles=2)
+    for draws, less in (
+        (sensor_draws(realistic), sensor_draws(without)),
+        (subject_draws(REALISTIC), subject_draws(off(name))),
+    ):
+        for other, values in draws.items():
+            if other == name and name not in ("palm_slip", "sway_deg_s"):
+                assert not np.array_equal(values, less[other]), other
+            else:
+                np.testing.assert_allclose(less[other], values, atol=2e-4 if other == "clock_offset" else 2e-12)
+    if name not in IN_BODY:
+        for segment in SEGMENTS:
+            assert np.array_equal(without.quat_WL[segment], realistic.quat_WL[segment])
+        assert np.array_equal(without.points["right_hand"], realistic.points["right_hand"])
+    # What is seen of the others does not change either.
+    clasp = within(realistic, "clasp")
+    slip, less_slip = (in_torso(s, s.points["left_hand"] - s.points["right_hand"])[clasp] for s in (realistic, without))
+    if name == "palm_slip":
+        assert np.abs(less_slip).max() < 1e-9
+    else:
+        np.testing.assert_allclose(less_slip, slip, atol=1e-9)
+    if name == "soft_tissue_deg":
+        assert not any(v.any() for v in without.soft_tissue.values())
+    elif name not in (*IN_BODY, "clock_jitter", "clock_offset"):
+        for segment in SEGMENTS:
+            assert np.array_equal(without.soft_tissue[segment], realistic.soft_tissue[segment])
+
+
+def test_mount_is_a_stream_of_its_own(realistic: Simulation) -> None:
+    loose = simulate(LENGTHS, seed=5, imperfections=replace(REALISTIC, mount="any"), clasp_s=20.0, circles=2)
+    for name, values in sensor_draws(loose).items():
+        assert np.array_equal(values, sensor_draws(realistic)[name]) == (name != "mount")
+    assert np.array_equal(loose.points["left_hand"], realistic.points["left_hand"])
+
+
+# One sensor ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "moving", "rate_peak", "accel_peak"),
+    [(paper_dynamic, (5.0, 55.0), (6.0, 8.0), (15.0, 20.0)), (paper_drift, (25.0, 35.0), (13.0, 15.0), (40.0, 50.0))],
+)
+def test_single_sensor(make: Callable[..., SingleSensor], moving: tuple, rate_peak: tuple, accel_peak: tuple) -> None:
+    for seed in range(3):
+        one = make(seed, 1000.0, noise=PERFECT)
+        assert one.moving == moving
+        assert one.time[-1] == 60.0
+        R_WS = Rotation.from_quat(one.quat_WS)
+        for end in (30000, 60000):
+            assert (product(one.gyro_S[1 : end + 1] / 1000.0).inv() * R_WS[0].inv() * R_WS[end]).magnitude() < 1e-6
+        accel_W = R_WS.apply(one.accel_S) - [0.0, 0.0, G]
+        k = slice(int(moving[0] * 1000) - 1000, int(moving[0] * 1000) + 9001)  # 10 s from before the motion
+        found = one.p_WS[k][0] + CubicSpline(one.time[k], accel_W[k]).antiderivative(2)(one.time[k])
+        assert np.abs(found - one.p_WS[k]).max() < 1e-3
+        for a, b in one.still:
+            rest = (one.time > a + 0.01) & (one.time < b - 0.01)
+            assert np.abs(one.gyro_S[rest]).max() < 1e-12
+            np.testing.assert_allclose(np.linalg.norm(one.accel_S[rest], axis=1), G, atol=1e-9)
+        for values, peak in ((one.gyro_S, rate_peak), (accel_W, accel_peak)):
+            assert peak[0] * 0.97 < np.linalg.norm(values, axis=1).max() < peak[1] * 1.03
+        assert np.abs(one.p_WS).max() < 0.8  # within reach of an arm
+
+
+def test_single_sensor_at_both_rates_and_with_a_real_device() -> None:
+    for make in (paper_dynamic, paper_drift):
+        slow, quick = make(4, 100.0, noise=PERFECT), make(4, 1000.0, noise=PERFECT)
+        np.testing.assert_allclose(slow.quat_WS, quick.quat_WS[::10], atol=1e-12)
+        np.testing.assert_allclose(slow.accel_S, quick.accel_S[::10], atol=1e-6)
+        real = make(4, 100.0, imperfections=REALISTIC)
+        assert np.array_equal(real.quat_WS, slow.quat_WS)
+        counts = real.gyro_S / (np.deg2rad(2000.0) / 2**15)
+        np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
+        noisy = make(4, 100.0)
+        still = noisy.time < noisy.moving[0]
+        white = noisy.gyro_S[still] - noisy.gyro_bias[still]
+        assert white.std() == pytest.approx(np.deg2rad(0.007) * 10.0, rel=0.1)
+
+
+def test_realistic_people_are_tracked() -> None:
+    person = simulated_person(1)
+    sim = simulate(person.lengths, seed=1, imperfections=REALISTIC, clasp_s=5.0, circles=1)
+    pose = track(sim.recording(), replace(person.average, lengths=person.lengths))
+    error = np.linalg.norm(pose.points["right_hand"] - sim.points["right_hand"], axis=1)
+    assert 0.005 < error.mean() < 0.12
