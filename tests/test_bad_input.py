@@ -160,13 +160,16 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     # phases
     "a phase outside": (
         lambda f: f.say("[[0.5, 2.5]]", "[[0.5, 25.0]]"),
-        "session.toml: phases.start: [0.5, 25] is outside the recording, which runs from 0 to 8.99 s",
+        "session.toml: phases.start: [0.5, 25] is outside the recording, which runs from 0.000 to 8.990 s",
     ),
     "an empty phase": (lambda f: f.say("[[0.5, 2.5]]", "[[2.5, 0.5]]"), "phases.start: [2.5, 0.5] is empty"),
     "a phase in words": (lambda f: f.say("[[0.5, 2.5]]", '"begin"'), "phases.start = 'begin' is not a list of interv"),
     "a phase of booleans": (lambda f: f.say("[[0.5, 2.5]]", "[[false, true]]"), "is not a list of intervals"),
     "a phase of nan": (lambda f: f.say("[[0.5, 2.5]]", "[[nan, 2.0]]"), "is not a list of intervals"),
-    "a phase with few samples": (lambda f: f.say("[[0.5, 2.5]]", "[[0.5, 0.55]]"), "0.5 to 0.55 s holds 6 samples"),
+    "a phase with few samples": (
+        lambda f: f.say("[[0.5, 2.5]]", "[[0.5, 0.55]]"),
+        "phases.start: [0.5, 0.55] holds 6 samples",
+    ),
     "a start phase in motion": (
         lambda f: f.say("[[0.5, 2.5]]", "[[4.0, 6.0]]"),
         "session.toml: sensors.torso turns by ",

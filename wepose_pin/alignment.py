@@ -188,12 +188,12 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
     still = recording.phases.get("still", ())
     if len(still) > 1:
         notes.append(f"phases.still holds several intervals; the first, {still[0][0]:g} to {still[0][1]:g} s, is used")
-    for interval in (start, *still[:1]):
+    for name, interval in (("start", start), *(("still", span) for span in still[:1])):
         samples = len(recording.time[recording.span(interval)])
         if samples < 10:
             raise BadPhase(
-                f"{recording.where()}: {interval[0]:g} to {interval[1]:g} s holds {samples} samples; the start and "
-                f"still phases need at least 10, better two seconds"
+                f"{recording.where()}: phases.{name}: [{interval[0]:g}, {interval[1]:g}] holds {samples} samples; it "
+                f"needs at least 10, better two seconds"
             )
     return start, still[0] if still else start, notes
 

@@ -193,4 +193,4 @@ def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tup
             if not first < last:
                 raise BadPhase(f"{place} is empty; the first number is the earlier one, in seconds")
             if first < time[0] - 1e-6 or last > time[-1] + 1e-6:
-                raise BadPhase(f"{place} is outside the recording, which runs from {time[0]:g} to {time[-1]:g} s")
+                raise BadPhase(f"{place} is outside the recording, which runs from {time[0]:.3f} to {time[-1]:.3f} s")

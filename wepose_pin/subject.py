@@ -163,6 +163,8 @@ def load_subject(path: str | Path) -> Subject:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise BadSubject(f"{path}: not valid TOML: {error}") from error
+    if "sensors" in table:
+        raise BadSubject(f"{path}: is a session; a subject is wanted here, as `wepose calibrate` writes one")
     if table.get("format") != FORMAT:
         raise BadSubject(f"{path}: format = {table.get('format')!r}; this version reads format = {FORMAT}")
     for key in ("lengths", "lengths_std", "mounts", "covariance"):

@@ -126,6 +126,9 @@ def view_html(
     frames = frame_indices(time, fps)
     trails = {name: np.asarray(points, dtype=float)[frames] for name, points in (trails or {}).items()}
     drawn = [v for v in visuals if v.link in placements and v.kind != "mesh"]
+    if drawn and max(max(v.rgba[:3]) for v in drawn) < 0.3:
+        # A body without colours of its own (human-gazebo: 0.1 grey) would be a silhouette.
+        drawn = [_lighter(v) for v in drawn]
     links = list(dict.fromkeys(v.link for v in drawn))
     motion = np.empty((len(links), len(frames), 7), dtype="<f4")  # quat_WL xyzw, p_WL
     for k, link in enumerate(links):
@@ -157,6 +160,11 @@ def view_html(
     }
     page = Path(__file__).with_name("viewer_page.html").read_text(encoding="utf-8")
     return re.sub(r"@@(\w+)@@", lambda found: parts[found[1]], page)  # one pass: a title cannot name a part
+
+
+def _lighter(visual: Visual) -> Visual:
+    red, green, blue, alpha = visual.rgba
+    return visual._replace(rgba=(0.4 + 0.6 * red, 0.4 + 0.6 * green, 0.4 + 0.6 * blue, alpha))
 
 
 def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
