@@ -1,0 +1,39 @@
+"""A subject with known truth and the IMU data that its motion gives.
+
+The motion is a closed form of continuous time, so that it is known exactly between the samples as well, and
+it shares no code with the model room: what the tests compare against is written here and nowhere else. Frames
+as everywhere: W is z up, x forward, y left, origin at the root of the trunk; each segment frame equals W in
+the N-pose; the arm runs along -z.
+
+By default a perfect world: no soft tissue, an exact N-pose, palms that coincide in the clasp, a hand still at rest, and
+sensors with noise and bias only. `Imperfections` add what reality has.
+"""
+
+from ..subject import LENGTHS
+from .imperfections import PERFECT_WORLD, REALISTIC, Imperfections
+from .imu import GRAVITY, MTI_3, PERFECT, Device, ImuNoise
+from .motion import SEGMENTS, SIDES
+from .single import SingleSensor, paper_drift, paper_dynamic
+from .subject import MOUNT, Person, Simulation, simulate, simulated_person
+
+__all__ = [
+    "GRAVITY",
+    "LENGTHS",
+    "MOUNT",
+    "MTI_3",
+    "PERFECT",
+    "PERFECT_WORLD",
+    "REALISTIC",
+    "SEGMENTS",
+    "SIDES",
+    "Device",
+    "Imperfections",
+    "ImuNoise",
+    "Person",
+    "Simulation",
+    "SingleSensor",
+    "paper_drift",
+    "paper_dynamic",
+    "simulate",
+    "simulated_person",
+]

@@ -1,0 +1,149 @@
+"""The sensor: noise, bias, scale, alignment, range, quantisation, clock and lost samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from .imperfections import Imperfections
+
+GRAVITY = 9.81  # [m/s^2]
+LONGEST_RUN_S = 0.05  # of lost samples
+_MEAN_RUN_S = 0.02
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Noise of an IMU; the defaults are those of the Xsens MTi-3.
+
+    Densities and in-run stabilities: MTi 1-series data sheet (0.007 deg/s/sqrt(Hz), 10 deg/h; 120
+    ug/sqrt(Hz), 0.03 mg). It gives no turn-on bias that is comparable: 0.2 deg/s and 3 mg are assumptions.
+
+    White noise has the standard deviation density * sqrt(rate) at each sample, the convention of angle and
+    velocity random walk. The bias is the turn-on bias, constant over the recording, plus a first-order
+    Gauss-Markov process whose standard deviation is the in-run stability and whose correlation time is an
+    assumption as well.
+    """
+
+    gyro_density: float = np.deg2rad(0.007)  # [rad/s/sqrt(Hz)]
+    gyro_bias_std: float = np.deg2rad(0.2)  # [rad/s], turn-on, each axis
+    gyro_bias_instability: float = np.deg2rad(10.0) / 3600.0  # [rad/s]
+    accel_density: float = 120e-6 * GRAVITY  # [m/s^2/sqrt(Hz)]
+    accel_bias_std: float = 3e-3 * GRAVITY  # [m/s^2], turn-on, each axis
+    accel_bias_instability: float = 0.03e-3 * GRAVITY  # [m/s^2]
+    correlation_s: float = 100.0  # [s], of the in-run biases
+
+
+MTI_3 = ImuNoise()
+PERFECT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Readings(NamedTuple):
+    """What a sensor gives, and its true biases."""
+
+    gyro_S: np.ndarray  # (n, 3) [rad/s]
+    accel_S: np.ndarray  # (n, 3) [m/s^2]
+    gyro_bias: np.ndarray  # (n, 3) [rad/s]
+    accel_bias: np.ndarray  # (n, 3) [m/s^2]
+
+
+@dataclass(frozen=True)
+class Device:
+    """One sensor's own errors: measured = matrix @ true (+ g_matrix @ specific force), then bias and noise."""
+
+    gyro_matrix: np.ndarray  # (3, 3)
+    accel_matrix: np.ndarray  # (3, 3)
+    g_matrix: np.ndarray  # (3, 3) [rad/s per m/s^2]
+
+    @staticmethod
+    def draw(rng: np.random.Generator, imperfections: Imperfections) -> Device:
+        """A sensor at random."""
+        scale, tilt, g = rng.standard_normal((2, 3)), rng.standard_normal((2, 3, 3)), rng.standard_normal((3, 3))
+        tilt *= np.deg2rad(imperfections.misalignment_deg) * (1.0 - np.eye(3))
+        return Device(
+            np.eye(3) + imperfections.gyro_scale * np.diag(scale[0]) + tilt[0],
+            np.eye(3) + imperfections.accel_scale * np.diag(scale[1]) + tilt[1],
+            np.deg2rad(imperfections.g_sensitivity_deg_s) / GRAVITY * g,
+        )
+
+    def measure(
+        self,
+        rate_S: np.ndarray,
+        force_S: np.ndarray,
+        rate_hz: float,
+        noise: ImuNoise,
+        imperfections: Imperfections,
+        rng: np.random.Generator,
+    ) -> Readings:
+        """What the sensor gives of the true rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2]."""
+        n = len(rate_S)
+        decay = np.exp(-1.0 / (noise.correlation_s * rate_hz))
+        gyro_bias = _bias(rng, (n, 3), noise.gyro_bias_std, noise.gyro_bias_instability, decay)
+        accel_bias = _bias(rng, (n, 3), noise.accel_bias_std, noise.accel_bias_instability, decay)
+        white = rng.standard_normal((2, n, 3)) * np.sqrt(rate_hz)
+        gyro_S, accel_S = rate_S, force_S
+        # A product with the identity, or with zeros, would not keep the last bit.
+        if imperfections.gyro_scale or imperfections.misalignment_deg:
+            gyro_S = rate_S @ self.gyro_matrix.T
+        if imperfections.g_sensitivity_deg_s:
+            gyro_S = gyro_S + force_S @ self.g_matrix.T
+        if imperfections.accel_scale or imperfections.misalignment_deg:
+            accel_S = force_S @ self.accel_matrix.T
+        gyro_S = gyro_S + gyro_bias + noise.gyro_density * white[0]
+        accel_S = accel_S + accel_bias + noise.accel_density * white[1]
+        return Readings(
+            _digits(gyro_S, np.deg2rad(imperfections.gyro_range_deg_s), imperfections.bits),
+            _digits(accel_S, imperfections.accel_range_g * GRAVITY, imperfections.bits),
+            gyro_bias,
+            accel_bias,
+        )
+
+
+def _bias(rng: np.random.Generator, shape: tuple[int, int], turn_on: float, in_run: float, decay: float) -> np.ndarray:
+    """Turn-on bias plus Gauss-Markov process of standard deviation `in_run`, which keeps `decay` a sample."""
+    white = rng.standard_normal(shape) * np.sqrt(1.0 - decay**2)
+    white[0] /= np.sqrt(1.0 - decay**2)  # stationary from the first sample
+    return turn_on * rng.standard_normal(shape[1]) + in_run * lfilter([1.0], [1.0, -decay], white, axis=0)
+
+
+def _digits(values: np.ndarray, full_scale: float, bits: int) -> np.ndarray:
+    """Cut off at ± `full_scale`, rounded to its digits."""
+    if not bits:
+        return np.clip(values, -full_scale, full_scale) if np.isfinite(full_scale) else values
+    count = 2 ** (bits - 1)
+    return np.clip(np.round(values / full_scale * count), -count, count - 1) * (full_scale / count)
+
+
+def jittered(rng: np.random.Generator, time: np.ndarray, rate_hz: float, std: float) -> np.ndarray:
+    """When a clock samples that means to at `time` (n,) [s]: off by `std` [s], in order all the same.
+
+    Raises
+    ------
+    ValueError
+        The jitter is too large for the rate.
+    """
+    if std * rate_hz > 0.25:
+        raise ValueError(f"clock_jitter {std} s must be at most a quarter of a step at {rate_hz} Hz")
+    return time + np.clip(std * rng.standard_normal(len(time)), -0.45 / rate_hz, 0.45 / rate_hz)
+
+
+def lost(rng: np.random.Generator, n: int, rate_hz: float, share: float) -> np.ndarray:
+    """Which of n samples are lost (n,): runs of 20 ms in the mean and 50 ms at most, ends and neighbours kept."""
+    gone = np.zeros(n, dtype=bool)
+    longest = max(1, int(LONGEST_RUN_S * rate_hz + 1e-9))
+    # Unit draws first: another share is the same runs closer together.
+    waits, lengths = rng.exponential(size=n), rng.exponential(size=n)
+    runs = np.clip(np.round(lengths * _MEAN_RUN_S * rate_hz).astype(int), 1, longest)
+    if share <= 0.0:
+        return gone
+    first = 1
+    for wait, run in zip(waits * np.mean(runs) / share, runs, strict=True):
+        first += int(wait) + 1
+        if first + run >= n:
+            break
+        gone[first : first + run] = True
+        first += run
+    return gone

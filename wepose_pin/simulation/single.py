@@ -1,0 +1,152 @@
+"""The paper's experiments with one sensor in the hand: known orientation, and the IMU data that it gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .imperfections import PERFECT_WORLD, Imperfections
+from .imu import GRAVITY, MTI_3, Device, ImuNoise, jittered
+from .motion import E_Z, pulse
+
+_STENCIL_S = 1e-3
+_GRID_HZ = 200.0  # at which the motion is scaled to its peaks
+
+
+@dataclass(frozen=True)
+class SingleSensor:
+    """One sensor moved by hand.
+
+    `gyro_S[k]` is the rate over (k−1, k], `accel_S[k]` the specific force at k; both with noise, bias and the sensor's
+    imperfections.
+    """
+
+    time: np.ndarray  # (n,) [s], from 0
+    rate_hz: float
+    quat_WS: np.ndarray  # (n, 4) xyzw, exact; W is z up
+    p_WS: np.ndarray  # (n, 3) [m], exact
+    gyro_S: np.ndarray  # (n, 3) [rad/s]
+    accel_S: np.ndarray  # (n, 3) [m/s^2]
+    gyro_bias: np.ndarray  # (n, 3) [rad/s], exact
+    accel_bias: np.ndarray  # (n, 3) [m/s^2], exact
+    still: list[tuple[float, float]]  # [s], before and after the motion
+    moving: tuple[float, float]  # [s]
+
+
+class _HandMotion:
+    """Rest, a burst of turning and translation, rest where it began."""
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        span: tuple[float, float],
+        ramp: float,
+        turn_hz: tuple[float, ...],
+        shake_hz: tuple[float, ...],
+        peaks: tuple[float, float],
+    ) -> None:
+        self.span, self.ramp = span, ramp
+        self.R_W0 = Rotation.random(random_state=rng)
+        # One frequency near each of those named; slower waves are larger, so that each has its share in the rate.
+        self.omega = [2.0 * np.pi * np.array(hz) * rng.uniform(0.85, 1.15, (3, len(hz))) for hz in (turn_hz, shake_hz)]
+        self.phase = [rng.uniform(0.0, 2.0 * np.pi, omega.shape) for omega in self.omega]
+        # A hand does not go on evenly: its vigour swells and falls between a third and one.
+        self.vigour = 2.0 * np.pi * rng.uniform(0.04, 0.12, 2), rng.uniform(0.0, 2.0 * np.pi, 2)
+        self.gain = [1.0, 1.0]
+        # Peaks of rate [rad/s] and acceleration [m/s^2]. The rate is not linear in the angles: a few rounds.
+        t = np.arange(span[0], span[1], 1.0 / _GRID_HZ)
+        for _ in range(6):
+            rate, acceleration = self.rates(t)
+            self.gain[0] *= peaks[0] / float(np.linalg.norm(rate, axis=1).max())
+            self.gain[1] *= peaks[1] / float(np.linalg.norm(acceleration, axis=1).max())
+
+    def _waves(self, which: int, t: np.ndarray) -> np.ndarray:
+        omega, phase = self.omega[which], self.phase[which]
+        power = which + 1  # angles count by their rate, positions by their acceleration
+        waves = np.sum(np.sin(omega * t[:, None, None] + phase) / omega**power, axis=2)
+        swell, start = self.vigour
+        vigour = 0.66 + 0.17 * np.sum(np.sin(swell * t[:, None] + start), axis=1)
+        return self.gain[which] * (pulse(t, *self.span, self.ramp) * vigour)[:, None] * waves
+
+    def orientation(self, t: np.ndarray) -> Rotation:
+        return self.R_W0 * Rotation.from_euler("ZYX", self._waves(0, t))
+
+    def position(self, t: np.ndarray) -> np.ndarray:
+        return self._waves(1, t)
+
+    def acceleration(self, t: np.ndarray) -> np.ndarray:
+        middle = self.position(t)
+        far, near, near_after, far_after = (self.position(t + k * _STENCIL_S) - middle for k in (-2, -1, 1, 2))
+        return (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
+
+    def rates(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Angular rate in S (n, 3) [rad/s] and acceleration in W (n, 3) [m/s^2]."""
+        h = _STENCIL_S
+        turn = (self.orientation(t - h).inv() * self.orientation(t + h)).as_rotvec()
+        return turn / (2.0 * h), self.acceleration(t)
+
+
+def _record(
+    rng: np.random.Generator,
+    motion: _HandMotion,
+    duration: float,
+    rate_hz: float,
+    noise: ImuNoise,
+    imperfections: Imperfections,
+) -> SingleSensor:
+    noise_rng, device_rng, jitter_rng = rng.spawn(3)
+    n = int(np.floor(duration * rate_hz)) + 1
+    time = np.arange(n) / rate_hz
+    own_time = jittered(jitter_rng, time, rate_hz, imperfections.clock_jitter)
+    R_WS = motion.orientation(own_time)
+    turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(own_time)[:, None]
+    rate_S = np.vstack((np.zeros(3), turned))
+    force_S = R_WS.inv().apply(motion.acceleration(own_time) + GRAVITY * E_Z)
+    readings = Device.draw(device_rng, imperfections).measure(rate_S, force_S, rate_hz, noise, imperfections, noise_rng)
+    return SingleSensor(
+        time=time,
+        rate_hz=rate_hz,
+        quat_WS=motion.orientation(time).as_quat(),
+        p_WS=motion.position(time),
+        still=[(0.0, motion.span[0]), (motion.span[1], duration)],
+        moving=motion.span,
+        **readings._asdict(),
+    )
+
+
+def paper_dynamic(
+    seed: int,
+    rate_hz: float = 100.0,
+    *,
+    noise: ImuNoise = MTI_3,
+    imperfections: Imperfections = PERFECT_WORLD,
+) -> SingleSensor:
+    """One trial of the paper's dynamic experiment: 5 s still, 50 s of free motion by hand, 5 s still.
+
+    Turns of 0.15 to 1.5 Hz with a peak of 6 to 8 rad/s, translation with a peak of 15 to 20 m/s^2, without pauses. Of
+    `imperfections` those of a single sensor count: scale, misalignment, g-sensitivity, range, bits and jitter.
+    """
+    motion_rng, sensor_rng = np.random.default_rng([seed, 11]).spawn(2)
+    peaks = motion_rng.uniform(6.0, 8.0), motion_rng.uniform(15.0, 20.0)
+    motion = _HandMotion(motion_rng, (5.0, 55.0), 1.5, (0.15, 0.4, 0.8, 1.5), (0.6, 1.0, 1.5, 2.2), peaks)
+    return _record(sensor_rng, motion, 60.0, rate_hz, noise, imperfections)
+
+
+def paper_drift(
+    seed: int,
+    rate_hz: float = 1000.0,
+    *,
+    noise: ImuNoise = MTI_3,
+    imperfections: Imperfections = PERFECT_WORLD,
+) -> SingleSensor:
+    """One trial of the paper's drift experiment: 25 s still, 10 s of fast shaking and turning, 25 s still.
+
+    Turns of 0.5 to 4 Hz with a peak of 13 to 15 rad/s, shaking of 2 to 5 Hz with a peak of 40 to 50 m/s^2;
+    `imperfections` as in `paper_dynamic`.
+    """
+    motion_rng, sensor_rng = np.random.default_rng([seed, 12]).spawn(2)
+    peaks = motion_rng.uniform(13.0, 15.0), motion_rng.uniform(40.0, 50.0)
+    motion = _HandMotion(motion_rng, (25.0, 35.0), 1.0, (0.5, 1.2, 2.2, 3.5), (2.0, 3.2, 4.5), peaks)
+    return _record(sensor_rng, motion, 60.0, rate_hz, noise, imperfections)

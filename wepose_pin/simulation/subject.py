@@ -1,0 +1,312 @@
+"""`simulate`: the paper's upper-body experiment with known truth, and what its sensors give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..pose import Pose
+from ..readers.clocks import Clock, bridge, lost_samples
+from ..recording import Recording, Sensor, check, mount_from_axes
+from ..subject import LENGTHS, SEXES, Subject, average_subject
+from .imperfections import PERFECT_WORLD, Imperfections
+from .imu import GRAVITY, MTI_3, Device, ImuNoise, jittered, lost
+from .motion import (
+    E_Z,
+    MARGIN_S,
+    SEGMENTS,
+    SIDES,
+    STAND_S,
+    BodyPose,
+    Flaws,
+    Motion,
+    Wander,
+    sensor_places,
+    sensor_position,
+)
+
+MOUNT = ("+x", "-z")  # sensor axes that point up and forward, but for the tilt of the strap
+
+_STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
+_GAIN_RATE_HZ = 20.0  # at which soft-tissue motion is scaled to its rms
+# Streams of random numbers beyond those of motion, mounts and noise: new ones go to the end.
+_STREAMS = (
+    "palm_slip",
+    "shoulder_wander",
+    "start_elbow",
+    "start_segment",
+    "sway",
+    "soft_tissue",
+    "device",
+    "clock_jitter",
+    "clock_offset",
+    "dropped",
+    "mount",
+)
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What `simulate` gives: exact motion, IMU data, and what the session file would state.
+
+    `quat_LS` is R_LS = Swing @ N, where N takes the axes of `stated_mount` to z (up) and x (forward) of the
+    segment and Swing turns by 2 to 10 deg about a horizontal axis. So, in an exact N-pose, the stated axes and gravity
+    measured there give the mount exactly: Swing is the least rotation from N @ (up in S) to e_z. With mounts at any
+    rotation nothing is stated.
+
+    Motion is that of the true skeleton, at `time`. Soft tissue turns a sensor by `soft_tissue` from its mount:
+    R_WS = R_WL @ exp(soft_tissue_L) @ R_LS, which is `quat_WS`. It and the IMU data are at `sample_time`.
+    """
+
+    time: np.ndarray  # (n,) [s], from 0
+    rate_hz: float
+    quat_WL: dict[str, np.ndarray]  # segment -> (n, 4) xyzw, exact
+    points: dict[str, np.ndarray]  # point -> (n, 3) [m] in W, exact
+    gyro_S: dict[str, np.ndarray]  # sensor (named by its segment) -> (n, 3) [rad/s], over (k-1, k]; NaN where lost
+    accel_S: dict[str, np.ndarray]  # sensor -> (n, 3) [m/s^2], specific force at sample k; NaN where lost
+    quat_LS: dict[str, np.ndarray]  # sensor -> (4,) xyzw, exact mount, sensor to segment
+    p_LS: dict[str, np.ndarray]  # sensor -> (3,) [m] in L, from hips, shoulder or elbow to the sensor
+    stated_mount: dict[str, tuple[str, str] | None]  # sensor -> its axes that point up, forward; None: not stated
+    gyro_bias: dict[str, np.ndarray]  # sensor -> (n, 3) [rad/s], exact
+    accel_bias: dict[str, np.ndarray]  # sensor -> (n, 3) [m/s^2], exact
+    lengths: dict[str, float]  # [m]
+    phases: dict[str, list[tuple[float, float]]]
+    """[s]. "start": still in the N-pose; "clasp": palms together; "circles": first lift off the table to last
+    return; "rest": each rest of the right hand on the table, all sensors still (but for the sway)."""
+    imperfections: Imperfections
+    quat_WS: dict[str, np.ndarray]  # sensor -> (n, 4) xyzw, its own true orientation
+    soft_tissue: dict[str, np.ndarray]  # sensor -> (n, 3) [rad], rotation vector in L
+    device: dict[str, Device]  # sensor -> its own errors
+    sample_time: dict[str, np.ndarray]  # sensor -> (n,) [s], when it did sample; the file states `time`
+
+    def recording(self, name: str = "simulated") -> Recording:
+        """What a user would have recorded of it: sensors, stated mounts and phases, no truth.
+
+        On the stated time: what clocks are off by stays in the data, as with a file. Lost samples are bridged by the
+        readers' own code.
+        """
+        clock = Clock(self.time, np.arange(len(self.time)), 1.0 / self.rate_hz)
+        sensors = {}
+        for segment, gyro_S in self.gyro_S.items():
+            marks = lost_samples(clock, np.isfinite(gyro_S).all(axis=1))
+            stated = self.stated_mount[segment]
+            sensors[segment] = Sensor(
+                gyro_S=bridge(gyro_S, marks, clock, rate=True),
+                accel_S=bridge(self.accel_S[segment], marks, clock),
+                stated_quat_LS=None if stated is None else mount_from_axes(*stated),
+            )
+        phases = {phase: tuple(spans) for phase, spans in self.phases.items() if spans}
+        return check(Recording(name, self.time, self.rate_hz, sensors, phases))
+
+    def truth(self) -> Pose:
+        """The exact pose."""
+        return Pose(self.time, self.quat_WL, self.points)
+
+
+class _Moved(NamedTuple):
+    """A segment with its sensor's place at n times."""
+
+    time: np.ndarray  # (n,) [s]
+    R_WL: Rotation
+    p_ddot: np.ndarray  # (n, 3) [m/s^2] in W, of the sensor's place
+    rate_L: np.ndarray  # (n, 3) [rad/s] of the segment
+
+
+class _Sampled:
+    """The motion at n times, and beside them for derivatives by differences."""
+
+    def __init__(self, motion: Motion, t: np.ndarray, segment: str = "") -> None:
+        """Of all segments, or of one and what carries it."""
+        sides = [side for side in SIDES if not segment or segment.startswith(side)]
+        self.time = t
+        self.pose: BodyPose = motion(t, sides)
+        self.beside = [motion(t + k * _STENCIL_S, sides) for k in (-2, -1, 1, 2)]
+
+    def segment(self, segment: str, p_LS: np.ndarray) -> _Moved:
+        # Differences to the middle first: where nothing moves they are exactly zero.
+        p_W = sensor_position(self.pose, segment, p_LS)
+        far, near, near_after, far_after = (sensor_position(b, segment, p_LS) - p_W for b in self.beside)
+        p_ddot = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
+        turn = self.beside[1].R_WL[segment].inv() * self.beside[2].R_WL[segment]
+        return _Moved(self.time, self.pose.R_WL[segment], p_ddot, turn.as_rotvec() / (2.0 * _STENCIL_S))
+
+
+class _SoftTissue:
+    """How a sensor turns on its segment: a mixture of specific force and rate, and a wandering while it moves."""
+
+    def __init__(self, rng: np.random.Generator, rms_deg: float) -> None:
+        self.mixture = rng.standard_normal((6, 3))
+        self.wander = [Wander(rng) for _ in range(3)]
+        self.rms = np.deg2rad(rms_deg) / np.sqrt(3.0)  # [rad] of an axis
+        self.gains = np.zeros((2, 3))  # of the two parts, of each axis
+
+    def scale(self, moved: _Moved, activity: np.ndarray) -> None:
+        """Sets the gains so that it has its rms over these samples."""
+        follows, wanders = self._parts(moved, activity)
+        each = np.array([1.0 / np.sqrt(np.mean(part**2, axis=0)) for part in (follows, wanders)])
+        total = each[0] * follows + each[1] * wanders
+        self.gains = each * self.rms / np.sqrt(np.mean(total**2, axis=0))
+
+    def _parts(self, moved: _Moved, activity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # In units of g and of 3 rad/s, about what free motion of the arms has; zero in a still N-pose.
+        force_L = moved.R_WL.inv().apply(moved.p_ddot / GRAVITY + E_Z) - E_Z
+        follows = np.column_stack((force_L, moved.rate_L / 3.0)) @ self.mixture
+        return follows, activity[:, None] * np.column_stack([wander(moved.time) for wander in self.wander])
+
+    def __call__(self, moved: _Moved, activity: np.ndarray) -> np.ndarray:
+        """Rotation vectors (n, 3) [rad] in L."""
+        if not self.rms:
+            return np.zeros((len(activity), 3))
+        follows, wanders = self._parts(moved, activity)
+        return self.gains[0] * follows + self.gains[1] * wanders
+
+
+def simulate(
+    lengths: Mapping[str, float],
+    *,
+    seed: int,
+    rate_hz: float = 100.0,
+    noise: ImuNoise = MTI_3,
+    imperfections: Imperfections = PERFECT_WORLD,
+    clasp_s: float = 60.0,
+    circles: int = 6,
+) -> Simulation:
+    """A recording of the paper's upper-body experiment with known truth.
+
+    0 to 5 s still in the N-pose; 2.5 s to the clasp; `clasp_s` of free motion with the palms together while
+    the torso leans and twists; 2.5 s in which the left arm returns to hang and the right hand goes to a
+    table; then `circles` circles in the air (Lisini Baldi 2019, upper-body experiment), a rest on the table
+    before and after each.
+
+    Parameters
+    ----------
+    lengths : segment lengths [m]: trunk, shoulder_width, and upper_arm, forearm, hand of left_ and right_.
+    seed : the same seed gives the same bits. Motion, mounts, noise and each imperfection draw from streams of their
+        own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
+    rate_hz : samples a second.
+    noise : of gyroscope and accelerometer; `PERFECT` for none.
+    imperfections : of subject, strapping and sensors; `PERFECT_WORLD` for none, `REALISTIC` for usual ones.
+    clasp_s : how long the palms stay together [s], at least 5.
+    circles : how many circles, 0 or more.
+
+    Returns
+    -------
+    Simulation
+        Before the sensor's own errors, gyro_S[k] is log(R_WS[k-1]^T R_WS[k]) over the time between the two samples, so
+        that multiplying up exp(gyro_S / rate) gives `quat_WS` back exactly; accel_S[k] is R_WS[k]^T (p_ddot + g e_z),
+        p_ddot by central differences.
+
+    Raises
+    ------
+    ValueError
+        A length is missing or not positive, the arms cannot do the motion, or a parameter is out of range.
+    """
+    wrong = {name: lengths.get(name) for name in LENGTHS if not 0.0 < lengths.get(name, 0.0) < np.inf}
+    if wrong:
+        raise ValueError(f"lengths: must be given in metres and above 0: {wrong}")
+    if not (clasp_s >= 5.0 and circles >= 0 and rate_hz > 0.0):
+        raise ValueError(f"clasp_s {clasp_s} must be >= 5, circles {circles} >= 0, rate_hz {rate_hz} > 0")
+    lengths = {name: float(lengths[name]) for name in LENGTHS}
+    motion_rng, mount_rng, noise_rng, *others = np.random.default_rng(seed).spawn(3 + len(_STREAMS))
+    rngs = dict(zip(_STREAMS, others, strict=True))
+    motion = Motion(lengths, motion_rng, clasp_s, circles, Flaws(imperfections, rngs))
+    n = int(np.floor(motion.rest[-1][1] * rate_hz)) + 1
+    time = np.arange(n) / rate_hz
+    p_LS = sensor_places(lengths)
+    N = Rotation.from_matrix([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # x_S to z_L, -z_S to x_L
+
+    stated_time = _Sampled(motion, time)
+    own_clocks = imperfections.clock_jitter > 0.0 or imperfections.clock_offset > 0.0
+    never_still = own_clocks or imperfections.sway_deg_s > 0.0
+    coarse_t = np.arange(motion.clasp[0], motion.rest[-1][1], 1.0 / _GAIN_RATE_HZ)
+    coarse = _Sampled(motion, coarse_t) if imperfections.soft_tissue_deg else None
+
+    found: dict[str, dict] = {name: {} for name in ("quat_LS", "gyro_S", "accel_S", "gyro_bias", "accel_bias")}
+    found |= {name: {} for name in ("quat_WS", "soft_tissue", "device", "sample_time")}
+    for segment in SEGMENTS:
+        heading, tilt = mount_rng.uniform(0.0, 2.0 * np.pi), np.deg2rad(mount_rng.uniform(2.0, 10.0))
+        R_LS = Rotation.from_rotvec(tilt * np.array((np.cos(heading), np.sin(heading), 0.0))) * N
+        any_quat = rngs["mount"].standard_normal(4)  # uniform on the sphere
+        if imperfections.mount == "any":
+            R_LS = Rotation.from_quat(any_quat / np.linalg.norm(any_quat))
+        own_time = jittered(rngs["clock_jitter"], time, rate_hz, imperfections.clock_jitter)
+        own_time = own_time + imperfections.clock_offset * rngs["clock_offset"].standard_normal()
+
+        tissue = _SoftTissue(rngs["soft_tissue"], imperfections.soft_tissue_deg)
+        if coarse is not None:
+            tissue.scale(coarse.segment(segment, p_LS[segment]), motion.activity(coarse_t))
+
+        sampled = _Sampled(motion, own_time, segment) if own_clocks else stated_time
+        moved = sampled.segment(segment, p_LS[segment])
+        soft_L = tissue(moved, motion.activity(own_time))
+        # A product with the identity would not keep the last bit.
+        R_WS = (moved.R_WL * Rotation.from_rotvec(soft_L) if tissue.rms else moved.R_WL) * R_LS
+        rotvec = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec()
+        rate_S = np.vstack((np.zeros(3), rotvec * rate_hz))  # still before the first sample
+        if own_clocks:
+            rate_S[1:] = rotvec / np.diff(own_time)[:, None]
+        if never_still:  # a sample before the first one, for the rate that ends there
+            before = _Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment).segment(segment, p_LS[segment])
+            R_before = before.R_WL * Rotation.from_rotvec(tissue(before, motion.activity(before.time))) * R_LS
+            rate_S[0] = (R_before[0].inv() * R_WS[0]).as_rotvec() * rate_hz
+        force_S = R_WS.inv().apply(moved.p_ddot + GRAVITY * E_Z)
+
+        device = Device.draw(rngs["device"], imperfections)
+        readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, noise_rng)
+        gone = lost(rngs["dropped"], n, rate_hz, imperfections.dropped)
+        readings.gyro_S[gone] = readings.accel_S[gone] = np.nan
+        for name, value in (
+            ("quat_LS", R_LS.as_quat()),
+            *readings._asdict().items(),
+            ("quat_WS", R_WS.as_quat()),
+            ("soft_tissue", soft_L),
+            ("device", device),
+            ("sample_time", own_time),
+        ):
+            found[name][segment] = value
+
+    phases = {
+        "start": [(0.5, STAND_S - 0.5)],
+        "clasp": [(motion.clasp[0] + MARGIN_S, motion.clasp[1] - MARGIN_S)],
+        "circles": [(motion.circles[0].start, motion.circles[-1].stop)] if motion.circles else [],
+        "rest": [(a + MARGIN_S, b - MARGIN_S) for a, b in motion.rest],
+    }
+    return Simulation(
+        time=time,
+        rate_hz=rate_hz,
+        quat_WL={segment: stated_time.pose.R_WL[segment].as_quat() for segment in SEGMENTS},
+        points=stated_time.pose.points,
+        p_LS=p_LS,
+        stated_mount=dict.fromkeys(SEGMENTS, MOUNT if imperfections.mount == "stated" else None),
+        lengths=lengths,
+        phases=phases,
+        imperfections=imperfections,
+        **found,
+    )
+
+
+class Person(NamedTuple):
+    """A random person, and what a user with a tape would know of them."""
+
+    lengths: dict[str, float]  # [m], true
+    stature: float  # [m]
+    sex: str  # "f" or "m"
+    taped: dict[str, float]  # [m], measured lengths, each off by a draw of `taped_std`
+    taped_std: float  # [m]
+    average: Subject  # the average person of that stature and sex
+
+
+def simulated_person(seed: int, taped_std: float = 0.003) -> Person:
+    """A person drawn from the anthropometric distribution; the shoulder width is taped."""
+    rng = np.random.default_rng([seed, 7])
+    sex = SEXES[int(rng.integers(2))]
+    mean, std = {"f": (1.63, 0.064), "m": (1.756, 0.069)}[sex]  # [m], ANSUR II (Gordon et al. 2014)
+    stature = float(np.clip(rng.normal(mean, std), 1.45, 2.0))
+    average = average_subject(round(stature, 2), sex)
+    lengths = dict(average_subject(stature, sex).draw(rng).lengths)
+    taped = {"shoulder_width": lengths["shoulder_width"] + float(rng.normal(0.0, taped_std))}
+    return Person(lengths, stature, sex, taped, taped_std, average)
