@@ -7,15 +7,16 @@ measured in the still phase is removed for every filter.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import so3
-from wepose_pin.filters import GdcParams, run_filter
+from wepose_pin.filters import GdcParams, Smekf, run_filter
 from wepose_pin.noise import noise_of
+from wepose_pin.readers.trials import read_broad
 from wepose_pin.static import StaticDetector, StaticTest
 
 ROWS = ("smekf", "smekf, no correction in motion", "smekf, start measured", "ncf", "gdc 0.12", "gdc 0.01")
@@ -23,39 +24,28 @@ ROWS = ("smekf", "smekf, no correction in motion", "smekf, start measured", "ncf
 
 def errors_deg(path: Path) -> dict[str, tuple[float, float, float]]:
     """Row → (inclination, heading, total) RMSE [deg] of one trial."""
-    trial = loadmat(path)
-    gyro, accel = np.ascontiguousarray(trial["imu_gyr"], float), np.ascontiguousarray(trial["imu_acc"], float)
-    rate_hz = float(trial["sampling_rate"].squeeze())
-    moving = trial["movement"].ravel().astype(bool)
-    true = so3.xyzw_from_wxyz(trial["opt_quat"])
-    seen = np.isfinite(true).all(axis=1)
-    begin = int(np.argmax(moving))
-    rest = slice(round(1.0 * rate_hz), begin - round(1.0 * rate_hz))
-    noise = noise_of(gyro[rest], accel[rest], rate_hz)
-    static = StaticDetector(noise, rate_hz).run(gyro, accel)
+    trial = read_broad(path)
+    gyro, accel, rate_hz = trial.gyro_S, trial.accel_S, trial.rate_hz
+    noise = noise_of(gyro[trial.still], accel[trial.still], rate_hz)
+    seen = np.isfinite(trial.quat_true).all(axis=1)
+    true = Rotation.from_quat(np.where(seen[:, None], trial.quat_true, [0, 0, 0, 1]))
+    resting = np.zeros(len(seen), dtype=bool)
+    resting[trial.still] = seen[trial.still]
 
     def rmse(quat_VS: np.ndarray) -> tuple[float, float, float]:
-        scored = moving & seen
-        aligning = seen.copy()
-        aligning[rest.stop :] = False
-        aligning[: rest.start] = False
         R_VS = Rotation.from_quat(quat_VS)
-        R_true = Rotation.from_quat(np.where(seen[:, None], true, [0, 0, 0, 1]))
-        psi = so3.heading((R_true[aligning] * R_VS[aligning].inv()).mean().as_quat())
-        error = (Rotation.from_rotvec([0, 0, psi]) * R_VS[scored]) * R_true[scored].inv()
-        up = error.as_matrix()[:, 2, 2]
-        total, heading = error.magnitude(), so3.heading(error.as_quat())
-        parts = np.arccos(np.clip(up, -1, 1)), heading, total
-        return tuple(float(np.degrees(np.sqrt(np.mean(part**2)))) for part in parts)  # type: ignore[return-value]
+        psi = so3.heading((true[resting] * R_VS[resting].inv()).mean().as_quat())
+        error = (Rotation.from_rotvec([0, 0, psi]) * R_VS[trial.scored]) * true[trial.scored].inv()
+        parts = np.arccos(np.clip(error.as_matrix()[:, 2, 2], -1, 1)), so3.heading(error.as_quat()), error.magnitude()
+        inclination, heading, total = (float(np.degrees(np.sqrt(np.mean(part**2)))) for part in parts)
+        return inclination, heading, total
 
-    def run(method: str, **options: object) -> np.ndarray:
-        return run_filter(gyro, accel, rate_hz, noise, method, **options).quat_WS  # type: ignore[arg-type]
+    def run(method: str, **options: Any) -> np.ndarray:
+        return run_filter(gyro, accel, rate_hz, noise, method, **options).quat_WS
 
     # Correction only up to the motion: what the corrections in the trial are worth.
-    from wepose_pin.filters import Smekf
-
-    early = static.copy()
-    early[begin:] = False
+    early = StaticDetector(noise, rate_hz).run(gyro, accel)
+    early[trial.still.stop + round(rate_hz) :] = False  # the motion begins a second after what counts as still
     start = so3.tilt(accel[: StaticTest().samples(rate_hz)].mean(axis=0))
     return {
         ROWS[0]: rmse(run("smekf")),

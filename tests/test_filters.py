@@ -13,6 +13,7 @@ from wepose_pin.errors import BadData, BadOption, BadPhase
 from wepose_pin.filters import METHODS, Gdc, GdcParams, Ncf, Smekf, SmekfParams, estimate_orientation, run_filter
 from wepose_pin.filters.smekf import starting_params
 from wepose_pin.noise import SensorNoise, noise_of
+from wepose_pin.readers.trials import read_authors_trial
 from wepose_pin.static import StaticTest
 
 RATE = 100.0
@@ -398,13 +399,11 @@ def test_starting_params_trust_tilt_and_heading_as_far_as_known() -> None:
 
 def test_the_authors_own_trial_against_vicon(data: Any) -> None:
     """1 kHz, aligned on the world side at the first Vicon sample: VQF 2.1.2 gets 1.94 deg mean angle."""
-    lines = (data / "wepose_hr" / "prova_HR.txt").read_text().splitlines()
-    table = np.array([line.replace(";", "").split() for line in lines if line.strip()], dtype=float)
-    vicon = table[:, 14:18]
-    seen = np.linalg.norm(vicon, axis=1) > 0.5
+    trial = read_authors_trial(data / "wepose_hr" / "prova_HR.txt")
+    true = Rotation.from_quat(trial.quat_true[trial.scored])
     for method, limit in (("smekf", 2.2), ("ncf", 2.5), ("gdc", 2.5)):
-        out = estimate_orientation(table[:, 1:4], table[:, 4:7], 1000.0, method=method, still=(0.05, 0.9))
-        true, found = Rotation.from_quat(vicon[seen]), Rotation.from_quat(out.quat_WS[seen])
+        out = estimate_orientation(trial.gyro_S, trial.accel_S, trial.rate_hz, method=method, still=(0.05, 0.9))
+        found = Rotation.from_quat(out.quat_WS[trial.scored])
         aligned = (true[0] * found[0].inv()) * found
         angle = np.degrees((true.inv() * aligned).magnitude())
         print(f"{method}: mean angle {angle.mean():.3f} deg, largest {angle.max():.2f} deg")

@@ -385,12 +385,68 @@ def view(
         _warn(["no browser could be started; open the page by hand"])
 
 
+def validate(
+    *,
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="DIR")] = None,
+    data: OptionalPath = None,
+    quick: bool = False,
+    force: bool = False,
+) -> None:
+    """The paper's experiments on simulated subjects, and real recordings, beside the paper's own figures.
+
+    Example: wepose validate --quick
+
+    Args:
+        out: Folder for validation.json with every trial.
+        data: Folder of the real recordings (broad/, wepose_hr/), to measure on them too.
+        quick: Two trials of each experiment instead of all.
+        force: Replace files of an earlier run.
+    """
+    import json
+
+    from .validation import experiments, summary
+    from .writers import whole_folder
+    from .writers.result import as_json, versions
+
+    todo = experiments(quick, data)
+    place = whole_folder(out, force) if out is not None else contextlib.nullcontext(None)
+    with place as folder, _steps(sum(count for count, _ in todo.values())) as step:
+        results = []
+        for name, (_, run) in todo.items():
+            last = None
+            for result in run():
+                if result.trial != last:
+                    step(name)
+                    last = result.trial
+                results.append(result)
+        if folder is not None:
+            document = {"versions": versions(), "quick": quick, "results": [as_json(result) for result in results]}
+            (folder / "validation.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    rows = summary(results)
+    for experiment in todo:
+        of = [row for row in rows if row[0] == experiment]
+        unit = "mm" if experiment.startswith("upper") else "deg"
+        names = [name for name in of[0][2] if not name.endswith(" std")]
+        cells = []
+        for _, method, mean, paper in of:
+            values = [f"{mean[n]:.2f}" + (f" ± {mean[f'{n} std']:.2f}" if f"{n} std" in mean else "") for n in names]
+            cells.append((method, *values, paper))
+        _print_table(f"{experiment}, {todo[experiment][0]} trials [{unit}]", ("filter", *names, "the paper"), cells)
+    _say(
+        "Simulated: MTi-3 noise and bias; `realistic` adds soft tissue, slip, sway and sensor errors. Bias of the still"
+    )
+    _say("phase removed for every filter; gains are the defaults. Heading aligned at rest, never fitted afterwards.")
+    if out is not None:
+        _say(f"Every trial: {out / 'validation.json'}")
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "track": track,
     "calibrate": calibrate,
     "evaluate": evaluate,
     "simulate": simulate,
+    "validate": validate,
     "view": view,
 }
 
