@@ -113,27 +113,10 @@ def rotate(quat: Any, v: Any) -> Any:
 
 
 def calibrate(
-    recording: Recording,
-    *,
-    gauge: Mapping[str, float] | None = None,
-    prior: Subject | None = None,
-    protocol: str = "clasp",
-    method: str = "smekf",
-    gauge_std: float = GAUGE_STD,
+    recording: Recording, *, gauge: Mapping[str, float] | None = None, prior: Subject | None = None, **options: Any
 ) -> Subject:
-    """The subject of a hands-together recording; see `calibrate_lengths` for all that was found beside it.
-
-    Parameters
-    ----------
-    gauge : measured lengths, name → [m]; without one the scale is the prior's
-    prior : lengths before, with covariance, and mounts; None for the anthropometric average
-    protocol : phase of the session in which the palms touch
-    method : the orientation filter
-    gauge_std : standard deviation [m] of each measured length
-    """
-    return calibrate_lengths(
-        recording, gauge=gauge, prior=prior, protocol=protocol, method=method, gauge_std=gauge_std
-    ).subject
+    """The subject of a hands-together recording; options, and what else was found: see `calibrate_lengths`."""
+    return calibrate_lengths(recording, gauge=gauge, prior=prior, **options).subject
 
 
 def calibrate_lengths(
@@ -145,7 +128,15 @@ def calibrate_lengths(
     method: str = "smekf",
     gauge_std: float = GAUGE_STD,
 ) -> Calibration:
-    """Link lengths with their covariance; parameters as `calibrate`.
+    """Link lengths with their covariance, and what was found beside them.
+
+    Parameters
+    ----------
+    gauge : measured lengths, name → [m]; without one the scale is the prior's
+    prior : lengths before, with covariance, and mounts; None for the anthropometric average
+    protocol : phase of the session in which the palms touch
+    method : the orientation filter
+    gauge_std : standard deviation [m] of each measured length
 
     Raises
     ------

@@ -601,8 +601,8 @@ def _print_table(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]
         table.add_column(escape(name), justify="left" if k == 0 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
-    # Piped output is not cut to 80 columns.
-    console = Console(width=None if sys.stdout.isatty() else 160)
+    # Wide enough for every table: rich would cut numbers off to fit a narrow terminal, which wraps by itself.
+    console = Console(width=160)
     console.print(escape(title), style="bold", highlight=False)
     console.print(table)
 

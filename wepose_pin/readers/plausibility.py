@@ -128,12 +128,12 @@ def _gyro_unit(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, place: s
         peak = float(np.max(np.abs(gyro_S)))
         raise BadData(
             f"{place}.gyro: with rates up to {peak:.3g} rad/s gravity would tumble, and accel shows that it does not; "
-            f'data.gyro_unit = "deg/s" would fit'
+            f'data.gyro_unit = "deg/s" would fit, or the time or rate_hz is wrong'
         )
     if as_stated < STIFF * larger and larger > COHERENT:
         raise BadData(
             f"{place}.gyro: with rates up to {float(np.max(np.abs(gyro_S))):.3g} rad/s the sensor turns too little for "
-            f'what accel shows; data.gyro_unit = "rad/s" would fit'
+            f'what accel shows; data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong'
         )
     mean = accel.mean(axis=1)
     norm = np.linalg.norm(mean, axis=1)
