@@ -371,6 +371,12 @@ def test_wrong_input_is_named() -> None:
         estimate_orientation(gyro, gyro, RATE, method="smekv", still=(0, 0.5))
     with pytest.raises(BadData, match=r"must both be \(n, 3\)"):
         estimate_orientation(gyro, gyro[:50], RATE, still=(0, 0.5))
+    noise = noise_of(*measured(np.random.default_rng(0), 2.0)[:2], RATE)
+    for wrong in (-1.0, np.nan, np.diag([1.0, 1.0, -1.0])):
+        with pytest.raises(BadOption, match="positive semidefinite"):
+            Smekf(noise, RATE, np.array([0.0, 0.0, 0.0, 1.0]), SmekfParams(attitude_cov0=wrong))
+    with pytest.raises(BadData, match="as many"):
+        Smekf(noise, RATE, np.array([0.0, 0.0, 0.0, 1.0])).run(np.zeros((5, 3)), np.zeros((5, 3)), True)
     with pytest.raises(BadData, match="finite"):
         estimate_orientation(gyro * np.nan, gyro, RATE, still=(0, 0.5))
     with pytest.raises(BadPhase, match=r"which lasts 1\.000 s"):

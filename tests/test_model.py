@@ -530,9 +530,9 @@ def test_a_file_that_is_not_there_and_lengths_that_cannot_be(tmp_path: Path) -> 
         load_model(tmp_path / "none.toml")
     with pytest.raises(BadModel, match="did you mean 'left_forearm'"):
         load_model(lengths={"left_forarm": 0.2})
-    with pytest.raises(BadModel, match="greater than 0 m"):
+    with pytest.raises(BadModel, match="above 0 and below 10 m"):
         load_model(lengths={"left_forearm": -0.2})
-    with pytest.raises(BadModel, match="greater than 0 m"):
+    with pytest.raises(BadModel, match="above 0 and below 10 m"):
         load_model(lengths={"left_forearm": float("nan")})
 
 

@@ -102,6 +102,8 @@ def configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray]) -> np.nda
     BadModel
         The model has no link for a measured segment.
     """
+    if not quat_WL:
+        raise BadData("no segment has an orientation: there is nothing to pose")
     n = len(next(iter(quat_WL.values())))
     found = chains(model.pin)
     for segment in quat_WL:

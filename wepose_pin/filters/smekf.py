@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import BadOption
 from ..noise import SensorNoise
 from ..so3 import compiled, rotate_by_vector, up_in_sensor
 from .base import FilterRun, samples
@@ -76,7 +77,7 @@ class Smekf:
         P[:3, :3] = _matrix(self.params.attitude_cov0)
         P[3:, 3:] = _matrix(self.params.bias_cov0)
         step = self.params.bias_step_cov
-        self._bias_step_cov = noise.bias_step_cov if step is None else np.asarray(step, dtype=float)
+        self._bias_step_cov = noise.bias_step_cov if step is None else _matrix(step)
         self.state = SmekfState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy(), P)
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
@@ -106,7 +107,10 @@ class Smekf:
 def _matrix(cov: float | np.ndarray) -> np.ndarray:
     """A covariance (3, 3) that may be given as one variance."""
     given = np.asarray(cov, dtype=float)
-    return given if given.ndim == 2 else given * np.eye(3)
+    matrix = given if given.ndim == 2 else given * np.eye(3)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] < -1e-15:
+        raise BadOption(f"covariance {cov!r}: a variance from 0 on is needed, or a positive semidefinite (3, 3)")
+    return matrix
 
 
 @compiled

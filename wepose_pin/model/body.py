@@ -63,8 +63,10 @@ class BodyModel:
         for name, value in lengths.items():
             if name not in own:
                 raise BadModel(f"{self.robot.name}: the model has no length '{name}'; {one_of(own, name)}")
-            if not value > 0.0:
-                raise BadModel(f"{self.robot.name}: length {name} = {value!r} must be greater than 0 m")
+            if not 0.0 < value < 10.0:
+                raise BadModel(
+                    f"{self.robot.name}: length {name} = {value!r} is no length of a body: above 0 and below 10 m"
+                )
         return _body(_lengths.with_lengths(self.robot, lengths), self.robot.name)
 
     def urdf(self) -> str:
