@@ -77,7 +77,7 @@ def test_without_a_gauge_the_proportions_are_right_and_the_scale_is_the_priors(e
     assert abs(np.mean(ratio) - 1) < 4 * found.scale_std
     assert 0.02 < found.scale_std < 0.1
     assert found.gauge == {}
-    assert any(warning.startswith("no gauge") for warning in found.warnings)
+    assert any(warning.startswith("no gauge in the chain") for warning in found.warnings)
     # Nothing drifts to zero: another prior, ten per cent larger, gives everything ten per cent larger.
     average = average_subject()
     larger = replace(
@@ -181,6 +181,11 @@ def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     found = calibrate(recording, prior=person.average)
     assert found.lengths["trunk"] == pytest.approx(person.average.lengths["trunk"], rel=1e-6)
     assert found.std("trunk") == pytest.approx(person.average.std("trunk"), rel=1e-3)
+    # A taped trunk is kept, and is no gauge of the arms.
+    alone = calibrate_lengths(recording, prior=person.average, gauge={"trunk": 0.5})
+    assert alone.subject.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
+    assert any(warning.startswith("no gauge in the chain") for warning in alone.warnings)
+    assert alone.subject.note.endswith("of the anthropometric prior")
     taped = calibrate(recording, prior=person.average, gauge={"trunk": 0.5, "shoulder_width": 0.38})
     assert taped.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
 

@@ -206,7 +206,8 @@ def _solve(
     gaps_before = np.asarray(problem.gaps(np.concatenate([mean, np.zeros(4 * problem.sensors)]), data))
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1)
     without_data = np.linalg.inv(information)[:k, :k]
-    warnings = _remarks(lengths, covariance, without_data, prior, None if gauge else scale_std)
+    scaling = [name for name in gauge if name != "trunk"]  # the trunk is not in the chain and cannot scale it
+    warnings = _remarks(lengths, covariance, without_data, prior, None if scaling else scale_std)
     subject = replace(
         prior,
         name=recording.name,
@@ -214,7 +215,7 @@ def _solve(
         order=LENGTHS,
         covariance=covariance,
         mounts=dict(segments.quat_LS),
-        note="hands together; scale " + (f"taped: {', '.join(gauge)}" if gauge else "of the anthropometric prior"),
+        note="hands together; scale " + (f"taped: {', '.join(scaling)}" if scaling else "of the anthropometric prior"),
     )
     return Calibration(
         subject=subject,
@@ -258,7 +259,7 @@ def _remarks(
     remarks = []
     if free_scale_std is not None:
         remarks.append(
-            f"no gauge: the hands together fix the proportions, not the scale, which is the prior's "
+            f"no gauge in the chain: the hands together fix the proportions, not the scale, which is the prior's "
             f"({prior.note or prior.name}): all lengths may be off together by {100 * free_scale_std:.1f} %; tape one, "
             f"as in --gauge shoulder_width=0.385"
         )
