@@ -404,21 +404,18 @@ def validate(
     """
     import json
 
-    from .validation import experiments, summary
+    from .validation import experiments, run, summary
     from .writers import whole_folder
     from .writers.result import as_json, versions
 
     todo = experiments(quick, data)
+    jobs = [job for of in todo.values() for job in of]
     place = whole_folder(out, force) if out is not None else contextlib.nullcontext(None)
-    with place as folder, _steps(sum(count for count, _ in todo.values())) as step:
+    with place as folder, _steps(len(jobs)) as step:
         results = []
-        for name, (_, run) in todo.items():
-            last = None
-            for result in run():
-                if result.trial != last:
-                    step(name)
-                    last = result.trial
-                results.append(result)
+        for job, found in zip(jobs, run(jobs), strict=True):
+            step(job.experiment)
+            results += found
         if folder is not None:
             document = {"versions": versions(), "quick": quick, "results": [as_json(result) for result in results]}
             (folder / "validation.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
@@ -431,7 +428,7 @@ def validate(
         for _, method, mean, paper in of:
             values = [f"{mean[n]:.2f}" + (f" ± {mean[f'{n} std']:.2f}" if f"{n} std" in mean else "") for n in names]
             cells.append((method, *values, paper))
-        _print_table(f"{experiment}, {todo[experiment][0]} trials [{unit}]", ("filter", *names, "the paper"), cells)
+        _print_table(f"{experiment}, {len(todo[experiment])} trials [{unit}]", ("filter", *names, "the paper"), cells)
     _say(
         "Simulated: MTi-3 noise and bias; `realistic` adds soft tissue, slip, sway and sensor errors. Bias of the still"
     )

@@ -1,0 +1,121 @@
+"""The paper's three experiments on simulated sensors and people with exact truth.
+
+The bias measured in the still phase is removed for every filter, and the heading is aligned once, in that phase, and
+never fitted to the truth afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .. import so3
+from ..calibration import calibrate
+from ..evaluation import AttitudeError, attitude_error, evaluate
+from ..noise import noise_of
+from ..recording import Recording, Sensor
+from ..simulation import PERFECT_WORLD, REALISTIC, SingleSensor, paper_drift, paper_dynamic, simulate, simulated_person
+from ..tracking import track
+from .contenders import Contender, contenders
+from .jobs import Job, Result
+from .series import aligned, over_time
+
+WORLDS = {"MTi-3 noise alone": PERFECT_WORLD, "realistic": REALISTIC}
+RATES = {"100 Hz": 100.0, "1 kHz": 1000.0}
+
+
+def experiments(quick: bool = False) -> dict[str, list[Job]]:
+    """Name → jobs; `quick`: two trials of each."""
+    found = {}
+    for rate, rate_hz in RATES.items():
+        name = f"dynamic {rate}"
+        found[name] = [Job(name, str(k), _dynamic, (k, rate, rate_hz)) for k in range(2 if quick else 12)]
+    found["drift"] = [Job("drift", str(k), _drift, (k,)) for k in range(2 if quick else 10)]
+    for world in WORLDS:
+        name = f"upper body, {world}"
+        found[name] = [Job(name, str(k), _upper_body, (k, world)) for k in range(2 if quick else 10)]
+    return found
+
+
+def _dynamic(experiment: str, trial: str, seed: int, rate: str, rate_hz: float) -> list[Result]:
+    """5 s still, 50 s of free motion, 5 s still; errors over the motion."""
+    sensor = paper_dynamic(seed, rate_hz)
+    results = []
+    for method, scored, error in _single(sensor, f"simulated {rate}"):
+        series = over_time(sensor.time, total_deg=np.degrees(error.magnitude())) if seed == 0 else {}
+        results.append(Result(experiment, trial, method, scored._asdict(), series))
+    return results
+
+
+def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
+    """25 s still, 10 s of shaking and turning, 25 s still; the heading error after the motion, against before it."""
+    sensor = paper_drift(seed)
+    after = sensor.time > sensor.moving[1] + 1.0
+    results = []
+    for method, _, error in _single(sensor, "simulated 1 kHz"):
+        yaw, pitch, roll = np.abs(error.as_euler("ZYX", degrees=True)[after]).T
+        heading = np.degrees(np.unwrap(so3.heading(error.as_quat())))
+        slope = np.polyfit(sensor.time[after], heading[after], 1)[0]
+        figures = {"roll": roll.mean(), "pitch": pitch.mean(), "yaw": yaw.mean(), "drift_deg_min": 60.0 * abs(slope)}
+        series = over_time(sensor.time, heading_deg=heading) if seed == 0 else {}
+        results.append(Result(experiment, trial, method, {k: float(v) for k, v in figures.items()}, series))
+    return results
+
+
+def _single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, AttitudeError, Rotation]]:
+    """Label, its error over the motion, and the error rotation of each sample; the heading aligned at rest."""
+    rest = (sensor.time >= sensor.still[0][0] + 0.5) & (sensor.time <= sensor.still[0][1] - 0.5)
+    moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
+    true = Rotation.from_quat(sensor.quat_WS)
+    noise = noise_of(sensor.gyro_S[rest], sensor.accel_S[rest], sensor.rate_hz)
+    for contender in contenders(setting):
+        quat = contender.orient(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise)
+        R_WS = aligned(Rotation.from_quat(quat), true, rest)
+        yield contender.label, attitude_error(R_WS[moving], true[moving], sensor.time[moving]), R_WS * true.inv()
+
+
+def _upper_body(experiment: str, trial: str, seed: int, world: str) -> list[Result]:
+    """Clasp calibration by each filter with a taped shoulder width, then six circles; mounts as stated."""
+    person = simulated_person(seed)
+    simulation = simulate(person.lengths, seed=seed, imperfections=WORLDS[world])
+    recorded, truth = simulation.recording(), simulation.truth()
+    circles = simulation.phases["circles"][0]
+    results = []
+    for contender in contenders("simulated 100 Hz"):
+        recording, method = oriented(recorded, contender)
+        subject = calibrate(
+            recording, gauge=person.taped, prior=person.average, method=method, gauge_std=person.taped_std
+        )
+        pose = track(recording, subject, method=method)
+        errors = evaluate(pose, truth, circles)
+        figures = {
+            "hand_mm": errors.position["right_hand"]._asdict(),
+            "hand_from_shoulders_mm": errors.position_from_shoulders["right_hand"]._asdict(),
+        }
+        series = {}
+        if seed == 0:
+            inside = recording.span(circles)
+            off = pose.points["right_hand"][inside] - truth.points["right_hand"][inside]
+            paths = {f"{axis}_mm": 1e3 * pose.points["right_hand"][inside, k] for k, axis in enumerate("xyz")}
+            paths |= {f"true_{axis}_mm": 1e3 * truth.points["right_hand"][inside, k] for k, axis in enumerate("xyz")}
+            series = over_time(recording.time[inside], error_mm=1e3 * np.linalg.norm(off, axis=1), **paths)
+        results.append(Result(experiment, trial, contender.label, figures, series))
+    return results
+
+
+def oriented(recording: Recording, contender: Contender) -> tuple[Recording, str]:
+    """What `track` takes to run a contender: the recording and a method, or one of ready orientations."""
+    if contender.method is not None:
+        return recording, contender.method
+    sensors = {}
+    rest = recording.span(recording.phases["start"][0])
+    for segment, sensor in recording.sensors.items():
+        assert sensor.gyro_S is not None
+        assert sensor.accel_S is not None
+        noise = noise_of(sensor.gyro_S[rest], sensor.accel_S[rest], recording.rate_hz)
+        quat_WS = contender.orient(sensor.gyro_S, sensor.accel_S, recording.rate_hz, noise)
+        sensors[segment] = Sensor(quat_WS=quat_WS, stated_quat_LS=sensor.stated_quat_LS)
+    return replace(recording, sensors=sensors), "smekf"
