@@ -12,7 +12,7 @@ from wepose_pin.alignment import heading_to, segment_orientations
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.recording import Recording, Sensor, axes_from_mount, mount_from_axes
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import Subject, average_subject
+from wepose_pin.subject import Subject, average_subject, mount_rows
 
 
 @pytest.mark.parametrize(("up", "forward"), [("+x", "-z"), ("-y", "+x"), ("+z", "+x"), ("-z", "-y")])
@@ -61,6 +61,42 @@ def test_calibrated_mounts_give_headings_of_any_size() -> None:
     for name, psi in headings.items():
         assert segments.heading[name] == pytest.approx(psi, abs=1e-9)
         assert (Rotation.from_quat(segments.quat_WL[name]) * true[name].inv()).magnitude().max() < 1e-9
+
+
+def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
+    """A person stands with the arm 5 deg bent: a sure mount sees it, a vague one takes it for its own error."""
+    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    bent = Rotation.from_rotvec([0.0, -np.deg2rad(5.0), 0.0])
+    recording, true = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * mount})
+    # Sensor orientation = bent pose times true mount: `true` of the helper is the segment, straight at the start.
+    truth = true["left_forearm"] * bent.inv()
+    for std_deg, share in ((0.0, 0.0), (4.0, 0.5), (400.0, 1.0)):
+        rows = mount_rows("left_forearm")
+        subject = replace(
+            average_subject(),
+            mounts={"left_forearm": mount.as_quat()},
+            order=tuple(rows),
+            covariance=np.deg2rad(std_deg) ** 2 * np.eye(3),
+        )
+        segments = segment_orientations(recording, subject)
+        off = (truth.inv() * Rotation.from_quat(segments.quat_WL["left_forearm"])).magnitude()
+        assert np.degrees(off.max()) == pytest.approx(5.0 * share, abs=0.05)
+        assert not segments.warnings
+
+
+def test_a_calibrated_mount_that_has_moved_is_said() -> None:
+    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    moved = Rotation.from_rotvec([0.0, np.deg2rad(20.0), 0.0])
+    recording, _ = ready_recording({"torso": 0.0}, {"torso": moved * mount})
+    subject = replace(
+        average_subject(),
+        mounts={"torso": mount.as_quat()},
+        order=tuple(mount_rows("torso")),
+        covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
+    )
+    (warning,) = segment_orientations(recording, subject).warnings
+    assert "calibrated mount is 20 deg off" in warning
+    assert 'strapping = "new"' in warning
 
 
 def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:

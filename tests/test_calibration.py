@@ -7,6 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import ARMS, CHAIN, calibrate, calibrate_lengths, palm_gap, rotate
@@ -15,7 +16,7 @@ from wepose_pin.model import load_model
 from wepose_pin.pose import pose_of
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.simulation import PERFECT, Person, Simulation, simulate, simulated_person
-from wepose_pin.subject import LENGTHS, average_subject
+from wepose_pin.subject import LENGTHS, average_subject, mount_rows
 
 
 def ready(simulation: Simulation) -> Recording:
@@ -50,6 +51,23 @@ def test_rotate_in_casadi_is_scipys() -> None:
     np.testing.assert_allclose(
         np.asarray(rotate(ca.DM(rotation.as_quat()), ca.DM(v))).ravel(), rotation.apply(v), atol=1e-15
     )
+
+
+def test_mounts_of_known_uncertainty_stay_with_it(exact: tuple[Person, Recording]) -> None:
+    _, recording = exact
+    rows = mount_rows("torso")
+    prior = average_subject()
+    prior = replace(
+        prior,
+        mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])},
+        order=(*prior.order, *rows),
+        covariance=block_diag(prior.covariance, np.diag([1e-4, 2e-4, 3e-4])),
+    )
+    found = calibrate_lengths(recording, prior=prior).subject
+    np.testing.assert_array_equal(found.mount_covariance("torso"), np.diag([1e-4, 2e-4, 3e-4]))
+    assert found.mount_covariance("left_forearm") is None
+    again = calibrate_lengths(replace(recording, strapping="new"), prior=prior).subject
+    assert again.mount_covariance("torso") is None
 
 
 def test_exact_orientations_and_a_gauge_give_the_lengths_back(exact: tuple[Person, Recording]) -> None:

@@ -10,6 +10,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 
@@ -91,6 +92,18 @@ def test_simulate_is_seeded(tmp_path: Path) -> None:
     assert not a.equals(c)
 
 
+def test_simulate_with_mounts_anywhere_is_tracked_with_its_subject(tmp_path: Path) -> None:
+    made = tmp_path / "made"
+    assert run("simulate", "-o", made, "--world", "realistic", "--set", "mount=any", "--set", "dropped=0") == 0
+    assert "mount =" not in (made / "session.toml").read_text()
+    track_it = ("track", made / "session.toml", "-o", tmp_path / "result")
+    assert run(*track_it) == 2
+    assert run(*track_it, "--subject", made / "subject.toml") == 0
+    pose, truth = (pl.read_parquet(p) for p in (tmp_path / "result" / "pose.parquet", made / "truth.parquet"))
+    off = np.sqrt(sum((pose[c] - truth[c]) ** 2 for c in ("right_hand_x", "right_hand_y", "right_hand_z")))
+    assert off.mean() < 0.03
+
+
 def test_nothing_is_overwritten_without_force(
     session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -168,6 +181,9 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["evaluate", "nowhere", "truth.csv"], "no pose.parquet in it"),
         (["view", "nowhere"], "no pose.parquet in it"),
         (["simulate", "-o", "OUT", "--rate-hz", "5"], "between 20 and 2000"),
+        (["simulate", "-o", "OUT", "--set", "palm_slide=0"], "palm_slip"),
+        (["simulate", "-o", "OUT", "--set", "palm_slip=much"], "could not convert"),
+        (["simulate", "-o", "OUT", "--set", "mount=taped"], "'stated' or 'any'"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(

@@ -2,7 +2,8 @@
 
 A sensor's filter knows the vertical and not the heading: its world V differs from W by a turn about z, the heading ψ.
 In the N-pose every segment frame equals W, so the mount is R_LS = R_WS = Rz(ψ) R_VS(start): the tilt of it is measured
-by gravity, and ψ is what makes it nearest to the mount as stated (or as calibrated).
+by gravity, and ψ is what makes it nearest to the mount as stated (or as calibrated). Nobody stands exactly so: what a
+calibrated mount's covariance says is weighed against the few degrees by which the pose itself is off.
 """
 
 from __future__ import annotations
@@ -25,6 +26,11 @@ from .subject import Subject
 # The stated axes are by hand; further off than this they are no longer what was meant.
 STATED_LIMIT_DEG = 60.0
 STATED_WARNING_DEG = 35.0
+
+# How far a person's segments are off the start pose [rad], about each axis: elbows never hang straight.
+START_POSE_STD = np.deg2rad(4.0)
+# A calibrated mount that gravity contradicts by more than this many standard deviations has moved.
+MOVED_MOUNT = 3.5
 
 # Turning in the start pose: root mean square of the rate, and largest turn from its mean. A person who stands sways
 # below 3 deg/s and 3 deg; at the limits the mean pose is no longer the pose that was meant.
@@ -119,6 +125,17 @@ def segment_orientations(
             )
         if off > STATED_WARNING_DEG:
             warnings.append(f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose")
+        known = _mount_covariance(recording, segment, subject)
+        if known is not None:
+            # The misfit is the pose's error and the mount's together; each takes its share.
+            misfit = (R_LS * R_stated.inv()).as_rotvec()
+            both = known + START_POSE_STD**2 * np.eye(3)
+            R_LS = Rotation.from_rotvec(known @ np.linalg.solve(both, misfit)) * R_stated
+            if misfit @ np.linalg.solve(both, misfit) > MOVED_MOUNT**2:
+                warnings.append(
+                    f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "
+                    f'pose; strapped on anew? then state strapping = "new"'
+                )
         quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
         quat_LS[segment] = R_LS.as_quat()
         heading[segment] = psi
@@ -159,13 +176,20 @@ def _covariance_W(
     cov_W = R @ orientation.attitude_cov @ R.swapaxes(1, 2)
     # Each rest measures the tilt anew with the same accelerometer bias, which averaging does not take away.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
-    if subject is not None and segment in subject.mounts and recording.strapping != "new":
-        # Of a mount's error only the heading counts, the tilt is measured anew: it turns R_WL into
-        # Rz(δ) R_WL Rz(δ)ᵀ, which is nothing in the start pose and grows as the segment turns away from it.
-        lever = np.array([0.0, 0.0, 1.0]) - (R_WS * R_LS.inv()).as_matrix()[:, :, 2]
-        heading_var = np.nan_to_num(subject.std(f"mounts.{segment}.z") ** 2)
-        cov_W += heading_var * lever[:, :, None] * lever[:, None, :]
+    known = _mount_covariance(recording, segment, subject)
+    if known is not None:
+        # A mount's error ε in L turns R_WL by R_WL ε. Its heading was taken for the world's, so that it turns R_WL
+        # into Rz(δ) R_WL Rz(δ)ᵀ, which is nothing in the start pose; the pose weighed in on its tilt.
+        R_WL = (R_WS * R_LS.inv()).as_matrix()
+        lever = R_WL - np.array([0.0, 0.0, 1.0])[:, None] * np.array([0.0, 0.0, 1.0])
+        tilt = known[:2]
+        left = known - tilt.T @ np.linalg.solve(tilt[:, :2] + START_POSE_STD**2 * np.eye(2), tilt)
+        cov_W += lever @ left @ lever.swapaxes(1, 2)
     return cov_W
+
+
+def _mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
+    return None if subject is None or recording.strapping == "new" else subject.mount_covariance(segment)
 
 
 def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[str]]:

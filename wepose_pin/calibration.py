@@ -31,11 +31,12 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import block_diag
 
 from .alignment import Segments, segment_orientations
 from .errors import BadOption, BadPhase, BadSession, BadSubject, NoSolution, one_of
 from .recording import Recording
-from .subject import LENGTHS, Subject, average_subject
+from .subject import LENGTHS, Subject, average_subject, mount_rows
 
 PROTOCOLS = ("clasp",)
 ARMS = tuple(f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm", "hand"))
@@ -208,13 +209,17 @@ def _solve(
     without_data = np.linalg.inv(information)[:k, :k]
     scaling = [name for name in gauge if name != "trunk"]  # the trunk is not in the chain and cannot scale it
     warnings = _remarks(lengths, covariance, without_data, prior, None if scaling else scale_std)
+    # Mounts of known uncertainty are the prior's still; of others the start pose has measured the tilt.
+    sure = [] if recording.strapping == "new" else [n for n in prior.mounts if prior.mount_covariance(n) is not None]
+    rows = [row for segment in sure for row in mount_rows(segment)]
+    at = [prior.order.index(row) for row in rows]
     subject = replace(
         prior,
         name=recording.name,
         lengths=dict(zip(LENGTHS, lengths.tolist(), strict=True)),
-        order=LENGTHS,
-        covariance=covariance,
-        mounts=dict(segments.quat_LS),
+        order=(*LENGTHS, *rows),
+        covariance=block_diag(covariance, prior.covariance[np.ix_(at, at)]),
+        mounts=dict(segments.quat_LS) | {segment: prior.mounts[segment] for segment in sure},
         note="hands together; scale " + (f"taped: {', '.join(scaling)}" if scaling else "of the anthropometric prior"),
     )
     return Calibration(

@@ -16,13 +16,16 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 from tyro.conf import Positional, arg
 
 from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of
 
 if TYPE_CHECKING:
+    from .simulation import Imperfections
     from .subject import Subject
+    from .validation import Document
 
 Method = Literal["smekf", "ncf", "gdc"]
 Session = Annotated[Positional[Path], arg(metavar="SESSION")]
@@ -305,35 +308,57 @@ def evaluate(
         )
 
 
-def simulate(*, out: Out, seed: int = 1, rate_hz: float = 100.0, force: bool = False) -> None:
+def simulate(
+    *,
+    out: Out,
+    seed: int = 1,
+    rate_hz: float = 100.0,
+    world: Literal["perfect", "realistic"] = "perfect",
+    change: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(name="set", metavar="NAME=VALUE")] = (),
+    force: bool = False,
+) -> None:
     """A subject with known truth: session file, recording, and truth.parquet as pose.parquet.
 
-    Example: wepose simulate -o made --seed 7
+    The sensors have an MTi-3's noise and bias in either world; what else is wrong in a realistic one, and the names for
+    --set, stand with sizes and sources in wepose_pin.simulation.Imperfections.
+
+    Example: wepose simulate -o made --seed 7 --world realistic --set palm_slip=0 --set mount=any
 
     Args:
-        out: Folder for session.toml, recording.parquet, truth.parquet, subject.toml (the true lengths).
+        out: Folder for session.toml, recording.parquet, truth.parquet, subject.toml (the true lengths and mounts).
         seed: Another number is another person and another motion.
         rate_hz: Samples a second.
+        world: Nothing wrong but the sensors' noise, or soft tissue, slip, sway and sensor errors of a usual size.
+        change: One imperfection at another size; may be given several times.
         force: Replace files of an earlier run.
     """
     from dataclasses import replace
 
+    from .simulation import PERFECT_WORLD, REALISTIC, simulated_person
     from .simulation import simulate as make
-    from .simulation import simulated_person
-    from .subject import LENGTHS, subject_toml
+    from .subject import LENGTHS, mount_rows, subject_toml
     from .writers import whole_folder, write_session
 
     if seed < 0:
         raise BadOption(f"--seed {seed}: a whole number from 0 on")
     if not 20.0 <= rate_hz <= 2000.0:
         raise BadOption(f"--rate-hz {rate_hz:g}: between 20 and 2000 samples a second")
+    imperfections = _changed(REALISTIC if world == "realistic" else PERFECT_WORLD, change)
     with whole_folder(out, force) as folder, _steps(1) as step:
         step("simulating a person")
         person = simulated_person(seed)
-        simulation = make(person.lengths, seed=seed, rate_hz=rate_hz)
+        simulation = make(person.lengths, seed=seed, rate_hz=rate_hz, imperfections=imperfections)
         write_session(folder, simulation.recording(f"simulated-{seed}"), simulation.truth())
-        true = replace(person.average, name="truth", lengths=person.lengths, note="simulated: the true lengths")
-        true = replace(true, covariance=0.0 * person.average.covariance, order=LENGTHS)
+        order = (*LENGTHS, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
+        true = replace(
+            person.average,
+            name="truth",
+            lengths=person.lengths,
+            mounts=simulation.quat_LS,
+            order=order,
+            covariance=np.zeros((len(order), len(order))),
+            note="simulated: the true lengths and mounts",
+        )
         (folder / "subject.toml").write_text(subject_toml(true), encoding="utf-8")
     taped = " ".join(f"{name}={value:.4f}" for name, value in person.taped.items())
     _say(f"Session: {out / 'session.toml'}  (taped: {taped}, stature {person.stature:.2f} m, sex {person.sex})")
@@ -390,6 +415,7 @@ def validate(
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="DIR")] = None,
     data: OptionalPath = None,
     quick: bool = False,
+    from_: Annotated[Path | None, arg(name="from", metavar="FILE")] = None,
     force: bool = False,
 ) -> None:
     """The paper's experiments on simulated subjects, and real recordings, beside the paper's own figures.
@@ -397,44 +423,111 @@ def validate(
     Example: wepose validate --quick
 
     Args:
-        out: Folder for validation.json with every trial.
-        data: Folder of the real recordings (broad/, wepose_hr/), to measure on them too.
+        out: Folder for validation.json with every trial, and the page with tables and figures: validation.html,
+            validation.md with validation/*.png.
+        data: Folder of the real recordings (broad/, wepose_hr/, ring/, ur5/), to measure on them too.
         quick: Two trials of each experiment instead of all.
+        from_: validation.json of an earlier run: tables and pages are made from it anew, and nothing is run.
         force: Replace files of an earlier run.
     """
     import json
 
-    from .validation import experiments, run, summary
+    from .validation import document_text, experiments, run
+    from .validation.document import as_document, read_document
+    from .validation.page import write_pages
     from .writers import whole_folder
-    from .writers.result import as_json, versions
+    from .writers.result import versions
 
-    todo = experiments(quick, data)
+    if from_ is not None and (quick or data is not None):
+        raise BadOption(f"--from {from_}: measures nothing, so that --quick and --data mean nothing beside it")
+    document = read_document(from_) if from_ is not None else None
+    todo = experiments(quick, data) if document is None else {}
     jobs = [job for of in todo.values() for job in of]
     place = whole_folder(out, force) if out is not None else contextlib.nullcontext(None)
-    with place as folder, _steps(len(jobs)) as step:
-        results = []
-        for job, found in zip(jobs, run(jobs), strict=True):
-            step(job.experiment)
-            results += found
+    with place as folder, _steps(len(jobs) + (folder is not None)) as step:
+        if document is None:
+            results = []
+            for job, found in zip(jobs, run(jobs), strict=True):
+                step(job.experiment)
+                results += found
+            text = document_text(results, quick, versions())
+            if folder is not None:
+                (folder / "validation.json").write_text(text, encoding="utf-8")
+            document = as_document(json.loads(text), "this run")
         if folder is not None:
-            document = {"versions": versions(), "quick": quick, "results": [as_json(result) for result in results]}
-            (folder / "validation.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    rows = summary(results)
-    for experiment in todo:
-        of = [row for row in rows if row[0] == experiment]
-        unit = "mm" if experiment.startswith("upper") else "deg"
-        names = [name for name in of[0][2] if not name.endswith(" std")]
-        cells = []
-        for _, method, mean, paper in of:
-            values = [f"{mean[n]:.2f}" + (f" ± {mean[f'{n} std']:.2f}" if f"{n} std" in mean else "") for n in names]
-            cells.append((method, *values, paper))
-        _print_table(f"{experiment}, {len(todo[experiment])} trials [{unit}]", ("filter", *names, "the paper"), cells)
-    _say(
-        "Simulated: MTi-3 noise and bias; `realistic` adds soft tissue, slip, sway and sensor errors. Bias of the still"
-    )
-    _say("phase removed for every filter; gains are the defaults. Heading aligned at rest, never fitted afterwards.")
+            step("drawing the figures")
+            write_pages(folder, document)
+    _validation_tables(document)
     if out is not None:
+        _say(f"Page: {out / 'validation.html'}  {out / 'validation.md'}  {out / 'validation'}/*.png")
+    if out is not None and from_ is None:
         _say(f"Every trial: {out / 'validation.json'}")
+
+
+def bench(
+    *,
+    quick: bool = False,
+    data: OptionalPath = None,
+    save: Annotated[Path | None, arg(metavar="FILE")] = None,
+    compare: Annotated[Path | None, arg(metavar="FILE")] = None,
+    force: bool = False,
+) -> None:
+    """Speed and accuracy of the filters on this machine, beside VQF and imufusion where they are installed.
+
+    Times belong to the machine and the moment; what counts are the ratios to VQF, timed in turn in the same run.
+
+    Example: wepose bench --quick --save before.json
+
+    Args:
+        quick: Less than half a minute in place of some minutes: shorter data, fewer rounds.
+        data: Folder of real recordings (broad/, wepose_hr/) to measure accuracy on; WEPOSE_DATA names one too.
+        save: Write the figures there, with versions, machine and date, as JSON.
+        compare: A file that --save wrote: then/now shows how much slower each was then, by its ratio to VQF.
+        force: Replace the file of --save.
+    """
+    import json
+
+    from .bench import document, read_document, sections, then_by_now
+    from .writers.result import versions
+
+    if data is None and os.environ.get("WEPOSE_DATA"):
+        data = Path(os.environ["WEPOSE_DATA"])
+    before = None if compare is None else read_document(compare)
+    if save is not None and save.exists() and not force:
+        raise ExistingOutput(f"{save}: exists; --force replaces it, --save names another file")
+    if save is not None and (save.is_dir() or not save.absolute().parent.is_dir()):
+        raise ExistingOutput(f"{save}: not a file that can be written; --save names a JSON file in an existing folder")
+    todo, tables = sections(quick, data), {}
+    with _steps(len(todo)) as step:
+        for name, measure in todo.items():
+            step(f"measuring {name.replace('_', ' ')}")
+            tables[name] = measure()
+    for name, table in tables.items():
+        header, rows = [""], {of: [of] for of in table.rows}
+        for column in table.columns:
+            compared = before is not None and column.compared
+            header += [column.header, "then/now"] if compared else [column.header]
+            for of, figures in table.rows.items():
+                value = figures.get(column.key, float("nan"))
+                rows[of].append(f"{value:.{column.digits}f}" if value == value else "")
+                if before is not None and compared:
+                    ratio = then_by_now(before, name, of, column.key, value)
+                    rows[of].append(f"{ratio:.2f}" if ratio == ratio else "")
+        _print_table(table.title, tuple(header), [tuple(row) for row in rows.values()])
+        for note in table.notes:
+            _say(note)
+        _say("")
+    if before is not None:
+        _say(f"then: {compare}, {before.get('date', 'undated')}; over 1, it was slower against VQF then")
+    if save is not None:
+        text = json.dumps(document(tables, quick, versions()), indent=1) + "\n"
+        partial = save.with_name(f".{save.name}.partial")
+        try:
+            partial.write_text(text, encoding="utf-8")
+            partial.replace(save)
+        finally:
+            partial.unlink(missing_ok=True)
+        _say(f"Figures: {save}")
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -445,6 +538,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "simulate": simulate,
     "validate": validate,
     "view": view,
+    "bench": bench,
 }
 
 
@@ -545,6 +639,23 @@ def _gauges(gauge: tuple[str, ...]) -> dict[str, float]:
     return taped
 
 
+def _changed(imperfections: Imperfections, changes: tuple[str, ...]) -> Imperfections:
+    """The imperfections with those of --set at other sizes."""
+    from dataclasses import fields, replace
+
+    names = [field.name for field in fields(imperfections)]
+    for text in changes:
+        name, _, value = text.partition("=")
+        if name not in names:
+            raise BadOption(f"--set {text}: '{name}' is no imperfection; {one_of(names, name)}")
+        try:
+            size: Any = value if name == "mount" else int(value) if name == "bits" else float(value)
+            imperfections = replace(imperfections, **{name: size})
+        except ValueError as error:
+            raise BadOption(f"--set {text}: {error}") from None
+    return imperfections
+
+
 # What the user sees ------------------------------------------------------------------------------------------------
 
 
@@ -622,6 +733,40 @@ def _lengths_table(
         "",
     )
     _print_table("Lengths from the joined hands", header, rows)
+
+
+def _validation_tables(document: Document) -> None:
+    """A table an experiment, what it says beside the paper, and the targets."""
+    import textwrap
+
+    from .validation import summary
+    from .validation.findings import order, target_line, targets, worse
+    from .validation.page import experiment_table, unit_of
+
+    def say(text: str) -> None:
+        _say(textwrap.fill(text, 98, initial_indent="  ", subsequent_indent="    "))
+
+    rows = summary(document.results)
+    for experiment in dict.fromkeys(row.experiment for row in rows):
+        of = [row for row in rows if row.experiment == experiment]
+        trials = len({result.trial for result in document.results if result.experiment == experiment})
+        unit = unit_of(of)
+        header, lines = experiment_table(of, whole=False)
+        # A long name in two lines: the tables stay within 100 columns.
+        header = [name if len(name) < 12 else "\n".join(name.rsplit(" ", 1)) for name in header]
+        title = f"{experiment}, {trials} trial{'s' * (trials != 1)}" + (f" [{unit}]" if unit else "")
+        _print_table(title + ", a quick run" * document.quick, tuple(header), [tuple(line) for line in lines])
+        said = [*order(of), *worse(of)]
+        for text in said:
+            say(text)
+        _say("")
+    found = targets(rows)
+    if found:
+        _say("Targets for the mean error of the hand, smekf:")
+        for target in found:
+            say(target_line(target))
+    _say("± is one standard deviation over time, averaged over the trials. Bias of the still phase removed for every")
+    _say("filter; heading aligned once, on a stretch that is not scored, and never fitted to the truth afterwards.")
 
 
 def _mean_std(error: Any) -> str:

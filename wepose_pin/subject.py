@@ -66,6 +66,14 @@ class Subject:
         found[np.ix_(known, known)] = self.covariance[np.ix_(rows, rows)]
         return found
 
+    def mount_covariance(self, segment: str) -> np.ndarray | None:
+        """Covariance (3, 3) [rad²] of a calibrated mount's error in L; None where nothing is known of it."""
+        rows = mount_rows(segment)
+        if segment not in self.mounts or not set(rows) <= set(self.order):
+            return None
+        at = [self.order.index(row) for row in rows]
+        return self.covariance[np.ix_(at, at)]
+
     def draw(self, rng: np.random.Generator) -> Subject:
         """A random person from this one's distribution of lengths, for simulation."""
         mean = np.array([self.lengths[name] for name in LENGTHS])
@@ -79,6 +87,11 @@ class Subject:
             covariance=np.zeros_like(self.covariance),
             note="drawn at random",
         )
+
+
+def mount_rows(segment: str) -> list[str]:
+    """What the rows of a subject's covariance that belong to a mount are called."""
+    return [f"mounts.{segment}.{axis}" for axis in "xyz"]
 
 
 def average_subject(stature: float | None = None, sex: str | None = None) -> Subject:
@@ -134,7 +147,7 @@ def subject_toml(subject: Subject) -> str:
     for segment, quat in subject.mounts.items():
         lines += ["", f"[mounts.{segment}]   # R_LS, sensor to segment"]
         lines += [f"{key} = {value:.9f}" for key, value in zip(("qx", "qy", "qz", "qw"), quat, strict=True)]
-        std = [subject.std(f"mounts.{segment}.{axis}") for axis in "xyz"]
+        std = [subject.std(row) for row in mount_rows(segment)]
         if np.isfinite(std).all():
             lines.append(f"std_deg = {np.degrees(np.sqrt(np.mean(np.square(std)))):.3f}")
     if subject.order:
@@ -196,7 +209,7 @@ def _covariance(path: Path, table: Mapping, std: Mapping) -> tuple[tuple[str, ..
     if not table:
         order = tuple(name for name in LENGTHS if name in std)
         return order, np.diag([float(std[name]) ** 2 for name in order])
-    known = (*LENGTHS, *(f"mounts.{segment}.{axis}" for segment in SEGMENTS for axis in "xyz"))
+    known = (*LENGTHS, *(row for segment in SEGMENTS for row in mount_rows(segment)))
     order = table.get("order", ())
     if not isinstance(order, list | tuple) or len(set(map(str, order))) != len(order):
         raise BadSubject(f"{path}: covariance.order = {order!r}; a list of names is needed, each once")

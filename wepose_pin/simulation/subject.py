@@ -301,12 +301,12 @@ class Person(NamedTuple):
 
 
 def simulated_person(seed: int, taped_std: float = 0.003) -> Person:
-    """A person drawn from the anthropometric distribution; the shoulder width is taped."""
+    """A person drawn from the anthropometric distribution; shoulder width and trunk are taped."""
     rng = np.random.default_rng([seed, 7])
     sex = SEXES[int(rng.integers(2))]
     mean, std = {"f": (1.63, 0.064), "m": (1.756, 0.069)}[sex]  # [m], ANSUR II (Gordon et al. 2014)
     stature = float(np.clip(rng.normal(mean, std), 1.45, 2.0))
     average = average_subject(round(stature, 2), sex)
     lengths = dict(average_subject(stature, sex).draw(rng).lengths)
-    taped = {"shoulder_width": lengths["shoulder_width"] + float(rng.normal(0.0, taped_std))}
+    taped = {name: lengths[name] + float(rng.normal(0.0, taped_std)) for name in ("shoulder_width", "trunk")}
     return Person(lengths, stature, sex, taped, taped_std, average)

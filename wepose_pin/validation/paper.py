@@ -8,23 +8,58 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..calibration import calibrate
-from ..evaluation import AttitudeError, attitude_error, evaluate
+from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
 from ..noise import noise_of
 from ..recording import Recording, Sensor
-from ..simulation import PERFECT_WORLD, REALISTIC, SingleSensor, paper_drift, paper_dynamic, simulate, simulated_person
+from ..simulation import (
+    PERFECT_WORLD,
+    REALISTIC,
+    Imperfections,
+    Person,
+    Simulation,
+    SingleSensor,
+    paper_drift,
+    paper_dynamic,
+    simulate,
+    simulated_person,
+)
+from ..subject import LENGTHS, Subject, mount_rows
 from ..tracking import track
 from .contenders import Contender, contenders
 from .jobs import Job, Result
 from .series import aligned, over_time
 
-WORLDS = {"MTi-3 noise alone": PERFECT_WORLD, "realistic": REALISTIC}
 RATES = {"100 Hz": 100.0, "1 kHz": 1000.0}
+WORLDS = {"MTi-3 noise alone": PERFECT_WORLD, "realistic": REALISTIC}
+KNOWN_MOUNT_STD = np.deg2rad(0.5)  # what the tracker is told of mounts that are in truth exact
+MILLIMETRES = "where the millimetres come from"
+# What is switched off in turn: imperfections as in a perfect world, or a part of the chain known exactly.
+SWITCHED: dict[str, dict[str, Any]] = {
+    label: {name: getattr(PERFECT_WORLD, name) for name in names.split()}
+    for label, names in {
+        "all on": "",
+        "orientations exact": "",
+        "lengths exact": "",
+        "mounts as stated": "",
+        "soft tissue off": "soft_tissue_deg",
+        "shoulder wander off": "shoulder_wander",
+        "palm slip off": "palm_slip",
+        "start pose exact": "start_elbow_deg start_segment_deg",
+        "sway off": "sway_deg_s",
+        "gyro and accel errors off": "gyro_scale accel_scale misalignment_deg g_sensitivity_deg_s "
+        "gyro_range_deg_s accel_range_g bits",
+        "clocks exact, none lost": "clock_jitter clock_offset dropped",
+    }.items()
+}
 
 
 def experiments(quick: bool = False) -> dict[str, list[Job]]:
@@ -34,9 +69,10 @@ def experiments(quick: bool = False) -> dict[str, list[Job]]:
         name = f"dynamic {rate}"
         found[name] = [Job(name, str(k), _dynamic, (k, rate, rate_hz)) for k in range(2 if quick else 12)]
     found["drift"] = [Job("drift", str(k), _drift, (k,)) for k in range(2 if quick else 10)]
-    for world in WORLDS:
+    for world, imperfections in WORLDS.items():
         name = f"upper body, {world}"
-        found[name] = [Job(name, str(k), _upper_body, (k, world)) for k in range(2 if quick else 10)]
+        found[name] = [Job(name, str(k), _upper_body, (k, imperfections)) for k in range(2 if quick else 10)]
+    found[MILLIMETRES] = [Job(MILLIMETRES, str(k), _millimetres, (k,)) for k in range(1 if quick else 10)]
     return found
 
 
@@ -77,24 +113,23 @@ def _single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, AttitudeE
         yield contender.label, attitude_error(R_WS[moving], true[moving], sensor.time[moving]), R_WS * true.inv()
 
 
-def _upper_body(experiment: str, trial: str, seed: int, world: str) -> list[Result]:
-    """Clasp calibration by each filter with a taped shoulder width, then six circles; mounts as stated."""
+@lru_cache(maxsize=1)
+def _simulated(seed: int, imperfections: Imperfections) -> tuple[Person, Simulation]:
     person = simulated_person(seed)
-    simulation = simulate(person.lengths, seed=seed, imperfections=WORLDS[world])
+    return person, simulate(person.lengths, seed=seed, imperfections=imperfections)
+
+
+def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfections) -> list[Result]:
+    """Clasp calibration by each filter with shoulder width and trunk taped and mounts known, then six circles."""
+    person, simulation = _simulated(seed, imperfections)
     recorded, truth = simulation.recording(), simulation.truth()
     circles = simulation.phases["circles"][0]
+    prior = mounts_known(person.average, simulation)
     results = []
     for contender in contenders("simulated 100 Hz"):
         recording, method = oriented(recorded, contender)
-        subject = calibrate(
-            recording, gauge=person.taped, prior=person.average, method=method, gauge_std=person.taped_std
-        )
+        subject = _calibrated(recording, person, prior, method)
         pose = track(recording, subject, method=method)
-        errors = evaluate(pose, truth, circles)
-        figures = {
-            "hand_mm": errors.position["right_hand"]._asdict(),
-            "hand_from_shoulders_mm": errors.position_from_shoulders["right_hand"]._asdict(),
-        }
         series = {}
         if seed == 0:
             inside = recording.span(circles)
@@ -102,8 +137,60 @@ def _upper_body(experiment: str, trial: str, seed: int, world: str) -> list[Resu
             paths = {f"{axis}_mm": 1e3 * pose.points["right_hand"][inside, k] for k, axis in enumerate("xyz")}
             paths |= {f"true_{axis}_mm": 1e3 * truth.points["right_hand"][inside, k] for k, axis in enumerate("xyz")}
             series = over_time(recording.time[inside], error_mm=1e3 * np.linalg.norm(off, axis=1), **paths)
+        figures = _hand(evaluate(pose, truth, circles)) | {"lengths_rms_mm": _lengths_rms(subject, person)}
         results.append(Result(experiment, trial, contender.label, figures, series))
     return results
+
+
+def _millimetres(experiment: str, trial: str, seed: int) -> list[Result]:
+    """smekf on the realistic subject, each imperfection switched off or each part known exactly, in turn."""
+    results = []
+    for label, off in SWITCHED.items():
+        person, simulation = _simulated(seed, replace(REALISTIC, **off))
+        recording = simulation.recording()
+        prior = person.average if label == "mounts as stated" else mounts_known(person.average, simulation)
+        if label == "orientations exact":
+            sensors = {
+                name: replace(sensor, gyro_S=None, accel_S=None, quat_WS=simulation.quat_WS[name])
+                for name, sensor in recording.sensors.items()
+            }
+            recording = replace(recording, sensors=sensors)
+        subject = _calibrated(recording, person, prior, "smekf")
+        if label == "lengths exact":
+            subject = replace(subject, lengths=person.lengths)
+        errors = evaluate(track(recording, subject), simulation.truth(), simulation.phases["circles"][0])
+        results.append(
+            Result(experiment, trial, label, _hand(errors) | {"lengths_rms_mm": _lengths_rms(subject, person)})
+        )
+    return results
+
+
+def _calibrated(recording: Recording, person: Person, prior: Subject, method: str) -> Subject:
+    return calibrate(recording, gauge=person.taped, prior=prior, method=method, gauge_std=person.taped_std)
+
+
+def _hand(errors: Evaluation) -> dict[str, dict[str, float]]:
+    figures = {
+        "hand_mm": errors.position["right_hand"]._asdict(),
+        "hand_from_shoulders_mm": errors.position_from_shoulders["right_hand"]._asdict(),
+    }
+    if "right_hand" in errors.position_uncertainty:
+        figures["hand_uncertainty"] = errors.position_uncertainty["right_hand"]._asdict()
+    return figures
+
+
+def _lengths_rms(subject: Subject, person: Person) -> float:
+    """[mm] of the lengths that the closed chain sees: all but the trunk."""
+    return 1e3 * float(
+        np.sqrt(np.mean([(subject.lengths[n] - person.lengths[n]) ** 2 for n in LENGTHS if n != "trunk"]))
+    )
+
+
+def mounts_known(subject: Subject, simulation: Simulation) -> Subject:
+    """The subject with the simulation's exact mounts, stated as known to `KNOWN_MOUNT_STD`."""
+    rows = [row for segment in simulation.quat_LS for row in mount_rows(segment)]
+    covariance = block_diag(subject.covariance, KNOWN_MOUNT_STD**2 * np.eye(len(rows)))
+    return replace(subject, mounts=simulation.quat_LS, order=(*subject.order, *rows), covariance=covariance)
 
 
 def oriented(recording: Recording, contender: Contender) -> tuple[Recording, str]:
