@@ -10,11 +10,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadData, BadOption, BadPhase
-from wepose_pin.filters import METHODS, Gdc, GdcParams, Ncf, Smekf, SmekfParams, estimate_orientation, run_filter
+from wepose_pin.filters import (
+    METHODS,
+    OFFLINE,
+    Gdc,
+    GdcParams,
+    Ncf,
+    Smekf,
+    SmekfParams,
+    check_method,
+    estimate_orientation,
+    run_filter,
+)
+from wepose_pin.filters.bank import LiveBank
+from wepose_pin.filters.base import in_parallel
 from wepose_pin.filters.smekf import starting_params
 from wepose_pin.noise import SensorNoise, noise_of
 from wepose_pin.readers.trials import read_authors_trial
-from wepose_pin.static import StaticTest
+from wepose_pin.so3 import tilt
+from wepose_pin.static import StaticDetector, StaticTest
 
 RATE = 100.0
 GRAVITY = 9.81
@@ -319,7 +333,7 @@ def test_gdc_is_madgwicks_equations() -> None:
 # All ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [name for name in METHODS if name not in OFFLINE])
 @pytest.mark.parametrize("cut", [1, 333, 999])
 def test_a_run_cut_in_two_and_one_by_one_give_the_same_bits(method: str, cut: int) -> None:
     gyro, accel, _, rest = measured(np.random.default_rng(3), 10.0, bias=(0.02, 0.0, -0.01))
@@ -398,6 +412,124 @@ def test_starting_params_trust_tilt_and_heading_as_far_as_known() -> None:
     across = np.linalg.svd(np.eye(3) - np.outer(up_S, up_S))[0][:, 0]
     assert 0.003 < np.sqrt(across @ still @ across) < 0.02
     assert np.sqrt(across @ moving @ across) > 0.1
+
+
+# Live, in threads, and with samples missing ---------------------------------------------------------------------------
+
+
+def sensors(
+    count: int, seconds: float = 20.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[SensorNoise], list[np.ndarray]]:
+    """Gyro (n, k, 3), accel (n, k, 3), true quaternions (n, k, 4), noise and start of each."""
+    found = [measured(np.random.default_rng(seed), seconds, bias=(0.01, -0.02, 0.005)) for seed in range(count)]
+    gyro, accel, true = (np.stack([sensor[i] for sensor in found], axis=1) for i in range(3))
+    noises = [noise_of(gyro[:180, i], accel[:180, i], RATE) for i in range(count)]
+    return gyro, accel, true, noises, [tilt(accel[:50, i].mean(axis=0)) for i in range(count)]
+
+
+def test_a_bank_of_sensors_gives_the_bits_of_each_alone() -> None:
+    gyro, accel, _, noises, starts = sensors(5)
+    gyro[700:703, 2] = np.nan  # one sensor's samples do not come
+    accel[1400, 4] = np.nan
+    alone, statics = [], []
+    for i, (noise, start) in enumerate(zip(noises, starts, strict=True)):
+        statics.append(StaticDetector(noise, RATE).run(gyro[:, i], accel[:, i]))
+        alone.append(Smekf(noise, RATE, start).run(gyro[:, i], accel[:, i], statics[-1]))
+    assert 0.1 < np.mean(statics) < 0.9
+    for first in (0, 1, 333):  # the bank goes on where single runs were
+        filters = [Smekf(noise, RATE, start) for noise, start in zip(noises, starts, strict=True)]
+        detectors = [StaticDetector(noise, RATE) for noise in noises]
+        for i, (filter_, detector) in enumerate(zip(filters, detectors, strict=True)):
+            filter_.run(gyro[:first, i], accel[:first, i], detector.run(gyro[:first, i], accel[:first, i]))
+        before = filters[0].state.row.copy()
+        bank = LiveBank(filters, detectors)
+        for k in range(first, len(gyro)):
+            quat = bank.update(gyro[k], accel[k])
+            np.testing.assert_array_equal(quat, [run.quat_WS[k] for run in alone])
+            np.testing.assert_array_equal(bank.static, [static[k] for static in statics])
+        assert quat is bank.quat_WS
+        np.testing.assert_array_equal(bank.gyro_bias, [run.gyro_bias[-1] for run in alone])
+        np.testing.assert_array_equal(bank.attitude_cov, [run.attitude_cov[-1] for run in alone])  # type: ignore[index]
+        np.testing.assert_array_equal(filters[0].state.row, before)  # on copies
+
+
+def test_a_bank_takes_any_array_and_names_what_does_not_fit() -> None:
+    gyro, accel, _, noises, starts = sensors(3, 2.0)
+    filters = [Smekf(noise, RATE, start) for noise, start in zip(noises, starts, strict=True)]
+    detectors = [StaticDetector(noise, RATE) for noise in noises]
+    bank, other = LiveBank(filters, detectors), LiveBank(filters, detectors)
+    np.testing.assert_array_equal(
+        bank.update(gyro[0].tolist(), accel[0].tolist()), other.update(np.asfortranarray(gyro[0]), accel[0])
+    )
+    with pytest.raises(BadData, match="each of 3 sensors"):
+        bank.update(gyro[0, :2], accel[0])
+    with pytest.raises(BadOption, match="3 filters and 2 detectors"):
+        LiveBank(filters, detectors[:2])
+    with pytest.raises(BadOption, match=r"windows of \[20, 50\]"):
+        LiveBank(filters, [StaticDetector(noises[0], RATE, StaticTest(window_s=0.2)), *detectors[1:]])
+    with pytest.raises(BadOption, match="kind Gdc, Smekf"):
+        LiveBank([*filters[:2], Gdc(noises[2], RATE, starts[2])], detectors)
+    with pytest.raises(BadOption, match="kind none"):
+        LiveBank([], [])
+
+
+def test_runs_in_threads_are_the_runs_one_after_the_other() -> None:
+    gyro, accel, _, noises, _ = sensors(7)
+
+    def run(i: int, noise: SensorNoise) -> Any:
+        return run_filter(gyro[:, i], accel[:, i], RATE, noise, "smekf")
+
+    one = in_parallel(run, range(7), noises, threads=1)
+    for threads in (2, 5, None):
+        for parallel, single in zip(in_parallel(run, range(7), noises, threads=threads), one, strict=True):
+            for found, expected in zip(parallel[:4], single[:4], strict=True):
+                np.testing.assert_array_equal(found, expected)
+    with pytest.raises(BadOption, match="not known"):
+        in_parallel(check_method, ["smekf", "none"])
+    assert in_parallel(check_method, []) == []
+
+
+@pytest.mark.parametrize("method", ["smekf", "ncf", "gdc"])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -1e300])
+def test_a_sample_that_is_no_number_does_not_stay(method: str, wrong: float) -> None:
+    """One in motion, three at rest, one at the very start; batch and sample by sample alike."""
+    gyro, accel, _, rest = measured(np.random.default_rng(9), 20.0)
+    noise = noise_of(gyro[:180], accel[:180], RATE)
+    start = tilt(accel[:50].mean(axis=0))
+    clean = METHODS[method](noise, RATE, start).run(gyro, accel, rest)
+    gyro[[0, 500, 1050, 1051, 1052], [0, 1, 2, 0, 1]] = wrong
+    accel[[0, 500, 1100, 1200, 1201], [0, 1, 2, 0, 1]] = wrong
+    run = METHODS[method](noise, RATE, start).run(gyro, accel, rest & np.isfinite(accel).all(axis=1))
+    assert all(np.isfinite(found).all() for found in run if found is not None)
+    turned = np.degrees((Rotation.from_quat(run.quat_WS).inv() * Rotation.from_quat(clean.quat_WS)).magnitude())
+    assert turned[:500].max() < 0.3
+    assert turned.max() < 3.0
+    filter_ = METHODS[method](noise, RATE, start)
+    single = [
+        filter_.update(g, a, s) for g, a, s in zip(gyro, accel, rest & np.isfinite(accel).all(axis=1), strict=True)
+    ]
+    np.testing.assert_array_equal(single, run.quat_WS)
+
+
+@pytest.mark.parametrize("gap", [1, 3, 10, 50, 200])
+def test_what_is_unseen_is_in_the_covariance(gap: int) -> None:
+    """The same motion with a gap in it: the error it makes is within the covariance it adds, and not far within."""
+    normalised, growth = [], []
+    for seed in range(40):
+        gyro, accel, _, rest = measured(np.random.default_rng(100 + seed), 10.0)
+        noise = noise_of(gyro[:180], accel[:180], RATE)
+        params = SmekfParams(1e-8, 1e-10)
+        clean = Smekf(noise, RATE, tilt(accel[:50].mean(axis=0)), params).run(gyro, accel, rest)
+        first = 350 + 5 * seed
+        gyro[first : first + gap] = np.nan
+        run = Smekf(noise, RATE, tilt(accel[:50].mean(axis=0)), params).run(gyro, accel, rest)
+        last = first + gap - 1
+        error = (Rotation.from_quat(run.quat_WS[last]).inv() * Rotation.from_quat(clean.quat_WS[last])).as_rotvec()
+        assert run.attitude_cov is not None
+        normalised.append(error @ np.linalg.solve(run.attitude_cov[last], error))
+        growth.append(np.sqrt(run.attitude_cov[last, 0, 0]))
+    print(f"{gap} missing: normalised error {np.mean(normalised):.2f} (3 is right), std {np.mean(growth):.4f} rad")
+    assert 0.03 < np.mean(normalised) < 3.5
 
 
 # A real recording --------------------------------------------------------------------------------------------------

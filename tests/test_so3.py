@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -10,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin import so3
 
 ANGLES = np.concatenate(
-    [[0.0], np.logspace(-16, 0, 33), so3.SMALL_ANGLE * (1 + np.array([-1e-3, 1e-3])), [3.0, np.pi - 1e-9]]
+    [[0.0], np.logspace(-16, 0, 33), 2 * so3.SERIES_HALF_ANGLE * (1 + np.array([-1e-3, 1e-3])), [3.0, np.pi - 1e-9]]
 )
 
 
@@ -35,10 +40,26 @@ def test_log_undoes_exp(angle: float) -> None:
 
 
 def test_the_compiled_step_keeps_relative_precision_on_both_sides_of_its_switch() -> None:
-    for half in so3.SMALL_ANGLE * np.array([1e-4, 0.99, 1.01, 100.0]):
+    for half in so3.SERIES_HALF_ANGLE * np.array([1e-15, 1e-8, 1e-4, 0.1, 0.5, 0.99, 0.999999, 1.000001, 1.01, 3.0]):
         quat = np.array([0.0, 0.0, 0.0, 1.0])
         so3.rotate_by_vector(quat, 2.0 * half, 0.0, 0.0)
-        assert quat[0] == pytest.approx(np.sin(half), rel=1e-15)
+        assert quat[0] == pytest.approx(np.sin(half), rel=1e-15, abs=0.0)
+        assert quat[3] == pytest.approx(np.cos(half), rel=1e-15, abs=1e-16)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.9, 1 - 1e-8, 1 - 1e-9, 1 + 1e-9, 1 + 1e-8, 1.1, 1e3])
+def test_the_compiled_step_renormalises_on_both_sides_of_its_switch(scale: float) -> None:
+    start = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_quat()
+    quat, unit = scale * start, start.copy()
+    so3.rotate_by_vector(quat, 0.1, 0.2, -0.3)
+    so3.rotate_by_vector(unit, 0.1, 0.2, -0.3)
+    assert np.linalg.norm(quat) == pytest.approx(1.0, rel=1e-15, abs=0.0)
+    np.testing.assert_allclose(quat, unit, rtol=1e-15)
+
+
+def test_a_million_steps_stay_on_the_sphere() -> None:
+    steps = np.random.default_rng(3).normal(scale=0.05, size=(1_000_000, 3))
+    assert np.abs(np.linalg.norm(so3.integrate(steps), axis=1) - 1.0).max() < 1e-15
 
 
 def test_the_compiled_step_multiplies_on_the_right() -> None:
@@ -50,6 +71,42 @@ def test_the_compiled_step_multiplies_on_the_right() -> None:
         expected = start * Rotation.from_rotvec(turn)
         assert (expected.inv() * Rotation.from_quat(quat)).magnitude() < 1e-14
         np.testing.assert_allclose(so3.up_in_sensor(quat), expected.as_matrix()[2], atol=1e-14)
+
+
+_FIRST_USE = """
+import numpy as np
+from wepose_pin import so3
+print(so3.integrate(np.zeros((3, 3)))[-1].tolist())
+"""
+_FULL_DISK = """
+import resource, signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+"""
+
+
+def _fresh(code: str, **environment: str) -> str:
+    run = subprocess.run(
+        [sys.executable, "-B", "-c", code], env=os.environ | environment, capture_output=True, text=True, check=True
+    )
+    assert run.stderr == ""
+    return run.stdout
+
+
+def test_compiled_once_and_kept(tmp_path: Path) -> None:
+    assert _fresh(_FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "[0.0, 0.0, 0.0, 1.0]\n"
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb*")}
+    assert kept
+    assert _fresh(_FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "[0.0, 0.0, 0.0, 1.0]\n"
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb*")} == kept
+
+
+def test_nowhere_to_keep_what_is_compiled_is_no_error(tmp_path: Path) -> None:
+    assert _fresh(_FULL_DISK + _FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "[0.0, 0.0, 0.0, 1.0]\n"
+    nowhere = str(tmp_path / "file" / "below")
+    (tmp_path / "file").touch()
+    code = "import numba.core.caching as c\nc._CacheImpl._locator_classes = []\n" + _FIRST_USE
+    assert _fresh(code, NUMBA_CACHE_DIR=nowhere) == "[0.0, 0.0, 0.0, 1.0]\n"
 
 
 def test_orders_of_the_quaternion() -> None:

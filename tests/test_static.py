@@ -115,3 +115,57 @@ def test_ten_million_samples_lose_no_precision() -> None:
     below = StaticDetector(noise, RATE, StaticTest(gamma2=variance * (1 - 1e-9), **huge)).run(gyro, accel)
     assert above[-1]
     assert not below[-1]
+
+
+def test_what_came_before_the_last_two_windows_leaves_no_trace() -> None:
+    """Why 1e8 samples are as good as the first hundred: the state after them is, to the last bit, that of a detector
+    that has seen the end alone."""
+    gyro, accel = stop_and_go(np.random.default_rng(6))
+    noise = noise_of(gyro[:500], accel[:500], RATE)
+    rng = np.random.default_rng(7)
+    states = []
+    for windows in (0, 1, 3, 2000):
+        detector = StaticDetector(noise, RATE)
+        wild = 10.0 ** rng.uniform(-6, 6, (windows * 50, 1)) * rng.normal(size=(windows * 50, 6))
+        detector.run(wild[:, :3], wild[:, 3:])
+        detector.run(gyro[:130], accel[:130])
+        states.append(detector.state)
+    for state in states[1:]:
+        for name, one, other in zip(state._fields, state, states[0], strict=True):
+            np.testing.assert_array_equal(one, other, err_msg=name)
+
+
+@pytest.mark.parametrize("rest_begins", range(500, 551))
+def test_a_window_at_rest_is_exact_right_after_a_blow(rest_begins: int) -> None:
+    """Rest of 1e-3 after 1e6, at every place of the block: the variance is right to 1e-12."""
+    rng = np.random.default_rng(rest_begins)
+    accel = np.zeros((700, 3))
+    accel[:, 2] = 9.81 + rng.normal(scale=1e-3, size=700)
+    accel[:rest_begins, 2] += rng.normal(scale=1e6, size=rest_begins)
+    noise = SensorNoise(np.zeros(3), np.eye(3), np.eye(3), np.eye(3), np.eye(3), 1.0)
+    ends = range(rest_begins + 49, 700)
+    huge = {"alpha": 1e9, "beta": 1e9, "gamma1": 1e9}
+    first = np.array(accel[ends[0] - 49 : ends[0] + 1, 2], dtype=np.longdouble)
+    variance = float(np.sum((first - first.mean()) ** 2) / 49)
+    for factor, expected in ((1 + 1e-12, True), (1 - 1e-12, False)):
+        found = StaticDetector(noise, RATE, StaticTest(gamma2=variance * factor, **huge)).run(np.zeros((700, 3)), accel)
+        assert found[ends[0]] == expected
+        assert not found[: ends[0]].any()
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300])
+@pytest.mark.parametrize("at", [330, 349, 350])
+@pytest.mark.parametrize("gyro_is_wrong", [True, False])
+def test_a_sample_that_is_no_number_says_no_for_one_window_and_is_forgotten(
+    wrong: float, at: int, gyro_is_wrong: bool
+) -> None:
+    gyro, accel = stop_and_go(np.random.default_rng(8))
+    noise = noise_of(gyro[:500], accel[:500], RATE)
+    without = StaticDetector(noise, RATE).run(gyro, accel)
+    assert without[300:450].any()
+    (gyro if gyro_is_wrong else accel)[at, 1] = wrong
+    found = StaticDetector(noise, RATE).run(gyro, accel)
+    assert not found[at : at + 50].any()
+    np.testing.assert_array_equal(np.delete(found, range(at, at + 50)), np.delete(without, range(at, at + 50)))
+    detector = StaticDetector(noise, RATE)
+    assert [detector.update(g, a) for g, a in zip(gyro[:600], accel[:600], strict=True)] == list(found[:600])

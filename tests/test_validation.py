@@ -13,48 +13,58 @@ from wepose_pin.errors import BadData, MissingFile
 from wepose_pin.filters import METHODS
 from wepose_pin.readers.trials import read_authors_trial, read_broad
 from wepose_pin.validation import Result, experiments, summary
+from wepose_pin.validation import run as run_jobs
 
 
 def run(name: str, quick: bool = True) -> list[Result]:
     return [result for job in experiments(quick)[name] for result in job()]
 
 
-def test_the_order_of_the_filters_in_the_dynamic_experiment() -> None:
-    results = run("dynamic 100 Hz")
-    assert len(results) == 2 * len(METHODS)
-    mean = {method: figures for _, method, figures, _ in summary(results)}
-    for axis in ("roll", "pitch"):
-        assert mean["smekf"][axis] < mean["gdc"][axis] < mean["ncf"][axis]
-    assert all(figures["yaw"] < 2.5 for figures in mean.values())
+def test_the_papers_order_comes_back_out_of_the_box_only() -> None:
+    """As they come, NCF and GDC are behind as in the paper; with tuned gains and the bias removed they are not."""
+    mean = {method: figures for _, method, figures, _ in summary(run("dynamic 100 Hz"))}
+    assert set(METHODS) < set(mean)
+    for axis in ("roll", "pitch", "yaw"):
+        assert mean["smekf"][axis] < mean["gdc as it comes"][axis] < 5.0
+        assert mean["smekf"][axis] < mean["ncf as it comes"][axis] < 5.0
+        assert mean["gdc"][axis] < mean["gdc as it comes"][axis]
+        assert mean["ncf"][axis] < mean["ncf as it comes"][axis]
 
 
-def test_two_runs_give_the_same_figures() -> None:
-    assert run("drift") == run("drift")
+def test_two_runs_give_the_same_figures_on_any_number_of_workers() -> None:
+    jobs = experiments(True)["dynamic 100 Hz"] * 2
+    alone, again, *_ = run_jobs(jobs, workers=1)
+    assert alone == again
+    assert list(run_jobs(jobs, workers=2)) == [alone, again]
 
 
 def test_the_drift_experiment_is_the_papers() -> None:
     mean = {method: figures for _, method, figures, _ in summary(run("drift"))}
     assert mean["smekf"]["drift_deg_min"] < 0.1
-    assert mean["smekf"]["drift_deg_min"] < mean["ncf"]["drift_deg_min"]
+    assert mean["smekf"]["drift_deg_min"] < mean["ncf"]["drift_deg_min"] < mean["ncf as it comes"]["drift_deg_min"]
 
 
-def test_the_hand_with_sensor_noise_alone_is_within_the_papers_error() -> None:
-    for _, method, figures, paper in summary(run("upper body, MTi-3 noise alone")):
-        print(f"{method}: hand {figures['hand']:.2f} mm, shoulders {figures['from shoulders']:.2f}, paper {paper}")
-        if method == "smekf":
-            assert figures["from shoulders"] < 12.0
+@pytest.mark.parametrize(("world", "limit_mm"), [("MTi-3 noise alone", 12.0), ("realistic", 25.0)])
+def test_the_hand_of_one_subject(world: str, limit_mm: float) -> None:
+    """The experiment's targets, 12 and 18 mm, are means over ten subjects; this one is among the worst of them."""
+    (smekf,) = [result for result in run(f"upper body, {world}") if result.method == "smekf"]
+    assert smekf.figures["hand_mm"]["mean"] < limit_mm
+    assert smekf.figures["hand_from_shoulders_mm"]["mean"] < limit_mm
 
 
-def test_the_command_writes_every_trial(tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_every_trial(
+    tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = {k: v[:1] for k, v in experiments(True, data).items() if k in ("dynamic 100 Hz", "BROAD", "UR5")}
+    monkeypatch.setattr("wepose_pin.validation.experiments", lambda *_: few)
     with pytest.raises(SystemExit) as stop:
         main(["validate", "--quick", "--data", str(data), "-o", str(tmp_path / "out")])
     assert not stop.value.code
     said = capsys.readouterr().out
-    for words in ("dynamic 1 kHz", "12.05 ± 6.20", "BROAD, 2 trials", "the authors' trial"):
+    for words in ("dynamic 100 Hz", "BROAD, 1 trial", "UR5"):
         assert words in said
     document = json.loads((tmp_path / "out" / "validation.json").read_text())
-    names = {result["experiment"] for result in document["results"]}
-    assert names == set(experiments(True, data))
+    assert {result["experiment"] for result in document["results"]} == set(few)
 
 
 def test_trials_that_are_none_are_named(tmp_path: Path) -> None:

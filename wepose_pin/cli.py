@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 import tyro
 from tyro.conf import Positional, arg
 
@@ -334,6 +333,8 @@ def simulate(
     """
     from dataclasses import replace
 
+    import numpy as np
+
     from .simulation import PERFECT_WORLD, REALISTIC, simulated_person
     from .simulation import simulate as make
     from .subject import LENGTHS, mount_rows, subject_toml
@@ -426,7 +427,7 @@ def validate(
         out: Folder for validation.json with every trial, and the page with tables and figures: validation.html,
             validation.md with validation/*.png.
         data: Folder of the real recordings (broad/, wepose_hr/, ring/, ur5/), to measure on them too.
-        quick: Two trials of each experiment instead of all.
+        quick: One trial of each experiment, and two of BROAD, instead of all.
         from_: validation.json of an earlier run: tables and pages are made from it anew, and nothing is run.
         force: Replace files of an earlier run.
     """
@@ -487,7 +488,7 @@ def bench(
     """
     import json
 
-    from .bench import document, read_document, sections, then_by_now
+    from .bench import FULL, QUICK, document, read_document, sections, then_by_now
     from .writers.result import versions
 
     if data is None and os.environ.get("WEPOSE_DATA"):
@@ -497,7 +498,7 @@ def bench(
         raise ExistingOutput(f"{save}: exists; --force replaces it, --save names another file")
     if save is not None and (save.is_dir() or not save.absolute().parent.is_dir()):
         raise ExistingOutput(f"{save}: not a file that can be written; --save names a JSON file in an existing folder")
-    todo, tables = sections(quick, data), {}
+    todo, tables = sections(QUICK if quick else FULL, data), {}
     with _steps(len(todo)) as step:
         for name, measure in todo.items():
             step(f"measuring {name.replace('_', ' ')}")
@@ -520,7 +521,7 @@ def bench(
     if before is not None:
         _say(f"then: {compare}, {before.get('date', 'undated')}; over 1, it was slower against VQF then")
     if save is not None:
-        text = json.dumps(document(tables, quick, versions()), indent=1) + "\n"
+        text = json.dumps(document(tables, quick, versions()), indent=1, allow_nan=False) + "\n"
         partial = save.with_name(f".{save.name}.partial")
         try:
             partial.write_text(text, encoding="utf-8")
@@ -765,8 +766,9 @@ def _validation_tables(document: Document) -> None:
         _say("Targets for the mean error of the hand, smekf:")
         for target in found:
             say(target_line(target))
-    _say("± is one standard deviation over time, averaged over the trials. Bias of the still phase removed for every")
-    _say("filter; heading aligned once, on a stretch that is not scored, and never fitted to the truth afterwards.")
+    _say("± is one standard deviation over time, averaged over the trials. The still phase's bias is removed for")
+    _say("every filter but those as they come; the heading is aligned once, where nothing is scored, and never")
+    _say("fitted to the truth afterwards.")
 
 
 def _mean_std(error: Any) -> str:

@@ -6,25 +6,84 @@ functions compiled with numba are the per-sample steps of the filters, which can
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from collections.abc import Callable
+from math import factorial
 from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.core.event import Event, Listener, register
+from numba.core.options import DefaultOptions
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
+
+# No fastmath: the same bits from a batch, from a sample at a time and from a bank of sensors need strict IEEE steps.
+# The numpy error model spares each division a branch; nogil lets several sensors run in threads.
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+# What allocates nothing needs no reference counts; numba leaves some in, atomic ones, several a sample. Its option has
+# no public name: where it is gone, kernels are slower and as right.
+_BARE = _OPTIONS | ({"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {})
+
+
+class _SayOnce(Listener):  # type: ignore[misc]
+    """One line on a terminal when the first of our functions is compiled, since that takes seconds; never again."""
+
+    said = False
+
+    def on_start(self, event: Event) -> None:
+        if self.said or not event.data["dispatcher"].py_func.__module__.startswith("wepose_pin."):
+            return
+        self.said = True
+        if sys.stderr.isatty():
+            print("compiling for this machine: some ten seconds, kept for the next time …", file=sys.stderr, flush=True)
+
+    def on_end(self, event: Event) -> None:
+        pass
+
+
+register("numba:compile", _SayOnce())
+
+
+def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
+    try:
+        dispatcher = njit(cache=True, **options)(function)
+    except RuntimeError:  # neither the package's folder nor a home can be written to
+        return njit(**options)(function)
+    cache = getattr(dispatcher, "_cache", None)
+    if cache is not None:  # a full disk is no reason to fail: it compiles again the next time
+        cache.save_overload = _unless_full(cache.save_overload)
+    return dispatcher
+
+
+def _unless_full(save: Callable[..., None]) -> Callable[..., None]:
+    def try_to_save(*args: Any) -> None:
+        with contextlib.suppress(OSError):
+            save(*args)
+
+    return try_to_save
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function compiled by numba, and kept for the next start where there is a place to keep it."""
-    try:
-        return njit(cache=True)(function)
-    except RuntimeError:  # neither the package's folder nor a home can be written to
-        return njit(function)
+    return _cached(function, _OPTIONS)
 
 
-# Below this angle [rad] the half-angle series replaces sin(x)/x; its first left-out term is under 1e-17 there.
-SMALL_ANGLE = 1e-4
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`compiled` for a function that makes no array, only fills those it is given: no reference counting in it."""
+    return _cached(function, _BARE | {"forceinline": True})
+
+
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A piece of kernels and of nothing else, always a part of its caller's code; it makes no array."""
+    return njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_BARE)(function)
+
+
+# Below this half angle [rad] polynomials replace sine and cosine; the first terms left out are under 1e-18 there.
+SERIES_HALF_ANGLE = 0.5
+S0, S1, S2, S3, S4, S5, S6, S7 = (0.5 * (-1) ** k / factorial(2 * k + 1) for k in range(8))  # ½ sin(h)/h in h²
+C0, C1, C2, C3, C4, C5, C6, C7 = ((-1) ** k / factorial(2 * k) for k in range(8))  # cos(h) in h²
 
 
 def xyzw_from_wxyz(quat_wxyz: ArrayLike) -> np.ndarray:
@@ -82,14 +141,20 @@ def continuous(quat: np.ndarray) -> np.ndarray:
     return quat * np.concatenate([[1.0], np.cumprod(jumps)])[:, None]
 
 
-@compiled
+@kernel
 def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
-    """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised. `quat` (4,) xyzw, vector [rad]."""
-    half = 0.5 * np.sqrt(x * x + y * y + z * z)
-    if half < SMALL_ANGLE:
-        s = 0.5 * (1.0 - half * half / 6.0)
-        c = 1.0 - half * half / 2.0
+    """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised. `quat` (4,) or more, its first four xyzw; vector [rad].
+
+    Sine and cosine of a sample's turn are power series in the square of the half angle: no call, no square root.
+    """
+    h1 = 0.25 * (x * x + y * y + z * z)
+    if h1 < SERIES_HALF_ANGLE * SERIES_HALF_ANGLE:
+        h2 = h1 * h1
+        h4 = h2 * h2
+        s = (S0 + S1 * h1 + h2 * (S2 + S3 * h1)) + h4 * (S4 + S5 * h1 + h2 * (S6 + S7 * h1))
+        c = (C0 + C1 * h1 + h2 * (C2 + C3 * h1)) + h4 * (C4 + C5 * h1 + h2 * (C6 + C7 * h1))
     else:
+        half = np.sqrt(h1)
         s = 0.5 * np.sin(half) / half
         c = np.cos(half)
     ex, ey, ez = s * x, s * y, s * z
@@ -98,13 +163,15 @@ def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     ry = qw * ey - qx * ez + qy * c + qz * ex
     rz = qw * ez + qx * ey - qy * ex + qz * c
     rw = qw * c - qx * ex - qy * ey - qz * ez
-    norm = np.sqrt(rx * rx + ry * ry + rz * rz + rw * rw)
-    quat[0], quat[1], quat[2], quat[3] = rx / norm, ry / norm, rz / norm, rw / norm
+    square = rx * rx + ry * ry + rz * rz + rw * rw
+    # Of an almost unit quaternion 1/norm is 1 − (square − 1)/2, to 3/8 (square − 1)².
+    scale = 1.5 - 0.5 * square if abs(square - 1.0) < 1e-8 else 1.0 / np.sqrt(square)
+    quat[0], quat[1], quat[2], quat[3] = rx * scale, ry * scale, rz * scale, rw * scale
 
 
-@compiled
+@kernel
 def up_in_sensor(quat):  # type: ignore[no-untyped-def]
-    """``R_WSᵀ e_z``: the vertical in sensor coordinates, as three floats."""
+    """``R_WSᵀ e_z``: the vertical in sensor coordinates, as three floats. `quat` (4,) or more: its first four, xyzw."""
     x, y, z, w = quat[0], quat[1], quat[2], quat[3]
     return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
 

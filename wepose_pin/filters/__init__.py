@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,13 +14,19 @@ from .. import so3
 from ..errors import BadData, BadOption, BadPhase, one_of
 from ..noise import SensorNoise, noise_of
 from ..static import StaticDetector, StaticTest
+from .amekf import Amekf, AmekfParams
 from .base import FilterRun, OrientationFilter
 from .gdc import Gdc, GdcParams
 from .ncf import Ncf, NcfParams
 from .smekf import Smekf, SmekfParams, starting_params
+from .smoother import Smoother
 
 __all__ = [
     "METHODS",
+    "OFFLINE",
+    "TYPICAL",
+    "Amekf",
+    "AmekfParams",
     "FilterRun",
     "Gdc",
     "GdcParams",
@@ -29,12 +36,25 @@ __all__ = [
     "OrientationFilter",
     "Smekf",
     "SmekfParams",
+    "Smoother",
     "check_method",
     "estimate_orientation",
     "run_filter",
 ]
 
-METHODS: dict[str, type] = {"smekf": Smekf, "ncf": Ncf, "gdc": Gdc}
+METHODS: dict[str, type] = {"smekf": Smekf, "ncf": Ncf, "gdc": Gdc, "amekf": Amekf, "smoother": Smoother}
+OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
+
+# Of a sensor that is never seen at rest: noise of a usual MEMS sensor at 100 to 300 Hz, a bias as it may be from the
+# factory. Only amekf and smoother find the bias in motion.
+TYPICAL = SensorNoise(
+    gyro_bias=np.zeros(3),
+    gyro_bias_cov=np.deg2rad(0.5) ** 2 * np.eye(3),
+    gyro_cov=np.deg2rad(0.1) ** 2 * np.eye(3),
+    accel_cov=0.003**2 * np.eye(3),
+    bias_step_cov=2.0 * np.deg2rad(0.1) ** 2 * np.eye(3),
+    gravity=9.80665,
+)
 
 
 class Orientation(NamedTuple):
@@ -66,7 +86,7 @@ def estimate_orientation(
     rate_hz: float,
     *,
     method: str = "smekf",
-    still: tuple[float, float],
+    still: tuple[float, float] | None,
     params: Any = None,
     static_test: StaticTest | None = None,
 ) -> Orientation:
@@ -78,7 +98,8 @@ def estimate_orientation(
     accel_S : (n, 3) [m/s²], specific force, +g up at rest
     rate_hz : samples a second, uniform
     method : a key of `METHODS`
-    still : from, to [s] after the first sample: the sensor rests; noise and bias are measured there
+    still : from, to [s] after the first sample: the sensor rests; noise and bias are measured there. None: it never
+        does; noise is then `TYPICAL`, the bias is looked for, and a warning says so
     params : the filter's own frozen parameters; None for its defaults
     static_test : when the sensor counts as still; None for the paper's values
 
@@ -94,12 +115,19 @@ def estimate_orientation(
         gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
     except (TypeError, ValueError) as error:
         raise BadData(f"gyro_S and accel_S must be arrays of numbers (n, 3): {error}") from None
-    if not (np.isfinite(rate_hz) and rate_hz > 0.0 and np.isfinite(still).all()):
+    if not (np.isfinite(rate_hz) and rate_hz > 0.0 and (still is None or np.isfinite(still).all())):
         raise BadOption(f"rate_hz = {rate_hz} and still = {still}: finite numbers, samples a second and seconds")
     if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
     if not np.isfinite(gyro).all() or not np.isfinite(accel).all():
         raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
+    if still is None:
+        warnings.warn(
+            f"no still phase: noise is that of a usual sensor and the gyroscope's bias starts at zero, which '{method}' "
+            + ("finds in motion, in a minute or so" if method in ("amekf", "smoother") else "does not find in motion"),
+            stacklevel=2,
+        )
+        return run_filter(gyro, accel, rate_hz, TYPICAL, method, params, static_test)
     first, last = round(still[0] * rate_hz), round(still[1] * rate_hz) + 1
     if not 0 <= first < last <= len(gyro) + 1:
         raise BadPhase(f"still = {still} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from ..errors import BadData
 from ..noise import SensorNoise
+
+T = TypeVar("T")
+
+# What is no number, or beyond any sensor (real ones end at 70 rad/s and 400 g), was not measured: a missing sample.
+HIGHEST_RATE = 1e3  # [rad/s]
+HIGHEST_ACCEL = 1e4  # [m/s²]
 
 
 class FilterRun(NamedTuple):
@@ -48,3 +57,38 @@ def samples(
             f"{len(gyro)} rows of gyro_S, {len(accel)} of accel_S, {len(at_rest)} of static: not as many each"
         )
     return gyro, accel, at_rest
+
+
+class OneSample:
+    """Room for one sample and what a run gives of it, so that `update` calls the run's kernel and allocates little."""
+
+    def __init__(self) -> None:
+        self.inputs = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1, dtype=np.bool_)
+        self.quat_WS, self.gyro_bias, self.attitude_cov = np.zeros((1, 4)), np.zeros((1, 3)), np.zeros((1, 3, 3))
+
+    def fill(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The sample as arrays of one row."""
+        gyro, accel, at_rest = self.inputs
+        gyro[0], accel[0], at_rest[0] = gyro_S, accel_S, static
+        return self.inputs
+
+
+def in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads: int | None = None) -> list[T]:
+    """``[function(*row) for row in zip(*columns)]`` in threads: the compiled runs of several sensors at a time.
+
+    The runs release the interpreter's lock, so that as many go on at once as there are processors (`threads` to say
+    otherwise). The order is that of the columns; the first error that one raises is raised here.
+    """
+    rows = list(zip(*columns, strict=True))
+    workers = min(threads or processors(), len(rows))
+    if workers <= 1:
+        return [function(*row) for row in rows]
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(lambda row: function(*row), rows))
+
+
+def processors() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # Linux: a container or taskset may have fewer than the machine
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

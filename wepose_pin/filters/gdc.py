@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..noise import SensorNoise
-from ..so3 import compiled
-from .base import FilterRun, samples
+from ..so3 import inlined, kernel
+from .base import HIGHEST_RATE, FilterRun, OneSample, samples
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class GdcState:
 
 
 class Gdc:
-    """GDC of one sensor; the bias is the still phase's mean."""
+    """GDC of one sensor; the bias is the still phase's mean. A sample that is no number is passed over."""
 
     def __init__(
         self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: GdcParams | None = None
@@ -37,6 +37,7 @@ class Gdc:
         self.params = params or GdcParams()
         self.rate_hz = rate_hz
         self.state = GdcState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
+        self._one = OneSample()
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
         gyro, accel, _ = samples(gyro_S, accel_S, static)
@@ -45,35 +46,44 @@ class Gdc:
         return FilterRun(quat, np.tile(self.state.gyro_bias, (len(gyro), 1)), None)
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
-        return self.run(gyro_S, accel_S, static).quat_WS[0]
+        one = self._one
+        gyro, accel, _ = one.fill(gyro_S, accel_S, static)
+        _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, self.params.gain, one.quat_WS)
+        return one.quat_WS[0].copy()
 
 
-@compiled
+@kernel
 def _run(quat, bias, gyro_S, accel_S, dt, gain, out_quat):  # type: ignore[no-untyped-def]
     for k in range(len(gyro_S)):
-        x, y, z, w = quat[0], quat[1], quat[2], quat[3]
         wx, wy, wz = gyro_S[k, 0] - bias[0], gyro_S[k, 1] - bias[1], gyro_S[k, 2] - bias[2]
-        dx = 0.5 * (w * wx + y * wz - z * wy)
-        dy = 0.5 * (w * wy - x * wz + z * wx)
-        dz = 0.5 * (w * wz + x * wy - y * wx)
-        dw = 0.5 * (-x * wx - y * wy - z * wz)
-        ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
-        norm = np.sqrt(ax * ax + ay * ay + az * az)
-        if norm > 0.0:  # in free fall there is no direction to descend
-            f1 = 2.0 * (x * z - w * y) - ax / norm
-            f2 = 2.0 * (w * x + y * z) - ay / norm
-            f3 = 1.0 - 2.0 * (x * x + y * y) - az / norm
-            gw = -2.0 * y * f1 + 2.0 * x * f2  # ∇f = Jᵀ f
-            gx = 2.0 * z * f1 + 2.0 * w * f2 - 4.0 * x * f3
-            gy = -2.0 * w * f1 + 2.0 * z * f2 - 4.0 * y * f3
-            gz = 2.0 * x * f1 + 2.0 * y * f2
-            steep = np.sqrt(gw * gw + gx * gx + gy * gy + gz * gz)
-            if steep > 0.0:
-                dx -= gain * gx / steep
-                dy -= gain * gy / steep
-                dz -= gain * gz / steep
-                dw -= gain * gw / steep
-        x, y, z, w = x + dx * dt, y + dy * dt, z + dz * dt, w + dw * dt
-        norm = np.sqrt(x * x + y * y + z * z + w * w)
-        quat[0], quat[1], quat[2], quat[3] = x / norm, y / norm, z / norm, w / norm
-        out_quat[k] = quat
+        if wx * wx + wy * wy + wz * wz < HIGHEST_RATE * HIGHEST_RATE:  # false for NaN
+            _step(quat, wx, wy, wz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2], dt, gain)
+        for i in range(4):
+            out_quat[k, i] = quat[i]
+
+
+@inlined
+def _step(quat, wx, wy, wz, ax, ay, az, dt, gain):  # type: ignore[no-untyped-def]
+    x, y, z, w = quat[0], quat[1], quat[2], quat[3]
+    dx = 0.5 * (w * wx + y * wz - z * wy)
+    dy = 0.5 * (w * wy - x * wz + z * wx)
+    dz = 0.5 * (w * wz + x * wy - y * wx)
+    dw = 0.5 * (-x * wx - y * wy - z * wz)
+    norm = np.sqrt(ax * ax + ay * ay + az * az)
+    if 0.0 < norm < np.inf:  # in free fall there is no direction to descend
+        f1 = 2.0 * (x * z - w * y) - ax / norm
+        f2 = 2.0 * (w * x + y * z) - ay / norm
+        f3 = 1.0 - 2.0 * (x * x + y * y) - az / norm
+        gw = -2.0 * y * f1 + 2.0 * x * f2  # ∇f = Jᵀ f
+        gx = 2.0 * z * f1 + 2.0 * w * f2 - 4.0 * x * f3
+        gy = -2.0 * w * f1 + 2.0 * z * f2 - 4.0 * y * f3
+        gz = 2.0 * x * f1 + 2.0 * y * f2
+        steep = np.sqrt(gw * gw + gx * gx + gy * gy + gz * gz)
+        if steep > 0.0:
+            dx -= gain * gx / steep
+            dy -= gain * gy / steep
+            dz -= gain * gz / steep
+            dw -= gain * gw / steep
+    x, y, z, w = x + dx * dt, y + dy * dt, z + dz * dt, w + dw * dt
+    norm = np.sqrt(x * x + y * y + z * z + w * w)
+    quat[0], quat[1], quat[2], quat[3] = x / norm, y / norm, z / norm, w / norm

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..noise import SensorNoise
-from ..so3 import compiled, rotate_by_vector, up_in_sensor
-from .base import FilterRun, samples
+from ..so3 import kernel, rotate_by_vector, up_in_sensor
+from .base import HIGHEST_RATE, FilterRun, OneSample, samples
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class NcfState:
 
 
 class Ncf:
-    """NCF of one sensor; the bias starts at the still phase's mean."""
+    """NCF of one sensor; the bias starts at the still phase's mean. A sample that is no number is passed over."""
 
     def __init__(
         self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: NcfParams | None = None
@@ -38,37 +38,48 @@ class Ncf:
         self.params = params or NcfParams()
         self.rate_hz = rate_hz
         self.state = NcfState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
+        self._one = OneSample()
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
         gyro, accel, _ = samples(gyro_S, accel_S, static)
         quat, bias = np.empty((len(gyro), 4)), np.empty((len(gyro), 3))
-        gains = self.params.proportional, self.params.integral
-        _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, *gains, quat, bias)
+        self._go(gyro, accel, quat, bias)
         return FilterRun(quat, bias, None)
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
-        return self.run(gyro_S, accel_S, static).quat_WS[0]
+        one = self._one
+        gyro, accel, _ = one.fill(gyro_S, accel_S, static)
+        self._go(gyro, accel, one.quat_WS, one.gyro_bias)
+        return one.quat_WS[0].copy()
+
+    def _go(self, gyro: np.ndarray, accel: np.ndarray, quat: np.ndarray, bias: np.ndarray) -> None:
+        gains = self.params.proportional, self.params.integral
+        _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, *gains, quat, bias)
 
 
-@compiled
+@kernel
 def _run(quat, bias, gyro_S, accel_S, dt, proportional, integral, out_quat, out_bias):  # type: ignore[no-untyped-def]
     for k in range(len(gyro_S)):
+        gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
-        norm = np.sqrt(ax * ax + ay * ay + az * az)
-        ex = ey = ez = 0.0
-        if norm > 0.0:  # in free fall there is no direction to follow
-            ux, uy, uz = up_in_sensor(quat)
-            ex = (ay * uz - az * uy) / norm
-            ey = (az * ux - ax * uz) / norm
-            ez = (ax * uy - ay * ux) / norm
-        rotate_by_vector(
-            quat,
-            (gyro_S[k, 0] - bias[0] + proportional * ex) * dt,
-            (gyro_S[k, 1] - bias[1] + proportional * ey) * dt,
-            (gyro_S[k, 2] - bias[2] + proportional * ez) * dt,
-        )
-        bias[0] -= integral * ex * dt
-        bias[1] -= integral * ey * dt
-        bias[2] -= integral * ez * dt
-        out_quat[k] = quat
-        out_bias[k] = bias
+        if gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE:  # false for NaN
+            norm = np.sqrt(ax * ax + ay * ay + az * az)
+            ex = ey = ez = 0.0
+            if 0.0 < norm < np.inf:  # in free fall there is no direction to follow
+                ux, uy, uz = up_in_sensor(quat)
+                ex = (ay * uz - az * uy) / norm
+                ey = (az * ux - ax * uz) / norm
+                ez = (ax * uy - ay * ux) / norm
+            rotate_by_vector(
+                quat,
+                (gx - bias[0] + proportional * ex) * dt,
+                (gy - bias[1] + proportional * ey) * dt,
+                (gz - bias[2] + proportional * ez) * dt,
+            )
+            bias[0] -= integral * ex * dt
+            bias[1] -= integral * ey * dt
+            bias[2] -= integral * ez * dt
+        for i in range(4):
+            out_quat[k, i] = quat[i]
+        for i in range(3):
+            out_bias[k, i] = bias[i]

@@ -1,4 +1,11 @@
-"""Real recordings of one sensor with an optical truth: BROAD's trials, and the paper authors' own."""
+"""Real recordings of sensors with a truth: BROAD's trials, the paper authors' own, the RING chain, a UR5 arm.
+
+How exact the truths are. BROAD: optical, on the sensor's clock and in its frame, by its authors. The authors' trial:
+Vicon, some 63 new poses a second; its world leans by degrees. RING: optical, 30 Hz; the markers stand to 0.4 µm in
+their segment, that is they were written from fitted rigid bodies and say nothing of their noise, but the hinges do:
+what turns about other axes is 0.2 to 0.4 deg, neighbours' joint centres agree to 0.4 to 1.6 mm; its world leans by
+0.9 deg. UR5: encoders, some 0.01 deg, but the arm flexes beyond them.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +13,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..errors import BadData, MissingFile
+from .tables import columns, read_table
+
+UR5_SENSORS = ("carpus", "radius")
+RING_SEGMENTS = ("seg1", "seg2", "seg3", "seg4", "seg5")
+RING_MOUNTS = ("rigid", "loose")
 
 
 class Trial(NamedTuple):
@@ -71,3 +84,119 @@ def read_authors_trial(path: Path) -> Trial:
     true[~seen] = np.nan
     gyro, accel = np.ascontiguousarray(table[:, 1:4]), np.ascontiguousarray(table[:, 4:7])
     return Trial(path.stem, 1000.0, gyro, accel, true, slice(50, 901), seen)
+
+
+class Referenced(NamedTuple):
+    """One sensor on a body, and the body as a reference saw it: on a clock, in a frame and in a world of its own."""
+
+    name: str
+    rate_hz: float
+    gyro_S: np.ndarray  # (n, 3) [rad/s]; sample k is at k / rate_hz of the sensor's clock
+    accel_S: np.ndarray  # (n, 3) [m/s²]
+    time: np.ndarray  # (m,) [s], the reference's clock
+    quat_VB: np.ndarray  # (m, 4) xyzw, body to the reference's world V, whose z is up but for a tilt; NaN: not seen
+    still: slice  # samples at rest before the motion; empty where there are none
+
+
+class Chain(NamedTuple):
+    """The RING chain: five segments in a row, each with an IMU screwed on and one on foam.
+
+    The frame of a segment has its origin at a marker near the joint to the one before, x along the link, z off the
+    plane of the markers. seg1 to seg2 is a ball joint, then hinges about x (the link itself), y and z: the links' line
+    runs along x, 17 mm below the origin.
+    """
+
+    sensors: dict[tuple[str, str], Referenced]  # by mount (of `RING_MOUNTS`) and segment
+    time: np.ndarray  # (m,) [s], the optical clock
+    origin_V: dict[str, np.ndarray]  # segment → (m, 3) [m], the segment's origin; NaN: not seen
+    quat_VB: dict[str, np.ndarray]  # segment → (m, 4) xyzw; NaN: not seen
+
+
+def read_ring(folder: Path) -> Chain:
+    """A trial of the RING chain: ``imu_rigid.csv``, ``imu_nonrigid.csv`` (40 Hz), ``omc.csv`` (30 Hz).
+
+    The optical system lost all segments at once, some 0.35 s each two or three seconds. The file has straight lines in
+    place of the markers there, NaN in place of the quaternions, but of one segment whose quaternions are made of those
+    lines: what one segment lacks is taken for lost in all.
+
+    Raises
+    ------
+    MissingFile, UnknownColumn, BadData
+        A file is not there; is none of RING's.
+    """
+    quat_VB, origin_V = {}, {}
+    omc = folder / "omc.csv"
+    table, rate_hz = read_table(omc), _stated_rate(omc)
+    for segment, marker in zip(RING_SEGMENTS, (2, 2, 1, 2, 4), strict=True):  # the origins of arm.xml
+        names = [f"{segment}_quat_{axis}" for axis in "wxyz"], [f"{segment}_marker{marker}_{axis}" for axis in "xyz"]
+        quat_VB[segment] = so3.xyzw_from_wxyz(columns(table, names[0], str(omc), segment))
+        origin_V[segment] = columns(table, names[1], str(omc), segment)
+    seen: np.ndarray = np.isfinite(np.stack([quat_VB[segment] for segment in RING_SEGMENTS])).all(axis=(0, 2))
+    if seen.sum() < 2:
+        raise BadData(f"{omc}: there are not two lines in which all segments were seen")
+    for segment in RING_SEGMENTS:
+        quat_VB[segment][~seen] = np.nan
+        origin_V[segment][~seen] = np.nan
+    time = np.arange(len(seen)) / rate_hz
+    sensors = {}
+    for mount, path in zip(RING_MOUNTS, (folder / "imu_rigid.csv", folder / "imu_nonrigid.csv"), strict=True):
+        table, imu_hz = read_table(path), _stated_rate(path)
+        for segment in RING_SEGMENTS:
+            gyro, accel = (
+                _complete(columns(table, [f"{segment}_{kind}_{axis}" for axis in "xyz"], str(path), segment), path)
+                for kind in ("gyr", "acc")
+            )
+            sensors[mount, segment] = Referenced(
+                f"{segment} {mount}", imu_hz, gyro, accel, time, quat_VB[segment], slice(0, 0)
+            )
+    return Chain(sensors, time, origin_V, quat_VB)
+
+
+def _stated_rate(path: Path) -> float:
+    """The rate in the first line, ``# sampling frequency: 40``."""
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        line = lines.readline(200)
+    try:
+        rate_hz = float(line.split("sampling frequency:")[1])
+    except (IndexError, ValueError):
+        rate_hz = 0.0
+    if not (np.isfinite(rate_hz) and rate_hz > 0.0):
+        raise BadData(f"{path}: begins with {line.strip()!r}; a file of RING states '# sampling frequency: 40' there")
+    return rate_hz
+
+
+def _complete(samples: np.ndarray, path: Path) -> np.ndarray:
+    if len(samples) < 2 or not np.isfinite(samples).all():
+        raise BadData(f"{path}: holds no sensor's data without gaps; {len(samples)} samples, some are no numbers")
+    return samples
+
+
+def read_ur5(folder: Path, recording: str, sensor: str) -> Referenced:
+    """An IMU on a UR5 arm, ``imu/RECORDING/SENSOR_adx.csv``, and the encoders' ``encoder/RECORDING/SENSOR.csv``.
+
+    Line k of the one was taken with line k of the other, 125 times a second. The still phase ends 0.1 s before the body
+    has turned by 0.3 deg (the encoders' own jitter is a tenth of that).
+
+    Raises
+    ------
+    MissingFile, UnknownColumn, BadData
+        A file is not there; is none of this data set's.
+    """
+    imu, encoder = folder / "imu" / recording / f"{sensor}_adx.csv", folder / "encoder" / recording / f"{sensor}.csv"
+    measured, true = read_table(imu), read_table(encoder)
+    gyro, accel = (
+        _complete(columns(measured, [f"{kind}_{axis}" for axis in "xyz"], str(imu), sensor), imu)
+        for kind in ("gyr", "acc")
+    )
+    time = 1e-6 * columns(true, ["TIME"], str(encoder), sensor)[:, 0]
+    quat_VB = so3.xyzw_from_wxyz(columns(true, [f"QUATERNION_{k}" for k in range(4)], str(encoder), sensor))
+    steps = np.diff(time)
+    if len(gyro) != len(time):
+        raise BadData(f"{encoder}: {len(time)} lines, but {len(gyro)} in {imu}; as many are needed")
+    if not np.all(steps > 0.0) or not np.isfinite(quat_VB).all():
+        raise BadData(f"{encoder}: TIME must grow from line to line, and no quaternion may lack a number")
+    rate_hz = 1.0 / float(np.median(steps))
+    R_VB = Rotation.from_quat(quat_VB)
+    turned = np.flatnonzero((R_VB[0].inv() * R_VB).magnitude() > np.deg2rad(0.3))
+    still = slice(0, max(0, int(turned[0]) - round(0.1 * rate_hz)) if len(turned) else len(time))
+    return Referenced(f"{recording} {sensor}", rate_hz, gyro, accel, time - time[0], quat_VB, still)

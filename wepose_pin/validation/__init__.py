@@ -1,19 +1,33 @@
 """How wrong the estimates are: the paper's experiments on simulated subjects, and real recordings with a truth.
 
 Everything is seeded: two runs give the same numbers. `contenders` are the filters as they are compared, `paper` the
-simulated experiments, `real` the recordings, `tables` sums them up beside the paper's figures.
+simulated experiments, `real` the recordings, `tables` sums them up beside the paper's figures, `findings` says in
+sentences what the figures show, `document` is their file, `page` the pages with `figures` and `words`.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from . import paper, real
+from . import gains, paper, real
 from .contenders import Contender, contenders
+from .document import Document, document_text, read_document
 from .jobs import Job, Result, run
 from .tables import Row, summary
 
-__all__ = ["Contender", "Job", "Result", "Row", "contenders", "experiments", "run", "summary"]
+__all__ = [
+    "Contender",
+    "Document",
+    "Job",
+    "Result",
+    "Row",
+    "contenders",
+    "document_text",
+    "experiments",
+    "read_document",
+    "run",
+    "summary",
+]
 
 
 def experiments(quick: bool = False, data: Path | None = None) -> dict[str, list[Job]]:
@@ -21,4 +35,6 @@ def experiments(quick: bool = False, data: Path | None = None) -> dict[str, list
     found = paper.experiments(quick)
     if data is not None:
         found |= real.experiments(data, quick)
+    if not quick:
+        found |= gains.experiments(data)
     return found

@@ -1,0 +1,226 @@
+"""RING and UR5: read as they are, registered on a stretch that is not scored, and what the filters make of them."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import BadData, MissingFile, UnknownColumn
+from wepose_pin.readers.trials import RING_MOUNTS, RING_SEGMENTS, Referenced, read_broad, read_ring, read_ur5
+from wepose_pin.simulation import SingleSensor, paper_dynamic
+from wepose_pin.validation import Result, real, summary
+from wepose_pin.validation.registration import register
+
+# What the simulated sensor and its reference lie apart by.
+OFFSET_S = -0.028
+R_BS = Rotation.from_rotvec([8.0, -3.0, 95.0], degrees=True)
+R_VW = Rotation.from_rotvec([0.0, 0.0, 130.0], degrees=True) * Rotation.from_rotvec([0.9, -0.5, 0.0], degrees=True)
+
+
+@pytest.fixture(scope="module")
+def moving() -> SingleSensor:
+    return paper_dynamic(5, 100.0)
+
+
+def seen_from_elsewhere(sensor: SingleSensor, still: slice = slice(0, 0)) -> Referenced:
+    """The sensor beside a reference at 60 Hz with gaps, of another body frame, world and clock."""
+    time = np.arange(0.0, sensor.time[-1] - 0.2, 1.0 / 60.0) + 0.1
+    k = (time + OFFSET_S) * sensor.rate_hz
+    before = np.floor(k).astype(int)
+    R_WS = Rotation.from_quat(sensor.quat_WS)
+    step = (R_WS[before].inv() * R_WS[before + 1]).as_rotvec()
+    true = R_WS[before] * Rotation.from_rotvec((k - before)[:, None] * step)
+    quat_VB = (R_VW * true * R_BS.inv()).as_quat()
+    quat_VB[np.sin(2.0 * time) > 0.9] = np.nan
+    return Referenced("made", sensor.rate_hz, sensor.gyro_S, sensor.accel_S, time, quat_VB, still)
+
+
+@pytest.mark.parametrize("still", [slice(0, 0), slice(50, 450)], ids=["bias unknown", "bias known"])
+def test_registration_finds_what_lies_between(moving: SingleSensor, still: slice) -> None:
+    (found,) = register([seen_from_elsewhere(moving, still)], (6.0, 16.0))
+    assert found.offset_s == pytest.approx(OFFSET_S, abs=1e-3)
+    assert np.degrees((Rotation.from_quat(found.quat_BS) * R_BS.inv()).magnitude()) < 0.1
+    up_W = (Rotation.from_quat(found.quat_WV) * R_VW).apply([0.0, 0.0, 1.0])
+    assert np.degrees(np.arccos(up_W[2])) < 0.35  # 3 mg of accelerometer bias are 0.17 deg
+    assert np.degrees(np.abs(found.gyro_bias - moving.gyro_bias.mean(axis=0)).max()) < 0.02
+    assert found.left_deg < 0.2
+
+
+def test_what_cannot_be_registered_is_said(moving: SingleSensor) -> None:
+    apart = seen_from_elsewhere(moving)
+    with pytest.raises(BadData, match="made: its body does not turn"):
+        register([apart], (0.0, 4.5))  # at rest
+    R_WS = Rotation.from_rotvec(np.sin(3.0 * apart.time)[:, None] * [0.5, 0.0, 0.0])
+    gyro = np.column_stack([1.5 * np.cos(3.0 * (moving.time - 0.005 - OFFSET_S)), *np.zeros((2, len(moving.time)))])
+    with pytest.raises(BadData, match="made: its body turns about one axis only"):
+        register([apart._replace(gyro_S=gyro, quat_VB=R_WS.as_quat())], (6.0, 16.0))
+    with pytest.raises(BadData, match="made: the reference saw 0 samples"):
+        register([apart._replace(quat_VB=np.full_like(apart.quat_VB, np.nan))], (6.0, 16.0))
+    with pytest.raises(BadData, match=r"made: no offset of the clocks within 0\.3 s"):
+        register([apart._replace(time=apart.time + 0.31)], (6.0, 16.0))
+
+
+def test_links_are_fitted_from_orientations_and_tip() -> None:
+    R_W2, R_W4 = Rotation.random(50, random_state=1), Rotation.random(50, random_state=2)
+    R_W3 = R_W2 * Rotation.from_rotvec(np.linspace(0.0, 2.0, 50)[:, None] * [1.0, 0.0, 0.0])  # about the link itself
+    along = np.array([1.0, 0.0, 0.0])
+    tip_W = 0.5 * R_W2.apply(along) + 0.3 * R_W4.apply(along)
+    np.testing.assert_allclose(real.fitted_links(tip_W, R_W2, R_W3, R_W4), (0.5, 0.3), atol=1e-12)
+
+
+def test_ring_is_read_as_it_is(data: Path) -> None:
+    chain = read_ring(data / "ring" / "trial1")
+    assert set(chain.sensors) == {(mount, segment) for mount in RING_MOUNTS for segment in RING_SEGMENTS}
+    lost = [np.isnan(quat).any(axis=1) for quat in chain.quat_VB.values()]
+    assert all(np.array_equal(lost[0], each) for each in lost)
+    assert lost[0].sum() == 223
+    for sensor in chain.sensors.values():
+        assert sensor.rate_hz == 40.0
+        assert np.median(np.linalg.norm(sensor.accel_S, axis=1)) == pytest.approx(9.9, abs=0.3)
+    lengths = real.optical_links(chain).lengths
+    assert lengths["seg2"] == pytest.approx(0.289, abs=1.5e-3)
+    assert lengths["seg3"] == pytest.approx(0.289, abs=1.5e-3)
+    assert lengths["seg4"] == pytest.approx(0.2705, abs=1e-3)
+
+
+def test_optical_orientations_give_the_optical_lengths(data: Path) -> None:
+    """Shares with `optical_links` only the tip: what is left is play in the joints."""
+    chain = read_ring(data / "ring" / "trial1")
+    links = real.optical_links(chain)
+    seen = np.isfinite(links.tip_V).all(axis=1)
+    R = [Rotation.from_quat(chain.quat_VB[segment][seen]) for segment in ("seg2", "seg3", "seg4")]
+    optical = links.lengths["seg2"] + links.lengths["seg3"], links.lengths["seg4"]
+    np.testing.assert_allclose(real.fitted_links(links.tip_V[seen], *R), optical, atol=1e-3)
+
+
+def test_ring_registration_is_consistent(data: Path) -> None:
+    """Ten sensors, one clock and one world: each rigid one alone finds the same."""
+    chain, registered = real._registered_ring(data / "ring" / "trial1")
+    one = registered["rigid", "seg3"]
+    assert one.offset_s == pytest.approx(-0.0285, abs=2e-3)
+    assert one.tilt_deg == pytest.approx(0.9, abs=0.3)
+    for segment in RING_SEGMENTS:
+        rigid = registered["rigid", segment]
+        assert rigid.left_deg < 0.5
+        assert rigid.left_deg < registered["loose", segment].left_deg
+        (alone,) = register([chain.sensors["rigid", segment]], (0.0, 10.0))
+        assert alone.offset_s == pytest.approx(rigid.offset_s, abs=2e-3)
+        mounts = Rotation.from_quat(alone.quat_BS) * Rotation.from_quat(rigid.quat_BS).inv()
+        assert np.degrees(mounts.magnitude()) < 0.3
+        up = (Rotation.from_quat(alone.quat_WV) * Rotation.from_quat(rigid.quat_WV).inv()).magnitude()
+        assert np.degrees(up) < 0.4
+
+
+@cache
+def results(data: Path, experiment: str) -> tuple[Result, ...]:
+    return tuple(result for job in real.experiments(data)[experiment] for result in job())
+
+
+def means(data: Path, experiment: str) -> dict[str, dict[str, float]]:
+    found = {row.method: row.figures for row in summary(results(data, experiment))}
+    for method, figures in found.items():
+        print(f"{experiment}, {method}: " + ", ".join(f"{k} {v:.2f}" for k, v in figures.items()))
+    return found
+
+
+def test_the_filters_on_ring(data: Path) -> None:
+    rigid = means(data, "RING, rigid mounts")
+    loose = means(data, "RING, loose mounts")
+    unknown = means(data, "RING, rigid mounts, bias unknown")
+    for method in ("smekf", "ncf", "gdc"):
+        assert rigid[method]["inclination rmse"] < 1.5
+        assert rigid[method]["heading rmse"] < 1.5
+        assert rigid[method]["total rmse"] < loose[method]["total rmse"] < 4.5
+    # Never still: what sMEKF does not know of the bias it never learns, while the others lose only the heading.
+    assert unknown["smekf"]["inclination rmse"] > 3.0 * unknown["ncf"]["inclination rmse"]
+
+
+def test_link_lengths_from_orientations_and_tip(data: Path) -> None:
+    for mount, limit_mm in (("rigid", 3.0), ("loose", 15.0)):
+        found = means(data, f"RING, link lengths, {mount} mounts")
+        for method in ("smekf", "ncf", "gdc"):
+            for link in ("seg2_and_seg3", "seg4"):
+                assert abs(found[method][f"{link}_difference_mm"]) < limit_mm
+
+
+def test_ur5_is_read_as_it_is(data: Path) -> None:
+    for recording, sensor, begins_s in (("circle-100", "carpus", 0.9), ("triangle-250", "radius", 4.2)):
+        found = read_ur5(data / "ur5", recording, sensor)
+        assert found.rate_hz == pytest.approx(125.0)
+        assert found.still.stop / found.rate_hz == pytest.approx(begins_s, abs=0.3)
+        at_rest = np.linalg.norm(found.accel_S[found.still], axis=1).mean()
+        assert at_rest == pytest.approx(0.97 * 9.81, abs=0.2)
+
+
+def test_the_filters_on_ur5(data: Path) -> None:
+    trials = results(data, "UR5")
+    assert len({result.trial for result in trials}) == 7
+    for result in trials:
+        assert abs(result.figures["clock_offset_ms"]) < 15.0
+        assert result.figures["mount_deg"] == pytest.approx(90.6, abs=0.5)
+        assert result.figures["registration_left_deg"] < 0.6
+    mean = means(data, "UR5")
+    for method in ("smekf", "ncf", "gdc"):
+        assert mean[method]["total rmse"] < 1.5
+
+
+def test_broad_needs_no_registration(data: Path) -> None:
+    """Its authors have aligned it: half a sample of the gyroscope's interval is left, and what ten seconds can tell."""
+    trial = read_broad(data / "broad" / "01_undisturbed_slow_rotation_A.mat")
+    first = int(np.argmax(trial.scored))
+    part = slice(first - 800, first + 2860)
+    gyro = trial.gyro_S[part] - trial.gyro_S[trial.still].mean(axis=0)
+    time = np.arange(len(gyro)) / trial.rate_hz
+    sensor = Referenced(
+        trial.name, trial.rate_hz, gyro, trial.accel_S[part], time, trial.quat_true[part], trial.still
+    )._replace(still=slice(0, 0))
+    (found,) = register([sensor], (0.0, 12.8))
+    assert found.offset_s == pytest.approx(0.5 / trial.rate_hz, abs=1e-3)
+    assert np.degrees(Rotation.from_quat(found.quat_BS).magnitude()) < 0.3
+    assert found.tilt_deg < 0.4
+
+
+def test_broken_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(MissingFile, match=r"omc\.csv"):
+        read_ring(tmp_path)
+    with pytest.raises(MissingFile, match=r"carpus_adx\.csv"):
+        read_ur5(tmp_path, "circle-250", "carpus")
+    (tmp_path / "omc.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(BadData, match=r"omc\.csv: begins with 'a,b'.*sampling frequency"):
+        read_ring(tmp_path)
+    (tmp_path / "omc.csv").write_text("# sampling frequency: 30\na,b\n1,2\n")
+    with pytest.raises(UnknownColumn, match=r"no column 'seg1_quat_w' in .*omc\.csv"):
+        read_ring(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("imu_rows", "encoder_rows", "said"),
+    [
+        (["0.1,0,9.4,0,0,0"] * 3, ["0,1,0,0,0", "8000,1,0,0,0"], "2 lines, but 3"),
+        (["0.1,0,9.4,0,0,0"] * 2, ["8000,1,0,0,0", "0,1,0,0,0"], "TIME must grow"),
+        (["0.1,0,9.4,0,0,", "0.1,0,9.4,0,0,0"], ["0,1,0,0,0", "8000,1,0,0,0"], "some are no numbers"),
+    ],
+)
+def test_a_ur5_that_does_not_fit_is_said(
+    tmp_path: Path, imu_rows: list[str], encoder_rows: list[str], said: str
+) -> None:
+    imu, encoder = tmp_path / "imu" / "r" / "s_adx.csv", tmp_path / "encoder" / "r" / "s.csv"
+    for path, head, rows in (
+        (imu, "acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z", imu_rows),
+        (encoder, "TIME," + ",".join(f"QUATERNION_{k}" for k in range(4)), encoder_rows),
+    ):
+        path.parent.mkdir(parents=True)
+        path.write_text("\n".join([head, *rows]) + "\n")
+    with pytest.raises(BadData, match=said):
+        read_ur5(tmp_path, "r", "s")
+
+
+def test_quick_takes_two_of_broad_and_one_of_the_others(data: Path) -> None:
+    quick = real.experiments(data, quick=True)
+    assert len(quick["BROAD"]) == 2
+    assert len(quick["RING, rigid mounts"]) == len(quick["UR5"]) == 1
+    assert len(real.experiments(data)["RING, loose mounts"]) == 5

@@ -1,0 +1,485 @@
+"""aMEKF: the multiplicative Kalman filter corrected in motion too, by the bound on where a hand can go; causal.
+
+No single acceleration is trusted. The specific force, turned into the almost-inertial frame of the gyroscope, is summed
+to a horizontal velocity and position; a tilt error of a degree would send them off by 8 m in 10 s, and a person's
+segment does not go there. That is the idea of VQF's low-pass in that frame (Laidig and Seel 2023, Information Fusion 91)
+as a Kalman filter, so that the same innovations also teach it the gyroscope's own errors: bias, scale and misalignment
+(the usual 3×3), and what the bias differs by in motion from that at rest. Turns about horizontal axes make these visible
+through gravity, and the heading, which nothing measures, is better for it.
+
+The 25 error states, additive but for the attitude: θ [rad] on the left (in W), so that one over a turn stays what it
+is; horizontal velocity [m/s] and position [m]; gyroscope bias at rest [rad/s]; gyroscope matrix M, rows first
+(measured = (I + M) true); accelerometer bias [m/s²]; bias in motion less that at rest [rad/s]. Error of velocity and
+position are taken as in the invariant filter (Barrau and Bonnabel 2017, IEEE TAC 62(4)): they are driven by θ × g e_z
+alone, so that the bound on them never says anything of the heading.
+
+The strapdown runs at each sample, the covariance once a block (`AmekfParams.block_s`): over a block the transition is
+exact in the sums of R_WS and R_WS ω, which is why 25 states cost less than six at each sample. At rest (the paper's
+static phase, Lisini Baldi 2019) velocity is zero and the gyroscope reads its bias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import BadOption
+from ..noise import SensorNoise
+from ..so3 import inlined, kernel
+from .base import HIGHEST_ACCEL, HIGHEST_RATE, FilterRun, OneSample, samples
+
+# Error states
+_V, _P, _B, _M, _F, _D = 3, 5, 7, 10, 19, 22  # velocity, position, bias, matrix, accel (force) bias, bias in motion
+STATES = 25
+
+# Sums over a block: of R (9, rows first), of R ω_c for c = x, y, z (9 each), of R while moving (9), and the rest.
+_MOVING = 36
+_GYRO, _RATE2, _FORCE, _KNOCK, _STATIC, _LOST_TURN, _LOST_FORCE, _SUMS = 45, 48, 49, 50, 51, 52, 53, 54
+# Kept from sample to sample besides: last good rate (3), how long it has been held.
+_HELD, _HELD_S, _KEPT = 0, 3, 4
+_FADE_S = 0.1  # [s] in which a held rate fades
+_LOST = 4.0  # [rad] of unknown turn are as good as any more
+# Parameters in the order in which the compiled steps take them
+_PARAMETERS = (
+    "gravity gyro_noise accel_noise speed position zero_speed rate_noise force_noise bias_walk matrix_walk "
+    "accel_bias_walk motion_bias_walk rest_bias lost_rate lost_force gyro_limit accel_limit knock"
+).split()
+
+# A tape row, for the smoother: transition sums (45), the block's length [s], variance of the turn lost in it, number of
+# measurements; for each the state it is of, 1/√s, innovation/√s and P h/√s; then of some states their correction and their rows of P after it.
+TAPE_ROWS = (0, 1, 2, _B, _B + 1, _B + 2, _D, _D + 1, _D + 2)
+MEASUREMENTS = 5
+TAPE_LENGTH, TAPE_LOST, TAPE_MEASURED, TAPE_FIRST = 45, 46, 47, 48
+TAPE_STEP = STATES + 3
+TAPE_D = TAPE_FIRST + MEASUREMENTS * TAPE_STEP
+TAPE_P = TAPE_D + len(TAPE_ROWS)
+TAPE = TAPE_P + len(TAPE_ROWS) * STATES
+_NO_TAPE = np.empty((0, TAPE))
+
+
+@dataclass(frozen=True)
+class AmekfParams:
+    """How wrong a MEMS sensor and how bounded a person's motion is; standard deviations, the same for all recordings.
+
+    The gyroscope's and the accelerometer's known errors (`gyro_matrix`, `accel_matrix`, `accel_bias`, of a calibration)
+    are taken off; `gyro_matrix_std` and `accel_bias_std` say how well they are known.
+    """
+
+    block_s: float = 0.25  # [s] between corrections; the covariance is propagated over it in one step
+    speed_std: float = 1.0  # [m/s] of the sensor, horizontal, each axis, new each `motion_s`
+    position_std: float = 1.5  # [m] around where it mostly is, horizontal, each axis, new each `motion_s`
+    motion_s: float = 1.0  # [s]
+    rest_speed_std: float = 0.01  # [m/s] in a static phase
+    rate_noise: float = 3e-4  # [1/√Hz] of gyro in motion, a share of |ω|: what the matrix does not explain
+    force_noise: float = 0.01  # share of the summed |acceleration| by which a block's velocity change is off
+    knock: float = 100.0  # [m/s²] acceleration beyond which is a hit: velocity is off by as much as that adds
+    tilt_std: float = 0.2  # [rad] at the start, which may be in motion; a first rest soon says more
+    gyro_matrix_std: float = 0.002  # each entry of M
+    gyro_matrix_walk: float = 1e-6  # [1/√s]
+    gyro_bias_walk: float = 5e-6  # [rad/s/√s], 10 deg/h in 100 s
+    rest_bias_std: float = 1e-4  # [rad/s] by which the mean of gyro over a static block is not the bias
+    motion_bias_std: float = 1.7e-4  # [rad/s], 0.01 deg/s, bias in motion less that at rest
+    motion_bias_walk: float = 5e-5  # [rad/s/√s]
+    accel_bias_std: float = 0.03  # [m/s²], 3 mg
+    accel_bias_walk: float = 1e-4  # [m/s²/√s]
+    gyro_range: float = np.inf  # [rad/s]; a sample at it is clipped: turned by it, but the turn is uncertain
+    accel_range: float = np.inf  # [m/s²]
+    lost_rate_std: float = 2.0  # [rad/s] of the unknown rate while gyro is lost (NaN) or clipped
+    lost_force_std: float = 5.0  # [m/s²] of the unknown acceleration while accel is lost or clipped
+    gyro_matrix: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))  # M: measured = (I + M) true
+    accel_matrix: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))  # measured = (I + this) true + bias
+    accel_bias: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [m/s²]
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name in ("gyro_matrix", "accel_matrix", "accel_bias"):
+                shape = (3,) if name == "accel_bias" else (3, 3)
+                if np.shape(value) != shape or not np.isfinite(value).all():
+                    raise BadOption(f"{name} must be finite numbers of shape {shape}")
+            elif not value >= 0.0 or (value == 0.0 and name in ("block_s", "speed_std", "position_std", "motion_s")):
+                raise BadOption(f"{name} = {value}: a number above 0 is needed (0 switches off what is no bound)")
+
+
+@dataclass
+class AmekfState:
+    """All that goes from sample to sample, so that a run may be cut anywhere."""
+
+    quat_WS: np.ndarray  # (4,) xyzw
+    x: np.ndarray  # (25,) the states as the module says; the first three, the attitude's error, stay zero
+    P: np.ndarray  # (25, 25)
+    sums: np.ndarray  # (54,) over the block that is open
+    kept: np.ndarray  # (4,) last good rate [rad/s] and for how long it has been held [s]
+    count: np.ndarray  # (1,) samples in the open block
+
+
+class Amekf:
+    """aMEKF of one sensor. First bias, its covariance, noise and gravity come from `noise`.
+
+    What bad data does: a NaN sample of gyro holds the last rate, which fades in 0.1 s, and the attitude's covariance
+    grows with the time squared; a NaN sample of accel counts as gravity alone, and the velocity's covariance grows; a
+    sample beyond the ranges in `params` does the same, but is used. A knock (a velocity change that cannot be) moves
+    velocity, which is corrected at reduced weight. A bias that jumps is taken over at the next rest at once. Without any
+    rest all is learned in motion, in a minute or so. Time is not an input: gaps, repeated and late samples are
+    the readers' to mend.
+    """
+
+    def __init__(
+        self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: AmekfParams | None = None
+    ) -> None:
+        self.params = p = params or AmekfParams()
+        self.rate_hz = rate_hz
+        self.noise = noise
+        self.block = max(1, round(p.block_s * rate_hz))
+        length = self.block / rate_hz
+        known = {
+            "gravity": noise.gravity,
+            "gyro_noise": float(np.trace(noise.gyro_cov)) / 3.0 / rate_hz,  # [rad²/s]
+            "accel_noise": float(np.trace(noise.accel_cov)) / 3.0 * noise.gravity**2 / rate_hz,  # [m²/s³]
+            "speed": p.speed_std**2 * p.motion_s / length,
+            "position": p.position_std**2 * p.motion_s / length,
+            "zero_speed": p.rest_speed_std**2,
+            "rate_noise": p.rate_noise**2,
+            "force_noise": p.force_noise**2,
+            "bias_walk": p.gyro_bias_walk**2,
+            "matrix_walk": p.gyro_matrix_walk**2,
+            "accel_bias_walk": p.accel_bias_walk**2,
+            "motion_bias_walk": p.motion_bias_walk**2,
+            "rest_bias": p.rest_bias_std**2 + float(np.trace(noise.gyro_cov)) / 3.0 / self.block,
+            "lost_rate": p.lost_rate_std,
+            "lost_force": p.lost_force_std**2,
+            "gyro_limit": p.gyro_range,
+            "accel_limit": p.accel_range,
+            "knock": p.knock,
+        }
+        self._numbers = np.array([known[name] for name in _PARAMETERS])
+        self._accel = np.linalg.inv(np.eye(3) + p.accel_matrix)  # measured to true
+        x, P = np.zeros(STATES), np.zeros((STATES, STATES))
+        x[_B : _B + 3], x[_M : _M + 9], x[_F : _F + 3] = noise.gyro_bias, p.gyro_matrix.ravel(), p.accel_bias
+        stds = np.zeros(STATES)
+        stds[:3] = p.tilt_std, p.tilt_std, 1e-5  # the heading of the start is zero by definition
+        stds[_V : _V + 2], stds[_P : _P + 2] = p.speed_std, p.position_std
+        stds[_M : _M + 9], stds[_F : _F + 3], stds[_D : _D + 3] = p.gyro_matrix_std, p.accel_bias_std, p.motion_bias_std
+        np.fill_diagonal(P, stds**2)
+        P[_B : _B + 3, _B : _B + 3] = noise.gyro_bias_cov
+        self.state = AmekfState(np.array(quat_WS, dtype=float), x, P, np.zeros(_SUMS), np.zeros(_KEPT), np.zeros(1, int))
+        self._one = OneSample()
+        shapes = (9,), (7, STATES), (STATES, 7), (7, 7), (STATES,), (STATES,)
+        self._scratch = [np.zeros(shape) for shape in shapes]  # for the step, which makes no array of its own
+
+    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
+        return self.taped(gyro_S, accel_S, static, _NO_TAPE)
+
+    def taped(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, tape: np.ndarray) -> FilterRun:
+        """`run` that writes a row of `tape` (blocks, `TAPE`) at the end of each block as well."""
+        gyro, accel, at_rest = samples(gyro_S, accel_S, static)
+        out = FilterRun(np.empty((len(gyro), 4)), np.empty((len(gyro), 3)), np.empty((len(gyro), 3, 3)))
+        self._go(gyro, accel, at_rest, tape, *out)
+        return out
+
+    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
+        one = self._one
+        self._go(*one.fill(gyro_S, accel_S, static), _NO_TAPE, one.quat_WS, one.gyro_bias, one.attitude_cov)
+        return one.quat_WS[0].copy()
+
+    def _go(
+        self,
+        gyro: np.ndarray,
+        accel: np.ndarray,
+        static: np.ndarray,
+        tape: np.ndarray,
+        quat: np.ndarray,
+        bias: np.ndarray,
+        cov: np.ndarray,
+    ) -> None:
+        s = self.state
+        state = s.quat_WS, s.x, s.P, s.sums, s.kept, s.count
+        model = 1.0 / self.rate_hz, self.block, self._numbers, self._accel
+        _run(*state, gyro, accel, static, *model, tape, *self._scratch, quat, bias, cov)
+
+
+@inlined
+def _series(h2):  # type: ignore[no-untyped-def]
+    """sin(h)/h and cos(h) of h² = `h2`; below 0.02 (0.28 rad a sample) by series, to the last bit or two."""
+    if h2 < 0.02:
+        s = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * (1.0 - h2 / 42.0 * (1.0 - h2 / 72.0)))
+        c = 1.0 - h2 / 2.0 * (1.0 - h2 / 12.0 * (1.0 - h2 / 30.0 * (1.0 - h2 / 56.0 * (1.0 - h2 / 90.0))))
+        return s, c
+    h = np.sqrt(h2)
+    return np.sin(h) / h, np.cos(h)
+
+
+@inlined
+def turn_left(quat, x, y, z):  # type: ignore[no-untyped-def]
+    """In place: ``quat ← exp([x, y, z]) ⊗ quat``, the vector in W [rad]."""
+    s, ew = _series(0.25 * (x * x + y * y + z * z))
+    ex, ey, ez = 0.5 * s * x, 0.5 * s * y, 0.5 * s * z
+    qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]
+    rx = ew * qx + ex * qw + ey * qz - ez * qy
+    ry = ew * qy - ex * qz + ey * qw + ez * qx
+    rz = ew * qz + ex * qy - ey * qx + ez * qw
+    rw = ew * qw - ex * qx - ey * qy - ez * qz
+    norm = 1.0 / np.sqrt(rx * rx + ry * ry + rz * rz + rw * rw)
+    quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
+
+
+@kernel
+def transition_rows(sums, length, gravity, P, out):  # type: ignore[no-untyped-def]
+    """Rows of ``F P`` that differ from P's, those of θ, velocity and position, to `out` (7, m); `P` is (25, m).
+
+    θ⁺ = θ − Σ R dt b − Σ R ω dt M − Σ_moving R dt d, v⁺ = v + ∫ θ × g e_z − Σ R dt f, p⁺ = p + ∫ v, the integrals by
+    the trapezoid.
+    """
+    columns = P.shape[1]
+    for i in range(3):
+        for j in range(columns):
+            out[i, j] = P[i, j]
+        for c in range(3):
+            at_rest, moving = sums[3 * i + c], sums[_MOVING + 3 * i + c]
+            for j in range(columns):
+                out[i, j] -= at_rest * P[_B + c, j] + moving * P[_D + c, j]
+            x, y, z = sums[9 + 3 * i + c], sums[18 + 3 * i + c], sums[27 + 3 * i + c]
+            for j in range(columns):
+                out[i, j] -= x * P[_M + 3 * c, j] + y * P[_M + 3 * c + 1, j] + z * P[_M + 3 * c + 2, j]
+    g, t = 0.5 * length * gravity, 0.5 * length
+    for i in range(2):
+        sign, other = (g, 1) if i == 0 else (-g, 0)
+        fx, fy, fz = sums[3 * i], sums[3 * i + 1], sums[3 * i + 2]
+        for j in range(columns):
+            out[3 + i, j] = (
+                P[_V + i, j]
+                + sign * (P[other, j] + out[other, j])
+                - (fx * P[_F, j] + fy * P[_F + 1, j] + fz * P[_F + 2, j])
+            )
+        for j in range(columns):
+            out[5 + i, j] = P[_P + i, j] + t * (P[_V + i, j] + out[3 + i, j])
+
+
+@inlined
+def _close(quat, x, P, sums, dt, count, numbers, tape, row, rows, columns, corner, d, scaled):  # type: ignore[no-untyped-def]
+    """End a block: propagate P over it, correct by what bounds the motion, or by rest."""
+    gravity, gyro_noise, accel_noise = numbers[0], numbers[1], numbers[2]
+    speed, position, zero_speed = numbers[3], numbers[4], numbers[5]
+    rate_noise, force_noise, bias_walk, matrix_walk = numbers[6], numbers[7], numbers[8], numbers[9]
+    accel_walk, motion_walk, rest_bias, lost_force = numbers[10], numbers[11], numbers[12], numbers[14]
+    length = count * dt
+    for i in range(45):
+        sums[i] *= dt
+    taped = row < len(tape)
+    if taped:
+        for i in range(45):
+            tape[row, i] = sums[i]
+        tape[row, TAPE_LENGTH], tape[row, TAPE_LOST] = length, sums[_LOST_TURN]
+
+    transition_rows(sums, length, gravity, P, rows)
+    for i in range(7):
+        for j in range(7, STATES):
+            P[i, j] = rows[i, j]
+            P[j, i] = rows[i, j]
+    # The corner, F's rows against those of F P: with them as columns it is the same product again.
+    for i in range(7):
+        for j in range(STATES):
+            columns[j, i] = rows[i, j]
+    transition_rows(sums, length, gravity, columns, corner)
+    for i in range(7):
+        for j in range(7):
+            P[i, j] = 0.5 * (corner[i, j] + corner[j, i])
+
+    turned = gyro_noise * length + rate_noise * sums[_RATE2] * dt + sums[_LOST_TURN]
+    pushed = accel_noise * length + force_noise * (sums[_FORCE] * dt) ** 2 + (sums[_KNOCK] * dt) ** 2
+    pushed += lost_force * sums[_LOST_FORCE] ** 2
+    for i in range(3):
+        P[i, i] += turned
+        P[_B + i, _B + i] += bias_walk * length
+        P[_F + i, _F + i] += accel_walk * length
+        P[_D + i, _D + i] += motion_walk * length
+    for i in range(9):
+        P[_M + i, _M + i] += matrix_walk * length
+    for i in range(2):
+        P[_V + i, _V + i] += pushed
+
+    still = sums[_STATIC] == count
+    for j in range(STATES):
+        d[j] = 0.0
+    n = MEASUREMENTS if still else 4
+    for m in range(n):
+        if m < 2:
+            at = _V + m
+            y = -x[at]
+            r = zero_speed if still else speed
+        elif still:
+            at = _B + m - 2
+            y = sums[_GYRO + m - 2] / count - x[at]
+            r = rest_bias
+        else:
+            at = _P + m - 2
+            y = -x[at]
+            r = position
+        y -= d[at]
+        s = P[at, at] + r
+        if y * y > 9.0 * s:
+            if still and m >= 2:  # the bias has jumped
+                P[at, at] += y * y
+                s += y * y
+            else:  # a knock, a walk: not more than three standard deviations of it are believed
+                s = y * y / 9.0
+        root = 1.0 / np.sqrt(s)
+        for j in range(STATES):
+            scaled[j] = P[at, j] * root
+        y *= root
+        for j in range(STATES):
+            d[j] += scaled[j] * y
+        for i in range(STATES):
+            gain = scaled[i]
+            for j in range(STATES):
+                P[i, j] -= gain * scaled[j]
+        if taped:
+            to = TAPE_FIRST + m * TAPE_STEP
+            tape[row, to], tape[row, to + 1], tape[row, to + 2] = at, root, y
+            for j in range(STATES):
+                tape[row, to + 3 + j] = scaled[j]
+    for i in range(3, STATES):
+        x[i] += d[i]
+    turn_left(quat, d[0], d[1], d[2])
+    if taped:
+        tape[row, TAPE_MEASURED] = n
+        for n in range(len(TAPE_ROWS)):
+            i = TAPE_ROWS[n]
+            tape[row, TAPE_D + n] = d[i]
+            for j in range(STATES):
+                tape[row, TAPE_P + STATES * n + j] = P[i, j]
+    for i in range(_SUMS):
+        sums[i] = 0.0
+
+
+@inlined
+def into_sensor(R, P, more, out):  # type: ignore[no-untyped-def]
+    """``out = Rᵀ P R + more I`` of symmetric 3×3 `P`; `R` (9,) rows first."""
+    xx, xy, xz, yy, yz, zz = P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2]
+    for j in range(3):
+        a, b, c = R[j], R[3 + j], R[6 + j]
+        u, v, w = xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c
+        for i in range(j + 1):
+            s = R[i] * u + R[3 + i] * v + R[6 + i] * w
+            out[i, j] = s
+            out[j, i] = s
+        out[j, j] += more
+
+
+@inlined
+def matrix_of(quat, R):  # type: ignore[no-untyped-def]
+    """`R` (9,) rows first, of `quat` (4,) xyzw."""
+    x, y, z, w = quat[0], quat[1], quat[2], quat[3]
+    x2, y2, z2 = 2.0 * x, 2.0 * y, 2.0 * z
+    R[0], R[1], R[2] = 1.0 - y * y2 - z * z2, x * y2 - w * z2, x * z2 + w * y2
+    R[3], R[4], R[5] = x * y2 + w * z2, 1.0 - x * x2 - z * z2, y * z2 - w * x2
+    R[6], R[7], R[8] = x * z2 - w * y2, y * z2 + w * x2, 1.0 - x * x2 - y * y2
+
+
+@kernel
+def _run(  # type: ignore[no-untyped-def]
+    quat,
+    x,
+    P,
+    sums,
+    kept,
+    count,
+    gyro_S,
+    accel_S,
+    static,
+    dt,
+    block,
+    numbers,
+    accel_matrix,
+    tape,
+    R,
+    rows,
+    columns,
+    corner,
+    d,
+    scaled,
+    out_quat,
+    out_bias,
+    out_cov,
+):
+    gravity, lost_rate, gyro_limit, accel_limit = numbers[0], numbers[13], numbers[15], numbers[16]
+    knock = numbers[17]
+    row = 0
+    for k in range(len(gyro_S)):
+        moving = 0.0 if static[k] else 1.0
+        gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
+        bx, by, bz = x[_B] + moving * x[_D], x[_B + 1] + moving * x[_D + 1], x[_B + 2] + moving * x[_D + 2]
+        if gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE:  # false for NaN
+            ux, uy, uz = gx - bx, gy - by, gz - bz
+            good = max(abs(gx), abs(gy), abs(gz)) < gyro_limit
+            sums[_GYRO] += gx
+            sums[_GYRO + 1] += gy
+            sums[_GYRO + 2] += gz
+            sums[_STATIC] += 1.0 - moving
+        else:
+            fade = 1.0 - min(1.0, dt / _FADE_S)
+            ux, uy, uz = fade * kept[_HELD], fade * kept[_HELD + 1], fade * kept[_HELD + 2]
+            good = False
+        kept[_HELD], kept[_HELD + 1], kept[_HELD + 2] = ux, uy, uz
+        if good:
+            kept[_HELD_S] = 0.0
+        else:
+            held = kept[_HELD_S]
+            if held * lost_rate < _LOST:
+                sums[_LOST_TURN] += lost_rate * lost_rate * dt * (2.0 * held + dt)
+            kept[_HELD_S] = held + dt
+
+        wx = ux - (x[_M] * ux + x[_M + 1] * uy + x[_M + 2] * uz)
+        wy = uy - (x[_M + 3] * ux + x[_M + 4] * uy + x[_M + 5] * uz)
+        wz = uz - (x[_M + 6] * ux + x[_M + 7] * uy + x[_M + 8] * uz)
+        sums[_RATE2] += wx * wx + wy * wy + wz * wz
+        s, ew = _series(0.25 * dt * dt * (wx * wx + wy * wy + wz * wz))
+        s *= 0.5 * dt
+        ex, ey, ez = s * wx, s * wy, s * wz
+        qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]
+        rx = qw * ex + qx * ew + qy * ez - qz * ey
+        ry = qw * ey - qx * ez + qy * ew + qz * ex
+        rz = qw * ez + qx * ey - qy * ex + qz * ew
+        rw = qw * ew - qx * ex - qy * ey - qz * ez
+        norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)  # 1/√, to first order: it is 1 but for rounding
+        quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
+        matrix_of(quat, R)
+        for i in range(9):
+            sums[i] += R[i]
+            sums[9 + i] += R[i] * ux
+            sums[18 + i] += R[i] * uy
+            sums[27 + i] += R[i] * uz
+            sums[_MOVING + i] += R[i] * moving
+
+        ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
+        if ax * ax + ay * ay + az * az < HIGHEST_ACCEL * HIGHEST_ACCEL:
+            if max(abs(ax), abs(ay), abs(az)) >= accel_limit:
+                sums[_LOST_FORCE] += dt
+            ax, ay, az = ax - x[_F], ay - x[_F + 1], az - x[_F + 2]
+            fx = accel_matrix[0, 0] * ax + accel_matrix[0, 1] * ay + accel_matrix[0, 2] * az
+            fy = accel_matrix[1, 0] * ax + accel_matrix[1, 1] * ay + accel_matrix[1, 2] * az
+            fz = accel_matrix[2, 0] * ax + accel_matrix[2, 1] * ay + accel_matrix[2, 2] * az
+            ax = R[0] * fx + R[1] * fy + R[2] * fz
+            ay = R[3] * fx + R[4] * fy + R[5] * fz
+            az = R[6] * fx + R[7] * fy + R[8] * fz - gravity
+            size = np.sqrt(ax * ax + ay * ay + az * az)
+            sums[_FORCE] += size
+            sums[_KNOCK] += max(0.0, size - knock)
+        else:
+            sums[_LOST_FORCE] += dt
+            ax = ay = 0.0
+        x[_P] += dt * x[_V]
+        x[_P + 1] += dt * x[_V + 1]
+        x[_V] += dt * ax
+        x[_V + 1] += dt * ay
+
+        count[0] += 1
+        if count[0] == block:
+            _close(quat, x, P, sums, dt, block, numbers, tape, row, rows, columns, corner, d, scaled)
+            count[0] = 0
+            row += 1
+            matrix_of(quat, R)
+        for i in range(4):
+            out_quat[k, i] = quat[i]
+        out_bias[k, 0], out_bias[k, 1], out_bias[k, 2] = bx, by, bz
+        into_sensor(R, P, sums[_LOST_TURN], out_cov[k])

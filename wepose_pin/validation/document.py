@@ -1,0 +1,119 @@
+"""``validation.json``: every trial of a run, and what it was run with."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..errors import BadData, MissingFile
+from ..simulation import MTI_3
+from .contenders import AS_IT_COMES
+from .gains import STATED
+from .jobs import Result
+from .paper import WORLDS
+
+
+class Document(NamedTuple):
+    """A run as its file holds it."""
+
+    results: list[Result]
+    quick: bool
+    versions: dict[str, str]
+    worlds: dict[str, dict[str, Any]]  # name → mounts_known, and imperfections with their sizes
+    noise: dict[str, float]  # of the simulated sensors, in `ImuNoise`'s units
+    gains: dict[str, dict[str, Any]]  # setting → "ncf", "gdc" → gains as stated
+
+
+def document_text(results: Sequence[Result], quick: bool, versions: Mapping[str, str]) -> str:
+    """The file's text: a line a result. No time stamp, so that two runs give the same file.
+
+    JSON knows no infinity and no NaN: a range without end, and a figure that is none, are null.
+    """
+    head = {
+        "versions": dict(versions),
+        "quick": quick,
+        "worlds": {
+            name: {"mounts_known": True, "imperfections": asdict(imperfections)}
+            for name, imperfections in WORLDS.items()
+        },
+        "noise": asdict(MTI_3),
+        "gains": {
+            setting: {name: asdict(params) for name, params in of.items()}
+            for setting, of in [("as it comes", AS_IT_COMES), *((s, gains._asdict()) for s, gains in STATED.items())]
+        },
+    }
+    text = json.dumps(_plain(head), indent=1, ensure_ascii=False, allow_nan=False).removesuffix("\n}")
+    lines = ",\n".join(
+        "  " + json.dumps(_plain(result._asdict()), ensure_ascii=False, allow_nan=False) for result in results
+    )
+    return f'{text},\n "results": [\n{lines}\n ]\n}}\n'
+
+
+def read_document(path: Path) -> Document:
+    """The run in `path`.
+
+    Raises
+    ------
+    MissingFile
+        It is not there.
+    BadData
+        It is no ``validation.json``.
+    """
+    if not path.is_file():
+        raise MissingFile(f"{path}: no such file; a validation.json that `wepose validate -o DIR` wrote is wanted here")
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise BadData(f"{path}: is no JSON: {error}") from error
+    return as_document(found, str(path))
+
+
+def as_document(found: Any, where: str) -> Document:
+    """A run from what JSON gave.
+
+    Raises
+    ------
+    BadData
+        A key is missing or its value is of the wrong kind.
+    """
+
+    def wanted(of: Any, key: str, kind: type, place: str, default: Any = None) -> Any:
+        value = of.get(key, default) if isinstance(of, dict) else None
+        if not isinstance(value, kind):
+            shown = "nothing" if value is None else type(value).__name__
+            raise BadData(f"{where}: {place}{key}: {shown}, a {kind.__name__} is wanted; is it `wepose validate`'s?")
+        return value
+
+    results = []
+    for k, item in enumerate(wanted(found, "results", list, "")):
+        place = f"results[{k}]."
+        experiment, trial, method = (wanted(item, key, str, place) for key in ("experiment", "trial", "method"))
+        series = wanted(item, "series", dict, place, {})
+        for curve in series:
+            wanted(series, curve, list, f"{place}series.")
+        results.append(Result(experiment, trial, method, wanted(item, "figures", dict, place), series))
+    if not results:
+        raise BadData(f"{where}: results: the list is empty; is it `wepose validate`'s?")
+    return Document(
+        results,
+        wanted(found, "quick", bool, "", False),
+        wanted(found, "versions", dict, "", {}),
+        wanted(found, "worlds", dict, "", {}),
+        wanted(found, "noise", dict, "", {}),
+        wanted(found, "gains", dict, "", {}),
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return _plain(value._asdict())
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):  # NumPy's
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not abs(value) < float("inf") else value

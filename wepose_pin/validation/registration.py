@@ -1,0 +1,171 @@
+"""How a reference lies to a sensor: clock, body frame and world, found on a stretch that is not scored.
+
+No filter takes part: the gyroscope is integrated over the stretch, so what is found is the same for all that are
+compared. Only the heading, which each filter has of its own, is left to `series.aligned`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation, Slerp
+
+from .. import so3
+from ..errors import BadData
+from ..readers.trials import Referenced
+
+LARGEST_OFFSET_S = 0.3  # of the clocks
+# Turns are compared over this time: long against what foam and a flexing arm add, short against the gyroscope's drift.
+TURN_S = 0.5
+_LARGEST_TURN = 2.8  # [rad] beyond it the axis of a turn may flip
+_LEAST_TURN = 0.02  # [rad] and [rad/s], rms: about a second axis, and of the rate; with less nothing is found
+
+
+class Registration(NamedTuple):
+    """What brings a reference to a sensor, and how well it does."""
+
+    offset_s: float  # the sensor's clock at the reference's zero [s]
+    quat_BS: np.ndarray  # (4,) xyzw, sensor to the reference's body
+    quat_WV: np.ndarray  # (4,) xyzw, the reference's world to a level one, without heading
+    gyro_bias: np.ndarray  # (3,) [rad/s]
+    correlation: float  # of the magnitudes of the two rates, at that offset
+    left_deg: float  # rms of the integrated gyroscope's orientation about the reference's, over the stretch
+
+    @property
+    def tilt_deg(self) -> float:
+        """How far the reference's world leans [deg]."""
+        return float(np.degrees(Rotation.from_quat(self.quat_WV).magnitude()))
+
+    def figures(self) -> dict[str, float]:
+        """For the table of trials."""
+        return {
+            "clock_offset_ms": 1e3 * self.offset_s,
+            "mount_deg": float(np.degrees(Rotation.from_quat(self.quat_BS).magnitude())),
+            "world_tilt_deg": self.tilt_deg,
+            "gyro_bias_deg_s": float(np.degrees(np.linalg.norm(self.gyro_bias))),
+            "registration_left_deg": self.left_deg,
+        }
+
+
+def register(sensors: Sequence[Referenced], stretch: tuple[float, float]) -> list[Registration]:
+    """Registrations of sensors that share a clock and a reference, from the time `stretch` [s] of the reference.
+
+    One offset of the clocks: where the correlations of ‖gyro‖ with the body's rate have their greatest sum. A mount
+    each: the rotation that brings the sensor's turns over half a second to the body's (Wahba's problem, on rotation
+    vectors), refined, together with the gyroscope's bias where there is no still phase, such that the integrated
+    gyroscope follows the body over the whole stretch. One tilt of the reference's world: specific force, turned by the
+    integrated gyroscope and averaged over the stretch with a window without jumps (what comes and goes cancels), each
+    sensor as heavy as it follows.
+
+    Raises
+    ------
+    BadData
+        The stretch is too short or holds too little motion.
+    """
+    spans = [_Span(sensor, stretch) for sensor in sensors]
+    offset, within = 0.0, LARGEST_OFFSET_S
+    for step in (4e-3, 0.25e-3):  # [s]
+        offsets = offset + np.arange(-round(within / step), round(within / step) + 1) * step
+        correlations = np.array([[span.correlation(each) for each in offsets] for span in spans])
+        best = int(np.argmax(correlations.sum(axis=0)))
+        offset, within = float(offsets[best]), step
+    if abs(offset) > LARGEST_OFFSET_S - 4e-3:
+        raise BadData(f"{sensors[0].name}: no offset of the clocks within {LARGEST_OFFSET_S:g} s fits the reference")
+    fits = [span.fit(offset) for span in spans]
+    up_V = np.array([span.up(offset, fit) for span, fit in zip(spans, fits, strict=True)])
+    quat_WV = so3.tilt(np.array([fit.rms for fit in fits]) ** -2.0 @ up_V)
+    return [
+        Registration(offset, fit.R_BS.as_quat(), quat_WV, fit.bias, float(row[best]), float(np.degrees(fit.rms)))
+        for fit, row in zip(fits, correlations, strict=True)
+    ]
+
+
+class _Fit(NamedTuple):
+    R_BS: Rotation
+    bias: np.ndarray  # (3,) [rad/s]
+    rms: float  # [rad]
+
+
+class _Span:
+    """A sensor and its reference over the stretch."""
+
+    def __init__(self, sensor: Referenced, stretch: tuple[float, float]) -> None:
+        self.sensor = sensor
+        beyond = stretch[1] + 2.0 * LARGEST_OFFSET_S
+        self.samples = slice(0, min(len(sensor.gyro_S), int(beyond * sensor.rate_hz)))
+        self.clock = np.arange(self.samples.stop) / sensor.rate_hz
+        self.known_bias = bool(sensor.still.stop)
+        self.bias = sensor.gyro_S[sensor.still].mean(axis=0) if self.known_bias else np.zeros(3)
+        self.angle = np.cumsum(sensor.gyro_S[self.samples], axis=0) / sensor.rate_hz  # its differences are mean rates
+        inside = (sensor.time >= stretch[0]) & (sensor.time <= stretch[1])
+        inside &= (sensor.time >= LARGEST_OFFSET_S) & (sensor.time <= self.clock[-1] - LARGEST_OFFSET_S)
+        self.seen = np.flatnonzero(inside & np.isfinite(sensor.quat_VB).all(axis=1))
+        if len(self.seen) < 10:
+            raise BadData(
+                f"{sensor.name}: the reference saw {len(self.seen)} samples within {stretch} s; 10 are needed"
+            )
+        self.R_VB = Rotation.from_quat(sensor.quat_VB[self.seen])
+        self.first = self.seen[np.isin(self.seen + 1, self.seen)]
+        self.interval = sensor.time[self.first + 1] - sensor.time[self.first]
+        self.rate = np.linalg.norm(self._turns(self.first, 1), axis=1) / self.interval
+        if self.rate.std() < _LEAST_TURN:
+            raise BadData(f"{sensor.name}: its body does not turn in the stretch that is to align it, {stretch} s")
+
+    def _turns(self, first: np.ndarray, n: int) -> np.ndarray:
+        """Rotation vectors (k, 3) of the body from `first` to n samples later, in its frame."""
+        begin, end = (Rotation.from_quat(self.sensor.quat_VB[k]) for k in (first, first + n))
+        return (begin.inv() * end).as_rotvec()
+
+    def correlation(self, offset: float) -> float:
+        """Of the magnitudes of the sensor's rate and the body's."""
+        begin, end = (
+            np.column_stack([np.interp(self.sensor.time[k] + offset, self.clock, angle) for angle in self.angle.T])
+            for k in (self.first, self.first + 1)
+        )
+        return float(np.corrcoef(np.linalg.norm(end - begin, axis=1) / self.interval, self.rate)[0, 1])
+
+    def integrated(self, bias: np.ndarray) -> Rotation:
+        """R_IS of all samples, I the sensor's frame at the beginning."""
+        rate = self.sensor.gyro_S[self.samples] - bias
+        return Rotation.from_quat(so3.integrate(np.ascontiguousarray(rate / self.sensor.rate_hz))[1:])
+
+    def mount(self, offset: float) -> Rotation:
+        """R_BS from turns over `TURN_S`."""
+        n = max(1, round(TURN_S / float(np.median(np.diff(self.sensor.time)))))
+        first = self.seen[np.isin(self.seen + n, self.seen)]
+        if len(first) < 10:
+            raise BadData(f"{self.sensor.name}: the reference is not seen for {TURN_S:g} s on end in the stretch")
+        at = Slerp(self.clock, self.integrated(self.bias))
+        begin, end = (at(self.sensor.time[k] + offset) for k in (first, first + n))
+        true, turned = self._turns(first, n), (begin.inv() * end).as_rotvec()
+        use = np.maximum(np.linalg.norm(true, axis=1), np.linalg.norm(turned, axis=1)) < _LARGEST_TURN
+        true, turned = true[use], turned[use]
+        if len(true) < 10 or np.linalg.svd(true, compute_uv=False)[1] < _LEAST_TURN * np.sqrt(len(true)):
+            raise BadData(f"{self.sensor.name}: its body turns about one axis only in the stretch that is to align it")
+        return Rotation.align_vectors(true, turned)[0]
+
+    def fit(self, offset: float) -> _Fit:
+        """The mount, and the bias where it is not known, with which the integrated gyroscope follows the body."""
+        R_BS, time = self.mount(offset), self.sensor.time[self.seen] + offset
+
+        def off(x: np.ndarray) -> np.ndarray:
+            turned = Slerp(self.clock, self.integrated(self.bias + x[3:] if len(x) > 3 else self.bias))(time)
+            R_VI = self.R_VB * R_BS * Rotation.from_rotvec(x[:3]) * turned.inv()
+            return (R_VI.mean().inv() * R_VI).as_rotvec().ravel()
+
+        found = least_squares(off, np.zeros(3 if self.known_bias else 6))
+        bias = self.bias if self.known_bias else self.bias + found.x[3:]
+        rms = float(np.sqrt(2.0 * found.cost / len(time)))
+        return _Fit(R_BS * Rotation.from_rotvec(found.x[:3]), bias, rms)
+
+    def up(self, offset: float, fit: _Fit) -> np.ndarray:
+        """The vertical (3,) in the reference's world."""
+        time, R_IS = self.sensor.time[self.seen] + offset, self.integrated(fit.bias)
+        R_VI = (self.R_VB * fit.R_BS * Slerp(self.clock, R_IS)(time).inv()).mean()
+        within = (self.clock >= time[0]) & (self.clock <= time[-1])
+        force_V = (R_VI * R_IS[within]).apply(self.sensor.accel_S[self.samples][within])
+        up = np.hanning(len(force_V)) @ force_V
+        return up / np.linalg.norm(up)
