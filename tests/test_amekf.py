@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +16,11 @@ from wepose_pin import so3
 from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import attitude_error, uncertainty
 from wepose_pin.filters import TYPICAL, Amekf, AmekfParams, FilterRun, Smoother, estimate_orientation, run_filter
-from wepose_pin.filters import amekf as amekf_module
 from wepose_pin.filters.amekf import STATES, TAPE, transition_rows
+from wepose_pin.filters.bank import LiveBank
 from wepose_pin.noise import SensorNoise, noise_of
 from wepose_pin.readers.trials import read_authors_trial, read_broad
-from wepose_pin.simulation import REALISTIC, paper_dynamic
+from wepose_pin.simulation import PERFECT_WORLD, REALISTIC, paper_dynamic
 from wepose_pin.static import StaticDetector
 
 RATE = 100.0
@@ -41,7 +42,7 @@ class Case(NamedTuple):
 
 @lru_cache
 def case(seed: int, realistic: bool = False) -> Case:
-    sensor = paper_dynamic(seed, RATE, **({"imperfections": REALISTIC} if realistic else {}))
+    sensor = paper_dynamic(seed, RATE, imperfections=REALISTIC if realistic else PERFECT_WORLD)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
     return as_case(sensor.gyro_S, sensor.accel_S, sensor.quat_WS, moving)
 
@@ -70,7 +71,13 @@ def drawn(seed: int) -> Case:
 
 
 def run(of: Case, params: AmekfParams | None = None, kind: Any = Amekf) -> FilterRun:
-    return kind(of.noise, RATE, of.start, params).run(of.gyro, of.accel, of.static)
+    found: FilterRun = kind(of.noise, RATE, of.start, params).run(of.gyro, of.accel, of.static)
+    return found
+
+
+def cov(found: FilterRun) -> np.ndarray:
+    assert found.attitude_cov is not None
+    return found.attitude_cov
 
 
 def errors(of: Case, quat_VS: np.ndarray) -> Rotation:
@@ -81,24 +88,26 @@ def errors(of: Case, quat_VS: np.ndarray) -> Rotation:
 
 
 def tilt_deg(error: Rotation) -> np.ndarray:
-    return np.degrees(np.arccos(np.clip(error.as_matrix()[:, 2, 2], -1.0, 1.0)))
+    tilt: np.ndarray = np.degrees(np.arccos(np.clip(error.as_matrix()[:, 2, 2], -1.0, 1.0)))
+    return tilt
 
 
 def columns(of: Case, quat_VS: np.ndarray) -> np.ndarray:
     """Roll, pitch, yaw, each mean and std [deg], over the motion."""
     true = Rotation.from_quat(of.true)
-    error = attitude_error(errors(of, quat_VS)[of.moving] * true[of.moving], true[of.moving], np.arange(of.moving.sum()) / RATE)
+    error = attitude_error(
+        errors(of, quat_VS)[of.moving] * true[of.moving], true[of.moving], np.arange(of.moving.sum()) / RATE
+    )
     return np.array([*error.roll, *error.pitch, *error.yaw])
 
 
 def nees(of: Case, found: FilterRun) -> float:
     """Mean normalised squared error of the attitude in the motion; the heading is exact at the first sample."""
-    assert found.attitude_cov is not None
     true, R_VS = Rotation.from_quat(of.true), Rotation.from_quat(found.quat_WS)
     psi = so3.heading((true[0] * R_VS[0].inv()).as_quat())
     k = np.flatnonzero(of.moving)[300::25]
     error = ((Rotation.from_rotvec([0, 0, float(psi)]) * R_VS[k]).inv() * true[k]).as_rotvec()
-    return uncertainty(error, found.attitude_cov[k]).nees
+    return uncertainty(error, cov(found)[k]).nees
 
 
 # Algebra -----------------------------------------------------------------------------------------------------------
@@ -160,7 +169,7 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     scale = np.sqrt(np.diag(filter_.state.P))
     filter_.state.P[:] = np.outer(scale, scale) * (np.eye(STATES) + half @ half.T)
     filter_.state.x[V : P + 2] = 0.1, -0.2, 0.05, 0.02
-    before = replace(filter_.state, x=filter_.state.x.copy(), P=filter_.state.P.copy())
+    x_before, P_start = filter_.state.x.copy(), filter_.state.P.copy()
     tape = np.empty((1, TAPE))
     found = filter_.taped(of.gyro[at], of.accel[at], np.full(25, still), tape)
 
@@ -174,7 +183,7 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     q[V : V + 2] = float(np.trace(of.noise.accel_cov)) / 3.0 * of.noise.gravity**2 * T / RATE
     q[B : B + 3], q[M : M + 9] = params.gyro_bias_walk**2 * T, params.gyro_matrix_walk**2 * T
     q[F : F + 3], q[D:] = params.accel_bias_walk**2 * T, params.motion_bias_walk**2 * T
-    P_before = whole @ before.P @ whole.T + np.diag(q)
+    P_before = whole @ P_start @ whole.T + np.diag(q)
     of_state = [V, V + 1, B, B + 1, B + 2] if still else [V, V + 1, P, P + 1]
     H = np.eye(STATES)[of_state]
     r = [params.rest_speed_std**2] * 2 if still else [params.speed_std**2 / T] * 2
@@ -183,7 +192,7 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     np.testing.assert_allclose(filter_.state.P, P_before - gain @ H @ P_before, atol=1e-12, rtol=1e-7)
     # The correction, from the strapdown's own end: the filter on a copy of which a block is a sample longer has it.
     open_ = Amekf(of.noise, RATE, of.true[at.start - 1], replace(params, block_s=0.26))
-    open_.state.x[:] = before.x
+    open_.state.x[:] = x_before
     end = open_.run(of.gyro[at], of.accel[at], np.full(25, still)).quat_WS[-1]
     expected = np.array([0.0, 0.0, 0.0, 0.0, 0.0]) if still else np.zeros(4)
     innovation = expected - H @ open_.state.x
@@ -194,7 +203,7 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     turned = (Rotation.from_quat(found.quat_WS[-1]) * Rotation.from_quat(end).inv()).as_rotvec()
     np.testing.assert_allclose(turned, d[:3], atol=1e-12)
     R = Rotation.from_quat(found.quat_WS[-1]).as_matrix()
-    np.testing.assert_allclose(found.attitude_cov[-1], R.T @ filter_.state.P[:3, :3] @ R, atol=1e-15)
+    np.testing.assert_allclose(cov(found)[-1], R.T @ filter_.state.P[:3, :3] @ R, atol=1e-15)
 
 
 def test_the_heading_is_nobody_s_to_measure() -> None:
@@ -217,12 +226,12 @@ def test_any_cut_and_one_by_one_give_the_same_bits_with_bad_samples_too() -> Non
     whole = Amekf(of.noise, RATE, of.start, params).run(gyro, accel, static)
     filter_ = Amekf(of.noise, RATE, of.start, params)
     edges = [0, 1, 24, 25, 26, 311, 700, 1200]
-    parts = [
-        filter_.run(gyro[a:b], accel[a:b], static[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)
-    ]
+    parts = [filter_.run(gyro[a:b], accel[a:b], static[a:b]) for a, b in pairwise(edges)]
     for k, name in enumerate(whole._fields):
-        np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), whole[k], err_msg=name)
-        assert np.isfinite(whole[k]).all()
+        expected = whole[k]
+        assert expected is not None
+        assert np.isfinite(expected).all()
+        np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), expected, err_msg=name)
     filter_ = Amekf(of.noise, RATE, of.start, params)
     single = [filter_.update(g, a, s) for g, a, s in zip(gyro, accel, static, strict=True)]
     np.testing.assert_array_equal(single, whole.quat_WS)
@@ -234,7 +243,9 @@ def test_large_turns_a_sample_are_exact_too() -> None:
         rate = np.array([0.6, -0.48, 0.64]) * angle * RATE
         quiet = AmekfParams(block_s=1e3, gyro_matrix_std=0.0)
         noise = replace(TYPICAL, gyro_bias=np.zeros(3))
-        found = Amekf(noise, RATE, np.array([0.0, 0.0, 0.0, 1.0]), quiet).run(np.tile(rate, (3, 1)), np.zeros((3, 3)), [False] * 3)
+        found = Amekf(noise, RATE, np.array([0.0, 0.0, 0.0, 1.0]), quiet).run(
+            np.tile(rate, (3, 1)), np.zeros((3, 3)), np.zeros(3, dtype=bool)
+        )
         apart = Rotation.from_quat(found.quat_WS[-1]).inv() * Rotation.from_rotvec(rate / RATE) ** 3
         assert apart.magnitude() < 1e-14
 
@@ -245,20 +256,22 @@ def test_known_errors_of_the_sensor_are_taken_off() -> None:
     accel_matrix = 0.01 * np.random.default_rng(4).normal(size=(3, 3))
     bias = np.array([0.3, -0.2, 0.1])
     rate = of.gyro - of.noise.gyro_bias
-    measured = of._replace(
-        gyro=of.gyro + rate @ gyro_matrix.T, accel=of.accel @ (np.eye(3) + accel_matrix).T + bias
-    )
+    measured = of._replace(gyro=of.gyro + rate @ gyro_matrix.T, accel=of.accel @ (np.eye(3) + accel_matrix).T + bias)
     known = AmekfParams(gyro_matrix=gyro_matrix, accel_matrix=accel_matrix, accel_bias=bias)
     ideal = Rotation.from_quat(run(of).quat_WS)
     with_, without = (Rotation.from_quat(run(measured, p).quat_WS) for p in (known, AmekfParams()))
     # (I − M)(I + M) is 1 to M², a part in 10⁴
-    assert np.degrees((ideal.inv() * with_).magnitude()).max() < 0.3 < np.degrees((ideal.inv() * without).magnitude()).max()
+    assert (
+        np.degrees((ideal.inv() * with_).magnitude()).max()
+        < 0.3
+        < np.degrees((ideal.inv() * without).magnitude()).max()
+    )
 
 
 def test_wrong_parameters_are_named() -> None:
     for wrong in ({"block_s": 0.0}, {"speed_std": -1.0}, {"gyro_matrix_std": np.nan}, {"gyro_matrix": np.eye(2)}):
         with pytest.raises(BadOption, match=next(iter(wrong))):
-            AmekfParams(**wrong)  # type: ignore[arg-type]
+            AmekfParams(**wrong)
 
 
 # Consistency and accuracy on simulated trials ----------------------------------------------------------------------
@@ -273,8 +286,8 @@ def test_the_covariance_is_right(kind: Any) -> None:
 
 
 def test_ahead_of_smekf_as_the_paper_measures() -> None:
-    """12 trials at 100 Hz. With noise and biases alone smekf's error hardly changes, so that its std over time is small:
-    amekf's roll starts from the same accelerometer bias, which it then finds; the std has that change in it."""
+    """12 trials at 100 Hz. With noise and biases alone smekf's error hardly changes, so its std over time is small;
+    amekf's starts from the same accelerometer bias, which it then finds: the std has that change in it."""
     for realistic in (False, True):
         mean = {}
         for name in ("smekf", "amekf", "smoother"):
@@ -316,9 +329,8 @@ def test_the_gyroscope_s_scale_is_learned_in_motion() -> None:
 
 def within(of: Case, found: FilterRun, after: int, sigmas: float = 3.0) -> bool:
     """Errors in W from a sample on are within so many of the stated standard deviations."""
-    assert found.attitude_cov is not None
     R = Rotation.from_quat(found.quat_WS).as_matrix()
-    std = np.sqrt(np.diagonal(R @ found.attitude_cov @ R.transpose(0, 2, 1), axis1=1, axis2=2))
+    std = np.sqrt(np.diagonal(R @ cov(found) @ R.transpose(0, 2, 1), axis1=1, axis2=2))
     return bool((np.abs(errors(of, found.quat_WS).as_rotvec()) <= sigmas * std)[after:].all())
 
 
@@ -329,9 +341,9 @@ def test_lost_gyro_samples_grow_the_covariance_and_are_got_over(length: int, kin
     gyro = of.gyro.copy()
     gyro[2000 : 2000 + length] = np.nan
     clean, found = run(of, kind=kind), run(of._replace(gyro=gyro), kind=kind)
-    assert all(np.isfinite(part).all() for part in found)
+    assert all(part is not None and np.isfinite(part).all() for part in found)
     assert within(of, found, 2000)
-    assert np.trace(found.attitude_cov[2100]) > np.trace(clean.attitude_cov[2100])
+    assert np.trace(cov(found)[2100]) > np.trace(cov(clean)[2100])
     tilt = tilt_deg(errors(of, found.quat_WS))
     assert tilt[-600:].max() < 1.0
     assert tilt[1500:1950].max() < 1.0
@@ -343,7 +355,7 @@ def test_lost_accel_samples_count_as_gravity_alone() -> None:
     accel[2000:2030] = np.nan
     accel[3000::7] = np.nan
     found = run(of._replace(accel=accel))
-    assert all(np.isfinite(part).all() for part in found)
+    assert all(part is not None and np.isfinite(part).all() for part in found)
     assert within(of, found, 500)
     assert tilt_deg(errors(of, found.quat_WS))[2000:].max() < 1.0
 
@@ -447,13 +459,16 @@ def test_broad_against_vqf(data: Path) -> None:
             of = attitude_error(error * true[scored], true[scored], scored / trial.rate_hz)
             table[method].append((of.inclination_rmse, of.heading_rmse, of.total_rmse))
             R = R_VS[scored].as_matrix()
+            assert out.attitude_cov is not None
             right = uncertainty(error.as_rotvec(), R @ out.attitude_cov[scored] @ R.transpose(0, 2, 1))
             shares[method].append((right.within_1, right.within_2))
     print(f"\n{len(paths)} trials, RMSE [deg]   inclination heading total | not chosen on | within 1, 2 std")
     print(f"VQF 2.1.2 {VQF}\noffline VQF 2.1.2 {OFFLINE_VQF}")
     for method, rows in table.items():
-        held = np.round(np.mean(rows[1::2], axis=0), 2)
-        print(f"{method:9s} {np.round(np.mean(rows, axis=0), 2)} | {held} | {np.round(np.mean(shares[method], axis=0), 2)}")
+        everywhere, held, within_std = (
+            np.round(np.mean(values, axis=0), 2) for values in (rows, rows[1::2], shares[method])
+        )
+        print(f"{method:9s} {everywhere} | {held} | {within_std}")
     for method, peer in (("amekf", VQF), ("smoother", OFFLINE_VQF)):
         inclination, _, total = np.mean(table[method], axis=0)
         assert inclination <= peer[0]
@@ -473,5 +488,13 @@ def test_the_authors_trial_is_no_worse_than_with_smekf(data: Path) -> None:
     assert max(mean["amekf"], mean["smoother"]) <= mean["smekf"] + 0.01  # what Vicon's own delay leaves is 1.85
 
 
-def test_the_module_s_numbers_fit() -> None:
-    assert len(amekf_module._PARAMETERS) == len(Amekf(TYPICAL, RATE, np.array([0.0, 0, 0, 1]))._numbers)
+def test_a_bank_of_sensors_gives_the_bits_of_each() -> None:
+    cases = [case(seed) for seed in range(3)]
+    filters = [Amekf(of.noise, RATE, of.start) for of in cases]
+    bank = LiveBank(filters, [StaticDetector(of.noise, RATE) for of in cases])
+    runs = [run(of) for of in cases]
+    for k in range(700):
+        quat = bank.update(np.array([of.gyro[k] for of in cases]), np.array([of.accel[k] for of in cases]))
+        np.testing.assert_array_equal(quat, [found.quat_WS[k] for found in runs])
+    np.testing.assert_array_equal(bank.attitude_cov, [cov(found)[699] for found in runs])
+    np.testing.assert_array_equal(bank.gyro_bias, [found.gyro_bias[699] for found in runs])

@@ -16,7 +16,7 @@ from wepose_pin.cli import main
 from wepose_pin.errors import BadData, MissingFile
 from wepose_pin.filters import METHODS
 
-TINY = bench.Effort(2, 8.0, 1.0, (200, 400), (1, 3), 1, 1)
+TINY = bench.Effort(2, 8.0, 1.0, (200, 400), (1, 3), 1, 1, False)
 
 
 def run(*words: object) -> int:
@@ -32,16 +32,15 @@ def without_peers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def fast(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command with little to measure, and without the processes that compile anew."""
-    nothing = bench.Table("First use", (bench.Column("first_s", "[s]"),), {"smekf": {"first_s": 1.0}})
+    """The command with little to measure."""
     monkeypatch.setattr(bench, "QUICK", TINY)
-    monkeypatch.setattr(bench, "first_use", lambda: nothing)
     monkeypatch.delenv("WEPOSE_DATA", raising=False)
 
 
 @pytest.mark.usefixtures("without_peers")
 def test_every_method_is_measured() -> None:
-    found = {name: measure() for name, measure in bench.sections(TINY).items() if name != "first_use"}
+    found = {name: measure() for name, measure in bench.sections(TINY).items()}
+    assert "first_use" in bench.sections(bench.FULL)
     assert set(found["filters"].rows) == {*METHODS, "static detector"}
     assert set(found["accuracy"].rows) == set(METHODS)
     assert set(found["samples"].rows) == {"2e2 samples", "4e2 samples"}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -67,32 +68,34 @@ class Segments:
     warnings: tuple[str, ...]
 
 
-def segment_orientations(
-    recording: Recording,
-    subject: Subject | None = None,
-    *,
-    method: str = "smekf",
-    static_test: StaticTest | None = None,
-) -> Segments:
-    """Filter every sensor, then align it with its segment by the start pose.
+class Filtered(NamedTuple):
+    """Every sensor in its own world, before any mount is known."""
 
-    A calibrated mount of the subject is taken before a stated one, unless the strapping is new.
+    R_VS: dict[str, Rotation]  # segment → n orientations of its sensor
+    at_start: dict[str, Rotation]  # their mean in the start pose
+    orientation: dict[str, Orientation]  # what the filter gave; none for ready orientations
+    start: tuple[float, float]  # [s]
+    still: tuple[float, float]  # [s]
+    warnings: list[str]
+
+
+def filtered(recording: Recording, *, method: str = "smekf", static_test: StaticTest | None = None) -> Filtered:
+    """Filter every sensor; the start pose, and how still it was.
 
     Raises
     ------
     WeposeError
-        No mount is known for a sensor; a start phase in which there are too few samples; an unknown method.
+        A start phase in which there are too few samples; an unknown method.
     """
     check_method(method)
     start, still, warnings = _phases(recording)
-    quat_WL, quat_LS, heading, orientation, covariance_W = {}, {}, {}, {}, {}
+    R_VS, at_start, orientation = {}, {}, {}
     for segment, sensor in recording.sensors.items():
         warnings += _motion(recording, segment, start, "start")
         if still != start:
             warnings += _motion(recording, segment, still, "still")
-        nominal = _nominal_mount(recording, segment, subject)
         if sensor.quat_WS is not None:
-            quat_VS = sensor.quat_WS
+            R_VS[segment] = Rotation.from_quat(sensor.quat_WS)
         else:
             assert sensor.gyro_S is not None
             assert sensor.accel_S is not None
@@ -110,10 +113,40 @@ def segment_orientations(
                 static_test=static_test,
                 measured_start=True,
             )
-            quat_VS = orientation[segment].quat_WS
-        R_VS = Rotation.from_quat(quat_VS)
-        at_start = R_VS[recording.span(start)].mean()
-        R_stated = Rotation.from_quat(nominal)
+            R_VS[segment] = Rotation.from_quat(orientation[segment].quat_WS)
+        at_start[segment] = R_VS[segment][recording.span(start)].mean()
+    return Filtered(R_VS, at_start, orientation, start, still, warnings)
+
+
+def segment_orientations(
+    recording: Recording,
+    subject: Subject | None = None,
+    *,
+    method: str = "smekf",
+    static_test: StaticTest | None = None,
+) -> Segments:
+    """Filter every sensor, then align it with its segment by the start pose.
+
+    A calibrated mount of the subject is taken before a stated one, unless the strapping is new.
+
+    Raises
+    ------
+    WeposeError
+        No mount is known for a sensor; a start phase in which there are too few samples; an unknown method.
+    """
+    stated = {segment: nominal_mount(recording, segment, subject) for segment in recording.sensors}
+    missing = [segment for segment, mount in stated.items() if mount is None]
+    if missing:
+        raise BadSession(
+            f'{recording.where()}: sensors.{missing[0]}.mount is not known: state it, as in mount = {{ up = "+x", '
+            f'forward = "-z" }}, or give a subject with calibrated mounts (`wepose calibrate` finds them)'
+        )
+    found = filtered(recording, method=method, static_test=static_test)
+    start, warnings = found.start, found.warnings
+    quat_WL, quat_LS, heading, covariance_W = {}, {}, {}, {}
+    for segment, R_VS in found.R_VS.items():
+        at_start = found.at_start[segment]
+        R_stated = Rotation.from_quat(stated[segment])
         psi = heading_to(at_start, R_stated)
         turn = Rotation.from_rotvec([0.0, 0.0, psi])
         R_LS = turn * at_start
@@ -125,7 +158,7 @@ def segment_orientations(
             )
         if off > STATED_WARNING_DEG:
             warnings.append(f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose")
-        known = _mount_covariance(recording, segment, subject)
+        known = mount_covariance(recording, segment, subject)
         if known is not None:
             # The misfit is the pose's error and the mount's together; each takes its share.
             misfit = (R_LS * R_stated.inv()).as_rotvec()
@@ -139,9 +172,20 @@ def segment_orientations(
         quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
         quat_LS[segment] = R_LS.as_quat()
         heading[segment] = psi
-        if segment in orientation and orientation[segment].attitude_cov is not None:
-            covariance_W[segment] = _covariance_W(recording, segment, subject, turn * R_VS, R_LS, orientation[segment])
-    return Segments(recording.time, quat_WL, quat_LS, heading, orientation, covariance_W, start, still, tuple(warnings))
+        ours = found.orientation.get(segment)
+        if ours is not None and ours.attitude_cov is not None:
+            covariance_W[segment] = _covariance_W(recording, segment, subject, turn * R_VS, R_LS, ours)
+    return Segments(
+        recording.time,
+        quat_WL,
+        quat_LS,
+        heading,
+        found.orientation,
+        covariance_W,
+        start,
+        found.still,
+        tuple(warnings),
+    )
 
 
 def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
@@ -149,18 +193,14 @@ def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
     return float(so3.heading((R_WS * R_VS.inv()).as_quat()))
 
 
-def _nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray:
+def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
+    """The mount `quat_LS` (4,) xyzw as calibrated, else as stated, else of a ready segment; None where unknown."""
     if subject is not None and segment in subject.mounts and recording.strapping != "new":
         return subject.mounts[segment]
     stated = recording.sensors[segment].stated_quat_LS
-    if stated is not None:
-        return stated
-    if recording.sensors[segment].ready:
+    if stated is None and recording.sensors[segment].ready:
         return np.array([0.0, 0.0, 0.0, 1.0])  # orientations of segments, from a device that aligned them itself
-    raise BadSession(
-        f'{recording.where()}: sensors.{segment}.mount is not known: state it, as in mount = {{ up = "+x", '
-        f'forward = "-z" }}, or give a subject with calibrated mounts'
-    )
+    return stated
 
 
 def _covariance_W(
@@ -176,7 +216,7 @@ def _covariance_W(
     cov_W = R @ orientation.attitude_cov @ R.swapaxes(1, 2)
     # Each rest measures the tilt anew with the same accelerometer bias, which averaging does not take away.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
-    known = _mount_covariance(recording, segment, subject)
+    known = mount_covariance(recording, segment, subject)
     if known is not None:
         # A mount's error ε in L turns R_WL by R_WL ε. Its heading was taken for the world's, so that it turns R_WL
         # into Rz(δ) R_WL Rz(δ)ᵀ, which is nothing in the start pose; the pose weighed in on its tilt.
@@ -188,7 +228,8 @@ def _covariance_W(
     return cov_W
 
 
-def _mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
+def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
+    """Covariance (3, 3) [rad²] of a calibrated mount's error in L, where it holds for this strapping and is known."""
     return None if subject is None or recording.strapping == "new" else subject.mount_covariance(segment)
 
 

@@ -480,7 +480,7 @@ def bench(
     Example: wepose bench --quick --save before.json
 
     Args:
-        quick: Less than half a minute in place of some minutes: shorter data, fewer rounds.
+        quick: Less than half a minute in place of two: shorter data, fewer rounds, nothing compiled anew.
         data: Folder of real recordings (broad/, wepose_hr/) to measure accuracy on; WEPOSE_DATA names one too.
         save: Write the figures there, with versions, machine and date, as JSON.
         compare: A file that --save wrote: then/now shows how much slower each was then, by its ratio to VQF.

@@ -122,9 +122,10 @@ def estimate_orientation(
     if not np.isfinite(gyro).all() or not np.isfinite(accel).all():
         raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
     if still is None:
+        found = "finds in motion, in a minute or so" if method in ("amekf", "smoother") else "does not find in motion"
         warnings.warn(
-            f"no still phase: noise is that of a usual sensor and the gyroscope's bias starts at zero, which '{method}' "
-            + ("finds in motion, in a minute or so" if method in ("amekf", "smoother") else "does not find in motion"),
+            "no still phase: noise is that of a usual sensor, and the gyroscope's bias starts at zero, "
+            f"which '{method}' {found}",
             stacklevel=2,
         )
         return run_filter(gyro, accel, rate_hz, TYPICAL, method, params, static_test)

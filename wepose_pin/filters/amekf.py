@@ -2,10 +2,10 @@
 
 No single acceleration is trusted. The specific force, turned into the almost-inertial frame of the gyroscope, is summed
 to a horizontal velocity and position; a tilt error of a degree would send them off by 8 m in 10 s, and a person's
-segment does not go there. That is the idea of VQF's low-pass in that frame (Laidig and Seel 2023, Information Fusion 91)
-as a Kalman filter, so that the same innovations also teach it the gyroscope's own errors: bias, scale and misalignment
-(the usual 3×3), and what the bias differs by in motion from that at rest. Turns about horizontal axes make these visible
-through gravity, and the heading, which nothing measures, is better for it.
+segment does not go there. That is the idea of VQF's low-pass in that frame (Laidig and Seel 2023, Information Fusion
+91) as a Kalman filter, so that the same innovations also teach it the gyroscope's own errors: bias, scale and
+misalignment (the usual 3×3), and what the bias differs by in motion from that at rest. Turns about horizontal axes make
+these visible through gravity, and the heading, which nothing measures, is better for it.
 
 The 25 error states, additive but for the attitude: θ [rad] on the left (in W), so that one over a turn stays what it
 is; horizontal velocity [m/s] and position [m]; gyroscope bias at rest [rad/s]; gyroscope matrix M, rows first
@@ -20,6 +20,7 @@ static phase, Lisini Baldi 2019) velocity is zero and the gyroscope reads its bi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +28,7 @@ import numpy as np
 from ..errors import BadOption
 from ..noise import SensorNoise
 from ..so3 import inlined, kernel
+from ..static import static_step
 from .base import HIGHEST_ACCEL, HIGHEST_RATE, FilterRun, OneSample, samples
 
 # Error states
@@ -47,7 +49,8 @@ _PARAMETERS = (
 ).split()
 
 # A tape row, for the smoother: transition sums (45), the block's length [s], variance of the turn lost in it, number of
-# measurements; for each the state it is of, 1/√s, innovation/√s and P h/√s; then of some states their correction and their rows of P after it.
+# measurements; for each the state it is of, 1/√s, innovation/√s and P h/√s; then of some states their correction and
+# their rows of P after it.
 TAPE_ROWS = (0, 1, 2, _B, _B + 1, _B + 2, _D, _D + 1, _D + 2)
 MEASUREMENTS = 5
 TAPE_LENGTH, TAPE_LOST, TAPE_MEASURED, TAPE_FIRST = 45, 46, 47, 48
@@ -101,16 +104,22 @@ class AmekfParams:
                 raise BadOption(f"{name} = {value}: a number above 0 is needed (0 switches off what is no bound)")
 
 
-@dataclass
-class AmekfState:
-    """All that goes from sample to sample, so that a run may be cut anywhere."""
+# The state of a sensor is one row of numbers, so that it may be cut anywhere and a bank of sensors stacks them: quat_WS
+# xyzw, bias as stated [rad/s], the attitude's covariance in S as an upper triangle (these three where smekf has them),
+# x, P, sums, kept, samples in the open block; then room for a block's end, which is no state.
+_X, _COV, _SUM, _KEEP, _COUNT, _ROOM = 13, 38, 663, 717, 721, 722
+STATE_SIZE = _ROOM + 9 + 7 * STATES + STATES * 7 + 7 * 7 + STATES + STATES
 
-    quat_WS: np.ndarray  # (4,) xyzw
-    x: np.ndarray  # (25,) the states as the module says; the first three, the attitude's error, stay zero
-    P: np.ndarray  # (25, 25)
-    sums: np.ndarray  # (54,) over the block that is open
-    kept: np.ndarray  # (4,) last good rate [rad/s] and for how long it has been held [s]
-    count: np.ndarray  # (1,) samples in the open block
+
+class AmekfState:
+    """Views of the row of numbers that the compiled steps work on."""
+
+    def __init__(self, row: np.ndarray) -> None:
+        self.row = row  # (1180,)
+        self.quat_WS = row[:4]  # (4,) xyzw
+        self.gyro_bias = row[4:7]  # (3,) [rad/s]
+        self.x = row[_X:_COV]  # (25,) the states as the module says; the attitude's error stays zero
+        self.P = row[_COV:_SUM].reshape(STATES, STATES)
 
 
 class Amekf:
@@ -118,10 +127,10 @@ class Amekf:
 
     What bad data does: a NaN sample of gyro holds the last rate, which fades in 0.1 s, and the attitude's covariance
     grows with the time squared; a NaN sample of accel counts as gravity alone, and the velocity's covariance grows; a
-    sample beyond the ranges in `params` does the same, but is used. A knock (a velocity change that cannot be) moves
-    velocity, which is corrected at reduced weight. A bias that jumps is taken over at the next rest at once. Without any
-    rest all is learned in motion, in a minute or so. Time is not an input: gaps, repeated and late samples are
-    the readers' to mend.
+    sample beyond the ranges in `params` does the same, but is used. What a knock (`AmekfParams.knock`) adds to velocity
+    is not believed. A bias that jumps is taken over at the next rest at once; until then it tilts by some degrees.
+    Without any rest all is learned in motion, the tilt in ten seconds, the others in a minute or so. Time is not an
+    input: gaps, repeated and late samples are the readers' to mend.
     """
 
     def __init__(
@@ -152,9 +161,13 @@ class Amekf:
             "accel_limit": p.accel_range,
             "knock": p.knock,
         }
-        self._numbers = np.array([known[name] for name in _PARAMETERS])
-        self._accel = np.linalg.inv(np.eye(3) + p.accel_matrix)  # measured to true
-        x, P = np.zeros(STATES), np.zeros((STATES, STATES))
+        accel = np.linalg.inv(np.eye(3) + p.accel_matrix)  # measured to true
+        self.model = np.concatenate(
+            [[known[name] for name in _PARAMETERS], accel.ravel(), [1.0 / rate_hz, float(self.block)]]
+        )
+        self.state = AmekfState(np.zeros(STATE_SIZE))
+        self.state.quat_WS[:], self.state.gyro_bias[:] = quat_WS, noise.gyro_bias
+        x, P = self.state.x, self.state.P
         x[_B : _B + 3], x[_M : _M + 9], x[_F : _F + 3] = noise.gyro_bias, p.gyro_matrix.ravel(), p.accel_bias
         stds = np.zeros(STATES)
         stds[:3] = p.tilt_std, p.tilt_std, 1e-5  # the heading of the start is zero by definition
@@ -162,10 +175,12 @@ class Amekf:
         stds[_M : _M + 9], stds[_F : _F + 3], stds[_D : _D + 3] = p.gyro_matrix_std, p.accel_bias_std, p.motion_bias_std
         np.fill_diagonal(P, stds**2)
         P[_B : _B + 3, _B : _B + 3] = noise.gyro_bias_cov
-        self.state = AmekfState(np.array(quat_WS, dtype=float), x, P, np.zeros(_SUMS), np.zeros(_KEPT), np.zeros(1, int))
         self._one = OneSample()
-        shapes = (9,), (7, STATES), (STATES, 7), (7, 7), (STATES,), (STATES,)
-        self._scratch = [np.zeros(shape) for shape in shapes]  # for the step, which makes no array of its own
+
+    @property
+    def live(self) -> Callable[..., None]:
+        """The kernel that steps many sensors at a time (`bank.LiveBank`)."""
+        return _live
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
         return self.taped(gyro_S, accel_S, static, _NO_TAPE)
@@ -173,29 +188,15 @@ class Amekf:
     def taped(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, tape: np.ndarray) -> FilterRun:
         """`run` that writes a row of `tape` (blocks, `TAPE`) at the end of each block as well."""
         gyro, accel, at_rest = samples(gyro_S, accel_S, static)
-        out = FilterRun(np.empty((len(gyro), 4)), np.empty((len(gyro), 3)), np.empty((len(gyro), 3, 3)))
-        self._go(gyro, accel, at_rest, tape, *out)
-        return out
+        out = np.empty((len(gyro), 4)), np.empty((len(gyro), 3)), np.empty((len(gyro), 3, 3))
+        _run(self.state.row, self.model, gyro, accel, at_rest, tape, *out)
+        return FilterRun(*out)
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
         one = self._one
-        self._go(*one.fill(gyro_S, accel_S, static), _NO_TAPE, one.quat_WS, one.gyro_bias, one.attitude_cov)
+        sample = one.fill(gyro_S, accel_S, static)
+        _run(self.state.row, self.model, *sample, _NO_TAPE, one.quat_WS, one.gyro_bias, one.attitude_cov)
         return one.quat_WS[0].copy()
-
-    def _go(
-        self,
-        gyro: np.ndarray,
-        accel: np.ndarray,
-        static: np.ndarray,
-        tape: np.ndarray,
-        quat: np.ndarray,
-        bias: np.ndarray,
-        cov: np.ndarray,
-    ) -> None:
-        s = self.state
-        state = s.quat_WS, s.x, s.P, s.sums, s.kept, s.count
-        model = 1.0 / self.rate_hz, self.block, self._numbers, self._accel
-        _run(*state, gyro, accel, static, *model, tape, *self._scratch, quat, bias, cov)
 
 
 @inlined
@@ -255,9 +256,14 @@ def transition_rows(sums, length, gravity, P, out):  # type: ignore[no-untyped-d
             out[5 + i, j] = P[_P + i, j] + t * (P[_V + i, j] + out[3 + i, j])
 
 
-@inlined
-def _close(quat, x, P, sums, dt, count, numbers, tape, row, rows, columns, corner, d, scaled):  # type: ignore[no-untyped-def]
+@kernel
+def _close(state, quat, x, P, sums, dt, numbers, tape, row):  # type: ignore[no-untyped-def]
     """End a block: propagate P over it, correct by what bounds the motion, or by rest."""
+    at = _ROOM + 9
+    rows, columns = state[at : at + 175].reshape((7, STATES)), state[at + 175 : at + 350].reshape((STATES, 7))
+    corner = state[at + 350 : at + 399].reshape((7, 7))
+    d, scaled = state[at + 399 : at + 424], state[at + 424 : at + 449]
+    count = numbers[28]
     gravity, gyro_noise, accel_noise = numbers[0], numbers[1], numbers[2]
     speed, position, zero_speed = numbers[3], numbers[4], numbers[5]
     rate_noise, force_noise, bias_walk, matrix_walk = numbers[6], numbers[7], numbers[8], numbers[9]
@@ -354,16 +360,26 @@ def _close(quat, x, P, sums, dt, count, numbers, tape, row, rows, columns, corne
 
 @inlined
 def into_sensor(R, P, more, out):  # type: ignore[no-untyped-def]
-    """``out = Rᵀ P R + more I`` of symmetric 3×3 `P`; `R` (9,) rows first."""
+    """Upper triangle `out` (6,) of ``Rᵀ P R + more I`` of symmetric 3×3 `P`; `R` (9,) rows first."""
     xx, xy, xz, yy, yz, zz = P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2]
-    for j in range(3):
-        a, b, c = R[j], R[3 + j], R[6 + j]
+    at = 0
+    for i in range(3):
+        a, b, c = R[i], R[3 + i], R[6 + i]
         u, v, w = xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c
-        for i in range(j + 1):
-            s = R[i] * u + R[3 + i] * v + R[6 + i] * w
-            out[i, j] = s
-            out[j, i] = s
-        out[j, j] += more
+        for j in range(i, 3):
+            out[at] = R[j] * u + R[3 + j] * v + R[6 + j] * w
+            at += 1
+    out[0] += more
+    out[3] += more
+    out[5] += more
+
+
+@inlined
+def fill_symmetric(upper, out):  # type: ignore[no-untyped-def]
+    """`out` (3, 3) of its upper triangle (6,)."""
+    out[0, 0], out[0, 1], out[0, 2] = upper[0], upper[1], upper[2]
+    out[1, 0], out[1, 1], out[1, 2] = upper[1], upper[3], upper[4]
+    out[2, 0], out[2, 1], out[2, 2] = upper[2], upper[4], upper[5]
 
 
 @inlined
@@ -377,109 +393,111 @@ def matrix_of(quat, R):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _run(  # type: ignore[no-untyped-def]
-    quat,
-    x,
-    P,
-    sums,
-    kept,
-    count,
-    gyro_S,
-    accel_S,
-    static,
-    dt,
-    block,
-    numbers,
-    accel_matrix,
-    tape,
-    R,
-    rows,
-    columns,
-    corner,
-    d,
-    scaled,
-    out_quat,
-    out_bias,
-    out_cov,
-):
-    gravity, lost_rate, gyro_limit, accel_limit = numbers[0], numbers[13], numbers[15], numbers[16]
-    knock = numbers[17]
+def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: ignore[no-untyped-def]
+    """One sample of one sensor: `state` (1180,), `model` (29,), gyro [rad/s], accel [m/s²]; whether a block ended."""
+    quat, x, sums, kept, R = state[:4], state[_X:_COV], state[_SUM:_KEEP], state[_KEEP:_COUNT], state[_ROOM : _ROOM + 9]
+    P = state[_COV:_SUM].reshape((STATES, STATES))
+    gravity, lost_rate, gyro_limit, accel_limit, knock = model[0], model[13], model[15], model[16], model[17]
+    dt = model[27]
+    moving = 0.0 if static else 1.0
+    bx, by, bz = x[_B] + moving * x[_D], x[_B + 1] + moving * x[_D + 1], x[_B + 2] + moving * x[_D + 2]
+    if gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE:  # false for NaN
+        ux, uy, uz = gx - bx, gy - by, gz - bz
+        good = max(abs(gx), abs(gy), abs(gz)) < gyro_limit
+        sums[_GYRO] += gx
+        sums[_GYRO + 1] += gy
+        sums[_GYRO + 2] += gz
+        sums[_STATIC] += 1.0 - moving
+    else:
+        fade = 1.0 - min(1.0, dt / _FADE_S)
+        ux, uy, uz = fade * kept[_HELD], fade * kept[_HELD + 1], fade * kept[_HELD + 2]
+        good = False
+    kept[_HELD], kept[_HELD + 1], kept[_HELD + 2] = ux, uy, uz
+    if good:
+        kept[_HELD_S] = 0.0
+    else:
+        held = kept[_HELD_S]
+        if held * lost_rate < _LOST:
+            sums[_LOST_TURN] += lost_rate * lost_rate * dt * (2.0 * held + dt)
+        kept[_HELD_S] = held + dt
+
+    wx = ux - (x[_M] * ux + x[_M + 1] * uy + x[_M + 2] * uz)
+    wy = uy - (x[_M + 3] * ux + x[_M + 4] * uy + x[_M + 5] * uz)
+    wz = uz - (x[_M + 6] * ux + x[_M + 7] * uy + x[_M + 8] * uz)
+    sums[_RATE2] += wx * wx + wy * wy + wz * wz
+    s, ew = _series(0.25 * dt * dt * (wx * wx + wy * wy + wz * wz))
+    s *= 0.5 * dt
+    ex, ey, ez = s * wx, s * wy, s * wz
+    qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]
+    rx = qw * ex + qx * ew + qy * ez - qz * ey
+    ry = qw * ey - qx * ez + qy * ew + qz * ex
+    rz = qw * ez + qx * ey - qy * ex + qz * ew
+    rw = qw * ew - qx * ex - qy * ey - qz * ez
+    norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)  # 1/√, to first order: it is 1 but for rounding
+    quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
+    matrix_of(quat, R)
+    for i in range(9):
+        sums[i] += R[i]
+        sums[9 + i] += R[i] * ux
+        sums[18 + i] += R[i] * uy
+        sums[27 + i] += R[i] * uz
+        sums[_MOVING + i] += R[i] * moving
+
+    if ax * ax + ay * ay + az * az < HIGHEST_ACCEL * HIGHEST_ACCEL:
+        if max(abs(ax), abs(ay), abs(az)) >= accel_limit:
+            sums[_LOST_FORCE] += dt
+        ax, ay, az = ax - x[_F], ay - x[_F + 1], az - x[_F + 2]
+        fx = model[18] * ax + model[19] * ay + model[20] * az
+        fy = model[21] * ax + model[22] * ay + model[23] * az
+        fz = model[24] * ax + model[25] * ay + model[26] * az
+        ax = R[0] * fx + R[1] * fy + R[2] * fz
+        ay = R[3] * fx + R[4] * fy + R[5] * fz
+        az = R[6] * fx + R[7] * fy + R[8] * fz - gravity
+        size = np.sqrt(ax * ax + ay * ay + az * az)
+        sums[_FORCE] += size
+        sums[_KNOCK] += max(0.0, size - knock)
+    else:
+        sums[_LOST_FORCE] += dt
+        ax = ay = 0.0
+    x[_P] += dt * x[_V]
+    x[_P + 1] += dt * x[_V + 1]
+    x[_V] += dt * ax
+    x[_V + 1] += dt * ay
+
+    state[_COUNT] += 1.0
+    full = state[_COUNT] == model[28]
+    if full:
+        _close(state, quat, x, P, sums, dt, model, tape, row)
+        state[_COUNT] = 0.0
+        matrix_of(quat, R)
+    state[4], state[5], state[6] = bx, by, bz
+    into_sensor(R, P, sums[_LOST_TURN], state[7:13])
+    return full
+
+
+@kernel
+def _run(state, model, gyro_S, accel_S, static, tape, out_quat, out_bias, out_cov):  # type: ignore[no-untyped-def]
     row = 0
     for k in range(len(gyro_S)):
-        moving = 0.0 if static[k] else 1.0
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
-        bx, by, bz = x[_B] + moving * x[_D], x[_B + 1] + moving * x[_D + 1], x[_B + 2] + moving * x[_D + 2]
-        if gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE:  # false for NaN
-            ux, uy, uz = gx - bx, gy - by, gz - bz
-            good = max(abs(gx), abs(gy), abs(gz)) < gyro_limit
-            sums[_GYRO] += gx
-            sums[_GYRO + 1] += gy
-            sums[_GYRO + 2] += gz
-            sums[_STATIC] += 1.0 - moving
-        else:
-            fade = 1.0 - min(1.0, dt / _FADE_S)
-            ux, uy, uz = fade * kept[_HELD], fade * kept[_HELD + 1], fade * kept[_HELD + 2]
-            good = False
-        kept[_HELD], kept[_HELD + 1], kept[_HELD + 2] = ux, uy, uz
-        if good:
-            kept[_HELD_S] = 0.0
-        else:
-            held = kept[_HELD_S]
-            if held * lost_rate < _LOST:
-                sums[_LOST_TURN] += lost_rate * lost_rate * dt * (2.0 * held + dt)
-            kept[_HELD_S] = held + dt
-
-        wx = ux - (x[_M] * ux + x[_M + 1] * uy + x[_M + 2] * uz)
-        wy = uy - (x[_M + 3] * ux + x[_M + 4] * uy + x[_M + 5] * uz)
-        wz = uz - (x[_M + 6] * ux + x[_M + 7] * uy + x[_M + 8] * uz)
-        sums[_RATE2] += wx * wx + wy * wy + wz * wz
-        s, ew = _series(0.25 * dt * dt * (wx * wx + wy * wy + wz * wz))
-        s *= 0.5 * dt
-        ex, ey, ez = s * wx, s * wy, s * wz
-        qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]
-        rx = qw * ex + qx * ew + qy * ez - qz * ey
-        ry = qw * ey - qx * ez + qy * ew + qz * ex
-        rz = qw * ez + qx * ey - qy * ex + qz * ew
-        rw = qw * ew - qx * ex - qy * ey - qz * ez
-        norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)  # 1/√, to first order: it is 1 but for rounding
-        quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
-        matrix_of(quat, R)
-        for i in range(9):
-            sums[i] += R[i]
-            sums[9 + i] += R[i] * ux
-            sums[18 + i] += R[i] * uy
-            sums[27 + i] += R[i] * uz
-            sums[_MOVING + i] += R[i] * moving
-
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
-        if ax * ax + ay * ay + az * az < HIGHEST_ACCEL * HIGHEST_ACCEL:
-            if max(abs(ax), abs(ay), abs(az)) >= accel_limit:
-                sums[_LOST_FORCE] += dt
-            ax, ay, az = ax - x[_F], ay - x[_F + 1], az - x[_F + 2]
-            fx = accel_matrix[0, 0] * ax + accel_matrix[0, 1] * ay + accel_matrix[0, 2] * az
-            fy = accel_matrix[1, 0] * ax + accel_matrix[1, 1] * ay + accel_matrix[1, 2] * az
-            fz = accel_matrix[2, 0] * ax + accel_matrix[2, 1] * ay + accel_matrix[2, 2] * az
-            ax = R[0] * fx + R[1] * fy + R[2] * fz
-            ay = R[3] * fx + R[4] * fy + R[5] * fz
-            az = R[6] * fx + R[7] * fy + R[8] * fz - gravity
-            size = np.sqrt(ax * ax + ay * ay + az * az)
-            sums[_FORCE] += size
-            sums[_KNOCK] += max(0.0, size - knock)
-        else:
-            sums[_LOST_FORCE] += dt
-            ax = ay = 0.0
-        x[_P] += dt * x[_V]
-        x[_P + 1] += dt * x[_V + 1]
-        x[_V] += dt * ax
-        x[_V + 1] += dt * ay
-
-        count[0] += 1
-        if count[0] == block:
-            _close(quat, x, P, sums, dt, block, numbers, tape, row, rows, columns, corner, d, scaled)
-            count[0] = 0
+        if step(state, model, gx, gy, gz, ax, ay, az, static[k], tape, row):
             row += 1
-            matrix_of(quat, R)
         for i in range(4):
-            out_quat[k, i] = quat[i]
-        out_bias[k, 0], out_bias[k, 1], out_bias[k, 2] = bx, by, bz
-        into_sensor(R, P, sums[_LOST_TURN], out_cov[k])
+            out_quat[k, i] = state[i]
+        for i in range(3):
+            out_bias[k, i] = state[4 + i]
+        fill_symmetric(state[7:13], out_cov[k])
+
+
+@kernel
+def _live(  # type: ignore[no-untyped-def]
+    rows, models, block, tail, head, anchor, counts, limits, gyro_S, accel_S, static
+):
+    """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `bank.LiveBank` has them."""
+    for i in range(len(rows)):
+        gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]
+        ax, ay, az = accel_S[i, 0], accel_S[i, 1], accel_S[i, 2]
+        still = static_step(block[i], tail[i], head[i], anchor[i], counts[i], limits[i], gx, gy, gz, ax, ay, az)
+        static[i] = still
+        step(rows[i], models[i], gx, gy, gz, ax, ay, az, still, models[:0], 0)  # no tape

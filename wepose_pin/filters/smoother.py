@@ -31,6 +31,7 @@ from .amekf import (
     TAPE_STEP,
     Amekf,
     AmekfParams,
+    fill_symmetric,
     into_sensor,
     matrix_of,
     turn_left,
@@ -66,7 +67,7 @@ class Smoother:
         _between(tape, deviation, cov, float(np.trace(start[:3, :3])), forward.block, at_rest, *out)
         return out
 
-    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
+    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:  # noqa: ARG002
         """There is none.
 
         Raises
@@ -171,11 +172,12 @@ def _backward(tape, start, gravity):  # type: ignore[no-untyped-def]
 def _between(tape, deviation, cov, start_trace, block, static, quat, bias, attitude_cov):  # type: ignore[no-untyped-def]
     """Correct the filter's run in place, sample by sample, between the corrections of its block's ends.
 
-    What gyro lost within a block is a bridge between them: of the variance up to a sample, and from it to the end, the
-    product over the sum is left.
+    They are taken in proportion to the time, or, where gyro was lost, to the variance of the turn that was lost up to
+    the sample; of that and the variance from there to the end, the product over the sum is left, as in any bridge.
     """
     R = np.empty(9)
     P = np.empty((3, 3))
+    upper = np.empty(6)
     e = np.empty(_SHARED)
     blocks = len(tape)
     for k in range(len(quat)):
@@ -190,12 +192,6 @@ def _between(tape, deviation, cov, start_trace, block, static, quat, bias, attit
         else:
             share = (k % block + 1) / block
             whole = k % block + 1 == block  # the filter has corrected this quaternion, not the bias it stated with it
-            for n in range(_SHARED):
-                after = deviation[row + 1, n] + (0.0 if whole and n < 3 else tape[row, TAPE_D + n])
-                e[n] = (1.0 - share) * deviation[row, n] + share * after
-            for i in range(3):
-                for j in range(3):
-                    P[i, j] = (1.0 - share) * cov[row, i, j] + share * cov[row + 1, i, j]
             lost = tape[row, TAPE_LOST]
             if lost > 0.0 and not whole:
                 before = start_trace
@@ -205,10 +201,18 @@ def _between(tape, deviation, cov, start_trace, block, static, quat, bias, attit
                         before += tape[row - 1, TAPE_P + (STATES + 1) * i]
                 so_far = attitude_cov[k, 0, 0] + attitude_cov[k, 1, 1] + attitude_cov[k, 2, 2]
                 so_far = min(max(0.0, (so_far - before) / 3.0), lost)
-                bridge = so_far * (lost - so_far) / lost
+                share = so_far / lost
+                bridge = so_far * (1.0 - share)
+            for n in range(_SHARED):
+                after = deviation[row + 1, n] + (0.0 if whole and n < 3 else tape[row, TAPE_D + n])
+                e[n] = (1.0 - share) * deviation[row, n] + share * after
+            for i in range(3):
+                for j in range(3):
+                    P[i, j] = (1.0 - share) * cov[row, i, j] + share * cov[row + 1, i, j]
         turn_left(quat[k], e[0], e[1], e[2])
         moving = 0.0 if static[k] else 1.0
         for c in range(3):
             bias[k, c] += e[3 + c] + moving * e[6 + c]
         matrix_of(quat[k], R)
-        into_sensor(R, P, bridge, attitude_cov[k])
+        into_sensor(R, P, bridge, upper)
+        fill_symmetric(upper, attitude_cov[k])
