@@ -25,7 +25,7 @@ stand out of the rest and lose their weight.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -84,6 +84,8 @@ class Calibration:
     drift : segment → [rad/s] of its sensor's heading
     hinge : side → (3,) the elbow's axis in the upper arm's frame, unit length, y towards the left
     hinge_rms : side → [rad] of the forearm against the plane of that hinge
+    learned : name as in the subject's covariance, or ``left_forearm + left_hand`` → (n,) share of what is known of it
+        that each look brought; their sum and what was known before make 1
     """
 
     subject: Subject
@@ -102,6 +104,7 @@ class Calibration:
     drift: Mapping[str, float]
     hinge: Mapping[str, np.ndarray]
     hinge_rms: Mapping[str, float]
+    learned: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def calibrate(
@@ -178,7 +181,7 @@ def _solve(
     looks = Looks(layout, np.vstack([*turned, recording.time[at] - found.start[1]]))
     center, information = _before(recording, found, looks, prior, gauge, gauge_std)
 
-    fit, weight, independent = _weighed(looks, center, information)
+    fit, weights, weight, independent = _weighed(looks, center, information)
     lengths = fit.x[:K]
     if np.min(lengths) < 0.01:
         raise NoSolution(
@@ -229,6 +232,7 @@ def _solve(
         drift=dict(zip(layout.sensors, fit.x[layout.drift].tolist(), strict=True)),
         hinge={side: axis / np.linalg.norm(axis) for side, axis in zip(SIDES, axes, strict=True)},
         hinge_rms={side: HINGE_STD * _rms(r) for side, r in zip(SIDES, fit.hinge.T, strict=True)},
+        learned=_learned(fit.x, looks, weights, covariance),
     )
 
 
@@ -298,8 +302,8 @@ def _mount_information(recording: Recording, segment: str, prior: Subject) -> np
     return np.diag([0.0, 0.0, STATED_STD**-2])
 
 
-def _weighed(looks: Looks, center: np.ndarray, information: np.ndarray) -> tuple[Fit, np.ndarray, float]:
-    """The fit, the weight (n,) that each look's gap kept, and how many independent looks it is worth.
+def _weighed(looks: Looks, center: np.ndarray, information: np.ndarray) -> tuple[Fit, np.ndarray, np.ndarray, float]:
+    """The fit, the weights (n, 5), the weight (n,) that each look's gap kept, how many independent looks it is worth.
 
     Gap and hinges are weighed by their own residuals: variance, and how long it stays correlated.
     """
@@ -321,7 +325,7 @@ def _weighed(looks: Looks, center: np.ndarray, information: np.ndarray) -> tuple
             weights[:, columns] = of[:, None] / (correlated * variance)
             if columns.start == 0:
                 independent = float(of.sum()) / correlated
-    return solve(looks, center, information, weights, x), kept, independent
+    return solve(looks, center, information, weights, x), weights, kept, independent
 
 
 def _handed_on(layout: Layout, covariance: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
@@ -334,6 +338,21 @@ def _handed_on(layout: Layout, covariance: np.ndarray) -> tuple[tuple[str, ...],
         take[K + 3 * i + 1, layout.tilt.start + 2 * i + 1] = -1.0
         take[K + 3 * i + 2, layout.heading.start + i] = 1.0
     return (*LENGTHS, *rows), take @ covariance @ take.T
+
+
+def _learned(x: np.ndarray, looks: Looks, weights: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndarray]:
+    """Which share of what is known each look brought: C = C (Σ Jᵀ W J + Λ) C, over C, is a sum to 1."""
+    layout, unit = looks.layout, np.eye(looks.layout.size)
+    of = dict(zip(LENGTHS, unit[:K], strict=True))
+    of |= {f"{s}_forearm + {s}_hand": of[f"{s}_forearm"] + of[f"{s}_hand"] for s in SIDES}
+    for i, name in enumerate(layout.sensors):
+        rows = (layout.tilt.start + 2 * i, layout.tilt.start + 2 * i + 1, layout.heading.start + i)
+        of |= dict(zip(mount_rows(name), unit[list(rows)], strict=True))
+    T = np.array(list(of.values()))
+    _, J, _ = residuals(x, looks)
+    moved = J @ covariance @ T.T  # (n, 5, k)
+    share = np.einsum("ni,nik->kn", weights, moved**2) / np.einsum("ki,ij,kj->k", T, covariance, T)[:, None]
+    return dict(zip(of, share, strict=True))
 
 
 def _mount(found: Filtered, x: np.ndarray, layout: Layout, name: str) -> Rotation:

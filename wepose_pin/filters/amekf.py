@@ -256,7 +256,7 @@ def transition_rows(sums, length, gravity, P, out):  # type: ignore[no-untyped-d
             out[5 + i, j] = P[_P + i, j] + t * (P[_V + i, j] + out[3 + i, j])
 
 
-@kernel
+@inlined
 def _close(state, quat, x, P, sums, dt, numbers, tape, row):  # type: ignore[no-untyped-def]
     """End a block: propagate P over it, correct by what bounds the motion, or by rest."""
     at = _ROOM + 9
@@ -392,7 +392,7 @@ def matrix_of(quat, R):  # type: ignore[no-untyped-def]
     R[6], R[7], R[8] = x * z2 - w * y2, y * z2 + w * x2, 1.0 - x * x2 - y * y2
 
 
-@kernel
+@inlined
 def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: ignore[no-untyped-def]
     """One sample of one sensor: `state` (1180,), `model` (29,), gyro [rad/s], accel [m/s²]; whether a block ended."""
     quat, x, sums, kept, R = state[:4], state[_X:_COV], state[_SUM:_KEEP], state[_KEEP:_COUNT], state[_ROOM : _ROOM + 9]

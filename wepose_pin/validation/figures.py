@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from PIL import Image
 
+from ..page import ACCENT, FONT, INK, LINE, SOFT, STYLE, Picture, capital, new_figure, png_of, stem
 from .document import Document
 from .findings import FROM, OURS, TARGETS, WATERFALL, Waterfall, waterfall
 from .jobs import Result
 from .tables import AXES, HAND, SPLIT, Row, figures, name_and_unit, paper_figures, summary
 from .words import AS_IT_COMES
 
-INK, SOFT, LINE, ACCENT = "#1d2935", "#66758a", "#d5dbe3", "#24618f"  # as in viewer_page.html
 COLOURS = {
     "smekf": ACCENT,
     "amekf": "#3fa7c9",
@@ -38,28 +34,7 @@ COLOURS = {
 OTHERS = ("#b23a48", "#6c757d", "#7a9e1f", "#5f4bb6")
 TRUTH: dict[str, Any] = {"color": INK, "linestyle": (0, (2, 1.5))}
 THEIRS: dict[str, Any] = {"facecolor": "white", "edgecolor": SOFT, "hatch": "//////"}  # the paper's bars
-DPI = 144
-COLOURS_A_PNG = 160
 WINDOWS = 60  # of the running root mean square, over a curve's time
-WIDTH = 9.0  # [in]
-FONT = 9.0  # [pt]
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib
-    "font.size": FONT,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "axes.titlesize": FONT + 0.5,
-    "legend.fontsize": FONT,
-    "hatch.linewidth": 0.5,
-}
-
-
-class Picture(NamedTuple):
-    """One figure of one experiment."""
-
-    stem: str  # of its file
-    caption: str
-    png: bytes
 
 
 def pictures(document: Document) -> Iterator[tuple[str, Picture]]:
@@ -74,13 +49,8 @@ def pictures(document: Document) -> Iterator[tuple[str, Picture]]:
                 if drawn is None:
                     continue
                 kind, caption, figure = drawn
-                picture = Picture(f"{stem(experiment)}-{kind}", caption, _png(figure))
+                picture = Picture(f"{stem(experiment)}-{kind}", caption, png_of(figure))
             yield experiment, picture
-
-
-def stem(experiment: str) -> str:
-    """An experiment's name as a file's: "upper body, realistic" → "upper-body-realistic"."""
-    return re.sub(r"[^a-z0-9]+", "-", experiment.lower().replace("'", "")).strip("-") or "experiment"
 
 
 _Drawn = tuple[str, str, Figure] | None
@@ -96,7 +66,7 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> _D
     if names is None or experiment == WATERFALL:
         return None
     paper = {row.method: paper_figures(experiment, row.method) for row in rows if row.method in COLOURS}
-    figure = _new(0.9 + 0.34 * len(rows))
+    figure = new_figure(0.9 + 0.34 * len(rows))
     panels: Sequence[Axes] = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     place = np.arange(len(rows))[::-1]
     for axes, name in zip(panels, names, strict=True):
@@ -124,7 +94,7 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> _D
         axes.grid(axis="x", color=LINE, linewidth=0.7)
     panels[0].set_yticks(place, [row.method for row in rows])
     panels[0].set_ylim(-0.6, len(rows) - 0.4 + (0.35 if experiment in TARGETS else 0.0))
-    caption = f"{_capital(experiment)}: {'error' if names not in wanted[:2] else 'mean error'}"
+    caption = f"{capital(experiment)}: {'error' if names not in wanted[:2] else 'mean error'}"
     caption += ", whiskers: one standard deviation over time" if f"{names[0]} std" in rows[0].figures else ""
     if any(paper.values()):
         _key(figure, [("ours", {"color": ACCENT}), ("the paper", THEIRS)])
@@ -138,7 +108,7 @@ def _trials(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> 
     trials = list(dict.fromkeys(result.trial for result in results))
     if len(trials) < 2 or not all(name in row.figures for row in rows for name in names):
         return None
-    figure = _new(1.3 + 0.3 * len(trials))
+    figure = new_figure(1.3 + 0.3 * len(trials))
     panels: Sequence[Axes] = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     place = {trial: -k for k, trial in enumerate(trials)}
     for axes, name in zip(panels, names, strict=True):
@@ -163,7 +133,7 @@ def _trials(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> 
     panels[0].tick_params(axis="y", labelsize=FONT - 1.5)
     panels[0].set_ylim(-len(trials) + 0.4, 0.6)
     _legend(figure, [row.method for row in rows], dots=True)
-    return "trials", f"{_capital(experiment)}: root mean square error of each trial, a dot a filter.", figure
+    return "trials", f"{capital(experiment)}: root mean square error of each trial, a dot a filter.", figure
 
 
 def _over_time(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> _Drawn:
@@ -181,7 +151,7 @@ def _over_time(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> 
         window = float(time[min(over, len(time) - 1)] - time[0])
         curves[method] = time, _running_rms(error, over)
     high = {method: float(np.nanpercentile(error, 95)) for method, (_, error) in curves.items()}
-    figure = _new(3.5)
+    figure = new_figure(3.5)
     axes = figure.add_subplot()
     for method in sorted(curves, key=lambda method: method == OURS):
         time, error = curves[method]
@@ -203,7 +173,7 @@ def _over_time(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> 
     axes.set_ylabel(unit)
     axes.grid(color=LINE, linewidth=0.7)
     _legend(figure, sorted(curves, key=lambda method: -high[method]))
-    caption = f"{_capital(experiment)}, trial {trial}: {unit.split(' [')[0]} over time"
+    caption = f"{capital(experiment)}, trial {trial}: {unit.split(' [')[0]} over time"
     caption += f", root mean square over {window:.2g} s" + (", logarithmic scale" if log else "")
     return "over-time", f"{caption}; the filters in the order of their errors, the largest first.", figure
 
@@ -219,7 +189,7 @@ def _paths(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> _Dra
     off = {m: [np.subtract(s[f"{axis}_mm"], s[f"true_{axis}_mm"]) for axis in "xyz"] for m, s in kept.items()}
     plain: list[str] = [m for m in ("ncf", "gdc") if m in kept] or [m for m in kept if m != first]
     others = sorted((m for m in plain if m != first), key=lambda m: float(np.mean(np.square(off[m]))))[-1:]
-    figure = _new(4.1)
+    figure = new_figure(4.1)
     panels: Sequence[Axes] = figure.subplots(1, 2)
     for axes, up, title in zip(panels, "zx", ("from behind", "from above"), strict=True):
         for method in [*others, first]:
@@ -233,7 +203,7 @@ def _paths(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> _Dra
         axes.set_ylabel({"z": "z, upwards [mm]", "x": "x, forwards [mm]"}[up])
         axes.grid(color=LINE, linewidth=0.7)
     _key(figure, [*((m, {"color": _colour(m)}) for m in [first, *others]), ("truth", TRUTH)], lines=True)
-    caption = f"{_capital(experiment)}, trial {trial}: the path of the right hand, in W, root of the trunk at zero"
+    caption = f"{capital(experiment)}, trial {trial}: the path of the right hand, in W, root of the trunk at zero"
     return "path", f"{caption}; {' and '.join([first, *others])} against the truth.", figure
 
 
@@ -246,7 +216,7 @@ def _waterfall(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> 
     ends += [("with none of them on", found.empty)] if found.empty else []
     ends += [(f"more: {part.name}", part.added) for part in found.more]
     names = list(found.full)
-    figure = _new(0.9 + 0.32 * len(ends))
+    figure = new_figure(0.9 + 0.32 * len(ends))
     panels: Sequence[Axes] = figure.subplots(1, len(names), sharey=True, sharex=True, squeeze=False)[0]
     place = np.arange(len(ends))[::-1]
     for axes, name in zip(panels, names, strict=True):
@@ -280,27 +250,6 @@ def _waterfall(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> 
 
 
 # How they look ------------------------------------------------------------------------------------------------------
-
-
-def _new(height: float) -> Figure:
-    return Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained", facecolor="white")
-
-
-def _png(figure: Figure) -> bytes:
-    """The figure's bytes; the same figure gives the same bytes."""
-    for axes in figure.axes:
-        axes.set_axisbelow(True)
-        axes.tick_params(which="both", color=SOFT, labelcolor=INK)
-        for side, spine in axes.spines.items():
-            spine.set_visible(side in ("left", "bottom"))
-            spine.set_color(SOFT)
-    out = io.BytesIO()
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-    pixels = Image.fromarray(drawn).convert("RGB")
-    pixels.quantize(COLOURS_A_PNG).save(out, "png", optimize=True)  # a third of the size; no eye sees it
-    return out.getvalue()
 
 
 def _running_rms(error: np.ndarray, over: int) -> np.ndarray:
@@ -378,7 +327,3 @@ def _dashes(method: str) -> Any:
 
 def _marker(method: str) -> str:
     return "D" if method.endswith(AS_IT_COMES) else "o"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

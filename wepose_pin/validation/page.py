@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
+from ..page import Block, Bullets, Heading, Picture, Table
+from ..page import as_html as one_file
+from ..page import markdown as as_markdown
 from .document import Document
-from .figures import Picture, pictures, stem
+from .figures import pictures
 from .findings import (
     ERRORS,
     OURS,
@@ -30,23 +29,6 @@ from .words import method_text, noise_text, words, world_text
 
 TITLE = "How wrong the estimates are"
 FOLDER = "validation"  # of the Markdown page's figures
-
-
-class Heading(NamedTuple):
-    text: str
-    level: int = 2
-
-
-class Bullets(NamedTuple):
-    items: list[str]
-
-
-class Table(NamedTuple):
-    header: list[str]
-    rows: list[list[str]]
-
-
-Block = str | Heading | Bullets | Table | Picture  # text: a paragraph
 
 
 def write_pages(folder: Path, document: Document) -> list[str]:
@@ -230,112 +212,11 @@ def _described(experiment: str, trials: int, document: Document) -> list[Block]:
     ]
 
 
-# Markdown and HTML ---------------------------------------------------------------------------------------------------
-
-
 def markdown(blocks: Sequence[Block]) -> str:
     """The page as Markdown, its figures in a folder beside it."""
-    out = []
-    for block in blocks:
-        match block:
-            case Heading(text, level):
-                out.append(f"{'#' * level} {text}")
-            case Bullets(items):
-                out.append("\n".join(f"- {item}" for item in items))
-            case Table(header, rows):
-                lines = [header, ["---", *["---" if _of_words(rows) else "---:"] * (len(header) - 1)], *rows]
-                escaped = [[cell.replace("|", "\\|") for cell in line] for line in lines]
-                out.append("\n".join(f"| {' | '.join(line)} |" for line in escaped))
-            case Picture(name, caption, _):
-                out.append(f"![{caption.replace('[', '(').replace(']', ')')}]({FOLDER}/{name}.png)\n\n*{caption}*")
-            case _:
-                out.append(block)
-    return "\n\n".join(out) + "\n"
+    return as_markdown(blocks, FOLDER)
 
 
 def as_html(blocks: Sequence[Block]) -> str:
     """The page as one HTML file with its figures in it."""
-    contents, out = [], []
-    for block in blocks:
-        match block:
-            case Heading(text, level):
-                name = stem(text)
-                if level > 1:
-                    contents.append(f'<a href="#{name}">{html.escape(text)}</a>')
-                out.append(f'<h{level} id="{name}">{html.escape(text)}</h{level}>')
-                if level == 1:
-                    out.append("@@contents@@")
-            case Bullets(items):
-                out.append(f"<ul>{''.join(f'<li>{_inline(item)}</li>' for item in items)}</ul>")
-            case Table(header, rows):
-                head = "".join(f"<th>{_inline(cell)}</th>" for cell in header)
-                lines = "".join(f"<tr>{''.join(f'<td>{_inline(cell)}</td>' for cell in row)}</tr>" for row in rows)
-                kind = ' class="words"' if _of_words(rows) else ""
-                table = f"<table{kind}><thead><tr>{head}</tr></thead><tbody>{lines}</tbody></table>"
-                out.append(f'<div class="wide">{table}</div>')
-            case Picture(_, caption, png):
-                data, text = base64.b64encode(png).decode("ascii"), _inline(caption)
-                image = f'<img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
-                out.append(f"<figure>{image}<figcaption>{text}</figcaption></figure>")
-            case _:
-                warning = ' class="warning"' if block.startswith("**") else ""
-                out.append(f"<p{warning}>{_inline(block)}</p>")
-    body = "\n".join(out).replace("@@contents@@", f"<nav>{' '.join(contents)}</nav>", 1)
-    return _HTML.replace("@@title@@", f"wepose validate: {html.escape(TITLE)}").replace("@@body@@", body)
-
-
-def _of_words(rows: Sequence[Sequence[str]]) -> bool:
-    """Tables of words are set to the left, and may break their lines."""
-    return any(len(cell) > 40 for row in rows for cell in row)
-
-
-def _inline(text: str) -> str:
-    text = html.escape(text)
-    text = re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
-    text = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", text)
-    return re.sub(r"\[([^\]]+)\]\((https://[^)]+)\)", r'<a href="\2">\1</a>', text)
-
-
-_HTML = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'; img-src data:">
-<title>@@title@@</title>
-<style>
-  :root { --ink: #1d2935; --soft: #66758a; --line: #d5dbe3; --accent: #24618f; }
-  * { box-sizing: border-box; }
-  body { margin: 0 auto; max-width: 1000px; padding: 28px 24px 60px; color: var(--ink); background: #fff;
-         font: 15px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-  h1 { margin: 0 0 10px; font-size: 28px; letter-spacing: -.01em; }
-  h2 { margin: 46px 0 8px; padding-top: 14px; border-top: 1px solid var(--line); font-size: 20px; }
-  p, ul { margin: 8px 0; max-width: 78ch; }
-  ul { padding-left: 20px; }
-  li { margin: 3px 0; }
-  a { color: var(--accent); }
-  nav { display: flex; flex-wrap: wrap; gap: 2px 16px; margin: 0 0 18px; font-size: 13.5px; }
-  code { padding: 0 3px; border-radius: 3px; background: #edf0f4; font-size: .92em; }
-  .warning { padding: 9px 13px; border-left: 4px solid #d9772b; background: #fdf3ea; }
-  .wide { margin: 14px 0 6px; overflow-x: auto; }
-  table { border-collapse: collapse; font-size: 13.5px; font-variant-numeric: tabular-nums; }
-  th, td { padding: 4px 12px 4px 0; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
-  th { color: var(--soft); font-weight: 600; border-bottom-color: var(--soft); vertical-align: bottom; }
-  th:first-child, td:first-child { text-align: left; }
-  .words th, .words td { text-align: left; white-space: normal; vertical-align: top; }
-  figure { margin: 20px 0; break-inside: avoid; }
-  figure img { display: block; width: 100%; max-width: 940px; height: auto; }
-  figcaption { color: var(--soft); font-size: 13px; max-width: 90ch; }
-  @media print {
-    body { max-width: none; padding: 0; font-size: 11pt; }
-    nav { display: none; }
-    h2 { break-after: avoid; }
-    tr { break-inside: avoid; }
-  }
-</style>
-</head>
-<body>
-@@body@@
-</body>
-</html>
-"""
+    return one_file(blocks, f"wepose validate: {TITLE}")
