@@ -18,7 +18,7 @@ else:
     simulation = wp.simulate(wp.average_subject(1.75, "f").lengths, seed=1, clasp_s=10.0, circles=2)
     recording, subject = simulation.recording(), wp.average_subject(1.75, "f")
 
-pose = wp.track(recording, subject, method="smekf")
+pose = wp.track(recording, subject)
 
 reach = np.linalg.norm(pose.points["right_hand"] - pose.points["right_shoulder"], axis=1)
 print(f"{recording.name}: {pose.time[-1] - pose.time[0]:.1f} s, segments: {', '.join(pose.quat_WL)}")

@@ -161,6 +161,7 @@ def test_the_transition_is_the_derivative_of_the_strapdown() -> None:
 def test_a_block_is_the_textbook_filter(still: bool) -> None:
     """P after one block against F P Fᵀ + Q and the joint correction, with full matrices."""
     of = case(0)
+    of = of._replace(noise=replace(of.noise, gyro_half_second_cov=None))  # white, to the last digit
     at = slice(100, 125) if still else slice(2000, 2025)
     params = AmekfParams(tilt_std=0.02, force_noise=0.0, rate_noise=0.0, speed_std=0.5)
     filter_ = Amekf(of.noise, RATE, of.true[at.start - 1], params)
@@ -388,6 +389,23 @@ def test_a_bias_that_jumps_is_taken_over_at_the_next_rest() -> None:
     assert of.static[-100:].all()
     np.testing.assert_allclose(found.gyro_bias[-1] - of.noise.gyro_bias, jump, atol=2e-4)
     assert tilt_deg(errors(of, found.quat_WS))[3000:].max() < 3.0
+
+
+def test_a_person_who_sways_at_rest_does_not_pass_for_bias() -> None:
+    """0.1 deg/s of sway, as a standing person has: at its end the rest knows the bias to a third of that, not less."""
+    rng = np.random.default_rng(8)
+    time = np.arange(500) / RATE
+    bias = np.deg2rad([0.2, -0.1, 0.3])
+    sway = np.deg2rad(0.14) * np.sin(2.0 * np.pi * 0.4 * time[:, None] + [0.3, 1.7, 4.0])
+    gyro = bias + sway + np.deg2rad(0.05) * rng.normal(size=(500, 3))
+    accel = [0.0, 0.0, 9.81] + 0.02 * rng.normal(size=(500, 3))
+    noise = noise_of(gyro[:400], accel[:400], RATE)
+    start = np.array([0.0, 0.0, 0.0, 1.0])
+    found = Amekf(noise, RATE, start).run(gyro, accel, np.ones(500, dtype=bool))
+    off = np.degrees(np.abs(found.gyro_bias[400:] - bias)).max()
+    white = replace(noise, gyro_half_second_cov=None)
+    taken_for_bias = Amekf(white, RATE, start).run(gyro, accel, np.ones(500, dtype=bool)).gyro_bias[400:]
+    assert off < 0.04 < np.degrees(np.abs(taken_for_bias - bias)).max()
 
 
 @pytest.mark.parametrize("method", ["amekf", "smoother"])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.cli import main
 from wepose_pin.model import load_model
 from wepose_pin.pose import point_covariance, pose_of, pose_table, spread
-from wepose_pin.simulation import ImuNoise, simulate, simulated_person
+from wepose_pin.simulation import REALISTIC, simulate, simulated_person
 from wepose_pin.subject import LENGTHS, average_subject
 from wepose_pin.tracking import track
 
@@ -60,13 +60,16 @@ def test_points_beyond_a_segment_without_covariance_have_none() -> None:
 
 
 def test_the_whole_chain_is_honest() -> None:
-    """Calibrated on MTi-3 data, tracked through six circles: the normalised error of the hand averages to three."""
+    """Realistic people, calibrated and tracked through six circles: the normalised error averages to about three.
+
+    The priors are those of real people and sensors: of a perfect one (no sway, no soft tissue) they say too much.
+    """
     from wepose_pin.calibration import calibrate
 
     hand, segments = [], []
-    for seed in range(8):
+    for seed in range(5):
         person = simulated_person(200 + seed)
-        simulation = simulate(person.lengths, seed=seed, noise=ImuNoise())
+        simulation = simulate(person.lengths, seed=seed, imperfections=REALISTIC)
         recording = simulation.recording()
         pose = track(recording, calibrate(recording, gauge=person.taped, prior=person.average))
         during = recording.span(simulation.phases["circles"][0])
@@ -76,9 +79,9 @@ def test_the_whole_chain_is_honest() -> None:
             segments.append(np.einsum("ni,nij,nj->n", turn, np.linalg.inv(pose.segment_cov[name][during]), turn).mean())
         error = (simulation.points["right_hand"] - pose.points["right_hand"])[during]
         hand.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(pose.point_cov["right_hand"][during]), error).mean())
-    print("NEES of the right hand, 8 people:", np.round(hand, 2), "mean", np.mean(hand).round(2))
-    print("NEES of the segments, 8 people:", np.round(segments, 2), "mean", np.mean(segments).round(2))
-    assert 1.0 < np.mean(hand) < 6.0
+    print("NEES of the right hand, 5 people:", np.round(hand, 2), "mean", np.mean(hand).round(2))
+    print("NEES of the segments, 5 people:", np.round(segments, 2), "mean", np.mean(segments).round(2))
+    assert 0.8 < np.mean(hand) < 6.0
     assert 0.7 < np.mean(segments) < 4.5
 
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from . import so3
 from .errors import BadPhase, BadSession, WeposeError
-from .filters import Orientation, check_method, run_filter
+from .filters import BEST, Orientation, check_method, run_filter
 from .filters.smekf import ACCEL_BIAS_STD
 from .noise import noise_of, quietest
 from .recording import Recording
@@ -79,7 +79,7 @@ class Filtered(NamedTuple):
     warnings: list[str]
 
 
-def filtered(recording: Recording, *, method: str = "smekf", static_test: StaticTest | None = None) -> Filtered:
+def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> Filtered:
     """Filter every sensor; the start pose, and how still it was.
 
     Raises
@@ -122,7 +122,7 @@ def segment_orientations(
     recording: Recording,
     subject: Subject | None = None,
     *,
-    method: str = "smekf",
+    method: str = BEST,
     static_test: StaticTest | None = None,
 ) -> Segments:
     """Filter every sensor, then align it with its segment by the start pose.

@@ -22,11 +22,12 @@ from tyro.conf import Positional, arg
 from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of
 
 if TYPE_CHECKING:
+    from .calibration import Calibration, Verdict
     from .simulation import Imperfections
     from .subject import Subject
     from .validation import Document
 
-Method = Literal["smekf", "ncf", "gdc"]
+Method = Literal["amekf", "smoother", "smekf", "ncf", "gdc"]
 Session = Annotated[Positional[Path], arg(metavar="SESSION")]
 Result = Annotated[Positional[Path], arg(metavar="RESULT")]
 OptionalPath = Annotated[Path | None, arg(metavar="PATH")]
@@ -51,7 +52,7 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
 
     from .calibration import calibrate_lengths
     from .evaluation import evaluate as compare
-    from .filters import METHODS
+    from .filters import BEST, METHODS
     from .simulation import simulate as make
     from .simulation import simulated_person
     from .tracking import track as follow
@@ -79,7 +80,7 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
             step(f"tracking by {method}")
             pose = follow(recording, found[method].subject, method=method)
             errors[method] = compare(pose, truth, circles)
-            if method == "smekf":
+            if method == BEST:
                 (folder / "subject").mkdir()
                 (folder / "result").mkdir()
                 assert pose.model is not None
@@ -95,15 +96,15 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
             "lengths": {
                 name: {
                     "true": value,
-                    "estimated": found["smekf"].subject.lengths[name],
-                    "std": found["smekf"].subject.std(name),
+                    "estimated": found[BEST].subject.lengths[name],
+                    "std": found[BEST].subject.std(name),
                 }
                 for name, value in person.lengths.items()
             },
             "errors": {method: asdict(error) for method, error in errors.items()},
         }
         (folder / "demo.json").write_text(json.dumps(as_json(report), indent=2) + "\n", encoding="utf-8")
-    _lengths_table(found["smekf"].subject, person.average, person.lengths, tuple(person.taped))
+    _lengths_table(found[BEST].subject, person.average, person.lengths, tuple(person.taped))
     _print_table(
         "Right hand while drawing six circles: distance to the truth [mm], mean ± std",
         ("filter", "from the shoulders", "from the root"),
@@ -129,7 +130,7 @@ def track(
     out: Out,
     subject: OptionalPath = None,
     model: OptionalPath = None,
-    method: Method = "smekf",
+    method: Method = "amekf",
     gaps: bool = False,
     covariance: bool = False,
     force: bool = False,
@@ -194,52 +195,73 @@ def calibrate(
     /,
     *,
     out: Out,
-    protocol: Literal["clasp"] = "clasp",
+    protocol: Annotated[str, arg(metavar="NAME|FILE.toml")] = "clasp",
     gauge: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(metavar="NAME=METRES")] = (),
     stature: Annotated[float | None, arg(metavar="METRES")] = None,
     sex: Annotated[Literal["f", "m"] | None, arg(metavar="{f,m}")] = None,
-    method: Method = "smekf",
+    method: Method = "amekf",
     force: bool = False,
 ) -> None:
-    """Hands-together recording to subject: the lengths of the arms with their standard deviations.
+    """Hands-together recording to subject: arm lengths and sensor mounts with their standard deviations, and a verdict.
 
     Hands together fix the proportions of the arms and not their scale: tape one length (the shoulder width serves) and
     give it as gauge. Without one the scale is that of the average person, and the output says how uncertain that is.
 
+    Exit code: 0 the calibration passes, 3 it is poor, 4 it fails; the files are written in each case and carry the
+    verdict. 2: the input is wrong, and nothing is written.
+
     Example: wepose calibrate session.toml --gauge shoulder_width=0.385 --stature 1.78 --sex f -o anna
 
     Args:
-        session: session.toml with a phase in which the palms are held together.
-        out: Folder for subject.toml and subject.urdf.
-        protocol: The phase of the session that is used.
-        gauge: A length measured with a tape, such as shoulder_width=0.385; may be given several times.
+        session: session.toml with the phases of the protocol, such as clasp, in which the palms are held together.
+        out: Folder for subject.toml, subject.urdf, calibration.json (the verdict and all figures) and report.html.
+        protocol: What was done: clasp (hands together), clasp_taped (the same, a gauge must be given), handle (hands on
+            a bar of known length), touch_left and touch_right (one palm on a fixed point), poses (T-pose and bow:
+            headings only), or a file of your own made like those in calibration/.
+        gauge: A length measured with a tape, such as shoulder_width=0.385; may be given several times. With protocol
+            handle also handle=0.42, the bar between the palms.
         stature: Body height in metres; narrows the average person.
         sex: Narrows the average person.
         method: The orientation filter.
         force: Replace files of an earlier run.
     """
-    from .calibration import calibrate_lengths
+    from .calibration import calibrate_lengths, judge, load_protocol
     from .model import load_model
     from .readers import load_session
+    from .report import calibration_report
     from .subject import average_subject
     from .writers import whole_folder
+    from .writers.calibration import write_calibration
     from .writers.result import write_subject
 
-    taped = _gauges(gauge)
-    with whole_folder(out, force) as folder, _steps(2) as step:
+    what = load_protocol(protocol)
+    taped = _gauges(gauge, what.gauges)
+    with whole_folder(out, force) as folder, _steps(3) as step:
         step("reading")
         average = average_subject(stature, sex)
         recording = load_session(session)
         step("calibrating")
-        found = calibrate_lengths(recording, gauge=taped, prior=average, protocol=protocol, method=method)
+        found = calibrate_lengths(recording, gauge=taped, prior=average, protocol=what, method=method)
+        verdict = judge(found)
         write_subject(folder, found.subject, load_model(lengths=found.subject.lengths))
+        write_calibration(folder, found, verdict)
+        step("writing the report")
+        report = calibration_report(found, recording, method=method, protocol=what, verdict=verdict)
+        (folder / "report.html").write_text(report, encoding="utf-8")
     _warn(found.warnings)
     _lengths_table(found.subject, average, None, tuple(taped))
-    _say(
-        f"Palm-to-palm gap: {1e3 * found.rms_gap:.1f} mm rms, {1e3 * found.prior_rms_gap:.1f} mm with the average "
-        f"person's lengths; worth {found.independent:.0f} independent looks"
-    )
-    _say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}")
+    _mounts_table(found)
+    if what.closures:
+        gap = "Palm-to-palm gap" if any(len(c.points) > 1 for c in what.closures) else "Gap from palm to its point"
+        _say(
+            f"{gap}: {1e3 * found.rms_gap:.1f} mm rms, {1e3 * found.prior_rms_gap:.1f} mm with the average person's "
+            f"lengths; worth {found.independent:.0f} looks"
+        )
+    _say(f"Report to look at:  {out / 'report.html'}")
+    _say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}  {out / 'calibration.json'}")
+    _verdict(verdict)
+    if verdict.grade != "pass":
+        sys.exit({"poor": 3, "fail": 4}[verdict.grade])
 
 
 def evaluate(
@@ -623,16 +645,18 @@ def _parse_and_run(argv: list[str]) -> None:
     chosen[0]()
 
 
-def _gauges(gauge: tuple[str, ...]) -> dict[str, float]:
+def _gauges(gauge: tuple[str, ...], distances: tuple[str, ...] = ()) -> dict[str, float]:
+    """Name → [m] of lengths of the body, and of the protocol's own `distances`."""
     from .subject import LENGTHS
 
+    known = (*LENGTHS, *distances)
     taped: dict[str, float] = {}
     for text in gauge:
         name, _, value = text.partition("=")
         if name in taped:
             raise BadOption(f"--gauge {text}: '{name}' is given twice; give the mean of both")
-        if name not in LENGTHS:
-            raise BadOption(f"--gauge {text}: '{name}' is not a length; {one_of(LENGTHS, name)}")
+        if name not in known:
+            raise BadOption(f"--gauge {text}: '{name}' is not a length; {one_of(known, name)}")
         try:
             taped[name] = float(value)
         except ValueError:
@@ -734,6 +758,44 @@ def _lengths_table(
         "",
     )
     _print_table("Lengths from the joined hands", header, rows)
+
+
+def _mounts_table(found: Calibration) -> None:
+    import numpy as np
+
+    from .recording import axes_from_mount
+    from .subject import mount_rows
+
+    rows: list[tuple[str, ...]] = []
+    for segment, tilt in found.start_tilt.items():
+        quat = found.subject.mounts[segment]
+        x, y, z = (np.degrees(found.subject.std(row)) for row in mount_rows(segment))
+        up, forward = axes_from_mount(quat)
+        rows.append(
+            (
+                segment,
+                f"{up} up, {forward} ahead",
+                f"± {z:.1f}",
+                f"± {np.hypot(x, y) / 2**0.5:.1f}",
+                f"{np.degrees(np.linalg.norm(tilt)):.1f}",
+                f"{60.0 * np.degrees(found.drift[segment]):+.1f}",
+            )
+        )
+    header = ("sensor", "nearest axes", "heading", "tilt", "off the start pose", "heading drift [1/min]")
+    _print_table("Mounts, in deg: ± is one standard deviation", header, rows)
+
+
+def _verdict(verdict: Verdict) -> None:
+    import textwrap
+
+    from rich.console import Console
+
+    colour = {"pass": "green", "poor": "yellow", "fail": "red"}[verdict.grade]
+    seen = f"the motion tells {verdict.determined} of {verdict.unknowns} unknowns better than they were known"
+    console = Console(width=160)
+    console.print(f"Verdict: [bold {colour}]{verdict.grade}[/] ({seen})", highlight=False)
+    for text in verdict.in_words():
+        _say(textwrap.fill(text, 98, initial_indent="  ", subsequent_indent="    "))
 
 
 def _validation_tables(document: Document) -> None:

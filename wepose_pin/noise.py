@@ -35,6 +35,7 @@ class SensorNoise:
     accel_cov : (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
     bias_step_cov : (3, 3) Σ_b, covariance of the first differences of gyro [rad²/s²], as in the authors' software
     gravity : mean norm of accel [m/s²]: the gravity scale
+    gyro_half_second_cov : (3, 3) covariance of gyro's means over `BLOCK_S` [rad²/s²]: a person sways; None: white noise
     """
 
     gyro_bias: np.ndarray
@@ -43,6 +44,7 @@ class SensorNoise:
     accel_cov: np.ndarray
     bias_step_cov: np.ndarray
     gravity: float
+    gyro_half_second_cov: np.ndarray | None = None
 
 
 def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> SensorNoise:
@@ -67,17 +69,25 @@ def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> SensorN
         accel_cov=_floored(np.cov(accel_S.T / gravity), ACCEL_FLOOR),
         bias_step_cov=_floored(np.cov(np.diff(gyro_S, axis=0).T), GYRO_FLOOR),
         gravity=gravity,
+        gyro_half_second_cov=_cov_of_half_seconds(gyro_S, rate_hz),
     )
 
 
 def _cov_of_mean(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray:
     """Covariance of the mean from the means of blocks: white noise averages out in them, sway stays and is counted."""
+    of_blocks = _cov_of_half_seconds(gyro_S, rate_hz)
+    if of_blocks is None:  # too short to see sway: the white part is all that can be said
+        return _floored(np.cov(gyro_S.T) / len(gyro_S), BIAS_FLOOR)
+    return _floored(of_blocks / (len(gyro_S) // max(1, round(BLOCK_S * rate_hz))), BIAS_FLOOR)
+
+
+def _cov_of_half_seconds(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray | None:
+    """Covariance of the means of blocks; None where there are fewer than four."""
     size = max(1, round(BLOCK_S * rate_hz))
     blocks = len(gyro_S) // size
-    if blocks < 4:  # too short to see sway: the white part is all that can be said
-        return _floored(np.cov(gyro_S.T) / len(gyro_S), BIAS_FLOOR)
-    means = gyro_S[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
-    return _floored(np.cov(means.T) / blocks, BIAS_FLOOR)
+    if blocks < 4:
+        return None
+    return np.cov(gyro_S[: blocks * size].reshape(blocks, size, 3).mean(axis=1).T)
 
 
 def _floored(cov: np.ndarray, std: float) -> np.ndarray:

@@ -223,11 +223,16 @@ _HTML = """<!DOCTYPE html>
   iframe { display: block; width: 100%; height: 620px; border: 1px solid var(--line); border-radius: 4px; }
   @page { size: A4; margin: 16mm 15mm; }
   @media print {
-    body { max-width: none; padding: 0; font-size: 11pt; }
+    body { max-width: none; padding: 0; font-size: 10pt; }
     nav { display: none; }
-    h2 { break-after: avoid; }
+    h2 { margin-top: 22px; padding-top: 8px; }
+    h2, h2 + p { break-after: avoid; }
+    p, li { orphans: 3; widows: 3; }
+    table, dl { font-size: 8.8pt; }
     tr, .wide { break-inside: avoid; }
-    .screen { display: none; }
+    .wide { overflow: visible; }
+    .screen, h2:has(+ .screen) { display: none; }
+    figure { margin: 12px 0; }
     .banner, .warning { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
   }
 </style>

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,13 @@ SEXES = ("f", "m")
 FORMAT = 1
 
 
+class Hinge(NamedTuple):
+    """An elbow's axis."""
+
+    axis: np.ndarray  # (3,) unit, in the upper arm's frame, y towards the left
+    std: float  # [rad] by which the forearm leaves the plane across it, soft tissue included
+
+
 @dataclass(frozen=True)
 class Subject:
     """A person as far as known.
@@ -41,6 +48,7 @@ class Subject:
     covariance : (k, k)
     mounts : segment → `quat_LS` (4,) xyzw, the calibrated mounts; empty where none are calibrated
     note : where the numbers come from, in a few words
+    hinges : side → its elbow's axis, where a calibration found it
     """
 
     name: str
@@ -49,6 +57,7 @@ class Subject:
     covariance: np.ndarray
     mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
     note: str = ""
+    hinges: Mapping[str, Hinge] = field(default_factory=dict)
 
     def std(self, name: str) -> float:
         """One standard deviation of a length [m], or of a mount's axis [rad]; NaN where nothing is known."""
@@ -150,6 +159,10 @@ def subject_toml(subject: Subject) -> str:
         std = [subject.std(row) for row in mount_rows(segment)]
         if np.isfinite(std).all():
             lines.append(f"std_deg = {np.degrees(np.sqrt(np.mean(np.square(std)))):.3f}")
+    for side, hinge in subject.hinges.items():
+        lines += ["", f"[hinges.{side}]   # the elbow's axis in the upper arm's frame"]
+        lines += [f"{key} = {value:.9f}" for key, value in zip("xyz", hinge.axis, strict=True)]
+        lines.append(f"std_deg = {np.degrees(hinge.std):.3f}")
     if subject.order:
         lines += ["", "[covariance]    # of lengths [m] and mount errors [rad], jointly"]
         lines.append(f"order = {json.dumps(list(subject.order))}")
@@ -180,7 +193,7 @@ def load_subject(path: str | Path) -> Subject:
         raise BadSubject(f"{path}: is a session; a subject is wanted here, as `wepose calibrate` writes one")
     if table.get("format") != FORMAT:
         raise BadSubject(f"{path}: format = {table.get('format')!r}; this version reads format = {FORMAT}")
-    for key in ("lengths", "lengths_std", "mounts", "covariance"):
+    for key in ("lengths", "lengths_std", "mounts", "hinges", "covariance"):
         if not isinstance(table.get(key, {}), dict):
             raise BadSubject(f"{path}: {key} = {table[key]!r} is not a table; write [{key}]")
     lengths = table.get("lengths", {})
@@ -199,6 +212,7 @@ def load_subject(path: str | Path) -> Subject:
         covariance=matrix,
         mounts={segment: _mount(path, segment, mount) for segment, mount in table.get("mounts", {}).items()},
         note=str(table.get("note", "")),
+        hinges={side: _read_hinge(path, side, hinge) for side, hinge in table.get("hinges", {}).items()},
     )
 
 
@@ -230,6 +244,18 @@ def _covariance(path: Path, table: Mapping, std: Mapping) -> tuple[tuple[str, ..
     ):
         raise BadSubject(f"{path}: covariance.matrix is not symmetric and positive semidefinite")
     return order, matrix
+
+
+def _read_hinge(path: Path, side: str, table: Any) -> Hinge:
+    if side not in ("left", "right"):
+        raise BadSubject(f"{path}: hinges.{side} is no side; left or right")
+    parts = [table.get(key) for key in ("x", "y", "z", "std_deg")] if isinstance(table, dict) else [None]
+    if not all(isinstance(part, int | float) and not isinstance(part, bool) for part in parts):
+        raise BadSubject(f"{path}: hinges.{side} needs four numbers, x, y, z, std_deg")
+    axis, std = np.array(parts[:3], dtype=float), float(np.radians(parts[3]))  # type: ignore[arg-type]
+    if not abs(np.linalg.norm(axis) - 1.0) < 1e-3 or not 0.0 < std < 1.0:
+        raise BadSubject(f"{path}: hinges.{side}: x, y, z must be of length 1, and std_deg between 0 and 57")
+    return Hinge(axis / np.linalg.norm(axis), std)
 
 
 def _mount(path: Path, segment: str, table: Any) -> np.ndarray:

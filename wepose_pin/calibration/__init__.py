@@ -1,13 +1,16 @@
-"""Link lengths, mounts and headings from a hands-together phase: the closed chain of both arms.
+"""Link lengths, mounts and headings from hands held together, or from another protocol.
 
-`chain` is the chain in CasADi, `problem` the least squares over all that is not known, `start` finds headings without a
-guess, `lengths` is the calibration from a recording to a subject.
+`protocols` says what holds in which phase, `chain` is the chain in CasADi, `problem` the least squares over all that is
+not known, `start` finds headings without a guess, `lengths` is the calibration from a recording to a subject,
+`touching` and `anatomy` what guards it against hands apart and sensors exchanged, `verdict` says what it is worth.
 """
 
 from __future__ import annotations
 
 from .chain import ARMS, CHAIN, palm_gap, rotate
-from .lengths import GAUGE_STD, PROTOCOLS, Calibration, calibrate, calibrate_lengths
+from .lengths import GAUGE_STD, Calibration, calibrate, calibrate_lengths
+from .protocols import PROTOCOLS, Protocol, load_protocol
+from .verdict import Finding, Verdict, document, judge
 
 __all__ = [
     "ARMS",
@@ -15,8 +18,14 @@ __all__ = [
     "GAUGE_STD",
     "PROTOCOLS",
     "Calibration",
+    "Finding",
+    "Protocol",
+    "Verdict",
     "calibrate",
     "calibrate_lengths",
+    "document",
+    "judge",
+    "load_protocol",
     "palm_gap",
     "rotate",
 ]

@@ -1,4 +1,4 @@
-"""The chain of both arms in CasADi: links from the right palm to the left one, quaternions xyzw as everywhere."""
+"""The chains of the arms in CasADi: links from the root to each point, quaternions xyzw as everywhere."""
 
 from __future__ import annotations
 
@@ -6,12 +6,30 @@ from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from ..subject import LENGTHS
 
 SIDES = ("left", "right")
 ARMS = tuple(f"{side}_{part}" for side in SIDES for part in ("upper_arm", "forearm", "hand"))
 CHAIN = ("torso", *ARMS)
+
+
+def _reaches() -> dict[str, dict[str, np.ndarray]]:
+    unit = dict(zip(LENGTHS, np.eye(len(LENGTHS)), strict=True))
+    found = {}
+    for side, y in zip(SIDES, (1.0, -1.0), strict=True):
+        parts = {"torso": np.array([0.0 * unit["trunk"], 0.5 * y * unit["shoulder_width"], unit["trunk"]])}
+        found[f"{side}_shoulder"] = dict(parts)
+        for part, end in (("upper_arm", "elbow"), ("forearm", "wrist"), ("hand", "hand")):
+            name = f"{side}_{part}"
+            parts[name] = np.array([0.0 * unit[name], 0.0 * unit[name], -unit[name]])
+            found[f"{side}_{end}"] = dict(parts)
+    return found
+
+
+# Point → segment → (3, 8), by which the lengths make the segment's part of the way from the root, in its own frame.
+REACHES = _reaches()
 
 
 def palm_gap(lengths: Any, quat_WL: Mapping[str, Any]) -> Any:
@@ -22,16 +40,23 @@ def palm_gap(lengths: Any, quat_WL: Mapping[str, Any]) -> Any:
     lengths : (8,) CasADi, in the order of `LENGTHS` [m]
     quat_WL : segment → (4,) CasADi xyzw, for the torso and both upper arms, forearms, hands
     """
-    return sum(links(lengths, quat_WL).values(), start=ca.SX.zeros(3))
+    left, right = REACHES["left_hand"], REACHES["right_hand"]
+    none = np.zeros((3, len(LENGTHS)))
+    way = {name: left.get(name, none) - right.get(name, none) for name in CHAIN}
+    return sum(links(lengths, quat_WL, way).values(), start=ca.SX.zeros(3))
 
 
-def links(lengths: Any, quat_WL: Mapping[str, Any]) -> dict[str, Any]:
-    """Segment → its part (3,) [m] of the way from the right palm to the left one, in W."""
-    found = {"torso": rotate(quat_WL["torso"], ca.vertcat(0.0, lengths[LENGTHS.index("shoulder_width")], 0.0))}
-    for name in ARMS:
-        down = -lengths[LENGTHS.index(name)] if name.startswith("left") else lengths[LENGTHS.index(name)]
-        found[name] = rotate(quat_WL[name], ca.vertcat(0.0, 0.0, down))
-    return found
+def links(lengths: Any, quat_WL: Mapping[str, Any], way: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Segment → its part (3,) [m] of a way, in W; `way` holds the (3, 8) of each segment, as in `REACHES`."""
+    return {
+        name: rotate(quat_WL[name], ca.vertcat(*(_combined(row, lengths) for row in rows)))
+        for name, rows in way.items()
+    }
+
+
+def _combined(row: np.ndarray, lengths: Any) -> Any:
+    """``row · lengths`` of what is not zero."""
+    return sum((row[i] * lengths[i] for i in map(int, np.flatnonzero(row))), start=ca.SX(0.0))
 
 
 def rotate(quat: Any, v: Any) -> Any:

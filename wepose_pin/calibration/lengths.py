@@ -33,13 +33,26 @@ from scipy.spatial.transform import Rotation
 
 from ..alignment import START_POSE_STD, Filtered, filtered, heading_to, mount_covariance, nominal_mount
 from ..errors import BadOption, BadPhase, BadSession, BadSubject, NoSolution, one_of
+from ..filters import BEST
 from ..recording import Recording
-from ..subject import LENGTHS, Subject, average_subject, mount_rows
-from .chain import ARMS, CHAIN, SIDES
-from .problem import HINGE_STD, Fit, K, Layout, Looks, residuals, solve
+from ..subject import LENGTHS, Hinge, Subject, average_subject, mount_rows
+from .anatomy import (
+    BETTER,
+    Arms,
+    Labels,
+    against_gravity,
+    against_motion,
+    arms,
+    check_labels,
+    relabelled,
+    segments_at,
+    without_mounts,
+)
+from .chain import CHAIN, SIDES
+from .problem import HINGE_STD, Fit, K, Layout, Looks, carrier, placed, residuals, solve
+from .protocols import Closure, Protocol, load_protocol
 from .start import headings
-
-PROTOCOLS = ("clasp",)
+from .touching import touching_start
 
 # One standard deviation [m] of a length taped over the skin, where the user gives none.
 GAUGE_STD = 0.003
@@ -49,6 +62,8 @@ LOOK_RATE_HZ = 8.0
 STATED_STD = np.deg2rad(10.0)  # [rad] of a stated mount's heading
 READY_STD = np.deg2rad(2.0)  # [rad] about each axis, of segments that a device aligned itself
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
+HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of a heading that nothing tells: the whole circle
+POINT_STD = 3.0  # [m] of a point of W that nothing tells
 SAG_STD = np.deg2rad(0.6)  # [rad] as the segment turns by a radian, each axis against each
 # Elbow axis (x, 1, z) in the upper arm: palms turn in or out alike on both sides, the torso's facing is common to both.
 HINGE_MIRROR_STD, HINGE_COMMON_STD, HINGE_TILT_STD = np.deg2rad([20.0, 5.0, 5.0])
@@ -58,10 +73,15 @@ LEAST_VARIANCE = 1e-4
 # looks in one phase. Found on simulated people, whose joint errors it brings within what the covariance says.
 LEAST_CORRELATION_S = 3.0
 LEAST_LOOKS = 10
+THIRD_CHI2 = {1: 0.1485, 3: 1.4237}  # what 30 % of chi² with so many degrees stay below
 ROUNDS = 5
+# To see whether labels and mounts can be as stated, the closure alone at fewer looks tells enough.
+QUICK_RATE_HZ, QUICK_ROUNDS, QUICK_STEPS = 1.0, 1, 15
 # A look whose gap is this many times the usual is one at which the palms were apart.
 APART = 5.0
 TOUCHED = 0.1  # of a look's weight
+LOOSE_SCALE = 0.6  # of the prior's relative standard deviation, from which on a gauge is said to tell little
+UNSEEN_HEADING_STD = np.deg2rad(15.0)  # [rad] from which on a heading is said to be unknown
 
 
 @dataclass(frozen=True)
@@ -86,6 +106,11 @@ class Calibration:
     hinge_rms : side → [rad] of the forearm against the plane of that hinge
     learned : name as in the subject's covariance, or ``left_forearm + left_hand`` → (n,) share of what is known of it
         that each look brought; their sum and what was known before make 1
+    before : (k, k) covariance before the motion, in the order of the subject's
+    quat_WL : segment → (n, 4) xyzw at each look, as `track` would have it
+    protocol : its name
+    labels : whether the sensors sit where the session says
+    contradicted : stated mounts that could not be and were not used, in words
     """
 
     subject: Subject
@@ -105,6 +130,19 @@ class Calibration:
     hinge: Mapping[str, np.ndarray]
     hinge_rms: Mapping[str, float]
     learned: Mapping[str, np.ndarray] = field(default_factory=dict)
+    before: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    quat_WL: Mapping[str, np.ndarray] = field(default_factory=dict)
+    protocol: str = "clasp"
+    labels: Labels = field(default_factory=Labels)
+    contradicted: tuple[str, ...] = ()
+
+    def arms(self) -> Arms:
+        """How the arms moved while the chain was closed."""
+        closed = np.isfinite(self.gap)
+        touched = closed & (self.kept > TOUCHED) if closed.any() else np.ones(len(self.gap), dtype=bool)
+        gap = np.sqrt(np.average(self.gap[closed] ** 2, weights=self.kept[closed])) if closed.any() else 0.0
+        quat_WL = {name: quat[touched] for name, quat in self.quat_WL.items()}
+        return arms(quat_WL, self.subject.lengths, float(gap))
 
 
 def calibrate(
@@ -119,17 +157,17 @@ def calibrate_lengths(
     *,
     gauge: Mapping[str, float] | None = None,
     prior: Subject | None = None,
-    protocol: str = "clasp",
-    method: str = "smekf",
+    protocol: str | Protocol = "clasp",
+    method: str = BEST,
     gauge_std: float = GAUGE_STD,
 ) -> Calibration:
     """Link lengths with their covariance, and what was found beside them.
 
     Parameters
     ----------
-    gauge : measured lengths, name → [m]; without one the scale is the prior's
+    gauge : measured lengths, and distances that the protocol names, name → [m]; without one the scale is the prior's
     prior : lengths before, with covariance, and mounts; None for the anthropometric average
-    protocol : phase of the session in which the palms touch
+    protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave
     method : the orientation filter
     gauge_std : standard deviation [m] of each measured length
 
@@ -138,52 +176,129 @@ def calibrate_lengths(
     BadOption
         An unknown protocol, or a gauge that is no length or no plausible one.
     BadSession, BadPhase
-        A sensor that the closed chain needs is missing; there is no such phase.
+        A sensor that the protocol needs is missing; there is no such phase.
     """
-    if protocol not in PROTOCOLS:
-        raise BadOption(f"protocol '{protocol}' is not known; {one_of(PROTOCOLS, protocol)}")
+    if not isinstance(protocol, Protocol):
+        protocol = load_protocol(protocol)
     gauge = dict(gauge or {})
     for name, value in gauge.items():
-        if name not in LENGTHS:
-            raise BadOption(f"gauge {name}: not a length; {one_of(LENGTHS, name)}")
+        if name not in (*LENGTHS, *protocol.gauges):
+            raise BadOption(f"gauge {name}: not a length; {one_of((*LENGTHS, *protocol.gauges), name)}")
         if not 0.02 < value < 1.0:
             raise BadOption(f"gauge {name}={value:g}: a length in metres is needed, between 0.02 and 1.0")
     if not gauge_std > 0.0:
         raise BadOption(f"gauge_std={gauge_std:g}: a standard deviation in metres is needed, above 0")
-    needed = ("torso", *(name for name in ARMS if not name.endswith("hand")))
-    for segment in needed:
+    if len(set(gauge) & set(protocol.chain)) < protocol.taped:
+        raise BadOption(
+            f"protocol '{protocol.name}' needs {protocol.taped} taped length of its chain, as in --gauge "
+            f"{protocol.tape}; {one_of(protocol.chain)}"
+        )
+    for segment in protocol.needs:
         if segment not in recording.sensors:
             raise BadSession(
-                f"{recording.where()}: no sensor on {segment}; the closed chain needs one each on {', '.join(needed)}"
+                f"{recording.where()}: no sensor on {segment}; protocol '{protocol.name}' needs one each on "
+                f"{', '.join(protocol.needs)}"
             )
     before = prior or average_subject()
-    intervals = recording.phase(protocol)
-    return _solve(recording, filtered(recording, method=method), intervals, before, gauge, gauge_std)
+    for condition in protocol.conditions:
+        recording.phase(condition.phase)
+    return _believed(recording, filtered(recording, method=method), protocol, before, gauge, gauge_std)
+
+
+def _believed(
+    recording: Recording,
+    found: Filtered,
+    protocol: Protocol,
+    prior: Subject,
+    gauge: Mapping[str, float],
+    gauge_std: float,
+) -> Calibration:
+    """The calibration by what the session says of its sensors, as far as gravity, motion and anatomy let it stand."""
+
+    def tried(recording: Recording, found: Filtered, prior: Subject) -> Calibration:
+        return _solve(recording, found, protocol, prior, gauge, gauge_std, quick=True)
+
+    where = "correct it in the session or leave it out"
+    notes = []
+    wrong = against_gravity(recording, prior, found)
+    for name, off in wrong.items():
+        notes.append(f"sensors.{name}.mount is {off:.0f} deg off gravity in the start pose and was not used; {where}")
+    recording, prior = without_mounts(recording, prior, wrong)
+    stated = tried(recording, found, prior)
+    doubt = stated.arms().doubt()
+    if doubt > 1.0 or against_motion(recording, prior, stated.subject.mounts):
+        bare, unknown = without_mounts(recording, prior, found.R_VS)
+        free = tried(bare, found, unknown)
+        if free.arms().doubt() < min(1.0, BETTER * max(doubt, 1.0 / BETTER)):
+            wrong = against_motion(recording, prior, free.subject.mounts)
+            for name, off in wrong.items():
+                notes.append(
+                    f"sensors.{name}.mount is {off:.0f} deg off what the motion says and was not used; {where}"
+                )
+            recording, prior = without_mounts(recording, prior, wrong)
+            doubt = 0.0 if wrong else doubt
+    if doubt > 1.0:
+        labels = check_labels(
+            stated.arms(),
+            lambda moved: tried(*relabelled(recording, found, moved), prior).arms(),
+            tuple(found.R_VS),
+        )
+        if labels.moved:
+            return replace(stated, labels=labels, warnings=(labels.said(), *notes, *stated.warnings))
+    best = _solve(recording, found, protocol, prior, gauge, gauge_std)
+    how = best.arms()
+    labels = Labels(how.doubt(), how.contradiction() if how.doubt() > 1.0 else "")
+    said = [labels.said()] if labels.said() else []
+    return replace(best, labels=labels, contradicted=tuple(notes), warnings=(*said, *notes, *best.warnings))
+
+
+def _looks(
+    recording: Recording, found: Filtered, protocol: Protocol, rate_hz: float = LOOK_RATE_HZ
+) -> tuple[Looks, np.ndarray]:
+    """The looks of all conditions, and their samples (n,)."""
+    stride = max(1, round(recording.rate_hz / rate_hz))
+    samples = []
+    for condition in protocol.conditions:
+        spans = [recording.span(interval) for interval in recording.phase(condition.phase)]
+        samples.append(np.concatenate([np.arange(len(recording))[span][::stride] for span in spans]))
+        if len(samples[-1]) < LEAST_LOOKS * rate_hz / LOOK_RATE_HZ:
+            raise BadPhase(
+                f"{recording.where()}: phases.{condition.phase} holds {len(samples[-1])} looks at {LOOK_RATE_HZ:g} a "
+                f"second; at least {LEAST_LOOKS} are needed"
+                + (", better a minute" if isinstance(condition, Closure) else ", better five seconds")
+            )
+    at = np.concatenate(samples)
+    seen = {carrier(segment, found.R_VS) for segment in protocol.segments}
+    fixed = sum(closure.kind == "fixed_point" for closure in protocol.closures)
+    layout = Layout(tuple(name for name in CHAIN if name in seen), fixed, protocol.gauges)
+    turned = [(found.R_VS[name][at] * found.at_start[name].inv()).as_quat().T for name in layout.sensors]
+    of = np.repeat(np.arange(len(samples)), [len(part) for part in samples])
+    return Looks(layout, np.vstack([*turned, recording.time[at] - found.start[1]]), protocol.conditions, of), at
 
 
 def _solve(
     recording: Recording,
     found: Filtered,
-    intervals: tuple[tuple[float, float], ...],
+    protocol: Protocol,
     prior: Subject,
     gauge: Mapping[str, float],
     gauge_std: float,
+    *,
+    quick: bool = False,
 ) -> Calibration:
-    stride = max(1, round(recording.rate_hz / LOOK_RATE_HZ))
-    at = np.concatenate([np.arange(len(recording))[recording.span(i)][::stride] for i in intervals])
-    if len(at) < LEAST_LOOKS:
-        raise BadPhase(
-            f"{recording.where()}: phases.clasp holds {len(at)} looks at {LOOK_RATE_HZ:g} a second; at least "
-            f"{LEAST_LOOKS} are needed, better a minute"
-        )
-    layout = Layout(tuple(name for name in CHAIN if name in found.R_VS))
-    turned = [(found.R_VS[name][at] * found.at_start[name].inv()).as_quat().T for name in layout.sensors]
-    looks = Looks(layout, np.vstack([*turned, recording.time[at] - found.start[1]]))
+    """The calibration; a quick one at fewer looks, by the closure alone, to see whether it can be at all."""
+    looks, at = _looks(recording, found, protocol, QUICK_RATE_HZ if quick else LOOK_RATE_HZ)
+    layout = looks.layout
     center, information = _before(recording, found, looks, prior, gauge, gauge_std)
+    start, touching = center, np.ones(len(at))
+    if not quick:
+        start, touching = touching_start(
+            looks, lambda some: _before(recording, found, some, prior, gauge, gauge_std)[0]
+        )
 
-    fit, weights, weight, independent = _weighed(looks, center, information)
+    fit, weights, weight, independent = _weighed(looks, center, information, start, touching, quick)
     lengths = fit.x[:K]
-    if np.min(lengths) < 0.01:
+    if not quick and np.min(lengths) < 0.01:
         raise NoSolution(
             f"the lengths did not converge ({LENGTHS[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm); "
             f"check that the palms touch in the phase and that every sensor sits where the session says"
@@ -200,39 +315,52 @@ def _solve(
 
     at_prior = fit.x.copy()
     at_prior[:K] = [prior.lengths[name] for name in LENGTHS]
+    at_prior = placed(at_prior, looks)
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance[:K, :K], lengths)) ** -1)
-    scaling = [name for name in gauge if name != "trunk"]  # the trunk is not in the chain and cannot scale it
+    # What is not in the chain, as the trunk where the hands are joined, cannot scale it.
+    scaling = [*(name for name in gauge if name in (protocol.chain or LENGTHS)), *protocol.gauges]
     without_data = np.linalg.inv(information[:K, :K])
-    warnings = _remarks(lengths, covariance[:K, :K], without_data, prior, None if scaling else scale_std)
+    warnings = _remarks(protocol, lengths, covariance[:K, :K], without_data, prior, None if scaling else scale_std)
+    warnings += _unseen(protocol, layout, covariance, gauge)
+    seen = {side: SIDES.index(side) for side in (layout.arms if looks.closed.any() else ())}
+    axes = {side: np.array([x, 1.0, z]) for side, (x, z) in zip(SIDES, fit.x[layout.hinge].reshape(2, 2), strict=True)}
+    hinge = {side: axes[side] / np.linalg.norm(axes[side]) for side in seen}
+    hinge_rms = {side: HINGE_STD * _rms(fit.hinge[looks.closed, i]) for side, i in seen.items()}
     subject = replace(
         prior,
         name=recording.name,
+        hinges={side: Hinge(hinge[side], max(hinge_rms[side], HINGE_STD)) for side in seen},
         lengths=dict(zip(LENGTHS, lengths.tolist(), strict=True)),
         order=order,
         covariance=joint,
         mounts=mounts,
-        note="hands together; scale " + (f"taped: {', '.join(scaling)}" if scaling else "of the anthropometric prior"),
+        note=f"{protocol.title}; scale "
+        + (f"taped: {', '.join(scaling)}" if scaling else "of the anthropometric prior"),
     )
     gap, prior_gap = (np.linalg.norm(gaps, axis=1) for gaps in (fit.gaps, residuals(at_prior, looks)[2]))
-    axes = [np.array([x, 1.0, z]) for x, z in fit.x[layout.hinge].reshape(2, 2)]
+    gap[~looks.closed] = prior_gap[~looks.closed] = np.nan
+    touched = looks.closed & (weight > TOUCHED)
     return Calibration(
         subject=subject,
         prior=prior,
-        rms_gap=_rms(gap[weight > TOUCHED]),
-        prior_rms_gap=_rms(prior_gap[weight > TOUCHED]),
+        rms_gap=_rms(gap[touched]),
+        prior_rms_gap=_rms(prior_gap[touched]),
         independent=independent,
         gauge=gauge,
         scale_std=scale_std,
-        warnings=(*found.warnings, *warnings, *_apart(recording.time[at], weight)),
+        warnings=(*found.warnings, *warnings, *_apart(recording.time[at], weight, looks)),
         time=recording.time[at],
         gap=gap,
         prior_gap=prior_gap,
         kept=weight,
         start_tilt=dict(zip(layout.sensors, fit.x[layout.tilt].reshape(-1, 2), strict=True)),
         drift=dict(zip(layout.sensors, fit.x[layout.drift].tolist(), strict=True)),
-        hinge={side: axis / np.linalg.norm(axis) for side, axis in zip(SIDES, axes, strict=True)},
-        hinge_rms={side: HINGE_STD * _rms(r) for side, r in zip(SIDES, fit.hinge.T, strict=True)},
-        learned=_learned(fit.x, looks, weights, covariance),
+        hinge=hinge,
+        hinge_rms=hinge_rms,
+        learned={} if quick else _learned(fit.x, looks, weights, covariance),
+        before=_handed_on(layout, np.linalg.inv(information))[1],
+        quat_WL=segments_at(found, mounts, at),
+        protocol=protocol.name,
     )
 
 
@@ -251,18 +379,24 @@ def _before(
         raise BadSubject(f"prior '{prior.name}': its lengths need a covariance that is positive definite, all of them")
     information[:K, :K] = np.linalg.inv(prior.lengths_covariance())
     target = information[:K, :K] @ [prior.lengths[name] for name in LENGTHS]
-    for name, value in gauge.items():
-        i = LENGTHS.index(name)
+    for name in gauge.keys() & set(LENGTHS):
+        i, value = LENGTHS.index(name), gauge[name]
         information[i, i] += 1.0 / gauge_std**2
         target[i] += value / gauge_std**2
     center[:K] = np.linalg.solve(information[:K, :K], target)
 
-    guess = headings(looks)
+    for name, row in zip(layout.gauges, range(layout.size)[layout.distances], strict=True):
+        stated = next(c for c in looks.conditions if isinstance(c, Closure) and c.gauge == name)
+        center[row] = gauge.get(name, stated.metres)
+        information[row, row] = (gauge_std if name in gauge else stated.metres_std) ** -2
+    information[layout.points, layout.points] = np.eye(3 * layout.fixed) / POINT_STD**2
+
+    guess = headings(looks, center[:K], center[layout.distances], _stated_headings(recording, found, layout, prior))
     for i, name in enumerate(layout.sensors):
         # What is known of this sensor's (ε_x, ε_y, ψ): the person stands nearly so, and of a mount R_LS = exp(m) R_0
         # that m = μ − ε + ψ' e_z is small, with μ the misfit of the start pose at the heading nearest to R_0.
         of = [layout.tilt.start + 2 * i, layout.tilt.start + 2 * i + 1, layout.heading.start + i]
-        known = np.diag([START_POSE_STD**-2, START_POSE_STD**-2, 0.0])
+        known = np.diag([START_POSE_STD**-2, START_POSE_STD**-2, HEADING_STD**-2])
         mean = np.zeros(3)
         center[of[2]] = guess[i]
         mount = nominal_mount(recording, name, prior)
@@ -288,7 +422,17 @@ def _before(
         (HINGE_TILT_STD, (z_right,), np.ones(1)),
     ):
         information[np.ix_(rows, rows)] += np.outer(share, share) / std**2
-    return center, information
+    return placed(center, looks), information
+
+
+def _stated_headings(recording: Recording, found: Filtered, layout: Layout, prior: Subject) -> dict[str, float]:
+    """Sensor → ψ [rad] to its nominal mount, of those that have one."""
+    mounts = {name: nominal_mount(recording, name, prior) for name in layout.sensors}
+    return {
+        name: heading_to(found.at_start[name], Rotation.from_quat(mount))
+        for name, mount in mounts.items()
+        if mount is not None
+    }
 
 
 def _mount_information(recording: Recording, segment: str, prior: Subject) -> np.ndarray:
@@ -302,30 +446,55 @@ def _mount_information(recording: Recording, segment: str, prior: Subject) -> np
     return np.diag([0.0, 0.0, STATED_STD**-2])
 
 
-def _weighed(looks: Looks, center: np.ndarray, information: np.ndarray) -> tuple[Fit, np.ndarray, np.ndarray, float]:
+def _weighed(
+    looks: Looks, center: np.ndarray, information: np.ndarray, start: np.ndarray, touching: np.ndarray, quick: bool
+) -> tuple[Fit, np.ndarray, np.ndarray, float]:
     """The fit, the weights (n, 5), the weight (n,) that each look's gap kept, how many independent looks it is worth.
 
     Gap and hinges are weighed by their own residuals: variance, and how long it stays correlated.
     """
     n = looks.data.shape[1]
-    x, kept = center, np.ones(n)
-    weights = np.full((n, 5), 1.0 / (LEAST_CORRELATION_S * LOOK_RATE_HZ))
-    independent = float(n)
-    for _ in range(ROUNDS):
-        fit = solve(looks, center, information, weights, x)
-        x = fit.x
-        for columns, r in ((slice(0, 3), fit.closure), (slice(3, 5), fit.hinge)):
-            size = np.sum(r**2, axis=1)
-            if columns.start == 0:
-                usual = max(float(np.median(size)) / 2.366, LEAST_VARIANCE)  # the median of chi² with 3 degrees
-                kept = (1.0 + size / (usual * APART**2 * 3.0)) ** -2
-            of = kept if columns.start == 0 else np.ones(n)
-            correlated = max(_correlation_time(r * of[:, None]), LEAST_CORRELATION_S * LOOK_RATE_HZ)
-            variance = max(float(np.sum(of * size)) / (r.shape[1] * float(of.sum())), LEAST_VARIANCE)
-            weights[:, columns] = of[:, None] / (correlated * variance)
-            if columns.start == 0:
-                independent = float(of.sum()) / correlated
-    return solve(looks, center, information, weights, x), weights, kept, independent
+    x, kept, closed = start, touching.copy(), looks.closed
+    steps = QUICK_STEPS if quick else 60
+    least = LEAST_CORRELATION_S * (QUICK_RATE_HZ if quick else LOOK_RATE_HZ)
+    weights = np.full((n, 5), 1.0 / least)
+    weights[:, :3] *= kept[:, None]
+    if quick:
+        weights[:, 3:] = 0.0
+    independent = float(closed.sum())
+    for condition, span in looks.spans():
+        if not isinstance(condition, Closure):
+            weights[span] = 1.0 / (span.stop - span.start)  # as it was held, it was held: one look altogether
+    if not closed.any():
+        return solve(looks, center, information, weights, x, steps, not quick), weights, kept, independent
+    for _ in range(QUICK_ROUNDS if quick else ROUNDS):
+        fit = solve(looks, center, information, weights, x, steps, not quick)
+        x, independent = fit.x, 0.0
+        for closure, span in looks.spans():
+            if isinstance(closure, Closure):
+                r = fit.closure[span, : closure.rows]
+                size = np.sum(r**2, axis=1)
+                # The lower third: the palms may be apart for half of the phase and more.
+                usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[closure.rows], LEAST_VARIANCE)
+                weight = (1.0 + size / (usual * APART**2 * closure.rows)) ** -2
+                kept[span] = np.where(weight > TOUCHED, weight, 0.0)
+                weights[span, :3] = _weights(r, kept[span], least)
+                independent += float(kept[span].sum()) / _correlated(r * kept[span, None], least)
+        arms = [SIDES.index(side) for side in looks.layout.arms]
+        if arms and not quick:
+            weights[closed, 3:] = _weights(fit.hinge[closed][:, arms], np.ones(int(closed.sum())), least)
+    return solve(looks, center, information, weights, x, steps, not quick), weights, kept, independent
+
+
+def _weights(r: np.ndarray, kept: np.ndarray, least: float) -> np.ndarray:
+    """Weights (n, 1) of residuals (n, k): what each look kept, over variance and looks to an independent one."""
+    variance = max(float(np.sum(kept * np.sum(r**2, axis=1))) / (r.shape[1] * float(kept.sum())), LEAST_VARIANCE)
+    return kept[:, None] / (_correlated(r * kept[:, None], least) * variance)
+
+
+def _correlated(r: np.ndarray, least: float) -> float:
+    """How many looks make one independent one."""
+    return max(_correlation_time(r), least)
 
 
 def _handed_on(layout: Layout, covariance: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
@@ -362,19 +531,51 @@ def _mount(found: Filtered, x: np.ndarray, layout: Layout, name: str) -> Rotatio
     return Rotation.from_rotvec(-tilt) * turn * found.at_start[name]
 
 
-def _apart(time: np.ndarray, kept: np.ndarray) -> list[str]:
-    """A line on the moments at which the palms were apart."""
-    apart = kept < TOUCHED
-    if not apart.any():
-        return []
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], apart.view(np.int8), [0]))))
-    spans = [(time[a], time[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    longest = sorted(spans, key=lambda span: span[0] - span[1])[:3]
-    said = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in sorted(longest))
-    return [f"the palms were apart for {100 * apart.mean():.0f} % of the phase, left out: {said}"]
+# What it means that a closure does not hold.
+OPEN = {
+    "coincide": "the palms were apart",
+    "fixed_point": "the palm was off its point",
+    "distance": "the hands did not keep their distance",
+}
+
+
+def _apart(time: np.ndarray, kept: np.ndarray, looks: Looks) -> list[str]:
+    """A line on the moments at which each closure was open."""
+    lines = []
+    for closure, span in looks.spans():
+        apart = kept[span] < TOUCHED
+        if not isinstance(closure, Closure) or not apart.any():
+            continue
+        edges = span.start + np.flatnonzero(np.diff(np.concatenate(([0], apart.view(np.int8), [0]))))
+        spans = [(time[a], time[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        longest = sorted(spans, key=lambda span: span[0] - span[1])[:3]
+        said = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in sorted(longest))
+        lines.append(f"{OPEN[closure.kind]} for {100 * apart.mean():.0f} % of the phase, left out: {said}")
+    return lines
+
+
+def _unseen(protocol: Protocol, layout: Layout, covariance: np.ndarray, gauge: Mapping[str, float]) -> list[str]:
+    """What the protocol, as it was done, does not tell."""
+    remarks = []
+    std = np.sqrt(np.diag(covariance)[layout.heading])
+    if np.any(std > UNSEEN_HEADING_STD):
+        said = ", ".join(
+            f"{name} ± {np.degrees(s):.0f} deg"
+            for name, s in zip(layout.sensors, std, strict=True)
+            if s > UNSEEN_HEADING_STD
+        )
+        remarks.append(f"headings that the motion hardly told: {said}; move through more of the reach, trunk as well")
+    remarks += [
+        f"{closure.gauge} = {closure.metres:g} m is the protocol's, not measured: give yours, as in --gauge "
+        f"{closure.gauge}={closure.metres:g}"
+        for closure in protocol.closures
+        if closure.gauge and closure.gauge not in gauge
+    ]
+    return remarks
 
 
 def _remarks(
+    protocol: Protocol,
     lengths: np.ndarray,
     covariance: np.ndarray,
     without_data: np.ndarray,
@@ -383,11 +584,25 @@ def _remarks(
 ) -> list[str]:
     """What the user should know of the result; `free_scale_std`: relative, where no gauge fixes the scale."""
     remarks = []
+    if not protocol.closures:
+        return [
+            f"{protocol.title} tell headings and no length: those are the average person's "
+            f"({prior.note or prior.name}), or taped"
+        ]
     if free_scale_std is not None:
         remarks.append(
-            f"no gauge in the chain: the hands together fix the proportions, not the scale, which is the prior's "
+            f"no gauge in the chain: {protocol.title} fix the proportions, not the scale, which is the prior's "
             f"({prior.note or prior.name}): all lengths may be off together by {100 * free_scale_std:.1f} %; tape one, "
-            f"as in --gauge shoulder_width=0.385"
+            f"as in --gauge {protocol.tape}"
+        )
+    arms = [LENGTHS.index(name) for name in protocol.chain if name.endswith(("upper_arm", "forearm"))]
+    share = np.zeros(K)
+    share[arms] = 1.0 / lengths[arms] / max(len(arms), 1)
+    scale_std, before = (float(np.sqrt(share @ C @ share)) for C in (covariance, prior.lengths_covariance()))
+    if free_scale_std is None and scale_std > LOOSE_SCALE * before:
+        remarks.append(
+            f"the gauge hardly tells the scale of the arms, which may be off together by {100 * scale_std:.1f} %: "
+            f"tape another length, as in --gauge {protocol.tape}"
         )
     for name, length in zip(LENGTHS, lengths, strict=True):
         z = (length - prior.lengths[name]) / prior.std(name)
@@ -396,17 +611,17 @@ def _remarks(
                 f"{name} = {length:.3f} m lies {abs(z):.1f} standard deviations from the average; "
                 f"check mounts and phases"
             )
-    # The hands tell the proportions: those must be known better than from the average person and the tape.
-    width = LENGTHS.index("shoulder_width")
-    for arm in (LENGTHS.index("left_upper_arm"), LENGTHS.index("right_upper_arm")):
-        share = np.zeros(len(LENGTHS))
-        share[arm], share[width] = 1.0 / lengths[arm], -1.0 / lengths[width]
+    # Closures tell proportions: those must be known better than from the average person and the tape.
+    arms = [LENGTHS.index(name) for name in protocol.chain if name.endswith("upper_arm")]
+    for a, b in ((arm, other) for arm in arms for other in map(LENGTHS.index, protocol.chain) if other not in arms):
+        share = np.zeros(K)
+        share[a], share[b] = 1.0 / lengths[a], -1.0 / lengths[b]
         if share @ covariance @ share < 0.5 * share @ without_data @ share:
             break
     else:
         remarks.append(
-            "the joined hands moved too little to tell the lengths, which are mostly the average person's: move them "
-            "through the whole reach"
+            f"{protocol.title} moved too little to tell the lengths, which are mostly the average person's: move "
+            f"through the whole reach"
         )
     return remarks
 

@@ -9,13 +9,16 @@ with ψ the heading, d its drift since the start, and A the sensor's sag on its 
 gravity turns in the segment. Neither d nor A nor the hinges are handed on, but the covariance of lengths and mounts
 holds what they cost.
 
-Two residuals of a look: the palm gap, whitened by the covariance that errors of the orientations and slipping palms
-give it, which makes it as homogeneous in the lengths as the gap itself (see `lengths`); and of each elbow how far the
-forearm leaves the plane in which a hinge lets it turn.
+What a look sees is the condition of its protocol that holds then. Of a closure it is the gap, whitened by the
+covariance that errors of the orientations and slipping palms give it, which makes it as homogeneous in the lengths as
+the gap itself (see `lengths`), and of each elbow how far the forearm leaves the plane in which a hinge lets it turn. Of
+a pose it is how far a segment is off its stated direction, of an axis how far it is off the level. Every look has the
+same five rows: three of its condition and two elbows; those that do not apply are zero.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -24,18 +27,20 @@ import numpy as np
 
 from ..errors import NoSolution
 from ..subject import LENGTHS
-from .chain import CHAIN, SIDES, about_z, inverse, links, product, rotate, small_turn
+from .chain import SIDES, about_z, inverse, links, product, rotate, small_turn
+from .protocols import Closure, Condition, Direction, coefficients
 
 ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation about each axis: sets the gap's weights, not its size
-SLIP_STD = 0.005  # [m] of the palms against each other, each axis
 HINGE_STD = np.deg2rad(2.0)  # [rad] of the forearm against the elbow's plane
 K = len(LENGTHS)
 
 
 class Layout(NamedTuple):
-    """Where in x what stands; `sensors` are those of the chain, in its order."""
+    """Where in x what stands: `sensors` of the chain in its order, how many unknown points, how many distances."""
 
     sensors: tuple[str, ...]
+    fixed: int = 0
+    gauges: tuple[str, ...] = ()
 
     @property
     def heading(self) -> slice:
@@ -63,8 +68,23 @@ class Layout(NamedTuple):
         return slice(self.hinge.stop, self.hinge.stop + 9 * len(self.sensors))
 
     @property
+    def points(self) -> slice:
+        """Unknown points of W (3,) each [m]."""
+        return slice(self.sag.stop, self.sag.stop + 3 * self.fixed)
+
+    @property
+    def distances(self) -> slice:
+        """Of each gauge that is no length of the body [m]."""
+        return slice(self.points.stop, self.points.stop + len(self.gauges))
+
+    @property
     def size(self) -> int:
-        return self.sag.stop
+        return self.distances.stop
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Sides whose elbow has a sensor above and below."""
+        return tuple(s for s in SIDES if {f"{s}_upper_arm", f"{s}_forearm"} <= set(self.sensors))
 
 
 class Fit(NamedTuple):
@@ -79,63 +99,139 @@ class Fit(NamedTuple):
 
 
 class Looks(NamedTuple):
-    """What the residuals see: n looks at the chain."""
+    """What the residuals see: n looks, each at what one condition says."""
 
     layout: Layout
     data: np.ndarray  # (4 sensors + 1, n): Q of each sensor xyzw, seconds since the start pose
+    conditions: tuple[Condition, ...]
+    of: np.ndarray  # (n,) which condition holds at each look, never falling
+
+    def take(self, columns: np.ndarray) -> Looks:
+        """Some of the looks: indices that grow, or bool (n,)."""
+        return self._replace(data=self.data[:, columns], of=self.of[columns])
+
+    def spans(self) -> list[tuple[Condition, slice]]:
+        """Which looks belong to each condition; none of them may be empty."""
+        edges = np.searchsorted(self.of, np.arange(len(self.conditions) + 1))
+        return [(c, slice(int(edges[i]), int(edges[i + 1]))) for i, c in enumerate(self.conditions)]
+
+    @property
+    def closed(self) -> np.ndarray:
+        """(n,) bool, looks at a closure."""
+        return np.array([isinstance(c, Closure) for c in self.conditions], dtype=bool)[self.of]
 
 
 def residuals(x: np.ndarray, looks: Looks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (n, 5), their Jacobian (n, 5, len(x)), gaps (n, 3) [m]."""
-    n = looks.data.shape[1]
-    r, J, gap = _mapped(looks.layout, n)(x, looks.data)
-    jacobian = np.asarray(J).reshape(5, n, looks.layout.size).transpose(1, 0, 2)
-    return np.asarray(r).T, jacobian, np.asarray(gap).T
+    """Residuals (n, 5), their Jacobian (n, 5, len(x)), gaps (n, 3) [m]; the gap of what is no closure is zero."""
+    found, point = [], 0
+    for condition, span in looks.spans():
+        n = span.stop - span.start
+        r, J, gap = _mapped(looks.layout, condition, point, n)(x, looks.data[:, span])
+        point += isinstance(condition, Closure) and condition.kind == "fixed_point"
+        jacobian = np.asarray(J).reshape(5, n, looks.layout.size).transpose(1, 0, 2)
+        found.append((np.asarray(r).T, jacobian, np.asarray(gap).T))
+    if len(found) == 1:
+        return found[0]
+    r, J, gap = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return r, J, gap
 
 
-@lru_cache(maxsize=8)
-def _mapped(layout: Layout, n: int) -> Any:
+def placed(x: np.ndarray, looks: Looks) -> np.ndarray:
+    """The same x with each unknown point in the middle of where the body's point was seen."""
+    if not looks.layout.fixed:
+        return x
+    x, gaps = x.copy(), residuals(x, looks)[2]
+    fixed = [span for c, span in looks.spans() if isinstance(c, Closure) and c.kind == "fixed_point"]
+    for i, span in enumerate(fixed):
+        x[looks.layout.points][3 * i : 3 * i + 3] += gaps[span].mean(axis=0)
+    return x
+
+
+@lru_cache(maxsize=32)
+def _mapped(layout: Layout, condition: Condition, point: int, n: int) -> Any:
     x, data = ca.MX.sym("x", layout.size), ca.MX.sym("data", 4 * len(layout.sensors) + 1, n)
-    r, J, gap = _look(layout).map(n)(ca.repmat(x, 1, n), data)
+    r, J, gap = _look(layout, condition, point).map(n)(ca.repmat(x, 1, n), data)
     return ca.Function("looks", [x, data], [r, J, gap])
 
 
-@lru_cache(maxsize=8)
-def _look(layout: Layout) -> Any:
+@lru_cache(maxsize=32)
+def _look(layout: Layout, condition: Condition, point: int) -> Any:
     """One look: (x, data) → residuals (5), Jacobian (5, len(x)), gap (3)."""
     sensors = layout.sensors
     x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", 4 * len(sensors) + 1)
-    heading, tilt, drift = x[layout.heading], x[layout.tilt], x[layout.drift]
-    hinge, sag = x[layout.hinge], x[layout.sag]
-    up = ca.vertcat(0.0, 0.0, 1.0)
+    heading, tilt, drift, sag = x[layout.heading], x[layout.tilt], x[layout.drift], x[layout.sag]
     quat_WL = {}
     for i, name in enumerate(sensors):
         turned = product(about_z(heading[i] + drift[i] * data[-1]), data[4 * i : 4 * i + 4])
         turned = product(turned, about_z(-heading[i]))
         quat = product(turned, small_turn(ca.vertcat(tilt[2 * i], tilt[2 * i + 1], 0.0)))
         A = ca.reshape(sag[9 * i : 9 * i + 9], 3, 3)
-        quat_WL[name] = product(quat, small_turn(A @ (rotate(inverse(quat), up) - up)))
-    # A link without a sensor of its own, a hand, is rigid with the forearm and shares its errors.
-    carrier = {name: name if name in sensors else name.replace("hand", "forearm") for name in CHAIN}
-    moved = {sensor: ca.SX.zeros(3) for sensor in sensors}
-    for name, vector in links(x[:K], {name: quat_WL[carrier[name]] for name in CHAIN}).items():
-        moved[carrier[name]] += vector
-    gap, covariance = ca.SX.zeros(3), SLIP_STD**2 * ca.SX.eye(3)
+        quat_WL[name] = product(quat, small_turn(A @ (rotate(inverse(quat), _UP) - _UP)))
+    gap, elbows = ca.SX.zeros(3), ca.SX.zeros(2)
+    if isinstance(condition, Closure):
+        whitened, gap = _closed(layout, condition, x, quat_WL, point)
+        elbows = _elbows(layout, x, quat_WL)
+    elif isinstance(condition, Direction):
+        along_T = rotate(inverse(quat_WL["torso"]), rotate(quat_WL[condition.segment], -_UP))
+        whitened = (along_T - ca.DM(condition.direction)) / condition.std
+    else:
+        level = rotate(quat_WL[condition.segment], ca.vertcat(0.0, 1.0, 0.0))[2]
+        whitened = ca.vertcat(level / condition.std, 0.0, 0.0)
+    r = ca.vertcat(whitened, elbows)
+    return ca.Function("look", [x, data], [r, ca.densify(ca.jacobian(r, x)), ca.densify(gap)])
+
+
+_UP = ca.vertcat(0.0, 0.0, 1.0)
+
+
+def carrier(segment: str, sensors: Collection[str]) -> str:
+    """Whose sensor turns with the segment: a hand without a sensor is rigid with the forearm and shares its errors."""
+    return segment if segment in sensors else segment.replace("hand", "forearm")
+
+
+def _closed(layout: Layout, closure: Closure, x: Any, quat_WL: Mapping[str, Any], point: int) -> tuple[Any, Any]:
+    """Whitened residual (3) and gap (3) [m] of a closure."""
+    way = coefficients(closure)
+    carried = {name: carrier(name, layout.sensors) for name in way}
+    moved = {sensor: ca.SX.zeros(3) for sensor in layout.sensors if sensor in carried.values()}
+    for name, vector in links(x[:K], {name: quat_WL[carried[name]] for name in way}, way).items():
+        moved[carried[name]] += vector
+    gap, covariance = ca.SX.zeros(3), closure.slip**2 * ca.SX.eye(3)
     for v in moved.values():
         gap += v
         # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ).
         covariance += ATTITUDE_STD**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
-    whitened = [ca.solve(ca.chol(covariance).T, gap)]
+    if closure.kind == "distance":
+        size = ca.norm_2(gap)
+        off = size - x[layout.distances][layout.gauges.index(closure.gauge)]
+        return ca.vertcat(off / ca.sqrt(gap.T @ covariance @ gap) * size, 0.0, 0.0), off * gap / size
+    if closure.kind == "fixed_point":
+        first = layout.points.start + 3 * point
+        gap -= x[first : first + 3]
+    return ca.solve(ca.chol(covariance).T, gap), gap
+
+
+def _elbows(layout: Layout, x: Any, quat_WL: Mapping[str, Any]) -> Any:
+    """How far each forearm leaves the plane of its hinge, (2) in units of `HINGE_STD`."""
+    hinge, found = x[layout.hinge], []
     for i, side in enumerate(SIDES):
-        forearm = rotate(inverse(quat_WL[f"{side}_upper_arm"]), rotate(quat_WL[f"{side}_forearm"], -up))
+        if side not in layout.arms:
+            found.append(ca.SX(0.0))
+            continue
+        forearm = rotate(inverse(quat_WL[f"{side}_upper_arm"]), rotate(quat_WL[f"{side}_forearm"], -_UP))
         axis = ca.vertcat(hinge[2 * i], 1.0, hinge[2 * i + 1])
-        whitened.append(ca.dot(axis, forearm) / ca.norm_2(axis) / HINGE_STD)
-    r = ca.vertcat(*whitened)
-    return ca.Function("look", [x, data], [r, ca.jacobian(r, x), gap])
+        found.append(ca.dot(axis, forearm) / ca.norm_2(axis) / HINGE_STD)
+    return ca.vertcat(*found)
 
 
 def solve(
-    looks: Looks, center: np.ndarray, prior: np.ndarray, weights: np.ndarray, start: np.ndarray, rounds: int = 60
+    looks: Looks,
+    center: np.ndarray,
+    prior: np.ndarray,
+    weights: np.ndarray,
+    start: np.ndarray,
+    rounds: int = 60,
+    strict: bool = True,
 ) -> Fit:
     """Minimiser of Σ w r² + (x − c)ᵀ Λ (x − c): Gauss-Newton, damped where a step does not lower the cost.
 
@@ -143,6 +239,7 @@ def solve(
     ----------
     center, prior : c (m,) and Λ (m, m)
     weights : (n, 5) of the residuals
+    strict : without it what was reached in these rounds is given
 
     Raises
     ------
@@ -174,7 +271,7 @@ def solve(
                 break
         x, r, J, gaps, cost = nearer, r_next, J_next, gaps_next, min(lower, cost)
         damping = max(damping / 8.0, 1e-12)
-    if gradient @ step < 0.05**2:
+    if gradient @ step < 0.05**2 or not strict:
         return Fit(x, r[:, :3], r[:, 3:], gaps, information, cost)
     raise NoSolution(
         f"the lengths did not converge ({np.sqrt(gradient @ step):.2g} standard deviations to go); check that the "

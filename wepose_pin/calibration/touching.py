@@ -16,23 +16,21 @@ from .problem import Looks, residuals
 WIDE = 0.15
 # A share of looks wider apart than that, from which on the start is looked for in subsets.
 MANY_WIDE = 0.05
-# Windows of a subset, looks of a window, and subsets: with half of the phase apart one in 16 has none of it.
-WINDOWS, WINDOW_LOOKS, SUBSETS = 4, 20, 60
+# Windows of a subset, their length [s], and subsets: with half of the phase apart one in 16 has none of it.
+WINDOWS, WINDOW_S, SUBSETS = 4, 2.5, 60
 SCORED = 120  # looks on which a start is scored
 
 
-def touching_start(
-    looks: Looks, center: np.ndarray, place: Callable[[Looks], np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def touching_start(looks: Looks, place: Callable[[Looks], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """A start x (m,) and the weight (n,) of each look's gap in it, near 0 where the palms are apart.
 
     Parameters
     ----------
-    center : (m,) what is known before
-    place : looks → x (m,), `center` with headings from the closure of these looks
+    place : looks → x (m,), what is known before, with headings from the closure of these looks
     """
     n = looks.data.shape[1]
-    few = Looks(looks.layout, looks.data[:, np.linspace(0, n - 1, min(n, SCORED)).astype(int)])
+    window = max(5, round(WINDOW_S / max(float(np.median(np.diff(looks.data[-1]))), 1e-3)))
+    few = looks.take(np.linspace(0, n - 1, min(n, SCORED)).astype(int))
 
     def wide(x: np.ndarray, at: Looks) -> np.ndarray:
         return np.sum(residuals(x, at)[2] ** 2, axis=1) / WIDE**2
@@ -42,13 +40,13 @@ def touching_start(
 
     best = place(looks)
     lowest = score(best)
-    if np.mean(wide(best, few) > 1.0) > MANY_WIDE and n > WINDOWS * WINDOW_LOOKS:
+    if looks.closed.all() and np.mean(wide(best, few) > 1.0) > MANY_WIDE and n > 2 * WINDOWS * window:
         rng = np.random.default_rng(0)
-        windows = np.array_split(np.arange(n), max(n // WINDOW_LOOKS, WINDOWS))
+        windows = np.array_split(np.arange(n), n // window)
         for _ in range(SUBSETS):
             chosen = rng.choice(len(windows), WINDOWS, replace=False)
             columns = np.concatenate([windows[k] for k in np.sort(chosen)])
-            x = place(Looks(looks.layout, looks.data[:, columns]))
+            x = place(looks.take(columns))
             found = score(x)
             if found < lowest:
                 best, lowest = x, found

@@ -22,6 +22,7 @@ from .smekf import Smekf, SmekfParams, starting_params
 from .smoother import Smoother
 
 __all__ = [
+    "BEST",
     "METHODS",
     "OFFLINE",
     "TYPICAL",
@@ -42,7 +43,8 @@ __all__ = [
     "run_filter",
 ]
 
-METHODS: dict[str, type] = {"smekf": Smekf, "ncf": Ncf, "gdc": Gdc, "amekf": Amekf, "smoother": Smoother}
+METHODS: dict[str, type] = {"amekf": Amekf, "smoother": Smoother, "smekf": Smekf, "ncf": Ncf, "gdc": Gdc}
+BEST = "amekf"  # of those that need no future (docs/validation.md)
 OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
 
 # Of a sensor that is never seen at rest: noise of a usual MEMS sensor at 100 to 300 Hz, a bias as it may be from the
@@ -85,7 +87,7 @@ def estimate_orientation(
     accel_S: np.ndarray,
     rate_hz: float,
     *,
-    method: str = "smekf",
+    method: str = BEST,
     still: tuple[float, float] | None,
     params: Any = None,
     static_test: StaticTest | None = None,

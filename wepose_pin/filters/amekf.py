@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..errors import BadOption
-from ..noise import SensorNoise
+from ..noise import BLOCK_S, SensorNoise
 from ..so3 import inlined, kernel
 from ..static import static_step
 from .base import HIGHEST_ACCEL, HIGHEST_RATE, FilterRun, OneSample, samples
@@ -81,7 +81,7 @@ class AmekfParams:
     gyro_matrix_std: float = 0.002  # each entry of M
     gyro_matrix_walk: float = 1e-6  # [1/√s]
     gyro_bias_walk: float = 5e-6  # [rad/s/√s], 10 deg/h in 100 s
-    rest_bias_std: float = 1e-4  # [rad/s] by which the mean of gyro over a static block is not the bias
+    rest_bias_std: float = 1e-4  # [rad/s] by which the mean of gyro over a static block is not the bias, sway aside
     motion_bias_std: float = 1.7e-4  # [rad/s], 0.01 deg/s, bias in motion less that at rest
     motion_bias_walk: float = 5e-5  # [rad/s/√s]
     accel_bias_std: float = 0.03  # [m/s²], 3 mg
@@ -141,6 +141,10 @@ class Amekf:
         self.noise = noise
         self.block = max(1, round(p.block_s * rate_hz))
         length = self.block / rate_hz
+        # By how much the mean of gyro over a static block is off: a person who stands still sways.
+        white = float(np.trace(noise.gyro_cov)) / 3.0 / self.block
+        slow = noise.gyro_half_second_cov
+        swaying = 0.0 if slow is None else float(np.trace(slow)) / 3.0 * BLOCK_S / length
         known = {
             "gravity": noise.gravity,
             "gyro_noise": float(np.trace(noise.gyro_cov)) / 3.0 / rate_hz,  # [rad²/s]
@@ -154,7 +158,7 @@ class Amekf:
             "matrix_walk": p.gyro_matrix_walk**2,
             "accel_bias_walk": p.accel_bias_walk**2,
             "motion_bias_walk": p.motion_bias_walk**2,
-            "rest_bias": p.rest_bias_std**2 + float(np.trace(noise.gyro_cov)) / 3.0 / self.block,
+            "rest_bias": p.rest_bias_std**2 + max(white, swaying),
             "lost_rate": p.lost_rate_std,
             "lost_force": p.lost_force_std**2,
             "gyro_limit": p.gyro_range,

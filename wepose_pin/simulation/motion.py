@@ -122,7 +122,17 @@ class _Circle:
 
 
 class Motion:
-    """The subject's motion as a function of continuous time."""
+    """The subject's motion as a function of continuous time; `tasks` holds those of other protocols than the clasp."""
+
+    phase = "clasp"
+    lean_deg: float | np.ndarray = 15.0  # yaw, pitch, roll of the torso in the clasp
+
+    def prepare(self, rng: np.random.Generator, pose_deg: float) -> None:
+        """What another protocol draws beyond the clasp; `pose_deg`: how far poses are off, each axis."""
+
+    def phases(self) -> dict[str, list[tuple[float, float]]]:
+        """What is done between start and circles: phase → intervals [s]."""
+        return {self.phase: [(self.clasp[0] + MARGIN_S, self.clasp[1] - MARGIN_S)]}
 
     def __init__(
         self, lengths: Mapping[str, float], rng: np.random.Generator, clasp_s: float, circles: int, flaws: Flaws
@@ -185,6 +195,23 @@ class Motion:
         lower = (lower**8 + chest**8) ** 0.125  # a smooth maximum
         return (lower + fraction * (upper - lower))[:, None] * ray
 
+    def _moving(self, t: np.ndarray) -> np.ndarray:
+        return pulse(t, *self.clasp, _RAMP_S)  # 0 at both ends of the clasp
+
+    def _torso(self, _t: np.ndarray, lean: np.ndarray) -> Rotation:
+        """R_WT, `lean` (n, 3) [rad] yaw, pitch, roll."""
+        return Rotation.from_euler("ZYX", lean)
+
+    def _palms(
+        self, _t: np.ndarray, _moving: np.ndarray, clasp_T: np.ndarray, _R_WT: Rotation
+    ) -> dict[str, np.ndarray]:
+        """Where each palm is before the right one goes to the table: (n, 3) [m] in T."""
+        return {"left": clasp_T, "right": clasp_T}
+
+    def _led(self, _t: np.ndarray, led: np.ndarray, table: np.ndarray) -> dict[str, np.ndarray]:
+        """How far each arm is led by its palm, 0 where it hangs: (n,)."""
+        return {"left": led * (1.0 - table), "right": led}  # the left arm goes back to hang
+
     def _arm(self, side: str, palm_T: np.ndarray, swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:
         """Upper arm in T and elbow flexion [rad] to bring the palm to `palm_T` (n, 3) [m], from the shoulder.
 
@@ -212,30 +239,28 @@ class Motion:
 
     def __call__(self, t: np.ndarray, sides: Collection[str] = tuple(SIDES)) -> BodyPose:
         """The pose of torso and arms of these sides at the times `t` (n,) [s], exact."""
-        moving = pulse(t, *self.clasp, _RAMP_S)  # 0 at both ends of the clasp
+        moving = self._moving(t)
         circling = sum((pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
         led = step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
         table = step(t, self.clasp[1], _BLEND_S)  # from the clasp to the table
 
         lean = np.column_stack([self.wander[name](t) for name in ("yaw", "pitch", "roll")])
-        lean *= np.deg2rad(15.0 * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
+        lean *= np.deg2rad(self.lean_deg * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
         flaws = self.flaws
         sway = np.deg2rad(flaws.sizes.sway_deg_s)
         if sway:
             lean[:, 1:] += sway * flaws.sway["torso"](t)
-        R_WT = Rotation.from_euler("ZYX", lean)
+        R_WT = self._torso(t, lean)
         clasp_T = self._clasp_point(t, moving) + self.lengths["trunk"] * E_Z
         hand_W = self.table_W + sum((c.offset_W(t, self.table_W) for c in self.circles), np.zeros((len(t), 3)))
-        palm_T = {
-            "left": clasp_T,
-            "right": clasp_T + table[:, None] * (R_WT.inv().apply(hand_W) - clasp_T),
-        }
+        palm_T = self._palms(t, moving, clasp_T, R_WT)
+        palm_T["right"] = palm_T["right"] + table[:, None] * (R_WT.inv().apply(hand_W) - palm_T["right"])
         if flaws.sizes.palm_slip:
             slip_T = moving[:, None] * np.column_stack(
                 [g * w(t) for g, w in zip(self.slip_gain, flaws.slip, strict=True)]
             )
             palm_T = {"left": palm_T["left"] + 0.5 * slip_T, "right": palm_T["right"] - 0.5 * slip_T}
-        led_by = {"left": led * (1.0 - table), "right": led}  # the left arm goes back to hang
+        led_by = self._led(t, led, table)
         palm_down = {"left": 0.0 * t, "right": np.deg2rad(40.0) * table}
 
         R_WL, points = {"torso": R_WT}, {}

@@ -28,6 +28,7 @@ from .motion import (
     sensor_places,
     sensor_position,
 )
+from .tasks import TASKS
 
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, but for the tilt of the strap
 
@@ -46,6 +47,7 @@ _STREAMS = (
     "clock_offset",
     "dropped",
     "mount",
+    "task",
 )
 
 
@@ -174,6 +176,8 @@ def simulate(
     imperfections: Imperfections = PERFECT_WORLD,
     clasp_s: float = 60.0,
     circles: int = 6,
+    protocol: str = "clasp",
+    pose_deg: float = 0.0,
 ) -> Simulation:
     """A recording of the paper's upper-body experiment with known truth.
 
@@ -192,6 +196,9 @@ def simulate(
     imperfections : of subject, strapping and sensors; `PERFECT_WORLD` for none, `REALISTIC` for usual ones.
     clasp_s : how long the palms stay together [s], at least 5.
     circles : how many circles, 0 or more.
+    protocol : what is done in place of the clasp, one of `TASKS`; "handle": 0.4 m between the palms; "touch_left" and
+        "touch_right": the palm on a fixed point while the trunk leans and turns; "poses": T-pose and bow, no circles.
+    pose_deg : how far T-pose and bow are off, standard deviation of each axis [deg].
 
     Returns
     -------
@@ -210,10 +217,13 @@ def simulate(
         raise ValueError(f"lengths: must be given in metres and above 0: {wrong}")
     if not (clasp_s >= 5.0 and circles >= 0 and rate_hz > 0.0):
         raise ValueError(f"clasp_s {clasp_s} must be >= 5, circles {circles} >= 0, rate_hz {rate_hz} > 0")
+    if protocol not in TASKS or (protocol == "poses" and circles):
+        raise ValueError(f"protocol {protocol!r} must be one of {', '.join(TASKS)}; with 'poses' circles must be 0")
     lengths = {name: float(lengths[name]) for name in LENGTHS}
     motion_rng, mount_rng, noise_rng, *others = np.random.default_rng(seed).spawn(3 + len(_STREAMS))
     rngs = dict(zip(_STREAMS, others, strict=True))
-    motion = Motion(lengths, motion_rng, clasp_s, circles, Flaws(imperfections, rngs))
+    motion = TASKS[protocol](lengths, motion_rng, clasp_s, circles, Flaws(imperfections, rngs))
+    motion.prepare(rngs["task"], pose_deg)
     n = int(np.floor(motion.rest[-1][1] * rate_hz)) + 1
     time = np.arange(n) / rate_hz
     p_LS = sensor_places(lengths)
@@ -271,7 +281,7 @@ def simulate(
 
     phases = {
         "start": [(0.5, STAND_S - 0.5)],
-        "clasp": [(motion.clasp[0] + MARGIN_S, motion.clasp[1] - MARGIN_S)],
+        **motion.phases(),
         "circles": [(motion.circles[0].start, motion.circles[-1].stop)] if motion.circles else [],
         "rest": [(a + MARGIN_S, b - MARGIN_S) for a, b in motion.rest],
     }

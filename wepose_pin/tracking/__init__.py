@@ -1,4 +1,4 @@
-"""Recording and subject → pose: filter, align, kinematics."""
+"""Recording and subject → pose: filter, align, hold the headings together, kinematics."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from .alignment import Segments, segment_orientations
-from .model import POINTS, BodyModel, load_model
-from .pose import Pose, deviation, point_covariance, pose_of
-from .recording import SEGMENTS, Recording
-from .static import StaticTest
-from .subject import Subject, average_subject
+from ..alignment import Segments, segment_orientations
+from ..filters import BEST
+from ..model import POINTS, BodyModel, load_model
+from ..pose import Pose, deviation, point_covariance, pose_of
+from ..recording import SEGMENTS, Recording
+from ..static import StaticTest
+from ..subject import Subject, average_subject
+from .headings import Reset, held_together
 
 _WORTH_A_WARNING_DEG = 1.0
 
@@ -26,6 +28,7 @@ class TrackedPose(Pose):
     model: BodyModel | None = None
     segments: Segments | None = None
     method: str = ""
+    reset: Reset | None = None
 
     def summary(self) -> dict[str, Any]:
         """What was run on what, in numbers and words, for ``summary.json``."""
@@ -67,8 +70,21 @@ class TrackedPose(Pose):
             "sensors": sensors,
             "points": sorted(self.points),
             "not_followed_rms_deg": missed,
+            "headings_held_together": self._held_together(),
             "warnings": [*self.segments.warnings, *self._not_known(), *lame],
         }
+
+    def _held_together(self) -> dict[str, Any] | None:
+        """Residuals of clasp and elbows before and after, and how far each heading was turned."""
+        if self.reset is None:
+            return None
+        about: dict[str, Any] = {
+            "hinge_rms_deg": {side: [round(v, 3) for v in values] for side, values in self.reset.hinge_deg.items()},
+            "largest_turn_deg": {name: round(value, 3) for name, value in self.reset.largest_deg.items()},
+        }
+        if self.reset.clasp_mm is not None:
+            about["clasp_gap_rms_mm"] = [round(value, 2) for value in self.reset.clasp_mm]
+        return about
 
     def _not_known(self) -> list[str]:
         """A line on the points that have no place for want of a sensor."""
@@ -90,9 +106,10 @@ def track(
     recording: Recording,
     subject: Subject | None = None,
     *,
-    method: str = "smekf",
+    method: str = BEST,
     model: BodyModel | None = None,
     static_test: StaticTest | None = None,
+    hold_headings: bool = True,
 ) -> TrackedPose:
     """The pose of the upper body.
 
@@ -100,6 +117,7 @@ def track(
     ----------
     subject : lengths and mounts; None for the anthropometric average and the session's stated mounts
     method : the orientation filter, a key of `wepose_pin.filters.METHODS`
+    hold_headings : use what a calibrated subject's elbows, and the joined hands of a phase `clasp`, say of drift
     model : a body; None for ours. It gets the subject's lengths; without a subject its own stand
 
     Raises
@@ -108,6 +126,9 @@ def track(
         What the recording, the subject or the model lacks.
     """
     segments = segment_orientations(recording, subject, method=method, static_test=static_test)
+    reset = None
+    if subject is not None and hold_headings:
+        segments, reset = held_together(recording, segments, subject)
     who = subject or average_subject()
     body = model or load_model()
     own = body.lengths
@@ -129,4 +150,5 @@ def track(
         model=body,
         segments=segments,
         method=method,
+        reset=reset,
     )

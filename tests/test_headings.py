@@ -1,0 +1,98 @@
+"""Headings held together by joined hands and elbows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import BadSubject
+from wepose_pin.evaluation import evaluate
+from wepose_pin.recording import Recording, Sensor
+from wepose_pin.simulation import PERFECT, Simulation, simulate, simulated_person
+from wepose_pin.subject import Hinge, Subject, load_subject, subject_toml
+from wepose_pin.tracking import track
+
+HINGES = {side: Hinge(np.array([0.0, 1.0, 0.0]), np.deg2rad(2.0)) for side in ("left", "right")}
+
+
+@pytest.fixture(scope="module")
+def made() -> tuple[Simulation, Subject]:
+    person = simulated_person(4)
+    simulation = simulate(person.lengths, seed=4, noise=PERFECT, clasp_s=40.0, circles=4)
+    mounts = dict.fromkeys(simulation.quat_WL, np.array([0.0, 0.0, 0.0, 1.0]))
+    return simulation, replace(person.average, lengths=person.lengths, mounts=mounts, hinges=HINGES)
+
+
+def drifting(simulation: Simulation, deg_min: dict[str, float]) -> Recording:
+    """Exact orientations whose headings drift from the end of the start pose on."""
+    recording = simulation.recording()
+    since = np.clip(recording.time - recording.phases["start"][0][1], 0.0, None)
+    sensors = {}
+    for name, quat in simulation.quat_WL.items():
+        turn = np.deg2rad(deg_min.get(name, 0.0)) / 60.0 * since[:, None] * [0.0, 0.0, 1.0]
+        sensors[name] = Sensor(quat_WS=(Rotation.from_rotvec(turn) * Rotation.from_quat(quat)).as_quat())
+    return replace(recording, sensors=sensors)
+
+
+def test_a_forearm_that_drifts_is_brought_back(made: tuple[Simulation, Subject]) -> None:
+    simulation, subject = made
+    recording = drifting(simulation, {"right_forearm": 8.0})
+    errors = {}
+    for hold in (False, True):
+        pose = track(recording, subject, hold_headings=hold)
+        errors[hold] = evaluate(pose, simulation.truth(), simulation.phases["circles"][0]).position["right_hand"].mean
+    assert errors[True] < 0.7 * errors[False]
+    assert pose.reset is not None
+    assert pose.reset.clasp_mm is not None
+    assert pose.reset.clasp_mm[1] < 0.6 * pose.reset.clasp_mm[0]
+    assert pose.reset.hinge_deg["right"][1] < pose.reset.hinge_deg["right"][0]
+    summary = pose.summary()["headings_held_together"]
+    assert summary["largest_turn_deg"]["right_forearm"] > 4.0 > summary["largest_turn_deg"]["left_upper_arm"]
+
+
+def test_what_does_not_drift_stays(made: tuple[Simulation, Subject]) -> None:
+    simulation, subject = made
+    recording = drifting(simulation, {})
+    with_, without = (track(recording, subject, hold_headings=hold) for hold in (True, False))
+    for name, quat in without.quat_WL.items():
+        off = Rotation.from_quat(with_.quat_WL[name]) * Rotation.from_quat(quat).inv()
+        assert np.degrees(off.magnitude().max()) < 0.02
+
+
+def test_nothing_is_corrected_without_a_clasp_and_hinges(made: tuple[Simulation, Subject]) -> None:
+    simulation, subject = made
+    recording = drifting(simulation, {"right_forearm": 8.0})
+    recording = replace(recording, phases={"start": recording.phases["start"]})
+    assert track(recording, replace(subject, hinges={})).reset is None
+    fewer = replace(recording, sensors={n: s for n, s in recording.sensors.items() if n != "torso"})
+    assert track(fewer, subject).reset is None
+
+
+def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simulation, Subject]) -> None:
+    simulation, subject = made
+    recording = drifting(simulation, {})
+    circles = simulation.phases["circles"][0]
+    apart = replace(recording, phases={"start": recording.phases["start"], "clasp": (circles,)})
+    pose = track(apart, replace(subject, hinges={}))
+    if pose.reset is not None:
+        assert max(pose.reset.largest_deg.values()) < 0.5
+
+
+def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tmp_path: Path) -> None:
+    _, subject = made
+    path = tmp_path / "subject.toml"
+    path.write_text(subject_toml(subject))
+    again = load_subject(path)
+    for side, hinge in subject.hinges.items():
+        np.testing.assert_allclose(again.hinges[side].axis, hinge.axis, atol=1e-9)
+        assert again.hinges[side].std == pytest.approx(hinge.std, rel=1e-3)
+    path.write_text(subject_toml(subject).replace("[hinges.left]", "[hinges.middle]"))
+    with pytest.raises(BadSubject, match=r"hinges\.middle is no side; left or right"):
+        load_subject(path)
+    path.write_text(subject_toml(subject).replace("y = 1.0", "y = 2.0"))
+    with pytest.raises(BadSubject, match=r"hinges\.left: x, y, z must be of length 1"):
+        load_subject(path)

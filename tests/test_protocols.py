@@ -1,0 +1,405 @@
+"""Protocols as data, one solver: each on exact motion and on usual imperfections, with mounts at any rotation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.calibration import PROTOCOLS, Calibration, calibrate_lengths, load_protocol
+from wepose_pin.calibration.chain import CHAIN, REACHES, links
+from wepose_pin.calibration.problem import Layout, Looks, residuals
+from wepose_pin.calibration.protocols import Closure
+from wepose_pin.cli import main
+from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
+from wepose_pin.model import load_model
+from wepose_pin.pose import pose_of
+from wepose_pin.recording import Recording
+from wepose_pin.simulation import (
+    MTI_3,
+    PERFECT,
+    PERFECT_WORLD,
+    REALISTIC,
+    Person,
+    Simulation,
+    simulate,
+    simulated_person,
+)
+from wepose_pin.simulation.tasks import TASKS, Touch
+from wepose_pin.subject import LENGTHS
+from wepose_pin.writers.session import write_session
+
+CALIBRATION = Path(__file__).resolve().parent.parent / "calibration"
+POSE_DEG = 4.0
+MADE: dict[tuple, tuple[Person, Simulation]] = {}
+
+
+def made(protocol: str, seed: int, real: bool) -> tuple[Person, Simulation]:
+    """A minute of a protocol with mounts at any rotation, exact or with usual imperfections."""
+    key = (protocol, seed, real)
+    if key not in MADE:
+        person = simulated_person(seed)
+        MADE[key] = (
+            person,
+            simulate(
+                person.lengths,
+                seed=seed,
+                rate_hz=100.0 if real else 50.0,
+                noise=MTI_3 if real else PERFECT,
+                imperfections=replace(REALISTIC if real else PERFECT_WORLD, mount="any"),
+                circles=0,
+                protocol=protocol,
+                pose_deg=POSE_DEG if real else 0.0,
+            ),
+        )
+    return MADE[key]
+
+
+def mount_errors(found: Calibration, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the mounts (sensors, 3) [deg] in L, the last of them the heading's, and their standard deviations."""
+    error, std = [], []
+    for name in found.drift:
+        off = Rotation.from_quat(found.subject.mounts[name]) * Rotation.from_quat(simulation.quat_LS[name]).inv()
+        error.append(off.as_rotvec(degrees=True))
+        std.append([np.degrees(found.subject.std(f"mounts.{name}.{axis}")) for axis in "xyz"])
+    return np.array(error), np.array(std)
+
+
+def length_errors(found: Calibration, person: Person, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of lengths [m], and their standard deviations."""
+    return (
+        np.array([found.subject.lengths[name] - person.lengths[name] for name in names]),
+        np.array([found.subject.std(name) for name in names]),
+    )
+
+
+# --------------------------------------------------------------------------------------------------------------- data
+
+
+def test_every_protocol_file_is_known_and_says_what_to_do() -> None:
+    assert {path.stem for path in CALIBRATION.glob("*.toml")} == {*PROTOCOLS, "anthropometry"}
+    for name in PROTOCOLS:
+        protocol = load_protocol(name)
+        assert protocol.name == name
+        assert protocol.steps[0].phase == "start"
+        assert {condition.phase for condition in protocol.conditions} == {s.phase for s in protocol.steps} - {"start"}
+        assert {segment.replace("hand", "forearm") for segment in protocol.segments} == set(protocol.needs)
+
+
+def test_what_is_in_the_chain_follows_from_the_points() -> None:
+    assert set(load_protocol("clasp").chain) == set(LENGTHS) - {"trunk"}  # the trunk cancels
+    assert load_protocol("touch_left").chain == (
+        "trunk",
+        "shoulder_width",
+        "left_upper_arm",
+        "left_forearm",
+        "left_hand",
+    )
+    assert load_protocol("poses").chain == ()
+    assert load_protocol("handle").gauges == ("handle",)
+
+
+def test_every_point_is_pinocchios() -> None:
+    rng = np.random.default_rng(0)
+    values = np.array([0.5, 0.4, 0.3, 0.25, 0.07, 0.31, 0.24, 0.08])
+    model = load_model(lengths=dict(zip(LENGTHS, values, strict=True)))
+    drawn = {segment: Rotation.random(3, random_state=rng).as_quat() for segment in CHAIN}
+    points = pose_of(model, np.arange(3.0), drawn).points
+    lengths, quats = ca.SX.sym("l", 8), {segment: ca.SX.sym(segment, 4) for segment in CHAIN}
+    for name, way in REACHES.items():
+        place = sum(links(lengths, quats, way).values(), start=ca.SX.zeros(3))
+        function = ca.Function(name, [lengths, *quats.values()], [place])
+        for k in range(3):
+            found = np.asarray(function(values, *(drawn[segment][k] for segment in CHAIN))).ravel()
+            np.testing.assert_allclose(found, points[name][k], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["clasp", "handle", "touch_right", "poses"])
+def test_jacobians_are_those_of_differences(name: str) -> None:
+    protocol = load_protocol(name)
+    rng = np.random.default_rng(1)
+    sensors = tuple(s for s in CHAIN if s in protocol.needs)
+    closures = protocol.closures
+    layout = Layout(sensors, sum(c.kind == "fixed_point" for c in closures), protocol.gauges)
+    n = 2 * len(protocol.conditions)
+    turns = [Rotation.random(n, random_state=rng).as_quat().T for _ in sensors]
+    looks = Looks(layout, np.vstack([*turns, rng.uniform(0, 60, n)]), protocol.conditions, np.arange(n) // 2)
+    x = rng.normal(scale=0.1, size=layout.size)
+    x[:8] = rng.uniform(0.1, 0.5, 8)
+    x[layout.heading] = rng.uniform(-3, 3, len(sensors))
+    x[layout.drift] = rng.normal(scale=1e-3, size=len(sensors))
+    _, J, gap = residuals(x, looks)
+    assert J.shape == (n, 5, layout.size)
+    for k in range(layout.size):
+        step = np.zeros(layout.size)
+        step[k] = 1e-6
+        slope = (residuals(x + step, looks)[0] - residuals(x - step, looks)[0]) / 2e-6
+        np.testing.assert_allclose(J[:, :, k], slope, atol=1e-5 * max(1.0, np.abs(slope).max()))
+    assert np.all((np.abs(gap).max(axis=1) > 0) == [isinstance(c, Closure) for c in protocol.conditions for _ in "ab"])
+
+
+# -------------------------------------------------------------------------------------------------------------- exact
+
+GAUGE = {"handle": None, "touch_left": "left_upper_arm", "touch_right": "right_upper_arm", "poses": None}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("protocol", list(GAUGE))
+def test_exact_motion_gives_headings_and_lengths_back(protocol: str, seed: int) -> None:
+    person, simulation = made(protocol, seed, real=False)
+    gauge = {name: person.lengths[name] for name in (GAUGE[protocol],) if name}
+    found = calibrate_lengths(
+        simulation.recording(), gauge=gauge, prior=person.average, protocol=protocol, gauge_std=1e-4
+    )
+    error, _ = mount_errors(found, simulation)
+    assert np.abs(error[:, 2]).max() < 0.3
+    if protocol == "poses":
+        assert found.subject.lengths == pytest.approx(person.average.lengths, rel=1e-9)
+        return
+    assert found.rms_gap < min(1e-3, 0.2 * found.prior_rms_gap)
+    for side in ("left", "right"):
+        if f"{side}_upper_arm" in load_protocol(protocol).chain:
+            parts = [f"{side}_upper_arm", f"{side}_forearm", f"{side}_hand"]
+            upper, *fore = (found.subject.lengths[name] - person.lengths[name] for name in parts)
+            assert abs(upper) < 4e-3
+            assert abs(sum(fore)) < 4e-3
+
+
+# ---------------------------------------------------------------------------------------------------------- realistic
+
+TAPED = {"handle": (), "touch_left": ("left_upper_arm",), "touch_right": ("right_upper_arm", "trunk"), "poses": ()}
+HEADINGS_DEG = {"handle": 5.0, "touch_left": 6.0, "touch_right": 6.0, "poses": 9.0}  # rms, one person
+
+
+@pytest.mark.parametrize("protocol", list(TAPED))
+def test_usual_imperfections_stay_within_the_stated_deviations(protocol: str) -> None:
+    z_lengths, z_headings = [], []
+    for seed in (4, 5, 6):
+        person, simulation = made(protocol, seed, real=True)
+        rng = np.random.default_rng(seed)
+        gauge = {name: person.lengths[name] + rng.normal(0.0, 0.003) for name in TAPED[protocol]}
+        found = calibrate_lengths(simulation.recording(), gauge=gauge, prior=person.average, protocol=protocol)
+        error, std = mount_errors(found, simulation)
+        off, off_std = length_errors(found, person, LENGTHS)
+        z_lengths.append(off / off_std)
+        z_headings.append(error[:, 2] / std[:, 2])
+        print(
+            f"{protocol} {seed}: gap {1e3 * found.rms_gap:.0f} mm, lengths off {np.round(1e3 * off)} ± "
+            f"{np.round(1e3 * off_std)} mm, headings off {error[:, 2].round(1)} ± {std[:, 2].round(1)} deg"
+        )
+        assert np.sqrt(np.mean(error[:, 2] ** 2)) < HEADINGS_DEG[protocol]
+        assert np.abs(error / std).max() < 3.5
+    assert np.sqrt(np.mean(np.square(z_lengths))) < 1.5
+    assert np.sqrt(np.mean(np.square(z_headings))) < 1.5
+
+
+def test_a_handle_fixes_the_scale_by_itself() -> None:
+    person, simulation = made("handle", 4, real=True)
+    recording = simulation.recording()
+    found = calibrate_lengths(recording, prior=person.average, protocol="handle")
+    given = calibrate_lengths(recording, prior=person.average, protocol="handle", gauge={"handle": 0.40})
+    assert any("handle = 0.4 m is the protocol's" in text for text in found.warnings)
+    assert not any("handle = " in text or "no gauge" in text for text in given.warnings)
+    assert given.subject.lengths == pytest.approx(found.subject.lengths)
+    assert found.subject.note == "hands on a handle; scale taped: handle"
+    # The scale is the bar's more than the average person's.
+    arms = [name for name in LENGTHS if name.endswith("upper_arm")]
+    assert np.mean([found.subject.std(n) / person.average.std(n) for n in arms]) < 0.8
+    # Of exact motion alone: another bar, five per cent longer, gives everything five per cent longer.
+    person, simulation = made("handle", 1, real=False)
+    scale = []
+    for bar in (0.40, 0.42):
+        exact = calibrate_lengths(
+            simulation.recording(), prior=person.average, protocol="handle", gauge={"handle": bar}, gauge_std=1e-4
+        )
+        scale.append(np.mean([exact.subject.lengths[name] / person.lengths[name] for name in arms]))
+    assert scale[0] == pytest.approx(1.0, abs=0.01)
+    assert scale[1] / scale[0] == pytest.approx(1.05, abs=0.012)
+
+
+def test_one_arm_needs_three_sensors_and_leaves_the_other_arm_to_the_prior() -> None:
+    person, simulation = made("touch_right", 4, real=True)
+    recording = simulation.recording()
+    three = {name: recording.sensors[name] for name in ("torso", "right_upper_arm", "right_forearm")}
+    alone = calibrate_lengths(
+        replace(recording, sensors=three), gauge=(gauge := {"right_upper_arm": person.lengths["right_upper_arm"]}),
+        prior=person.average, protocol="touch_right",
+    )  # fmt: skip
+    whole = calibrate_lengths(recording, gauge=gauge, prior=person.average, protocol="touch_right")
+    assert alone.subject.lengths == pytest.approx(whole.subject.lengths, abs=1e-6)
+    assert set(alone.subject.mounts) == set(three)
+    assert set(alone.hinge) == {"right"}
+    # The other arm is like this one to within a per cent, and that is all that is known of it.
+    assert alone.subject.std("left_upper_arm") > alone.subject.std("right_upper_arm")
+    assert alone.subject.std("left_forearm") < 1.1 * person.average.std("left_forearm")
+
+
+def test_a_fixed_point_says_that_it_has_no_scale_and_which_gauge_would_serve() -> None:
+    person, simulation = made("touch_right", 4, real=True)
+    recording = simulation.recording()
+    free = calibrate_lengths(recording, prior=person.average, protocol="touch_right")
+    assert any(text.startswith("no gauge in the chain") and "right_upper_arm=" in text for text in free.warnings)
+    width = {"shoulder_width": person.lengths["shoulder_width"]}
+    loose = calibrate_lengths(recording, gauge=width, prior=person.average, protocol="touch_right")
+    assert any("hardly tells the scale" in text and "right_upper_arm=" in text for text in loose.warnings)
+    upper = {"right_upper_arm": person.lengths["right_upper_arm"]}
+    good = calibrate_lengths(recording, gauge=upper, prior=person.average, protocol="touch_right")
+    assert not any("scale" in text for text in good.warnings)
+    assert good.subject.std("trunk") < 0.7 * person.average.std("trunk")  # seen beside the arm
+
+
+class StillTrunk(Touch):
+    def prepare(self, rng: np.random.Generator, pose_deg: float) -> None:
+        super().prepare(rng, pose_deg)
+        self.lean_deg = 0.0
+
+
+def test_a_trunk_that_keeps_still_leaves_headings_unknown_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The arm's swivel about the line from shoulder to palm is all that moves."""
+    monkeypatch.setitem(TASKS, "touch_right", StillTrunk)
+    monkeypatch.delitem(MADE, ("touch_right", 9, False), raising=False)
+    person, simulation = made("touch_right", 9, real=False)
+    found = calibrate_lengths(simulation.recording(), prior=person.average, protocol="touch_right")
+    error, std = mount_errors(found, simulation)
+    print(found.warnings, error[:, 2], std[:, 2])
+    assert any(text.startswith("headings that the motion hardly told: torso ±") for text in found.warnings)
+    assert std[0, 2] > 50.0
+    # The swivel's radius tells upper arm against forearm; of the trunk nothing is seen.
+    assert found.subject.std("trunk") > 0.95 * person.average.std("trunk")
+
+
+def test_a_palm_off_its_point_is_found_and_left_out() -> None:
+    person, simulation = made("touch_right", 5, real=True)
+    recording = simulation.recording()
+    first, last = recording.phases["touch"][0]
+    early = replace(recording, phases={**recording.phases, "touch": ((first - 2.3, last),)})  # the way to the table
+    found = calibrate_lengths(early, prior=person.average, protocol="touch_right")
+    assert any(text.startswith("the palm was off its point for ") for text in found.warnings)
+    assert found.kept[:8].max() < 0.1
+    whole = calibrate_lengths(recording, prior=person.average, protocol="touch_right")
+    error, std = length_errors(found, person, load_protocol("touch_right").chain)
+    assert np.abs(error / std).max() < 3.5
+    assert found.rms_gap < 1.3 * whole.rms_gap
+
+
+def test_poses_tell_headings_and_no_length() -> None:
+    person, simulation = made("poses", 4, real=True)
+    recording = simulation.recording()
+    found = calibrate_lengths(recording, prior=person.average, protocol="poses")
+    assert found.subject.lengths == pytest.approx(person.average.lengths)
+    for name in LENGTHS:
+        assert found.subject.std(name) == pytest.approx(person.average.std(name))
+    assert any(text.startswith("N-pose, T-pose and bow tell headings and no length") for text in found.warnings)
+    _, std = mount_errors(found, simulation)
+    assert np.all((std[:, 2] > 5.0) & (std[:, 2] < 9.0))  # as well as the poses are held
+    taped = calibrate_lengths(recording, prior=person.average, protocol="poses", gauge={"trunk": 0.47})
+    assert taped.subject.lengths["trunk"] == pytest.approx(0.47, abs=2e-3)
+
+
+def test_a_longer_phase_makes_no_better_pose() -> None:
+    _, simulation = made("poses", 4, real=True)
+    recording = simulation.recording()
+    ((first, last),) = recording.phases["t_pose"]
+    short = replace(recording, phases={**recording.phases, "t_pose": ((first, 0.5 * (first + last)),)})
+    both = [mount_errors(calibrate_lengths(r, protocol="poses"), simulation)[1] for r in (short, recording)]
+    np.testing.assert_allclose(both[0], both[1], rtol=0.05)
+
+
+def test_clasp_with_a_taped_length_is_clasp_with_a_gauge() -> None:
+    person, simulation = made("clasp", 4, real=False)
+    recording = simulation.recording()
+    with pytest.raises(BadOption, match=r"needs 1 taped length of its chain, as in --gauge shoulder_width=0\.385"):
+        calibrate_lengths(recording, protocol="clasp_taped")
+    with pytest.raises(BadOption, match="needs 1 taped length"):
+        calibrate_lengths(recording, protocol="clasp_taped", gauge={"trunk": 0.5})
+    both = [
+        calibrate_lengths(recording, prior=person.average, gauge=person.taped, protocol=name)
+        for name in ("clasp", "clasp_taped")
+    ]
+    assert both[0].subject.lengths == both[1].subject.lengths
+
+
+# ------------------------------------------------------------------------------------------------------ wrong requests
+
+
+def without(recording: Recording, phase: str) -> Recording:
+    return replace(recording, phases={name: spans for name, spans in recording.phases.items() if name != phase})
+
+
+def test_wrong_requests_are_one_line_that_names_them() -> None:
+    recording = made("handle", 1, real=False)[1].recording()
+    fewer = replace(recording, sensors={k: v for k, v in recording.sensors.items() if k != "torso"})
+    for error, match, asked in (
+        (BadOption, "protocol 'clap' is not known; did you mean 'clasp'", lambda: load_protocol("clap")),
+        (MissingFile, "mine.toml: no such protocol file", lambda: load_protocol("mine.toml")),
+        (BadPhase, r"phases\.handle is needed here", lambda: run(without(recording, "handle"), "handle")),
+        (BadPhase, r"phases\.t_pose is needed here", lambda: run(recording, "poses")),
+        (BadSession, "no sensor on torso; protocol 'touch_left' needs one", lambda: run(fewer, "touch_left")),
+        (BadOption, "gauge handle: not a length", lambda: run(recording, "clasp", handle=0.4)),
+        (BadOption, "gauge handel: not a length; did you mean 'handle'", lambda: run(recording, "handle", handel=0.4)),
+    ):
+        with pytest.raises(error, match=match) as caught:
+            asked()
+        assert "\n" not in str(caught.value)
+
+
+def run(recording: Recording, protocol: str, **gauge: float) -> Calibration:
+    return calibrate_lengths(recording, protocol=protocol, gauge=gauge)
+
+
+OWN = """
+needs = ["torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"]
+[[closure]]
+phase = "handle"
+kind = "distance"
+points = ["left_wrist", "right_wrist"]
+gauge = "rope"
+metres = 0.5
+"""
+
+
+def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
+    own = tmp_path / "rope.toml"
+    own.write_text(OWN)
+    protocol = load_protocol(own)
+    assert protocol.name == "rope"
+    assert "left_hand" not in protocol.chain
+    person, simulation = made("handle", 1, real=False)
+    found = calibrate_lengths(simulation.recording(), prior=person.average, protocol=protocol)
+    assert "rope" in found.subject.note
+    for old, new, match in (
+        ('"left_wrist"', '"left_wirst"', r"closure 1: points: 'left_wirst' is not known; did you mean 'left_wrist'"),
+        (', "right_wrist"', "", r"points = \['left_wrist'\]; kind 'distance' takes 2"),
+        ('"distance"', '"near"', r"closure 1: kind: 'near' is not known"),
+        ("metres = 0.5", 'metres = "half"', r"metres = 'half'; a number between"),
+        ("gauge =", "guage =", r"closure 1: no 'gauge'"),
+        ("[[closure]]", "[[closures]]", r"'closures' is no key of a protocol; did you mean 'closure'"),
+        ("needs =", "# needs =", r"no 'needs'"),
+        ("needs =", "needs ==", r"not valid TOML"),
+    ):
+        own.write_text(OWN.replace(old, new))
+        with pytest.raises(BadOption, match=match) as caught:
+            load_protocol(own)
+        assert "\n" not in str(caught.value)
+
+
+def command(*argv: str) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        main(list(argv))
+    return int(stopped.value.code or 0)
+
+
+def test_the_command_takes_protocols(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_session(tmp_path, made("handle", 1, real=False)[1].recording())
+    asked = ["calibrate", str(tmp_path / "session.toml"), "--protocol", "handle", "-o", str(tmp_path / "out")]
+    assert command(*asked, "--gauge", "handle=0.4") in (0, 3)  # pass or poor
+    assert "scale taped: handle" in (tmp_path / "out" / "subject.toml").read_text()
+    assert command(*asked, "--force", "--gauge", "bar=0.4") == 2
+    assert "'bar' is not a length" in capsys.readouterr().err
+    asked[3] = "hande"
+    assert command(*asked, "--force") == 2
+    assert "protocol 'hande' is not known; did you mean 'handle'" in capsys.readouterr().err

@@ -1,0 +1,214 @@
+"""The calibration's report: what it says, that it opens offline, that it bears what is missing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from html import unescape
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.calibration import Calibration, calibrate_lengths
+from wepose_pin.calibration.verdict import judge
+from wepose_pin.recording import Recording
+from wepose_pin.report import calibration_report
+from wepose_pin.report.figures import broken, direction, plus_minus, smoothed
+from wepose_pin.simulation import REALISTIC, simulate, simulated_person
+from wepose_pin.tracking import TrackedPose, track
+
+Made = tuple[Calibration, Recording, TrackedPose]
+REASONS = ["the left upper arm ± 9 mm, more than 8 mm: move the joined hands up and down"]
+
+
+@pytest.fixture(scope="module")
+def made() -> Made:
+    person = simulated_person(3)
+    world = replace(REALISTIC, mount="any")
+    recording = simulate(person.lengths, seed=3, imperfections=world, clasp_s=30.0, circles=0).recording("anna <3")
+    found = calibrate_lengths(recording, gauge=person.taped, prior=person.average)
+    return found, recording, track(recording, found.subject)
+
+
+@pytest.fixture(scope="module")
+def page(made: Made) -> str:
+    return calibration_report(made[0], made[1], verdict=("poor", REASONS), pose=made[2])
+
+
+def without_frame(page: str) -> str:
+    return re.sub(r'srcdoc="[^"]*"', "", page)
+
+
+def headings(page: str) -> list[str]:
+    return [unescape(text) for text in re.findall(r"<h2[^>]*>(.*?)</h2>", without_frame(page))]
+
+
+def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) -> None:
+    found = made[0]
+    for name, value in found.subject.lengths.items():
+        assert f"<td>{name.replace('_', ' ')}</td>" in page
+        assert plus_minus(1e3 * value, 1e3 * found.subject.std(name), "mm") in page
+        assert plus_minus(1e3 * found.prior.lengths[name], 1e3 * found.prior.std(name), "mm") in page
+    for name in found.subject.mounts:
+        assert f"{np.degrees(found.subject.std(f'mounts.{name}.z')):.1f}°" in page
+    assert f"{1e3 * found.prior_rms_gap:.1f} mm before, {1e3 * found.rms_gap:.1f} mm after" in page
+    assert headings(page) == [
+        "Lengths",
+        "Sensors",
+        "Palm to palm over time",
+        "Where the motion was informative",
+        "The start pose",
+        "The elbows as hinges",
+        "The motion in 3D",
+        "What was run",
+    ]
+
+
+def test_the_verdict_comes_first_with_its_reasons(made: Made, page: str) -> None:
+    failed = calibration_report(made[0], made[1], verdict=("fail", REASONS), pose=made[2])
+    for text, word, said in ((page, "poor", "Poor:"), (failed, "fail", "Fail:")):
+        text = without_frame(text)
+        assert text.index(f'<section class="banner {word}">') < text.index(said)
+        assert text.index(said) < text.index("The left upper arm ± 9 mm") < text.index("<h2")
+
+
+def test_the_judges_verdict_with_its_numbers(made: Made) -> None:
+    verdict = judge(made[0])
+    page = without_frame(calibration_report(made[0], made[1], verdict=verdict, pose=made[2]))
+    assert f'<section class="banner {verdict.grade}">' in page
+    assert "Behind the verdict" in headings(page)
+    for finding in verdict.reasons:
+        assert finding.said in unescape(page)
+    assert "<td>10 mm</td><td>20 mm</td>" in page  # limits of the lengths
+    assert " rad<" not in page
+
+
+def test_warnings_stand_above_the_figures_in_words(made: Made) -> None:
+    warned = replace(made[0], warnings=("the palms were apart for 12 % of the phase",))
+    page = without_frame(calibration_report(warned, made[1], pose=made[2]))
+    assert page.index("The palms were apart for 12 %") < page.index("<figure")
+    assert 'class="banner p' not in page  # nobody gave a verdict
+
+
+def test_it_opens_offline_and_is_one_small_file(page: str) -> None:
+    assert "default-src 'none'" in page.split("<title>")[0]
+    for text in (without_frame(page), unescape(page)):
+        assert not re.search(r"""(src|href)\s*=\s*["']?\s*(https?:)?//""", text.split("<script>")[0])
+        assert not re.search(r"@import|url\(", text.split("<script>")[0])
+    assert without_frame(page).count("<script") == 0
+    assert 'sandbox="allow-scripts"' in page
+    assert len(page) < 3e6
+
+
+def test_names_are_text(page: str) -> None:
+    assert "anna &lt;3" in page
+    assert "anna <3" not in without_frame(page)
+
+
+def test_every_figure_has_a_caption_and_the_same_text(page: str) -> None:
+    figures = re.findall(r'<img alt="([^"]+)" src="data:image/png;base64,[^"]+"><figcaption>(.+?)</figcaption>', page)
+    assert len(figures) == 5
+    assert all(unescape(alt) == unescape(re.sub("<[^>]+>", "", caption)) for alt, caption in figures)
+
+
+def test_it_prints(page: str) -> None:
+    assert "@page { size: A4" in page
+    assert re.search(r"@media print \{.*\.screen.*display: none", page, re.DOTALL)
+
+
+def test_equal_arguments_give_equal_text(made: Made, page: str) -> None:
+    assert calibration_report(made[0], made[1], verdict=("poor", REASONS), pose=made[2]) == page
+
+
+def test_hands_that_came_apart_are_shown(made: Made) -> None:
+    found = made[0]
+    kept, gap = found.kept.copy(), found.gap.copy()
+    kept[40:60], gap[40:60] = 0.01, 0.3
+    page = calibration_report(replace(found, kept=kept, gap=gap), made[1], pose=made[2])
+    assert "Crosses: apart." in page
+    nowhere = calibration_report(replace(found, kept=np.zeros_like(kept)), made[1], pose=made[2])
+    assert "Palm to palm over time" in headings(nowhere)
+    assert "Where the motion was informative" not in headings(nowhere)
+
+
+def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
+    found = made[0]
+    bare = replace(
+        found,
+        subject=replace(found.subject, order=(), covariance=np.zeros((0, 0))),
+        gap=np.full_like(found.gap, np.nan),
+        prior_gap=np.full_like(found.gap, np.nan),
+        rms_gap=float("nan"),
+        gauge={},
+        start_tilt={"torso": np.array([np.nan, 0.0])},
+        drift={},
+        hinge={},
+        hinge_rms={},
+        learned={},
+    )
+    page = calibration_report(bare, made[1], pose=made[2])
+    assert headings(page) == ["Lengths", "Sensors", "The motion in 3D", "What was run"]
+    assert "± not known" in page
+    assert "nan" not in re.sub(r'"data:[^"]*"', "", without_frame(page)).split("</style>")[1]
+    few = replace(found, time=found.time[:1], gap=found.gap[:1], prior_gap=found.prior_gap[:1], kept=found.kept[:1])
+    few = replace(few, learned={name: share[:1] for name, share in found.learned.items()}, start_tilt={})
+    assert "Palm to palm over time" not in headings(calibration_report(few, made[1], pose=made[2]))
+
+
+def test_without_a_mount_it_says_why_there_is_no_motion(made: Made) -> None:
+    found = replace(made[0], subject=replace(made[0].subject, mounts={}))
+    page = calibration_report(found, made[1])
+    assert "without hand positions and 3D view" in page
+    assert "mount is not known" in page
+    assert headings(page) == [
+        "Lengths",
+        "Palm to palm over time",
+        "The start pose",
+        "The elbows as hinges",
+        "What was run",
+    ]
+
+
+def test_one_hand_at_a_point(made: Made) -> None:
+    page = calibration_report(made[0], made[1], pose=made[2], protocol="touch_left")
+    assert "Palm to its point over time" in headings(page)
+    assert "The left hand went from" in page
+    assert "Not in the chain, known by the average person" in page
+    assert "joined" not in without_frame(page)
+
+
+def test_what_each_look_told_and_what_was_known_before_make_one(made: Made) -> None:
+    for name, share in made[0].learned.items():
+        assert np.all(share >= 0.0)
+        assert 0.0 <= share.sum() <= 1.0 + 1e-9, name
+    assert made[0].learned["trunk"].sum() == pytest.approx(0.0, abs=1e-9)  # it cancels in the closure
+    smooth = smoothed(made[0].time, made[0].learned["left_upper_arm"])
+    step = np.median(np.diff(made[0].time))
+    assert smooth.sum() * step / 100 == pytest.approx(made[0].learned["left_upper_arm"].sum(), rel=0.1)
+
+
+WHERE: Mapping[str, tuple[int, int]] = {
+    "forwards": (0, 1), "backwards": (0, -1), "to the left": (1, 1), "to the right": (1, -1)
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("segment", ["torso", "left_upper_arm", "right_forearm"])
+@pytest.mark.parametrize("angle", [0.1, -0.1])
+@pytest.mark.parametrize("across", [0, 1])
+def test_tilts_are_named_by_where_the_free_end_goes(segment: str, angle: float, across: int) -> None:
+    rotvec = [angle, 0.0, 0.0] if across == 1 else [0.0, angle, 0.0]
+    end = Rotation.from_rotvec(rotvec).apply([0.0, 0.0, 1.0 if segment == "torso" else -1.0])
+    said = direction(segment, across, angle)
+    side = "to the left" if segment.startswith("left") else "to the right"
+    said = {"outwards": side, "inwards": "to the left" if side == "to the right" else "to the right"}.get(said, said)
+    axis, sign = WHERE[said]
+    assert np.sign(round(float(end[axis]), 6)) == sign
+
+
+def test_a_line_breaks_where_time_jumps() -> None:
+    time, values = broken(np.array([0.0, 0.1, 0.2, 5.0, 5.1]), np.arange(5.0))
+    assert np.flatnonzero(np.isnan(time)).tolist() == [3]
+    assert np.isnan(values[3])
+    assert plus_minus(float("nan"), 1.0, "mm") == "not known"

@@ -1,0 +1,258 @@
+"""What a calibration says of itself: each way in which a session goes wrong is recognised and said, or solved."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.calibration import Calibration, calibrate_lengths, judge
+from wepose_pin.calibration.anatomy import Arms, check_labels
+from wepose_pin.calibration.verdict import APART, GRADES
+from wepose_pin.cli import main
+from wepose_pin.recording import Recording
+from wepose_pin.simulation import REALISTIC, Imperfections, Person, Simulation, simulate, simulated_person
+from wepose_pin.simulation import motion as motions
+from wepose_pin.simulation.tasks import TASKS
+from wepose_pin.writers import write_session
+
+ANY = replace(REALISTIC, mount="any")
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def person() -> Person:
+    return simulated_person(SEED)
+
+
+@pytest.fixture(scope="module")
+def anywhere(person: Person) -> Simulation:
+    return simulate(person.lengths, seed=SEED, imperfections=ANY, circles=0)
+
+
+@pytest.fixture(scope="module")
+def stated(person: Person) -> Simulation:
+    return simulate(person.lengths, seed=SEED, imperfections=REALISTIC, circles=0)
+
+
+def moved_otherwise(person: Person, share: Mapping[str, float], imperfections: Imperfections = ANY) -> Simulation:
+    """The same person, with these parts of the motion at a share of their size; ``hands`` parts them now and then."""
+
+    class Less(motions.Motion):
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, **options)
+            for name, wander in self.wander.items():
+                part = share.get(name, share.get("all", 1.0))
+                self.wander[name] = lambda t, wander=wander, part=part: part * wander(t)  # type: ignore[assignment]
+            if "hands" in share:
+                # Together and apart for ten seconds each.
+                self.flaws.slip = [
+                    lambda t, slip=slip: slip(t) * (0.5 + 0.5 * np.tanh(8.0 * np.sin(np.pi * t / 10.0)))  # type: ignore[misc]
+                    for slip in self.flaws.slip
+                ]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(TASKS, "clasp", Less)
+        return simulate(person.lengths, seed=SEED, imperfections=imperfections, circles=0)
+
+
+def solved(recording: Recording, person: Person, gauge: bool = True) -> Calibration:
+    taped = {"shoulder_width": person.taped["shoulder_width"]} if gauge else {}
+    return calibrate_lengths(recording, gauge=taped, prior=person.average, gauge_std=person.taped_std)
+
+
+def exchanged(recording: Recording, *pairs: tuple[str, str]) -> Recording:
+    """Sensors under each other's name, with the mount that their place has."""
+    names = {a: b for pair in pairs for a, b in (pair, pair[::-1])}
+    return replace(recording, sensors={k: recording.sensors[names.get(k, k)] for k in recording.sensors})
+
+
+def turned(recording: Recording, segment: str, turn: Rotation) -> Recording:
+    """The sensor strapped on otherwise than its mount says."""
+    sensor = recording.sensors[segment]
+    assert sensor.gyro_S is not None
+    assert sensor.accel_S is not None
+    other = replace(sensor, gyro_S=turn.apply(sensor.gyro_S), accel_S=turn.apply(sensor.accel_S))
+    return replace(recording, sensors={**recording.sensors, segment: other})
+
+
+def heading_errors(found: Calibration, quat_LS: Mapping[str, np.ndarray]) -> np.ndarray:
+    off = [Rotation.from_quat(found.subject.mounts[k]) * Rotation.from_quat(q).inv() for k, q in quat_LS.items()]
+    return np.degrees([r.as_rotvec()[2] for r in off])
+
+
+def arm_errors(found: Calibration, person: Person) -> np.ndarray:
+    parts = [(f"{s}_upper_arm",) for s in ("left", "right")] + [
+        (f"{s}_forearm", f"{s}_hand") for s in ("left", "right")
+    ]
+    return np.array([sum(found.subject.lengths[n] - person.lengths[n] for n in names) for names in parts])
+
+
+SIDES_EXCHANGED = tuple((f"left_{part}", f"right_{part}") for part in ("upper_arm", "forearm"))
+# Case → what is done to a good recording, the verdict, and what is said.
+TABLE: dict[str, tuple[Callable[[Recording], Recording], str, str]] = {
+    "as it should be": (lambda r: r, "pass", ""),
+    "left and right swapped": (
+        lambda r: exchanged(r, *SIDES_EXCHANGED),
+        "fail",
+        "left and right sensors look exchanged: the left elbow would bend backward",
+    ),
+    "upper arm and forearm exchanged": (
+        lambda r: exchanged(r, ("left_upper_arm", "left_forearm")),
+        "fail",
+        "sensors left_upper_arm and left_forearm look exchanged: the left elbow would bend backward",
+    ),
+    "the forearms exchanged": (
+        lambda r: exchanged(r, ("left_forearm", "right_forearm")),
+        "fail",
+        "sensors left_forearm and right_forearm look exchanged",
+    ),
+    "torso and an upper arm exchanged": (
+        lambda r: exchanged(r, ("torso", "right_upper_arm")),
+        "fail",
+        "sensors torso and right_upper_arm look exchanged",
+    ),
+    "eight seconds of motion": (
+        lambda r: replace(r, phases={**r.phases, "clasp": ((20.0, 28.0),)}),
+        "poor",
+        "heading of the torso sensor ±",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TABLE)
+def test_what_goes_wrong_is_said(case: str, anywhere: Simulation, person: Person) -> None:
+    change, grade, said = TABLE[case]
+    verdict = judge(solved(change(anywhere.recording()), person))
+    words = " | ".join(verdict.in_words())
+    print(case, "→", verdict.grade, words)
+    assert verdict.grade == grade, words
+    assert said in words
+    assert (not words) == (grade == "pass")
+    assert words.count("look exchanged") == words.count("fail: ")
+
+
+def test_without_a_gauge_the_scale_is_the_average_persons(anywhere: Simulation, person: Person) -> None:
+    verdict = judge(solved(anywhere.recording(), person, gauge=False))
+    assert verdict.grade == "poor"
+    assert [f.name for f in verdict.reasons] == ["scale"]
+    assert "nothing was taped" in verdict.reasons[0].said
+    assert "--gauge shoulder_width" in verdict.reasons[0].do
+
+
+@pytest.mark.parametrize(
+    ("share", "grade", "said"),
+    [
+        ({"all": 0.05}, "fail", "hardly"),
+        ({"roll": 0.1, "pitch": 0.1, "yaw": 0.1}, "fail", "lean and twist the torso"),
+    ],
+)
+def test_too_little_motion_is_named(share: dict[str, float], grade: str, said: str, person: Person) -> None:
+    found = solved(moved_otherwise(person, share).recording(), person)
+    verdict = judge(found)
+    print(verdict.in_words())
+    assert found.labels.doubt < 1.0  # uncertain headings are no exchange
+    assert verdict.grade == grade
+    assert any(said in text for text in verdict.in_words())
+    assert verdict.determined < verdict.unknowns
+
+
+def test_hands_apart_for_half_of_the_time_are_found_and_left_out(person: Person, anywhere: Simulation) -> None:
+    simulation = moved_otherwise(person, {"hands": 1.0}, replace(ANY, palm_slip=0.15))
+    found, good = solved(simulation.recording(), person), solved(anywhere.recording(), person)
+    verdict = judge(found)
+    print(verdict.in_words(), 1e3 * arm_errors(found, person), 1e3 * arm_errors(good, person))
+    assert verdict.grade == "poor"
+    apart = next(f for f in verdict.findings if f.name == "apart")
+    assert APART.passes < apart.value < 0.6
+    assert "keep the palms together" in apart.do
+    assert np.abs(arm_errors(found, person)).max() < 0.025
+    assert np.abs(heading_errors(found, simulation.quat_LS)[1:]).max() < 8.0
+    gap = np.linalg.norm(simulation.points["left_hand"] - simulation.points["right_hand"], axis=1)
+    at = np.searchsorted(simulation.time, found.time - 1e-6)
+    assert np.mean(found.kept[gap[at] > 0.2]) < 0.1
+    assert np.mean(found.kept[gap[at] < 0.02]) > 0.8
+
+
+def test_a_sensor_upside_down_is_another_mount_or_said_and_solved(
+    person: Person, anywhere: Simulation, stated: Simulation
+) -> None:
+    over = Rotation.from_rotvec([0.0, 0.0, np.pi])
+    good = solved(anywhere.recording(), person)
+    found = solved(turned(anywhere.recording(), "left_forearm", over), person)
+    assert judge(found).grade == "pass"
+    np.testing.assert_allclose(list(found.subject.lengths.values()), list(good.subject.lengths.values()), atol=2e-3)
+
+    found = solved(turned(stated.recording(), "left_forearm", over), person)
+    verdict = judge(found)
+    assert verdict.grade == "poor"
+    assert len(found.contradicted) == 1
+    assert "sensors.left_forearm.mount is 1" in verdict.in_words()[0]
+    assert "off gravity" in verdict.in_words()[0]
+    true = {**stated.quat_LS}
+    true["left_forearm"] = (Rotation.from_quat(true["left_forearm"]) * over.inv()).as_quat()
+    assert np.abs(heading_errors(found, true)).max() < 8.0
+
+
+def test_a_mount_that_faces_elsewhere_is_said_and_solved(person: Person, stated: Simulation) -> None:
+    """Gravity does not see it, the motion does."""
+    quarter = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])  # about the axis that points up
+    found = solved(turned(stated.recording(), "right_upper_arm", quarter), person)
+    assert judge(found).grade == "poor"
+    assert len(found.contradicted) == 1
+    assert found.contradicted[0].startswith("sensors.right_upper_arm.mount is ")
+    assert "off what the motion says" in found.contradicted[0]
+    assert judge(solved(stated.recording(), person)).grade == "pass"
+
+
+def test_labels_are_searched_only_where_a_person_cannot_move_so() -> None:
+    def arms(doubt: float) -> Arms:
+        return Arms({}, {"left": 0.15 * doubt}, {"left": 0.0}, 0.0, 0.01)
+
+    tried: list[Mapping[str, str]] = []
+
+    def solve(moved: Mapping[str, str]) -> Arms:
+        tried.append(moved)
+        return arms(0.2 if moved == {"torso": "left_forearm", "left_forearm": "torso"} else 3.0)
+
+    places = ("torso", "left_upper_arm", "left_forearm")
+    assert check_labels(arms(0.9), solve, places).said() == ""
+    assert tried == []
+    assert "sensors torso and left_forearm look exchanged" in check_labels(arms(3.0), solve, places).said()
+    none = check_labels(arms(3.0), lambda _: arms(3.0), places)
+    assert none.said().endswith("no other labelling of the sensors explains it")
+
+
+def test_exit_code_and_file_carry_the_verdict(
+    anywhere: Simulation,
+    person: Person,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_session(tmp_path, anywhere.recording("made"))
+    taped = f"shoulder_width={person.taped['shoulder_width']:.4f}"
+    words = ["--stature", f"{person.stature:.3f}", "--sex", person.sex]
+    for options, grade, code in ((["--gauge", taped], "pass", 0), ([], "poor", 3)):
+        with pytest.raises(SystemExit) as stop:
+            main(["calibrate", "session.toml", "-o", grade, *words, *options])
+        assert int(stop.value.code or 0) == code
+        said = capsys.readouterr().out
+        assert f"Verdict: {grade}" in said
+        assert max(map(len, said.splitlines())) <= 100
+        content = json.loads((tmp_path / grade / "calibration.json").read_text(encoding="utf-8"))
+        assert content["verdict"] == grade
+        assert bool(content["reasons"]) == (grade != "pass")
+        assert len(content["gap"]["time"]) <= 600
+        assert content["mounts"].keys() == anywhere.quat_LS.keys()
+        assert content["lengths"]["left_upper_arm"]["std"] > 0.0
+        assert content["conditioning"]["rank"] < content["conditioning"]["unknowns"]
+        assert {"wepose-pin", "casadi"} <= content["versions"].keys()
+    assert GRADES == ("pass", "poor", "fail")

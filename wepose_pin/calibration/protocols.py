@@ -1,0 +1,236 @@
+"""Protocols as data: what a person does in which phase, and what therefore holds of the body at every look.
+
+A ``calibration/<name>.toml`` lists steps for the person and conditions for the solver. There are three kinds:
+
+- ``[[closure]]``: two points of the body coincide (``kind = "coincide"``) or keep a distance (``"distance"``), or one
+  stays at an unknown point of W (``"fixed_point"``). All of them tell lengths and headings by motion.
+- ``[[pose]]``: segments point in given directions of the torso; `std_deg` is how well a person does that.
+- ``[[axis]]``: a segment turns forwards about its own y, as the torso in a bow.
+
+How well a pose is held cannot be seen in its own residual, so its weight is stated; that of a closure is measured.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..assets import asset
+from ..errors import BadOption, MissingFile, one_of
+from ..recording import SEGMENTS
+from ..subject import LENGTHS
+from .chain import REACHES
+
+PROTOCOLS = ("clasp", "clasp_taped", "handle", "poses", "touch_left", "touch_right")
+KINDS = {"coincide": 2, "distance": 2, "fixed_point": 1}  # how many points each takes
+
+
+@dataclass(frozen=True)
+class Closure:
+    """Points that stay together, at a distance, or on a point of W.
+
+    Parameters
+    ----------
+    phase : of the session in which it holds
+    kind : one of `KINDS`
+    points : of the body
+    slip : [m] one standard deviation, each axis, of what holds only nearly; sets the weights' shape, not their size
+    gauge : name of the distance, as in ``--gauge handle=0.4``; empty where none is kept
+    metres, metres_std : the distance where the user gives none, and one standard deviation [m]
+    """
+
+    phase: str
+    kind: str
+    points: tuple[str, ...]
+    slip: float = 0.005
+    gauge: str = ""
+    metres: float = 0.0
+    metres_std: float = 0.003
+
+    @property
+    def rows(self) -> int:
+        """How many residuals one look has."""
+        return 1 if self.kind == "distance" else 3
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A segment's −z points along `direction` (3,) of the torso, to within `std` [rad] about each axis."""
+
+    phase: str
+    segment: str
+    direction: tuple[float, float, float]
+    std: float
+    rows: int = 3
+
+
+@dataclass(frozen=True)
+class Axis:
+    """The segment turns forwards about its own y, which stays level to within `std` [rad]."""
+
+    phase: str
+    segment: str
+    std: float
+    rows: int = 1
+
+
+Condition = Closure | Direction | Axis
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the person does, for how long [s]."""
+
+    phase: str
+    seconds: float
+    do: str
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A calibration session as data.
+
+    Parameters
+    ----------
+    name : of the protocol, and of its file
+    title : in a few words, for the subject's note
+    needs : segments that must carry a sensor
+    steps : for the person
+    conditions : for the solver
+    taped : how many lengths of the chain must be given with a tape
+    tape : the length that serves best as gauge, with an example: ``name=metres``
+    """
+
+    name: str
+    title: str
+    needs: tuple[str, ...]
+    steps: tuple[Step, ...]
+    conditions: tuple[Condition, ...]
+    taped: int = 0
+    tape: str = "shoulder_width=0.385"
+
+    @property
+    def closures(self) -> tuple[Closure, ...]:
+        return tuple(c for c in self.conditions if isinstance(c, Closure))
+
+    @property
+    def gauges(self) -> tuple[str, ...]:
+        """Names of distances outside the body that can be given as gauges."""
+        return tuple(dict.fromkeys(c.gauge for c in self.closures if c.gauge))
+
+    @property
+    def chain(self) -> tuple[str, ...]:
+        """Lengths that some closure holds."""
+        held = [abs(c) for closure in self.closures for c in coefficients(closure).values()]
+        return tuple(np.array(LENGTHS)[np.sum(held, axis=(0, 1)) > 0.0].tolist()) if held else ()
+
+    @property
+    def segments(self) -> frozenset[str]:
+        """Segments whose orientation some condition looks at, hands included."""
+        held = {segment for closure in self.closures for segment in coefficients(closure)}
+        held |= {c.segment for c in self.conditions if isinstance(c, Direction | Axis)}
+        return frozenset(held | ({"torso"} if any(isinstance(c, Direction) for c in self.conditions) else set()))
+
+
+def coefficients(closure: Closure) -> dict[str, np.ndarray]:
+    """Segment → (3, 8), by which the lengths make its part of the way that is closed, in its own frame."""
+    found = dict(REACHES[closure.points[0]])
+    for other in closure.points[1:]:
+        for segment, part in REACHES[other].items():
+            found[segment] = found.get(segment, 0.0) - part
+    return {segment: part for segment, part in found.items() if np.any(part)}
+
+
+def load_protocol(name: str | Path) -> Protocol:
+    """A protocol by its name, or from a TOML file of one's own.
+
+    Raises
+    ------
+    BadOption
+        There is no such protocol, or its file has a key or value that is none.
+    """
+    own = str(name).endswith(".toml")
+    if not own and name not in PROTOCOLS:
+        raise BadOption(
+            f"protocol '{name}' is not known; {one_of(PROTOCOLS, str(name))}; or the path of a .toml of one's own"
+        )
+    path = Path(name) if own else asset("calibration", f"{name}.toml")
+    if not path.is_file():
+        raise MissingFile(f"{path}: no such protocol file")
+    try:
+        return _protocol(tomllib.loads(path.read_text(encoding="utf-8")), path)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadOption(f"{path}: not valid TOML: {error}") from error
+
+
+def _protocol(table: dict[str, Any], path: Path) -> Protocol:
+    known = ("name", "title", "needs", "taped", "tape", "step", "closure", "pose", "axis")
+    for key in table:
+        if key not in known:
+            raise BadOption(f"{path}: '{key}' is no key of a protocol; {one_of(known, key)}")
+    conditions: list[Condition] = []
+    for i, entry in enumerate(table.get("closure", [])):
+        conditions.append(_closure(entry, f"{path}: closure {i + 1}"))
+    for i, entry in enumerate(table.get("pose", [])):
+        place = f"{path}: pose {i + 1}"
+        std = np.deg2rad(_number(entry, "std_deg", place, 0.1, 45.0))
+        for segment, value in _get(entry, "directions", place).items():
+            _among(segment, SEGMENTS, f"{place}: directions")
+            size = np.linalg.norm(value)
+            if np.shape(value) != (3,) or not size > 0.0:
+                raise BadOption(f"{place}: directions.{segment} = {value}; three numbers are needed: x, y, z")
+            x, y, z = (float(v / size) for v in value)
+            conditions.append(Direction(str(_get(entry, "phase", place)), segment, (x, y, z), std))
+    for i, entry in enumerate(table.get("axis", [])):
+        place = f"{path}: axis {i + 1}"
+        segment = _among(_get(entry, "segment", place), SEGMENTS, place)
+        std = np.deg2rad(_number(entry, "std_deg", place, 0.1, 45.0))
+        conditions.append(Axis(str(_get(entry, "phase", place)), segment, std))
+    if not conditions:
+        raise BadOption(f"{path}: no [[closure]], [[pose]] or [[axis]]; a protocol needs one at least")
+    needs = tuple(_among(segment, SEGMENTS, f"{path}: needs") for segment in _get(table, "needs", str(path)))
+    steps = tuple(Step(step["phase"], float(step["seconds"]), step["do"]) for step in table.get("step", []))
+    name = str(table.get("name", path.stem))
+    tape = str(table.get("tape", Protocol.tape))
+    _among(tape.partition("=")[0], LENGTHS, f"{path}: tape")
+    title = str(table.get("title", name))
+    return Protocol(name, title, needs, steps, tuple(conditions), int(table.get("taped", 0)), tape)
+
+
+def _closure(entry: dict[str, Any], place: str) -> Closure:
+    kind = _among(_get(entry, "kind", place), KINDS, f"{place}: kind")
+    points = tuple(_among(point, REACHES, f"{place}: points") for point in _get(entry, "points", place))
+    if len(points) != KINDS[kind]:
+        raise BadOption(f"{place}: points = {list(points)}; kind '{kind}' takes {KINDS[kind]}")
+    more: dict[str, Any] = {}
+    if "slip" in entry:
+        more["slip"] = _number(entry, "slip", place, 1e-4, 0.1)
+    if kind == "distance":
+        more["gauge"] = str(_get(entry, "gauge", place))
+        more["metres"] = _number(entry, "metres", place, 0.02, 2.0)
+        if "metres_std" in entry:
+            more["metres_std"] = _number(entry, "metres_std", place, 1e-5, 0.1)
+    return Closure(str(_get(entry, "phase", place)), kind, points, **more)
+
+
+def _get(table: dict[str, Any], key: str, place: str) -> Any:
+    if key not in table:
+        raise BadOption(f"{place}: no '{key}'; it has: {', '.join(table)}")
+    return table[key]
+
+
+def _number(table: dict[str, Any], key: str, place: str, least: float, most: float) -> float:
+    value = _get(table, key, place)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not least <= value <= most:
+        raise BadOption(f"{place}: {key} = {value!r}; a number between {least:g} and {most:g} is needed")
+    return float(value)
+
+
+def _among(name: Any, choices: Any, place: str) -> str:
+    if name not in choices:
+        raise BadOption(f"{place}: {name!r} is not known; {one_of(choices, str(name))}")
+    return str(name)

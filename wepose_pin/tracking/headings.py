@@ -1,0 +1,230 @@
+"""Headings held together: what drifts apart between sensors is seen at joined hands and at the elbows' hinges.
+
+The filters' tilt is good and their headings drift. δ_i(t) is the heading error of segment i, R_WL,true = Rz(δ) R_WL, a
+random walk whose steps are what the filter's own covariance grows by. Two things measure it, both linear in δ:
+
+- the palm gap in a later `clasp` phase: g + Σ δ_i e_z × v_i = 0, with v_i the link of segment i;
+- the elbow of a calibrated subject: the forearm stays in the plane of its hinge, n · R_Uᵀ R_F (−e_z) = 0.
+
+A forward pass and a Rauch-Tung-Striebel pass over knots of a few seconds give δ and its covariance. What is common to
+all segments, nothing here sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..alignment import Segments
+from ..recording import Recording
+from ..subject import LENGTHS, Subject
+
+CHAIN = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+KNOT_S = 2.0
+LOOK_RATE_HZ = 8.0
+# Errors of the residuals that have nothing to do with headings, and how long they last: soft tissue and what is left of
+# the mounts' errors come back in every pose, so that a minute of joined hands is worth three looks. Found on simulated
+# people, where less takes a good filter's headings for worse than they are.
+ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of each segment, soft tissue above all
+SLIP_STD = 0.005  # [m]
+CORRELATION_S = 20.0
+START_STD = np.deg2rad(0.5)  # [rad] of each heading when the start pose ends
+UNKNOWN_DRIFT = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance
+APART = 5.0  # standard deviations from which on palms are not joined, or an elbow is no hinge
+
+
+class Reset(NamedTuple):
+    """What held the headings together, before and after."""
+
+    clasp_mm: tuple[float, float] | None  # rms palm gap in the clasp phases
+    hinge_deg: Mapping[str, tuple[float, float]]  # side → rms of the forearm against the elbow's plane
+    largest_deg: Mapping[str, float]  # segment → largest turn
+
+
+def held_together(recording: Recording, segments: Segments, subject: Subject) -> tuple[Segments, Reset | None]:
+    """Segments with their headings corrected; as they were where neither a clasp nor a hinge is known."""
+    quat_WL = segments.quat_WL
+    if not set(CHAIN) <= set(quat_WL):
+        return segments, None
+    stride = max(1, round(recording.rate_hz / LOOK_RATE_HZ))
+    at = np.arange(0, len(recording), stride)
+    at = at[recording.time[at] >= segments.start[1]]
+    R = {name: Rotation.from_quat(quat_WL[name][at]) for name in CHAIN}
+    time = recording.time[at]
+    joined = np.zeros(len(at), dtype=bool)
+    for begin, end in recording.phases.get("clasp", ()):
+        joined |= (time >= begin) & (time <= end)
+    rows = [_gaps(R, subject, joined), *(_hinge(R, subject, side) for side in subject.hinges)]
+    rows = [row for row in rows if len(row.look)]
+    if not rows:
+        return segments, None
+
+    begin = float(time[0])
+    knot = np.floor((time - begin) / KNOT_S).astype(int)
+    count = knot[-1] + 1
+    information, pull = np.zeros((count, 5, 5)), np.zeros((count, 5))
+    share = 1.0 / max(1.0, CORRELATION_S * recording.rate_hz / stride)
+    for row in rows:
+        weight = share * row.weight[:, None]
+        np.add.at(information, knot[row.look], np.einsum("na,nb->nab", weight * row.H, row.H))
+        np.add.at(pull, knot[row.look], -weight * row.H * row.r[:, None])
+    middle = begin + KNOT_S * (np.arange(count) + 0.5)
+    delta, cov = _smoothed(information, pull, _walk(recording, segments, middle))
+    # Constant before the first middle and after the last, and in the start pose exactly zero.
+    knots = np.concatenate([[segments.start[1]], middle])
+    turn = {
+        name: np.interp(recording.time, knots, np.concatenate([[0.0], delta[:, i]])) for i, name in enumerate(CHAIN)
+    }
+    corrected = dict(quat_WL)
+    for name in CHAIN:
+        about_z = Rotation.from_rotvec(turn[name][:, None] * [0.0, 0.0, 1.0])
+        corrected[name] = (about_z * Rotation.from_quat(quat_WL[name])).as_quat()
+    covariance = dict(segments.covariance_W)
+    for i, name in enumerate(CHAIN):
+        if name in covariance:
+            covariance[name] = _narrowed(covariance[name], np.interp(recording.time, middle, cov[:, i, i]))
+    after = {name: Rotation.from_quat(corrected[name][at]) for name in CHAIN}
+    reset = Reset(
+        clasp_mm=(_rms_mm(_palms(R, subject)[joined]), _rms_mm(_palms(after, subject)[joined]))
+        if joined.any()
+        else None,
+        hinge_deg={
+            side: (_rms_deg(_elbow(R, subject, side)), _rms_deg(_elbow(after, subject, side)))
+            for side in subject.hinges
+        },
+        largest_deg={name: float(np.degrees(np.abs(turn[name]).max())) for name in CHAIN},
+    )
+    return replace(segments, quat_WL=corrected, covariance_W=covariance), reset
+
+
+class _Rows(NamedTuple):
+    """Scalar measurements 0 = r + H δ + e."""
+
+    look: np.ndarray  # (m,) index of the look
+    r: np.ndarray  # (m,)
+    H: np.ndarray  # (m, 5)
+    weight: np.ndarray  # (m,) 1 / variance of e
+
+
+def _links(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
+    """(5, n, 3) [m] in W: each segment's part of the way from the right palm to the left one."""
+    length = subject.lengths
+    found = [R["torso"].apply([0.0, length["shoulder_width"], 0.0])]
+    for name in CHAIN[1:]:
+        side, part = name.split("_", 1)
+        along = length[name] + (length[f"{side}_hand"] if part == "forearm" else 0.0)
+        found.append(R[name].apply([0.0, 0.0, -along if side == "left" else along]))
+    return np.array(found)
+
+
+def _palms(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
+    """(n, 3) [m] left palm minus right palm in W."""
+    return _links(R, subject).sum(axis=0)
+
+
+def _gaps(R: Mapping[str, Rotation], subject: Subject, joined: np.ndarray) -> _Rows:
+    """Of each look with joined palms three whitened rows; those that lie far out are left out."""
+    v = _links(R, subject)[:, joined]
+    n = v.shape[1]
+    eye = np.eye(3)
+    covariance = np.tile(SLIP_STD**2 * eye, (n, 1, 1))
+    for link in v:
+        covariance += ATTITUDE_STD**2 * (
+            np.sum(link**2, axis=1)[:, None, None] * eye - np.einsum("na,nb->nab", link, link)
+        )
+    covariance += _of_lengths(v, subject)
+    H = np.stack([np.cross([0.0, 0.0, 1.0], link) for link in v], axis=2)  # (n, 3, 5)
+    r = v.sum(axis=0)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance)) if n else covariance
+    r, H = np.einsum("nab,nb->na", whiten, r), whiten @ H
+    near = np.sum(r**2, axis=1) < APART**2 * 3.0
+    look = np.repeat(np.flatnonzero(joined)[near], 3)
+    return _Rows(look, r[near].ravel(), H[near].reshape(-1, 5), np.ones(len(look)))
+
+
+def _of_lengths(v: np.ndarray, subject: Subject) -> np.ndarray:
+    """(n, 3, 3) [m²]: what the lengths' own covariance makes of the gap."""
+    of = {"torso": ("shoulder_width",)} | {
+        name: (name, name.replace("forearm", "hand")) if name.endswith("forearm") else (name,) for name in CHAIN[1:]
+    }
+    names, J = [], []
+    for link, name in zip(v, CHAIN, strict=True):
+        direction = link / np.linalg.norm(link, axis=1)[:, None]
+        for length in of[name]:
+            names.append(length)
+            J.append(direction)
+    jacobian = np.stack(J, axis=2)  # (n, 3, k)
+    assert set(names) <= set(LENGTHS)
+    return jacobian @ subject.lengths_covariance(names) @ jacobian.swapaxes(1, 2)
+
+
+def _elbow(R: Mapping[str, Rotation], subject: Subject, side: str) -> np.ndarray:
+    """(n,) [rad] by which the forearm is out of the plane of the elbow's hinge."""
+    forearm_U = R[f"{side}_upper_arm"].inv().apply(R[f"{side}_forearm"].apply([0.0, 0.0, -1.0]))
+    return forearm_U @ subject.hinges[side].axis
+
+
+def _hinge(R: Mapping[str, Rotation], subject: Subject, side: str) -> _Rows:
+    upper, fore = R[f"{side}_upper_arm"], R[f"{side}_forearm"]
+    r = _elbow(R, subject, side)
+    turned = np.cross([0.0, 0.0, 1.0], fore.apply([0.0, 0.0, -1.0]))
+    slope = upper.inv().apply(turned) @ subject.hinges[side].axis
+    H = np.zeros((len(r), 5))
+    H[:, CHAIN.index(f"{side}_forearm")], H[:, CHAIN.index(f"{side}_upper_arm")] = slope, -slope
+    std = subject.hinges[side].std
+    near = np.abs(r) < APART * std + np.deg2rad(10.0)  # a heading that has drifted is no reason to doubt the hinge
+    look = np.flatnonzero(near)
+    return _Rows(look, r[near], H[near], np.full(len(look), std**-2))
+
+
+def _walk(recording: Recording, segments: Segments, middle: np.ndarray) -> np.ndarray:
+    """(knots, 5) [rad²]: variance of each heading's step to each knot, by what its filter's covariance grew."""
+    steps = np.full((len(middle), 5), UNKNOWN_DRIFT * KNOT_S)
+    for i, name in enumerate(CHAIN):
+        if name in segments.orientation and name in segments.covariance_W:
+            variance = segments.covariance_W[name][:, 2, 2]
+            at = np.interp(np.concatenate([[segments.start[1]], middle]), recording.time, variance)
+            steps[:, i] = np.maximum(np.diff(at), 1e-10)
+    return steps
+
+
+def _smoothed(information: np.ndarray, pull: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Random walks (knots, 5) and their covariances (knots, 5, 5), seen through information matrices."""
+    n = len(pull)
+    x, P = np.zeros(5), START_STD**2 * np.eye(5)
+    before, filtered = [], []
+    for k in range(n):
+        P = P + np.diag(steps[k])
+        before.append((x, P))
+        P = np.linalg.inv(np.linalg.inv(P) + information[k])
+        x = x + P @ (pull[k] - information[k] @ x)
+        filtered.append((x, P))
+    means, covs = [x], [P]
+    for k in range(n - 2, -1, -1):
+        gain = filtered[k][1] @ np.linalg.inv(before[k + 1][1])
+        x = filtered[k][0] + gain @ (x - before[k + 1][0])
+        P = filtered[k][1] + gain @ (P - before[k + 1][1]) @ gain.T
+        means.append(x)
+        covs.append(P)
+    return np.array(means[::-1]), np.array(covs[::-1])
+
+
+def _narrowed(cov_W: np.ndarray, heading_var: np.ndarray) -> np.ndarray:
+    """Covariances (n, 3, 3) with the heading's variance no larger than `heading_var` (n,), the tilt's as it was."""
+    scale = np.sqrt(np.minimum(1.0, heading_var / cov_W[:, 2, 2]))
+    narrowed = cov_W.copy()
+    narrowed[:, 2, :] *= scale[:, None]
+    narrowed[:, :, 2] *= scale[:, None]
+    return narrowed
+
+
+def _rms_mm(gaps: np.ndarray) -> float:
+    return float(1e3 * np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
+
+
+def _rms_deg(angles: np.ndarray) -> float:
+    return float(np.degrees(np.sqrt(np.mean(angles**2))))
