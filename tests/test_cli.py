@@ -64,8 +64,12 @@ def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("calibrate", session, "--gauge", "shoulder_width=0.4", "--stature", 1.7, "-o", tmp_path / "subject") == 0
-    assert "Palm-to-palm gap" in capsys.readouterr().out
+    assert (
+        run("calibrate", session, "--gauge", "shoulder_width=0.35", "--stature", 1.67, "-o", tmp_path / "subject") == 0
+    )
+    said = capsys.readouterr().out
+    assert "Palm-to-palm gap" in said
+    assert "Verdict: pass" in said
     assert run("track", session, "--subject", tmp_path / "subject", "-o", tmp_path / "result") == 0
     assert "at rest" in capsys.readouterr().out
     assert run("evaluate", tmp_path / "result", tmp_path / "truth.parquet", "--interval", 72, 100) == 0
@@ -80,8 +84,10 @@ def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: py
 def test_without_a_gauge_it_says_whose_scale_it_is(
     session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("calibrate", session, "-o", tmp_path / "subject") == 0
-    assert "note: no gauge" in capsys.readouterr().err
+    assert run("calibrate", session, "-o", tmp_path / "subject") == 3
+    said = capsys.readouterr()
+    assert "note: no gauge" in said.err
+    assert "Verdict: poor" in said.out
 
 
 def test_simulate_is_seeded(tmp_path: Path) -> None:

@@ -80,7 +80,9 @@ QUICK_RATE_HZ, QUICK_ROUNDS, QUICK_STEPS = 1.0, 1, 15
 # A look whose gap is this many times the usual is one at which the palms were apart.
 APART = 5.0
 TOUCHED = 0.1  # of a look's weight
+SURE = 0.4  # below it the look is left out altogether, once the fit is about right
 LOOSE_SCALE = 0.6  # of the prior's relative standard deviation, from which on a gauge is said to tell little
+LEAST_LOOSE_SCALE = 0.025  # ... but not below this: a taped shoulder width leaves about 2 %
 UNSEEN_HEADING_STD = np.deg2rad(15.0)  # [rad] from which on a heading is said to be unknown
 
 
@@ -467,7 +469,7 @@ def _weighed(
             weights[span] = 1.0 / (span.stop - span.start)  # as it was held, it was held: one look altogether
     if not closed.any():
         return solve(looks, center, information, weights, x, steps, not quick), weights, kept, independent
-    for _ in range(QUICK_ROUNDS if quick else ROUNDS):
+    for k in range(QUICK_ROUNDS if quick else ROUNDS):
         fit = solve(looks, center, information, weights, x, steps, not quick)
         x, independent = fit.x, 0.0
         for closure, span in looks.spans():
@@ -477,7 +479,7 @@ def _weighed(
                 # The lower third: the palms may be apart for half of the phase and more.
                 usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[closure.rows], LEAST_VARIANCE)
                 weight = (1.0 + size / (usual * APART**2 * closure.rows)) ** -2
-                kept[span] = np.where(weight > TOUCHED, weight, 0.0)
+                kept[span] = np.where(weight > (SURE if k > 1 else TOUCHED), weight, 0.0)
                 weights[span, :3] = _weights(r, kept[span], least)
                 independent += float(kept[span].sum()) / _correlated(r * kept[span, None], least)
         arms = [SIDES.index(side) for side in looks.layout.arms]
@@ -599,7 +601,7 @@ def _remarks(
     share = np.zeros(K)
     share[arms] = 1.0 / lengths[arms] / max(len(arms), 1)
     scale_std, before = (float(np.sqrt(share @ C @ share)) for C in (covariance, prior.lengths_covariance()))
-    if free_scale_std is None and scale_std > LOOSE_SCALE * before:
+    if free_scale_std is None and scale_std > max(LOOSE_SCALE * before, LEAST_LOOSE_SCALE):
         remarks.append(
             f"the gauge hardly tells the scale of the arms, which may be off together by {100 * scale_std:.1f} %: "
             f"tape another length, as in --gauge {protocol.tape}"

@@ -39,6 +39,7 @@ class Limits(NamedTuple):
 LENGTH = Limits(0.010, 0.020)  # [m] of an upper arm, of forearm + hand, of the shoulder width, the scale apart
 ARM_HEADING = Limits(np.deg2rad(3.0), np.deg2rad(6.0))  # [rad]
 TORSO_HEADING = Limits(np.deg2rad(6.0), np.deg2rad(12.0))  # [rad]
+LONE_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] by poses, or by one arm: no better is to be had
 SCALE = Limits(0.02, 0.08)  # relative; a tape has 1 %, an average person 5 %
 # What the solution leaves over.
 GAP = Limits(0.030, 0.060)  # [m] rms while the palms touch
@@ -48,7 +49,7 @@ UNUSUAL = Limits(4.0, 6.0)  # standard deviations of a length from the average p
 DOUBT = Limits(1.0, 1.0)  # of anatomy, see `anatomy`
 
 # What moved less than this is said to be the cause of what is uncertain.
-ENOUGH = {"elevation": 40.0, "sideways": 35.0, "elbow": 45.0, "lean": 8.0, "twist": 12.0}  # [deg]
+ENOUGH = {"elevation": 40.0, "sideways": 35.0, "elbow": 40.0, "lean": 8.0, "twist": 12.0}  # [deg]
 ENOUGH_LOOKS = 12.0  # independent ones
 # A direction counts as determined by the motion where that tells more than was known before.
 SEEN = 1e-2  # information, in units of what was known before, below which a direction was not seen at all
@@ -212,7 +213,7 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
         "shoulder_width": ("the shoulder width", {"": std("shoulder_width")}, ("sideways", "elevation")),
     }
     for name, (what, each, causes) in parts.items():
-        if each:
+        if each and np.isfinite(calibration.gap).any():  # without a closure lengths are the average person's
             side = max(each, key=lambda s: each[s])
             why, do = _cause(calibration, motion, causes, [side] if side else sides)
             said = f"{what} ± {1e3 * each[side]:.0f} mm"
@@ -225,6 +226,8 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
         why, do = _cause(calibration, motion, causes, own or sides)
         said = f"heading of the {segment.replace('_', ' ')} sensor ± {np.degrees(value):.1f} deg"
         limits = TORSO_HEADING if torso else ARM_HEADING
+        if len(calibration.hinge_rms) < 2:
+            limits = LONE_HEADING
         found.append(_finding(f"heading.{segment}", value, limits, "rad", said, do, why))
     whose = "" if calibration.subject.note.count("taped") else ": nothing was taped, it is the average person's"
     found.append(
@@ -243,6 +246,9 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
 def _cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...], sides: list[str]) -> tuple[str, str]:
     """Why something is uncertain, as a clause, and what to do: what moved least of what it needs."""
     joined = "joined hands" if calibration.protocol in ("clasp", "clasp_taped") else "hands"
+
+    if not np.isfinite(calibration.gap).any():
+        return "", "hold each pose more exactly, and for longer; or hold the hands together"
 
     def of(values: Mapping[str, Range]) -> float:
         return min((values[side].size for side in sides if side in values), default=np.nan)
