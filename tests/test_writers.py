@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,14 @@ import polars as pl
 import pytest
 
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
+from wepose_pin.model import load_model
 from wepose_pin.pose import pose_from_table, pose_table
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
+from wepose_pin.subject import average_subject
 from wepose_pin.tracking import track
 from wepose_pin.writers import read_result, whole_folder, write_result, write_session
+from wepose_pin.writers.result import write_subject
 
 
 def test_a_folder_appears_when_all_of_it_is_there(tmp_path: Path) -> None:
@@ -113,6 +117,24 @@ def test_a_result_reads_back(simulation: Simulation, tmp_path: Path) -> None:
     assert model.lengths == pytest.approx(dict(pose.subject.lengths), abs=1e-12)
     assert summary == json.loads((tmp_path / "summary.json").read_text())
     assert summary["versions"]["wepose-pin"]
+
+
+def test_the_subjects_urdf_opens_in_other_tools_and_says_how_sure_it_is(tmp_path: Path) -> None:
+    import pinocchio as pin
+    import yourdfpy
+
+    person = replace(average_subject(1.7, "f"), name="Anna --> <test>")
+    write_subject(tmp_path, person, load_model(lengths=person.lengths))
+    path = tmp_path / "subject.urdf"
+    assert f"left_forearm {person.lengths['left_forearm']:.4f} ± {person.std('left_forearm'):.4f}" in path.read_text()
+    model = pin.buildModelFromUrdf(str(path))
+    robot = yourdfpy.URDF.load(path)
+    assert model.nq == len(robot.actuated_joints)
+    reach = pin.neutral(model)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, reach)
+    upper, fore = (data.oMf[model.getFrameId(f"left_{part}")].translation for part in ("upper_arm", "forearm"))
+    assert fore[2] - upper[2] == pytest.approx(-person.lengths["left_upper_arm"], abs=1e-12)
 
 
 def test_a_folder_that_is_no_result_is_named(tmp_path: Path) -> None:

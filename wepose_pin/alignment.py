@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 from . import so3
 from .errors import BadPhase, BadSession, WeposeError
 from .filters import BEST, Orientation, check_method, run_filter
+from .filters.base import in_parallel
 from .filters.smekf import ACCEL_BIAS_STD
-from .noise import noise_of, quietest
+from .noise import SensorNoise, noise_of, quietest
 from .recording import Recording
 from .static import StaticTest
 from .subject import Subject
@@ -89,7 +90,8 @@ def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTes
     """
     check_method(method)
     start, still, warnings = _phases(recording)
-    R_VS, at_start, orientation = {}, {}, {}
+    R_VS = {}
+    raw: dict[str, tuple[np.ndarray, np.ndarray, SensorNoise]] = {}
     for segment, sensor in recording.sensors.items():
         warnings += _motion(recording, segment, start, "start")
         if still != start:
@@ -104,17 +106,18 @@ def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTes
                 noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], recording.rate_hz)
             except WeposeError as error:
                 raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
-            orientation[segment] = run_filter(
-                sensor.gyro_S,
-                sensor.accel_S,
-                recording.rate_hz,
-                noise,
-                method,
-                static_test=static_test,
-                measured_start=True,
-            )
-            R_VS[segment] = Rotation.from_quat(orientation[segment].quat_WS)
-        at_start[segment] = R_VS[segment][recording.span(start)].mean()
+            raw[segment] = sensor.gyro_S, sensor.accel_S, noise
+
+    def oriented(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise) -> Orientation:
+        return run_filter(
+            gyro_S, accel_S, recording.rate_hz, noise, method, static_test=static_test, measured_start=True
+        )
+
+    found = in_parallel(oriented, *zip(*raw.values(), strict=True)) if raw else []
+    orientation = dict(zip(raw, found, strict=True))
+    R_VS |= {segment: Rotation.from_quat(of.quat_WS) for segment, of in orientation.items()}
+    R_VS = {segment: R_VS[segment] for segment in recording.sensors}
+    at_start = {segment: R[recording.span(start)].mean() for segment, R in R_VS.items()}
     return Filtered(R_VS, at_start, orientation, start, still, warnings)
 
 

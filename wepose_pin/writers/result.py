@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,15 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
 def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
     """``subject.toml``, and ``subject.urdf``: the body with the subject's lengths."""
     (folder / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
-    (folder / "subject.urdf").write_text(model.urdf(), encoding="utf-8")
+    head, _, body = model.urdf().partition("\n")
+    said = "; ".join(
+        f"{name} {value:.4f}" + (f" ± {subject.std(name):.4f}" if np.isfinite(subject.std(name)) else "")
+        for name, value in subject.lengths.items()
+    )
+    comment = re.sub(
+        "-(?=-)", "- ", f"{subject.name}: lengths in metres ± one standard deviation. {said}"
+    )  # no -- in XML
+    (folder / "subject.urdf").write_text(f"{head}\n<!-- {comment} -->\n{body}", encoding="utf-8")
 
 
 def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
