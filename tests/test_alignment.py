@@ -84,6 +84,26 @@ def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
         assert not segments.warnings
 
 
+def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
+    """A mount whose tilt and heading err together is corrected in both, and the person still faces ahead."""
+    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    bent = Rotation.from_rotvec([0.0, -np.deg2rad(5.0), 0.0])
+    recording, _ = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * mount})
+    known = np.deg2rad(4.0) ** 2 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.9], [0.0, 0.9, 1.0]])
+    subject = replace(
+        average_subject(),
+        mounts={"left_forearm": mount.as_quat()},
+        order=tuple(mount_rows("left_forearm")),
+        covariance=known,
+    )
+    segments = segment_orientations(recording, subject)
+    moved = (Rotation.from_quat(segments.quat_LS["left_forearm"]) * mount.inv()).as_rotvec(degrees=True)
+    # Half of the 5 deg is the mount's, and with it 0.9 as much of its heading.
+    np.testing.assert_allclose(np.abs(moved), [0.0, 2.5, 2.25], atol=0.06)
+    start = Rotation.from_quat(segments.quat_WL["left_forearm"][:100]).mean()
+    assert abs(np.degrees(heading_to(Rotation.identity(), start))) < 0.01
+
+
 def test_a_calibrated_mount_that_has_moved_is_said() -> None:
     mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
     moved = Rotation.from_rotvec([0.0, np.deg2rad(20.0), 0.0])

@@ -16,7 +16,7 @@ from wepose_pin.cli import main
 from wepose_pin.errors import BadData, MissingFile
 from wepose_pin.filters import METHODS
 
-TINY = bench.Effort(2, 8.0, 1.0, (200, 400), (1, 3), 1, 1, False)
+TINY = bench.Effort(2, 8.0, 1.0, (200, 400), (1, 3), 1, 1, False, clasp_s=10.0, solves=1)
 
 
 def run(*words: object) -> int:
@@ -45,15 +45,26 @@ def test_every_method_is_measured() -> None:
     assert set(found["accuracy"].rows) == set(METHODS)
     assert set(found["samples"].rows) == {"2e2 samples", "4e2 samples"}
     assert set(found["sensors"].rows) == set(found["live"].rows) == {"1 sensor", "3 sensors"}
-    for table in found.values():
+    for name, table in found.items():
         for row in table.rows.values():
             assert set(row) <= {column.key for column in table.columns}
             assert all(value >= 0.0 for value in row.values())
-            assert not any("ratio" in key for key in row)
+            assert name == "calibration" or not any("ratio" in key for key in row)
     assert any("pip install 'wepose-pin[peers]'" in note for note in found["filters"].notes)
     for causal in ("smekf", "ncf", "gdc"):
         assert found["filters"].rows[causal]["live_ns"] > 0.0
     assert 0.0 < found["accuracy"].rows["smekf"]["total_rmse"] < 1.0
+
+
+def test_scipy_solves_the_same_calibration() -> None:
+    rows = bench.calibration(TINY).rows
+    names = [name.partition(": ")[2] for name in rows]
+    solvers = ["Gauss-Newton, ours", "least_squares, our Jacobian", "least_squares, 2-point"]
+    assert names == ["building", *solvers, "whole"]
+    for name, row in rows.items():
+        assert "cost" not in row or row["cost"] == pytest.approx(1.0, abs=1e-3), name
+    assert len({name.partition(":")[0] for name in rows}) == 1
+    assert bench.FULL.look_rates_hz[-1] == 100.0
 
 
 @pytest.mark.skipif(not (bench.have("vqf") and bench.have("imufusion")), reason="no peers installed")

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ import pytest
 
 from wepose_pin import __version__
 from wepose_pin.cli import COMMANDS, main
-from wepose_pin.simulation import Simulation
+from wepose_pin.simulation import Imperfections, Simulation
 from wepose_pin.writers import write_session
 
 
@@ -41,6 +41,13 @@ def test_help_of_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
         assert f"Example: wepose {command}" in capsys.readouterr().out
     assert run("--version") == 0
     assert __version__ in capsys.readouterr().out
+
+
+def test_help_names_each_imperfection(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("simulate", "--help") == 0
+    text = capsys.readouterr().out
+    for field in fields(Imperfections):
+        assert field.name in text
 
 
 def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -143,6 +150,7 @@ def test_view_replaces_nothing_that_is_there(session: Path, tmp_path: Path, caps
     assert mine.read_text() == "keep"
     assert run("view", tmp_path / "result", "-o", mine, "--no-open", "--force") == 0
     assert mine.read_text().startswith("<!")
+    assert '"circles"' in mine.read_text()  # the phases of the recording, as on the page that track made
 
 
 def test_a_session_that_lacks_sensors_says_what_is_not_known(
@@ -177,7 +185,10 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
     ("words", "says"),
     [
         (["trak"], "did you mean 'track'?"),
-        (["track"], "Missing from wepose track"),
+        (["track"], "Missing from wepose track: SESSION, -o DIR; see: wepose track --help"),
+        (["simulate", "-o", "OUT", "--rate-hz", "fast"], "'fast'; see wepose"),
+        (["simulate", "-o", "OUT", "--wrld", "perfect"], "Perhaps you meant: --world; see wepose"),
+        (["calibrate", "s.toml", "-o", "OUT", "--gauge", "handle=0.4"], "the bar of --protocol handle"),
         (["track", "s.toml"], "-o"),
         (["track", "s.toml", "-o", "OUT", "--method", "ekf"], "'smekf'"),
         (["track", "nowhere.toml", "-o", "OUT"], "nowhere.toml: no such file"),
@@ -188,7 +199,9 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["view", "nowhere"], "no pose.parquet in it"),
         (["simulate", "-o", "OUT", "--rate-hz", "5"], "between 20 and 2000"),
         (["simulate", "-o", "OUT", "--set", "palm_slide=0"], "palm_slip"),
-        (["simulate", "-o", "OUT", "--set", "palm_slip=much"], "could not convert"),
+        (["simulate", "-o", "OUT", "--set", "palm_slip=much"], "'much' is not a number, as in palm_slip=0"),
+        (["simulate", "-o", "OUT", "--set", "bits=1.5"], "'1.5' is not a whole number"),
+        (["simulate", "-o", "OUT", "--set", "nothing=1"], ", mount"),
         (["simulate", "-o", "OUT", "--set", "mount=taped"], "'stated' or 'any'"),
     ],
 )

@@ -96,3 +96,29 @@ def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tm
     path.write_text(subject_toml(subject).replace("y = 1.0", "y = 2.0"))
     with pytest.raises(BadSubject, match=r"hinges\.left: x, y, z must be of length 1"):
         load_subject(path)
+
+
+def test_hands_with_sensors_of_their_own_bend_at_the_wrist(made: tuple[Simulation, Subject]) -> None:
+    """Forearms as long as forearm and hand were, so that the wrists meet; both hands point up from there."""
+    simulation, subject = made
+    recording = drifting(simulation, {})
+    bent = np.clip((recording.time - recording.phases["start"][0][1]) / 2.0, 0.0, 1.0)[:, None] * [0.0, -2.8, 0.0]
+    lengths, sensors, mounts = dict(subject.lengths), dict(recording.sensors), dict(subject.mounts)
+    for side in ("left", "right"):
+        lengths[f"{side}_forearm"] += lengths[f"{side}_hand"]
+        sensors[f"{side}_hand"] = Sensor(quat_WS=Rotation.from_rotvec(bent).as_quat())
+        mounts[f"{side}_hand"] = np.array([0.0, 0.0, 0.0, 1.0])
+    pose = track(replace(recording, sensors=sensors), replace(subject, lengths=lengths, mounts=mounts, hinges={}))
+    assert pose.reset is not None
+    assert pose.reset.clasp_mm is not None
+    assert max(pose.reset.clasp_mm) < 2.0
+    assert max(pose.reset.largest_deg.values()) < 0.05
+    assert set(pose.reset.largest_deg) == set(sensors)
+
+
+def test_hinges_hold_for_the_strapping_in_which_they_were_found(made: tuple[Simulation, Subject]) -> None:
+    simulation, subject = made
+    recording = drifting(simulation, {"right_forearm": 8.0})
+    recording = replace(recording, phases={"start": recording.phases["start"]})
+    assert track(recording, subject).reset is not None
+    assert track(replace(recording, strapping="new"), subject).reset is None

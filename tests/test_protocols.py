@@ -360,6 +360,7 @@ points = ["left_wrist", "right_wrist"]
 gauge = "rope"
 metres = 0.5
 """
+POSE = "[[pose]]\nphase = 'still'\nstd_deg = 5\ndirections = {}\n[[closure]]"
 
 
 def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
@@ -379,6 +380,12 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
         ("gauge =", "guage =", r"closure 1: no 'gauge'"),
         ("[[closure]]", "[[closures]]", r"'closures' is no key of a protocol; did you mean 'closure'"),
         ("needs =", "# needs =", r"no 'needs'"),
+        ("needs =", "needs = ['torso'] #", r"lacks left_forearm, left_upper_arm, right_"),
+        ("[[closure]]", "pose = 3\n[[closure]]", r"pose = 3 is no list of tables; write \[\[pose\]\]"),
+        ("[[closure]]", "[[step]]\nseconds = 3\n[[closure]]", r"step 1: no 'phase'"),
+        ("[[closure]]", POSE.format("3"), r"pose 1: directions = 3; of each segment"),
+        ("[[closure]]", POSE.format("{ torso = ['a', 0, 0] }"), r"directions\.torso = .*three numbers are needed"),
+        ("[[closure]]", POSE.format("{ head = [0, 0, 1] }"), r"directions: 'head' is not known"),
         ("needs =", "needs ==", r"not valid TOML"),
     ):
         own.write_text(OWN.replace(old, new))

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.calibration import Calibration, calibrate_lengths
 from wepose_pin.calibration.verdict import judge
 from wepose_pin.recording import Recording
-from wepose_pin.report import calibration_report
+from wepose_pin.report import calibration_report, unsaid
 from wepose_pin.report.figures import broken, direction, plus_minus, smoothed
 from wepose_pin.simulation import REALISTIC, simulate, simulated_person
 from wepose_pin.tracking import TrackedPose, track
@@ -90,6 +90,13 @@ def test_warnings_stand_above_the_figures_in_words(made: Made) -> None:
     page = without_frame(calibration_report(warned, made[1], pose=made[2]))
     assert page.index("The palms were apart for 12 %") < page.index("<figure")
     assert 'class="banner p' not in page  # nobody gave a verdict
+
+
+def test_what_the_verdict_says_is_not_said_twice(made: Made) -> None:
+    verdict = judge(made[0])
+    finding = verdict.findings[0]._replace(grade="fail", said="the left elbow would bend backward", why="", do="look")
+    verdict = replace(verdict, grade="fail", findings=(finding,))
+    assert unsaid(("the left elbow would bend backward", "another"), verdict) == ["another"]
 
 
 def test_it_opens_offline_and_is_one_small_file(page: str) -> None:

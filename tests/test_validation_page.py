@@ -25,7 +25,7 @@ from wepose_pin.validation.findings import (
     waterfall_lines,
     worse,
 )
-from wepose_pin.validation.page import as_html, experiment_table, markdown, page, table_note
+from wepose_pin.validation.page import as_html, experiment_table, how_many, markdown, page, table_note
 from wepose_pin.validation.words import world_text
 
 TIME = np.linspace(0.0, 10.0, 61)
@@ -135,6 +135,22 @@ def test_the_papers_order_and_what_is_worse() -> None:
     best = summary([dynamic("smekf", 0.1, 0.1, 0.1), dynamic("ncf", 0.3, 0.3, 0.3)])
     assert worse(best) == ["No figure is worse than the paper's."]
     assert beaten(best, DYNAMIC) == ["No other filter has a smaller error than smekf here."]
+
+
+def test_a_glance_tells_a_larger_mean_from_a_larger_deviation() -> None:
+    wide = dynamic("smekf", 0.1, 0.1, 0.1)._replace(
+        figures={name: {"mean": 0.1, "std": std} for name, std in (("roll", 9.0), ("pitch", 0.1), ("yaw", 0.1))}
+    )
+    cells = at_a_glance(summary([wide]), [wide])
+    assert cells is not None
+    assert cells[2] == "smekf: roll (± only)"
+
+
+def test_small_gains_are_not_rounded_away() -> None:
+    rows = summary([Result("gains", "BROAD", "gdc, BROAD", {"gain": 0.000562, "integral": 0.0, "total_rmse_deg": 1.0})])
+    assert experiment_table(rows, whole=True).rows == [["gdc, BROAD", "0.000562", "0", "1.00"]]
+    assert how_many("gains", 7) == "7 kinds of motion"
+    assert how_many("drift", 1) == "1 trial"
 
 
 def test_what_is_won_without_correcting_is_not_said_to_be_won_by_it() -> None:

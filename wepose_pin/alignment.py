@@ -163,10 +163,13 @@ def segment_orientations(
             warnings.append(f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose")
         known = mount_covariance(recording, segment, subject)
         if known is not None:
-            # The misfit is the pose's error and the mount's together; each takes its share.
-            misfit = (R_LS * R_stated.inv()).as_rotvec()
-            both = known + START_POSE_STD**2 * np.eye(3)
-            R_LS = Rotation.from_rotvec(known @ np.linalg.solve(both, misfit)) * R_stated
+            # The tilt's misfit is the pose's error and the mount's together; each takes its share. Of the heading,
+            # which was made to fit, the start pose says nothing but through the mount's own correlations.
+            misfit = (R_LS * R_stated.inv()).as_rotvec()[:2]
+            both = known[:2, :2] + START_POSE_STD**2 * np.eye(2)
+            R_LS = Rotation.from_rotvec(known[:, :2] @ np.linalg.solve(both, misfit)) * R_stated
+            psi = heading_to(at_start, R_LS)
+            turn = Rotation.from_rotvec([0.0, 0.0, psi])
             if misfit @ np.linalg.solve(both, misfit) > MOVED_MOUNT**2:
                 warnings.append(
                     f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "

@@ -1,4 +1,4 @@
-"""Measured speed and accuracy of the filters beside the peers that are installed, as ratios within one run.
+"""Measured speed and accuracy of filters and calibration beside peers, as ratios within one run.
 
 A section is a function that gives a `Table`; `sections` lists them. Absolute times belong to the machine and to what
 else it does: everything is timed in turn with VQF's C++ (``pip install wepose-pin[peers]``) and its ratio is the median
@@ -28,6 +28,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from . import so3
+from .calibration.lengths import LOOK_RATE_HZ
 from .errors import BadData, MissingFile
 from .evaluation import attitude_error
 from .filters import METHODS, OFFLINE, Smekf, run_filter
@@ -35,7 +36,7 @@ from .filters.bank import LiveBank
 from .filters.base import in_parallel, processors
 from .noise import SensorNoise, noise_of
 from .readers.trials import read_authors_trial, read_broad
-from .simulation import paper_dynamic
+from .simulation import REALISTIC, paper_dynamic, simulate, simulated_person
 from .static import StaticDetector, StaticTest
 
 FORMAT = 1
@@ -82,9 +83,22 @@ class Effort(NamedTuple):
     trials: int  # simulated
     recordings: int  # of BROAD
     compiling: bool  # what the first use costs: a quarter of a minute by itself
+    clasp_s: float = 60.0  # [s] of joined hands to calibrate from
+    look_rates_hz: tuple[float, ...] = (LOOK_RATE_HZ,)  # at which the calibration looks at them
+    solves: int = 3  # of each problem of a calibration
 
 
-FULL = Effort(15, 1200.0, 60.0, (10_000, 100_000, 1_000_000, 10_000_000), (1, 2, 4, 5, 8, 16), 12, 1000, True)
+FULL = Effort(
+    rounds=15,
+    seconds=1200.0,
+    live_seconds=60.0,
+    lengths=(10_000, 100_000, 1_000_000, 10_000_000),
+    counts=(1, 2, 4, 5, 8, 16),
+    trials=12,
+    recordings=1000,
+    compiling=True,
+    look_rates_hz=(LOOK_RATE_HZ, 100.0),
+)
 QUICK = Effort(7, 300.0, 20.0, (10_000, 100_000, 1_000_000), (1, 2, 5, 16), 3, 2, False)
 
 
@@ -103,6 +117,7 @@ def sections(effort: Effort = FULL, data: Path | None = None) -> dict[str, Calla
         "samples": partial(samples, effort),
         "sensors": partial(sensors, effort),
         "accuracy": partial(simulated_accuracy, effort),
+        "calibration": partial(calibration, effort),
     }
     if paths:
         found["recordings"] = partial(recorded_accuracy, paths)
@@ -380,6 +395,46 @@ def sensors(effort: Effort) -> Table:
         timing = in_turn(cases, effort.rounds, "one", time.perf_counter)["all"]
         row = {"seconds": timing.median, "ns": 1e9 * timing.median / n / count, "speedup": 1.0 / timing.ratio}
         table.rows[f"{count} sensor{'s' * (count > 1)}"] = row
+    return table
+
+
+def calibration(effort: Effort) -> Table:
+    """The solve of a hands-together calibration beside SciPy's."""
+    from .calibration.timed import OURS, building, peak_memory, posed, solvers
+
+    person = simulated_person(3)
+    made = simulate(person.lengths, seed=3, imperfections=REALISTIC, clasp_s=effort.clasp_s, circles=0)
+    table = Table(
+        f"Calibration: {effort.clasp_s:g} s of joined hands, one least squares from one start",
+        (
+            Column("seconds", "solve [s]", 3),
+            Column("spread_s", "± [s]", 3),
+            Column("ratio", "by ours", 2, True),
+            Column("cost", "cost by ours", 4),
+            Column("megabytes", "memory [MB]"),
+        ),
+        notes=[
+            "Processor time of all threads, medians; no compiler. Memory: by how much a new process grows at most.",
+            "least_squares: trf, scaled by the Jacobian, tolerances as they come. Whole: search for a start, all",
+            "rounds of weights, the last solve; filters apart. Building: CasADi's functions, once for so many looks.",
+        ],
+    )
+    problems, whole = posed(made.recording(), person.average, person.taped, person.taped_std, effort.look_rates_hz)
+    for problem, calibrated in zip(problems, whole, strict=True):
+        looks = f"{len(problem.weights)} looks"
+        table.rows[f"{looks}: building"] = {"seconds": building(problem)}
+        costs: dict[str, float] = {}
+
+        def solved(name: str, run: Callable[[], float], costs: dict[str, float] = costs) -> None:
+            costs[name] = run()
+
+        cases: dict[str, Callable[[], Any]] = {n: partial(solved, n, run) for n, run in solvers(problem).items()}
+        timings = in_turn(cases | {"whole": calibrated}, effort.solves, OURS, time.process_time)
+        for name, timing in timings.items():
+            row = {"seconds": timing.median, "spread_s": timing.spread, "ratio": timing.ratio}
+            if name in cases:
+                row |= {"cost": costs[name] / costs[OURS], "megabytes": 1e-6 * peak_memory(problem, name)}
+            table.rows[f"{looks}: {name}"] = {key: value for key, value in row.items() if value == value}
     return table
 
 

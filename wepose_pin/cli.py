@@ -12,7 +12,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -38,7 +38,7 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
     """The whole chain on a recording that it makes itself: simulate, calibrate, track, evaluate, view.
 
     A person of random size stands in the N-pose, moves the joined hands for a minute, then draws six circles in the
-    air with rests on a table; five Xsens MTi-3 watch.
+    air with rests on a table, with five Xsens MTi-3 on. All of it is simulated, so that the truth is known.
 
     Example: wepose demo -o demo
 
@@ -85,7 +85,7 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
                 (folder / "result").mkdir()
                 assert pose.model is not None
                 write_subject(folder / "subject", found[method].subject, pose.model)
-                write_result(folder / "result", pose)
+                write_result(folder / "result", pose, phases=recording.phases)
                 best = pose
         step("making the page")
         assert best.model is not None
@@ -104,7 +104,7 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
             "errors": {method: asdict(error) for method, error in errors.items()},
         }
         (folder / "demo.json").write_text(json.dumps(as_json(report), indent=2) + "\n", encoding="utf-8")
-    _lengths_table(found[BEST].subject, person.average, person.lengths, tuple(person.taped))
+    _lengths_table("Lengths from the joined hands", found[BEST].subject, person.average, person.lengths, person.taped)
     _print_table(
         "Right hand while drawing six circles: distance to the truth [mm], mean ± std",
         ("filter", "from the shoulders", "from the root"),
@@ -163,7 +163,7 @@ def track(
         body = load_model(model) if model else None
         step(f"tracking by {method}")
         pose = follow(recording, who, method=method, model=body)
-        write_result(folder, pose, covariance)
+        write_result(folder, pose, covariance, recording.phases)
         step("making the page")
         assert pose.model is not None
         page = pose_html(pose.model, pose, phases=recording.phases, title=recording.name)
@@ -202,7 +202,7 @@ def calibrate(
     method: Method = "amekf",
     force: bool = False,
 ) -> None:
-    """Hands-together recording to subject: arm lengths and sensor mounts with their standard deviations, and a verdict.
+    """Hands-together recording to subject: arm lengths and sensor mounts, with standard deviations and a verdict.
 
     Hands together fix the proportions of the arms and not their scale: tape one length (the shoulder width serves) and
     give it as gauge. Without one the scale is that of the average person, and the output says how uncertain that is.
@@ -221,14 +221,14 @@ def calibrate(
         gauge: A length measured with a tape, such as shoulder_width=0.385; may be given several times. With protocol
             handle also handle=0.42, the bar between the palms.
         stature: Body height in metres; narrows the average person.
-        sex: Narrows the average person.
+        sex: f or m; narrows the average person.
         method: The orientation filter.
         force: Replace files of an earlier run.
     """
     from .calibration import calibrate_lengths, judge, load_protocol
     from .model import load_model
     from .readers import load_session
-    from .report import calibration_report
+    from .report import calibration_report, unsaid
     from .subject import average_subject
     from .writers import whole_folder
     from .writers.calibration import write_calibration
@@ -248,15 +248,16 @@ def calibrate(
         step("writing the report")
         report = calibration_report(found, recording, method=method, protocol=what, verdict=verdict)
         (folder / "report.html").write_text(report, encoding="utf-8")
-    _warn(found.warnings)
-    _lengths_table(found.subject, average, None, tuple(taped))
+    _warn(unsaid(found.warnings, verdict))
+    _lengths_table(f"Lengths, by {what.title}", found.subject, average, None, taped)
     _mounts_table(found)
     if what.closures:
         gap = "Palm-to-palm gap" if any(len(c.points) > 1 for c in what.closures) else "Gap from palm to its point"
         _say(
             f"{gap}: {1e3 * found.rms_gap:.1f} mm rms, {1e3 * found.prior_rms_gap:.1f} mm with the average person's "
-            f"lengths; worth {found.independent:.0f} looks"
+            f"lengths;"
         )
+        _say(f"the motion counts as {found.independent:.0f} independent measurements")
     _say(f"Report to look at:  {out / 'report.html'}")
     _say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}  {out / 'calibration.json'}")
     _verdict(verdict)
@@ -340,8 +341,8 @@ def simulate(
 ) -> None:
     """A subject with known truth: session file, recording, and truth.parquet as pose.parquet.
 
-    The sensors have an MTi-3's noise and bias in either world; what else is wrong in a realistic one, and the names for
-    --set, stand with sizes and sources in wepose_pin.simulation.Imperfections.
+    The sensors have an MTi-3's noise and bias in either world; what else is wrong in a realistic one stands with sizes
+    and sources in wepose_pin/simulation/imperfections.py. `wepose calibrate DIR --gauge …`, `wepose track DIR` go on.
 
     Example: wepose simulate -o made --seed 7 --world realistic --set palm_slip=0 --set mount=any
 
@@ -350,7 +351,10 @@ def simulate(
         seed: Another number is another person and another motion.
         rate_hz: Samples a second.
         world: Nothing wrong but the sensors' noise, or soft tissue, slip, sway and sensor errors of a usual size.
-        change: One imperfection at another size; may be given several times.
+        change: One imperfection at another size; may be given several times. mount=any: sensors in any rotation,
+            nothing stated; the rest are numbers, 0 for off: soft_tissue_deg, palm_slip [m], shoulder_wander [m],
+            start_elbow_deg, start_segment_deg, sway_deg_s, gyro_scale, accel_scale, misalignment_deg,
+            g_sensitivity_deg_s, gyro_range_deg_s, accel_range_g, bits, clock_jitter [s], clock_offset [s], dropped.
         force: Replace files of an earlier run.
     """
     from dataclasses import replace
@@ -420,7 +424,7 @@ def view(
         raise ExistingOutput(f"{page}: not a file that can be written; -o names an HTML file in an existing folder")
     if out is not None or force or not page.is_file():
         pose, model, summary = read_result(result)
-        phases = {name: [tuple(span)] for name, span in summary.get("phases", {}).items()}
+        phases = {name: [(a, b) for a, b in spans] for name, spans in summary.get("recorded_phases", {}).items()}
         text = pose_html(model, pose, phases=phases, title=summary.get("recording", result.name))
         partial = page.with_name(f".{page.name}.partial")
         try:
@@ -443,13 +447,16 @@ def validate(
 ) -> None:
     """The paper's experiments on simulated subjects, and real recordings, beside the paper's own figures.
 
+    On two cores a quick run takes under a minute, a full one some ten.
+
     Example: wepose validate --quick
 
     Args:
         out: Folder for validation.json with every trial, and the page with tables and figures: validation.html,
             validation.md with validation/*.png.
         data: Folder of the real recordings (broad/, wepose_hr/, ring/, ur5/), to measure on them too.
-        quick: One trial of each experiment, and two of BROAD, instead of all.
+        quick: One trial of each experiment, and two of BROAD, instead of all; without the account of what costs how
+            many millimetres and without the search for gains.
         from_: validation.json of an earlier run: tables and pages are made from it anew, and nothing is run.
         force: Replace files of an earlier run.
     """
@@ -555,12 +562,12 @@ def bench(
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
-    "track": track,
-    "calibrate": calibrate,
-    "evaluate": evaluate,
     "simulate": simulate,
-    "validate": validate,
+    "calibrate": calibrate,
+    "track": track,
     "view": view,
+    "evaluate": evaluate,
+    "validate": validate,
     "bench": bench,
 }
 
@@ -638,11 +645,25 @@ def _parse_and_run(argv: list[str]) -> None:
     except SystemExit as stop:
         if not stop.code:
             raise
-        lines = [re.sub(r"[│╭╮╰╯─]+", " ", line).strip() for line in complaint.getvalue().splitlines()]
+        frame = r"[│╭╮╰╯─]+|^[+|]|[+|]$|-{4,}"  # of ASCII where the terminal knows no other
+        lines = [re.sub(frame, " ", line).strip() for line in complaint.getvalue().splitlines()]
         text = " ".join(line for line in lines[1:] if line)  # the first line is the panel's title
         text = re.sub(r"\[/?bold\]|\{None\}\||Argument helptext:.*?(?=For full)", "", text)
-        raise BadOption(text.replace(" For full helptext, run", "; see").removesuffix(":")) from None
+        head, missing, rest = text.partition("Missing from wepose ")
+        if missing:  # each with its whole help: its name is enough
+            command, _, said = rest.partition(": ")
+            *of, rest = said.split("(required)")
+            text = f"{head}{missing}{command}: {', '.join(_option_name(each) for each in of)}{rest}"
+        text = re.sub(r"(Perhaps you meant: --[\w-]+).*?(?=For full|$)", r"\1 ", text)
+        text = re.sub(r"\.? *For full helptext, (run|see)", "; see", text)
+        raise BadOption(text.removesuffix(":")) from None
     chosen[0]()
+
+
+def _option_name(text: str) -> str:
+    """What stands before an option's help: "-o DIR, --out DIR Folder for …" → "-o DIR"."""
+    name, *more = text.split()
+    return f"{name} {more[0].rstrip(',')}" if name.startswith("-") and more else name
 
 
 def _gauges(gauge: tuple[str, ...], distances: tuple[str, ...] = ()) -> dict[str, float]:
@@ -653,6 +674,8 @@ def _gauges(gauge: tuple[str, ...], distances: tuple[str, ...] = ()) -> dict[str
     taped: dict[str, float] = {}
     for text in gauge:
         name, _, value = text.partition("=")
+        if name == "handle" and name not in known:
+            raise BadOption(f"--gauge {text}: the bar of --protocol handle, which is not given")
         if name in taped:
             raise BadOption(f"--gauge {text}: '{name}' is given twice; give the mean of both")
         if name not in known:
@@ -672,9 +695,13 @@ def _changed(imperfections: Imperfections, changes: tuple[str, ...]) -> Imperfec
     for text in changes:
         name, _, value = text.partition("=")
         if name not in names:
-            raise BadOption(f"--set {text}: '{name}' is no imperfection; {one_of(names, name)}")
+            raise BadOption(f"--set {text}: '{name}' is no imperfection; {one_of(names, name, len(names))}")
         try:
             size: Any = value if name == "mount" else int(value) if name == "bits" else float(value)
+        except ValueError:
+            kind = "whole number" if name == "bits" else "number"
+            raise BadOption(f"--set {text}: '{value}' is not a {kind}, as in {name}=0") from None
+        try:
             imperfections = replace(imperfections, **{name: size})
         except ValueError as error:
             raise BadOption(f"--set {text}: {error}") from None
@@ -741,7 +768,7 @@ def _print_table(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]
 
 
 def _lengths_table(
-    subject: Subject, average: Subject, true: Mapping[str, float] | None, taped: tuple[str, ...]
+    title: str, subject: Subject, average: Subject, true: Mapping[str, float] | None, taped: Collection[str]
 ) -> None:
     rows = []
     for name, value in subject.lengths.items():
@@ -757,7 +784,7 @@ def _lengths_table(
         "average person",
         "",
     )
-    _print_table("Lengths from the joined hands", header, rows)
+    _print_table(title, header, rows)
 
 
 def _mounts_table(found: Calibration) -> None:
@@ -778,7 +805,7 @@ def _mounts_table(found: Calibration) -> None:
                 f"± {z:.1f}",
                 f"± {np.hypot(x, y) / 2**0.5:.1f}",
                 f"{np.degrees(np.linalg.norm(tilt)):.1f}",
-                f"{60.0 * np.degrees(found.drift[segment]):+.1f}",
+                f"{60.0 * np.degrees(found.drift[segment]):+z.1f}",
             )
         )
     header = ("sensor", "nearest axes", "heading", "tilt", "off the start pose", "heading drift [1/min]")
@@ -804,7 +831,7 @@ def _validation_tables(document: Document) -> None:
 
     from .validation import summary
     from .validation.findings import order, target_line, targets, worse
-    from .validation.page import experiment_table, unit_of
+    from .validation.page import experiment_table, how_many, unit_of
 
     def say(text: str) -> None:
         _say(textwrap.fill(text, 98, initial_indent="  ", subsequent_indent="    "))
@@ -817,7 +844,7 @@ def _validation_tables(document: Document) -> None:
         header, lines = experiment_table(of, whole=False)
         # A long name in two lines: the tables stay within 100 columns.
         header = [name if len(name) < 12 else "\n".join(name.rsplit(" ", 1)) for name in header]
-        title = f"{experiment}, {trials} trial{'s' * (trials != 1)}" + (f" [{unit}]" if unit else "")
+        title = f"{experiment}, {how_many(experiment, trials)}" + (f" [{unit}]" if unit else "")
         _print_table(title + ", a quick run" * document.quick, tuple(header), [tuple(line) for line in lines])
         said = [*order(of), *worse(of)]
         for text in said:

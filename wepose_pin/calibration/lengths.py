@@ -65,6 +65,7 @@ DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
 HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of a heading that nothing tells: the whole circle
 POINT_STD = 3.0  # [m] of a point of W that nothing tells
 SAG_STD = np.deg2rad(0.6)  # [rad] as the segment turns by a radian, each axis against each
+SHOULDERS_STD = np.deg2rad(2.0)  # [rad] of the shoulders' line about the torso's z: some 9 mm of one of them
 # Elbow axis (x, 1, z) in the upper arm: palms turn in or out alike on both sides, the torso's facing is common to both.
 HINGE_MIRROR_STD, HINGE_COMMON_STD, HINGE_TILT_STD = np.deg2rad([20.0, 5.0, 5.0])
 # Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
@@ -75,6 +76,7 @@ LEAST_CORRELATION_S = 3.0
 LEAST_LOOKS = 10
 THIRD_CHI2 = {1: 0.1485, 3: 1.4237}  # what 30 % of chi² with so many degrees stay below
 ROUNDS = 5
+MANY_LOOKS = 1000  # from twice as many on, all rounds but the last are made with every second, third, … look
 # To see whether labels and mounts can be as stated, the closure alone at fewer looks tells enough.
 QUICK_RATE_HZ, QUICK_ROUNDS, QUICK_STEPS = 1.0, 1, 15
 # A look whose gap is this many times the usual is one at which the palms were apart.
@@ -262,7 +264,8 @@ def _looks(
     samples = []
     for condition in protocol.conditions:
         spans = [recording.span(interval) for interval in recording.phase(condition.phase)]
-        samples.append(np.concatenate([np.arange(len(recording))[span][::stride] for span in spans]))
+        # Each look once, however the intervals overlap.
+        samples.append(np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride])
         if len(samples[-1]) < LEAST_LOOKS * rate_hz / LOOK_RATE_HZ:
             raise BadPhase(
                 f"{recording.where()}: phases.{condition.phase} holds {len(samples[-1])} looks at {LOOK_RATE_HZ:g} a "
@@ -306,10 +309,13 @@ def _solve(
             f"check that the palms touch in the phase and that every sensor sits where the session says"
         )
     covariance = np.linalg.inv(fit.information)
+    if not quick:
+        learned = _learned(fit, looks.layout, weights, covariance)
+        covariance = _covariance(looks, fit, information, weights, weight)
     order, joint = _handed_on(layout, covariance)
     mounts = {name: _mount(found, fit.x, layout, name).as_quat() for name in layout.sensors}
     # Of sensors that are not in the chain the start pose has measured what it can.
-    for name in set(found.R_VS) - set(mounts):
+    for name in [name for name in found.R_VS if name not in mounts]:
         stated = nominal_mount(recording, name, prior)
         if stated is not None:
             psi = heading_to(found.at_start[name], Rotation.from_quat(stated))
@@ -359,7 +365,7 @@ def _solve(
         drift=dict(zip(layout.sensors, fit.x[layout.drift].tolist(), strict=True)),
         hinge=hinge,
         hinge_rms=hinge_rms,
-        learned={} if quick else _learned(fit.x, looks, weights, covariance),
+        learned={} if quick else learned,
         before=_handed_on(layout, np.linalg.inv(information))[1],
         quat_WL=segments_at(found, mounts, at),
         protocol=protocol.name,
@@ -416,6 +422,7 @@ def _before(
         information[np.ix_(of, of)] = known
     information[layout.drift, layout.drift] = np.eye(len(layout.sensors)) / DRIFT_STD**2
     information[layout.sag, layout.sag] = np.eye(9 * len(layout.sensors)) / SAG_STD**2
+    information[layout.shoulders, layout.shoulders] = SHOULDERS_STD**-2
     x_left, z_left, x_right, z_right = range(layout.hinge.start, layout.hinge.stop)
     for std, rows, share in (
         (HINGE_COMMON_STD, (x_left, x_right), np.array([0.5, 0.5])),
@@ -456,9 +463,14 @@ def _weighed(
     Gap and hinges are weighed by their own residuals: variance, and how long it stays correlated.
     """
     n = looks.data.shape[1]
-    x, kept, closed = start, touching.copy(), looks.closed
+    closed, rounds, least = looks.closed, range(QUICK_ROUNDS if quick else ROUNDS), _least(looks)
+    if n >= 2 * MANY_LOOKS and closed.any() and not quick:
+        few = np.concatenate([np.arange(n)[span][:: n // MANY_LOOKS] for _, span in looks.spans()])
+        fit, _, kept, _ = _weighed(looks.take(few), center, information, start, touching[few], quick)
+        start, touching, rounds = fit.x, np.interp(np.arange(n), few, kept), rounds[-1:]
+    x: np.ndarray | Fit = start
+    kept = touching.copy()
     steps = QUICK_STEPS if quick else 60
-    least = LEAST_CORRELATION_S * (QUICK_RATE_HZ if quick else LOOK_RATE_HZ)
     weights = np.full((n, 5), 1.0 / least)
     weights[:, :3] *= kept[:, None]
     if quick:
@@ -469,9 +481,9 @@ def _weighed(
             weights[span] = 1.0 / (span.stop - span.start)  # as it was held, it was held: one look altogether
     if not closed.any():
         return solve(looks, center, information, weights, x, steps, not quick), weights, kept, independent
-    for k in range(QUICK_ROUNDS if quick else ROUNDS):
-        fit = solve(looks, center, information, weights, x, steps, not quick)
-        x, independent = fit.x, 0.0
+    for k in rounds:
+        x = fit = solve(looks, center, information, weights, x, steps, not quick)
+        independent = 0.0
         for closure, span in looks.spans():
             if isinstance(closure, Closure):
                 r = fit.closure[span, : closure.rows]
@@ -494,9 +506,51 @@ def _weights(r: np.ndarray, kept: np.ndarray, least: float) -> np.ndarray:
     return kept[:, None] / (_correlated(r * kept[:, None], least) * variance)
 
 
+def _least(looks: Looks) -> float:
+    """How many looks `LEAST_CORRELATION_S` is."""
+    return LEAST_CORRELATION_S / max(float(np.median(np.diff(looks.data[-1]))), 1e-3)
+
+
 def _correlated(r: np.ndarray, least: float) -> float:
     """How many looks make one independent one."""
     return max(_correlation_time(r), least)
+
+
+def _covariance(looks: Looks, fit: Fit, before: np.ndarray, weights: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Covariance of x: what errors that stay for a while do to this fit.
+
+    The weights count as many looks for one as the errors last. That is what they are worth where the motion is as slow
+    as the errors; where it turns through a good part of its reach meanwhile, an error pulls at other unknowns from look
+    to look, and cancels. So the gradient's covariance is that of sums over windows of the errors' duration,
+    C (Λ + Σ (Σ w J)ᵀ σ² (Σ w J) / duration) C, as of Newey and West 1987 with their triangle of weights.
+    """
+    C = np.linalg.inv(fit.information)
+    J, r, least = fit.jacobian, np.hstack((fit.closure, fit.hinge)), _least(looks)
+    weights = np.broadcast_to(weights, r.shape)
+    arms = [3 + SIDES.index(side) for side in looks.layout.arms]
+    gradient = before.copy()
+    for condition, span in looks.spans():
+        parts = [(list(range(condition.rows)), kept[span])]
+        if isinstance(condition, Closure):
+            parts += [(arms, np.ones(span.stop - span.start))] if arms else []
+        for rows, share in parts:
+            slope, w = J[span][:, rows], weights[span][:, rows]
+            pull = w[:, :, None] * slope
+            if not isinstance(condition, Closure):
+                gradient += np.einsum("nki,nkj->ij", pull, slope)
+                continue
+            if not share.sum() > 0.0:
+                continue
+            # What the fit took out of the residuals is given back to their variance.
+            size = np.sum(r[span][:, rows] ** 2, axis=1) + np.einsum("nki,ij,nkj->n", slope, C, slope, optimize=True)
+            variance = max(float(share @ size) / (len(rows) * float(share.sum())), LEAST_VARIANCE)
+            lasts = round(_correlated(r[span][:, rows] * share[:, None], least))
+            summed = np.concatenate((np.zeros((1, *pull.shape[1:])), np.cumsum(pull, axis=0)))
+            ends = np.arange(1, len(pull) + lasts)
+            windows = summed[np.minimum(ends, len(pull))] - summed[np.maximum(ends - lasts, 0)]
+            windows = windows.reshape(-1, C.shape[0])
+            gradient += variance / lasts * windows.T @ windows
+    return C @ gradient @ C
 
 
 def _handed_on(layout: Layout, covariance: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
@@ -511,17 +565,16 @@ def _handed_on(layout: Layout, covariance: np.ndarray) -> tuple[tuple[str, ...],
     return (*LENGTHS, *rows), take @ covariance @ take.T
 
 
-def _learned(x: np.ndarray, looks: Looks, weights: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndarray]:
+def _learned(fit: Fit, layout: Layout, weights: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndarray]:
     """Which share of what is known each look brought: C = C (Σ Jᵀ W J + Λ) C, over C, is a sum to 1."""
-    layout, unit = looks.layout, np.eye(looks.layout.size)
+    unit = np.eye(layout.size)
     of = dict(zip(LENGTHS, unit[:K], strict=True))
     of |= {f"{s}_forearm + {s}_hand": of[f"{s}_forearm"] + of[f"{s}_hand"] for s in SIDES}
     for i, name in enumerate(layout.sensors):
         rows = (layout.tilt.start + 2 * i, layout.tilt.start + 2 * i + 1, layout.heading.start + i)
         of |= dict(zip(mount_rows(name), unit[list(rows)], strict=True))
     T = np.array(list(of.values()))
-    _, J, _ = residuals(x, looks)
-    moved = J @ covariance @ T.T  # (n, 5, k)
+    moved = fit.jacobian @ covariance @ T.T  # (n, 5, k)
     share = np.einsum("ni,nik->kn", weights, moved**2) / np.einsum("ki,ij,kj->k", T, covariance, T)[:, None]
     return dict(zip(of, share, strict=True))
 

@@ -6,8 +6,9 @@ pose that is held ε off the N-pose, R_WL(start) = exp(ε), the mount is R_LS = 
     R_WL(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
 
 with ψ the heading, d its drift since the start, and A the sensor's sag on its segment: soft tissue turns a sensor as
-gravity turns in the segment. Neither d nor A nor the hinges are handed on, but the covariance of lengths and mounts
-holds what they cost.
+gravity turns in the segment. The line between the shoulders is the torso's y but for what collarbones and shoulder
+blades make of it while the arms are raised. Neither that nor d, A and the hinges are handed on, but the covariance of
+lengths and mounts holds what they cost.
 
 What a look sees is the condition of its protocol that holds then. Of a closure it is the gap, whitened by the
 covariance that errors of the orientations and slipping palms give it, which makes it as homogeneous in the lengths as
@@ -18,7 +19,7 @@ same five rows: three of its condition and two elbows; those that do not apply a
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -68,9 +69,14 @@ class Layout(NamedTuple):
         return slice(self.hinge.stop, self.hinge.stop + 9 * len(self.sensors))
 
     @property
+    def shoulders(self) -> slice:
+        """How far the line between the shoulders is turned about the torso's z [rad]."""
+        return slice(self.sag.stop, self.sag.stop + 1)
+
+    @property
     def points(self) -> slice:
         """Unknown points of W (3,) each [m]."""
-        return slice(self.sag.stop, self.sag.stop + 3 * self.fixed)
+        return slice(self.shoulders.stop, self.shoulders.stop + 3 * self.fixed)
 
     @property
     def distances(self) -> slice:
@@ -94,6 +100,7 @@ class Fit(NamedTuple):
     closure: np.ndarray  # (n, 3) whitened residuals of the gap
     hinge: np.ndarray  # (n, 2) of the elbows, in units of `HINGE_STD`
     gaps: np.ndarray  # (n, 3) [m]
+    jacobian: np.ndarray  # (n, 5, m) of gap and hinge
     information: np.ndarray  # of x, prior included
     cost: float
 
@@ -126,14 +133,28 @@ def residuals(x: np.ndarray, looks: Looks) -> tuple[np.ndarray, np.ndarray, np.n
     found, point = [], 0
     for condition, span in looks.spans():
         n = span.stop - span.start
-        r, J, gap = _mapped(looks.layout, condition, point, n)(x, looks.data[:, span])
+        r, J, gap = np.empty((n, 5)), np.empty((n, len(x), 5)), np.empty((n, 3))
+        taken = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(looks.data[:, span].T, dtype=float)
+        filled(_mapped(looks.layout, condition, point, n), taken, (r, J, gap))
+        found.append((r, np.ascontiguousarray(J.swapaxes(1, 2)), gap))
         point += isinstance(condition, Closure) and condition.kind == "fixed_point"
-        jacobian = np.asarray(J).reshape(5, n, looks.layout.size).transpose(1, 0, 2)
-        found.append((np.asarray(r).T, jacobian, np.asarray(gap).T))
     if len(found) == 1:
         return found[0]
     r, J, gap = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return r, J, gap
+
+
+def filled(function: Any, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+    """Evaluate a CasADi function from arrays into arrays, contiguous, an array's row each of CasADi's columns.
+
+    CasADi's own matrices would cost as much again as the evaluation.
+    """
+    buffer, evaluate = function.buffer()
+    for i, array in enumerate(arguments):
+        buffer.set_arg(i, array.data)
+    for i, array in enumerate(results):
+        buffer.set_res(i, array.data)
+    evaluate()
 
 
 def placed(x: np.ndarray, looks: Looks) -> np.ndarray:
@@ -177,8 +198,8 @@ def _look(layout: Layout, condition: Condition, point: int) -> Any:
     else:
         level = rotate(quat_WL[condition.segment], ca.vertcat(0.0, 1.0, 0.0))[2]
         whitened = ca.vertcat(level / condition.std, 0.0, 0.0)
-    r = ca.vertcat(whitened, elbows)
-    return ca.Function("look", [x, data], [r, ca.densify(ca.jacobian(r, x)), ca.densify(gap)])
+    r = ca.cse(ca.vertcat(whitened, elbows))
+    return ca.Function("look", [x, data], ca.cse([r, ca.densify(ca.jacobian(r, x)), ca.densify(gap)]))
 
 
 _UP = ca.vertcat(0.0, 0.0, 1.0)
@@ -194,7 +215,10 @@ def _closed(layout: Layout, closure: Closure, x: Any, quat_WL: Mapping[str, Any]
     way = coefficients(closure)
     carried = {name: carrier(name, layout.sensors) for name in way}
     moved = {sensor: ca.SX.zeros(3) for sensor in layout.sensors if sensor in carried.values()}
-    for name, vector in links(x[:K], {name: quat_WL[carried[name]] for name in way}, way).items():
+    turned = {name: quat_WL[carried[name]] for name in way}
+    if "torso" in turned:
+        turned["torso"] = product(turned["torso"], about_z(x[layout.shoulders]))
+    for name, vector in links(x[:K], turned, way).items():
         moved[carried[name]] += vector
     gap, covariance = ca.SX.zeros(3), closure.slip**2 * ca.SX.eye(3)
     for v in moved.values():
@@ -229,7 +253,7 @@ def solve(
     center: np.ndarray,
     prior: np.ndarray,
     weights: np.ndarray,
-    start: np.ndarray,
+    start: np.ndarray | Fit,
     rounds: int = 60,
     strict: bool = True,
 ) -> Fit:
@@ -239,6 +263,7 @@ def solve(
     ----------
     center, prior : c (m,) and Λ (m, m)
     weights : (n, 5) of the residuals
+    start : x to begin with, or a fit of the same looks with other weights
     strict : without it what was reached in these rounds is given
 
     Raises
@@ -246,8 +271,11 @@ def solve(
     NoSolution
         It did not converge.
     """
-    x = start
-    r, J, gaps = residuals(x, looks)
+    if isinstance(start, Fit):
+        x, r, J, gaps = start.x, np.hstack((start.closure, start.hinge)), start.jacobian, start.gaps
+    else:
+        x = start
+        r, J, gaps = residuals(x, looks)
     off = x - center
     cost = float(np.sum(weights * r**2) + off @ prior @ off)
     damping = 1e-4
@@ -258,7 +286,7 @@ def solve(
         step = np.linalg.solve(information, gradient)
         # What is left to go, in standard deviations of the result.
         if gradient @ step < 1e-8:
-            return Fit(x, r[:, :3], r[:, 3:], gaps, information, cost)
+            return Fit(x, r[:, :3], r[:, 3:], gaps, J, information, cost)
         while True:
             nearer = x - np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
             r_next, J_next, gaps_next = residuals(nearer, looks)
@@ -272,7 +300,7 @@ def solve(
         x, r, J, gaps, cost = nearer, r_next, J_next, gaps_next, min(lower, cost)
         damping = max(damping / 8.0, 1e-12)
     if gradient @ step < 0.05**2 or not strict:
-        return Fit(x, r[:, :3], r[:, 3:], gaps, information, cost)
+        return Fit(x, r[:, :3], r[:, 3:], gaps, J, information, cost)
     raise NoSolution(
         f"the lengths did not converge ({np.sqrt(gradient @ step):.2g} standard deviations to go); check that the "
         f"palms touch in the phase and that every sensor sits where the session says"

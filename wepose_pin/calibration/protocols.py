@@ -23,7 +23,7 @@ from ..assets import asset
 from ..errors import BadOption, MissingFile, one_of
 from ..recording import SEGMENTS
 from ..subject import LENGTHS
-from .chain import REACHES
+from .chain import CHAIN, REACHES
 
 PROTOCOLS = ("clasp", "clasp_taped", "handle", "poses", "touch_left", "touch_right")
 KINDS = {"coincide": 2, "distance": 2, "fixed_point": 1}  # how many points each takes
@@ -169,36 +169,55 @@ def load_protocol(name: str | Path) -> Protocol:
 
 def _protocol(table: dict[str, Any], path: Path) -> Protocol:
     known = ("name", "title", "needs", "taped", "tape", "step", "closure", "pose", "axis")
-    for key in table:
+    for key, value in table.items():
         if key not in known:
             raise BadOption(f"{path}: '{key}' is no key of a protocol; {one_of(known, key)}")
+        tables = isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
+        if key in ("step", "closure", "pose", "axis") and not tables:
+            raise BadOption(f"{path}: {key} = {value!r} is no list of tables; write [[{key}]]")
     conditions: list[Condition] = []
     for i, entry in enumerate(table.get("closure", [])):
         conditions.append(_closure(entry, f"{path}: closure {i + 1}"))
     for i, entry in enumerate(table.get("pose", [])):
         place = f"{path}: pose {i + 1}"
         std = np.deg2rad(_number(entry, "std_deg", place, 0.1, 45.0))
-        for segment, value in _get(entry, "directions", place).items():
-            _among(segment, SEGMENTS, f"{place}: directions")
-            size = np.linalg.norm(value)
-            if np.shape(value) != (3,) or not size > 0.0:
+        directions = _get(entry, "directions", place)
+        if not isinstance(directions, dict):
+            raise BadOption(f"{place}: directions = {directions!r}; of each segment x, y, z, as in directions.torso")
+        for segment, value in directions.items():
+            _among(segment, CHAIN, f"{place}: directions")
+            try:
+                x, y, z = (np.array(value, dtype=float) / np.linalg.norm(value)).tolist()
+            except (TypeError, ValueError):
+                x = float("nan")
+            if not np.isfinite(x):
                 raise BadOption(f"{place}: directions.{segment} = {value}; three numbers are needed: x, y, z")
-            x, y, z = (float(v / size) for v in value)
             conditions.append(Direction(str(_get(entry, "phase", place)), segment, (x, y, z), std))
     for i, entry in enumerate(table.get("axis", [])):
         place = f"{path}: axis {i + 1}"
-        segment = _among(_get(entry, "segment", place), SEGMENTS, place)
+        segment = _among(_get(entry, "segment", place), CHAIN, place)
         std = np.deg2rad(_number(entry, "std_deg", place, 0.1, 45.0))
         conditions.append(Axis(str(_get(entry, "phase", place)), segment, std))
     if not conditions:
         raise BadOption(f"{path}: no [[closure]], [[pose]] or [[axis]]; a protocol needs one at least")
     needs = tuple(_among(segment, SEGMENTS, f"{path}: needs") for segment in _get(table, "needs", str(path)))
-    steps = tuple(Step(step["phase"], float(step["seconds"]), step["do"]) for step in table.get("step", []))
+    steps = []
+    for i, entry in enumerate(table.get("step", [])):
+        place = f"{path}: step {i + 1}"
+        seconds = _number(entry, "seconds", place, 0.0, 3600.0)
+        steps.append(Step(str(_get(entry, "phase", place)), seconds, str(_get(entry, "do", place))))
     name = str(table.get("name", path.stem))
     tape = str(table.get("tape", Protocol.tape))
     _among(tape.partition("=")[0], LENGTHS, f"{path}: tape")
     title = str(table.get("title", name))
-    return Protocol(name, title, needs, steps, tuple(conditions), int(table.get("taped", 0)), tape)
+    taped = round(_number({"taped": 0, **table}, "taped", str(path), 0, len(LENGTHS)))
+    found = Protocol(name, title, needs, tuple(steps), tuple(conditions), taped, tape)
+    # A hand may go without a sensor, rigid with its forearm.
+    looked_at = {segment if segment in needs else segment.replace("hand", "forearm") for segment in found.segments}
+    if not looked_at <= set(needs):
+        lacking = ", ".join(sorted(looked_at - set(needs)))
+        raise BadOption(f"{path}: needs = {list(needs)} lacks {lacking}, whose orientation a condition looks at")
+    return found
 
 
 def _closure(entry: dict[str, Any], place: str) -> Closure:

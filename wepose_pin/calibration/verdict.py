@@ -38,7 +38,8 @@ class Limits(NamedTuple):
 # degree of an arm's heading; the torso's heading moves it only as the torso leans.
 LENGTH = Limits(0.010, 0.020)  # [m] of an upper arm, of forearm + hand, of the shoulder width, the scale apart
 ARM_HEADING = Limits(np.deg2rad(3.0), np.deg2rad(6.0))  # [rad]
-TORSO_HEADING = Limits(np.deg2rad(6.0), np.deg2rad(12.0))  # [rad]
+TORSO_HEADING = Limits(np.deg2rad(5.0), np.deg2rad(7.0))  # [rad]; beyond, soft tissue makes it worse than stated
+HAND_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] short links, seen little
 LONE_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] by poses, or by one arm: no better is to be had
 SCALE = Limits(0.02, 0.08)  # relative; a tape has 1 %, an average person 5 %
 # What the solution leaves over.
@@ -46,6 +47,7 @@ GAP = Limits(0.030, 0.060)  # [m] rms while the palms touch
 APART = Limits(0.10, 0.60)  # share of looks
 TILT = Limits(np.deg2rad(12.0), np.deg2rad(20.0))  # [rad] of a segment in the start pose; elbows hang 5 to 8 deg bent
 UNUSUAL = Limits(4.0, 6.0)  # standard deviations of a length from the average person
+SHARE = Limits(1.0 / 6.0, 1.0 / 2.0)  # of one independent look in all: some six carry a calibration
 DOUBT = Limits(1.0, 1.0)  # of anatomy, see `anatomy`
 
 # What moved less than this is said to be the cause of what is uncertain.
@@ -225,7 +227,7 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
         own = [s for s in SIDES if segment.startswith(s)]
         why, do = _cause(calibration, motion, causes, own or sides)
         said = f"heading of the {segment.replace('_', ' ')} sensor ± {np.degrees(value):.1f} deg"
-        limits = TORSO_HEADING if torso else ARM_HEADING
+        limits = TORSO_HEADING if torso else HAND_HEADING if segment.endswith("hand") else ARM_HEADING
         if len(calibration.hinge_rms) < 2:
             limits = LONE_HEADING
         found.append(_finding(f"heading.{segment}", value, limits, "rad", said, do, why))
@@ -303,6 +305,16 @@ def _left_over(calibration: Calibration) -> list[Finding]:
                 "m",
                 f"the palms are {1e3 * calibration.rms_gap:.0f} mm apart (rms) by the solution",
                 "press the palms together, wrists straight; tighten the straps",
+            )
+        )
+        found.append(
+            _finding(
+                "motion",
+                1.0 / max(calibration.independent, 1e-9),
+                SHARE,
+                "of one independent look",
+                f"the motion is worth {calibration.independent:.0f} independent looks only",
+                "move for a minute, through all of the reach, the palms together all the time",
             )
         )
         share = float(np.mean(calibration.kept[closed] < TOUCHED))

@@ -81,7 +81,10 @@ def calibration_report(
     if verdict is not None:
         grade, reasons = verdict if isinstance(verdict, tuple) else (verdict.grade, verdict.in_words())
         blocks.append(Banner(grade, VERDICTS.get(grade, grade), [capital(reason) for reason in reasons]))
-    notes = [capital(warning) for warning in (*calibration.warnings, *([trouble] if trouble else []))]
+    warnings = calibration.warnings
+    if isinstance(verdict, Verdict):
+        warnings = tuple(unsaid(warnings, verdict))
+    notes = [capital(warning) for warning in (*warnings, *([trouble] if trouble else []))]
     if notes:
         blocks.append(Banner("note", "What to know" if len(notes) > 1 else "One thing to know", notes))
     blocks += [
@@ -94,10 +97,16 @@ def calibration_report(
         *_posture(calibration),
         *_elbows(calibration),
         *(_view(calibration, recording, pose) if pose is not None else []),
-        *(_findings(verdict) if isinstance(verdict, Verdict) else []),
+        *(_findings(verdict, contact) if isinstance(verdict, Verdict) else []),
         *_run(calibration, recording, contact, method, gauge_std),
     ]
     return as_html(blocks, f"Calibration of {recording.name}" if recording.name else "Calibration")
+
+
+def unsaid(warnings: Sequence[str], verdict: Verdict) -> list[str]:
+    """The warnings that the verdict does not repeat word for word."""
+    said = " ".join(verdict.in_words())
+    return [warning for warning in warnings if warning not in said]
 
 
 class _Contact(NamedTuple):
@@ -235,7 +244,9 @@ def _gap(calibration: Calibration, contact: _Contact) -> list[Block]:
         said.append(f"{half:.0f} s of {len(time) * step:.0f} s told half of what the motion told about {label}")
     rms = f"{1e3 * calibration.prior_rms_gap:.1f} mm before, {1e3 * calibration.rms_gap:.1f} mm after"
     said.insert(0, f"{contact.gap}, root mean square where they touched: {rms}")
-    said.append(f"The motion is worth {calibration.independent:.0f} independent looks")
+    said.append(
+        f"the motion counts as {calibration.independent:.0f} independent measurements: neighbours tell the same"
+    )
     return [*blocks, Bullets([f"{capital(text)}." for text in said])]
 
 
@@ -383,7 +394,7 @@ def _run(
         ("sensors", f"{', '.join(map(_plain, recording.sensors))} ({', '.join(raw)})"),
         ("length", f"{recording.time[-1] - recording.time[0]:.1f} s at {recording.rate_hz:g} Hz"),
         *((f"phase {name}", _spans(spans)) for name, spans in recording.phases.items()),
-        ("protocol", f"{contact.protocol}, {len(calibration.time)} looks"),
+        ("protocol", f"{contact.protocol}, {len(calibration.time)} moments of it"),
         ("filter", method),
         ("gauge", ", ".join(gauge) or "none"),
         ("average person", calibration.prior.note or calibration.prior.name),
@@ -394,11 +405,12 @@ def _run(
     return [Heading("What was run"), Facts(rows)]
 
 
-def _findings(verdict: Verdict) -> list[Block]:
+def _findings(verdict: Verdict, contact: _Contact) -> list[Block]:
     lines = [
         [
-            _plain(found.name.replace(".", ", ")),
-            *(_shown(value, found.unit) for value in (found.value, found.passes, found.poor)),
+            _looked_at(found.name, contact),
+            _shown(found.value, found.unit, ".1f"),
+            *(_shown(limit, found.unit, ".3g") for limit in (found.passes, found.poor)),
             found.grade,
         ]
         for found in verdict.findings
@@ -472,15 +484,36 @@ def _sign(axis: str) -> str:
     return axis.replace("-", "−")
 
 
-def _shown(value: float, unit: str) -> str:
+def _looked_at(name: str, contact: _Contact) -> str:
+    """What a finding is about."""
+    what, _, of = name.partition(".")
+    if what == "heading":
+        return f"± heading, {_plain(of)}"
+    return {
+        "anatomy": "doubt of the sensors' places, by anatomy",
+        "upper_arms": "± upper arm, the scale apart",
+        "forearms": "± forearm + hand, the scale apart",
+        "shoulder_width": "± shoulder width, the scale apart",
+        "scale": "± scale, all lengths together",
+        "gap": f"{contact.gap}, root mean square",
+        "motion": "1 / independent measurements",
+        "apart": "share of the time apart",
+        "start_pose": "segment farthest off the start pose",
+        "person": "length farthest from the average person",
+    }.get(what, _plain(name))
+
+
+def _shown(value: float, unit: str, digits: str) -> str:
     """A value of a finding in the unit that people use."""
     scale, shown = {
         "m": (1e3, "mm"),
         "rad": (np.degrees(1.0), "°"),
         "relative": (100.0, "%"),
         "share": (100.0, "%"),
+        "std of the average person": (1.0, "std"),
+        "of one independent look": (1.0, ""),
     }.get(unit, (1.0, unit))
-    return f"{scale * value:.3g} {shown}".replace(" °", "°")
+    return f"{scale * value:{digits}} {shown}".replace(" °", "°").strip()
 
 
 def _tilt(name: str, across: int, angle: float, std: float, seen: bool) -> str:

@@ -127,7 +127,7 @@ def track(
     """
     segments = segment_orientations(recording, subject, method=method, static_test=static_test)
     reset = None
-    if subject is not None and hold_headings:
+    if hold_headings and subject is not None and subject.mounts and recording.strapping != "new":
         segments, reset = held_together(recording, segments, subject)
     who = subject or average_subject()
     body = model or load_model()

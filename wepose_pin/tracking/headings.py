@@ -24,6 +24,7 @@ from ..recording import Recording
 from ..subject import LENGTHS, Subject
 
 CHAIN = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+HANDS = ("left_hand", "right_hand")  # each in the chain where it has a sensor, else rigid with its forearm
 KNOT_S = 2.0
 LOOK_RATE_HZ = 8.0
 # Errors of the residuals that have nothing to do with headings, and how long they last: soft tissue and what is left of
@@ -50,15 +51,18 @@ def held_together(recording: Recording, segments: Segments, subject: Subject) ->
     quat_WL = segments.quat_WL
     if not set(CHAIN) <= set(quat_WL):
         return segments, None
+    chain = (*CHAIN, *(hand for hand in HANDS if hand in quat_WL))
+    # A hinge was seen through the mounts of its calibration and holds as long as they do.
+    hinges = subject.hinges if recording.strapping != "new" else {}
     stride = max(1, round(recording.rate_hz / LOOK_RATE_HZ))
     at = np.arange(0, len(recording), stride)
     at = at[recording.time[at] >= segments.start[1]]
-    R = {name: Rotation.from_quat(quat_WL[name][at]) for name in CHAIN}
+    R = {name: Rotation.from_quat(quat_WL[name][at]) for name in chain}
     time = recording.time[at]
     joined = np.zeros(len(at), dtype=bool)
     for begin, end in recording.phases.get("clasp", ()):
         joined |= (time >= begin) & (time <= end)
-    rows = [_gaps(R, subject, joined), *(_hinge(R, subject, side) for side in subject.hinges)]
+    rows = [_gaps(R, subject, joined), *(_hinge(R, subject, side) for side in hinges)]
     rows = [row for row in rows if len(row.look)]
     if not rows:
         return segments, None
@@ -66,37 +70,36 @@ def held_together(recording: Recording, segments: Segments, subject: Subject) ->
     begin = float(time[0])
     knot = np.floor((time - begin) / KNOT_S).astype(int)
     count = knot[-1] + 1
-    information, pull = np.zeros((count, 5, 5)), np.zeros((count, 5))
+    information, pull = np.zeros((count, len(chain), len(chain))), np.zeros((count, len(chain)))
     share = 1.0 / max(1.0, CORRELATION_S * recording.rate_hz / stride)
     for row in rows:
         weight = share * row.weight[:, None]
         np.add.at(information, knot[row.look], np.einsum("na,nb->nab", weight * row.H, row.H))
         np.add.at(pull, knot[row.look], -weight * row.H * row.r[:, None])
     middle = begin + KNOT_S * (np.arange(count) + 0.5)
-    delta, cov = _smoothed(information, pull, _walk(recording, segments, middle))
+    delta, cov = _smoothed(information, pull, _walk(recording, segments, chain, middle))
     # Constant before the first middle and after the last, and in the start pose exactly zero.
     knots = np.concatenate([[segments.start[1]], middle])
     turn = {
-        name: np.interp(recording.time, knots, np.concatenate([[0.0], delta[:, i]])) for i, name in enumerate(CHAIN)
+        name: np.interp(recording.time, knots, np.concatenate([[0.0], delta[:, i]])) for i, name in enumerate(chain)
     }
     corrected = dict(quat_WL)
-    for name in CHAIN:
+    for name in chain:
         about_z = Rotation.from_rotvec(turn[name][:, None] * [0.0, 0.0, 1.0])
         corrected[name] = (about_z * Rotation.from_quat(quat_WL[name])).as_quat()
     covariance = dict(segments.covariance_W)
-    for i, name in enumerate(CHAIN):
+    for i, name in enumerate(chain):
         if name in covariance:
             covariance[name] = _narrowed(covariance[name], np.interp(recording.time, middle, cov[:, i, i]))
-    after = {name: Rotation.from_quat(corrected[name][at]) for name in CHAIN}
+    after = {name: Rotation.from_quat(corrected[name][at]) for name in chain}
     reset = Reset(
         clasp_mm=(_rms_mm(_palms(R, subject)[joined]), _rms_mm(_palms(after, subject)[joined]))
         if joined.any()
         else None,
         hinge_deg={
-            side: (_rms_deg(_elbow(R, subject, side)), _rms_deg(_elbow(after, subject, side)))
-            for side in subject.hinges
+            side: (_rms_deg(_elbow(R, subject, side)), _rms_deg(_elbow(after, subject, side))) for side in hinges
         },
-        largest_deg={name: float(np.degrees(np.abs(turn[name]).max())) for name in CHAIN},
+        largest_deg={name: float(np.degrees(np.abs(turn[name]).max())) for name in chain},
     )
     return replace(segments, quat_WL=corrected, covariance_W=covariance), reset
 
@@ -106,19 +109,27 @@ class _Rows(NamedTuple):
 
     look: np.ndarray  # (m,) index of the look
     r: np.ndarray  # (m,)
-    H: np.ndarray  # (m, 5)
+    H: np.ndarray  # (m, k), δ of the chain in its order
     weight: np.ndarray  # (m,) 1 / variance of e
 
 
 def _links(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
-    """(5, n, 3) [m] in W: each segment's part of the way from the right palm to the left one."""
+    """(k, n, 3) [m] in W: each segment's part of the way from the right palm to the left one."""
     length = subject.lengths
     found = [R["torso"].apply([0.0, length["shoulder_width"], 0.0])]
-    for name in CHAIN[1:]:
-        side, part = name.split("_", 1)
-        along = length[name] + (length[f"{side}_hand"] if part == "forearm" else 0.0)
+    for name in [name for name in R if name != "torso"]:
+        side = name.split("_", 1)[0]
+        along = sum(length[part] for part in _carried(name, R))
         found.append(R[name].apply([0.0, 0.0, -along if side == "left" else along]))
     return np.array(found)
+
+
+def _carried(name: str, R: Mapping[str, Rotation]) -> tuple[str, ...]:
+    """The lengths that turn with a segment of the chain."""
+    hand = name.replace("forearm", "hand")
+    if name == "torso":
+        return ("shoulder_width",)
+    return (name,) if hand in R else (name, hand)
 
 
 def _palms(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
@@ -136,25 +147,22 @@ def _gaps(R: Mapping[str, Rotation], subject: Subject, joined: np.ndarray) -> _R
         covariance += ATTITUDE_STD**2 * (
             np.sum(link**2, axis=1)[:, None, None] * eye - np.einsum("na,nb->nab", link, link)
         )
-    covariance += _of_lengths(v, subject)
-    H = np.stack([np.cross([0.0, 0.0, 1.0], link) for link in v], axis=2)  # (n, 3, 5)
+    covariance += _of_lengths(v, R, subject)
+    H = np.stack([np.cross([0.0, 0.0, 1.0], link) for link in v], axis=2)  # (n, 3, k)
     r = v.sum(axis=0)
     whiten = np.linalg.inv(np.linalg.cholesky(covariance)) if n else covariance
     r, H = np.einsum("nab,nb->na", whiten, r), whiten @ H
     near = np.sum(r**2, axis=1) < APART**2 * 3.0
     look = np.repeat(np.flatnonzero(joined)[near], 3)
-    return _Rows(look, r[near].ravel(), H[near].reshape(-1, 5), np.ones(len(look)))
+    return _Rows(look, r[near].ravel(), H[near].reshape(-1, len(v)), np.ones(len(look)))
 
 
-def _of_lengths(v: np.ndarray, subject: Subject) -> np.ndarray:
+def _of_lengths(v: np.ndarray, R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
     """(n, 3, 3) [m²]: what the lengths' own covariance makes of the gap."""
-    of = {"torso": ("shoulder_width",)} | {
-        name: (name, name.replace("forearm", "hand")) if name.endswith("forearm") else (name,) for name in CHAIN[1:]
-    }
     names, J = [], []
-    for link, name in zip(v, CHAIN, strict=True):
+    for link, name in zip(v, R, strict=True):
         direction = link / np.linalg.norm(link, axis=1)[:, None]
-        for length in of[name]:
+        for length in _carried(name, R):
             names.append(length)
             J.append(direction)
     jacobian = np.stack(J, axis=2)  # (n, 3, k)
@@ -173,29 +181,31 @@ def _hinge(R: Mapping[str, Rotation], subject: Subject, side: str) -> _Rows:
     r = _elbow(R, subject, side)
     turned = np.cross([0.0, 0.0, 1.0], fore.apply([0.0, 0.0, -1.0]))
     slope = upper.inv().apply(turned) @ subject.hinges[side].axis
-    H = np.zeros((len(r), 5))
-    H[:, CHAIN.index(f"{side}_forearm")], H[:, CHAIN.index(f"{side}_upper_arm")] = slope, -slope
+    H, names = np.zeros((len(r), len(R))), list(R)
+    H[:, names.index(f"{side}_forearm")], H[:, names.index(f"{side}_upper_arm")] = slope, -slope
     std = subject.hinges[side].std
     near = np.abs(r) < APART * std + np.deg2rad(10.0)  # a heading that has drifted is no reason to doubt the hinge
     look = np.flatnonzero(near)
     return _Rows(look, r[near], H[near], np.full(len(look), std**-2))
 
 
-def _walk(recording: Recording, segments: Segments, middle: np.ndarray) -> np.ndarray:
-    """(knots, 5) [rad²]: variance of each heading's step to each knot, by what its filter's covariance grew."""
-    steps = np.full((len(middle), 5), UNKNOWN_DRIFT * KNOT_S)
-    for i, name in enumerate(CHAIN):
-        if name in segments.orientation and name in segments.covariance_W:
-            variance = segments.covariance_W[name][:, 2, 2]
+def _walk(recording: Recording, segments: Segments, chain: tuple[str, ...], middle: np.ndarray) -> np.ndarray:
+    """(knots, k) [rad²]: variance of each heading's step to each knot, by what its filter's covariance grew."""
+    steps = np.full((len(middle), len(chain)), UNKNOWN_DRIFT * KNOT_S)
+    for i, name in enumerate(chain):
+        cov_S = segments.orientation[name].attitude_cov if name in segments.orientation else None
+        if cov_S is not None:
+            up_S = Rotation.from_quat(segments.orientation[name].quat_WS).inv().apply([0.0, 0.0, 1.0])
+            variance = np.einsum("na,nab,nb->n", up_S, cov_S, up_S)
             at = np.interp(np.concatenate([[segments.start[1]], middle]), recording.time, variance)
             steps[:, i] = np.maximum(np.diff(at), 1e-10)
     return steps
 
 
 def _smoothed(information: np.ndarray, pull: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Random walks (knots, 5) and their covariances (knots, 5, 5), seen through information matrices."""
-    n = len(pull)
-    x, P = np.zeros(5), START_STD**2 * np.eye(5)
+    """Random walks (knots, k) and their covariances (knots, k, k), seen through information matrices."""
+    n, size = pull.shape
+    x, P = np.zeros(size), START_STD**2 * np.eye(size)
     before, filtered = [], []
     for k in range(n):
         P = P + np.diag(steps[k])

@@ -29,6 +29,7 @@ from .words import method_text, noise_text, words, world_text
 
 TITLE = "How wrong the estimates are"
 FOLDER = "validation"  # of the Markdown page's figures
+GAINS = {"gain", "integral"}  # of the grid search: small numbers, three digits
 
 
 def write_pages(folder: Path, document: Document) -> list[str]:
@@ -98,6 +99,12 @@ def experiment_table(rows: Sequence[Row], whole: bool) -> Table:
     return Table(header, cells)
 
 
+def how_many(experiment: str, trials: int) -> str:
+    """How many trials an experiment has, in words."""
+    what = "kind of motion" if experiment == "gains" else "trial"
+    return f"{trials} {what if trials == 1 else what.replace('kind', 'kinds') if ' ' in what else what + 's'}"
+
+
 def unit_of(rows: Sequence[Row]) -> str:
     """The unit that all columns of a short table share; empty where they differ."""
     names = dict.fromkeys(name for row in rows for name in row.names() if name not in SHORT.values())
@@ -129,7 +136,7 @@ def table_note(rows: Sequence[Row]) -> str:
 def _cell(row: Row, name: str, whole: bool) -> str:
     if name not in row.figures:
         return ""
-    text = f"{row.figures[name]:.2f}"
+    text = f"{row.figures[name]:.3g}" if name in GAINS else f"{row.figures[name]:.2f}"
     text += f" ± {row.figures[f'{name} std']:.2f}" if f"{name} std" in row.figures else ""
     return text + (f" ({row.figures[f'{name} between']:.2f})" if whole and f"{name} between" in row.figures else "")
 
@@ -148,8 +155,8 @@ def _head(document: Document, experiments: Sequence[str]) -> list[Block]:
         *blocks,
         "What this software claims, measured: the experiments of Lisini Baldi et al., IEEE Sensors Journal 2019 "
         "([10.1109/JSEN.2019.2940612](https://doi.org/10.1109/JSEN.2019.2940612)), with simulated sensors and people, "
-        "and real recordings with a truth. Where our figures are worse than the paper's, or another filter is better "
-        "than the paper's, it is said below.",
+        "and real recordings with a truth. Where our figures are worse than the paper's, or another filter has a "
+        f"smaller error than {OURS}, the paper's filter, it is said below.",
         f"Written by `wepose validate --from validation.json -o DIR` from what `{command}` measured; nothing in it is "
         "typed by hand. Seeds are fixed: the same versions give the same figures. "
         f"Made with {versions or 'versions that it does not state'}.",
@@ -201,7 +208,7 @@ def _reading(document: Document, rows: Sequence[Row]) -> list[Block]:
 
 
 def _described(experiment: str, trials: int, document: Document) -> list[Block]:
-    count = f"{trials} {'trial' if trials == 1 else 'trials'}" + (" (quick run)" if document.quick else "")
+    count = how_many(experiment, trials) + (" (quick run)" if document.quick else "")
     text = words(experiment)
     if text is None:
         return [f"{count}."]

@@ -159,7 +159,9 @@ def _millimetres(experiment: str, trial: str, seed: int) -> list[Result]:
         subject = _calibrated(recording, person, prior, "smekf")
         if label == "lengths exact":
             subject = replace(subject, lengths=person.lengths)
-        errors = evaluate(track(recording, subject, method="smekf"), simulation.truth(), simulation.phases["circles"][0])
+        errors = evaluate(
+            track(recording, subject, method="smekf"), simulation.truth(), simulation.phases["circles"][0]
+        )
         results.append(
             Result(experiment, trial, label, _hand(errors) | {"lengths_rms_mm": _lengths_rms(subject, person)})
         )

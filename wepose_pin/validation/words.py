@@ -74,6 +74,12 @@ EXPERIMENTS: dict[str, Words] = {
         "One trial of the paper's kind; its own figures are means over others.",
         "Aligned in full once, at the first Vicon sample, as Vicon's world is not level to a degree.",
     ),
+    "gains": Words(
+        "The grid searches for the gains of ncf and gdc, on trials of the same kind that are scored nowhere else.",
+        "Nothing in the paper.",
+        "The total error over the motion, RMSE, mean over the trials: with the best gains of the grid, which the table "
+        "gives, and with those that the experiments run with.",
+    ),
     "RING, link lengths": Words(
         "Recorded: the RING chain, five segments on hinges; its link lengths by least squares from each filter's "
         "orientations and the optical tip, beside the optical lengths.",

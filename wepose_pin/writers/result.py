@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import re
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,13 +22,22 @@ from ..subject import Subject, subject_toml
 from ..tracking import TrackedPose
 
 
-def write_result(folder: Path, pose: TrackedPose, covariance: bool = False) -> None:
-    """Write what `track` gave into an existing folder; with `covariance` its entries as well, not only deviations."""
+def write_result(
+    folder: Path,
+    pose: TrackedPose,
+    covariance: bool = False,
+    phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+) -> None:
+    """Write what `track` gave into an existing folder; with `covariance` its entries as well, not only deviations.
+
+    `phases` of the recording go to the summary, so that a page made from the folder shows them too.
+    """
     assert pose.model is not None
     assert pose.subject is not None
     write_table(folder / "pose.parquet", pose_table(pose, covariance))
     write_subject(folder, pose.subject, pose.model)
-    summary = pose.summary() | {"versions": versions()}
+    spans = {name: [[float(a), float(b)] for a, b in of] for name, of in (phases or {}).items()}
+    summary = pose.summary() | {"recorded_phases": spans, "versions": versions()}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
