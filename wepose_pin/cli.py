@@ -255,7 +255,7 @@ def calibrate(
         gap = "Palm-to-palm gap" if any(len(c.points) > 1 for c in what.closures) else "Gap from palm to its point"
         _say(
             f"{gap}: {1e3 * found.rms_gap:.1f} mm rms, {1e3 * found.prior_rms_gap:.1f} mm with the average person's "
-            f"lengths;"
+            f"lengths"
         )
         _say(f"the motion counts as {found.independent:.0f} independent measurements")
     _say(f"Report to look at:  {out / 'report.html'}")
