@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.alignment import heading_to, segment_orientations
 from wepose_pin.errors import BadPhase, BadSession
+from wepose_pin.evaluation import uncertainty
 from wepose_pin.recording import Recording, Sensor, axes_from_mount, mount_from_axes
-from wepose_pin.simulation import Simulation
+from wepose_pin.simulation import Simulation, paper_dynamic
 from wepose_pin.subject import Subject, average_subject, mount_rows
 
 
@@ -170,3 +171,25 @@ def test_without_phases_the_quietest_window_is_taken_and_said(simulation: Simula
     assert any("quietest window" in warning for warning in segments.warnings)
     with pytest.raises(BadPhase, match="holds 2 samples"):
         segment_orientations(replace(simulation.recording(), phases={"start": ((1.0, 1.01),)}))
+
+
+@pytest.mark.parametrize("method", ["amekf", "smekf"])
+def test_what_is_bridged_is_uncertain(method: str) -> None:
+    """Half a second of the motion is lost and bridged: the orientation is off, and its covariance says so."""
+    nees = []
+    for seed in range(4):
+        sensor = paper_dynamic(seed, 100.0)
+        lost = np.zeros(len(sensor.time), dtype=bool)
+        lost[2000:2050] = True
+        gyro, accel = sensor.gyro_S.copy(), sensor.accel_S.copy()
+        for measured in (gyro, accel):
+            measured[lost] = np.linspace(measured[1999], measured[2050], 50)
+        stated = Rotation.from_quat(sensor.quat_WS[:400]).mean().as_quat()
+        one = Sensor(gyro_S=gyro, accel_S=accel, stated_quat_LS=stated, gap=lost)
+        recording = Recording("gap", sensor.time, 100.0, {"torso": one}, {"start": ((0.5, 4.5),)})
+        found = segment_orientations(recording, method=method)
+        true = Rotation.from_quat(sensor.quat_WS) * Rotation.from_quat(stated).inv()
+        error = (true * Rotation.from_quat(found.quat_WL["torso"]).inv()).as_rotvec()[2050:2600]
+        nees.append(uncertainty(error, found.covariance_W["torso"][2050:2600]).nees)
+    print(method, "NEES after the gap:", np.round(nees, 2))
+    assert np.mean(nees) < 6.0

@@ -106,7 +106,14 @@ def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTes
                 noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], recording.rate_hz)
             except WeposeError as error:
                 raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
-            raw[segment] = sensor.gyro_S, sensor.accel_S, noise
+            gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
+            if sensor.gap is not None:
+                # A long bridge is a guess that no filter may take for measured: lost, its covariance grows over it.
+                # The first window starts the filter and has to be there.
+                lost = sensor.gap.copy()
+                lost[: (static_test or StaticTest()).samples(recording.rate_hz)] = False
+                gyro_S, accel_S = (np.where(lost[:, None], np.nan, measured) for measured in (gyro_S, accel_S))
+            raw[segment] = gyro_S, accel_S, noise
 
     def oriented(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise) -> Orientation:
         return run_filter(
