@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate
 from wepose_pin.recording import Recording, Sensor
-from wepose_pin.simulation import PERFECT, Simulation, simulate, simulated_person
-from wepose_pin.subject import Hinge, Subject, load_subject, subject_toml
+from wepose_pin.simulation import MTI_3, PERFECT, Simulation, simulate, simulated_person
+from wepose_pin.subject import LENGTHS, Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.tracking import track
 
 HINGES = {side: Hinge(np.array([0.0, 1.0, 0.0]), np.deg2rad(2.0)) for side in ("left", "right")}
@@ -73,13 +73,47 @@ def test_nothing_is_corrected_without_a_clasp_and_hinges(made: tuple[Simulation,
 
 
 def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simulation, Subject]) -> None:
+    """A phase that goes on into the circles, in which the palms are half a metre apart, is one without them."""
     simulation, subject = made
-    recording = drifting(simulation, {})
-    circles = simulation.phases["circles"][0]
-    apart = replace(recording, phases={"start": recording.phases["start"], "clasp": (circles,)})
-    pose = track(apart, replace(subject, hinges={}))
-    if pose.reset is not None:
-        assert max(pose.reset.largest_deg.values()) < 0.5
+    recording = drifting(simulation, {"right_forearm": 8.0})
+    start, clasp, circles = recording.phases["start"], recording.phases["clasp"], simulation.phases["circles"]
+    only, longer, alone = (
+        track(replace(recording, phases={"start": start, "clasp": spans}), replace(subject, hinges={}))
+        for spans in (clasp, (*clasp, *circles), tuple(circles))
+    )
+    assert only.reset is not None
+    assert only.reset.largest_deg["right_forearm"] > 0.5
+    assert longer.reset is not None
+    assert longer.reset.clasp_mm is not None
+    assert longer.reset.clasp_mm[0] > 300.0
+    for name, quat in only.quat_WL.items():
+        np.testing.assert_allclose(longer.quat_WL[name], quat, atol=1e-12)
+    assert alone.reset is None
+
+
+def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
+    """Joined hands bound the drift; of a mount's heading that is off they say nothing."""
+    noise = replace(MTI_3, gyro_density=40.0 * MTI_3.gyro_density)
+    simulation = simulate(simulated_person(4).lengths, seed=4, noise=noise, clasp_s=40.0, circles=2)
+    recording = simulation.recording()
+    average = simulated_person(4).average
+    order = (*LENGTHS, *mount_rows("torso"), *mount_rows("right_forearm"))
+    covariance = np.zeros((len(order), len(order)))
+    covariance[:8, :8] = average.covariance
+    sure = replace(average, mounts=simulation.quat_LS, hinges=HINGES, order=order, covariance=covariance)
+    loose = covariance.copy()
+    loose[-1, -1] = np.deg2rad(5.0) ** 2
+    held, free = (
+        [track(recording, replace(sure, covariance=C), hold_headings=hold) for C in (covariance, loose)]
+        for hold in (True, False)
+    )
+    name = "right_forearm"
+    brought = [of[1].segment_cov[name] - of[0].segment_cov[name] for of in (held, free)]
+    assert brought[1][:, 2, 2].max() > np.deg2rad(3.0) ** 2
+    np.testing.assert_allclose(brought[0], brought[1], atol=1e-12)
+    assert np.all(np.linalg.eigvalsh(held[1].segment_cov[name]) > 0.0)
+    end = [np.degrees(np.sqrt(of[0].segment_cov[name][-1, 2, 2])) for of in (held, free)]
+    assert end[0] < 0.9 * end[1]
 
 
 def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tmp_path: Path) -> None:

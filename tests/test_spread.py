@@ -10,20 +10,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import START_POSE_STD, Filtered
+from wepose_pin.alignment import ATTITUDE_STD, START_POSE_STD, Filtered
 from wepose_pin.calibration import lengths, load_protocol
-from wepose_pin.calibration.lengths import (
+from wepose_pin.calibration.known import (
     DRIFT_STD,
     HINGE_COMMON_STD,
     HINGE_MIRROR_STD,
     HINGE_TILT_STD,
-    LEAST_CORRELATION_S,
     SAG_STD,
     SHOULDERS_STD,
-    Calibration,
-    _solve,
 )
-from wepose_pin.calibration.problem import ATTITUDE_STD
+from wepose_pin.calibration.lengths import Calibration, _solve
+from wepose_pin.calibration.weighing import LEAST_CORRELATION_S
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.simulation import PERFECT, Person, simulate, simulated_person
 from wepose_pin.subject import LENGTHS, mount_rows

@@ -28,6 +28,7 @@ _WHERE = {
     "calibrate": "calibration",
     "estimate_orientation": "filters",
     "evaluate": "evaluation",
+    "joint_angles": "angles",
     "load_model": "model",
     "load_session": "readers",
     "load_subject": "subject",

@@ -21,7 +21,7 @@ from .filters import BEST, Orientation, check_method, run_filter
 from .filters.base import in_parallel
 from .filters.smekf import ACCEL_BIAS_STD
 from .noise import SensorNoise, noise_of, quietest
-from .recording import Recording
+from .recording import SEGMENTS, Recording
 from .static import StaticTest
 from .subject import Subject
 
@@ -31,6 +31,12 @@ STATED_WARNING_DEG = 35.0
 
 # How far a person's segments are off the start pose [rad], about each axis: elbows never hang straight.
 START_POSE_STD = np.deg2rad(4.0)
+# How alike a person stands again: so far apart are two start poses of one person [rad], about each axis. An assumption.
+REPEATED_START_STD = np.deg2rad(2.0)
+# How far a sensor's orientation is off its segment's about each axis [rad], soft tissue above all, and palms that are
+# held together slip [m], each axis.
+ATTITUDE_STD = np.deg2rad(1.5)
+SLIP_STD = 0.005
 # A calibrated mount that gravity contradicts by more than this many standard deviations has moved.
 MOVED_MOUNT = 3.5
 
@@ -93,8 +99,9 @@ def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTes
     R_VS = {}
     raw: dict[str, tuple[np.ndarray, np.ndarray, SensorNoise]] = {}
     for segment, sensor in recording.sensors.items():
-        warnings += _motion(recording, segment, start, "start")
-        if still != start:
+        if not sensor.aligned:
+            warnings += _motion(recording, segment, start, "start")
+        if still != start and not sensor.aligned:
             warnings += _motion(recording, segment, still, "still")
         if sensor.quat_WS is not None:
             R_VS[segment] = Rotation.from_quat(sensor.quat_WS)
@@ -137,7 +144,9 @@ def segment_orientations(
 ) -> Segments:
     """Filter every sensor, then align it with its segment by the start pose.
 
-    A calibrated mount of the subject is taken before a stated one, unless the strapping is new.
+    A calibrated mount of the subject is taken before a stated one, unless the strapping is new. Orientations that are
+    aligned already are only turned about the vertical, all by the same angle, so that the torso faces x in the start
+    pose.
 
     Raises
     ------
@@ -154,17 +163,31 @@ def segment_orientations(
     found = filtered(recording, method=method, static_test=static_test)
     start, warnings = found.start, found.warnings
     quat_WL, quat_LS, heading, covariance_W = {}, {}, {}, {}
+    aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
+    if aligned:
+        # The torso faces x; where it is not among them the most central of the others does.
+        facing = min(aligned, key=SEGMENTS.index)
+        psi_aligned = heading_to(found.at_start[facing], Rotation.identity())
     for segment, R_VS in found.R_VS.items():
         at_start = found.at_start[segment]
+        if recording.sensors[segment].aligned:
+            quat_WL[segment] = (Rotation.from_rotvec([0.0, 0.0, psi_aligned]) * R_VS).as_quat()
+            quat_LS[segment] = Rotation.identity().as_quat()
+            heading[segment] = psi_aligned
+            continue
         R_stated = Rotation.from_quat(stated[segment])
         psi = heading_to(at_start, R_stated)
         turn = Rotation.from_rotvec([0.0, 0.0, psi])
         R_LS = turn * at_start
         off = np.degrees((R_LS * R_stated.inv()).magnitude())
         if off > STATED_LIMIT_DEG:
+            calibrated = subject is not None and segment in subject.mounts and recording.strapping != "new"
+            of, do = ".mount", "check which sensor axis points up and which forward"
+            if calibrated:
+                of, do = ": its calibrated mount", 'strapped on anew? then state strapping = "new" and the mounts'
             raise BadSession(
-                f"{recording.where()}: sensors.{segment}.mount is {off:.0f} deg off gravity in the start pose "
-                f"({start[0]:g} to {start[1]:g} s); check which sensor axis points up and which forward"
+                f"{recording.where()}: sensors.{segment}{of} is {off:.0f} deg off gravity in the start pose "
+                f"({start[0]:g} to {start[1]:g} s); {do}"
             )
         if off > STATED_WARNING_DEG:
             warnings.append(f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose")
@@ -172,22 +195,23 @@ def segment_orientations(
         if known is not None:
             # The tilt's misfit is the pose's error and the mount's together; each takes its share. Of the heading,
             # which was made to fit, the start pose says nothing but through the mount's own correlations.
-            misfit = (R_LS * R_stated.inv()).as_rotvec()[:2]
-            both = known[:2, :2] + START_POSE_STD**2 * np.eye(2)
-            R_LS = Rotation.from_rotvec(known[:, :2] @ np.linalg.solve(both, misfit)) * R_stated
+            pose = _stands(subject, segment)
+            misfit = (R_LS * R_stated.inv()).as_rotvec()[:2] - pose.tilt
+            both = pose.share**2 * known[:2, :2] + pose.std**2 * np.eye(2)
+            R_LS = Rotation.from_rotvec(pose.share * known[:, :2] @ np.linalg.solve(both, misfit)) * R_stated
             psi = heading_to(at_start, R_LS)
             turn = Rotation.from_rotvec([0.0, 0.0, psi])
             if misfit @ np.linalg.solve(both, misfit) > MOVED_MOUNT**2:
                 warnings.append(
-                    f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "
-                    f'pose; strapped on anew? then state strapping = "new"'
+                    f"sensors.{segment}: its calibrated mount is {np.degrees(np.linalg.norm(misfit)):.0f} deg off what "
+                    f'gravity says in the start pose; strapped on anew? then state strapping = "new"'
                 )
         quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
         quat_LS[segment] = R_LS.as_quat()
         heading[segment] = psi
         ours = found.orientation.get(segment)
         if ours is not None and ours.attitude_cov is not None:
-            covariance_W[segment] = _covariance_W(recording, segment, subject, turn * R_VS, R_LS, ours)
+            covariance_W[segment] = covariance_of(recording, segment, subject, turn * R_VS, R_LS, ours)
     return Segments(
         recording.time,
         quat_WL,
@@ -216,7 +240,7 @@ def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -
     return stated
 
 
-def _covariance_W(
+def covariance_of(
     recording: Recording,
     segment: str,
     subject: Subject | None,
@@ -224,6 +248,7 @@ def _covariance_W(
     R_LS: Rotation,
     orientation: Orientation,
 ) -> np.ndarray:
+    """Covariance (n, 3, 3) [rad²] in W of a segment's orientation, error on the left; see `Segments.covariance_W`."""
     R = R_WS.as_matrix()
     assert orientation.attitude_cov is not None
     cov_W = R @ orientation.attitude_cov @ R.swapaxes(1, 2)
@@ -235,10 +260,33 @@ def _covariance_W(
         # into Rz(δ) R_WL Rz(δ)ᵀ, which is nothing in the start pose; the pose weighed in on its tilt.
         R_WL = (R_WS * R_LS.inv()).as_matrix()
         lever = R_WL - np.array([0.0, 0.0, 1.0])[:, None] * np.array([0.0, 0.0, 1.0])
-        tilt = known[:2]
-        left = known - tilt.T @ np.linalg.solve(tilt[:, :2] + START_POSE_STD**2 * np.eye(2), tilt)
+        pose, tilt = _stands(subject, segment), known[:2]
+        both = pose.share**2 * tilt[:, :2] + pose.std**2 * np.eye(2)
+        left = known - pose.share**2 * tilt.T @ np.linalg.solve(both, tilt)
         cov_W += lever @ left @ lever.swapaxes(1, 2)
     return cov_W
+
+
+class _Stands(NamedTuple):
+    """What is known of a segment's tilt in the start pose: it differs from the mount's own misfit by share · error."""
+
+    tilt: np.ndarray  # (2,) [rad] expected of the misfit
+    share: float  # of the mount's error that the misfit shows
+    std: float  # [rad]
+
+
+def _stands(subject: Subject | None, segment: str) -> _Stands:
+    """How a person stands: anyhow, or as in the calibration.
+
+    The calibrated tilt ε̂ and the mount come from one start pose: what the mount is off by, m, the tilt is off by −m.
+    Two start poses of a person correlate by c, so that the misfit in the next one, ε + m with ε = c (ε̂ − m) + ν, is
+    c ε̂ + (1 − c) m + ν: of the mount it shows next to nothing, and in the same recording nothing, as it must.
+    """
+    known = subject.start_tilt.get(segment) if subject is not None else None
+    if known is None:
+        return _Stands(np.zeros(2), 1.0, float(START_POSE_STD))
+    c = 1.0 - 0.5 * (REPEATED_START_STD / START_POSE_STD) ** 2
+    return _Stands(c * known.tilt, 1.0 - c, float(START_POSE_STD * np.sqrt(1.0 - c**2)))
 
 
 def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:

@@ -133,20 +133,22 @@ def track(
     method: Method = "amekf",
     gaps: bool = False,
     covariance: bool = False,
+    report: bool = True,
     force: bool = False,
 ) -> None:
-    """Recording to pose: orientations, points, a summary, and a page to look at.
+    """Recording to pose: orientations, points, a summary, a page to look at, and a report on how far to trust it.
 
     Example: wepose track session.toml --subject anna/subject.toml -o result
 
     Args:
         session: session.toml, or the folder that holds it.
-        out: Folder for pose.parquet, subject.toml, subject.urdf, summary.json, view.html.
+        out: Folder for pose.parquet, subject.toml, subject.urdf, summary.json, view.html, report.html.
         subject: subject.toml of `wepose calibrate`, or its folder; without it lengths are an average person's.
         model: A body's URDF, or a TOML that names it and its links (docs/models.md); without it ours.
         method: The orientation filter.
         gaps: Accept lost samples for longer than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap).
         covariance: Write the covariances of orientations and points, not only their standard deviations.
+        report: Leave out report.html (warnings and what to do, noise, drift, hands, joint angles).
         force: Replace files of an earlier run.
     """
     from .model import load_model
@@ -156,7 +158,7 @@ def track(
     from .viewer import pose_html
     from .writers import whole_folder, write_result
 
-    with whole_folder(out, force) as folder, _steps(3) as step:
+    with whole_folder(out, force) as folder, _steps(4 if report else 3) as step:
         step("reading")
         recording = load_session(session, gaps=gaps)
         who = load_subject(subject) if subject else None
@@ -168,6 +170,11 @@ def track(
         assert pose.model is not None
         page = pose_html(pose.model, pose, phases=recording.phases, title=recording.name)
         (folder / "view.html").write_text(page, encoding="utf-8")
+        if report:
+            from .report import track_report
+
+            step("writing the report")
+            (folder / "report.html").write_text(track_report(pose, view=page), encoding="utf-8")
     summary = pose.summary()
     _warn(summary["warnings"])
     _print_table(
@@ -186,6 +193,8 @@ def track(
             for segment, about in summary["sensors"].items()
         ],
     )
+    if report:
+        _say(f"Report to look at:  {out / 'report.html'}")
     _say(f"Motion to look at:  {out / 'view.html'}")
     _say(f"Pose: {out / 'pose.parquet'}  ({len(pose.quat_WL)} segments, {len(pose.points)} points)")
 
@@ -200,6 +209,7 @@ def calibrate(
     stature: Annotated[float | None, arg(metavar="METRES")] = None,
     sex: Annotated[Literal["f", "m"] | None, arg(metavar="{f,m}")] = None,
     method: Method = "amekf",
+    gaps: bool = False,
     force: bool = False,
 ) -> None:
     """Hands-together recording to subject: arm lengths and sensor mounts, with standard deviations and a verdict.
@@ -223,6 +233,7 @@ def calibrate(
         stature: Body height in metres; narrows the average person.
         sex: f or m; narrows the average person.
         method: The orientation filter.
+        gaps: Accept lost samples for longer than 50 ms, which are bridged.
         force: Replace files of an earlier run.
     """
     from .calibration import calibrate_lengths, judge, load_protocol
@@ -239,7 +250,7 @@ def calibrate(
     with whole_folder(out, force) as folder, _steps(3) as step:
         step("reading")
         average = average_subject(stature, sex)
-        recording = load_session(session)
+        recording = load_session(session, gaps=gaps)
         step("calibrating")
         found = calibrate_lengths(recording, gauge=taped, prior=average, protocol=what, method=method)
         verdict = judge(found)
@@ -252,7 +263,9 @@ def calibrate(
     _lengths_table(f"Lengths, by {what.title}", found.subject, average, None, taped)
     _mounts_table(found)
     if what.closures:
-        gap = "Palm-to-palm gap" if any(len(c.points) > 1 for c in what.closures) else "Gap from palm to its point"
+        gap = {"coincide": "Palm-to-palm gap", "distance": "Palms off their distance"}.get(
+            found.closure, "Gap from palm to its point"
+        )
         _say(
             f"{gap}: {1e3 * found.rms_gap:.1f} mm rms, {1e3 * found.prior_rms_gap:.1f} mm with the average person's "
             f"lengths"
@@ -335,6 +348,7 @@ def simulate(
     out: Out,
     seed: int = 1,
     rate_hz: float = 100.0,
+    protocol: Literal["clasp", "handle", "touch_left", "touch_right", "poses"] = "clasp",
     world: Literal["perfect", "realistic"] = "perfect",
     change: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(name="set", metavar="NAME=VALUE")] = (),
     force: bool = False,
@@ -350,6 +364,8 @@ def simulate(
         out: Folder for session.toml, recording.parquet, truth.parquet, subject.toml (the true lengths and mounts).
         seed: Another number is another person and another motion.
         rate_hz: Samples a second.
+        protocol: What the person does to be calibrated, as of `wepose calibrate --protocol`; with poses no circles
+            follow.
         world: Nothing wrong but the sensors' noise, or soft tissue, slip, sway and sensor errors of a usual size.
         change: One imperfection at another size; may be given several times. mount=any: sensors in any rotation,
             nothing stated; the rest are numbers, 0 for off: soft_tissue_deg, palm_slip [m], shoulder_wander [m],
@@ -374,7 +390,10 @@ def simulate(
     with whole_folder(out, force) as folder, _steps(1) as step:
         step("simulating a person")
         person = simulated_person(seed)
-        simulation = make(person.lengths, seed=seed, rate_hz=rate_hz, imperfections=imperfections)
+        circles = 0 if protocol == "poses" else 6
+        simulation = make(
+            person.lengths, seed=seed, rate_hz=rate_hz, imperfections=imperfections, protocol=protocol, circles=circles
+        )
         write_session(folder, simulation.recording(f"simulated-{seed}"), simulation.truth())
         order = (*LENGTHS, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
         true = replace(
@@ -560,12 +579,66 @@ def bench(
         _say(f"Figures: {save}")
 
 
+def info(
+    file: Annotated[Positional[Path], arg(metavar="FILE")],
+    /,
+    *,
+    write: bool = False,
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None,
+    force: bool = False,
+) -> None:
+    """What a file is: its sensors, rates and gaps, and a session file that is ready for it.
+
+    Knows Xsens MVNX, MT Manager's text, Movella DOT, x-IMU3, OpenSim .sto of orientations, CSV, Parquet, HDF5, MATLAB
+    (docs/formats/), and sessions, subjects and results. What is marked CHECK in the session is guessed.
+
+    Example: wepose info trial.mvnx --write
+
+    Args:
+        file: A file or folder.
+        write: Write the session too, to session.toml beside the file.
+        out: Write it there instead.
+        force: Replace an existing session.
+    """
+    from .readers.describe import describe
+
+    beside = file.absolute().parent
+    target = out or (beside / "session.toml" if write else None)
+    if target is not None and target.exists() and not force:
+        raise ExistingOutput(f"{target}: exists; --force replaces it, -o names another file")
+    if target is not None and (target.is_dir() or not target.absolute().parent.is_dir()):
+        raise ExistingOutput(f"{target}: not a file that can be written; -o names a .toml file in an existing folder")
+    found = describe(file, target.absolute().parent if target is not None else beside)
+    if target is not None and found.session is None:
+        raise BadOption(f"--write: there is no session to write for {found.what}")
+    _say(found.what)
+    for fact in found.facts:
+        _say(f"  {fact}")
+    if found.sensors:
+        header = ("sensor", "in the file", "holds", "fastest turn", "median force", "gaps over 50 ms")
+        _print_table("Sensors", header, list(found.sensors))
+    if target is None:
+        if found.session is not None:
+            _say(f"# A session for it; --write writes it to {beside / 'session.toml'}")
+            print(found.session, end="")
+        return
+    assert found.session is not None
+    partial = target.with_name(f".{target.name}.partial")
+    try:
+        partial.write_text(found.session, encoding="utf-8")
+        partial.replace(target)
+    finally:
+        partial.unlink(missing_ok=True)
+    _say(f"Session: {target}  (check the lines marked CHECK, then: wepose track {target} -o result)")
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "simulate": simulate,
     "calibrate": calibrate,
     "track": track,
     "view": view,
+    "info": info,
     "evaluate": evaluate,
     "validate": validate,
     "bench": bench,

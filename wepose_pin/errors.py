@@ -50,6 +50,10 @@ class BadOption(WeposeError):
     """An option's value is outside what it may be."""
 
 
+class BadSource(WeposeError):
+    """A live source cannot be opened: no port, no stream, no device that answers."""
+
+
 class NoSolution(WeposeError):
     """A problem that was well posed by its form has no solution on these data."""
 

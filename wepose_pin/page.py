@@ -187,9 +187,16 @@ _HTML = """<!DOCTYPE html>
 <meta http-equiv="Content-Security-Policy" content="@@policy@@">
 <title>@@title@@</title>
 <style>
-  :root { --ink: #1d2935; --soft: #66758a; --line: #d5dbe3; --accent: #24618f; }
+  :root { color-scheme: light; --ink: #1d2935; --soft: #5a697d; --line: #d5dbe3; --accent: #24618f; --paper: #fff;
+          --code: #edf0f4; --pass: #24618f; --pass-paper: #eef5fa; --poor: #d9772b; --poor-paper: #fdf3ea;
+          --fail: #b23a48; --fail-paper: #fbeef0; --dim: 1; }
+  @media screen and (prefers-color-scheme: dark) {
+    :root { color-scheme: dark; --ink: #dde4ec; --soft: #9aa8b8; --line: #36424f; --accent: #7fb8e0; --paper: #161c23;
+            --code: #27313c; --pass: #5fa3d3; --pass-paper: #1b2a37; --poor: #e08a45; --poor-paper: #33271c;
+            --fail: #e0707e; --fail-paper: #361f24; --dim: .9; }
+  }
   * { box-sizing: border-box; }
-  body { margin: 0 auto; max-width: 1000px; padding: 28px 24px 60px; color: var(--ink); background: #fff;
+  body { margin: 0 auto; max-width: 1000px; padding: 28px 24px 60px; color: var(--ink); background: var(--paper);
          font: 15px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
   h1 { margin: 0 0 10px; font-size: 28px; letter-spacing: -.01em; }
   h2 { margin: 46px 0 8px; padding-top: 14px; border-top: 1px solid var(--line); font-size: 20px; }
@@ -198,8 +205,8 @@ _HTML = """<!DOCTYPE html>
   li { margin: 3px 0; }
   a { color: var(--accent); }
   nav { display: flex; flex-wrap: wrap; gap: 2px 16px; margin: 0 0 18px; font-size: 13.5px; }
-  code { padding: 0 3px; border-radius: 3px; background: #edf0f4; font-size: .92em; }
-  .warning { padding: 9px 13px; border-left: 4px solid #d9772b; background: #fdf3ea; }
+  code { padding: 0 3px; border-radius: 3px; background: var(--code); font-size: .92em; }
+  .warning { padding: 9px 13px; border-left: 4px solid var(--poor); background: var(--poor-paper); }
   .wide { margin: 14px 0 6px; overflow-x: auto; }
   table { border-collapse: collapse; font-size: 13.5px; font-variant-numeric: tabular-nums; }
   th, td { padding: 4px 12px 4px 0; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
@@ -213,13 +220,14 @@ _HTML = """<!DOCTYPE html>
             break-inside: avoid; }
   .banner > p { margin: 0; font-size: 17px; }
   .banner ul { margin: 6px 0 0; }
-  .pass { border-color: #24618f; background: #eef5fa; }
-  .poor, .note { border-color: #d9772b; background: #fdf3ea; }
-  .fail { border-color: #b23a48; background: #fbeef0; }
+  .pass { border-color: var(--pass); background: var(--pass-paper); }
+  .poor, .note { border-color: var(--poor); background: var(--poor-paper); }
+  .fail { border-color: var(--fail); background: var(--fail-paper); }
   .note > p { font-size: inherit; font-weight: 600; }
   figure { margin: 20px 0; break-inside: avoid; }
-  figure img { display: block; width: 100%; max-width: 940px; height: auto; }
-  figcaption { color: var(--soft); font-size: 13px; max-width: 90ch; }
+  figure img { display: block; width: 100%; max-width: 940px; height: auto; border-radius: 4px;
+               filter: brightness(var(--dim)); }
+  figcaption { margin-top: 5px; color: var(--soft); font-size: 13px; max-width: 90ch; }
   iframe { display: block; width: 100%; height: 620px; border: 1px solid var(--line); border-radius: 4px; }
   @page { size: A4; margin: 16mm 15mm; }
   @media print {
@@ -265,5 +273,5 @@ def png_of(figure: Figure) -> bytes:
     canvas.draw()  # type: ignore[no-untyped-call]
     drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
     pixels = Image.fromarray(drawn).convert("RGB")
-    pixels.quantize(COLOURS_A_PNG).save(out, "png", optimize=True)  # a third of the size; no eye sees it
+    pixels.quantize(COLOURS_A_PNG).save(out, "png", compress_level=6)  # a third of the size; no eye sees it
     return out.getvalue()

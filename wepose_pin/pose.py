@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +15,7 @@ from .errors import BadData, BadModel, one_of
 from .model import POINTS, BodyModel, chains
 from .model.chains import about, axis_in_joint, conjugate, multiply, solve
 from .recording import SEGMENTS
+from .so3 import kernel
 from .subject import LENGTHS
 
 
@@ -171,6 +172,74 @@ def forward_kinematics(
         for i, view in enumerate(R_view):
             R[k, i] = view
     return R, p
+
+
+class LiveKinematics:
+    """Points of one pose after another; what does not change is looked up once.
+
+    Parameters
+    ----------
+    model : the body
+    segments : the measured ones, in the order of the rows that `points_of` takes
+
+    Attributes
+    ----------
+    points : names of the points that are known
+    data : Pinocchio's, of the last pose
+    """
+
+    def __init__(self, model: BodyModel, segments: Sequence[str]) -> None:
+        self.segments = tuple(segments)
+        self.points = tuple(p for p in known_points(self.segments) if model.pin.existFrame(POINTS[p]))
+        self._model, self.data, self._q = model, model.pin.createData(), pin.neutral(model.pin)
+        self._views = [self.data.oMf[model.pin.getFrameId(POINTS[point])].translation for point in self.points]
+        self._joints = self._spherical()
+
+    def _spherical(self) -> list[tuple[int, int, int]] | None:
+        """Of each measured segment its place in q, its row and that of the one above (−1: W); None: not so simple."""
+        found, joints = chains(self._model.pin), []
+        rows: dict[int, int] = {}  # Pinocchio joint → row of the segment whose orientation its frame has
+        identity = np.array([0.0, 0.0, 0.0, 1.0])
+        for joint in range(1, self._model.pin.njoints):
+            above = rows.get(self._model.pin.parents[joint], -1)
+            rows[joint] = above
+            if not np.allclose(self._model.pin.jointPlacements[joint].rotation, np.eye(3), atol=1e-15):
+                return None
+            for segment, chain in found.items():
+                if segment not in self.segments or joint not in chain.joints:
+                    continue
+                if chain.axes != (None,) or not all(np.allclose(q, identity) for q in (*chain.quat, chain.quat_AL)):
+                    return None
+                row = self.segments.index(segment)
+                joints.append((self._model.pin.idx_qs[joint], row, above))
+                rows[joint] = row
+        return joints if len(joints) == len(self.segments) else None
+
+    def points_of(self, quat_WL: np.ndarray) -> np.ndarray:
+        """(p, 3) [m] in W, of `quat_WL` (k, 4) xyzw."""
+        if self._joints is None:
+            rows = {segment: quat_WL[i : i + 1] for i, segment in enumerate(self.segments)}
+            self._q = configuration(self._model, rows)[0]
+        else:
+            for at, row, above in self._joints:
+                relative(quat_WL, row, above, self._q, at)
+        pin.framesForwardKinematics(self._model.pin, self.data, self._q)
+        return np.array(self._views)
+
+
+@kernel
+def relative(quat, row, above, q, at):  # type: ignore[no-untyped-def]
+    """``q[at : at + 4]``: rotation of row `row` of `quat` (k, 4) xyzw in the frame of row `above`; −1: in W."""
+    bx, by, bz, bw = quat[row, 0], quat[row, 1], quat[row, 2], quat[row, 3]
+    ax, ay, az, aw = 0.0, 0.0, 0.0, 1.0
+    if above >= 0:
+        ax, ay, az, aw = -quat[above, 0], -quat[above, 1], -quat[above, 2], quat[above, 3]
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    w = aw * bw - ax * bx - ay * by - az * bz
+    scale = 1.0 / np.sqrt(x * x + y * y + z * z + w * w)
+    q[at], q[at + 1], q[at + 2], q[at + 3] = x * scale, y * scale, z * scale, w * scale
 
 
 def placements(model: BodyModel, q: np.ndarray, links: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -60,6 +60,8 @@ class Sensor:
     quat_WS : (n, 4) xyzw, sensor to a world of its own whose z points up; None for raw sensors
     stated_quat_LS : (4,) xyzw, the mount as the session states it, sensor to segment; None where it says nothing
     gap : (n,) bool, true where samples were lost for longer than is bridged in silence; None where that is not allowed
+    aligned : `quat_WS` is the segment's own orientation, in a world that is common to all that are aligned: only where
+        that world's x points is taken from the start pose
     """
 
     gyro_S: np.ndarray | None = None
@@ -67,6 +69,7 @@ class Sensor:
     quat_WS: np.ndarray | None = None
     stated_quat_LS: np.ndarray | None = None
     gap: np.ndarray | None = None
+    aligned: bool = False
 
     @property
     def ready(self) -> bool:
@@ -86,6 +89,7 @@ class Recording:
     strapping : "as_calibrated" or "new": whether a subject's calibrated mounts hold here
     source : the file it was read from, for messages
     truth : file with the reference, where there is one
+    resets : samples before which headings were set anew, live: the person stood in the start pose
     notes : what was assumed or mended while reading, for the summary
     """
 
@@ -98,6 +102,7 @@ class Recording:
     strapping: str = "as_calibrated"
     source: Path | None = None
     truth: Path | None = None
+    resets: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:

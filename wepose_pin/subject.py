@@ -36,6 +36,20 @@ class Hinge(NamedTuple):
     std: float  # [rad] by which the forearm leaves the plane across it, soft tissue included
 
 
+class StartTilt(NamedTuple):
+    """How far a segment was off the start pose when its mount was calibrated."""
+
+    tilt: np.ndarray  # (2,) [rad] about x and y of W
+    std: float  # [rad] of each
+
+
+class Drift(NamedTuple):
+    """How fast a sensor's heading drifted in the calibration, which is its gyroscope's bias as far as it was left."""
+
+    rate: float  # [rad/s]
+    std: float  # [rad/s]
+
+
 @dataclass(frozen=True)
 class Subject:
     """A person as far as known.
@@ -49,6 +63,8 @@ class Subject:
     mounts : segment → `quat_LS` (4,) xyzw, the calibrated mounts; empty where none are calibrated
     note : where the numbers come from, in a few words
     hinges : side → its elbow's axis, where a calibration found it
+    start_tilt : segment → how it was off the start pose in the calibration; a person stands so again, nearly
+    drift : segment → the heading's drift of its sensor in the calibration; its spread is what another day's may have
     """
 
     name: str
@@ -58,6 +74,8 @@ class Subject:
     mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
     note: str = ""
     hinges: Mapping[str, Hinge] = field(default_factory=dict)
+    start_tilt: Mapping[str, StartTilt] = field(default_factory=dict)
+    drift: Mapping[str, Drift] = field(default_factory=dict)
 
     def std(self, name: str) -> float:
         """One standard deviation of a length [m], or of a mount's axis [rad]; NaN where nothing is known."""
@@ -163,6 +181,14 @@ def subject_toml(subject: Subject) -> str:
         lines += ["", f"[hinges.{side}]   # the elbow's axis in the upper arm's frame"]
         lines += [f"{key} = {value:.9f}" for key, value in zip("xyz", hinge.axis, strict=True)]
         lines.append(f"std_deg = {np.degrees(hinge.std):.3f}")
+    for segment, start in subject.start_tilt.items():
+        lines += ["", f"[start_tilt.{segment}]   # off the start pose in the calibration, about x and y of W"]
+        lines += [f"{key} = {np.degrees(value):.4f}" for key, value in zip(("x_deg", "y_deg"), start.tilt, strict=True)]
+        lines.append(f"std_deg = {np.degrees(start.std):.4f}")
+    for segment, drift in subject.drift.items():
+        lines += ["", f"[drift.{segment}]   # of its sensor's heading in the calibration"]
+        rates = {"rate_deg_min": drift.rate, "std_deg_min": drift.std}
+        lines += [f"{key} = {60.0 * np.degrees(value):.4f}" for key, value in rates.items()]
     if subject.order:
         lines += ["", "[covariance]    # of lengths [m] and mount errors [rad], jointly"]
         lines.append(f"order = {json.dumps(list(subject.order))}")
@@ -193,7 +219,7 @@ def load_subject(path: str | Path) -> Subject:
         raise BadSubject(f"{path}: is a session; a subject is wanted here, as `wepose calibrate` writes one")
     if table.get("format") != FORMAT:
         raise BadSubject(f"{path}: format = {table.get('format')!r}; this version reads format = {FORMAT}")
-    for key in ("lengths", "lengths_std", "mounts", "hinges", "covariance"):
+    for key in ("lengths", "lengths_std", "mounts", "hinges", "start_tilt", "drift", "covariance"):
         if not isinstance(table.get(key, {}), dict):
             raise BadSubject(f"{path}: {key} = {table[key]!r} is not a table; write [{key}]")
     lengths = table.get("lengths", {})
@@ -213,6 +239,16 @@ def load_subject(path: str | Path) -> Subject:
         mounts={segment: _mount(path, segment, mount) for segment, mount in table.get("mounts", {}).items()},
         note=str(table.get("note", "")),
         hinges={side: _read_hinge(path, side, hinge) for side, hinge in table.get("hinges", {}).items()},
+        start_tilt={
+            segment: StartTilt(np.radians([x, y]), float(np.radians(std)))
+            for segment in table.get("start_tilt", {})
+            for x, y, std in [_spread(path, table, "start_tilt", segment, ("x_deg", "y_deg", "std_deg"), 90.0)]
+        },
+        drift={
+            segment: Drift(float(np.radians(rate)) / 60.0, float(np.radians(std)) / 60.0)
+            for segment in table.get("drift", {})
+            for rate, std in [_spread(path, table, "drift", segment, ("rate_deg_min", "std_deg_min"), 600.0)]
+        },
     )
 
 
@@ -256,6 +292,20 @@ def _read_hinge(path: Path, side: str, table: Any) -> Hinge:
     if not abs(np.linalg.norm(axis) - 1.0) < 1e-3 or not 0.0 < std < 1.0:
         raise BadSubject(f"{path}: hinges.{side}: x, y, z must be of length 1, and std_deg between 0 and 57")
     return Hinge(axis / np.linalg.norm(axis), std)
+
+
+def _spread(path: Path, table: Mapping, key: str, segment: str, names: tuple[str, ...], most: float) -> list[float]:
+    """The numbers of a segment's table, none larger than `most`, the last of them a standard deviation."""
+    if segment not in SEGMENTS:
+        raise BadSubject(f"{path}: {key}.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
+    entry = table[key][segment]
+    found = [entry.get(name) for name in names] if isinstance(entry, dict) else [None]
+    numbers = [v for v in found if isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= most]
+    if len(numbers) != len(names) or numbers[-1] < 0.0:
+        raise BadSubject(
+            f"{path}: {key}.{segment} = {entry!r}; it needs {', '.join(names)}, numbers up to {most:g}, the last from 0"
+        )
+    return numbers
 
 
 def _mount(path: Path, segment: str, table: Any) -> np.ndarray:

@@ -12,10 +12,10 @@ import html
 import json
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,9 +23,7 @@ from scipy.spatial.transform import Rotation
 from .model import BodyModel, Visual
 from .pose import Pose, configuration, known_links, placements
 
-BACKGROUND_TOP = (0.985, 0.99, 0.995)
-BACKGROUND_BOTTOM = (0.89, 0.91, 0.935)
-GRID_COLOUR = (0.70, 0.74, 0.79)
+FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips
 GRID_CELL = 0.25  # [m]
 GRID_RADIUS = 3.0  # [m] where the grid has faded away
 CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
@@ -37,6 +35,18 @@ LIGHTS = (  # meshcat's own; positions in W [m]
     ("PointLightPositiveX", 0.16, (1.0, -3.0, 1.0)),
 )
 LEFT_COLOUR, RIGHT_COLOUR, OTHER_COLOUR = "#e8743b", "#2a7fb8", "#5b6b7d"
+
+
+class Backdrop(NamedTuple):
+    """Colours behind the body, red, green, blue from 0 to 1."""
+
+    top: tuple[float, float, float]
+    bottom: tuple[float, float, float]
+    grid: tuple[float, float, float]
+
+
+LIGHT = Backdrop((0.985, 0.99, 0.995), (0.89, 0.91, 0.935), (0.70, 0.74, 0.79))
+DARK = Backdrop((0.085, 0.105, 0.130), (0.135, 0.160, 0.190), (0.30, 0.34, 0.39))
 
 
 class CommandList:
@@ -91,7 +101,7 @@ def view_html(
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     title: str = "",
     fps: float = 30.0,
-    floor_z: float = -0.93,
+    floor_z: float = FLOOR_Z,
 ) -> str:
     """The page that plays a motion; write it to a file and open it in any browser.
 
@@ -115,7 +125,7 @@ def view_html(
     fps
         Frames a second in the page: the nearest samples, none made up; a slower recording stays as it is.
     floor_z
-        Height [m] of the ground grid in W, whose origin is between the hips.
+        Height [m] of the ground grid in W.
 
     Returns
     -------
@@ -125,10 +135,7 @@ def view_html(
     time = np.asarray(time, dtype=float)
     frames = frame_indices(time, fps)
     trails = {name: np.asarray(points, dtype=float)[frames] for name, points in (trails or {}).items()}
-    drawn = [v for v in visuals if v.link in placements and v.kind != "mesh"]
-    if drawn and max(max(v.rgba[:3]) for v in drawn) < 0.3:
-        # A body without colours of its own (human-gazebo: 0.1 grey) would be a silhouette.
-        drawn = [_lighter(v) for v in drawn]
+    drawn = visible(v for v in visuals if v.link in placements)
     links = list(dict.fromkeys(v.link for v in drawn))
     motion = np.empty((len(links), len(frames), 7), dtype="<f4")  # quat_WL xyzw, p_WL
     for k, link in enumerate(links):
@@ -142,24 +149,39 @@ def view_html(
         "links": links,
         "motion": _base64(motion),
         "trails": [
-            {"name": name, "colour": _trail_colour(name, visuals), "points": _base64(points)}
+            {"name": name, "colour": trail_colour(name, visuals), "points": _base64(points)}
             for name, points in trails.items()
         ],
         "phases": [
             {"name": name, "spans": [[float(begin), float(end)] for begin, end in spans]}
             for name, spans in (phases or {}).items()
         ],
-        "view": _view(drawn, links, motion, list(trails.values())),
-        "commands": [base64.b64encode(c).decode("ascii") for c in _scene(drawn, links, floor_z)],
+        "view": view(drawn, links, motion, list(trails.values())),
+        "commands": as_base64([*scene(drawn, links), *backdrop(LIGHT, floor_z)]),
     }
+    return filled(Path(__file__).with_name("viewer_page.html"), data, title)
+
+
+def filled(template: Path, data: Mapping[str, Any], title: str) -> str:
+    """The page of a template: with the viewer, what both pages share, the data and the title."""
     parts = {
         "title": html.escape(title),
         "window_title": html.escape(title or "wepose"),
         "meshcat": _meshcat_source(),
+        "parts": Path(__file__).with_name("viewer_parts.js").read_text(encoding="utf-8"),
         "data": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
     }
-    page = Path(__file__).with_name("viewer_page.html").read_text(encoding="utf-8")
+    page = template.read_text(encoding="utf-8")
     return re.sub(r"@@(\w+)@@", lambda found: parts[found[1]], page)  # one pass: a title cannot name a part
+
+
+def visible(visuals: Iterable[Visual]) -> list[Visual]:
+    """What can be drawn, in colours that can be told from each other."""
+    drawn = [v for v in visuals if v.kind != "mesh"]
+    if drawn and max(max(v.rgba[:3]) for v in drawn) < 0.3:
+        # A body without colours of its own (human-gazebo: 0.1 grey) would be a silhouette.
+        drawn = [_lighter(v) for v in drawn]
+    return drawn
 
 
 def _lighter(visual: Visual) -> Visual:
@@ -174,32 +196,41 @@ def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
     return np.unique(np.searchsorted(nearest_changes, clock))
 
 
-def _scene(drawn: Sequence[Visual], links: Sequence[str], floor_z: float) -> list[bytes]:
-    """meshcat's commands for everything that is not the motion; `links` are groups the player moves."""
+def scene(drawn: Sequence[Visual], links: Sequence[str]) -> list[bytes]:
+    """meshcat's commands for lights, camera and body; `links` are groups that the page moves."""
     import meshcat
     import meshcat.geometry as g
 
     window = CommandList()
-    scene = meshcat.Visualizer(window=window)
-    scene["/Background"].set_property("top_color", list(BACKGROUND_TOP))
-    scene["/Background"].set_property("bottom_color", list(BACKGROUND_BOTTOM))
-    scene["/Axes"].set_property("visible", False)
-    scene["/Grid"].set_property("visible", False)
-    scene["/Cameras/default/rotated/<object>"].set_property("fov", FIELD_OF_VIEW_DEG)
+    root = meshcat.Visualizer(window=window)
+    root["/Axes"].set_property("visible", False)
+    root["/Grid"].set_property("visible", False)
+    root["/Cameras/default/rotated/<object>"].set_property("fov", FIELD_OF_VIEW_DEG)
     for light, intensity, position in LIGHTS:
-        scene[f"/Lights/{light}"].set_property("visible", True)
-        scene[f"/Lights/{light}/<object>"].set_property("intensity", intensity)
+        root[f"/Lights/{light}"].set_property("visible", True)
+        root[f"/Lights/{light}/<object>"].set_property("intensity", intensity)
         if position is not None:
-            scene[f"/Lights/{light}/<object>"].set_property("position", list(position))
-
-    points, colours = _grid(floor_z)
-    grid = g.LineSegments(g.PointsGeometry(points, colours), g.LineBasicMaterial(vertexColors=True))
-    scene["ground"].set_object(_named(grid, "ground"))
+            root[f"/Lights/{light}/<object>"].set_property("position", list(position))
     for k, visual in enumerate(drawn):
         path = f"body/{links.index(visual.link)}/{k}"  # numbers: a link's name may hold a slash
-        part = scene[path]
+        part = root[path]
         part.set_object(_named(g.Mesh(_geometry(visual), _material(visual.rgba)), path))
         part.set_transform(_transform(visual))
+    return window.commands
+
+
+def backdrop(colours: Backdrop, floor_z: float = FLOOR_Z) -> list[bytes]:
+    """meshcat's commands for the background and the ground grid, in place of those before."""
+    import meshcat
+    import meshcat.geometry as g
+
+    window = CommandList()
+    root = meshcat.Visualizer(window=window)
+    root["/Background"].set_property("top_color", list(colours.top))
+    root["/Background"].set_property("bottom_color", list(colours.bottom))
+    points, vertex_colours = _grid(colours, floor_z)
+    grid = g.LineSegments(g.PointsGeometry(points, vertex_colours), g.LineBasicMaterial(vertexColors=True))
+    root["ground"].set_object(_named(grid, "ground"))
     return window.commands
 
 
@@ -237,7 +268,7 @@ def _transform(visual: Visual) -> np.ndarray:
     return T_LV
 
 
-def _grid(floor_z: float) -> tuple[np.ndarray, np.ndarray]:
+def _grid(colours: Backdrop, floor_z: float) -> tuple[np.ndarray, np.ndarray]:
     """The ends of the ground's line pieces and their colours, each (3, m); it fades into the background."""
     ticks = np.arange(-GRID_RADIUS, GRID_RADIUS + GRID_CELL / 2, GRID_CELL)
     x, y = np.meshgrid(ticks, ticks[:-1], indexing="ij")
@@ -246,11 +277,11 @@ def _grid(floor_z: float) -> tuple[np.ndarray, np.ndarray]:
     xy = np.concatenate([along_y, along_y[::-1]], axis=1)
     points = np.vstack([xy, np.full(xy.shape[1], floor_z)])
     fade = np.clip(np.hypot(*xy) / GRID_RADIUS, 0.0, 1.0)
-    near, far = np.array(GRID_COLOUR)[:, None], np.array(BACKGROUND_BOTTOM)[:, None]
+    near, far = np.array(colours.grid)[:, None], np.array(colours.bottom)[:, None]
     return points.astype(np.float32), (near + fade * (far - near)).astype(np.float32)
 
 
-def _view(
+def view(
     visuals: Sequence[Visual], links: Sequence[str], motion: np.ndarray, trails: Sequence[np.ndarray]
 ) -> dict[str, Any]:
     """The camera's axes in W (right, up, toward it) and, along them, the motion's outermost points [m]."""
@@ -284,7 +315,7 @@ def _half_edges(visual: Visual) -> np.ndarray:
     return np.array([radius, radius, visual.size[1] / 2.0 if visual.kind == "cylinder" else radius])
 
 
-def _trail_colour(point: str, visuals: Sequence[Visual]) -> str:
+def trail_colour(point: str, visuals: Sequence[Visual]) -> str:
     """The colour that most of that arm's visuals have, where the other arm has another; else one of ours."""
     most = {}
     for side in ("left", "right"):
@@ -307,3 +338,7 @@ def _meshcat_source() -> str:
 
 def _base64(values: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
+
+
+def as_base64(commands: Iterable[bytes]) -> list[str]:
+    return [base64.b64encode(command).decode("ascii") for command in commands]

@@ -26,12 +26,12 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from ..alignment import ATTITUDE_STD
 from ..errors import NoSolution
 from ..subject import LENGTHS
 from .chain import SIDES, about_z, inverse, links, product, rotate, small_turn
 from .protocols import Closure, Condition, Direction, coefficients
 
-ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation about each axis: sets the gap's weights, not its size
 HINGE_STD = np.deg2rad(2.0)  # [rad] of the forearm against the elbow's plane
 K = len(LENGTHS)
 
@@ -223,7 +223,8 @@ def _closed(layout: Layout, closure: Closure, x: Any, quat_WL: Mapping[str, Any]
     gap, covariance = ca.SX.zeros(3), closure.slip**2 * ca.SX.eye(3)
     for v in moved.values():
         gap += v
-        # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ).
+        # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ). This
+        # sets the gap's weights among each other, not their size.
         covariance += ATTITUDE_STD**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
     if closure.kind == "distance":
         size = ca.norm_2(gap)
@@ -303,5 +304,5 @@ def solve(
         return Fit(x, r[:, :3], r[:, 3:], gaps, J, information, cost)
     raise NoSolution(
         f"the lengths did not converge ({np.sqrt(gradient @ step):.2g} standard deviations to go); check that the "
-        f"palms touch in the phase and that every sensor sits where the session says"
+        f"hands do in the phase what the protocol says, and that every sensor sits where the session says"
     )

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ..alignment import SLIP_STD
 from ..assets import asset
 from ..errors import BadOption, MissingFile, one_of
 from ..recording import SEGMENTS
@@ -46,7 +47,7 @@ class Closure:
     phase: str
     kind: str
     points: tuple[str, ...]
-    slip: float = 0.005
+    slip: float = SLIP_STD
     gauge: str = ""
     metres: float = 0.0
     metres_std: float = 0.003
@@ -200,7 +201,7 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
         conditions.append(Axis(str(_get(entry, "phase", place)), segment, std))
     if not conditions:
         raise BadOption(f"{path}: no [[closure]], [[pose]] or [[axis]]; a protocol needs one at least")
-    needs = tuple(_among(segment, SEGMENTS, f"{path}: needs") for segment in _get(table, "needs", str(path)))
+    needs = tuple(_among(segment, SEGMENTS, f"{path}: needs") for segment in _list(table, "needs", str(path)))
     steps = []
     for i, entry in enumerate(table.get("step", [])):
         place = f"{path}: step {i + 1}"
@@ -222,7 +223,7 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
 
 def _closure(entry: dict[str, Any], place: str) -> Closure:
     kind = _among(_get(entry, "kind", place), KINDS, f"{place}: kind")
-    points = tuple(_among(point, REACHES, f"{place}: points") for point in _get(entry, "points", place))
+    points = tuple(_among(point, REACHES, f"{place}: points") for point in _list(entry, "points", place))
     if len(points) != KINDS[kind]:
         raise BadOption(f"{place}: points = {list(points)}; kind '{kind}' takes {KINDS[kind]}")
     more: dict[str, Any] = {}
@@ -242,6 +243,13 @@ def _get(table: dict[str, Any], key: str, place: str) -> Any:
     return table[key]
 
 
+def _list(table: dict[str, Any], key: str, place: str) -> list[Any]:
+    value = _get(table, key, place)
+    if not isinstance(value, list):
+        raise BadOption(f'{place}: {key} = {value!r}; a list of names is needed, as in {key} = ["left_hand"]')
+    return value
+
+
 def _number(table: dict[str, Any], key: str, place: str, least: float, most: float) -> float:
     value = _get(table, key, place)
     if not isinstance(value, int | float) or isinstance(value, bool) or not least <= value <= most:
@@ -250,6 +258,6 @@ def _number(table: dict[str, Any], key: str, place: str, least: float, most: flo
 
 
 def _among(name: Any, choices: Any, place: str) -> str:
-    if name not in choices:
+    if not isinstance(name, str) or name not in choices:
         raise BadOption(f"{place}: {name!r} is not known; {one_of(choices, str(name))}")
-    return str(name)
+    return name

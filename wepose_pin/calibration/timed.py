@@ -18,10 +18,12 @@ from ..alignment import filtered
 from ..recording import Recording
 from ..subject import Subject
 from . import problem
-from .lengths import _before, _looks, _weighed
+from .known import known_before
+from .lengths import _looks
 from .problem import Looks, filled, residuals, solve
 from .protocols import load_protocol
 from .touching import touching_start
+from .weighing import weighed
 
 OURS = "Gauss-Newton, ours"
 _STATUS = Path("/proc/self/status")
@@ -49,11 +51,11 @@ def posed(
 
         def calibrated(looks: Looks = looks) -> Problem:
             def place(some: Looks) -> np.ndarray:
-                return _before(recording, found, some, prior, gauge, gauge_std)[0]
+                return known_before(recording, found, some, prior, gauge, gauge_std)[0]
 
-            center, information = _before(recording, found, looks, prior, gauge, gauge_std)
+            center, information = known_before(recording, found, looks, prior, gauge, gauge_std)
             start, touching = touching_start(looks, place)
-            _, weights, _, _ = _weighed(looks, center, information, start, touching, quick=False)
+            _, weights, _, _ = weighed(looks, center, information, start, touching, quick=False)
             weights = np.broadcast_to(weights, (looks.data.shape[1], 5)).copy()
             return Problem(looks, center, information, weights, start)
 

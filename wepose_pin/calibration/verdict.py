@@ -16,8 +16,10 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from ..subject import LENGTHS
+from .advice import ADVICE, POSED
 from .anatomy import E_Z, SIDES
-from .lengths import TOUCHED, Calibration
+from .lengths import Calibration
+from .weighing import CONTRADICTED, TOUCHED
 
 Grade = Literal["pass", "poor", "fail"]
 GRADES: tuple[Grade, ...] = ("pass", "poor", "fail")
@@ -47,6 +49,7 @@ GAP = Limits(0.030, 0.060)  # [m] rms while the palms touch
 APART = Limits(0.10, 0.60)  # share of looks
 TILT = Limits(np.deg2rad(12.0), np.deg2rad(20.0))  # [rad] of a segment in the start pose; elbows hang 5 to 8 deg bent
 UNUSUAL = Limits(4.0, 6.0)  # standard deviations of a length from the average person
+TAPE = Limits(CONTRADICTED, 5.0)  # of a taped length from what the motion and the average person say of it
 SHARE = Limits(1.0 / 6.0, 1.0 / 2.0)  # of one independent look in all: some six carry a calibration
 DOUBT = Limits(1.0, 1.0)  # of anatomy, see `anatomy`
 
@@ -136,9 +139,10 @@ class Verdict:
         said = []
         for same in lines.values():
             worst = "fail" if any(f.grade == "fail" for f in same) else "poor"
-            why = next((f": {f.why}" for f in same if f.why), "")
+            what = ", ".join(f.said for f in same)
+            why = next((f": {f.why}" for f in same if f.why and f.why not in what), "")
             do = f"; {same[0].do}" if same[0].do else ""
-            said.append(f"{worst}: {', '.join(f.said for f in same)}{why}{do}")
+            said.append(f"{worst}: {what}{why}{do}")
         return said
 
 
@@ -215,9 +219,11 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
         "shoulder_width": ("the shoulder width", {"": std("shoulder_width")}, ("sideways", "elevation")),
     }
     for name, (what, each, causes) in parts.items():
-        if each and np.isfinite(calibration.gap).any():  # without a closure lengths are the average person's
+        if each and calibration.closure in ADVICE:  # without a closure lengths are the average person's
             side = max(each, key=lambda s: each[s])
             why, do = _cause(calibration, motion, causes, [side] if side else sides)
+            if not side and ADVICE[calibration.closure].width:
+                why, do = "", ADVICE[calibration.closure].width
             said = f"{what} ± {1e3 * each[side]:.0f} mm"
             found.append(_finding(name, each[side], LENGTH, "m", said, do, why))
     for segment in (s for s in subject.mounts if f"mounts.{s}.z" in subject.order):
@@ -239,7 +245,7 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
             SCALE,
             "relative",
             f"all lengths together ± {100 * calibration.scale_std:.1f} %{whose}",
-            "tape one length and give it, as in --gauge shoulder_width=0.385",
+            f"tape one length and give it, as in --gauge {calibration.tape}",
         )
     )
     return found
@@ -247,87 +253,49 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
 
 def _cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...], sides: list[str]) -> tuple[str, str]:
     """Why something is uncertain, as a clause, and what to do: what moved least of what it needs."""
-    joined = "joined hands" if calibration.protocol in ("clasp", "clasp_taped") else "hands"
-
-    if not np.isfinite(calibration.gap).any():
-        return "", "hold each pose more exactly, and for longer; or hold the hands together"
+    if calibration.closure not in ADVICE:
+        return "", POSED
 
     def of(values: Mapping[str, Range]) -> float:
         return min((values[side].size for side in sides if side in values), default=np.nan)
 
-    moved = {
-        "elevation": (
-            of(motion.elevation),
-            "the upper arms were hardly raised (by {:.0f} deg)",
-            f"move the {joined} up and down, from the belly to above the head",
-        ),
-        "sideways": (
-            of(motion.sideways),
-            f"the {joined} hardly went sideways (by {{:.0f}} deg)",
-            f"move the {joined} far to the left and right",
-        ),
-        "elbow": (
-            of(motion.elbow),
-            "the elbows hardly bent (by {:.0f} deg)",
-            f"bring the {joined} to the chest and stretch them far out",
-        ),
-        "lean": (
-            motion.lean,
-            "the torso hardly leaned (by {:.0f} deg)",
-            f"lean and twist the torso while the {joined} move",
-        ),
-        "twist": (
-            motion.twist.size if motion.twist else np.nan,
-            "the torso hardly twisted (by {:.0f} deg)",
-            f"lean and twist the torso while the {joined} move",
-        ),
+    size = {
+        "elevation": of(motion.elevation),
+        "sideways": of(motion.sideways),
+        "elbow": of(motion.elbow),
+        "lean": motion.lean,
+        "twist": motion.twist.size if motion.twist else np.nan,
     }
-    seen = {name: moved[name] for name in causes if np.isfinite(moved[name][0])}
-    least = min(seen, key=lambda name: seen[name][0] / ENOUGH[name], default="")
-    if least and seen[least][0] < ENOUGH[least]:
-        value, why, do = seen[least]
-        return why.format(value), do
+    advice = ADVICE[calibration.closure]
+    seen = {name: size[name] for name in causes if np.isfinite(size[name])}
+    least = min(seen, key=lambda name: seen[name] / ENOUGH[name], default="")
+    if least and seen[least] < ENOUGH[least]:
+        why, do = advice.moved[least]
+        return why.format(seen[least]), do
     if calibration.independent < ENOUGH_LOOKS:
-        said = f"the motion is worth {calibration.independent:.0f} independent looks only"
-        return said, "move for a minute, through all of the reach, the palms together all the time"
+        return f"the motion is worth {calibration.independent:.0f} independent looks only", advice.longer
     return "", "move further and faster, through all of the reach"
 
 
 def _left_over(calibration: Calibration) -> list[Finding]:
     closed = np.isfinite(calibration.gap)
     found = []
-    if closed.any():
-        found.append(
-            _finding(
-                "gap",
-                calibration.rms_gap,
-                GAP,
-                "m",
-                f"the palms are {1e3 * calibration.rms_gap:.0f} mm apart (rms) by the solution",
-                "press the palms together, wrists straight; tighten the straps",
-            )
-        )
-        found.append(
+    if calibration.closure in ADVICE:
+        advice = ADVICE[calibration.closure]
+        gap, looks = calibration.rms_gap, calibration.independent
+        share = float(np.mean(calibration.kept[closed] < TOUCHED))
+        found += [
+            _finding("gap", gap, GAP, "m", advice.gap.format(1e3 * gap), advice.closer),
             _finding(
                 "motion",
-                1.0 / max(calibration.independent, 1e-9),
+                1.0 / max(looks, 1e-9),
                 SHARE,
                 "of one independent look",
-                f"the motion is worth {calibration.independent:.0f} independent looks only",
-                "move for a minute, through all of the reach, the palms together all the time",
-            )
-        )
-        share = float(np.mean(calibration.kept[closed] < TOUCHED))
-        found.append(
-            _finding(
-                "apart",
-                share,
-                APART,
-                "share",
-                f"the palms were apart for {100 * share:.0f} % of the phase; that was left out",
-                "keep the palms together, or name only the seconds in which they are",
-            )
-        )
+                f"the motion is worth {looks:.0f} independent looks only",
+                advice.longer,
+            ),
+            _finding("apart", share, APART, "share", advice.apart.format(100 * share), advice.together),
+        ]
     tilts = {name: float(np.linalg.norm(tilt)) for name, tilt in calibration.start_tilt.items()}
     if tilts:
         name = max(tilts, key=lambda n: tilts[n])
@@ -341,6 +309,19 @@ def _left_over(calibration: Calibration) -> list[Finding]:
                 "stand upright in the start pose, arms hanging straight down",
             )
         )
+    for name, tape in calibration.tapes.items():
+        found.append(
+            _finding(
+                f"tape.{name}",
+                tape.off,
+                TAPE,
+                "std of what is known without it",
+                tape.said(name),
+                "measure it anew, and check --stature and --sex",
+            )
+        )
+    if any(tape.off > TAPE.passes for tape in calibration.tapes.values()):
+        return found  # all lengths have followed a tape that is wrong
     prior, subject = calibration.prior, calibration.subject
     z = {n: abs(subject.lengths[n] - prior.lengths[n]) / prior.std(n) for n in LENGTHS if n not in calibration.gauge}
     name = max(z, key=lambda n: z[n])

@@ -67,6 +67,8 @@ class Orientation(NamedTuple):
     static: np.ndarray  # (n,) bool
     attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²], error on the right, in S; None where the filter has none
     noise: SensorNoise  # what the still phase said
+    filter: OrientationFilter | None = None  # where it stands after the last sample, to go on live; None: it cannot
+    detector: StaticDetector | None = None  # the same
 
 
 def check_method(method: str) -> str:
@@ -160,7 +162,8 @@ def run_filter(
     `measured_start`: without `params`, smekf takes P₀ from `noise` in place of the paper's (`smekf.starting_params`).
     """
     test = static_test or StaticTest()
-    static = StaticDetector(noise, rate_hz, test).run(gyro_S, accel_S)
+    detector = StaticDetector(noise, rate_hz, test)
+    static = detector.run(gyro_S, accel_S)
     window = test.samples(rate_hz)
     first_accel = accel_S[:window].mean(axis=0)
     if not np.linalg.norm(first_accel) > 0.0:
@@ -172,4 +175,6 @@ def run_filter(
         params = starting_params(noise, quat_start, still_start=bool(static[window - 1 : window].any()))
     filter_ = METHODS[method](noise, rate_hz, quat_start, params)
     quat_WS, bias, cov = filter_.run(gyro_S, accel_S, static)
-    return Orientation(quat_WS, bias, static, cov, noise)
+    if method in OFFLINE:
+        return Orientation(quat_WS, bias, static, cov, noise)
+    return Orientation(quat_WS, bias, static, cov, noise, filter_, detector)

@@ -69,3 +69,31 @@ class LiveBank:
     def attitude_cov(self) -> np.ndarray:
         """(k, 3, 3) [rad²] of the error on the right, in S; a copy."""
         return symmetric(self._rows[:, P_AA:P_AB])
+
+
+class OneByOne:
+    """As `LiveBank`, for filters without a kernel for many: each is updated on its own, and goes on itself."""
+
+    def __init__(self, filters: Sequence[Any], detectors: Sequence[StaticDetector]) -> None:
+        self._filters, self._detectors = filters, detectors
+        self.static = np.zeros(len(filters), dtype=np.bool_)
+        self.quat_WS = np.stack([filter_.state.quat_WS for filter_ in filters])
+        self.gyro_bias = np.stack([filter_.state.gyro_bias for filter_ in filters])
+
+    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+        """As `LiveBank.update`."""
+        for i, (filter_, detector) in enumerate(zip(self._filters, self._detectors, strict=True)):
+            self.static[i] = detector.update(gyro_S[i], accel_S[i])
+            self.quat_WS[i] = filter_.update(gyro_S[i], accel_S[i], bool(self.static[i]))
+            self.gyro_bias[i] = filter_.state.gyro_bias
+        return self.quat_WS
+
+    @property
+    def attitude_cov(self) -> np.ndarray | None:
+        return None
+
+
+def bank_of(filters: Sequence[Any], detectors: Sequence[StaticDetector]) -> LiveBank | OneByOne:
+    """The fastest of the two that these filters allow."""
+    kind = LiveBank if all(hasattr(filter_, "live") for filter_ in filters) else OneByOne
+    return kind(filters, detectors)

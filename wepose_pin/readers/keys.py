@@ -10,6 +10,9 @@ from typing import Any
 
 from ..errors import BadSession, MissingFile, one_of
 
+# Endings of files that hold the data themselves.
+DATA = (".csv", ".parquet", ".txt", ".mat", ".h5", ".hdf5", ".mvnx", ".sto")
+
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """The contents of a TOML file; `what` is wanted there, for the error's text.
@@ -21,8 +24,11 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     BadSession
         Not TOML.
     """
-    if path.suffix.lower() in (".csv", ".parquet", ".txt", ".mat"):
-        raise BadSession(f"{path}: is a table of data by its name; {what} is wanted here, which names the table")
+    if path.suffix.lower() in DATA:
+        raise BadSession(
+            f"{path}: is a table of data by its name; {what} is wanted here, which names the table (`wepose info "
+            f"{path.name} --write` writes one)"
+        )
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except FileNotFoundError:

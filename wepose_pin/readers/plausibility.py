@@ -170,10 +170,18 @@ def _range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: 
 
 def _saturation(values: np.ndarray, least: float, place: str) -> list[str]:
     """A note for each axis that stays at its extreme value as if cut off there."""
-    notes = []
-    for axis, name in enumerate("xyz"):
-        x = values[:, axis]
-        cut = 0
+    return [
+        f"{place}: {np.count_nonzero(cut)} samples on {name} stand at {values[cut, axis].min():.4g}, as if cut off by "
+        f"the sensor's range; choose a larger range"
+        for axis, (name, cut) in enumerate(zip("xyz", cut_off(values, least).T, strict=True))
+        if cut.any()
+    ]
+
+
+def cut_off(values: np.ndarray, least: float) -> np.ndarray:
+    """(n, 3) bool: where an axis of `values` (n, 3) stays at its extreme value, `least` or more, as if cut off there."""
+    cut = np.zeros(values.shape, dtype=bool)
+    for axis, x in enumerate(values.T):
         for extreme in (float(x.max()), float(x.min())):
             if abs(extreme) < least:
                 continue
@@ -184,15 +192,7 @@ def _saturation(values: np.ndarray, least: float, place: str) -> list[str]:
             # A slow signal rests on its peak too, a quantum below on both sides; one that is cut off comes steeply.
             steps = np.abs(np.diff(x))
             quantum = float(steps[steps > same].min())
-            steep = [
-                (a, b) for a, b in plateaus if max(*steps[max(a - 1, 0) : a], *steps[b - 1 : b], 0.0) > 3 * quantum
-            ]
-            cut += sum(b - a for a, b in steep)
-            if steep:
-                reached = extreme
-        if cut:
-            notes.append(
-                f"{place}: {cut} samples on {name} stand at {reached:.4g}, as if cut off by the sensor's range; "
-                f"choose a larger range"
-            )
-    return notes
+            for a, b in plateaus:
+                if max(*steps[max(a - 1, 0) : a], *steps[b - 1 : b], 0.0) > 3 * quantum:
+                    cut[a:b, axis] = True
+    return cut

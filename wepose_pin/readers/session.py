@@ -1,26 +1,31 @@
-"""The session file: what the user writes about a recording (TOML), and the CSV or Parquet it names."""
+"""The session file: what the user writes about a recording (TOML), and the files that it names."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 
-from ..errors import BadData, BadOption, BadPhase, BadSession, MissingFile, one_of
-from ..recording import AXES, SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases, mount_from_axes
+from ..errors import BadData, BadOption, BadSession, MissingFile, one_of
+from ..recording import SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases
+from .arrays import ArrayFile, is_array_file
 from .clocks import BRIDGED, LONG, Clock, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time, runs
+from .device import Device
+from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
 from .plausibility import sensor_notes
+from .stated import WIDTHS, Stated, label_stated, phases_stated, sensor_stated, truth_stated
 from .tables import Rows, columns, one_column, read_table
 
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "g": 9.80665}
-STRAPPINGS = ("as_calibrated", "new")
 # How far a quaternion's norm may be off 1: decimals that were cut.
 NORM_OFF = 1e-2
+SI = {"gyro": 1.0, "accel": 1.0}
 
 
 def load_session(path: str | Path, gaps: bool = False) -> Recording:
@@ -70,9 +75,12 @@ class _Plan:
 
     place: str
     path: Path
+    table: str  # which of the reader's tables
     signals: Mapping[str, list[str]]
+    units: Mapping[str, float]
     clock: Clock
     mount: np.ndarray | None
+    aligned: bool
 
 
 class SessionReader:
@@ -81,21 +89,29 @@ class SessionReader:
     Parameters
     ----------
     gaps : accept lost samples for longer than 50 ms
-    in_memory : hold the tables as a whole; else they are read by rows, each `recording` after the one before
+    in_memory : hold CSV and Parquet as a whole; else they are read by rows, each `recording` after the one before
+    values : the session's contents, where they do not stand in the file yet
 
     Attributes
     ----------
     time, rate_hz : the common time base (n,) [s], and its rate
     """
 
-    def __init__(self, path: str | Path, *, gaps: bool = False, in_memory: bool = True) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        gaps: bool = False,
+        in_memory: bool = True,
+        values: Mapping[str, Any] | None = None,
+    ) -> None:
         path = Path(path)
         self.path = path / "session.toml" if path.is_dir() else path
         self.gaps = gaps
-        top = Keys(read_toml(self.path, "a session file"), str(self.path))
+        top = Keys(read_toml(self.path, "a session file") if values is None else values, str(self.path))
         top.allow("name", "start_pose", "strapping", "data", "phases", "sensors")
         data, sensors = top.table("data"), top.table("sensors", {})
-        data.allow("file", "time", "rate_hz", "gyro_unit", "accel_unit", "truth")
+        data.allow("file", "time", "rate_hz", "gyro_unit", "accel_unit", "truth", "format", "use")
         for segment in sensors.values:
             if segment not in SEGMENTS:
                 raise BadSession(f"{self.path}: sensors.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
@@ -108,39 +124,79 @@ class SessionReader:
             time=np.empty(0),
             rate_hz=0.0,
             sensors={},
-            phases=_phases(top.table("phases", {})),
+            phases=phases_stated(top.table("phases", {})),
             start_pose=top.choice("start_pose", START_POSES, "n_pose"),
-            strapping=top.choice("strapping", STRAPPINGS, "as_calibrated"),
+            strapping=top.choice("strapping", ("as_calibrated", "new"), "as_calibrated"),
             source=self.path,
-            truth=_truth(self.path, data),
+            truth=truth_stated(self.path, data),
         )
-        keys = {segment: _sensor_keys(sensors.table(segment)) for segment in sensors.values}
-        if any("gyro" in signals for signals, _ in keys.values()):
+        stated = {segment: sensor_stated(sensors.table(segment)) for segment in sensors.values}
+        self._units: Mapping[str, float] = SI
+        if any("gyro" in (said.signals or ()) for said in stated.values()):
             self._units = {
                 "gyro": GYRO_UNITS[data.choice("gyro_unit", GYRO_UNITS)],
                 "accel": ACCEL_UNITS[data.choice("accel_unit", ACCEL_UNITS)],
             }
-        self._tables: dict[Path, pl.DataFrame | Rows] = {}
-        self._clocks: dict[tuple[Path, str | None, float | None, float], Clock] = {}
+        self._tables: dict[str, pl.DataFrame | Rows] = {}
+        self._clocks: dict[tuple[str, str | None, float | None, float], Clock] = {}
+        self._array_files: dict[Path, ArrayFile] = {}
         self._in_memory = in_memory
-        self._plans = {
-            segment: self._plan(sensors.table(segment), data, signals, mount)
-            for segment, (signals, mount) in keys.items()
-        }
+        self.devices: dict[Path, Device] = {}
+        for segment, said in stated.items():
+            if said.signals is None:
+                self._read_device(sensors.table(segment), data)
+        self._on_one_clock()
+        self._plans = {segment: self._plan(sensors.table(segment), data, said) for segment, said in stated.items()}
         clocks = {segment: plan.clock for segment, plan in self._plans.items()}
         self.time, self._notes = common_time(str(self.path), clocks)
         self._resampled = bool(self._notes)
+        self._notes += tuple(note for device in self.devices.values() for note in device.notes)
         self.rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
         check_phases(str(self.path), self.time, self._head.phases)
 
-    def _plan(self, keys: Keys, data: Keys, signals: Mapping[str, list[str]], mount: np.ndarray | None) -> _Plan:
+    def _file(self, keys: Keys, data: Keys) -> Path:
         file = (keys if "file" in keys else data).text("file", None)
         if file is None:
             raise BadSession(f"{data.at('file')} is missing; the .csv or .parquet file beside {self.path}")
-        path = self.path.parent / file
+        return self.path.parent / file
+
+    def _read_device(self, keys: Keys, data: Keys) -> None:
+        """A file whose format says where its values stand."""
+        path = self._file(keys, data)
+        own = keys if "format" in keys else data
+        format = own.choice("format", FORMATS) if "format" in own else format_of(path) if path.exists() else None
+        if format is None:
+            if not path.exists() and path.suffix.lower() in (".mvnx", ".sto", ".txt", ""):
+                raise MissingFile(f"{path}: no such file or folder")
+            keys.names("gyro", 3)  # a table of which the session must say what it holds
+        elif path not in self.devices:
+            use = data.choice("use", USES) if "use" in data else None
+            self.devices[path] = read_device(path, format, use)
+
+    def _on_one_clock(self) -> None:
+        """Times of devices that count since they were switched on begin at zero, with the earliest of them."""
+        running = {path: device for path, device in self.devices.items() if device.since_power_on}
+        first = {path: float(np.nanmin(device.table["time"].to_numpy())) for path, device in running.items()}
+        for path, device in running.items():
+            if device.wraps_s:  # the counter of one began anew before it started, the other's did not
+                reference = next(iter(first.values()))
+                first[path] += device.wraps_s * round((reference - first[path]) / device.wraps_s)
+        origin = min(first.values(), default=0.0)
+        for path, device in self.devices.items():
+            table = device.table
+            if path in first:
+                time = table["time"].to_numpy()
+                table = table.with_columns(time=time - np.nanmin(time) + (first[path] - origin))
+            self._tables[str(path)] = table
+
+    def _plan(self, keys: Keys, data: Keys, stated: Stated) -> _Plan:
+        path, segment = self._file(keys, data), keys.place.split(".")[1]
+        device = self.devices.get(path) if stated.signals is None else None
         # A file of its own has a clock of its own.
         own = keys if any(key in keys for key in ("file", "time", "rate_hz")) else data
         name, rate_hz = own.text("time", None), own.number("rate_hz", None, positive=True)
+        if device is not None and name is None and rate_hz is None:
+            name = "time"
         if (name is None) == (rate_hz is None):
             found = "neither" if name is None else "both"
             raise BadSession(
@@ -148,11 +204,24 @@ class SessionReader:
                 f"or a rate"
             )
         offset = keys.number("offset_s", 0.0) or 0.0
-        if path not in self._tables:
-            self._tables[path] = read_table(path) if self._in_memory else Rows(path)
-        key = (path, name, rate_hz, offset)
+        which = str(path)
+        if device is not None:
+            signals: Mapping[str, list[str]] = device.signals(label_stated(keys, device, segment, path))
+        else:
+            assert stated.signals is not None
+            signals = stated.signals
+            if is_array_file(path):
+                which = f"{path} {segment}"
+                self._tables[which], signals = self._arrays(keys, path, signals, name, own)
+            else:
+                for signal, named in signals.items():
+                    if len(named) == 1:  # one array, which a table of columns has not
+                        keys.names(signal, WIDTHS[signal])
+        if which not in self._tables:
+            self._tables[which] = read_table(path) if self._in_memory else Rows(path)
+        key = (which, name, rate_hz, offset)
         if key not in self._clocks:
-            table, place = self._tables[path], own.at("time")
+            table, place = self._tables[which], own.at("time")
             if isinstance(table, Rows):
                 time, height = one_column(path, name, str(path), place)
             else:
@@ -168,27 +237,53 @@ class SessionReader:
                     f"{path}: rows are missing after row {clock.row[before] + 1}: time steps by "
                     f"{clock.time[after] - clock.time[before]:.3f} s at {clock.time[before]:.3f} s; {_too_long(clock)}"
                 )
-        return _Plan(keys.place.rstrip("."), path, signals, self._clocks[key], mount)
+        aligned = stated.aligned if stated.aligned is not None else device is not None and device.aligned
+        if aligned and stated.mount is not None:
+            raise BadSession(
+                f"{keys.at('mount')} stands beside aligned orientations, which are the segment's own; leave it out, or "
+                f"state aligned = false"
+            )
+        if aligned and "orientation" not in signals:
+            raise BadSession(f"{keys.at('aligned')} = true needs orientations; leave it out where there are none")
+        units = SI if device is not None else self._units
+        place = keys.place.rstrip(".")
+        return _Plan(place, path, which, signals, units, self._clocks[key], stated.mount, aligned)
+
+    def _arrays(
+        self, keys: Keys, path: Path, signals: Mapping[str, list[str]], time: str | None, own: Keys
+    ) -> tuple[pl.DataFrame, Mapping[str, list[str]]]:
+        """The columns of an HDF5 or MATLAB file that a sensor and its clock need, and their names by signal."""
+        if path not in self._array_files:
+            self._array_files[path] = ArrayFile(path)
+        file = self._array_files[path]
+        named = {
+            signal: file.expanded(names[0], WIDTHS[signal], keys.at(signal)) if len(names) == 1 else names
+            for signal, names in signals.items()
+        }
+        wanted = {name: keys.at(signal) for signal, names in named.items() for name in names}
+        if time is not None:
+            wanted[time] = own.at("time")
+        return file.table(wanted), named
 
     def recording(self, first: int, last: int) -> Recording:
         """The recording from sample `first` of the common time to before `last`, checked."""
         time = self.time[first:last]
         windows = {segment: self._window(plan, first, last) for segment, plan in self._plans.items()}
-        rows: dict[Path, slice] = {}
+        rows: dict[str, slice] = {}
         for segment, (low, high) in windows.items():
             plan = self._plans[segment]
             there = plan.clock.row[low:high]
             begin, end = int(there[there >= 0].min(initial=2**62)), int(there.max(initial=-1)) + 1
-            so_far = rows.get(plan.path, slice(begin, end))
-            rows[plan.path] = slice(min(begin, so_far.start), max(end, so_far.stop))
-        tables = {path: self._tables[path][span] for path, span in rows.items()}
+            so_far = rows.get(plan.table, slice(begin, end))
+            rows[plan.table] = slice(min(begin, so_far.start), max(end, so_far.stop))
+        tables = {which: self._tables[which][span] for which, span in rows.items()}
 
         sensors: dict[str, Sensor] = {}
         bridged: dict[str, list[str]] = {}
         for segment, (low, high) in windows.items():
             plan = self._plans[segment]
             clock = replace(plan.clock, time=plan.clock.time[low:high], row=plan.clock.row[low:high])
-            sensor, marks = self._sensor(plan, clock, tables[plan.path], rows[plan.path].start)
+            sensor, marks = self._sensor(plan, clock, tables[plan.table], rows[plan.table].start)
             if not self._resampled:
                 sensors[segment] = _cut(sensor, first - low, last - low)
                 marks = marks[first - low : last - low]
@@ -243,7 +338,7 @@ class SessionReader:
         gap = every == LONG if self.gaps else None
         if "orientation" in found:
             quat = bridge_quat(found["orientation"][0], marks["orientation"], clock)
-            return Sensor(quat_WS=quat, stated_quat_LS=plan.mount, gap=gap), every
+            return Sensor(quat_WS=quat, stated_quat_LS=plan.mount, gap=gap, aligned=plan.aligned), every
         gyro_S = bridge(found["gyro"][0], marks["gyro"], clock, rate=True)
         accel_S = bridge(found["accel"][0], marks["accel"], clock)
         return Sensor(gyro_S=gyro_S, accel_S=accel_S, stated_quat_LS=plan.mount, gap=gap), every
@@ -262,7 +357,7 @@ class SessionReader:
             values[there] = read[clock.row[there] - first_row]
         good = np.isfinite(values).all(axis=1)
         if name != "orientation":
-            return self._units[name] * values, good
+            return plan.units[name] * values, good
         norm = np.linalg.norm(values, axis=1)
         good &= norm > 0.0  # zeros stand for "not seen" in many exports
         odd = np.flatnonzero(good & (np.abs(norm - 1.0) > NORM_OFF))
@@ -272,53 +367,6 @@ class SessionReader:
                 f"{clock.row[odd[0]] + 1}; a unit quaternion is needed, columns in the order x, y, z, w"
             )
         return values / np.where(good, norm, np.nan)[:, None], good
-
-
-def _sensor_keys(keys: Keys) -> tuple[dict[str, list[str]], np.ndarray | None]:
-    """Columns by signal, and the mount as stated."""
-    keys.allow("gyro", "accel", "orientation", "mount", "file", "time", "rate_hz", "offset_s")
-    mount = _mount(keys.table("mount")) if "mount" in keys else None
-    if "orientation" not in keys:
-        return {"gyro": keys.names("gyro", 3), "accel": keys.names("accel", 3)}, mount
-    if "gyro" in keys or "accel" in keys:
-        raise BadSession(f"{keys.at('orientation')} stands beside gyro or accel; a sensor has one or the other")
-    return {"orientation": keys.names("orientation", 4)}, mount
-
-
-def _mount(keys: Keys) -> np.ndarray:
-    keys.allow("up", "forward")
-    up, forward = keys.choice("up", AXES), keys.choice("forward", AXES)
-    if abs(AXES[up] @ AXES[forward]) > 0.5:
-        raise BadSession(
-            f"{keys.at('forward')} = '{forward}' is parallel to up = '{up}'; name two different sensor axes"
-        )
-    return mount_from_axes(up, forward)
-
-
-def _phases(keys: Keys) -> dict[str, Intervals]:
-    phases: dict[str, Intervals] = {}
-    for name, value in keys.values.items():
-        well = isinstance(value, list) and all(
-            isinstance(pair, list) and len(pair) == 2 and all(is_number(v) for v in pair) for pair in value
-        )
-        if not well:
-            raise BadSession(f"{keys.at(name)} = {value!r} is not a list of intervals; write [[from, to]] in seconds")
-        phases[name] = tuple((float(a), float(b)) for a, b in value)
-        for first, last in phases[name]:
-            if not first < last:
-                raise BadPhase(f"{keys.at(name)}: [{first:g}, {last:g}] is empty; the earlier time comes first")
-    return phases
-
-
-def _truth(path: Path, data: Keys) -> Path | None:
-    name = data.text("truth", None)
-    if name is None:
-        return None
-    if not (path.parent / name).is_file():
-        raise MissingFile(
-            f"{data.at('truth')}: no such file '{name}' beside {path.name}; name it rightly or not at all"
-        )
-    return path.parent / name
 
 
 def _within(phases: Mapping[str, Intervals], time: np.ndarray) -> dict[str, Intervals]:

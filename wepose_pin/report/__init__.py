@@ -1,5 +1,16 @@
 """The HTML reports: one file each, opens offline, prints on A4."""
 
-from .calibration import calibration_report, unsaid
+from __future__ import annotations
 
-__all__ = ["calibration_report", "unsaid"]
+from importlib import import_module
+from typing import Any
+
+# Loaded on first use: who tracks does not wait for the rooms of the calibration.
+_WHERE = {"calibration_report": "calibration", "track_report": "track", "unsaid": "calibration"}
+__all__ = ["calibration_report", "track_report", "unsaid"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(import_module(f".{_WHERE[name]}", __name__), name)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import __version__
 from ..alignment import START_POSE_STD
 from ..calibration import Calibration
-from ..calibration.lengths import DRIFT_STD, GAUGE_STD, TOUCHED
+from ..calibration.known import DRIFT_STD
+from ..calibration.lengths import GAUGE_STD
 from ..calibration.protocols import Protocol, load_protocol
 from ..calibration.verdict import Verdict
+from ..calibration.weighing import TOUCHED
 from ..errors import WeposeError
 from ..filters import BEST
 from ..page import Banner, Block, Bullets, Facts, Frame, Heading, Table, as_html, capital
@@ -33,12 +32,11 @@ from .figures import (
     gap_picture,
     hands_picture,
     lengths_picture,
-    plus_minus,
     posture_picture,
     sensors_picture,
-    signed,
     smoothed,
 )
+from .words import degrees, intervals, plain, plus_minus, signed, versions
 
 SIDES, PARTS = ("left", "right"), ("upper_arm", "forearm", "hand")
 FRAMES_A_SECOND = 20.0  # of the 3D view
@@ -122,7 +120,7 @@ class _Contact(NamedTuple):
 def _contact(protocol: Protocol) -> _Contact:
     hands = tuple(dict.fromkeys(p for c in protocol.closures for p in c.points if p.endswith("_hand")))
     if len(hands) < 2:
-        noun = f"the {_plain(hands[0])}" if hands else "the hands"
+        noun = f"the {plain(hands[0])}" if hands else "the hands"
         return _Contact(protocol.name, hands, noun, "palm to its point", protocol.chain)
     bar = any(c.kind == "distance" for c in protocol.closures)
     noun, gap = ("the hands on the handle", "palms against the handle") if bar else ("the joined hands", "palm to palm")
@@ -135,7 +133,7 @@ def _contact(protocol: Protocol) -> _Contact:
 def _in_short(calibration: Calibration, contact: _Contact) -> list[str]:
     subject = calibration.subject
     scaling = [name for name in calibration.gauge if name in contact.chain or name not in subject.lengths]
-    scale = f"from the tape ({', '.join(map(_plain, scaling))})" if scaling else "the average person's, nothing taped"
+    scale = f"from the tape ({', '.join(map(plain, scaling))})" if scaling else "the average person's, nothing taped"
     said = []
     if contact.chain:
         said.append(f"Scale {scale}: all lengths together may be off by {100 * calibration.scale_std:.1f} %.")
@@ -149,8 +147,8 @@ def _in_short(calibration: Calibration, contact: _Contact) -> list[str]:
     if known:
         tilt, heading = (max(known, key=lambda name, k=k: known[name][k]) for k in (0, 1))  # type: ignore[misc]
         said.append(
-            f"Mounts: tilt known to ± {known[tilt][0]:.1f}° or better ({_plain(tilt)}), heading to "
-            f"± {known[heading][1]:.1f}° or better ({_plain(heading)})."
+            f"Mounts: tilt known to ± {known[tilt][0]:.1f}° or better ({plain(tilt)}), heading to "
+            f"± {known[heading][1]:.1f}° or better ({plain(heading)})."
         )
     return said
 
@@ -180,7 +178,7 @@ def _lengths(calibration: Calibration, contact: _Contact) -> list[Block]:
         said.append(
             "A hand without a sensor moves with its forearm: only their sum is seen, the average ratio splits it."
         )
-    outside = [_plain(name) for name in subject.lengths if name not in contact.chain and name not in calibration.gauge]
+    outside = [plain(name) for name in subject.lengths if name not in contact.chain and name not in calibration.gauge]
     if outside:
         said.append(f"Not in the chain, known by the average person's proportions alone: {', '.join(outside)}.")
     if calibration.learned:
@@ -195,7 +193,7 @@ def _sensors(calibration: Calibration, recording: Recording) -> list[Block]:
     for name, quat_LS in subject.mounts.items():
         tilt, heading = _mount_stds(subject, name)
         drift = np.degrees(calibration.drift.get(name, np.nan)) * 60.0
-        rows.append(Sensor(_plain(name), tilt, heading, drift))
+        rows.append(Sensor(plain(name), tilt, heading, drift))
         up, forward = axes_from_mount(quat_LS)
         nearest = Rotation.from_quat(mount_from_axes(up, forward))
         off = np.degrees((nearest.inv() * Rotation.from_quat(quat_LS)).magnitude())
@@ -203,11 +201,11 @@ def _sensors(calibration: Calibration, recording: Recording) -> list[Block]:
         stated = sensor is not None and sensor.stated_quat_LS is not None
         lines.append(
             [
-                _plain(name),
+                plain(name),
                 f"{_sign(up)} up, {_sign(forward)} forward, turned {off:.0f}°",
                 "yes" if stated else "no",
-                _deg(tilt),
-                _deg(heading),
+                degrees(tilt),
+                degrees(heading),
                 f"{signed(drift)} °/min" if np.isfinite(drift) else "",
             ]
         )
@@ -316,7 +314,7 @@ def _posture(calibration: Calibration) -> list[Block]:
         std = np.degrees([calibration.subject.std(row) for row in mount_rows(name)[:2]])
         seen[name] = (~(std > UNSEEN * np.degrees(START_POSE_STD))).tolist()
         of = ((1, x, std[0], seen[name][0]), (0, y, std[1], seen[name][1]))
-        lines.append([_plain(name), *(_tilt(name, *about) for about in of)])
+        lines.append([plain(name), *(_tilt(name, *about) for about in of)])
     said = []
     for side in SIDES:
         upper, fore = (tilt.get(f"{side}_{part}") for part in ("upper_arm", "forearm"))
@@ -346,7 +344,7 @@ def _elbows(calibration: Calibration) -> list[Block]:
         if not np.isfinite([forward, up]).all():
             continue
         ends = f"{abs(forward):.1f}° {'forwards' if forward > 0 else 'backwards'}", f"{abs(up):.1f}° "
-        lines.append([side, ends[0], ends[1] + ("up" if up > 0 else "down"), _deg(softness)])
+        lines.append([side, ends[0], ends[1] + ("up" if up > 0 else "down"), degrees(softness)])
     if not lines:
         return []
     text = (
@@ -385,22 +383,22 @@ def _view(calibration: Calibration, recording: Recording, pose: TrackedPose) -> 
 def _run(
     calibration: Calibration, recording: Recording, contact: _Contact, method: str, gauge_std: float
 ) -> list[Block]:
-    gauge = [f"{_plain(name)} {1e3 * v:.0f} ± {1e3 * gauge_std:.0f} mm" for name, v in calibration.gauge.items()]
+    gauge = [f"{plain(name)} {1e3 * v:.0f} ± {1e3 * gauge_std:.0f} mm" for name, v in calibration.gauge.items()]
     raw = sorted(
         {"ready orientations" if s.ready else "gyroscope and accelerometer" for s in recording.sensors.values()}
     )
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
-        ("sensors", f"{', '.join(map(_plain, recording.sensors))} ({', '.join(raw)})"),
+        ("sensors", f"{', '.join(map(plain, recording.sensors))} ({', '.join(raw)})"),
         ("length", f"{recording.time[-1] - recording.time[0]:.1f} s at {recording.rate_hz:g} Hz"),
-        *((f"phase {name}", _spans(spans)) for name, spans in recording.phases.items()),
+        *((f"phase {name}", intervals(spans)) for name, spans in recording.phases.items()),
         ("protocol", f"{contact.protocol}, {len(calibration.time)} moments of it"),
         ("filter", method),
         ("gauge", ", ".join(gauge) or "none"),
         ("average person", calibration.prior.note or calibration.prior.name),
         ("strapping", recording.strapping.replace("_", " ")),
         *(("while reading", note) for note in recording.notes),
-        ("made with", ", ".join(f"{name} {number}" for name, number in _versions().items())),
+        ("made with", versions()),
     ]
     return [Heading("What was run"), Facts(rows)]
 
@@ -469,15 +467,7 @@ def _std(subject: Subject, names: Sequence[str], weights: np.ndarray) -> float:
 
 
 def _label(parts: Sequence[str]) -> str:
-    return _plain(parts[0]) if len(parts) == 1 else f"{_plain(parts[0])} + hand"
-
-
-def _plain(name: str) -> str:
-    return name.replace("_", " ")
-
-
-def _deg(value: float) -> str:
-    return f"{value:.1f}°" if np.isfinite(value) else "not known"
+    return plain(parts[0]) if len(parts) == 1 else f"{plain(parts[0])} + hand"
 
 
 def _sign(axis: str) -> str:
@@ -488,7 +478,7 @@ def _looked_at(name: str, contact: _Contact) -> str:
     """What a finding is about."""
     what, _, of = name.partition(".")
     if what == "heading":
-        return f"± heading, {_plain(of)}"
+        return f"± heading, {plain(of)}"
     return {
         "anatomy": "doubt of the sensors' places, by anatomy",
         "upper_arms": "± upper arm, the scale apart",
@@ -500,7 +490,7 @@ def _looked_at(name: str, contact: _Contact) -> str:
         "apart": "share of the time apart",
         "start_pose": "segment farthest off the start pose",
         "person": "length farthest from the average person",
-    }.get(what, _plain(name))
+    }.get(what, plain(name))
 
 
 def _shown(value: float, unit: str, digits: str) -> str:
@@ -525,14 +515,3 @@ def _tilt(name: str, across: int, angle: float, std: float, seen: bool) -> str:
 
 def _side(value: float, negative: str, positive: str) -> str:
     return f"{abs(value):.0f} cm {positive if value >= 0.0 else negative}"
-
-
-def _spans(spans: Sequence[tuple[float, float]]) -> str:
-    return ", ".join(f"{a:g} to {b:g} s" for a, b in spans)
-
-
-def _versions() -> dict[str, str]:
-    packages = ("pin", "casadi", "numpy", "scipy")
-    return {
-        "wepose-pin": __version__, "python": platform.python_version(), **{name: version(name) for name in packages}
-    }  # fmt: skip

@@ -10,17 +10,15 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 from scipy.spatial.transform import Rotation
 
 from ..page import ACCENT, FONT, INK, LINE, SOFT, STYLE, Picture, capital, new_figure, png_of
 from ..viewer import LEFT_COLOUR, OTHER_COLOUR, RIGHT_COLOUR
+from .drawing import BAND, BEFORE, HATCHED, above, body, broken
+from .words import plus_minus, signed
 
-BEFORE = "#d9772b"
-BAND = "#dfe4ea"  # what was known before
-APART: dict[str, Any] = {"facecolor": "#f1f3f6", "edgecolor": "#9aa5b3", "hatch": "////", "linewidth": 0.0}
 TELLING = LinearSegmentedColormap.from_list("telling", ["#dbe9f4", "#7fb0d3", ACCENT, "#0e2a40"])
 CELL = 5.0  # [cm] of the map of the hands
 SMOOTHED_S = 2.0
@@ -95,7 +93,7 @@ def lengths_picture(rows: Sequence[Length]) -> Picture:
         tape = Line2D([], [], linestyle="", marker="v", markerfacecolor="white", markeredgecolor=INK, label="taped")
         known = any(np.isfinite(row.taped) for row in rows)
         average = Patch(color=BAND, label="average person, ± 1 std")
-        _above(figure, [dot, average, *([tape] if known else [])])
+        above(figure, [dot, average, *([tape] if known else [])])
         png = png_of(figure)
     return Picture("lengths", "Lengths against the average person's; to the right what was found.", png)
 
@@ -132,7 +130,7 @@ def sensors_picture(rows: Sequence[Sensor], tilt_before_deg: float, drift_before
         panels[0].set_yticks(place, [row.label for row in rows])
         panels[0].set_ylim(-0.6, len(rows) - 0.4)
         line = Line2D([], [], color=SOFT, linewidth=1.2, linestyle=(0, (4, 2)), label="by the start pose alone")
-        _above(figure, [line, Patch(color=BAND, label="drift that is usual, ± 1 std")])
+        above(figure, [line, Patch(color=BAND, label="drift that is usual, ± 1 std")])
         png = png_of(figure)
     return Picture("sensors", "How well each sensor's mount is known (one standard deviation), and its drift.", png)
 
@@ -180,13 +178,13 @@ def gap_picture(
             panels[1].margins(y=0.25)
         for axes in panels:
             for a, b in apart:
-                axes.axvspan(a, b, **APART, zorder=0)
+                axes.axvspan(a, b, **HATCHED, zorder=0)
             axes.grid(color=LINE, linewidth=0.7)
             axes.set_xlim(time[0], time[-1])
         if apart:
-            handles.append(Patch(label="apart, left out", **APART))
+            handles.append(Patch(label="apart, left out", **HATCHED))
         panels[-1].set_xlabel("time in the recording [s]")
-        _above(figure, handles)
+        above(figure, handles)
         png = png_of(figure)
     caption = capital(f"{'above: ' * bool(told)}{label}, before and after.")
     if told:
@@ -207,7 +205,7 @@ def hands_picture(hands: Hands, noun: str) -> Picture:
         views = (("from the front", 1, 2), ("from the right", 0, 2), ("from above", 1, 0))
         drawn, most = [], 1e-9
         for axes, (title, across, up) in zip(panels, views, strict=True):
-            _body(axes, title, half, trunk)
+            body(axes, title, half, trunk)
             told, edges = _cells(reach[hands.touched][:, [across, up]], hands.learned[hands.touched])
             most = max(most, float(told.max()))
             drawn.append(axes.pcolormesh(*edges, told.T, cmap=TELLING, zorder=3))
@@ -289,7 +287,7 @@ def posture_picture(
         dotted = Line2D([], [], color=SOFT, linewidth=1.0, linestyle=(0, (2, 2)), label="as meant")
         colours = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR}
         limbs = [Line2D([], [], color=colours[side], linewidth=4.5, label=side) for side in arms]
-        _above(figure, [*limbs, dotted])
+        above(figure, [*limbs, dotted])
         png = png_of(figure)
     drawn = f"drawn {factor} times as large as they are" if factor > 1 else "as they are"
     return Picture("posture", f"How the start pose was held; tilts {drawn}, the degrees are the true ones.", png)
@@ -307,19 +305,6 @@ def direction(segment: str, across: int, angle: float) -> str:
     return "outwards" if positive == segment.startswith("left") else "inwards"
 
 
-def plus_minus(value: float, std: float, unit: str, digits: int = 1) -> str:
-    """A number with its standard deviation and its unit."""
-    if not np.isfinite(value):
-        return "not known"
-    text = f"{value:.{digits}f}"
-    return f"{text} ± {std:.{digits}f} {unit}" if np.isfinite(std) else f"{text} {unit}, ± not known"
-
-
-def signed(value: float) -> str:
-    """A number with its sign, to a tenth."""
-    return f"{value:+.1f}".replace("-", "−") if abs(value) >= 0.05 else "0.0"
-
-
 def smoothed(time: np.ndarray, share: np.ndarray) -> np.ndarray:
     """(n,) shares of each look → (n,) [%/s], over `SMOOTHED_S` around each look."""
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
@@ -329,23 +314,11 @@ def smoothed(time: np.ndarray, share: np.ndarray) -> np.ndarray:
     return 100.0 * (total[last] - total[first]) / ((last - first) * step)
 
 
-def broken(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line that breaks where time jumps."""
-    if len(time) < 3:
-        return time, values
-    jumps = np.flatnonzero(np.diff(time) > 3.0 * np.median(np.diff(time))) + 1
-    return np.insert(time, jumps, np.nan), np.insert(values.astype(float), jumps, np.nan)
-
-
 _STYLES: tuple[dict[str, Any], ...] = (
     {"color": INK, "linewidth": 1.4},
     {"color": "#4b9a55", "linewidth": 1.4, "linestyle": (0, (5, 1.5))},
     {"color": "#a04c9c", "linewidth": 1.4, "linestyle": (0, (1.2, 1.2))},
 )
-
-
-def _above(figure: Figure, handles: Sequence[Any]) -> None:
-    figure.legend(handles=handles, loc="outside upper right", ncols=len(handles), frameon=False, handlelength=2.4)
 
 
 def _limb(colour: str) -> dict[str, Any]:
@@ -354,17 +327,6 @@ def _limb(colour: str) -> dict[str, Any]:
 
 def _line(ends: Sequence[np.ndarray], across: int) -> tuple[list[float], list[float]]:
     return [100 * float(end[across]) for end in ends], [100 * float(end[2]) for end in ends]
-
-
-def _body(axes: Axes, view: str, half: float, trunk: float) -> None:
-    """Head, shoulders and trunk behind the hands [cm]; origin between the shoulders."""
-    pale: dict[str, Any] = {"color": BAND, "linewidth": 6.0, "solid_capstyle": "round", "zorder": 1}
-    across = "right" not in view
-    axes.add_patch(Circle((0.0, 0.0 if "above" in view else 20.0), 10.0, color=BAND, zorder=1))
-    if across:
-        axes.plot([-half, half], [0.0, 0.0], **pale)
-    if "above" not in view:
-        axes.plot([0.0, 0.0], [0.0, -trunk], **pale)
 
 
 def _cells(at: np.ndarray, learned: np.ndarray) -> tuple[np.ma.MaskedArray, tuple[np.ndarray, np.ndarray]]:

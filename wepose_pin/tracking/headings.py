@@ -19,19 +19,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import Segments
-from ..recording import Recording
-from ..subject import LENGTHS, Subject
+from ..alignment import ATTITUDE_STD, SLIP_STD, Segments
+from ..recording import SEGMENTS, Recording
+from ..subject import Subject
 
-CHAIN = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+CHAIN = SEGMENTS[:5]
 HANDS = ("left_hand", "right_hand")  # each in the chain where it has a sensor, else rigid with its forearm
 KNOT_S = 2.0
 LOOK_RATE_HZ = 8.0
-# Errors of the residuals that have nothing to do with headings, and how long they last: soft tissue and what is left of
-# the mounts' errors come back in every pose, so that a minute of joined hands is worth three looks. Found on simulated
+# How long errors of the residuals last that have nothing to do with headings: soft tissue and what is left of the
+# mounts' errors come back in every pose, so that a minute of joined hands is worth three looks. Found on simulated
 # people, where less takes a good filter's headings for worse than they are.
-ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of each segment, soft tissue above all
-SLIP_STD = 0.005  # [m]
 CORRELATION_S = 20.0
 START_STD = np.deg2rad(0.5)  # [rad] of each heading when the start pose ends
 UNKNOWN_DRIFT = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance
@@ -90,7 +88,8 @@ def held_together(recording: Recording, segments: Segments, subject: Subject) ->
     covariance = dict(segments.covariance_W)
     for i, name in enumerate(chain):
         if name in covariance:
-            covariance[name] = _narrowed(covariance[name], np.interp(recording.time, middle, cov[:, i, i]))
+            variance = np.interp(recording.time, middle, cov[:, i, i])
+            covariance[name] = _narrowed(covariance[name], *_of_filter(segments, name), variance)
     after = {name: Rotation.from_quat(corrected[name][at]) for name in chain}
     reset = Reset(
         clasp_mm=(_rms_mm(_palms(R, subject)[joined]), _rms_mm(_palms(after, subject)[joined]))
@@ -166,7 +165,6 @@ def _of_lengths(v: np.ndarray, R: Mapping[str, Rotation], subject: Subject) -> n
             names.append(length)
             J.append(direction)
     jacobian = np.stack(J, axis=2)  # (n, 3, k)
-    assert set(names) <= set(LENGTHS)
     return jacobian @ subject.lengths_covariance(names) @ jacobian.swapaxes(1, 2)
 
 
@@ -193,13 +191,21 @@ def _walk(recording: Recording, segments: Segments, chain: tuple[str, ...], midd
     """(knots, k) [rad²]: variance of each heading's step to each knot, by what its filter's covariance grew."""
     steps = np.full((len(middle), len(chain)), UNKNOWN_DRIFT * KNOT_S)
     for i, name in enumerate(chain):
-        cov_S = segments.orientation[name].attitude_cov if name in segments.orientation else None
-        if cov_S is not None:
-            up_S = Rotation.from_quat(segments.orientation[name].quat_WS).inv().apply([0.0, 0.0, 1.0])
-            variance = np.einsum("na,nab,nb->n", up_S, cov_S, up_S)
+        if name in segments.covariance_W:
+            _, variance = _of_filter(segments, name)
             at = np.interp(np.concatenate([[segments.start[1]], middle]), recording.time, variance)
             steps[:, i] = np.maximum(np.diff(at), 1e-10)
     return steps
+
+
+def _of_filter(segments: Segments, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """What the filter's own covariance says of the heading: with each axis of W (n, 3), and of itself (n,) [rad²]."""
+    of = segments.orientation[name]
+    R_VS = Rotation.from_quat(of.quat_WS)
+    assert of.attitude_cov is not None
+    with_heading_V = R_VS.apply(np.einsum("nab,nb->na", of.attitude_cov, R_VS.inv().apply([0.0, 0.0, 1.0])))
+    to_W = Rotation.from_rotvec([0.0, 0.0, segments.heading[name]])
+    return to_W.apply(with_heading_V), with_heading_V[:, 2]
 
 
 def _smoothed(information: np.ndarray, pull: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -223,12 +229,17 @@ def _smoothed(information: np.ndarray, pull: np.ndarray, steps: np.ndarray) -> t
     return np.array(means[::-1]), np.array(covs[::-1])
 
 
-def _narrowed(cov_W: np.ndarray, heading_var: np.ndarray) -> np.ndarray:
-    """Covariances (n, 3, 3) with the heading's variance no larger than `heading_var` (n,), the tilt's as it was."""
-    scale = np.sqrt(np.minimum(1.0, heading_var / cov_W[:, 2, 2]))
+def _narrowed(cov_W: np.ndarray, filter_W: np.ndarray, filter_var: np.ndarray, heading_var: np.ndarray) -> np.ndarray:
+    """Covariances (n, 3, 3) in which the filter's part of the heading is no larger than `heading_var` (n,).
+
+    What comes from elsewhere, as from a mount's heading, joined hands and elbows do not take away: it stays.
+    """
+    share = np.sqrt(np.minimum(1.0, heading_var / filter_var))
+    less = (1.0 - share)[:, None] * filter_W
     narrowed = cov_W.copy()
-    narrowed[:, 2, :] *= scale[:, None]
-    narrowed[:, :, 2] *= scale[:, None]
+    narrowed[:, 2, :2] -= less[:, :2]
+    narrowed[:, :2, 2] -= less[:, :2]
+    narrowed[:, 2, 2] -= (1.0 - share**2) * filter_var
     return narrowed
 
 

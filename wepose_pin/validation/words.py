@@ -23,7 +23,8 @@ _UPPER = (
     "Simulated people, sizes drawn from anthropometric distributions, a motion of their own each, truth exact; not the "
     "paper's ten subjects and no Vicon. Hands joined and moved for a minute, then six circles in the air with rests on "
     "a table. Each filter calibrates the lengths from the joined hands with a taped shoulder width (off by 3 mm, one "
-    "standard deviation) and tracks with what it calibrated. "
+    "standard deviation) and tracks with what it calibrated. All rows are of headings that are held together by "
+    "the joined hands and the elbows' hinges, as `wepose track` does for every filter with a calibrated subject. "
 )
 _PEOPLE = (
     "Distance of the right hand to the truth during circles and rests, from the root (the trunk's length counts, which "

@@ -39,6 +39,8 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
             names = [f"{segment}_q{c}" if short == "q" else f"{segment}_{short}_{c}" for c in "xyzw"[: values.shape[1]]]
             table |= {name: values[:, k] for k, name in enumerate(names)}
             lines.append(f"{keys[short]} = {json.dumps(names)}")
+        if sensor.aligned:
+            lines.append("aligned = true")
         if sensor.stated_quat_LS is not None:
             up, forward = axes_from_mount(sensor.stated_quat_LS)
             lines.append(f'mount = {{ up = "{up}", forward = "{forward}" }}')

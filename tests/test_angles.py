@@ -1,0 +1,498 @@
+"""Joint angles against closed forms through gimbal lock, SciPy on frames from bony landmarks, and drawn errors."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial.transform import Rotation
+
+import wepose_pin as wp
+from wepose_pin.angles import (
+    ISB_AXES,
+    JOINTS,
+    NEAR_LOCK,
+    RATE_WINDOW_S,
+    SHOULDER_SEQUENCES,
+    angle_table,
+    compose,
+    joint_angles,
+    summary,
+    summary_table,
+)
+from wepose_pin.angles.euler import UNKNOWN, decompose, follow, wrap
+from wepose_pin.errors import BadData, BadOption
+from wepose_pin.pose import Pose
+from wepose_pin.simulation import Person, Simulation
+from wepose_pin.subject import average_subject
+
+ARM = ("upper_arm", "forearm", "hand")
+SEGMENTS = ["torso", *(f"{side}_{part}" for side in ("left", "right") for part in ARM)]
+ALL_SEQUENCES = ["".join(p) for p in itertools.product("XYZ", repeat=3) if p[0] != p[1] and p[1] != p[2]]
+GLOBAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # columns: X, Y, Z of the ISB in x, y, z of W
+MIRROR = np.diag([1.0, -1.0, 1.0])
+
+
+def pose_with(quat_WL: dict[str, np.ndarray], rate_hz: float = 100.0, **more: dict[str, np.ndarray]) -> Pose:
+    """A pose of all segments; those not given stand as in the N-pose."""
+    n = max(len(np.atleast_2d(quat)) for quat in quat_WL.values())
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    return Pose(np.arange(n) / rate_hz, {s: np.atleast_2d(quat_WL.get(s, still)) for s in SEGMENTS}, {}, **more)
+
+
+def turned(**degrees: float) -> np.ndarray:
+    """Turns about axes x, y, z of W, one after the other, as a quaternion (4,)."""
+    total = Rotation.identity()
+    for axis, angle in degrees.items():
+        total = Rotation.from_euler(axis, angle, degrees=True) * total
+    return total.as_quat()
+
+
+def arm_of(side: str, matrix_I: np.ndarray) -> dict[str, np.ndarray]:
+    """A pose in which the upper arm stands so, (n, 3, 3) in the ISB's axes of a right side, to the upright thorax."""
+    matrix = GLOBAL @ matrix_I @ GLOBAL.T
+    if side == "left":
+        matrix = MIRROR @ matrix @ MIRROR
+    return {f"{side}_upper_arm": Rotation.from_matrix(matrix).as_quat()}
+
+
+def same_angles(found: np.ndarray, expected: np.ndarray, atol: float) -> None:
+    np.testing.assert_allclose(wrap(found - expected), 0.0, atol=atol)
+
+
+# Apart and together -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ALL_SEQUENCES)
+def test_every_sequence_gives_the_angles_that_scipy_gives(name: str) -> None:
+    R = Rotation.random(500, random_state=1)
+    found = decompose(R.as_quat(), name)
+    expected = R.as_euler(name)
+    if name[0] == name[2]:  # SciPy's second angle of a proper sequence is positive: the other solution
+        expected = np.column_stack([expected[:, 0] + np.pi, -expected[:, 1], expected[:, 2] + np.pi])
+        lock = np.minimum(-expected[:, 1], np.pi + expected[:, 1])
+    else:
+        lock = np.pi / 2.0 - np.abs(expected[:, 1])
+    same_angles(found.values, expected, 1e-10)
+    np.testing.assert_allclose(found.gimbal, lock, atol=1e-10)
+    assert np.all(np.abs(found.values) <= np.pi + 1e-12)
+
+
+@pytest.mark.parametrize("name", ALL_SEQUENCES)
+def test_angles_give_the_rotation_back_near_the_lock_and_in_it(name: str) -> None:
+    rng = np.random.default_rng(2)
+    lock = (0.0, -np.pi, np.pi) if name[0] == name[2] else (-np.pi / 2.0, np.pi / 2.0)
+    away = [0.0, *(sign * 10.0**-k for k in range(18) for sign in (1.0, -1.0))]
+    second = np.array([at + by for at in lock for by in away])
+    R = Rotation.from_euler(
+        name, np.column_stack([rng.uniform(-3, 3, second.size), second, rng.uniform(-3, 3, second.size)])
+    )
+    for values in (found := decompose(R.as_quat(), name)).values, follow(found, name, NEAR_LOCK):
+        back = Rotation.from_quat(compose(values, name))
+        assert (back.inv() * R).magnitude().max() < 1e-12
+    assert found.gimbal.min() < 1e-15
+    assert found.gimbal.max() > 0.5
+
+
+@pytest.mark.parametrize("name", SHOULDER_SEQUENCES)
+def test_in_the_lock_the_first_angle_is_held(name: str) -> None:
+    lock = 0.0 if name[0] == name[2] else np.pi / 2.0
+    first = np.radians(np.concatenate([np.linspace(20.0, 30.0, 11), np.full(20, 30.0)]))
+    third = np.radians(np.concatenate([np.zeros(11), np.linspace(0.0, 40.0, 20)]))
+    second = lock - np.radians(np.concatenate([np.linspace(40.0, 10.0, 11), np.zeros(20)]))
+    given = np.column_stack([first, second, third])
+    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler(name, given).as_matrix())), name)[
+        "right_shoulder"
+    ]
+    np.testing.assert_allclose(found.values, given, atol=1e-8)
+    assert np.all(found.near_lock[-20:])
+    later = decompose(compose(given[::-1], name), name).values  # begins in the lock: the first angle that there is
+    same_angles(later[:20, 0], np.full(20, later[20, 0]), 1e-12)
+
+
+# Closed forms over time -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("name", SHOULDER_SEQUENCES)
+@pytest.mark.parametrize("samples", [201, 2000])
+def test_a_motion_straight_through_the_lock_keeps_its_angles(name: str, side: str, samples: int) -> None:
+    t = np.linspace(0.0, 1.0, samples)
+    reach = (-80.0, 60.0) if name == "YXY" else (-20.0, 150.0)
+    given = np.radians(
+        np.column_stack([35.0 + 10.0 * np.sin(4.0 * t), reach[0] + (reach[1] - reach[0]) * t, -50.0 + 20.0 * t**2])
+    )
+    pose = pose_with(arm_of(side, Rotation.from_euler(name, given).as_matrix()))
+    found = joint_angles(pose, name)[f"{side}_shoulder"]
+    np.testing.assert_allclose(found.values, given, atol=1e-9)
+    lock = np.abs(given[:, 1]) if name == "YXY" else np.abs(given[:, 1] - np.pi / 2.0)
+    expected = np.minimum(lock, np.pi / 2.0 - np.abs(lock - np.pi / 2.0) if name == "YXY" else np.pi - lock)
+    np.testing.assert_allclose(found.gimbal, expected, atol=1e-9)
+    clear = np.abs(expected - NEAR_LOCK) > 1e-6
+    assert np.array_equal(found.near_lock[clear], expected[clear] < NEAR_LOCK)
+    assert found.near_lock.any()
+
+
+def test_angles_do_not_stop_at_a_half_turn() -> None:
+    given = np.column_stack([np.linspace(0.0, 9.0, 500), np.full(500, -1.0), np.linspace(0.0, -7.0, 500)])
+    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler("YXY", given).as_matrix())))["right_shoulder"]
+    shift = found.values - given
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=1e-9)
+    same_angles(found.values, given, 1e-9)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("seed", range(10))
+def test_what_a_hanging_arm_does_decides_nothing_about_the_motions_after_it(side: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    raised = -np.radians(110.0) * np.sin(np.linspace(0.0, np.pi, 200)) ** 2
+    wander = np.cumsum(rng.normal(size=(3, 300, 3)), axis=1)  # it circles about the lock, and shakes
+    wander *= np.radians(6.0) * np.sin(np.linspace(0.0, np.pi, 300))[:, None] / np.abs(wander).max()
+    hang = [Rotation.from_rotvec(way + 0.003 * rng.normal(size=(300, 3))) for way in wander]
+    abducted, flexed = (
+        Rotation.from_euler("YXY", np.column_stack([np.full(200, plane), raised, np.full(200, -plane)]))
+        for plane in (0.0, np.pi / 2.0)
+    )
+    R = Rotation.concatenate([hang[0], abducted, hang[1], flexed, hang[2]])
+    found = joint_angles(pose_with(arm_of(side, R.as_matrix())))[f"{side}_shoulder"]
+    for middle, plane in ((400, 0.0), (900, 90.0)):
+        np.testing.assert_allclose(np.degrees(found.values[middle]), [plane, -110.0, -plane], atol=0.1)
+    jumps = np.abs(np.diff(found.values, axis=0)).max(axis=1) > np.radians(60.0)
+    assert not np.any(jumps & ~(found.near_lock[1:] & found.near_lock[:-1]))
+    assert (
+        Rotation.from_quat(compose(found.values, "YXY")).inv() * Rotation.from_quat(found.quat)
+    ).magnitude().max() < 1e-12
+
+
+# Against SciPy, on frames from bony landmarks as Wu et al. define them ----------------------------------------------
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def frame(up: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Axes X, Y, Z as columns: Y along `up`, X across the plane of both and forward, Z the common perpendicular."""
+    Y = unit(up)
+    X = unit(np.cross(Y, right))
+    return np.stack([X, Y, np.cross(X, Y)], axis=-1)
+
+
+def landmark_frames(R: dict[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
+    """ISB frames from landmarks of a person who stands in W; a left side's positions are mirrored, z → −z."""
+    out = -1.0 if side == "right" else 1.0  # +y is to the left
+
+    def place(segment: str, at: list[float]) -> np.ndarray:
+        p_W = R[segment] @ np.array([at[0], out * at[1], at[2]])
+        p = np.stack([p_W[:, 0], p_W[:, 2], -p_W[:, 1]], axis=-1)  # the ISB's world: x forward, y up, z to the right
+        return p * [1.0, 1.0, -1.0 if side == "left" else 1.0]
+
+    # Thorax: incisura jugularis, C7, processus xiphoideus, T8. The right of the mirrored body is where its left was.
+    IJ, C7, PX, T8 = (place("torso", at) for at in ([0.1, 0, 0.5], [-0.06, 0, 0.5], [0.1, 0, 0.3], [-0.06, 0, 0.3]))
+    thorax_up = (IJ + C7) / 2.0 - (PX + T8) / 2.0
+    thorax = frame(thorax_up, np.cross(IJ - C7, thorax_up))
+    arm, forearm, hand = (f"{side}_{part}" for part in ARM)
+    GH = place("torso", [0.0, 0.2, 0.45])
+    EL, EM = (GH + place(arm, at) for at in ([0.0, 0.04, -0.3], [0.0, -0.04, -0.3]))
+    E = (EL + EM) / 2.0
+    US, RS = (E + place(forearm, at) for at in ([0.0, 0.0, -0.25], [0.05, 0.0, -0.25]))  # thumbs forward in the N-pose
+    base, head = (RS + place(hand, at) for at in ([0.0, 0.0, -0.02], [0.0, 0.0, -0.09]))  # third metacarpal
+    MC2, MC5 = (RS + place(hand, at) for at in ([0.02, 0.0, -0.09], [-0.05, 0.0, -0.08]))
+    return {
+        "thorax": thorax,
+        "shoulder": frame(GH - E, EL - EM),
+        "elbow": frame(E - US, RS - US),
+        "wrist": frame(base - head, MC2 - MC5),
+    }
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("name", SHOULDER_SEQUENCES)
+def test_angles_are_scipys_on_frames_from_landmarks(side: str, name: str) -> None:
+    quat_WL = {s: Rotation.random(300, random_state=k).as_quat() for k, s in enumerate(SEGMENTS)}
+    frames = landmark_frames({s: Rotation.from_quat(quat).as_matrix() for s, quat in quat_WL.items()}, side)
+    angles = joint_angles(pose_with(quat_WL), name)
+    chain = ["thorax", "shoulder", "elbow", "wrist"]
+    for proximal, distal in itertools.pairwise(chain):
+        found = angles[f"{side}_{distal}"]
+        R = Rotation.from_matrix(frames[proximal].transpose(0, 2, 1) @ frames[distal])
+        np.testing.assert_allclose((R.inv() * Rotation.from_quat(found.quat)).magnitude(), 0.0, atol=1e-9)
+        sequence = name if distal == "shoulder" else "ZXY"
+        assert found.sequence == sequence
+        one = R.as_euler(sequence)
+        offset = 0.0 if sequence == "YXY" else np.pi
+        two = np.column_stack([one[:, 0] + np.pi, offset - one[:, 1], one[:, 2] + np.pi])
+        error = [np.abs(wrap(found.values - solution)).max(axis=1) for solution in (one, two)]
+        assert np.minimum(*error).max() < 1e-8
+    if side == "right":
+        R = Rotation.from_matrix(frames["thorax"])
+        np.testing.assert_allclose(
+            (R.inv() * Rotation.from_quat(angles["thorax"].quat)).magnitude(), 0.0, atol=1e-9
+        )  # the ISB's world is the identity there
+
+
+# Signs and names --------------------------------------------------------------------------------------------------
+
+# A segment of the right arm, turns about x, y, z of W, and what of the angles is to be seen [deg].
+PLAIN = {
+    "n_pose": ({}, {"elbow": {"flexion": 0.0, "carrying_angle": 0.0, "pronation": 90.0}}),
+    "abducted": ({"upper_arm": {"x": -90.0}}, {"shoulder": {"plane_of_elevation": 0.0, "elevation": -90.0}}),
+    "raised_forward": ({"upper_arm": {"y": -60.0}}, {"shoulder": {"plane_of_elevation": 90.0, "elevation": -60.0}}),
+    "raised_backward": ({"upper_arm": {"y": 40.0}}, {"shoulder": {"plane_of_elevation": -90.0, "elevation": -40.0}}),
+    "bent": ({"forearm": {"y": -80.0}}, {"elbow": {"flexion": 80.0, "carrying_angle": 0.0, "pronation": 90.0}}),
+    "palm_forward": ({"forearm": {"z": -90.0}}, {"elbow": {"flexion": 0.0, "pronation": 0.0}}),
+    "palm_back": ({"forearm": {"z": 60.0}}, {"elbow": {"flexion": 0.0, "pronation": 150.0}}),
+    "forearm_outward": ({"forearm": {"x": -10.0}}, {"elbow": {"carrying_angle": -10.0}}),
+    "hand_to_its_palm": ({"hand": {"x": 30.0}}, {"wrist": {"flexion": 30.0, "ulnar_deviation": 0.0, "pronation": 0.0}}),
+    "hand_to_the_thumb": ({"hand": {"y": -20.0}}, {"wrist": {"flexion": 0.0, "ulnar_deviation": -20.0}}),
+    "hand_to_the_little_finger": ({"hand": {"y": 20.0}}, {"wrist": {"flexion": 0.0, "ulnar_deviation": 20.0}}),
+}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("pose", PLAIN)
+def test_plain_poses_have_the_angles_of_the_isb_on_both_sides(pose: str, side: str) -> None:
+    turns, expected = PLAIN[pose]
+    quat_WL, last = {}, {}
+    for part in ARM:  # the hand goes with the forearm, that with the upper arm
+        last = turns.get(part, last)
+        sign = {"x": 1.0, "y": 1.0, "z": 1.0} if side == "right" else {"x": -1.0, "y": 1.0, "z": -1.0}
+        quat_WL[f"{side}_{part}"] = turned(**{axis: sign[axis] * angle for axis, angle in last.items()})
+    angles = joint_angles(pose_with(quat_WL))
+    for joint, named in expected.items():
+        found = angles[f"{side}_{joint}"]
+        for name, value in named.items():
+            assert np.degrees(found.values[0, found.names.index(name)]) == pytest.approx(value, abs=1e-9)
+
+
+def test_the_thorax_extends_bends_right_and_turns_left_in_the_positive() -> None:
+    for k, turn in enumerate((turned(y=-20.0), turned(x=20.0), turned(z=20.0))):
+        found = joint_angles(pose_with({"torso": turn}))["thorax"]
+        np.testing.assert_allclose(np.degrees(found.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
+    assert found.names == ("extension", "lateral_flexion_right", "axial_rotation_left")
+
+
+@pytest.mark.parametrize("name", ["XZY", "ZXY"])
+def test_the_other_sequences_of_the_shoulder_name_what_they_turn(name: str) -> None:
+    names = SHOULDER_SEQUENCES[name]
+    turns = {"flexion": turned(y=-30.0), "adduction": turned(x=30.0), "internal_rotation": turned(z=30.0)}
+    for angle, turn in turns.items():
+        found = joint_angles(pose_with({"right_upper_arm": turn}), name)["right_shoulder"]
+        assert found.names == names
+        np.testing.assert_allclose(np.degrees(found.values[0]), [30.0 * (n == angle) for n in names], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", SHOULDER_SEQUENCES)
+def test_a_mirrored_person_has_the_same_angles_on_the_other_side(name: str) -> None:
+    rng = np.random.default_rng(4)
+    quat_WL = {s: Rotation.from_rotvec(rng.normal(scale=0.4, size=(50, 3))).as_quat() for s in SEGMENTS}
+    root = rng.normal(scale=0.02, size=(len(SEGMENTS), 3, 3))
+    cov = {s: np.tile(a @ a.T, (50, 1, 1)) for s, a in zip(SEGMENTS, root, strict=True)}
+
+    def other(segment: str) -> str:
+        side, _, part = segment.partition("_")
+        return f"{'right' if side == 'left' else 'left'}_{part}" if part else segment
+
+    mirrored = {
+        other(s): Rotation.from_matrix(MIRROR @ Rotation.from_quat(q).as_matrix() @ MIRROR).as_quat()
+        for s, q in quat_WL.items()
+    }
+    axial = np.linalg.det(MIRROR) * MIRROR  # of a vector that stands for a turn
+    mirrored_cov = {other(s): axial @ c @ axial.T for s, c in cov.items()}
+    here = joint_angles(pose_with(quat_WL, segment_cov=cov), name)
+    there = joint_angles(pose_with(mirrored, segment_cov=mirrored_cov), name)
+    for joint in here.joints:
+        if joint != "thorax":
+            np.testing.assert_allclose(here[joint].values, there[other(joint)].values, atol=1e-12)
+            np.testing.assert_allclose(here[joint].std, there[other(joint)].std, atol=1e-12)
+
+
+# Uncertainty ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SHOULDER_SEQUENCES)
+def test_standard_deviations_are_those_of_drawn_errors(name: str) -> None:
+    n = 20_000
+    rng = np.random.default_rng(5)
+    middle = {s: Rotation.from_rotvec(rng.normal(scale=0.6, size=3)) for s in SEGMENTS}
+    roots = {s: np.radians(0.4) * rng.normal(size=(3, 3)) for s in SEGMENTS}  # errors lean to some direction in W
+    drawn = {s: (Rotation.from_rotvec(rng.normal(size=(n, 3)) @ roots[s].T) * middle[s]).as_quat() for s in SEGMENTS}
+    spread = joint_angles(pose_with(drawn), name)
+    cov = {s: (a @ a.T)[None] for s, a in roots.items()}
+    stated = joint_angles(pose_with({s: R.as_quat() for s, R in middle.items()}, segment_cov=cov), name)
+    assert set(stated.joints) == set(JOINTS)
+    for joint, found in stated.joints.items():
+        assert found.gimbal[0] > NEAR_LOCK
+        assert found.std is not None
+        np.testing.assert_allclose(spread[joint].values.std(axis=0), found.std[0], rtol=0.03)
+
+
+def test_towards_the_lock_the_deviation_grows_to_that_of_any_angle() -> None:
+    away = np.radians([90.0, 45.0, 20.0, 5.0, 1.0, 1e-3, 0.0])
+    given = np.column_stack([np.full(7, 0.5), -away, np.full(7, 0.2)])
+    cov = {s: np.tile(np.radians(1.0) ** 2 * np.eye(3), (7, 1, 1)) for s in SEGMENTS}
+    pose = pose_with(arm_of("right", Rotation.from_euler("YXY", given).as_matrix()), segment_cov=cov)
+    found = joint_angles(pose)["right_shoulder"]
+    assert found.std is not None
+    each = np.radians(1.0) * np.sqrt(2.0)
+    np.testing.assert_allclose(found.std[:, 1], each, rtol=1e-9)
+    np.testing.assert_allclose(found.std[:5, 2], each / np.sin(away[:5]), rtol=1e-9)
+    np.testing.assert_allclose(found.std[-2:, [0, 2]], UNKNOWN, rtol=1e-12)
+    assert np.array_equal(found.near_lock, away < np.radians(10.0))
+
+
+def test_without_covariances_there_are_no_deviations() -> None:
+    half = {s: np.eye(3)[None] * 1e-4 for s in ("torso", "right_upper_arm")}
+    angles = joint_angles(pose_with({"torso": turned(x=5.0)}, segment_cov=half))
+    assert {name for name, joint in angles.joints.items() if joint.std is not None} == {"thorax", "right_shoulder"}
+
+
+# Gaps, missing segments, bad options ------------------------------------------------------------------------------
+
+
+def test_gaps_and_what_is_not_known_are_flagged_and_hide_nothing_else() -> None:
+    n = 100
+    given = np.column_stack([np.full(n, 1.0), np.linspace(-0.5, -1.5, n), np.zeros(n)])
+    quat_WL = arm_of("right", Rotation.from_euler("YXY", given).as_matrix())
+    quat_WL["right_upper_arm"][40:45] = np.nan
+    bridged = np.zeros(n, dtype=bool)
+    bridged[70:80] = True
+    cov = {s: np.tile(1e-4 * np.eye(3), (n, 1, 1)) for s in SEGMENTS}
+    angles = joint_angles(pose_with(quat_WL, gap={"right_upper_arm": bridged}, segment_cov=cov))
+    shoulder = angles["right_shoulder"]
+    unknown = np.isnan(shoulder.values).any(axis=1)
+    assert np.array_equal(np.flatnonzero(unknown), np.arange(40, 45))
+    assert np.array_equal(shoulder.gap, unknown | bridged)
+    assert np.array_equal(angles["right_elbow"].gap, shoulder.gap)
+    assert not angles["left_shoulder"].gap.any()
+    assert np.isnan(shoulder.quat[42]).all()
+    np.testing.assert_allclose(shoulder.values[~unknown], given[~unknown], atol=1e-12)
+    found = summary(angles)["right_shoulder"]
+    assert found.gap == pytest.approx(0.15)
+    assert found.range[1] == pytest.approx(1.0)
+
+
+def test_a_segment_that_is_never_known_gives_no_number() -> None:
+    angles = joint_angles(pose_with({"right_upper_arm": np.full((20, 4), np.nan)}))
+    assert np.isnan(angles["right_shoulder"].values).all()
+    assert angles["right_shoulder"].gap.all()
+    found = summary(angles)["right_shoulder"]
+    assert np.isnan([*found.range, *found.peak_rate, found.peak_speed]).all()
+
+
+def test_only_joints_with_both_segments_are_there() -> None:
+    whole = pose_with({"torso": turned(x=5.0)})
+    some = Pose(
+        whole.time, {s: whole.quat_WL[s] for s in ("torso", "left_forearm", "right_upper_arm", "right_forearm")}, {}
+    )
+    assert list(joint_angles(some).joints) == ["thorax", "right_shoulder", "right_elbow"]
+    with pytest.raises(BadData, match=r"torso, or an upper arm and its forearm, are needed; there is: left_forearm$"):
+        joint_angles(Pose(whole.time, {"left_forearm": whole.quat_WL["left_forearm"]}, {}))
+
+
+def test_bad_options_are_named() -> None:
+    pose = pose_with({"torso": turned(x=5.0)})
+    with pytest.raises(BadOption, match=r"shoulder sequence 'YXZ' is not known; .*YXY, XZY, ZXY"):
+        joint_angles(pose, "YXZ")
+    for degrees in (1.0, 60.0, float("nan")):
+        with pytest.raises(BadOption, match=f"near_lock of {degrees:g} degrees; between 2 and 45"):
+            joint_angles(pose, near_lock=np.radians(degrees))
+    assert joint_angles(pose, near_lock=np.radians(2.0))["thorax"].near_lock.sum() == 0
+
+
+# Ranges, rates, tables --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate_hz", [40.0, 100.0, 400.0])
+def test_range_and_peak_rate_of_a_swing_are_its_closed_form(rate_hz: float) -> None:
+    frequency, reach = 0.77, np.radians(50.0)  # no whole number of samples, so that one of them is near the peak
+    t = np.arange(0.0, 20.0, 1.0 / rate_hz)
+    flexion = np.radians(70.0) + reach * np.sin(2.0 * np.pi * frequency * t)
+    forearm = Rotation.from_rotvec(np.outer(flexion, [0.0, -1.0, 0.0])).as_quat()
+    torso = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+    pose = Pose(t, {"torso": torso, "right_upper_arm": torso, "right_forearm": forearm}, {})
+    found = summary(joint_angles(pose))["right_elbow"]
+    window = round(RATE_WINDOW_S * rate_hz) / rate_hz
+    peak = 2.0 * np.pi * frequency * reach * np.sinc(frequency * window)
+    np.testing.assert_allclose(np.degrees(found.range), [100.0, 0.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(np.degrees([found.lowest[0], found.highest[0]]), [20.0, 120.0], atol=0.02)
+    assert found.peak_rate[0] == pytest.approx(peak, rel=1e-3)
+    assert found.peak_speed == pytest.approx(peak, rel=1e-3)
+    assert (found.near_lock, found.gap) == (0.0, 0.0)
+
+
+def test_near_the_lock_no_angle_makes_a_range_or_a_rate() -> None:
+    n = 400
+    rng = np.random.default_rng(6)
+    hanging = Rotation.from_rotvec(0.003 * rng.normal(size=(n, 3)))
+    raised = Rotation.from_euler(
+        "YXY", np.column_stack([np.full(n, 0.3), np.linspace(-0.2, -1.2, n), np.full(n, -0.3)])
+    )
+    angles = joint_angles(pose_with(arm_of("left", Rotation.concatenate([hanging, raised]).as_matrix())))
+    found = summary(angles)["left_shoulder"]
+    assert np.ptp(angles["left_shoulder"].values[:n, 0]) > 1.0  # it spins
+    np.testing.assert_allclose(found.range[[0, 2]], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.peak_rate, [0.0, 100.0 / (n - 1), 0.0], atol=1e-6)
+    assert found.near_lock == pytest.approx(0.5)
+    assert found.highest[1] == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_range_is_at_most_a_turn() -> None:
+    given = np.column_stack([np.linspace(0.0, 30.0, 3000), np.full(3000, -0.5), np.zeros(3000)])
+    angles = joint_angles(pose_with(arm_of("right", Rotation.from_euler("YXY", given).as_matrix())))
+    assert np.ptp(angles["right_shoulder"].values[:, 0]) == pytest.approx(30.0)
+    assert summary(angles)["right_shoulder"].range[0] == pytest.approx(2.0 * np.pi)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_a_pose_of_few_samples_has_angles(n: int) -> None:
+    angles = joint_angles(pose_with({"right_forearm": np.tile(turned(y=-30.0), (n, 1))}))
+    assert np.degrees(angles["right_elbow"].values[:, 0]) == pytest.approx(30.0)
+    assert summary_table(angles).height == 3 * len(JOINTS)
+
+
+def test_the_table_is_in_degrees_and_keeps_the_rotation() -> None:
+    n = 5
+    cov = {s: np.tile(np.radians(1.0) ** 2 * np.eye(3), (n, 1, 1)) for s in ("right_upper_arm", "right_forearm")}
+    pose = pose_with({"right_forearm": np.tile(turned(y=-30.0), (n, 1))}, segment_cov=cov)
+    table = angle_table(joint_angles(pose))
+    assert table["right_elbow_flexion_deg"].to_list() == pytest.approx([30.0] * n)
+    assert table["right_elbow_flexion_std_deg"].to_list() == pytest.approx([np.sqrt(2.0)] * n)
+    assert table["right_elbow_gimbal_deg"].to_list() == pytest.approx([90.0] * n)
+    assert table["right_shoulder_near_lock"].dtype == pl.Boolean
+    assert table["right_shoulder_near_lock"].all()
+    assert "left_elbow_flexion_std_deg" not in table.columns
+    quat = table.select([f"right_elbow_{c}" for c in ("qx", "qy", "qz", "qw")]).to_numpy()
+    values = np.radians(table.select([f"right_elbow_{a}_deg" for a in JOINTS["right_elbow"].names]).to_numpy())
+    assert (Rotation.from_quat(quat).inv() * Rotation.from_euler("ZXY", values)).magnitude().max() < 1e-12
+
+
+def test_the_axes_of_a_segment_are_right_handed() -> None:
+    for axes in ISB_AXES.values():
+        X, Y, Z = ((1 if a[0] == "+" else -1) * np.eye(3)["xyz".index(a[1])] for a in axes)
+        np.testing.assert_array_equal(np.cross(X, Y), Z)
+
+
+def test_of_a_tracked_person_the_angles_are_within_their_deviations(simulation: Simulation, person: Person) -> None:
+    pose = wp.track(simulation.recording(), replace(average_subject(), lengths=person.lengths))
+    found, true = wp.joint_angles(pose), wp.joint_angles(simulation.truth())
+    for joint in ("right_elbow", "left_elbow", "thorax"):
+        assert found[joint].std is not None
+        error = wrap(found[joint].values - true[joint].values)[~found[joint].near_lock]
+        normalised = error / found[joint].std[~found[joint].near_lock]
+        assert np.sqrt(np.mean(np.square(normalised))) < 1.5
+        assert np.degrees(np.sqrt(np.mean(np.square(error)))) < 1.5
+
+
+def test_the_page_shows_every_axis_and_angle() -> None:
+    page = (Path(__file__).resolve().parent.parent / "docs" / "angles.md").read_text(encoding="utf-8")
+    for joint in JOINTS.values():
+        assert all(f"`{name}`" in page for name in joint.names)
+    assert all(f"`{name}`" in page for names in SHOULDER_SEQUENCES.values() for name in names)
+    for segment, axes in ISB_AXES.items():
+        row = next(line for line in page.splitlines() if line.startswith(f"| `{segment}`"))
+        assert [cell.strip().strip("`") for cell in row.split("|")[2:5]] == list(axes)

@@ -1,0 +1,220 @@
+"""Samples in the order of arrival → ticks: what is on its tick is kept to the bit, whatever else happens."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from wepose_pin.readers.arrivals import (
+    BAD,
+    BRIDGE_S,
+    DUPLICATE,
+    JUMP_S,
+    LATE,
+    MISSING,
+    REORDER_S,
+    TAKEN,
+    WAIT_S,
+    Aligner,
+    Arrivals,
+    Samples,
+    Ticks,
+    arrivals,
+)
+
+NAMES = ("torso", "left_upper_arm", "left_forearm")
+RATE = 100.0
+BEGIN = 3.0
+
+
+def signals(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """gyro_S, accel_S (k, n, 3)."""
+    rng = np.random.default_rng(seed)
+    return rng.standard_normal((3, n, 3)), rng.standard_normal((3, n, 3)) + [0.0, 0.0, 9.8]
+
+
+def fed(aligner: Aligner, came: Iterable[tuple[int, float, np.ndarray, np.ndarray]]) -> Ticks:
+    """All ticks of single samples (sensor, time, gyro, accel) that come one by one."""
+    made = [
+        aligner.push(
+            arrivals([Samples(aligner.sensors[i], np.array([t]), g[None], a[None])], aligner.sensors),
+        )
+        for i, t, g, a in came
+    ]
+    made = [ticks for ticks in made if len(ticks.time)]
+    assert all(a.first + len(a.time) == b.first for a, b in pairwise(made))
+    return Ticks(made[0].first, *(np.concatenate([getattr(t, part) for t in made]) for part in Ticks._fields[1:]))
+
+
+def tick_time(k: int) -> float:
+    return BEGIN + k / RATE
+
+
+def in_order(gyro: np.ndarray, accel: np.ndarray) -> list[tuple[int, float, np.ndarray, np.ndarray]]:
+    return [(i, tick_time(k), gyro[i, k], accel[i, k]) for k in range(gyro.shape[1]) for i in range(3)]
+
+
+def test_samples_on_their_ticks_come_out_to_the_bit_and_at_once() -> None:
+    gyro, accel = signals(300)
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    ticks = fed(aligner, in_order(gyro, accel))
+    assert np.array_equal(ticks.gyro_S, gyro.swapaxes(0, 1))
+    assert np.array_equal(ticks.accel_S, accel.swapaxes(0, 1))
+    assert not ticks.lost.any()
+    assert aligner.counts[:, TAKEN].tolist() == [300] * 3
+    assert aligner.counts[:, [MISSING, LATE, DUPLICATE, BAD]].sum() == 0
+    np.testing.assert_allclose(ticks.time, BEGIN + np.arange(300) / RATE, atol=1e-12)
+
+
+def test_the_same_arrivals_in_blocks_give_the_same_ticks() -> None:
+    gyro, accel = signals(500)
+    rng = np.random.default_rng(1)
+    came = sorted(
+        ((t + rng.exponential(0.02), i, t, g, a) for i, t, g, a in in_order(gyro, accel) if rng.random() > 0.05),
+        key=lambda each: each[0],
+    )
+    one_by_one = Aligner(NAMES, RATE, BEGIN)
+    first = fed(one_by_one, [each[1:] for each in came])
+    which = np.array([each[1] for each in came], dtype=np.uint8)
+    parts = [np.array([each[k] for each in came]) for k in (2, 3, 4)]
+    blocks = Aligner(NAMES, RATE, BEGIN)
+    cuts = [0, 1, 2, 50, 700, len(came)]
+    made = [blocks.push(Arrivals(which[a:b], *(part[a:b] for part in parts))) for a, b in pairwise(cuts)]
+    for part in ("gyro_S", "accel_S", "lost"):
+        whole = np.concatenate([getattr(ticks, part) for ticks in made])
+        np.testing.assert_array_equal(whole, getattr(first, part))
+    assert np.array_equal(one_by_one.counts, blocks.counts)
+    assert first.lost.any() or np.isnan(first.gyro_S).any() or one_by_one.counts[:, LATE].any()  # something did happen
+
+
+def test_what_one_read_gives_is_taken_by_time_and_not_by_sensor() -> None:
+    """A loop that was held up reads half a second of every sensor: none of them is lost for coming second."""
+    gyro, accel = signals(200)
+    times = BEGIN + np.arange(200) / RATE
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    got = [Samples(name, times, gyro[i], accel[i]) for i, name in enumerate(NAMES)]
+    ticks = aligner.push(arrivals(got, NAMES))
+    assert np.array_equal(ticks.gyro_S, gyro.swapaxes(0, 1))
+
+
+def test_overtaken_samples_find_their_place_and_later_ones_are_late() -> None:
+    gyro, accel = signals(100)
+    came = in_order(gyro, accel)
+    at = came.index(next(c for c in came if c[0] == 1 and c[1] == tick_time(50)))
+    overtaken = came[:at] + came[at + 1 : at + 5] + [came[at]] + came[at + 5 :]
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    assert np.array_equal(fed(aligner, overtaken).gyro_S, gyro.swapaxes(0, 1))
+
+    behind = 3 * round((REORDER_S + 0.03) * RATE)
+    too_late = came[:at] + came[at + 1 : at + behind] + [came[at]] + came[at + behind :]
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    ticks = fed(aligner, too_late)
+    assert aligner.counts[1].tolist() == [0, 1, 0, 0, 99]
+    np.testing.assert_allclose(ticks.gyro_S[50, 1], 0.5 * (gyro[1, 49] + gyro[1, 51]))  # bridged
+    keep = np.ones((100, 3), dtype=bool)
+    keep[50, 1] = False
+    assert np.array_equal(ticks.gyro_S[keep], gyro.swapaxes(0, 1)[keep])
+
+
+def test_duplicates_and_what_is_no_measurement_are_counted_and_change_nothing() -> None:
+    gyro, accel = signals(100)
+    came = in_order(gyro, accel)
+    bad = [
+        (0, np.nan, gyro[0, 0], accel[0, 0]),
+        (0, tick_time(40), np.array([np.nan, 0.0, 0.0]), accel[0, 0]),
+        (0, tick_time(40), np.array([1e4, 0.0, 0.0]), accel[0, 0]),
+        (0, tick_time(40), gyro[0, 0], np.array([0.0, np.inf, 0.0])),
+        (0, tick_time(40) + 2.0 * JUMP_S, gyro[0, 0], accel[0, 0]),
+        (0, 1e300, gyro[0, 0], accel[0, 0]),
+    ]
+    mixed = came[:120] + bad + [came[118], came[119]] + came[120:]
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    assert np.array_equal(fed(aligner, mixed).gyro_S, gyro.swapaxes(0, 1))
+    assert aligner.counts[:, BAD].tolist() == [len(bad), 0, 0]
+    assert aligner.counts[:, DUPLICATE].tolist() == [0, 1, 1]
+
+
+@pytest.mark.parametrize(("lost", "bridged"), [(1, True), (5, True), (6, False), (40, False)])
+def test_holes_are_bridged_up_to_a_limit_and_then_nan(lost: int, bridged: bool) -> None:
+    assert round(BRIDGE_S * RATE) == 5
+    gyro, accel = signals(200)
+    came = [c for c in in_order(gyro, accel) if not (c[0] == 2 and 60 <= round((c[1] - BEGIN) * RATE) < 60 + lost)]
+    ticks = fed(Aligner(NAMES, RATE, BEGIN), came)
+    hole = ticks.gyro_S[60 : 60 + lost, 2]
+    if bridged:
+        share = (np.arange(1, lost + 1) / (lost + 1))[:, None]
+        np.testing.assert_allclose(hole, gyro[2, 59] + share * (gyro[2, 60 + lost] - gyro[2, 59]))
+    else:
+        assert np.isnan(hole).all()
+    back = 60 + lost + (lost == 40)  # of a sensor that was given up the first sample comes when its tick is gone
+    assert np.array_equal(ticks.gyro_S[back:, 2], gyro[2, back:])
+    assert np.array_equal(ticks.gyro_S[:, :2], gyro[:2].swapaxes(0, 1))
+
+
+def test_ticks_wait_for_a_silent_sensor_once_and_not_again() -> None:
+    gyro, accel = signals(400)
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    behind = []
+    for i, t, g, a in in_order(gyro, accel):
+        if i == 1 and 100 <= round((t - BEGIN) * RATE) < 300:
+            continue
+        aligner.push(arrivals([Samples(NAMES[i], np.array([t]), g[None], a[None])], NAMES))
+        if i == 2:
+            behind.append(round((t - BEGIN) * RATE) + 1 - aligner.next_tick)
+    wait = round(WAIT_S * RATE)
+    assert max(behind) <= wait + 1
+    assert max(behind[:100]) == 0
+    assert max(behind[100 + wait + 1 : 300]) == 0  # lost: none waits for it
+    assert max(behind[302:]) == 0  # and back
+    assert aligner.counts[1].tolist() == [200, 0, 0, 0, 200]
+
+
+def test_clocks_that_are_off_the_ticks_lose_no_rotation() -> None:
+    """A sensor 30 ppm fast and half a step off: the integral of its rate is kept."""
+    n = 3000
+    times = BEGIN - 0.0047 + np.arange(n) / (RATE * (1.0 + 3e-5))
+    rate = np.sin(2.0 * np.pi * 0.7 * times)[:, None] * [1.0, 0.0, 0.0]
+    force = np.cos(2.0 * np.pi * 0.7 * times)[:, None] * [0.0, 0.0, 9.8]
+    rows = [(0, float(t), r, f) for t, r, f in zip(times, rate, force, strict=True)]
+    ticks = fed(Aligner(NAMES[:1], RATE, BEGIN), rows)
+    turned = np.cumsum(ticks.gyro_S[:, 0, 0]) / RATE
+    expected = np.interp(ticks.time, times, np.cumsum(rate[:, 0]) / RATE)
+    np.testing.assert_allclose(turned - turned[10], expected - expected[10], atol=2e-4)
+    np.testing.assert_allclose(ticks.accel_S[:, 0, 2], 9.8 * np.cos(2.0 * np.pi * 0.7 * ticks.time), atol=6e-3)
+
+
+def test_a_faster_sensor_is_averaged_over_the_step() -> None:
+    n = 1000
+    times = BEGIN + np.arange(n) / (4.0 * RATE)
+    rate = np.random.default_rng(2).standard_normal((n, 3))
+    rows = [(0, float(t), r, r) for t, r in zip(times, rate, strict=True)]
+    ticks = fed(Aligner(NAMES[:1], RATE, BEGIN), rows)
+    means = rate[1 : 4 * ((n - 1) // 4) + 1].reshape(-1, 4, 3).mean(axis=1)
+    np.testing.assert_allclose(ticks.gyro_S[1:, 0], means[: len(ticks.time) - 1], atol=1e-9)
+
+
+def test_a_clock_that_really_went_on_is_followed() -> None:
+    """All sensors sleep for a minute: the ticks between are lost ones, and it goes on."""
+    gyro, accel = signals(200)
+    came = [(i, t + (60.0 if t >= tick_time(100) else 0.0), g, a) for i, t, g, a in in_order(gyro, accel)]
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    ticks = fed(aligner, came)
+    assert len(ticks.time) == 6200
+    assert np.isnan(ticks.gyro_S[100:6100]).all()
+    assert np.array_equal(ticks.gyro_S[6104:], gyro.swapaxes(0, 1)[104:])
+
+
+def test_random_arrivals_never_stop_the_ticks() -> None:
+    rng = np.random.default_rng(3)
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    made = 0
+    for k in range(3000):
+        wild = rng.random() < 0.1
+        t = float(rng.choice([np.nan, np.inf, -1e9, 1e9, rng.normal(0.0, 1e3)])) if wild else tick_time(k // 3)
+        values = rng.standard_normal((2, 3)) * (1e6 if rng.random() < 0.05 else 1.0)
+        name = NAMES[int(rng.integers(3))]
+        made += len(aligner.push(arrivals([Samples(name, np.array([t]), values[:1], values[1:])], NAMES)).time)
+    assert made > 900

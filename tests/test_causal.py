@@ -1,0 +1,153 @@
+"""Tracking without a look ahead: steps and runs give the same bits, and nothing later changes what was said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import BadOption, BadPhase
+from wepose_pin.recording import Recording
+from wepose_pin.simulation import Simulation
+from wepose_pin.tracking import track
+from wepose_pin.tracking.causal import HOLD_S, CausalTracker, StartGuide, start_of
+
+
+@pytest.fixture(scope="module")
+def recording(simulation: Simulation) -> Recording:
+    """The first forty seconds."""
+    return first(simulation.recording("causal"), 4000)
+
+
+def first(recording: Recording, n: int, begin: int = 0) -> Recording:
+    """Some samples of it, with the start pose alone for a phase."""
+    sensors = {
+        name: replace(
+            of,
+            gyro_S=of.gyro_S[begin:n] if of.gyro_S is not None else None,
+            accel_S=of.accel_S[begin:n] if of.accel_S is not None else None,
+        )
+        for name, of in recording.sensors.items()
+    }
+    phases = {"start": recording.phases["start"]}
+    return replace(recording, time=recording.time[begin:n], sensors=sensors, phases=phases)
+
+
+def columns(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    gyro = [sensor.gyro_S for sensor in recording.sensors.values()]
+    accel = [sensor.accel_S for sensor in recording.sensors.values()]
+    return np.stack([g for g in gyro if g is not None], axis=1), np.stack([a for a in accel if a is not None], axis=1)
+
+
+@pytest.mark.parametrize("method", ["amekf", "smekf", "ncf", "gdc"])
+def test_sample_by_sample_gives_the_bits_of_a_run_through_resets_and_gaps(recording: Recording, method: str) -> None:
+    gap = np.zeros(len(recording), dtype=bool)
+    gap[2100:2300] = True
+    sensors = dict(recording.sensors)
+    sensors["left_forearm"] = replace(sensors["left_forearm"], gap=gap)
+    recording = replace(recording, sensors=sensors, resets=(1500, 1520, 2900))
+    pose = track(recording, method=method, causal=True)
+    until, begin = start_of(recording)
+    tracker = CausalTracker(until, method=method)
+    gyro, accel = columns(recording)
+    column = tracker.names.index("left_forearm")
+    gyro[gap, column] = np.nan
+    accel[gap, column] = np.nan
+    for k in range(begin, len(recording)):
+        if k in recording.resets:
+            tracker.reset()
+        stepped = tracker.step(gyro[k], accel[k])
+        for i, name in enumerate(tracker.names):
+            assert np.array_equal(stepped[i], pose.quat_WL[name][k - begin]), (name, k)
+    assert pose.time[0] == recording.time[begin]
+    assert recording.phases["start"][0][1] < pose.time[0]
+
+
+def test_what_comes_later_changes_nothing(recording: Recording) -> None:
+    whole, part = track(recording, causal=True), track(first(recording, 2500), causal=True)
+    for name, quat in part.quat_WL.items():
+        assert np.array_equal(quat, whole.quat_WL[name][: len(quat)])
+        assert np.array_equal(part.segment_cov[name], whole.segment_cov[name][: len(quat)])
+
+
+def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording) -> None:
+    begin = recording.span(recording.phases["start"][0]).start
+    assert begin > 0
+    whole, part = track(recording, causal=True), track(first(recording, len(recording), begin), causal=True)
+    assert all(np.array_equal(part.quat_WL[name], quat) for name, quat in whole.quat_WL.items())
+
+
+def test_it_is_close_to_tracking_the_whole_recording(recording: Recording) -> None:
+    """The filter begins half a second later and is else the same."""
+    causal, whole = track(recording, causal=True), track(recording, hold_headings=False)
+    for name, quat in causal.quat_WL.items():
+        offline = Rotation.from_quat(whole.quat_WL[name][-len(quat) :])
+        assert np.degrees((offline.inv() * Rotation.from_quat(quat)).magnitude().max()) < 0.2
+
+
+def test_a_reset_turns_headings_to_where_the_person_stands(recording: Recording) -> None:
+    """Standing in the start pose with headings that are off by 30 degrees: a reset brings them back."""
+    until, begin = start_of(recording)
+    tracker = CausalTracker(until)
+    before = tracker.heading.copy()
+    tracker.heading += np.deg2rad(30.0)
+    tracker._turn = Rotation.from_rotvec(tracker.heading[:, None] * [0.0, 0.0, 1.0]).as_quat()
+    std = tracker.heading_std()
+    tracker.reset()
+    np.testing.assert_allclose(tracker.heading, before, atol=np.deg2rad(1.5))  # as the person sways
+    assert (tracker.heading_std() > std).all()  # a person stands to some degrees, a filter drifts by tenths
+    gyro, accel = columns(recording)
+    np.testing.assert_allclose(np.abs(tracker.step(gyro[begin], accel[begin])[:, 3]), 1.0, atol=0.01)
+
+
+def test_the_guide_finds_the_first_stillness_and_says_who_moves() -> None:
+    rng = np.random.default_rng(0)
+    rate, n = 100.0, 1500
+    gyro = 0.002 * rng.standard_normal((n, 3, 3))
+    gyro[:400, 1] += 2.0 * np.sin(np.arange(400) / 10.0)[:, None]
+    gyro[600, 2] = np.nan
+    guide = StartGuide(rate, 3)
+    states = [guide.push(tick) for tick in gyro]
+    assert states[50] == "moved"
+    assert guide.moving == (1,)
+    assert "hold" in states[520:600]
+    assert states[600] == "waiting"
+    assert states[601] == "hold"
+    assert states[-1] == "ready"
+    assert (guide.begin, guide.end) == (601, 600 + round(HOLD_S * rate))
+
+
+def test_a_slow_steady_turn_is_no_stillness() -> None:
+    gyro = np.full((1000, 1, 3), np.deg2rad(6.0))
+    guide = StartGuide(100.0, 1)
+    assert all(guide.push(tick) != "ready" for tick in gyro)
+
+
+def test_without_a_named_start_pose_it_is_found(recording: Recording) -> None:
+    found = track(replace(recording, phases={}), causal=True)
+    named = track(recording, causal=True)
+    assert found.time[0] == pytest.approx(recording.time[0] + HOLD_S, abs=0.5)
+    for name, quat in named.quat_WL.items():
+        both = found.quat_WL[name][-len(quat) :]
+        assert np.degrees((Rotation.from_quat(both).inv() * Rotation.from_quat(quat)).magnitude().max()) < 3.0
+
+
+def test_what_cannot_be_causal_is_said(recording: Recording) -> None:
+    with pytest.raises(BadOption, match=r"'smoother' needs the whole recording"):
+        track(recording, method="smoother", causal=True)
+    torso = recording.sensors["torso"]
+    identity = np.tile([0.0, 0.0, 0.0, 1.0], (len(recording), 1))
+    ready = {**recording.sensors, "torso": replace(torso, gyro_S=None, accel_S=None, quat_WS=identity)}
+    with pytest.raises(BadOption, match=r"sensors.torso comes with ready orientations"):
+        track(replace(recording, sensors=ready), causal=True)
+    end = float(recording.time[-1])
+    with pytest.raises(BadPhase, match="ends with the recording"):
+        track(replace(recording, phases={"start": ((end - 2.0, end),)}), causal=True)
+    moving = {
+        name: replace(of, gyro_S=(of.gyro_S if of.gyro_S is not None else 0.0) + 1.0)
+        for name, of in recording.sensors.items()
+    }
+    with pytest.raises(BadPhase, match="nobody stands still for 3 s"):
+        track(replace(recording, sensors=moving, phases={}), causal=True)

@@ -1,0 +1,502 @@
+"""Files of devices and programs: each written as its maker writes it, of one known motion, and read back in SI."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.io import savemat
+from scipy.spatial.transform import Rotation
+
+import wepose_pin as wp
+from wepose_pin.errors import BadData, BadSession, MissingFile, UnknownColumn, WeposeError
+from wepose_pin.readers.device import segment_of, unwrapped
+from wepose_pin.readers.formats import format_of, read_device
+from wepose_pin.readers.guess import guess_columns
+from wepose_pin.recording import Recording
+
+N, RATE = 400, 100.0
+TIME = np.arange(N) / RATE
+R_WS = Rotation.from_euler("ZYX", np.column_stack([0.8 * np.sin(TIME), 0.5 * np.sin(2 * TIME), 0.3 * TIME]))
+GYRO = np.concatenate([np.zeros((1, 3)), (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * RATE])
+ACCEL = R_WS.inv().apply([0.0, 0.0, 9.80665])
+WXYZ = R_WS.as_quat()[:, [3, 0, 1, 2]]
+
+
+def rows(columns: list[np.ndarray | list[str]], separator: str = ",", decimal: str = ".") -> str:
+    cells = [[v if isinstance(v, str) else f"{v:.9g}" for v in column] for column in columns]
+    return "".join(separator.join(row).replace(".", decimal) + "\n" for row in zip(*cells, strict=True))
+
+
+def load(folder: Path, text: str) -> Recording:
+    (folder / "session.toml").write_text(text, encoding="utf-8")
+    return wp.load_session(folder / "session.toml")
+
+
+def check_raw(recording: Recording, segment: str = "torso") -> None:
+    sensor = recording.sensors[segment]
+    np.testing.assert_allclose(sensor.gyro_S, GYRO, atol=1e-6)
+    np.testing.assert_allclose(sensor.accel_S, ACCEL, atol=1e-6)
+    np.testing.assert_allclose(recording.time, TIME, atol=1e-6)
+
+
+def check_orientation(recording: Recording, segment: str = "torso") -> None:
+    sensor = recording.sensors[segment]
+    assert sensor.gyro_S is None
+    assert (Rotation.from_quat(sensor.quat_WS).inv() * R_WS).magnitude().max() < 1e-6
+    assert not sensor.aligned
+
+
+# Xsens MT Manager --------------------------------------------------------------------------------------------------
+
+PREAMBLE = (
+    "// Start Time: Unknown\n// Update Rate: 100.0Hz\n// Filter Profile: human (46.1)\n// Firmware Version: 4.6.0\n"
+)
+MT_RAW = [f"{kind}_{axis}" for kind in ("Acc", "Gyr") for axis in "XYZ"]
+
+
+def mt_manager(
+    path: Path, *, separator: str = "\t", decimal: str = ".", preamble: str = PREAMBLE, first: int = 0, raw: bool = True
+) -> Path:
+    matrix = R_WS.as_matrix().transpose(0, 2, 1).reshape(N, 9)  # columns of the matrix one after the other
+    names = ["PacketCounter", "SampleTimeFine", *(MT_RAW if raw else [])]
+    names += [f"Mat[{row}][{column}]" for column in (1, 2, 3) for row in (1, 2, 3)]
+    columns: list[Any] = [[f"{(first + k) % 65536:05d}" for k in range(N)], [""] * N]
+    columns += [*ACCEL.T, *GYRO.T, *matrix.T] if raw else [*matrix.T]
+    path.write_text(preamble + separator.join(names) + "\n" + rows(columns, separator, decimal), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(("separator", "decimal"), [("\t", "."), (",", "."), (";", "."), (";", ","), ("\t", ",")])
+def test_mt_manager_in_every_separator(separator: str, decimal: str, tmp_path: Path) -> None:
+    path = mt_manager(tmp_path / "MT_012345_001-000_00B40001.txt", separator=separator, decimal=decimal)
+    assert format_of(path) == "mt_manager"
+    check_raw(load(tmp_path, f'[data]\nfile = "{path.name}"\n[sensors.torso]'))
+    check_orientation(load(tmp_path, f'[data]\nfile = "{path.name}"\nuse = "orientation"\n[sensors.torso]'))
+
+
+@pytest.mark.parametrize("names", ["Quat_q0 Quat_q1 Quat_q2 Quat_q3", "Quat_w Quat_x Quat_y Quat_z", "Roll Pitch Yaw"])
+def test_mt_manager_orientations_of_each_kind(names: str, tmp_path: Path) -> None:
+    values = WXYZ if names.startswith("Quat") else np.degrees(R_WS.as_euler("ZYX"))[:, ::-1]
+    columns: list[Any] = [[str(k) for k in range(N)], *values.T]
+    text = PREAMBLE + "\t".join(["PacketCounter", *names.split()]) + "\n" + rows(columns, "\t")
+    (tmp_path / "a.txt").write_text(text)
+    check_orientation(load(tmp_path, '[data]\nfile = "a.txt"\n[sensors.torso]'))
+
+
+def test_sensors_of_one_station_share_its_counter(tmp_path: Path) -> None:
+    """One sensor comes ten packets later and after the counter began anew."""
+    mt_manager(tmp_path / "a.txt", first=65530)
+    mt_manager(tmp_path / "b.txt", first=4)
+    sensors = '[sensors.torso]\nfile = "a.txt"\n[sensors.left_forearm]\nfile = "b.txt"\n'
+    recording = load(tmp_path, f"[data]\n{sensors}")
+    assert recording.time[0] == pytest.approx(0.10)
+    assert len(recording) == N - 10
+    np.testing.assert_allclose(recording.sensors["left_forearm"].accel_S, ACCEL[:-10], atol=1e-6)
+    np.testing.assert_allclose(recording.sensors["torso"].accel_S, ACCEL[10:], atol=1e-6)
+
+
+def test_packets_lost_on_the_air_are_gaps(tmp_path: Path) -> None:
+    path = mt_manager(tmp_path / "a.txt")
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:100] + lines[103:]))
+    recording = load(tmp_path, '[data]\nfile = "a.txt"\n[sensors.torso]')
+    assert len(recording) == N
+    assert "3 samples" in recording.notes[0]
+
+
+def test_without_a_rate_the_fine_time_counts_tenths_of_milliseconds(tmp_path: Path) -> None:
+    fine = [str((4294967000 + 100 * k) % 2**32) for k in range(N)]
+    text = "// a\n" + ",".join(["PacketCounter", "SampleTimeFine", *MT_RAW]) + "\n"
+    (tmp_path / "a.txt").write_text(text + rows([[str(k) for k in range(N)], fine, *ACCEL.T, *GYRO.T]))
+    check_raw(load(tmp_path, '[data]\nfile = "a.txt"\n[sensors.torso]'))
+
+
+# Movella DOT -------------------------------------------------------------------------------------------------------
+
+DOT = (
+    "sep=,\nDeviceTag:,{tag}\nFirmwareVersion:,3.0.0\nAppVersion:,2023.6.0\nSyncStatus:,{sync}\nOutputRate:,100Hz\n"
+    "FilterProfile:,General\nMeasurement Mode:,Custom Mode 5\nStartTime: ,2025-07-11_20:06:00_086 WEST\n"
+    "© Movella Technologies B. V. 2005-2025\n\n"
+)
+
+
+def dot(path: Path, mode: str = "rates", *, tag: str = "left_wrist", sync: str = "Synced", first_us: int = 0) -> Path:
+    fine = [str((first_us + 10000 * k) % 2**32) for k in range(N)]
+    step = np.concatenate([np.zeros((1, 3)), (R_WS[:-1].inv() * R_WS[1:]).as_rotvec()])
+    modes: dict[str, dict[str, np.ndarray]] = {
+        "rates": {
+            "Quat_W,Quat_X,Quat_Y,Quat_Z": WXYZ,
+            "Acc_X,Acc_Y,Acc_Z": ACCEL,
+            "Gyr_X,Gyr_Y,Gyr_Z": np.degrees(GYRO),
+        },
+        "increments": {
+            "dq_W,dq_X,dq_Y,dq_Z": Rotation.from_rotvec(step).as_quat()[:, [3, 0, 1, 2]],
+            "dv[1],dv[2],dv[3]": ACCEL / RATE,
+        },
+        "quaternion": {"Quat_W,Quat_X,Quat_Y,Quat_Z": WXYZ, "FreeAcc_X,FreeAcc_Y,FreeAcc_Z": ACCEL},
+        "euler": {"Euler_X,Euler_Y,Euler_Z": np.degrees(R_WS.as_euler("ZYX"))[:, ::-1]},
+    }
+    names = ",".join(["PacketCounter", "SampleTimeFine", *modes[mode], "Status"])
+    columns: list[Any] = [[str(k + 1) for k in range(N)], fine]
+    columns += [*np.column_stack(list(modes[mode].values())).T, ["0"] * N]
+    text = DOT.format(tag=tag, sync=sync) + names + "\n" + rows(columns)
+    path.write_bytes(text.encode("latin-1"))  # the sign © in the encoding of some Windows
+    return path
+
+
+@pytest.mark.parametrize("mode", ["rates", "increments"])
+def test_dot_rates_and_increments(mode: str, tmp_path: Path) -> None:
+    path = dot(tmp_path / "1_20250711.csv", mode)
+    assert format_of(path) == "dot"
+    recording = load(tmp_path, f'[data]\nfile = "{path.name}"\n[sensors.left_forearm]')
+    check_raw(recording, "left_forearm")
+
+
+@pytest.mark.parametrize("mode", ["rates", "quaternion", "euler"])
+def test_dot_orientations(mode: str, tmp_path: Path) -> None:
+    path = dot(tmp_path / "1.csv", mode)
+    check_orientation(load(tmp_path, f'[data]\nfile = "{path.name}"\nuse = "orientation"\n[sensors.torso]'))
+
+
+def test_dot_clocks_that_were_synchronised_are_one_even_where_they_begin_anew(tmp_path: Path) -> None:
+    dot(tmp_path / "a.csv", first_us=2**32 - 2_000_000)
+    dot(tmp_path / "b.csv", first_us=2**32 - 1_800_000)
+    dot(tmp_path / "c.csv", first_us=100_000)  # 2.1 s after the first
+    sensors = "".join(
+        f'[sensors.{name}]\nfile = "{file}.csv"\n'
+        for name, file in (("torso", "a"), ("left_forearm", "b"), ("right_forearm", "c"))
+    )
+    recording = load(tmp_path, f"[data]\n{sensors}")
+    assert recording.time[0] == pytest.approx(2.1)
+    np.testing.assert_allclose(recording.sensors["torso"].accel_S[0], ACCEL[210], atol=1e-6)
+    np.testing.assert_allclose(recording.sensors["left_forearm"].accel_S[0], ACCEL[190], atol=1e-6)
+    np.testing.assert_allclose(recording.sensors["right_forearm"].accel_S[0], ACCEL[0], atol=1e-6)
+
+
+def test_dot_that_was_not_synchronised_is_said(tmp_path: Path) -> None:
+    dot(tmp_path / "a.csv", sync="Un-synced")
+    recording = load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.torso]')
+    assert recording.notes == ("a.csv: SyncStatus says that it is not synced",)
+
+
+def test_a_dot_without_its_preamble_must_be_named_if_rates_alone_are_in_it(tmp_path: Path) -> None:
+    path = dot(tmp_path / "a.csv")
+    table = path.read_bytes().partition(b"\n\n")[2]
+    path.write_bytes(table)
+    assert format_of(path) == "dot"  # Quat_W is the DOT's word
+    path.write_bytes(table.replace(b"Quat_", b"Other_"))
+    assert format_of(path) is None  # Gyr_X could be in deg/s or rad/s
+    with pytest.raises(BadSession, match=r"sensors\.torso\.gyro is missing"):
+        load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.torso]')
+    check_raw(load(tmp_path, '[data]\nfile = "a.csv"\nformat = "dot"\n[sensors.torso]'))
+
+
+# x-io x-IMU3 -------------------------------------------------------------------------------------------------------
+
+
+def ximu3(folder: Path, first_us: int = 52100347) -> Path:
+    folder.mkdir()
+    fine = [str(first_us + 10000 * k) for k in range(N)]
+    names = "Timestamp (us),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),"
+    names += "Accelerometer X (g),Accelerometer Y (g),Accelerometer Z (g)\n"
+    (folder / "Inertial.csv").write_text(names + rows([fine, *np.degrees(GYRO).T, *(ACCEL / 9.80665).T]))
+    (folder / "Quaternion.csv").write_text("Timestamp (us),W,X,Y,Z\n" + rows([fine, *WXYZ.T]))
+    return folder
+
+
+@pytest.mark.parametrize("first_us", [52100347, 1_700_000_000_000_000])
+def test_ximu3_by_its_folder_or_a_file_of_it(first_us: int, tmp_path: Path) -> None:
+    ximu3(tmp_path / "x-IMU3 12AB34CD (UDP)", first_us)
+    for file in ("x-IMU3 12AB34CD (UDP)", "x-IMU3 12AB34CD (UDP)/Inertial.csv"):
+        assert format_of(tmp_path / file) == "ximu3"
+        check_raw(load(tmp_path, f'[data]\nfile = "{file}"\n[sensors.torso]'))
+    file = "x-IMU3 12AB34CD (UDP)"
+    check_orientation(load(tmp_path, f'[data]\nfile = "{file}"\nuse = "orientation"\n[sensors.torso]'))
+    check_orientation(load(tmp_path, f'[data]\nfile = "{file}/Quaternion.csv"\n[sensors.torso]'))
+
+
+def test_ximu3_devices_that_were_switched_on_at_other_times_need_an_offset(tmp_path: Path) -> None:
+    ximu3(tmp_path / "a")
+    ximu3(tmp_path / "b", 90_000_000)
+    text = '[data]\n[sensors.torso]\nfile = "a"\n[sensors.left_forearm]\nfile = "b"\n'
+    with pytest.raises(BadData, match=r"clocks do not overlap .*check each sensor's time and offset_s"):
+        load(tmp_path, text)
+    recording = load(tmp_path, f"{text}offset_s = -37.899653\n")
+    assert len(recording) >= N - 1
+
+
+def test_ximu3_folder_without_what_is_asked_for(tmp_path: Path) -> None:
+    (ximu3(tmp_path / "a") / "Quaternion.csv").unlink()
+    with pytest.raises(MissingFile, match=r"no Quaternion\.csv in it"):
+        load(tmp_path, '[data]\nfile = "a"\nuse = "orientation"\n[sensors.torso]')
+
+
+# OpenSim -----------------------------------------------------------------------------------------------------------
+
+
+def sto(path: Path, kind: str = "Quaternion", labels: tuple[str, ...] = ("torso_imu", "humerus_r_imu")) -> Path:
+    cells = [",".join(f"{value:.9f}" for value in quat) for quat in WXYZ]
+    head = f"DataRate=100.000000\nDataType={kind}\nversion=3\nOpenSimVersion=4.4\nendheader\n"
+    names = "\t".join(["time", *labels]) + "\n"
+    path.write_text(
+        head + names + "".join(f"{t:.6f}" + f"\t{c}" * len(labels) + "\n" for t, c in zip(TIME, cells, strict=True))
+    )
+    return path
+
+
+def test_opensim_orientations(tmp_path: Path) -> None:
+    sto(tmp_path / "trial_orientations.sto")
+    text = '[data]\nfile = "trial_orientations.sto"\n[sensors.torso]\n[sensors.right_upper_arm]\n'
+    recording = load(tmp_path, text)
+    check_orientation(recording)
+    check_orientation(recording, "right_upper_arm")
+    recording = load(tmp_path, '[data]\nfile = "trial_orientations.sto"\n[sensors.head]\nlabel = "humerus_r_imu"')
+    check_orientation(recording, "head")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("DataType=Quaternion", "DataType=double"), "DataType=double; orientations are needed"),
+        (("endheader", "end"), "no line 'endheader'"),
+        (("0.010000\t", "0.010000\tmore\t"), "row 2 has 4 cells, the line of names has 3"),
+        (("time\ttorso_imu", "torso_imu\ttime"), "a line of names that begins with time"),
+        (("humerus_r_imu", "torso_imu"), "two columns have one name"),
+        (("1.000000000,0.", "one,0."), "column 'torso_imu' holds 'one,0"),
+    ],
+)
+def test_opensim_files_that_are_wrong(change: tuple[str, str], says: str, tmp_path: Path) -> None:
+    path = sto(tmp_path / "a.sto")
+    path.write_text(path.read_text().replace(*change))
+    with pytest.raises(BadData, match=says):
+        read_device(path, "opensim")
+
+
+# HDF5 and MATLAB ---------------------------------------------------------------------------------------------------
+
+ARRAYS = """
+[data]
+file = "{file}"
+time = "/clock/time"
+gyro_unit = "rad/s"
+accel_unit = "m/s^2"
+[sensors.torso]
+gyro = "/imu/torso/gyro"
+accel = "/imu/torso/accel"
+"""
+READY = """
+[data]
+file = "{file}"
+rate_hz = 100.0
+[sensors.torso]
+orientation = ["/q[1]", "/q[2]", "/q[3]", "/q[0]"]
+"""
+
+
+def hdf5(path: Path, turned: bool = False) -> Path:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for name, values in {"/imu/torso/gyro": GYRO, "/imu/torso/accel": ACCEL, "/q": WXYZ}.items():
+            file[name] = values.T if turned else values
+        file["/clock/time"] = TIME[None] if turned else TIME
+        file["/note"] = "walking"
+    return path
+
+
+def mat(path: Path) -> Path:
+    savemat(path, {"imu": {"torso": {"gyro": GYRO, "accel": ACCEL}}, "clock": {"time": TIME}, "q": WXYZ, "note": "a"})
+    return path
+
+
+@pytest.mark.parametrize("make", [hdf5, lambda path: hdf5(path, True), mat], ids=["hdf5", "turned", "mat"])
+def test_arrays_by_their_path(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    path = make(tmp_path / ("a.mat" if make is mat else "a.h5"))
+    check_raw(load(tmp_path, ARRAYS.format(file=path.name)))
+    check_raw(load(tmp_path, ARRAYS.format(file=path.name).replace("/imu/torso/gyro", "imu.torso.gyro")))
+    check_orientation(load(tmp_path, READY.format(file=path.name)))
+
+
+def test_a_mat_file_of_version_7_3_is_hdf5(tmp_path: Path) -> None:
+    h5 = hdf5(tmp_path / "a.h5", True).read_bytes()
+    with pytest.importorskip("h5py").File(tmp_path / "b.mat", "w", userblock_size=512) as file:
+        for name, values in {"/imu/torso/gyro": GYRO, "/imu/torso/accel": ACCEL, "/clock/time": TIME[None]}.items():
+            file[name] = values.T if values.shape[0] == N else values
+    (tmp_path / "a.h5").unlink()
+    raw = bytearray((tmp_path / "b.mat").read_bytes())
+    raw[:10] = b"MATLAB 7.3"
+    (tmp_path / "b.mat").write_bytes(raw)
+    assert h5[:8] == raw[512:520]
+    check_raw(load(tmp_path, ARRAYS.format(file="b.mat")))
+
+
+def test_without_h5py_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hdf5(tmp_path / "a.h5")
+    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
+    with pytest.raises(BadData, match=r"a\.h5: is HDF5 .* pip install 'wepose-pin\[hdf5\]'"):
+        load(tmp_path, ARRAYS.format(file="a.h5"))
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "says"),
+    [
+        (("/imu/torso/gyro", "/imu/torso/gyr"), UnknownColumn, "no array '/imu/torso/gyr' in a.mat; did you mean"),
+        (("/imu/torso/gyro", "/q"), BadData, r"/q in a\.mat has shape \(400, 4\); \(n, 3\) is needed"),
+        (("/clock/time", "/q"), BadData, r"name a column: /q\[0\]"),
+        (('"/imu/torso/gyro"', '["/q[0]", "/q[1]", "/q[9]"]'), UnknownColumn, "no column 9 in /q"),
+    ],
+)
+def test_arrays_that_are_not_there(change: tuple[str, str], kind: type, says: str, tmp_path: Path) -> None:
+    mat(tmp_path / "a.mat")
+    with pytest.raises(kind, match=says):
+        load(tmp_path, ARRAYS.format(file="a.mat").replace(*change))
+
+
+def test_arrays_of_unlike_length_are_named(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"imu": {"torso": {"gyro": GYRO[:-1], "accel": ACCEL}}, "clock": {"time": TIME}})
+    with pytest.raises(BadData, match=r"differ in length: .*gyro\[0\] 399"):
+        load(tmp_path, ARRAYS.format(file="a.mat"))
+
+
+def test_an_array_named_in_a_csv_is_an_error(tmp_path: Path) -> None:
+    pl.DataFrame({"clock": TIME}).write_csv(tmp_path / "a.csv")
+    with pytest.raises(BadSession, match=r"sensors\.torso\.gyro is '/imu/torso/gyro'; a list of 3 column names"):
+        load(tmp_path, ARRAYS.format(file="a.csv"))
+
+
+# What every reader does --------------------------------------------------------------------------------------------
+
+MAKERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "mt_manager": ("a.txt", mt_manager),
+    "dot": ("a.csv", dot),
+    "ximu3": ("x", ximu3),
+    "opensim": ("a.sto", sto),
+}
+
+
+def made(format: str, folder: Path) -> Path:
+    name, make = MAKERS[format]
+    path = make(folder / name)
+    return path / "Inertial.csv" if path.is_dir() else path
+
+
+@pytest.mark.parametrize("format", MAKERS)
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda _: b"",
+        lambda _: b"\x00\xff\xfe\x01" * 300,
+        lambda raw: raw[:60],
+        lambda raw: raw.decode("latin-1").encode("utf-16"),
+        lambda raw: raw[: raw.rfind(b"\n", 0, 700)] + b"\n" + b"\xff\x00" * 300,
+        lambda raw: raw.replace(b"\n", b"\n###", 900),
+    ],
+    ids=["empty", "binary", "head alone", "UTF-16", "garbage after the names", "text in the cells"],
+)
+def test_a_damaged_file_is_one_line_that_names_it(
+    format: str, damage: Callable[[bytes], bytes], tmp_path: Path
+) -> None:
+    path = made(format, tmp_path)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(WeposeError) as error:
+        load(tmp_path, f'[data]\nfile = "{path.relative_to(tmp_path)}"\nformat = "{format}"\n[sensors.torso]')
+    assert "\n" not in str(error.value)
+    assert path.name in str(error.value)
+
+
+@pytest.mark.parametrize("format", ["mt_manager", "dot", "ximu3"])
+def test_a_last_line_that_was_cut_off_is_left_out(format: str, tmp_path: Path) -> None:
+    path = made(format, tmp_path)
+    path.write_bytes(path.read_bytes()[:-60])
+    recording = load(tmp_path, f'[data]\nfile = "{path.relative_to(tmp_path)}"\n[sensors.torso]')
+    assert N - 2 <= len(recording) < N
+    np.testing.assert_allclose(recording.sensors["torso"].accel_S, ACCEL[: len(recording)], atol=1e-6)
+
+
+@pytest.mark.parametrize("format", ["mt_manager", "dot", "ximu3"])
+def test_gigantic_numbers_are_refused(format: str, tmp_path: Path) -> None:
+    path = made(format, tmp_path)
+    text = path.read_text(encoding="latin-1")
+    lines = text.splitlines()
+    cell = "\t" if format == "mt_manager" else ","
+    cells = lines[-40].split(cell)
+    cells[{"mt_manager": 2, "dot": 7, "ximu3": 4}[format]] = "1e300"
+    lines[-40] = cell.join(cells)
+    path.write_text("\n".join(lines) + "\n", encoding="latin-1")
+    with pytest.raises(BadData, match=r"no sensor measures above"):
+        load(tmp_path, f'[data]\nfile = "{path.relative_to(tmp_path)}"\n[sensors.torso]')
+
+
+@pytest.mark.parametrize("format", MAKERS)
+def test_raw_data_that_are_not_there_cannot_be_used(format: str, tmp_path: Path) -> None:
+    path = made(format, tmp_path)
+    if format == "opensim":
+        with pytest.raises(BadData, match="no gyroscope and accelerometer"):
+            read_device(path, format, "raw")
+        return
+    path.write_bytes(path.read_bytes().replace(b"Gyr", b"Gxx"))
+    if format == "ximu3":
+        with pytest.raises(BadData, match="neither Gyroscope X"):
+            read_device(path, format, "raw")
+        return
+    with pytest.raises(BadData, match=r"leave out data\.use"):
+        read_device(path, format, "raw")
+
+
+def test_a_session_in_pieces_is_the_session(tmp_path: Path) -> None:
+    mt_manager(tmp_path / "a.txt")
+    whole = load(tmp_path, '[data]\nfile = "a.txt"\n[sensors.torso]')
+    pieces = list(wp.readers.iter_session(tmp_path / "session.toml", 1.0))
+    assert len(pieces) == 4
+    np.testing.assert_array_equal(
+        np.concatenate([p.sensors["torso"].gyro_S for p in pieces]), whole.sensors["torso"].gyro_S
+    )
+
+
+def test_a_counter_that_begins_anew_goes_on() -> None:
+    counter = np.array([65534.0, 65535.0, np.nan, 1.0, 2.0])
+    np.testing.assert_array_equal(unwrapped(counter, 65536.0), [65534.0, 65535.0, np.nan, 65537.0, 65538.0])
+
+
+@pytest.mark.parametrize(
+    ("label", "segment"),
+    [
+        ("torso_imu", "torso"),
+        ("humerus_r_imu", "right_upper_arm"),
+        ("ulna_l_imu", "left_forearm"),
+        ("LeftForeArm", "left_forearm"),
+        ("T8", "torso"),
+        ("Right upper arm", "right_upper_arm"),
+        ("left_wrist", "left_forearm"),
+        ("hand_r", "right_hand"),
+        ("sternum", "torso"),
+        ("pelvis_imu", "pelvis"),
+        ("MT_012345_001-000_00B40001", None),
+        ("forearm", None),
+        ("tibia_r_imu", None),
+        ("head", "head"),
+    ],
+)
+def test_segments_by_their_names(label: str, segment: str | None) -> None:
+    assert segment_of(label) == segment
+
+
+def test_columns_by_their_names() -> None:
+    names = (
+        "Time (s),chest_gyro_x [deg/s],chest_gyro_y [deg/s],chest_gyro_z [deg/s],chest_acc_x,chest_acc_y,chest_acc_z"
+    )
+    found = guess_columns([*names.split(","), "chest_mag_x", "chest_mag_y", "chest_mag_z", "left_wrist_qw"])
+    assert found.time == "Time (s)"
+    assert found.degrees
+    assert list(found.sensors) == ["torso"]
+    assert found.sensors["torso"]["accel"] == ["chest_acc_x", "chest_acc_y", "chest_acc_z"]
+    found = guess_columns(["t", "gx", "gy", "gz", "ax", "ay", "az"])
+    assert found.sensors == {"torso": {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
+    assert not found.sure
+    found = guess_columns(["head_q0", "head_q1", "head_q2", "head_q3"])
+    assert found.sensors == {"head": {"orientation": ["head_q1", "head_q2", "head_q3", "head_q0"]}}
+    assert guess_columns(["a", "b", "velocity_x"]).sensors == {}

@@ -1,0 +1,317 @@
+"""The live loop: what it shows is what it records and what tracking the file gives, whatever befalls the samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_causal import first
+
+from wepose_pin.errors import BadData, ExistingOutput, MissingFile
+from wepose_pin.live.loop import Ended, Latencies, LiveLoop
+from wepose_pin.live.sources.replay import ReplaySource
+from wepose_pin.live.state import LivePose, Stage, Status
+from wepose_pin.live.wearing import Wearing
+from wepose_pin.readers.arrivals import Samples
+from wepose_pin.readers.live_log import SAMPLES, blocks, read_live_log
+from wepose_pin.recording import Recording
+from wepose_pin.simulation import Simulation
+from wepose_pin.tracking import track
+from wepose_pin.writers.live_log import LiveLog
+
+
+@pytest.fixture(scope="module")
+def recording(simulation: Simulation) -> Recording:
+    """The first thirty seconds."""
+    return first(simulation.recording("live"), 3000)
+
+
+class Watcher:
+    """An output that keeps what it was shown, and presses keys when the time has come."""
+
+    def __init__(self, keys: Sequence[tuple[float, str]] = ()) -> None:
+        self.stage: Stage | None = None
+        self.poses: list[LivePose] = []
+        self.statuses: list[Status] = []
+        self.closed = False
+        self._keys = list(keys)
+
+    def start(self, stage: Stage) -> None:
+        self.stage = stage
+
+    def show(self, pose: LivePose) -> None:
+        self.poses.append(pose)
+
+    def status(self, status: Status) -> None:
+        self.statuses.append(status)
+
+    def take_keys(self) -> list[str]:
+        now = self.poses[-1].time if self.poses else -math.inf
+        due = [key for at, key in self._keys if at <= now]
+        self._keys = [(at, key) for at, key in self._keys if at > now]
+        return due
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Chaos:
+    """A recording whose samples come as they may: a virtual clock, 20 ms from read to read."""
+
+    rate_hz: float | None
+
+    def __init__(self, recording: Recording, arrivals: list[tuple[float, Samples]]) -> None:
+        self.sensors = tuple(recording.sensors)
+        self.rate_hz = recording.rate_hz
+        self.problems: dict[str, int] = {}
+        self._arrivals, self._now, self._at = sorted(arrivals, key=lambda a: a[0]), float(recording.time[0]), 0
+
+    def open(self) -> None: ...
+
+    def read(self, timeout_s: float) -> list[Samples] | None:
+        assert timeout_s > 0.0
+        if self._at == len(self._arrivals):
+            return None
+        self._now += 0.02
+        got = []
+        while self._at < len(self._arrivals) and self._arrivals[self._at][0] <= self._now:
+            got.append(self._arrivals[self._at][1])
+            self._at += 1
+        return got
+
+    def clock(self) -> float:
+        return self._now
+
+    def close(self) -> None: ...
+
+
+def single(recording: Recording, name: str, k: int) -> Samples:
+    sensor = recording.sensors[name]
+    assert sensor.gyro_S is not None
+    assert sensor.accel_S is not None
+    return Samples(name, recording.time[k : k + 1], sensor.gyro_S[k : k + 1], sensor.accel_S[k : k + 1])
+
+
+def live(
+    recording: Recording, file: Path, source: Chaos | None = None, watcher: Watcher | None = None, method: str = "amekf"
+) -> Ended:
+    wearing = Wearing.of(recording)
+    log = LiveLog(file, wearing.header(tuple(recording.sensors)) | {"method": method})
+    loop = LiveLoop(
+        source or ReplaySource(recording, math.inf),
+        wearing,
+        method=method,
+        log=log,
+        begin=float(recording.time[0]),
+        outputs=[watcher] if watcher else [],
+    )
+    return loop.run()
+
+
+@pytest.mark.parametrize("method", ["amekf", "smekf", "ncf"])
+def test_live_its_file_and_causal_tracking_give_the_same_bits(
+    recording: Recording, tmp_path: Path, method: str
+) -> None:
+    ended = live(recording, tmp_path / "a.wepose", method=method)
+    found = read_live_log(tmp_path / "a.wepose")
+    causal, again = track(recording, method=method, causal=True), track(found.recording, method=method, causal=True)
+    assert not found.broken_off
+    assert found.first == len(recording) - len(causal.time)
+    assert ended.poses == len(found.quat_WL) == len(causal.time) == len(again.time)
+    for i, name in enumerate(recording.sensors):
+        assert np.array_equal(found.quat_WL[:, i], causal.quat_WL[name])
+        assert np.array_equal(found.quat_WL[:, i], again.quat_WL[name])
+        assert ended.counts[name]["taken"] == len(recording)
+        assert ended.counts[name]["missing"] == ended.counts[name]["late"] == 0
+
+
+def test_a_marked_gap_is_silence_live_and_causally(recording: Recording, tmp_path: Path) -> None:
+    gap = np.zeros(len(recording), dtype=bool)
+    gap[1500:1700] = True
+    sensors = {**recording.sensors, "torso": replace(recording.sensors["torso"], gap=gap)}
+    recording = replace(recording, sensors=sensors)
+    live(recording, tmp_path / "a.wepose")
+    found = read_live_log(tmp_path / "a.wepose")
+    causal = track(recording, causal=True)
+    assert all(np.array_equal(found.quat_WL[:, i], causal.quat_WL[n]) for i, n in enumerate(recording.sensors))
+    lost = found.recording.sensors["torso"].gap
+    assert lost is not None
+    np.testing.assert_array_equal(np.flatnonzero(lost), np.flatnonzero(gap))
+
+
+def test_heading_resets_are_in_the_file(recording: Recording, tmp_path: Path) -> None:
+    watcher = Watcher([(12.0, "r"), (20.0, "r"), (28.0, "q")])
+    ended = live(recording, tmp_path / "a.wepose", watcher=watcher)
+    found = read_live_log(tmp_path / "a.wepose")
+    assert len(found.recording.resets) == 2
+    again = track(found.recording, causal=True)
+    assert all(np.array_equal(found.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
+    untouched = track(recording, causal=True)
+    before = found.recording.resets[0] - found.first
+    assert np.array_equal(found.quat_WL[:before, 0], untouched.quat_WL["torso"][:before])
+    assert not np.array_equal(found.quat_WL[before + 5, 0], untouched.quat_WL["torso"][before + 5])
+    assert ended.poses < len(untouched.time)  # q ended it
+    assert watcher.closed
+    ages = [status.sensors[0].heading_age for status in watcher.statuses if status.state == "ready"]
+    assert watcher.statuses[-1].state == "ended"
+    assert all(age >= 0.0 for age in ages)
+
+
+def test_outputs_get_the_newest_pose_with_its_points(recording: Recording, tmp_path: Path) -> None:
+    watcher = Watcher()
+    live(recording, tmp_path / "a.wepose", watcher=watcher)
+    causal = track(recording, causal=True)
+    assert watcher.stage is not None
+    assert watcher.stage.segments == tuple(recording.sensors)
+    for pose in watcher.poses[:: len(watcher.poses) // 10]:
+        k = int(np.argmin(np.abs(causal.time - pose.time)))
+        assert abs(causal.time[k] - pose.time) < 1e-6
+        for i, name in enumerate(watcher.stage.segments):
+            assert np.array_equal(pose.quat_WL[i], causal.quat_WL[name][k])
+        for i, name in enumerate(watcher.stage.points):
+            np.testing.assert_allclose(pose.points[i], causal.points[name][k], atol=1e-12)
+
+
+def chaos(recording: Recording, seed: int, hurt: str) -> tuple[list[tuple[float, Samples]], int]:
+    """Arrivals in which one sensor loses, delays, repeats, corrupts samples and dies for four seconds; and how many."""
+    rng = np.random.default_rng(seed)
+    came = []
+    for name in recording.sensors:
+        for k, t in enumerate(recording.time):
+            sample = single(recording, name, k)
+            if name != hurt:
+                came.append((float(t) + 0.005 + rng.exponential(0.001), sample))
+                continue
+            if 1200 <= k < 1600 or (k > 600 and rng.random() < 0.1):
+                continue
+            delay = rng.exponential(0.01) + (0.3 if rng.random() < 0.02 else 0.0)
+            came.append((float(t) + delay, sample))
+            if rng.random() < 0.05:
+                came.append((float(t) + delay + 0.01, sample))
+            if rng.random() < 0.05:
+                wild = rng.choice([np.nan, np.inf, 1e30])
+                came.append((float(t) + delay, sample._replace(gyro_S=sample.gyro_S * wild)))
+            if rng.random() < 0.01:
+                came.append((float(t) + delay, sample._replace(time=sample.time + rng.choice([1e4, -1e4, np.nan]))))
+    return came, sum(len(sample.time) for _, sample in came)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recording, tmp_path: Path, seed: int) -> None:
+    hurt = list(recording.sensors)[seed + 1]
+    came, count = chaos(recording, seed, hurt)
+    watcher = Watcher()
+    live(recording, tmp_path / "a.wepose", Chaos(recording, came), watcher)
+    found = read_live_log(tmp_path / "a.wepose")
+    clean, again = track(recording, causal=True), track(found.recording, causal=True)
+    n = len(found.quat_WL)
+    assert n >= len(clean.time) - 40
+    for i, name in enumerate(recording.sensors):
+        assert np.array_equal(found.quat_WL[:, i], again.quat_WL[name])  # the file decides it all
+        if name != hurt:
+            assert np.array_equal(found.quat_WL[:, i], clean.quat_WL[name][:n])
+    i = list(recording.sensors).index(hurt)
+    off = (Rotation.from_quat(clean.quat_WL[hurt][:n]).inv() * Rotation.from_quat(found.quat_WL[:, i])).magnitude()
+    assert np.degrees(off[: 1150 - found.first].max()) < 8.0  # a tenth of the samples lost, some for 50 ms and more
+    # Nobody saw the four seconds; then the tilt comes back, and the heading is off by no more than is said.
+    up = Rotation.from_quat(clean.quat_WL[hurt][n - 300 : n]).inv().apply([0.0, 0.0, 1.0])
+    seen = Rotation.from_quat(found.quat_WL[n - 300 :, i]).inv().apply([0.0, 0.0, 1.0])
+    assert np.degrees(np.arccos(np.clip(np.sum(up * seen, axis=1), -1.0, 1.0)).max()) < 12.0
+    std = np.sqrt(again.segment_cov[hurt][:, 2, 2])
+    assert std[-1] > np.deg2rad(5.0) > std[1000 - found.first]
+    assert np.all(off[n - 300 :] < 3.0 * np.sqrt(np.trace(again.segment_cov[hurt][n - 300 : n], axis1=1, axis2=2)))
+    # It was shown as lost while it was, and no other ever.
+    shown = [(pose.time, pose.lost) for pose in watcher.poses]
+    assert all(lost[i] for t, lost in shown if recording.time[1220] < t < recording.time[1590])
+    assert not any(lost[j] for _, lost in shown for j in range(len(recording.sensors)) if j != i)
+    assert watcher.statuses[-2].problems == {}
+    # All that was received is in the file.
+    of_samples = [payload for tag, payload in blocks(tmp_path / "a.wepose") if tag == SAMPLES]
+    assert sum(int.from_bytes(payload[:4], "little") for payload in of_samples) == count
+
+
+def test_a_file_that_breaks_off_anywhere_is_read_up_to_there(recording: Recording, tmp_path: Path) -> None:
+    whole = tmp_path / "a.wepose"
+    live(recording, whole)
+    full = read_live_log(whole)
+    data = whole.read_bytes()
+    rng = np.random.default_rng(0)
+    lengths = []
+    for size in [len(data) - 1, *rng.integers(len(data) // 2, len(data), 8).tolist()]:
+        part = tmp_path / "part.wepose"
+        part.write_bytes(data[:size])
+        found = read_live_log(part)
+        lengths.append(len(found.quat_WL))
+        assert np.array_equal(found.quat_WL, full.quat_WL[: len(found.quat_WL)])
+        again = track(found.recording, causal=True)
+        for i, name in enumerate(recording.sensors):
+            assert np.array_equal(again.quat_WL[name][: len(found.quat_WL)], found.quat_WL[:, i])
+    assert max(lengths) > 0
+    part.write_bytes(data[: len(data) // 20])
+    with pytest.raises(BadData, match="broke off"):
+        read_live_log(part)
+    damaged = bytearray(data)
+    damaged[len(data) // 2] ^= 0xFF
+    part.write_bytes(damaged)
+    assert read_live_log(part).broken_off
+
+
+def test_files_that_are_none_are_said_to_be(recording: Recording, tmp_path: Path) -> None:
+    with pytest.raises(MissingFile, match="no such file"):
+        read_live_log(tmp_path / "none.wepose")
+    other = tmp_path / "other.wepose"
+    other.write_bytes(b"something else")
+    with pytest.raises(BadData, match="is not the recording of a live session"):
+        read_live_log(other)
+    with pytest.raises(ExistingOutput, match="exists; --force"):
+        live(recording, other)
+    with pytest.raises(ExistingOutput, match="cannot be written"):
+        live(recording, tmp_path / "no" / "folder.wepose")
+
+
+def test_the_person_is_told_what_to_do(recording: Recording, tmp_path: Path) -> None:
+    """Without a named start pose: waiting for a sensor that comes late, then hold, then ready."""
+    recording = replace(recording, phases={})
+    late = "right_forearm"
+    came = [
+        (float(t), single(recording, name, k))
+        for name in recording.sensors
+        for k, t in enumerate(recording.time)
+        if name != late or k >= 100
+    ]
+    watcher = Watcher()
+    live(recording, tmp_path / "a.wepose", Chaos(recording, came), watcher)
+    states = [status.state for status in watcher.statuses]
+    assert states[0] == "waiting"
+    assert states[-1] == "ended"
+    assert watcher.stage is not None
+    assert "right forearm" in watcher.statuses[0].message
+    found = read_live_log(tmp_path / "a.wepose")
+    again = track(found.recording, causal=True)
+    assert all(np.array_equal(found.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_session(recording: Recording) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full on this system")
+    wearing = Wearing.of(recording)
+    log = LiveLog(Path("/dev/full"), wearing.header(tuple(recording.sensors)) | {"method": "amekf"}, force=True)
+    ended = LiveLoop(ReplaySource(recording, math.inf), wearing, log=log, begin=float(recording.time[0])).run()
+    assert ended.poses > 2000
+    assert "the recording ended: No space left" in ended.problem
+
+
+def test_latencies_keep_their_quantiles() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.lognormal(-7.0, 1.0, 20000)
+    kept = Latencies()
+    assert math.isnan(kept.quantile(0.5))
+    for value in values:
+        kept.add(float(value))
+    for share in (0.5, 0.9, 0.99):
+        assert kept.quantile(share) == pytest.approx(np.quantile(values, share), rel=0.03)

@@ -1,0 +1,251 @@
+"""Xsens MVNX: a real export, tracked, against Xsens's own positions; made files of each version, and damaged ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import wepose_pin as wp
+from wepose_pin.errors import BadData, BadSession, MissingFile
+from wepose_pin.readers.mvnx import read_mvnx
+
+SEGMENTS = ("Pelvis", "T8", "LeftUpperArm", "LeftForeArm", "LeftHand", "RightUpperArm")
+OURS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+HEAD = '<mvnx version="{version}"><mvn version="x"/><subject frameRate="{rate}" segmentCount="6">'
+
+
+def mvnx(
+    folder: Path,
+    quat_wxyz: np.ndarray,
+    *,
+    raw: bool = False,
+    version: str = "3",
+    rate: str = "50",
+    index: list[int] | None = None,
+    before: str = "",
+    end: str = "</frames></subject></mvnx>",
+) -> Path:
+    """A file with these orientations (n, 6, 4) and, with `raw`, two sensors that rest with gravity on z."""
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', before, HEAD.format(version=version, rate=rate), "<segments>"]
+    lines += [f'<segment label="{name}" id="{k}"><points/></segment>' for k, name in enumerate(SEGMENTS, 1)]
+    lines += ["</segments><sensors>", '<sensor label="T8"/><sensor label="LeftForeArm"/>', "</sensors><frames>"]
+    ones = " ".join(["1 0 0 0"] * len(SEGMENTS))
+    poses = ("npose", "tpose") if version == "2" else ("identity", "tpose", "tpose-isb")
+    lines += [f'<frame time="0" type="{pose}"><orientation>{ones}</orientation></frame>' for pose in poses]
+    for k, quats in enumerate(quat_wxyz):
+        number = k if index is None else index[k]
+        lines.append(f'<frame time="{round(20 * number)}" index="{number}" type="normal">')
+        lines.append(f"<orientation>{' '.join(f'{value:.9f}' for value in quats.ravel())}</orientation>")
+        if raw:
+            lines.append("<sensorAcceleration>0 0 9.81 0 9.81 0</sensorAcceleration>")
+            lines.append(f"<sensorAngularVelocity>0.1 0 0 0 0 {0.001 * k}</sensorAngularVelocity>")
+        lines.append("</frame>")
+    (folder / "trial.mvnx").write_text("\n".join([*lines, end]), encoding="utf-8")
+    return folder / "trial.mvnx"
+
+
+def turning(n: int = 40) -> np.ndarray:
+    """(n, 6, 4) wxyz: each segment turns about z by its own angle."""
+    angles = np.linspace(0.0, 0.5, n)[:, None] * np.arange(1, len(SEGMENTS) + 1)
+    xyzw = Rotation.from_rotvec(angles.reshape(-1, 1) * [0.0, 0.0, 1.0]).as_quat()
+    return xyzw[:, [3, 0, 1, 2]].reshape(n, len(SEGMENTS), 4)
+
+
+def session(folder: Path, file: str | Path, segments: tuple[str, ...], data: str = "", each: str = "") -> Path:
+    tables = "".join(f"[sensors.{name}]\n{each}\n" for name in segments)
+    (folder / "session.toml").write_text(f'[data]\nfile = "{file}"\n{data}\n{tables}', encoding="utf-8")
+    return folder / "session.toml"
+
+
+# The real export ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def xsens(data: Path) -> tuple[Path, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The file, Xsens's own joint positions in the identity pose (3,) and over time (n, 3), by segment."""
+    path = data / "mvnx" / "test_mocap.mvnx"
+    root = ElementTree.parse(path).getroot()
+    name = "{http://www.xsens.com/mvn/mvnx}"
+    labels = [segment.get("label") or "" for segment in root.iter(f"{name}segment")]
+    at: dict[str, list[np.ndarray]] = {}
+    for frame in root.iter(f"{name}frame"):
+        text = frame.findtext(f"{name}position") or ""
+        at.setdefault(frame.get("type") or "", []).append(np.array(text.split(), dtype=float).reshape(-1, 3))
+    still, moving = at["identity"][0], np.array(at["normal"])
+    return (
+        path,
+        {label: still[k] for k, label in enumerate(labels)},
+        {label: moving[:, k] for k, label in enumerate(labels)},
+    )
+
+
+@pytest.fixture(scope="module")
+def tracked(
+    xsens: tuple[Path, dict[str, np.ndarray], dict[str, np.ndarray]], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[wp.Pose, dict[str, np.ndarray]]:
+    """Our pose with Xsens's lengths, and Xsens's positions (n, 3) turned to our heading."""
+    path, still, moving = xsens
+    lengths = {}
+    for side, name in (("left", "Left"), ("right", "Right")):
+        lengths[f"{side}_upper_arm"] = np.linalg.norm(still[f"{name}ForeArm"] - still[f"{name}UpperArm"])
+        lengths[f"{side}_forearm"] = np.linalg.norm(still[f"{name}Hand"] - still[f"{name}ForeArm"])
+    lengths["shoulder_width"] = np.linalg.norm(still["LeftUpperArm"] - still["RightUpperArm"])
+    subject = wp.average_subject()
+    subject = replace(subject, lengths={**subject.lengths, **{name: float(v) for name, v in lengths.items()}})
+    pose = wp.track(wp.load_session(session(tmp_path_factory.mktemp("mvnx"), path, OURS)), subject)
+    turn = Rotation.from_rotvec([0.0, 0.0, pose.segments.heading["torso"]])
+    return pose, {label: turn.apply(position) for label, position in moving.items()}
+
+
+@pytest.mark.parametrize(("side", "name"), [("left", "Left"), ("right", "Right")])
+def test_elbow_and_wrist_stand_to_the_shoulder_as_in_xsens(tracked, side: str, name: str) -> None:
+    pose, xsens = tracked
+    for point, joint in (("elbow", "ForeArm"), ("wrist", "Hand")):
+        ours = pose.points[f"{side}_{point}"] - pose.points[f"{side}_shoulder"]
+        theirs = xsens[f"{name}{joint}"] - xsens[f"{name}UpperArm"]
+        assert np.linalg.norm(ours - theirs, axis=1).max() < 1e-3  # 0.17 mm found
+
+
+def test_one_rigid_trunk_costs_millimetres_at_the_shoulders(tracked) -> None:
+    """Against Xsens's spine of four joints and its moving shoulder girdle, the line between the shoulders aside."""
+    pose, xsens = tracked
+    ours = pose.points["left_shoulder"] - pose.points["right_shoulder"]
+    theirs = xsens["LeftUpperArm"] - xsens["RightUpperArm"]
+    each = 0.5 * np.linalg.norm(ours - theirs, axis=1)  # of a shoulder to the middle of both
+    assert 0.003 < each.mean() < 0.007
+    assert each.max() < 0.007
+
+
+def test_the_torso_faces_x_and_arms_keep_what_they_had_to_it(tracked) -> None:
+    pose, _ = tracked
+    recording = pose.recording
+    assert recording.rate_hz == pytest.approx(60.0)
+    assert all(sensor.aligned for sensor in recording.sensors.values())
+    start = recording.span(pose.segments.start)
+    forward = Rotation.from_quat(pose.quat_WL["torso"][start]).mean().apply([1.0, 0.0, 0.0])
+    assert abs(np.arctan2(forward[1], forward[0])) < 0.01
+    torso, arm = (Rotation.from_quat(recording.sensors[name].quat_WS) for name in ("torso", "left_forearm"))
+    ours = Rotation.from_quat(pose.quat_WL["torso"]).inv() * Rotation.from_quat(pose.quat_WL["left_forearm"])
+    assert (ours.inv() * torso.inv() * arm).magnitude().max() < 1e-9
+
+
+# Made files --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", ["2", "3", "4"])
+def test_poses_are_no_motion_and_segment_frames_are_those_of_the_n_pose(version: str, tmp_path: Path) -> None:
+    device = read_mvnx(mvnx(tmp_path, turning(), version=version))
+    assert device.kind == "orientation"
+    assert device.table.height == 40
+    np.testing.assert_allclose(device.table["time"], np.arange(40) / 50.0)
+    # In the T-pose the left arm points along +y of the world: along −z of its segment, palm down, is a quarter turn.
+    left = Rotation.from_quat(device.table.select([f"LeftForeArm orientation {c}" for c in "xyzw"]).row(0))
+    np.testing.assert_allclose(left.apply([0.0, 0.0, -1.0]), [0.0, 1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(left.apply([1.0, 0.0, 0.0]), [1.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(left.apply([0.0, -1.0, 0.0]), [0.0, 0.0, -1.0], atol=1e-9)  # the palm, to the thigh
+    right = Rotation.from_quat(device.table.select([f"RightUpperArm orientation {c}" for c in "xyzw"]).row(0))
+    np.testing.assert_allclose(right.apply([0.0, 0.0, -1.0]), [0.0, -1.0, 0.0], atol=1e-9)
+
+
+def test_raw_data_come_first_and_orientations_when_asked_for(tmp_path: Path) -> None:
+    path = mvnx(tmp_path, turning(200), raw=True)
+    raw = wp.load_session(session(tmp_path, path.name, ("torso", "left_forearm")))
+    np.testing.assert_allclose(raw.sensors["left_forearm"].accel_S[0], [0.0, 9.81, 0.0])
+    np.testing.assert_allclose(raw.sensors["left_forearm"].gyro_S[:, 2], 0.001 * np.arange(200))
+    np.testing.assert_allclose(raw.sensors["torso"].gyro_S[:, 0], 0.1)
+    assert not raw.sensors["torso"].aligned
+    ready = wp.load_session(session(tmp_path, path.name, ("torso", "left_forearm"), 'use = "orientation"'))
+    assert ready.sensors["torso"].aligned
+    angle = Rotation.from_quat(ready.sensors["torso"].quat_WS[-1]).magnitude()
+    assert angle == pytest.approx(2 * 0.5)
+
+
+def test_lost_frames_are_gaps(tmp_path: Path) -> None:
+    index = [k for k in range(60) if k not in (20, 21)]
+    path = mvnx(tmp_path, turning(58), index=index)
+    recording = wp.load_session(session(tmp_path, path.name, ("torso",)))
+    assert len(recording) == 60
+    assert "bridged: 2 samples" in recording.notes[0]
+    path = mvnx(tmp_path, turning(58), index=[k + 40 * (k > 20) for k in range(58)])
+    with pytest.raises(BadData, match=r"rows are missing after row 21"):
+        wp.load_session(session(tmp_path, path.name, ("torso",)))
+
+
+def test_a_mount_beside_aligned_orientations_is_an_error(tmp_path: Path) -> None:
+    path = mvnx(tmp_path, turning())
+    mount = 'mount = { up = "+x", forward = "-z" }'
+    with pytest.raises(BadSession, match=r"sensors\.torso\.mount stands beside aligned"):
+        wp.load_session(session(tmp_path, path.name, ("torso",), each=mount))
+    assert (
+        not wp.load_session(session(tmp_path, path.name, ("torso",), each=f"aligned = false\n{mount}"))
+        .sensors["torso"]
+        .aligned
+    )
+
+
+LAUGHS = '<!DOCTYPE mvnx [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>'
+OUTSIDE = '<!DOCTYPE mvnx [<!ENTITY a SYSTEM "file:///etc/hostname">]>'
+
+
+def test_a_document_type_without_entities_is_what_mvn_writes(tmp_path: Path) -> None:
+    before = '<!DOCTYPE mvnx SYSTEM "http://www.xsens.com/mvn/mvnx/schema.dtd">'
+    assert read_mvnx(mvnx(tmp_path, turning(), before=before)).table.height == 40
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"before": LAUGHS}, "declares entities"),
+        ({"before": OUTSIDE}, "declares entities"),
+        ({"end": ""}, "is damaged or cut off in line"),
+        ({"end": "</frames></mvnx>"}, "is damaged or cut off in line"),
+        ({"rate": "fast"}, "subject frameRate='fast' is no rate"),
+        ({"rate": "0"}, "subject frameRate='0' is no rate"),
+    ],
+)
+def test_a_damaged_file_is_one_line(change: dict[str, str], says: str, tmp_path: Path) -> None:
+    path = mvnx(tmp_path, turning(), **change)  # type: ignore[arg-type]
+    with pytest.raises(BadData, match=says) as error:
+        read_mvnx(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("<mvnx version", "<html version", "its root is <html>"),
+        ("0.000000000</orientation>", "zero</orientation>", "something else than numbers"),
+        ("0.000000000</orientation>", "</orientation>", "holds 23 numbers; 4 for each of 6"),
+        ('type="normal"', 'type="tpose"', "0 frames of type 'normal'"),
+        ('label="', 'label="My', "none of the upper body's segments"),
+    ],
+)
+def test_a_file_of_another_content_is_one_line(old: str, new: str, says: str, tmp_path: Path) -> None:
+    path = mvnx(tmp_path, np.tile([1.0, 0.0, 0.0, 0.0], (5, len(SEGMENTS), 1)))
+    text = path.read_text().replace(old, new)
+    path.write_text(text.replace("</mvnx>", "</html>") if "html" in new else text)
+    with pytest.raises(BadData, match=says):
+        read_mvnx(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00\x01\xff" * 500, b"time,x\n1,2\n"])
+def test_what_is_no_xml_is_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "trial.mvnx").write_bytes(content)
+    with pytest.raises(BadData, match="damaged or cut off"):
+        read_mvnx(tmp_path / "trial.mvnx")
+
+
+def test_a_missing_file_and_a_wrong_label(tmp_path: Path) -> None:
+    with pytest.raises(MissingFile, match=r"none\.mvnx: no such file"):
+        wp.load_session(session(tmp_path, "none.mvnx", ("torso",)))
+    path = mvnx(tmp_path, turning())
+    with pytest.raises(BadSession, match=r"sensors\.torso\.label = 'T9' is not in trial\.mvnx; there is: Pelvis, T8"):
+        wp.load_session(session(tmp_path, path.name, ("torso",), each='label = "T9"'))
+    with pytest.raises(BadSession, match=r"sensors\.right_hand\.label is missing; which of trial\.mvnx is it"):
+        wp.load_session(session(tmp_path, path.name, ("right_hand",)))

@@ -1,0 +1,493 @@
+"""The report of a tracked recording: what it says, what it warns of, that it opens offline and stays small."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.cli import main
+from wepose_pin.pose import Pose
+from wepose_pin.readers.plausibility import cut_off
+from wepose_pin.recording import Recording, Sensor
+from wepose_pin.report import track_report
+from wepose_pin.report.concerns import ADVICE, Concern, concerns
+from wepose_pin.report.drawing import COLUMNS, envelope
+from wepose_pin.report.measures import between, elbow_of, hands_of, heading_budgets, longest, signal_of
+from wepose_pin.report.words import listed, signed, whole
+from wepose_pin.simulation import Simulation, simulate, simulated_person
+from wepose_pin.subject import Hinge, Subject, average_subject
+from wepose_pin.tracking import TrackedPose, track
+from wepose_pin.writers import write_session
+
+SECTIONS = [
+    "What was recorded",
+    "Noise and bias",
+    "Drift of the headings",
+    "The hands",
+    "Joint angles",
+    "The motion in 3D",
+    "What was run",
+]
+
+
+@pytest.fixture(scope="module")
+def pose(simulation: Simulation) -> TrackedPose:
+    return track(simulation.recording("anna <3"))
+
+
+@pytest.fixture(scope="module")
+def page(pose: TrackedPose) -> str:
+    return track_report(pose)
+
+
+def without_frame(page: str) -> str:
+    return re.sub(r'srcdoc="[^"]*"', "", page)
+
+
+def text_of(page: str) -> str:
+    """What a reader sees."""
+    body = without_frame(page).split("<body>")[1]
+    return unescape(re.sub(r"<[^>]+>", " ", body))
+
+
+def headings(page: str) -> list[str]:
+    return [unescape(text) for text in re.findall(r"<h2[^>]*>(.*?)</h2>", without_frame(page))]
+
+
+def rows(page: str) -> list[list[str]]:
+    found = re.findall(r"<tr>(<td>.*?)</tr>", without_frame(page))
+    return [[unescape(cell) for cell in re.findall(r"<td>(.*?)</td>", row)] for row in found]
+
+
+def changed(recording: Recording, name: str, **signals: np.ndarray) -> Recording:
+    return replace(recording, sensors={**recording.sensors, name: replace(recording.sensors[name], **signals)})
+
+
+def looked_at(pose: TrackedPose) -> list[Concern]:
+    assert pose.recording is not None
+    signals = {name: signal_of(pose.recording, name, pose) for name in pose.recording.sensors}
+    found = {side: elbow_of(pose, side, pose.subject) for side in ("left", "right")}
+    elbows = {side: elbow for side, elbow in found.items() if elbow is not None}
+    return concerns(pose, signals, heading_budgets(pose), elbows)
+
+
+def said(pose: TrackedPose, words: str) -> Concern:
+    matching = [concern for concern in looked_at(pose) if words in concern.said]
+    assert len(matching) == 1, [concern.said for concern in looked_at(pose)]
+    return matching[0]
+
+
+# What the page says ---------------------------------------------------------------------------------------------------
+
+
+def test_it_has_its_sections_and_every_figure_a_caption(page: str) -> None:
+    assert headings(page) == SECTIONS
+    figures = re.findall(r'<img alt="([^"]+)" src="data:image/png;base64,[^"]+"><figcaption>(.+?)</figcaption>', page)
+    assert len(figures) == 8  # timeline, noise, headings, paths, reach; thorax, shoulders, elbows
+    assert 'title="The motion in 3D"' in page
+    assert "anna &lt;3" in page
+
+
+def test_it_gives_the_sensors_in_numbers(page: str, pose: TrackedPose) -> None:
+    assert pose.recording is not None
+    assert pose.segments is not None
+    table = rows(page)
+    for name, sensor in pose.recording.sensors.items():
+        label = name.replace("_", " ")
+        of = pose.segments.orientation[name]
+        recorded, noise = [row for row in table if row[0] == label][:2]
+        assert sensor.gyro_S is not None
+        assert recorded[1] == f"{np.degrees(np.linalg.norm(sensor.gyro_S, axis=1)).max():.0f} °/s"
+        assert recorded[3:6] == ["no", "no", f"{100 * of.static.mean():.0f} %"]
+        start = [float(part.replace("−", "-")) for part in noise[1].split(" / ")]
+        assert start == pytest.approx(np.degrees(of.noise.gyro_bias), abs=0.0051)
+        assert noise[3] == f"{of.noise.gravity:.3f} m/s²"
+
+
+def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedPose) -> None:
+    table = rows(page)
+    std = {name: np.degrees(np.sqrt(cov[:, 2, 2])) for name, cov in pose.segment_cov.items()}
+    for name, values in std.items():
+        line = [row for row in table if row[0] == name.replace("_", " ")][2]
+        assert line[1:3] == [f"{values.max():.1f}°", f"{values[-1]:.1f}°"]
+        assert line[4].endswith("°/min")
+    worst = max(std, key=lambda name: float(std[name].max()))
+    assert f"The {worst.replace('_', ' ')}'s heading may be off by ± {std[worst].max():.1f}°" in text_of(page)
+    elbow = np.hypot(std["right_upper_arm"], std["right_forearm"])
+    assert ["right elbow", f"{np.median(elbow):.1f}°", f"{elbow.max():.1f}°"] in table
+
+
+def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedPose, page: str) -> None:
+    assert pose.recording is not None
+    assert pose.segments is not None
+    warned = replace(
+        pose, segments=replace(pose.segments, warnings=("no phases.start: the quietest window was taken",))
+    )
+    text = without_frame(track_report(warned))
+    assert '<section class="banner poor">' in text
+    first = text.index("No phases.start: the quietest window was taken")
+    assert first < text.index("State <code>phases.start</code>") < text.index("<h2") < text.index("<figure")
+    assert '<section class="banner note">' in page  # the average person's lengths are worth a word and no more
+    assert "The lengths are an average person's" in text_of(page)
+
+
+def test_a_known_person_and_nothing_to_say(pose: TrackedPose) -> None:
+    assert pose.subject is not None
+    quiet = replace(pose, subject=replace(pose.subject, name="anna", note=""))
+    assert looked_at(quiet) == []
+    assert "Nothing stands out." in text_of(track_report(quiet))
+
+
+def test_it_opens_offline_prints_and_has_no_nan(page: str) -> None:
+    assert "default-src 'none'" in page.split("<title>")[0]
+    for text in (without_frame(page), unescape(page)):
+        assert not re.search(r"""(src|href)\s*=\s*["']?\s*(https?:)?//""", text.split("<script>")[0])
+    assert without_frame(page).count("<script") == 0
+    assert "nan" not in re.sub(r'"data:[^"]*"', "", without_frame(page)).split("</style>")[1]
+    assert "@media screen and (prefers-color-scheme: dark)" in page
+
+
+def test_equal_arguments_give_equal_text_and_a_ready_view_is_taken(pose: TrackedPose, page: str) -> None:
+    assert track_report(pose) == page
+    assert 'srcdoc="&lt;p&gt;mine&lt;/p&gt;"' in track_report(pose, view="<p>mine</p>")
+
+
+def test_it_does_not_grow_with_the_recording() -> None:
+    simulation = simulate(simulated_person(3).lengths, seed=3, rate_hz=50.0, clasp_s=600.0, circles=0)
+    page = track_report(track(simulation.recording("long")))
+    assert len(page) < 5e6
+    assert re.search(r"thinned to 8\.\d pictures a second", page)
+
+
+# What is missing ------------------------------------------------------------------------------------------------------
+
+
+def test_without_a_covariance_it_says_so(simulation: Simulation) -> None:
+    page = track_report(track(simulation.recording("ncf"), method="ncf"))
+    assert headings(page) == SECTIONS
+    assert "The filter ncf has no covariance: what the headings may be off by is not known" in text_of(page)
+    assert "± nan" not in page
+
+
+def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedPose) -> None:
+    recording = simulation.recording("ready")
+    assert pose.segments is not None
+    sensors = {
+        name: Sensor(quat_WS=pose.quat_WL[name]) for name in ("torso", "right_upper_arm", "right_forearm")
+    }  # orientations of segments
+    ready = track(replace(recording, sensors=sensors))
+    page = track_report(ready)
+    assert headings(page) == [name for name in SECTIONS if name != "Noise and bias"]
+    assert "The device gave orientations without an uncertainty" in text_of(page)
+    assert said(ready, "ready orientations of the device: torso, right upper arm and right forearm").do
+    assert said(ready, "no sensor on left_upper_arm, left_forearm").do.startswith("Strap a sensor on")
+    assert not any(row[0] == "left hand" for row in rows(page))
+
+
+def test_a_torso_alone_has_no_hands(simulation: Simulation) -> None:
+    recording = simulation.recording("torso")
+    alone = track(replace(recording, sensors={"torso": recording.sensors["torso"]}))
+    page = track_report(alone)
+    assert headings(page) == [name for name in SECTIONS if name != "The hands"]
+    head = track_report(
+        track(replace(recording, sensors={"head": recording.sensors["torso"]}, phases={"start": ((0.5, 4.5),)}))
+    )
+    assert headings(head) == [name for name in SECTIONS if name not in ("The hands", "Joint angles")]
+
+
+# What it warns of -----------------------------------------------------------------------------------------------------
+
+
+def test_motion_beyond_the_range(simulation: Simulation) -> None:
+    recording = simulation.recording("range")
+    gyro = recording.sensors["right_forearm"].gyro_S
+    assert gyro is not None
+    clipped = np.clip(gyro, -2.1, 2.1)
+    count = np.count_nonzero(cut_off(clipped, 2.0).any(axis=1))
+    assert count > 10
+    pose = track(changed(recording, "right_forearm", gyro_S=clipped))
+    concern = said(pose, "beyond the sensor's range")
+    assert concern.grave
+    assert f"right forearm {count / 100:.2g} s" in concern.said
+    page = track_report(pose)
+    assert f"{count / 100:.2f} s" in next(row for row in rows(page) if row[0] == "right forearm")
+    note = "sensors.right_forearm.gyro: 40 samples on x stand at 2.1, as if cut off by the sensor's range; choose more"
+    told = replace(pose, segments=replace(pose.segments, warnings=(note,)))  # type: ignore[arg-type,type-var]
+    assert sum("cut off" in concern.said for concern in looked_at(told)) == 1  # the reader has said it
+
+
+def test_gaps(simulation: Simulation) -> None:
+    recording = simulation.recording("gaps")
+    gap = np.zeros(len(recording), dtype=bool)
+    gap[3000:3400] = True
+    page = track_report(pose := track(changed(recording, "torso", gap=gap)))
+    assert f"torso {100 * 400 / len(gap):.1f} %" in said(pose, "samples were lost").said
+    assert next(row for row in rows(page) if row[0] == "torso")[4] == "4.00 s"
+    assert "Lines break where a sensor gave nothing" in text_of(page)
+
+
+def test_gravity_bias_and_stamps(simulation: Simulation) -> None:
+    recording = simulation.recording("off")
+    torso = recording.sensors["torso"]
+    assert torso.gyro_S is not None
+    assert torso.accel_S is not None
+    rng = np.random.default_rng(1)
+    time = recording.time + rng.uniform(-0.004, 0.004, len(recording))
+    off = changed(recording, "torso", gyro_S=torso.gyro_S + np.deg2rad([2.0, 0.0, 0.0]), accel_S=1.04 * torso.accel_S)
+    pose = track(replace(off, time=time))
+    assert re.search(r"not measure as 9\.81 m/s²: torso 10\.\d\d m/s² \(\+[34]\.\d %\)", said(pose, "gravity").said)
+    assert re.search(r"bias is large: torso [12]\.\d °/s", said(pose, "bias is large").said)
+    assert "`rate_hz`" in said(pose, "time stamps are uneven").do
+    assert pose.segments is not None
+    ours = pose.segments.orientation["torso"]
+    drifted = ours._replace(
+        gyro_bias=ours.gyro_bias + np.linspace(0.0, np.deg2rad(0.5), len(time))[:, None] * [1, 0, 0]
+    )
+    warm = replace(pose, segments=replace(pose.segments, orientation={**pose.segments.orientation, "torso": drifted}))
+    assert "by 0.5" in said(warm, "at the end is another").said
+
+
+def test_a_person_who_never_rests(pose: TrackedPose) -> None:
+    assert pose.segments is not None
+    restless = {name: of._replace(static=np.zeros_like(of.static)) for name, of in pose.segments.orientation.items()}
+    never = replace(pose, segments=replace(pose.segments, orientation=restless))
+    assert not said(never, "little rest").grave
+    assert said(replace(never, method="smekf"), "little rest").grave
+    assert longest(np.array([True, False, True, True, True, False]), 2.0) == 1.5
+
+
+def test_a_late_start_pose(pose: TrackedPose) -> None:
+    assert pose.segments is not None
+    late = replace(pose, segments=replace(pose.segments, start=(40.0, 44.0)))
+    assert said(late, "the start pose comes 40 s into the recording").do
+
+
+def test_headings_that_may_be_far_off(pose: TrackedPose) -> None:
+    wide = replace(pose, segment_cov={name: 100.0 * cov for name, cov in pose.segment_cov.items()})
+    concern = said(wide, "may be off against each other")
+    assert concern.grave
+    assert "calibrate the person" in concern.do
+    assert len(between(heading_budgets(wide))) == 4
+
+
+def test_headings_that_were_turned_far(pose: TrackedPose) -> None:
+    from wepose_pin.tracking.headings import Reset
+
+    turned = replace(pose, reset=Reset(None, {}, {"right_forearm": 23.0, "torso": 1.0}))
+    assert said(turned, "sensors drift apart").said.endswith("right forearm by 23°")
+
+
+def bent(forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:
+    """Torso and upper arms upright, the left forearm bent in the plane of its elbow and out of it."""
+    n = len(forward_deg)
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    aside = np.broadcast_to(aside_deg, n)
+    fore = Rotation.from_euler("ZY", np.column_stack([aside, -forward_deg]), degrees=True)
+    return {"torso": still, "left_upper_arm": still, "left_forearm": fore.as_quat(canonical=True)}
+
+
+def with_elbow(pose: TrackedPose, forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0) -> TrackedPose:
+    quat_WL = {**pose.quat_WL, **bent(forward_deg, aside_deg)}
+    return replace(pose, quat_WL=quat_WL)
+
+
+def test_elbows_that_cannot_be(pose: TrackedPose) -> None:
+    n = len(pose.time)
+    assert not any("elbow" in concern.said for concern in looked_at(with_elbow(pose, np.linspace(-10.0, 140.0, n))))
+    assert said(with_elbow(pose, np.full(n, -30.0)), "the left elbow bends backward, to 30°").grave
+    assert said(with_elbow(pose, np.full(n, 170.0)), "the left elbow is bent by 170°").grave
+    turned = said(with_elbow(pose, np.full(n, 90.0), 40.0), "the left forearm leaves the plane of its elbow")
+    assert "by up to 40°" in turned.said
+    assert "A mount is turned" in turned.do
+    drifting = said(with_elbow(pose, np.full(n, 90.0), np.linspace(0.0, 60.0, n)), "leaves the plane of its elbow")
+    assert "by 15° in the first half of the recording and 45° in the second" in drifting.said
+
+
+def test_new_strapping(simulation: Simulation, pose: TrackedPose) -> None:
+    assert pose.subject is not None
+    known: Subject = replace(pose.subject, mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])})
+    anew = track(replace(simulation.recording("new"), strapping="new"), known)
+    assert said(anew, "strapped on anew").do
+
+
+@pytest.mark.parametrize("pattern", [pattern for pattern, _ in ADVICE])
+def test_advice_fits_texts_that_are_written_somewhere(pattern: str) -> None:
+    """A warning that is worded anew loses its advice unseen: the words of the pattern stand in the sources."""
+    sources = (Path(__file__).parent.parent / "wepose_pin").rglob("*.py")
+    words = pattern.replace("\\.", ".").replace("^", "").split("\\d+")
+    text = "\n".join(path.read_text(encoding="utf-8") for path in sources if path.name != "concerns.py")
+    text = re.sub(r'"\s*f?"', "", text)
+    assert all(part in text for part in words)
+
+
+# Its sums -------------------------------------------------------------------------------------------------------------
+
+
+def test_an_elbow_in_closed_form() -> None:
+    forward = np.linspace(-40.0, 150.0, 39)
+    pose = Pose(np.arange(39.0), bent(forward), {})
+    elbow = elbow_of(pose, "left")
+    assert elbow is not None
+    assert elbow_of(pose, "right") is None
+    np.testing.assert_allclose(np.degrees(elbow.forward), forward, atol=1e-9)
+    np.testing.assert_allclose(np.degrees(elbow.bend), np.abs(forward), atol=1e-6)
+    np.testing.assert_allclose(elbow.aside, 0.0, atol=1e-12)
+    # The same elbow about an axis that is turned with it.
+    turn = Rotation.from_euler("z", 25.0, degrees=True)
+    fore = (turn * Rotation.from_quat(pose.quat_WL["left_forearm"])).as_quat()
+    subject = replace(average_subject(), hinges={"left": Hinge(turn.apply([0.0, 1.0, 0.0]), 0.05)})
+    again = elbow_of(replace(pose, quat_WL={**pose.quat_WL, "left_forearm": fore}), "left", subject)
+    assert again is not None
+    np.testing.assert_allclose(np.degrees(again.forward), forward, atol=1e-9)
+    np.testing.assert_allclose(again.aside, 0.0, atol=1e-12)
+
+
+def test_the_elbows_uncertainty_against_draws() -> None:
+    rng = np.random.default_rng(5)
+    quats = {**bent(np.array([70.0])), "left_upper_arm": Rotation.from_euler("xyz", [[20, -30, 40]], True).as_quat()}
+    covs: Mapping[str, np.ndarray] = {}
+    for name in ("left_upper_arm", "left_forearm"):
+        root = np.deg2rad(1.5) * rng.normal(size=(3, 3))
+        covs = {**covs, name: (root @ root.T)[None]}
+    pose = Pose(np.zeros(1), quats, {}, segment_cov=covs)
+    elbow = elbow_of(pose, "left")
+    assert elbow is not None
+    assert elbow.std is not None
+    n = 20000
+    drawn = {
+        name: (
+            Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), covs[name][0], n))
+            * Rotation.from_quat(quats[name][0])
+        ).as_quat()
+        for name in covs
+    }
+    draws = elbow_of(Pose(np.arange(float(n)), drawn, {}), "left")
+    assert draws is not None
+    assert elbow.std[0] == pytest.approx(draws.bend.std(), rel=0.03)
+
+
+def test_heading_budgets_are_those_of_the_covariance(pose: TrackedPose) -> None:
+    assert pose.segments is not None
+    assert pose.recording is not None
+    for name, budget in heading_budgets(pose).items():
+        of = pose.segments.orientation[name]
+        assert of.attitude_cov is not None
+        R = Rotation.from_quat(of.quat_WS).as_matrix()
+        cov = R @ of.attitude_cov @ R.swapaxes(1, 2)
+        std = np.sqrt(cov[:, 2, 2])
+        assert budget.filter_end == pytest.approx(std[-1], rel=1e-9)
+        np.testing.assert_allclose(budget.std, std, rtol=1e-6)  # a stated mount adds nothing to the heading
+        minutes = np.count_nonzero(~of.static) / pose.recording.rate_hz / 60.0
+        assert budget.growth * minutes == pytest.approx(std[-1] - std[0], rel=1e-6)
+
+
+def test_hands_are_seen_from_the_torso(pose: TrackedPose) -> None:
+    turn = Rotation.from_euler("zyx", [70.0, 10.0, -20.0], degrees=True)
+    turned = Pose(
+        pose.time,
+        {"torso": (turn * Rotation.from_quat(pose.quat_WL["torso"])).as_quat()},
+        {name: turn.apply(p) + 1.0 for name, p in pose.points.items()},
+    )
+    assert pose.recording is not None
+    as_was, now = (hands_of(of, pose.recording.rate_hz) for of in (pose, turned))
+    for name in ("left_hand", "right_hand"):
+        np.testing.assert_allclose(now[name].reach, as_was[name].reach, atol=1e-9)
+        assert now[name].std is None
+        assert now[name].peak_speed == pytest.approx(as_was[name].peak_speed)
+    start = as_was["left_hand"].reach[100]
+    assert start[1] > 0.1  # the left hand hangs at the left
+    assert start[2] < -0.4
+
+
+def test_an_envelope_keeps_the_extremes_and_the_holes() -> None:
+    rng = np.random.default_rng(2)
+    time, values = np.arange(100_000.0), rng.normal(size=100_000)
+    values[40_000:50_000] = np.nan
+    values[77_777] = 50.0
+    at, drawn = envelope(time, values)
+    assert len(at) == len(drawn) == 2 * COLUMNS
+    assert np.nanmax(drawn) == 50.0
+    assert np.nanmin(drawn) == np.nanmin(values)
+    inside = (at > 40_100) & (at < 49_900)
+    assert np.isnan(drawn[inside]).all()
+    assert np.isfinite(drawn[~((at > 39_900) & (at < 50_100))]).all()
+    assert envelope(time[:10], values[:10])[1] is not None
+    np.testing.assert_array_equal(envelope(time[:10], values[:10])[1], values[:10])
+
+
+def test_what_is_cut_off() -> None:
+    wave = 5.0 * np.sin(np.linspace(0.0, 20.0, 4000))
+    values = np.column_stack([np.clip(wave, -3.0, 3.0), wave, np.clip(wave, -9.0, 2.5)])
+    cut = cut_off(values, 2.0)
+    np.testing.assert_array_equal(cut[:, 0], np.abs(wave) >= 3.0)
+    assert not cut[:, 1].any()
+    np.testing.assert_array_equal(cut[:, 2], wave >= 2.5)
+    assert not cut_off(values, 4.0)[:, 0].any()
+
+
+def test_words() -> None:
+    assert [listed(parts) for parts in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == ["", "a", "a and b", "a, b and c"]
+    assert [whole(value) for value in (-0.4, -1.6, 12.5)] == ["0", "−2", "12"]
+    assert signed(-0.04) == "0.0"
+
+
+# The command and the browser ------------------------------------------------------------------------------------------
+
+
+def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = simulate(simulated_person(3).lengths, seed=3, clasp_s=5.0, circles=0)
+    write_session(tmp_path, made.recording("short"))
+    for folder, options in (("with", []), ("without", ["--no-report"])):
+        with pytest.raises(SystemExit) as ended:
+            main(["track", str(tmp_path), "-o", str(tmp_path / folder), *options])
+        assert ended.value.code == 0
+        assert ("report.html" in capsys.readouterr().out) == (not options)
+        assert (tmp_path / folder / "report.html").exists() == (not options)
+        assert (tmp_path / folder / "view.html").exists()
+    assert "Motion of short" in (tmp_path / "with" / "report.html").read_text(encoding="utf-8")
+
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+def browse(page: Path, *options: str) -> str:
+    assert BROWSER is not None
+    return subprocess.run(
+        [
+            BROWSER,
+            *"--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking".split(),
+            *"--use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=1000,700".split(),
+            f"--user-data-dir={page.parent / 'profile'}",
+            "--virtual-time-budget=3000",
+            *options,
+            page.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    ).stdout
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome")
+def test_in_a_browser_it_has_its_sections_light_and_dark(page: str, tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    file.write_text(page, encoding="utf-8")
+    assert headings(browse(file, "--dump-dom")) == SECTIONS
+    corner = {}
+    for scheme, number in (("dark", 0), ("light", 1)):
+        picture = tmp_path / f"{scheme}.png"
+        browse(file, f"--blink-settings=preferredColorScheme={number}", f"--screenshot={picture}")
+        corner[scheme] = np.asarray(Image.open(picture).convert("L"))[5, 5]
+    assert corner["dark"] < 60
+    assert corner["light"] > 250

@@ -1,0 +1,240 @@
+"""Lab Streaming Layer: streams found, read, lost and taken up again, on this machine only."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wepose_pin.errors import BadOption, BadSource
+from wepose_pin.live.sources import lsl, open_source
+from wepose_pin.live.sources.udp import UdpSource
+from wepose_pin.readers.arrivals import Samples
+
+RATE = 100.0
+Outlet = Callable[..., Any]
+
+
+@pytest.fixture
+def pylsl(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    pytest.importorskip("pylsl")
+    monkeypatch.delenv("LSLAPICFG", raising=False)
+    return lsl._pylsl(None)[0]
+
+
+@pytest.fixture
+def outlet(pylsl: ModuleType) -> Iterator[Outlet]:
+    def make(name: str, labels: list[str] | None = None, units: list[str] | None = None, channels: int = 6) -> Any:
+        count = len(labels) if labels else channels
+        info = pylsl.StreamInfo(name, "IMU", count, RATE, "float32", "")
+        described = info.desc().append_child("channels")
+        for k, label in enumerate(labels or []):
+            channel = described.append_child("channel")
+            channel.append_child_value("label", label)
+            channel.append_child_value("unit", units[k] if units else "")
+        return pylsl.StreamOutlet(info)
+
+    return make
+
+
+def send(outlets: list[Any], rows: np.ndarray, stamps: np.ndarray) -> None:
+    for row, stamp in zip(rows.tolist(), stamps.tolist(), strict=True):
+        for outlet in outlets:
+            outlet.push_sample(row, stamp)
+
+
+def collect(source: Any, count: int) -> dict[str, Samples]:
+    """Samples by sensor until each has `count`, or what came in two seconds."""
+    parts: dict[str, list[Samples]] = {}
+    deadline = time.monotonic() + 2.0
+    while time.monotonic() < deadline and (
+        len(parts) < len(source.sensors) or any(sum(len(s.time) for s in of) < count for of in parts.values())
+    ):
+        for samples in source.read(0.05):
+            parts.setdefault(samples.sensor, []).append(samples)
+    return {name: Samples(name, *(np.concatenate([s[k] for s in of]) for k in (1, 2, 3))) for name, of in parts.items()}
+
+
+def labels_of(*segments: str) -> list[str]:
+    return [f"{segment}_{signal}" for segment in segments for signal in lsl.SIGNALS]
+
+
+def test_one_stream_a_sensor(pylsl: ModuleType, outlet: Outlet) -> None:
+    outlets = [outlet("each-left_forearm"), outlet("each_torso"), outlet("eacher-head"), outlet("other")]
+    source = open_source("lsl:each", wait_s=5.0)
+    source.open()
+    assert source.sensors == ("torso", "left_forearm")
+    assert source.rate_hz == RATE
+    rows = np.random.default_rng(1).normal(size=(50, 6)).astype(np.float32)
+    stamps = pylsl.local_clock() + np.arange(50) / RATE - 0.5
+    send(outlets[:2], rows, stamps)
+    found = collect(source, 50)
+    for name in source.sensors:
+        np.testing.assert_array_equal(np.column_stack([found[name].gyro_S, found[name].accel_S]), rows)
+        np.testing.assert_array_equal(found[name].time, stamps)
+    assert abs(source.clock() - stamps[-1]) < 5.0
+    source.close()
+    source.close()
+    assert source.problems == {}
+
+
+def test_one_stream_for_all_with_units_and_other_channels(pylsl: ModuleType, outlet: Outlet) -> None:
+    labels = ["counter", *reversed(labels_of("head", "torso")), "torso_mag_x"]
+    units = ["", *(["g"] * 3 + ["deg/s"] * 3) * 2, ""]
+    out = outlet("all", labels, units)
+    source = open_source("lsl:all", sensors=["torso", "head"], wait_s=5.0)
+    source.open()
+    rows = np.random.default_rng(2).normal(size=(20, len(labels))).astype(np.float32)
+    send([out], rows, pylsl.local_clock() + np.arange(20) / RATE)
+    found = collect(source, 20)
+    source.close()
+    assert source.sensors == ("torso", "head")
+    for name in source.sensors:
+        columns = [rows[:, labels.index(label)].astype(float) for label in labels_of(name)]
+        np.testing.assert_allclose(found[name].gyro_S, np.deg2rad(np.column_stack(columns[:3])), rtol=1e-12)
+        np.testing.assert_allclose(found[name].accel_S, 9.80665 * np.column_stack(columns[3:]), rtol=1e-12)
+
+
+def test_samples_that_cannot_be_are_counted(pylsl: ModuleType, outlet: Outlet) -> None:
+    out = outlet("bad-torso")
+    source = open_source("lsl:bad", wait_s=5.0)
+    source.open()
+    rows = np.ones((10, 6))
+    rows[3, 2], rows[7, 4] = np.nan, 1e30
+    send([out], rows, pylsl.local_clock() + np.arange(10) / RATE)
+    found = collect(source, 8)["torso"]
+    source.close()
+    np.testing.assert_array_equal(found.accel_S, np.ones((8, 3)))
+    assert source.problems == {"samples with values that no body sensor gives": 2}
+
+
+def test_lost_samples_leave_the_times_of_the_others_alone(pylsl: ModuleType, outlet: Outlet) -> None:
+    """A second is missing: dejittering would move all that follows."""
+    out = outlet("gap-torso")
+    source = open_source("lsl:gap", wait_s=5.0)
+    source.open()
+    stamps = pylsl.local_clock() + np.arange(300) / RATE
+    stamps = stamps[(np.arange(300) < 100) | (np.arange(300) >= 200)]
+    send([out], np.ones((200, 6)), stamps)
+    found = collect(source, 200)["torso"]
+    source.close()
+    np.testing.assert_array_equal(found.time, stamps)
+
+
+def test_a_stream_that_starts_anew_is_taken_up(pylsl: ModuleType, outlet: Outlet) -> None:
+    """It has no source_id; the other one goes on."""
+    gone, stays = outlet("back-torso"), outlet("back-head")
+    source = open_source("lsl:back", wait_s=5.0)
+    source.open()
+    send([gone, stays], np.ones((5, 6)), pylsl.local_clock() + np.arange(5) / RATE)
+    collect(source, 5)
+    del gone
+    deadline = time.monotonic() + 5.0
+    while "streams lost: back-torso" not in source.problems and time.monotonic() < deadline:
+        source.read(0.05)
+    assert source.problems["streams lost: back-torso"] == 1
+    again = outlet("back-torso")
+    heard: set[str] = set()
+    deadline = time.monotonic() + 10.0
+    while heard != {"torso", "head"} and time.monotonic() < deadline:
+        send([again, stays], np.ones((1, 6)), np.array([pylsl.local_clock()]))
+        heard |= {samples.sensor for samples in source.read(0.02) if samples.sensor == "torso" or "torso" in heard}
+    source.close()
+    assert heard == {"torso", "head"}
+
+
+@pytest.mark.usefixtures("pylsl")
+def test_what_is_not_there() -> None:
+    with pytest.raises(BadSource, match=r"lsl:nobody: no such stream on this machine, within 0\.5 s"):
+        open_source("lsl:nobody", wait_s=0.5).open()
+    with pytest.raises(BadOption, match="scope site after machine; liblsl keeps the first of a process"):
+        open_source("lsl:nobody@site").open()
+
+
+def test_a_sensor_that_is_missing_or_twice(outlet: Outlet) -> None:
+    outlets = [outlet("some-torso"), outlet("some", labels_of("head"))]
+    with pytest.raises(BadSource, match=r"lsl:some: pelvis is in none of the streams"):
+        open_source("lsl:some", sensors=["torso", "pelvis"], wait_s=1.0).open()
+    outlets.append(outlet("some_head"))
+    with pytest.raises(BadSource, match=r"lsl:some: head is in two streams"):
+        open_source("lsl:some", wait_s=5.0).open()
+
+
+@pytest.mark.parametrize(
+    ("stream", "labels", "units", "count", "words"),
+    [
+        ("x-trso", [], [], 6, "'trso' is not a segment; did you mean 'torso'"),
+        ("x-torso", [], [], 9, "9 channels without labels"),
+        ("x-torso", ["gyr_x", "gyr_y", "gyr_z", "acc_x", "acc_y"], [], 5, "no channel labelled 'acc_z'"),
+        ("x-torso", list(lsl.SIGNALS), ["rpm"] * 6, 6, "channel 'gyr_x': unit 'rpm'; there is: rad/s, deg/s"),
+        ("x", [], [], 6, "no channel label names a segment"),
+        ("x", labels_of("torso")[:5], [], 5, "no channel labelled 'torso_acc_z'"),
+    ],
+)
+def test_wrong_channels_say_what_is_right(
+    stream: str, labels: list[str], units: list[str], count: int, words: str
+) -> None:
+    with pytest.raises(BadSource) as error:
+        lsl.layout(stream, "x", labels, units, count)
+    assert words in str(error.value)
+
+
+SENDER = """
+import sys, time
+from wepose_pin.live.sources import lsl
+pylsl = lsl._pylsl("machine")[0]
+out = pylsl.StreamOutlet(pylsl.StreamInfo("far-torso", "IMU", 6, 100.0, "float32", ""))
+print("ready", flush=True)
+while True:
+    out.push_sample([0.0] * 6)
+    time.sleep(0.01)
+"""
+
+
+def bound() -> set[tuple[str, str, str]]:
+    """Protocol, address and inode of this process's sockets that listen (TCP) or are bound (UDP); Linux."""
+    mine = {link.readlink().name for link in Path("/proc/self/fd").iterdir() if link.is_symlink()}
+    found = set()
+    for protocol in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path(f"/proc/self/net/{protocol}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if f"socket:[{fields[9]}]" in mine and (protocol[:3] == "udp" or fields[3] == "0A"):
+                found.add((protocol, fields[1].split(":")[0], fields[9]))
+    return found
+
+
+LOOPBACK = "{:08X}".format(int.from_bytes(socket.inet_aton("127.0.0.1"), sys.byteorder))
+
+
+@pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="reads /proc")
+@pytest.mark.usefixtures("pylsl")
+def test_sources_listen_on_loopback_only() -> None:
+    """A reading LSL source has no socket that listens; a UDP source the one that is asked for, on 127.0.0.1."""
+    before = bound()
+    with subprocess.Popen([sys.executable, "-c", SENDER], stdout=subprocess.PIPE, text=True) as sender:
+        try:
+            assert sender.stdout is not None
+            assert sender.stdout.readline() == "ready\n"
+            source = open_source("lsl:far", wait_s=5.0)
+            source.open()
+            assert len(collect(source, 10)["torso"].time) >= 10
+            assert bound() - before == set()
+            source.close()
+        finally:
+            sender.kill()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    udp = open_source(f"udp:{port}", sensors=["torso"])
+    assert isinstance(udp, UdpSource)
+    udp.open()
+    assert {(protocol, address) for protocol, address, _ in bound() - before} == {("udp", LOOPBACK)}
+    udp.close()

@@ -1,0 +1,123 @@
+"""A recording as a source: nothing lost, nothing early, at any speed."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wepose_pin.errors import BadOption, WeposeError
+from wepose_pin.live.sources import open_source
+from wepose_pin.live.sources.base import Source
+from wepose_pin.live.sources.replay import ReplaySource
+from wepose_pin.recording import Recording, Sensor
+
+
+def recording(n: int = 300, rate_hz: float = 100.0) -> Recording:
+    rng = np.random.default_rng(5)
+    sensors = {
+        name: Sensor(gyro_S=rng.normal(size=(n, 3)), accel_S=rng.normal(size=(n, 3)))
+        for name in ("torso", "left_upper_arm")
+    }
+    return Recording("r", 20.0 + np.arange(n) / rate_hz, rate_hz, sensors)
+
+
+def drained(source: Source, pause_s: float = 0.0) -> dict[str, np.ndarray]:
+    """Time, gyro and accel (n, 7) of each sensor, to the end."""
+    rows: dict[str, list[np.ndarray]] = {}
+    source.open()
+    while (found := source.read(0.05)) is not None:
+        now = source.clock()
+        for samples in found:
+            assert samples.time[-1] <= now + 1e-9
+            rows.setdefault(samples.sensor, []).append(np.column_stack([samples.time, samples.gyro_S, samples.accel_S]))
+        time.sleep(pause_s)
+    source.close()
+    return {name: np.concatenate(parts) for name, parts in rows.items()}
+
+
+@pytest.mark.parametrize(("speed", "pause_s"), [(math.inf, 0.0), (20.0, 0.0), (20.0, 0.03)])
+def test_every_sample_comes_once_and_in_order(speed: float, pause_s: float) -> None:
+    r = recording()
+    found = drained(ReplaySource(r, speed), pause_s)
+    assert list(found) == list(r.sensors)
+    for name, sensor in r.sensors.items():
+        np.testing.assert_array_equal(found[name], np.column_stack([r.time, sensor.gyro_S, sensor.accel_S]))
+
+
+def test_the_clock_runs_at_the_speed() -> None:
+    source = ReplaySource(recording(), 10.0)
+    source.open()
+    begin, host = source.clock(), time.monotonic()
+    time.sleep(0.05)
+    assert source.clock() - begin == pytest.approx(10.0 * (time.monotonic() - host), abs=0.05)
+    assert begin == pytest.approx(20.0, abs=0.1)
+
+
+def test_no_sample_in_a_marked_gap() -> None:
+    r = recording()
+    gap = (r.time > 21.0) & (r.time < 22.0)
+    sensors = {name: replace(sensor, gap=gap if name == "torso" else None) for name, sensor in r.sensors.items()}
+    found = drained(ReplaySource(replace(r, sensors=sensors), math.inf))
+    np.testing.assert_array_equal(found["torso"][:, 0], r.time[~gap])
+    assert len(found["left_upper_arm"]) == len(r)
+
+
+def test_nothing_due_is_nothing() -> None:
+    source = ReplaySource(recording(), 0.01)
+    source.open()
+    assert source.read(0.0) is not None  # the first sample
+    assert source.read(0.0) == []
+
+
+def test_ready_orientations_are_refused() -> None:
+    r = recording()
+    ready = Sensor(quat_WS=np.tile([0.0, 0.0, 0.0, 1.0], (len(r), 1)))
+    with pytest.raises(BadOption, match=r"sensors\.torso gives ready orientations"):
+        ReplaySource(replace(r, sensors={"torso": ready}))
+
+
+@pytest.mark.parametrize(
+    ("spec", "options", "words"),
+    [
+        ("torso", {}, "source 'torso' is none; there is: replay:PATH"),
+        ("rplay:x", {}, "did you mean 'replay:PATH'"),
+        ("udp:", {}, "source 'udp:' is none"),
+        ("replay:nothing", {}, "nothing"),
+        ("replay:x", {"speed": "fast"}, "speed: 'fast'; a positive number"),
+        ("replay:x", {"speed": 0.0}, "speed: '0.0'"),
+        ("udp:port", {}, "'port' is no port"),
+        ("udp:0.0.0.0:70000", {}, "'70000' is no port"),
+        ("lsl:x@moon", {}, "'moon' is no reach of a search; there is: machine"),
+        ("lsl:a'b", {}, "no quote"),
+        ("mti:/dev/ttyUSB0", {}, "'/dev/ttyUSB0' is no DEVICE=SEGMENT"),
+        ("mti:/dev/ttyUSB0=trso", {}, "did you mean 'torso'"),
+        ("mti:/dev/a=torso,/dev/a=head", {}, "'/dev/a=head': each device"),
+        ("mti:/dev/a=torso@fast", {}, "rate 'fast'"),
+        ("mti:/dev/a=torso", {"sensors": ["head"]}, "no device for head"),
+        ("udp:9000", {"sensors": ["trunk"]}, "'trunk' is not a segment"),
+    ],
+)
+def test_a_wrong_spec_says_what_is_right(spec: str, options: dict, words: str) -> None:
+    with pytest.raises(WeposeError) as error:
+        open_source(spec, **options)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_session_is_replayed(tmp_path) -> None:
+    lines = ["time,gx,gy,gz,ax,ay,az", *(f"{k / 100},0.1,0.2,0.3,0,0,9.81" for k in range(200))]
+    (tmp_path / "r.csv").write_text("\n".join(lines))
+    (tmp_path / "session.toml").write_text(
+        '[data]\nfile = "r.csv"\ntime = "time"\ngyro_unit = "rad/s"\naccel_unit = "m/s^2"\n'
+        '[sensors.torso]\ngyro = ["gx", "gy", "gz"]\naccel = ["ax", "ay", "az"]\n'
+    )
+    source = open_source(f"replay:{tmp_path}", speed="max")
+    assert source.sensors == ("torso",)
+    assert source.rate_hz == pytest.approx(100.0)
+    assert drained(source)["torso"].shape == (200, 7)
+    with pytest.raises(BadOption, match="no sensor head"):
+        open_source(f"replay:{tmp_path}", sensors=["head"])

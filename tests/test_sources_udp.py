@@ -1,0 +1,265 @@
+"""Datagrams: what is documented is read, whatever else comes is counted and harms nothing."""
+
+from __future__ import annotations
+
+import binascii
+import json
+import random
+import re
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wepose_pin.errors import BadSource
+from wepose_pin.live.sources import open_source, packets
+from wepose_pin.live.sources.udp import MOST_KINDS, UdpSource
+from wepose_pin.readers.arrivals import Samples
+from wepose_pin.recording import SEGMENTS
+
+GOOD = {"sensor": "torso", "t": 12.345, "gyro": [0.1, -0.2, 0.3], "accel": [0.0, 0.5, 9.81]}
+
+
+def binary(number: int, times: list[float], values: list[list[float]], version: int = 1) -> bytes:
+    """A packet written from the page of the format, not with the package's own layout."""
+    head = b"WPIN" + bytes([version, number]) + len(times).to_bytes(2, "little") + struct.pack("<d", times[0])
+    body = b"".join(struct.pack("<7f", t - times[0], *row) for t, row in zip(times, values, strict=True))
+    return head + body + binascii.crc32(head + body).to_bytes(4, "little")
+
+
+@pytest.fixture
+def source() -> Iterator[UdpSource]:
+    source = UdpSource("127.0.0.1", 0, SEGMENTS)
+    source.open()
+    yield source
+    source.close()
+
+
+@pytest.fixture
+def sender() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        yield sender
+
+
+def read_until(source: UdpSource, count: int) -> dict[str, Samples]:
+    """Samples by sensor, put together, as soon as there are `count` of them, or what came in two seconds."""
+    parts: dict[str, list[Samples]] = {}
+    deadline = time.monotonic() + 2.0
+    while sum(len(s.time) for of in parts.values() for s in of) < count and time.monotonic() < deadline:
+        for samples in source.read(0.05):
+            parts.setdefault(samples.sensor, []).append(samples)
+    return {name: Samples(name, *(np.concatenate([s[k] for s in of]) for k in (1, 2, 3))) for name, of in parts.items()}
+
+
+def test_a_json_line_of_one_sample(source: UdpSource, sender: socket.socket) -> None:
+    before = time.monotonic()
+    sender.sendto(json.dumps(GOOD).encode(), source.address)
+    found = read_until(source, 1)["torso"]
+    np.testing.assert_array_equal(found.gyro_S, [GOOD["gyro"]])
+    np.testing.assert_array_equal(found.accel_S, [GOOD["accel"]])
+    assert before <= found.time[0] <= source.clock()
+    assert source.problems == {}
+
+
+def test_many_lines_and_lists_of_samples(source: UdpSource, sender: socket.socket) -> None:
+    rows = np.random.default_rng(1).normal(size=(5, 6))
+    times = (100.0 + 0.01 * np.arange(5)).tolist()
+    many = {"sensor": "head", "t": times, "gyro": rows[:, :3].tolist(), "accel": rows[:, 3:].tolist()}
+    lines = "\r\n".join([json.dumps(many), "", json.dumps({**GOOD, "t": 100.04, "extra": "passed over"})]) + "\n"
+    sender.sendto(lines.encode(), source.address)
+    found = read_until(source, 6)
+    np.testing.assert_array_equal(np.column_stack([found["head"].gyro_S, found["head"].accel_S]), rows)
+    np.testing.assert_allclose(np.diff(found["head"].time), 0.01, atol=1e-9)
+    assert found["torso"].time[0] == pytest.approx(found["head"].time[4], abs=1e-9)
+
+
+def test_a_binary_packet(source: UdpSource, sender: socket.socket) -> None:
+    rows = np.random.default_rng(2).normal(size=(40, 6)).astype(np.float32)
+    times = [1.7e9 + k / 1000.0 for k in range(40)]
+    sender.sendto(binary(3, times, rows.tolist()), source.address)
+    found = read_until(source, 40)["right_upper_arm"]
+    np.testing.assert_array_equal(np.column_stack([found.gyro_S, found.accel_S]), rows)
+    np.testing.assert_allclose(np.diff(found.time), 0.001, atol=1e-6)
+
+
+def test_the_numbers_of_sensors_are_all_segments() -> None:
+    assert sorted(packets.NUMBERS) == sorted(SEGMENTS)
+
+
+@pytest.mark.parametrize(
+    ("datagram", "problem"),
+    [
+        (b"hello", "lines that are no JSON"),
+        (b"\xff\xfe\x00", "lines that are no JSON"),
+        (b"[" * 60000, "lines that are no JSON"),
+        (b'{"t": ' + b"9" * 5000 + b"}", "lines that are no JSON"),
+        (b"[1, 2]", "JSON lines without sensor, t, gyro and accel"),
+        (json.dumps({**GOOD, "sensor": "trunk"}).encode(), "samples of an unknown sensor: 'trunk'"),
+        (json.dumps({**GOOD, "sensor": ["torso"]}).encode(), "samples of an unknown sensor: \"['torso']\""),
+        (json.dumps({**GOOD, "t": float("nan")}).encode(), "JSON lines with NaN, which is no number"),
+        (json.dumps({**GOOD, "t": "12"}).encode(), "JSON lines with something else than numbers"),
+        (json.dumps({**GOOD, "t": 10**400}).encode(), "JSON lines with something else than numbers"),
+        (json.dumps({**GOOD, "gyro": [True, 0, 0]}).encode(), "JSON lines with something else than numbers"),
+        (json.dumps({**GOOD, "gyro": [0, 0]}).encode(), "JSON lines whose gyro or accel is not three numbers"),
+        (
+            json.dumps({**GOOD, "t": [], "gyro": [], "accel": []}).encode(),
+            "JSON lines with something else than numbers",
+        ),
+        (json.dumps({**GOOD, "t": [1.0, 2.0]}).encode(), "JSON lines whose t, gyro and accel differ in length"),
+        (json.dumps({**GOOD, "gyro": [1e9, 0, 0]}).encode(), "samples with values that no body sensor gives"),
+        (b'{"sensor": "torso", "t": 1e999, "gyro": [0, 0, 0], "accel": [0, 0, 0]}', "samples with values"),
+        (binary(0, [1.0], [[0.0] * 6])[:-1], "binary packets of a wrong length"),
+        (binary(0, [1.0], [[0.0] * 6]) + b"\0", "binary packets of a wrong length"),
+        (b"WPIN", "binary packets of a wrong length"),
+        (binary(0, [1.0], [[0.0] * 6], version=2), "binary packets of version 2, not 1"),
+        (binary(0, [1.0], [[0.0] * 6])[:-4] + b"abcd", "binary packets with a bad checksum"),
+        (binary(200, [1.0], [[0.0] * 6]), "samples of an unknown sensor: number 200"),
+        (binary(0, [1.0], [[float("nan")] * 6]), "samples with values that no body sensor gives"),
+    ],
+)
+def test_what_is_wrong_is_counted_and_the_next_is_read(
+    source: UdpSource, sender: socket.socket, datagram: bytes, problem: str
+) -> None:
+    sender.sendto(datagram, source.address)
+    sender.sendto(json.dumps(GOOD).encode(), source.address)
+    found = read_until(source, 1)
+    assert [len(samples.time) for samples in found.values()] == [1]
+    assert [kind.startswith(problem) for kind in source.problems] == [True]
+    assert list(source.problems.values()) == [1]
+
+
+def test_the_examples_of_the_page_are_read() -> None:
+    page = (Path(__file__).resolve().parent.parent / "docs" / "live-sources.md").read_text(encoding="utf-8")
+    lines = re.findall(r"```json\n(.*?)\n```", page, re.DOTALL)
+    assert len(lines) == 2
+    for line in lines:
+        batches, problems = packets.decode(line.encode())
+        assert problems == []
+        assert len(batches) == 1
+    [packet] = re.findall(r"```hex\n(.*?)\n```", page, re.DOTALL)
+    [batch], problems = packets.decode(bytes.fromhex(packet))
+    assert (batch.sensor, problems) == ("torso", [])
+    np.testing.assert_allclose(batch.time, [12.5, 12.51], atol=1e-9)
+    np.testing.assert_allclose(
+        batch.values, [[0.1, -0.2, 0.3, 0, 0.5, 9.81], [0.125, -0.25, 0.5, 0, 0.5, 9.75]], rtol=1e-7
+    )
+    for number, name in enumerate(packets.NUMBERS):
+        assert f"{number} {name}" in page
+
+
+def test_two_senders_with_clocks_of_their_own() -> None:
+    """Sent at the same moment, their samples have the same time."""
+    with UdpPair() as (source, first, second):
+        for k in range(20):
+            first.sendto(json.dumps({**GOOD, "t": 5000.0 + k / 100}).encode(), source.address)
+            second.sendto(json.dumps({**GOOD, "t": k / 100, "sensor": "head"}).encode(), source.address)
+            time.sleep(0.01)
+        found = read_until(source, 40)
+        assert np.abs(found["torso"].time - found["head"].time).max() < 0.02
+
+
+class UdpPair:
+    def __enter__(self) -> tuple[UdpSource, socket.socket, socket.socket]:
+        self.all = (
+            UdpSource("127.0.0.1", 0, ["torso", "head"]),
+            *(socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)),
+        )
+        self.all[0].open()
+        return self.all
+
+    def __exit__(self, *_: object) -> None:
+        for one in self.all:
+            one.close()
+
+
+def test_a_sensor_that_is_not_tracked_is_counted(sender: socket.socket) -> None:
+    source = UdpSource("127.0.0.1", 0, ["head"])
+    source.open()
+    sender.sendto(json.dumps(GOOD).encode(), source.address)
+    assert source.read(0.2) == []
+    assert source.problems == {"samples of torso, which is not tracked": 1}
+    source.close()
+
+
+def test_kinds_of_problems_are_bounded(source: UdpSource, sender: socket.socket) -> None:
+    for k in range(3 * MOST_KINDS):
+        sender.sendto(json.dumps({**GOOD, "sensor": f"sensor {k}"}).encode(), source.address)
+    source.read(0.2)
+    assert len(source.problems) == MOST_KINDS + 1
+    assert sum(source.problems.values()) == 3 * MOST_KINDS
+
+
+def test_sensors_are_found_where_they_are_not_given(sender: socket.socket) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    source = open_source(f"udp:{port}", wait_s=5.0)
+    assert isinstance(source, UdpSource)
+    assert source.address == ("127.0.0.1", port)
+
+    def send() -> None:
+        for k in range(30):
+            for name in ("left_forearm", "torso"):
+                sender.sendto(json.dumps({**GOOD, "sensor": name, "t": k / 20}).encode(), source.address)
+            time.sleep(0.05)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    source.open()
+    assert source.sensors == ("torso", "left_forearm")
+    assert source.read(0.1) != []  # what came while it waited is not lost
+    thread.join()
+    source.close()
+
+
+def test_nobody_sends() -> None:
+    source = UdpSource("127.0.0.1", 0, None, 0.2)
+    with pytest.raises(BadSource, match=r"no samples within 0\.2 s"):
+        source.open()
+
+
+def test_a_port_in_use_is_told(source: UdpSource) -> None:
+    other = UdpSource(*source.address, ["torso"])
+    with pytest.raises(BadSource, match="cannot listen there"):
+        other.open()
+
+
+def test_close_frees_the_port_and_may_be_repeated() -> None:
+    source = UdpSource("127.0.0.1", 0, ["torso"])
+    source.open()
+    source.close()
+    source.close()
+    again = UdpSource(*source.address, ["torso"])
+    again.open()
+    again.close()
+
+
+def test_random_datagrams_raise_nothing() -> None:
+    """A hundred thousand of them: bytes, damaged packets, damaged lines."""
+    rng = random.Random(7)
+    whole = [
+        json.dumps(GOOD).encode(),
+        json.dumps({**GOOD, "t": [1.0, 2.0], "gyro": [[0, 0, 0]] * 2, "accel": [[0, 0, 0]] * 2}).encode(),
+        binary(1, [1.0, 1.01], [[0.5] * 6] * 2),
+    ]
+    batches = 0
+    for k in range(100_000):
+        if k % 4 == 3:
+            datagram = rng.randbytes(rng.randrange(64))
+        else:
+            damaged = bytearray(whole[k % 4])
+            for _ in range(rng.randrange(3)):
+                damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+            datagram = bytes(damaged[: rng.randrange(len(damaged) + 1)] if k % 2 else damaged)
+        good, problems = packets.decode(datagram)
+        batches += len(good)
+        for batch in good:
+            assert batch.values.shape == (len(batch.time), 6)
+            assert batch.sensor in SEGMENTS
+        assert all(isinstance(problem, str) and problem for problem in problems)
+    assert batches > 10_000

@@ -1,0 +1,208 @@
+"""A pose → the angles of its joints, after Wu et al. 2005."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .. import so3
+from ..errors import BadData, BadOption, one_of
+from ..model.chains import conjugate, multiply
+from ..pose import Pose
+from ..recording import AXES
+from . import euler
+
+# Where the ISB's axes X, Y, Z of a segment point in our frame of it. X is forward (of a forearm and a hand: to the side
+# of the palm), Y up or proximal, Z to the right (of a forearm and a hand: from the ulna to the radius, the side of the
+# thumb). In the N-pose, palms to the thighs, a forearm is turned by 90° of pronation from the anatomical position, in
+# which all of the ISB's axes are parallel; so are the axes here.
+ISB_AXES = {
+    "world": ("+x", "+z", "-y"),
+    "torso": ("+x", "+z", "-y"),
+    "upper_arm": ("+x", "+z", "-y"),
+    "forearm": ("+y", "+z", "+x"),
+    "hand": ("+y", "+z", "+x"),
+}
+# What lies across the sagittal plane is mirrored on it: quaternions xyzw, and vectors that stand for a turn.
+_MIRRORED_QUAT = np.array([-1.0, 1.0, -1.0, 1.0])
+_MIRRORED_TURN = np.array([-1.0, 1.0, -1.0])
+
+# Nearer than this to the lock [rad] an angle is flagged: there an error of the orientation is 5.8 times that in the
+# first and third angle, or more.
+NEAR_LOCK = np.radians(10.0)
+# Nearer than this [rad] the first and third angle follow from noise, whatever the sensors.
+LEAST_NEAR_LOCK = np.radians(2.0)
+
+# The names say where an angle is positive. Elevation alone is negative where the arm is raised, as the ISB has it.
+SHOULDER_SEQUENCES = {
+    "YXY": ("plane_of_elevation", "elevation", "internal_rotation"),  # Wu 2005, 2.4.7
+    "XZY": ("adduction", "flexion", "internal_rotation"),
+    "ZXY": ("flexion", "adduction", "internal_rotation"),
+}
+
+
+class Joint(NamedTuple):
+    """Which segment moves in which, and how its angles are called; `sequence` is empty for the shoulder's choice."""
+
+    proximal: str
+    distal: str
+    sequence: str
+    names: tuple[str, ...]
+
+
+def _sided(side: str) -> dict[str, Joint]:
+    upper_arm, forearm, hand = f"{side}_upper_arm", f"{side}_forearm", f"{side}_hand"
+    return {
+        f"{side}_shoulder": Joint("torso", upper_arm, "", ()),
+        f"{side}_elbow": Joint(upper_arm, forearm, "ZXY", ("flexion", "carrying_angle", "pronation")),  # 3.4.1
+        f"{side}_wrist": Joint(forearm, hand, "ZXY", ("flexion", "ulnar_deviation", "pronation")),  # 4.4.1
+    }
+
+
+JOINTS = {
+    "thorax": Joint("world", "torso", "ZXY", ("extension", "lateral_flexion_right", "axial_rotation_left")),  # 2.4.1
+    **_sided("left"),
+    **_sided("right"),
+}
+
+
+@dataclass(frozen=True)
+class JointAngles:
+    """The angles of one joint over time.
+
+    Parameters
+    ----------
+    sequence : intrinsic axes, such as "ZXY"
+    names : of the three angles
+    values : (n, 3) [rad], unwrapped; NaN where the pose has none
+    gimbal : (n,) [rad], how far from gimbal lock, at most π/2
+    near_lock : (n,) bool, nearer than asked: first and third angle say little there, and may jump
+    gap : (n,) bool, one of the segments was bridged over a gap of its sensor, or is not known
+    std : (n, 3) [rad], one standard deviation, at most that of an angle even over the circle (104°); None where the
+        pose has no covariances
+    quat : (n, 4) xyzw, the rotation that the angles are of: the distal segment in the proximal one, both in the
+        ISB's axes, a left joint mirrored on the sagittal plane as its angles are
+    """
+
+    sequence: str
+    names: tuple[str, ...]
+    values: np.ndarray
+    gimbal: np.ndarray
+    near_lock: np.ndarray
+    gap: np.ndarray
+    std: np.ndarray | None
+    quat: np.ndarray
+
+
+@dataclass(frozen=True)
+class Angles:
+    """The angles of all joints whose segments are known. `time` (n,) [s]; `joints`: name → its angles."""
+
+    time: np.ndarray
+    joints: Mapping[str, JointAngles]
+
+    def __getitem__(self, joint: str) -> JointAngles:
+        return self.joints[joint]
+
+
+def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK) -> Angles:
+    """Thorax in W, shoulders (upper arm in thorax), elbows, and wrists where hands are measured.
+
+    Left joints are mirrored on the sagittal plane first, so that an angle has the same sign and meaning on both sides.
+    Angles are followed over time (`euler.follow`); standard deviations are to first order, with the errors of two
+    segments taken as independent.
+
+    Parameters
+    ----------
+    sequence : of the shoulder, one of `SHOULDER_SEQUENCES`; other joints have the ISB's ZXY
+    near_lock : [rad], what is nearer to gimbal lock is flagged, and does not decide how angles go on after it
+
+    Raises
+    ------
+    BadOption
+        Another sequence; `near_lock` below 2° or above 45°.
+    BadData
+        No joint has both of its segments in the pose.
+    """
+    if sequence not in SHOULDER_SEQUENCES:
+        raise BadOption(f"shoulder sequence '{sequence}' is not known; {one_of(SHOULDER_SEQUENCES, sequence)}")
+    if not LEAST_NEAR_LOCK <= near_lock <= np.pi / 4.0:
+        raise BadOption(f"near_lock of {np.degrees(near_lock):g} degrees; between 2 and 45 degrees are needed")
+    found = {}
+    for name, joint in JOINTS.items():
+        if joint.distal in pose.quat_WL and (joint.proximal == "world" or joint.proximal in pose.quat_WL):
+            if not joint.sequence:
+                joint = joint._replace(sequence=sequence, names=SHOULDER_SEQUENCES[sequence])
+            found[name] = _angles(pose, joint, name.startswith("left_"), near_lock)
+    if not found:
+        raise BadData(
+            f"no joint has its segments in the pose: torso, or an upper arm and its forearm, are needed; "
+            f"{one_of(pose.quat_WL)}"
+        )
+    return Angles(pose.time, found)
+
+
+def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngles:
+    n = len(pose.time)
+    members = [segment for segment in (joint.proximal, joint.distal) if segment != "world"]
+    known = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in members], axis=0)
+    quat_WP, quat_WD = (_isb_frame(pose, segment, left, known) for segment in (joint.proximal, joint.distal))
+    quat = multiply(conjugate(quat_WP), quat_WD)
+    angles = euler.decompose(quat, joint.sequence)
+    values = euler.follow(angles, joint.sequence, near_lock)
+    std = None
+    if all(segment in pose.segment_cov for segment in members):
+        cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)
+        if left:
+            cov_W = cov_W * np.outer(_MIRRORED_TURN, _MIRRORED_TURN)
+        std = _spread(values, joint.sequence, quat_WP, cov_W)
+    gap = np.any([~known, *(pose.gap[segment] for segment in members if segment in pose.gap)], axis=0)
+    gimbal = _at(known, angles.gimbal, n)
+    return JointAngles(
+        joint.sequence,
+        joint.names,
+        _at(known, values, n),
+        gimbal,
+        gimbal < near_lock,
+        gap,
+        None if std is None else _at(known, std, n),
+        _at(known, so3.continuous(quat), n),
+    )
+
+
+def _quat_LI(segment: str) -> np.ndarray:
+    """The ISB's axes of a segment, or of "world", in our frame of it, (4,) xyzw."""
+    part = segment.removeprefix("left_").removeprefix("right_")
+    return Rotation.from_matrix(np.column_stack([AXES[axis] for axis in ISB_AXES[part]])).as_quat()
+
+
+def _isb_frame(pose: Pose, segment: str, left: bool, known: np.ndarray) -> np.ndarray:
+    """The ISB's frame of a segment in W, (n, 4) where it is `known`, of a left joint mirrored."""
+    quat_LI = _quat_LI(segment)
+    if segment == "world":
+        return np.tile(quat_LI, (int(np.count_nonzero(known)), 1))
+    quat_WL = pose.quat_WL[segment][known]
+    return multiply(quat_WL * _MIRRORED_QUAT if left else quat_WL, quat_LI)
+
+
+def _spread(values: np.ndarray, sequence: str, quat_WP: np.ndarray, cov_W: np.ndarray) -> np.ndarray:
+    """Standard deviations (n, 3) [rad] of angles from the covariance (n, 3, 3) of the turn between the segments, in W.
+
+    With ``exp(e_W) R_WL`` for each segment the rotation between two is turned on its left by ``R_WPᵀ (e_D − e_P)``.
+    """
+    if not len(values):
+        return values
+    rows = euler.gradients(values, sequence) @ np.swapaxes(Rotation.from_quat(quat_WP).as_matrix(), -1, -2)
+    variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
+    return np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN)
+
+
+def _at(known: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+    """`values` of the known samples among n, NaN elsewhere."""
+    out = np.full((n, *values.shape[1:]), np.nan)
+    out[known] = values
+    return out

@@ -1,0 +1,1 @@
+"""Live: samples from a stream → the loop → pose, page, terminal, streams and a recording."""

@@ -1,0 +1,127 @@
+"""Where samples come from, live: one file a kind, one protocol (`base.Source`)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...errors import BadOption, one_of
+from ...recording import SEGMENTS
+from .base import Source
+
+FORMS = {
+    "replay": "replay:PATH",
+    "lsl": "lsl:NAME[@machine|link|site]",
+    "udp": "udp:[HOST:]PORT",
+    "mti": "mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]",
+}
+LOOPBACK = "127.0.0.1"
+
+
+def open_source(
+    spec: str,
+    *,
+    sensors: Sequence[str] | None = None,
+    speed: float | str = 1.0,
+    baud: int = 115200,
+    wait_s: float = 10.0,
+) -> Source:
+    """The source that `spec` describes, not yet opened.
+
+    Parameters
+    ----------
+    spec : ``replay:PATH`` (a session.toml or its folder), ``lsl:NAME``, ``udp:PORT``, ``udp:HOST:PORT`` or
+        ``mti:DEVICE=SEGMENT,…@RATE``; docs/live-sources.md says what each takes
+    sensors : those that are wanted; None: all that the source has. A UDP or LSL source waits for its sensors in `open`
+    speed : of a replay: 1.0 its own, 4.0 four times that, "max" as fast as it is read
+    baud : of serial ports
+    wait_s : how long `open` waits for streams or senders [s]
+
+    Raises
+    ------
+    BadOption
+        The spec is none, or names what does not exist; WeposeErrors of the recording that is replayed.
+    """
+    kind, colon, rest = spec.partition(":")
+    if kind not in FORMS or not colon or not rest:
+        raise BadOption(f"source '{spec}' is none; {one_of(FORMS.values(), kind)}")
+    unknown = [name for name in sensors or () if name not in SEGMENTS]
+    if unknown:
+        raise BadOption(f"source '{spec}': '{unknown[0]}' is not a segment; {one_of(SEGMENTS, unknown[0])}")
+    if kind == "replay":
+        return _replay(spec, rest, sensors, speed)
+    if kind == "lsl":
+        return _lsl(spec, rest, sensors, wait_s)
+    if kind == "udp":
+        return _udp(spec, rest, sensors, wait_s)
+    return _mti(spec, rest, sensors, baud)
+
+
+def _replay(spec: str, path: str, sensors: Sequence[str] | None, speed: float | str) -> Source:
+    from dataclasses import replace
+
+    from ...readers import load_session
+    from .replay import ReplaySource
+
+    try:
+        times = math.inf if speed == "max" else float(speed)
+    except ValueError:
+        times = math.nan
+    if not times > 0.0:
+        raise BadOption(f"speed: '{speed}'; a positive number, 1.0 is the recording's own, or max")
+    recording = load_session(Path(path), gaps=True)
+    if sensors is not None:
+        missing = [name for name in sensors if name not in recording.sensors]
+        if missing:
+            raise BadOption(f"source '{spec}': no sensor {missing[0]}; {one_of(recording.sensors, missing[0])}")
+        recording = replace(recording, sensors={name: recording.sensors[name] for name in sensors})
+    return ReplaySource(recording, times)
+
+
+def _lsl(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float) -> Source:
+    from .lsl import SCOPES, LslSource
+
+    name, at, scope = rest.rpartition("@")
+    if not at:
+        return LslSource(rest, sensors, None, wait_s)
+    if scope not in SCOPES:
+        raise BadOption(f"source '{spec}': '{scope}' is no reach of a search; {one_of(SCOPES, scope)}")
+    return LslSource(name, sensors, scope, wait_s)
+
+
+def _udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float) -> Source:
+    from .udp import UdpSource
+
+    host, _, port = rest.rpartition(":")
+    if not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise BadOption(f"source '{spec}': '{port}' is no port; a number from 1 to 65535, as udp:9000")
+    host = host.removeprefix("[").removesuffix("]")
+    return UdpSource(host or LOOPBACK, int(port), sensors, wait_s)
+
+
+def _mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int) -> Source:
+    from .mti import MTiSource
+
+    listed, at, rate = rest.rpartition("@")
+    rate_hz = None
+    if at:
+        if not (rate.isascii() and rate.isdigit() and 0 < int(rate) <= 2000):
+            raise BadOption(f"source '{spec}': rate '{rate}'; whole samples a second from 1 to 2000, as @100")
+        rate_hz = int(rate)
+    devices: dict[str, str] = {}
+    for pair in (listed if at else rest).split(","):
+        device, equals, segment = pair.rpartition("=")
+        if not equals or not device:
+            raise BadOption(f"source '{spec}': '{pair}' is no DEVICE=SEGMENT, as /dev/ttyUSB0=torso")
+        if segment not in SEGMENTS:
+            raise BadOption(f"source '{spec}': '{segment}' is not a segment; {one_of(SEGMENTS, segment)}")
+        if segment in devices or device in devices.values():
+            raise BadOption(f"source '{spec}': '{pair}': each device and each segment is named once")
+        devices[segment] = device
+    if sensors is not None:
+        missing = [name for name in sensors if name not in devices]
+        if missing:
+            raise BadOption(f"source '{spec}': no device for {missing[0]}; {one_of(devices, missing[0])}")
+        devices = {name: devices[name] for name in sensors}
+    return MTiSource(devices, rate_hz, baud)

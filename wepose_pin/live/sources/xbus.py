@@ -1,0 +1,293 @@
+"""Xbus, the protocol of Xsens MTi sensors: bytes → frames → packets → samples; no port in here.
+
+A frame is ``FA FF MID LEN data checksum``; LEN ``FF`` is followed by the length in two bytes. All bytes but the first
+add up to zero in the low byte. Numbers are big endian. An MTData2 frame (MID 36) is a row of items ``id id length
+data``; the last four bits of an id say how its numbers are written. Source: Xsens, MT Low Level Communication Protocol
+Documentation (MT0101P).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+PREAMBLE, BID = 0xFA, 0xFF
+LONGEST = 2048  # [bytes] of data in a frame
+GO_TO_MEASUREMENT, GO_TO_CONFIG, DATA, ERROR, SET_OUTPUT = 0x10, 0x30, 0x36, 0x42, 0xC0
+
+PACKET_COUNTER, SAMPLE_TIME_FINE = 0x1020, 0x1060
+ACCELERATION, ACCELERATION_HR = 0x4020, 0x4040
+RATE_OF_TURN, RATE_OF_TURN_HR = 0x8020, 0x8040
+TICKS_HZ = 10_000.0  # SampleTimeFine
+WITH_EVERY_PACKET = 0xFFFF  # the rate of items that have none of their own
+
+# Results that an Error message carries.
+ERRORS = {
+    0x03: "the period is not one it can keep",
+    0x04: "the message is not valid in this state, or unknown to it",
+    0x1E: "its timer overflowed: too much data, or too high a rate",
+    0x20: "the baud rate is not one it knows",
+    0x21: "a parameter is not one it knows",
+    0x28: "the device failed; update its firmware",
+    0x29: "too much data for this baud rate",
+    0x2A: "its buffer overflowed: too much data for this baud rate",
+}
+
+
+class Frame(NamedTuple):
+    """One message."""
+
+    mid: int
+    data: bytes
+
+
+class Packet(NamedTuple):
+    """What a sample needs of one MTData2 frame; None where it is not in it. In the sensor's axes."""
+
+    ticks: int | None  # SampleTimeFine
+    gyro: tuple[float, float, float] | None  # [rad/s]
+    accel: tuple[float, float, float] | None  # [m/s²]
+    gyro_hr: tuple[float, float, float] | None
+    accel_hr: tuple[float, float, float] | None
+
+
+class Malformed(ValueError):
+    """The data of a frame with a good checksum are no MTData2."""
+
+
+def frame(mid: int, data: bytes = b"") -> bytes:
+    """The bytes of one message to a device."""
+    length = bytes([len(data)]) if len(data) < 0xFF else b"\xff" + struct.pack(">H", len(data))
+    body = bytes([BID, mid]) + length + data
+    return bytes([PREAMBLE]) + body + bytes([-sum(body) & 0xFF])
+
+
+class Frames:
+    """Takes bytes as they come, gives whole frames; after noise it starts again at the next one with a good checksum.
+
+    Attributes
+    ----------
+    skipped : bytes that were in no frame
+    bad_checksums : of these, how often what began like a frame was none
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.skipped = 0
+        self.bad_checksums = 0
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that are complete with these bytes."""
+        buffer = self._buffer
+        buffer += data
+        frames: list[Frame] = []
+        at = 0
+        while True:
+            begin = buffer.find(PREAMBLE, at)
+            if begin < 0:
+                self.skipped += len(buffer) - at
+                at = len(buffer)
+                break
+            self.skipped += begin - at
+            at = begin
+            if len(buffer) - at < 4:
+                break
+            head, length = 4, buffer[at + 3]
+            if length == 0xFF:
+                if len(buffer) - at < 6:
+                    break
+                head, length = 6, buffer[at + 4] << 8 | buffer[at + 5]
+            end = at + head + length + 1
+            if buffer[at + 1] != BID or length > LONGEST:
+                self.skipped += 1
+                at += 1
+            elif end > len(buffer):
+                break
+            elif sum(buffer[at + 1 : end]) & 0xFF:
+                self.bad_checksums += 1
+                self.skipped += 1
+                at += 1
+            else:
+                frames.append(Frame(buffer[at + 2], bytes(buffer[at + head : end - 1])))
+                at = end
+        del buffer[:at]
+        return frames
+
+
+def packet(data: bytes) -> Packet:
+    """The items of an MTData2 frame that a sample needs; others are passed over.
+
+    Raises
+    ------
+    Malformed
+        An item is cut off, or of a length that its id does not have.
+    """
+    ticks = None
+    vectors: dict[int, tuple[float, float, float]] = {}
+    at = 0
+    while at < len(data):
+        if at + 3 > len(data) or at + 3 + data[at + 2] > len(data):
+            raise Malformed("an item is cut off")
+        kind = data[at] << 8 | data[at + 1]
+        content = data[at + 3 : at + 3 + data[at + 2]]
+        at += 3 + len(content)
+        item = kind & 0xFFF0
+        if item == SAMPLE_TIME_FINE:
+            if len(content) != 4:
+                raise Malformed("SampleTimeFine is not of four bytes")
+            ticks = int.from_bytes(content, "big")
+        elif item in (ACCELERATION, ACCELERATION_HR, RATE_OF_TURN, RATE_OF_TURN_HR):
+            vectors[item] = _vector(kind & 0x3, content)
+    return Packet(
+        ticks,
+        vectors.get(RATE_OF_TURN),
+        vectors.get(ACCELERATION),
+        vectors.get(RATE_OF_TURN_HR),
+        vectors.get(ACCELERATION_HR),
+    )
+
+
+def _vector(written: int, content: bytes) -> tuple[float, float, float]:
+    """Three numbers; `written` is 0 float32, 1 fixed 12.20, 2 fixed 16.32 (fraction first), 3 float64."""
+    try:
+        if written == 2:
+            x0, x1, y0, y1, z0, z1 = struct.unpack(">IhIhIh", content)
+            return x1 + x0 / 2**32, y1 + y0 / 2**32, z1 + z0 / 2**32
+        x, y, z = struct.unpack((">3f", ">3i", "", ">3d")[written], content)
+    except struct.error:
+        raise Malformed(f"three numbers in {len(content)} bytes") from None
+    return (x / 2**20, y / 2**20, z / 2**20) if written == 1 else (x, y, z)
+
+
+# Samples -------------------------------------------------------------------------------------------------------------
+
+# Between accelerations further apart than this [s] none is interpolated, and no rate waits longer for one.
+LONGEST_STEP_S = 0.1
+# A device's time that goes back by more than this [s] is that of a device that started anew.
+RESTART_S = 1.0
+
+
+class Joiner:
+    """Rates and accelerations of one device, which may come in packets and at rates of their own → samples of both.
+
+    A sample is made for each rate; its acceleration is of the same time, or interpolated linearly. Where a device sends
+    the high-rate (HR) kind of either, that is taken and the plain kind is passed over.
+
+    Attributes
+    ----------
+    untimed : packets without SampleTimeFine
+    alone : rates for which there was no acceleration
+    """
+
+    def __init__(self) -> None:
+        self.untimed = 0
+        self.alone = 0
+        self._ticks: int | None = None
+        self._hr = [False, False]
+        self._rates: deque[tuple[float, tuple[float, float, float]]] = deque()
+        self._accels: deque[tuple[float, tuple[float, float, float]]] = deque(maxlen=1024)
+        self._time: list[float] = []
+        self._values: list[tuple[float, ...]] = []
+
+    def add(self, found: Packet) -> None:
+        """Take a packet."""
+        gyro = self._chosen(0, found.gyro, found.gyro_hr)
+        accel = self._chosen(1, found.accel, found.accel_hr)
+        if gyro is None and accel is None:
+            return
+        if found.ticks is None:
+            self.untimed += 1
+            return
+        time = self._seconds(found.ticks)
+        if accel is not None:
+            self._accels.append((time, accel))
+        if gyro is not None:
+            self._rates.append((time, gyro))
+        self._join()
+
+    def take(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the samples since the last call, device times (m,) [s] and values (m, 6): gyro [rad/s], accel [m/s²]."""
+        time, values = np.array(self._time), np.array(self._values).reshape(-1, 6)
+        self._time, self._values = [], []
+        return time, values
+
+    def _chosen(
+        self, which: int, plain: tuple[float, float, float] | None, hr: tuple[float, float, float] | None
+    ) -> tuple[float, float, float] | None:
+        self._hr[which] = self._hr[which] or hr is not None
+        return hr if self._hr[which] else plain
+
+    def _seconds(self, ticks: int) -> float:
+        """Device time [s] that does not wrap at 2³² ticks."""
+        if self._ticks is None:
+            self._ticks = ticks
+        step = (ticks - self._ticks) & 0xFFFFFFFF
+        step -= (step & 0x80000000) << 1
+        if step < -RESTART_S * TICKS_HZ:
+            self._rates.clear()
+            self._accels.clear()
+        self._ticks += step
+        return self._ticks / TICKS_HZ
+
+    def _join(self) -> None:
+        rates, accels = self._rates, self._accels
+        while rates:
+            time, gyro = rates[0]
+            while len(accels) > 1 and accels[1][0] <= time:
+                accels.popleft()
+            accel = None
+            if accels and accels[0][0] == time:
+                accel = accels[0][1]
+            elif accels and accels[0][0] < time:
+                if len(accels) < 2:
+                    if rates[-1][0] - time <= LONGEST_STEP_S:
+                        return  # the acceleration after it is still to come
+                elif accels[1][0] - accels[0][0] <= LONGEST_STEP_S:
+                    (t0, before), (t1, after) = accels[0], accels[1]
+                    part = (time - t0) / (t1 - t0)
+                    accel = (
+                        before[0] + part * (after[0] - before[0]),
+                        before[1] + part * (after[1] - before[1]),
+                        before[2] + part * (after[2] - before[2]),
+                    )
+            elif not accels and rates[-1][0] - time <= LONGEST_STEP_S:
+                return
+            rates.popleft()
+            if accel is None:
+                self.alone += 1
+            else:
+                self._time.append(time)
+                self._values.append((*gyro, *accel))
+
+
+# Configuration -------------------------------------------------------------------------------------------------------
+
+
+def output_items(rate_hz: int, hr: bool) -> bytes:
+    """Data of SetOutputConfiguration: counter, time, rate of turn and acceleration in float32, at `rate_hz`."""
+    items = ACCELERATION_HR if hr else ACCELERATION, RATE_OF_TURN_HR if hr else RATE_OF_TURN
+    return struct.pack(
+        ">8H",
+        PACKET_COUNTER,
+        WITH_EVERY_PACKET,
+        SAMPLE_TIME_FINE,
+        WITH_EVERY_PACKET,
+        items[0],
+        rate_hz,
+        items[1],
+        rate_hz,
+    )
+
+
+def granted(data: bytes) -> dict[int, int]:
+    """Item → rate [Hz] of a device's answer to SetOutputConfiguration."""
+    pairs = struct.iter_unpack(">2H", data[: len(data) // 4 * 4])
+    return {item & 0xFFF0: rate for item, rate in pairs}
+
+
+def error_words(data: bytes) -> str:
+    """What an Error message says."""
+    return ERRORS.get(data[0], f"error {data[0]:#04x}") if data else "an error without a number"

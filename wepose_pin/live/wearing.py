@@ -1,0 +1,87 @@
+"""Who wears the sensors, and how: all that is known before the first sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import BadSession, one_of
+from ..readers.keys import Keys, read_toml
+from ..readers.stated import phases_stated, sensor_stated
+from ..recording import SEGMENTS, START_POSES, Intervals, Recording
+from ..subject import Subject
+
+
+@dataclass(frozen=True)
+class Wearing:
+    """A person with sensors on.
+
+    Parameters
+    ----------
+    subject : lengths and calibrated mounts; None: the average person and stated mounts
+    mounts : segment → stated `quat_LS` (4,) xyzw
+    phases : of a replay: `start` and `still` [s], else the start pose is found
+    """
+
+    name: str = "live"
+    subject: Subject | None = None
+    mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
+    phases: Mapping[str, Intervals] = field(default_factory=dict)
+    start_pose: str = "n_pose"
+    strapping: str = "as_calibrated"
+
+    @classmethod
+    def of(cls, recording: Recording, subject: Subject | None = None) -> Wearing:
+        """As a recording has it that is replayed."""
+        return cls(
+            recording.name,
+            subject,
+            {n: s.stated_quat_LS for n, s in recording.sensors.items() if s.stated_quat_LS is not None},
+            recording.phases,
+            recording.start_pose,
+            recording.strapping,
+        )
+
+    def header(self, sensors: Sequence[str]) -> dict[str, Any]:
+        """What the recording of a live session begins with, the subject and method apart."""
+        return {
+            "name": self.name,
+            "sensors": list(sensors),
+            "mounts": {name: np.asarray(quat).tolist() for name, quat in self.mounts.items() if name in sensors},
+            "phases": {name: [list(span) for span in spans] for name, spans in self.phases.items()},
+            "start_pose": self.start_pose,
+            "strapping": self.strapping,
+        }
+
+
+def read_wearing(path: Path, subject: Subject | None = None) -> Wearing:
+    """What a session file says of the sensors' mounts; what it says of data and phases is of another recording.
+
+    Raises
+    ------
+    MissingFile, BadSession
+        Not there, or a key in it that no session has.
+    """
+    path = path / "session.toml" if path.is_dir() else path
+    top = Keys(read_toml(path, "a session file"), str(path))
+    top.allow("name", "start_pose", "strapping", "data", "phases", "sensors")
+    phases_stated(top.table("phases", {}))
+    tables = top.table("sensors")
+    mounts = {}
+    for segment in tables.values:
+        if segment not in SEGMENTS:
+            raise BadSession(f"{path}: sensors.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
+        mount = sensor_stated(tables.table(segment)).mount
+        if mount is not None:
+            mounts[segment] = mount
+    return Wearing(
+        top.text("name", None) or path.absolute().parent.name,
+        subject,
+        mounts,
+        start_pose=top.choice("start_pose", START_POSES, "n_pose"),
+        strapping=top.choice("strapping", ("as_calibrated", "new"), "as_calibrated"),
+    )

@@ -1,0 +1,161 @@
+"""HDF5 and MATLAB files: arrays by their path, as ``/imu/torso/gyro``, and single columns of them, ``/imu/gyro[0]``.
+
+An array is (n,), (n, k) or (k, n) with n samples; the fields of a MATLAB struct are a path's parts. HDF5, and with it
+MATLAB's v7.3, is read by h5py, which is optional.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from ..errors import BadData, MissingFile, UnknownColumn, one_of
+
+SUFFIXES = (".h5", ".hdf5", ".mat")
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+# More columns than this is no signal of a sensor.
+MOST_COLUMNS = 16
+
+
+def is_array_file(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES
+
+
+@dataclass
+class ArrayFile:
+    """The arrays of numbers in a file; an HDF5 file's are read when they are asked for.
+
+    Raises
+    ------
+    MissingFile, BadData
+        Not there; neither HDF5 nor MATLAB's, or damaged; h5py is needed and missing.
+    """
+
+    path: Path
+    shapes: dict[str, tuple[int, ...]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        try:
+            with self.path.open("rb") as file:
+                start = file.read(1024)
+        except OSError as error:
+            reason = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+            raise MissingFile(f"{self.path}: {reason}; an HDF5 or MATLAB file is wanted here") from None
+        self._hdf5 = HDF5_MAGIC in (start[:8], start[512:520])  # MATLAB puts 512 bytes of its own before it
+        self._loaded: dict[str, np.ndarray] = {}
+        self.shapes = self._hdf5_shapes() if self._hdf5 else self._matlab_shapes()
+        if not self.shapes:
+            raise BadData(f"{self.path}: no arrays of numbers in it")
+
+    def table(self, wanted: Mapping[str, str]) -> pl.DataFrame:
+        """Columns by name, ``path`` of an array (n,) or ``path[k]``; `wanted` has for each what begins an error's text.
+
+        Raises
+        ------
+        UnknownColumn, BadData
+            No such array, or no such column of it; arrays of unlike length.
+        """
+        found = {name: self._column(name, place) for name, place in wanted.items()}
+        lengths = {name: len(values) for name, values in found.items()}
+        if len(set(lengths.values())) > 1:
+            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            raise BadData(f"{self.path}: the arrays of a sensor and its time differ in length: {listed}")
+        return pl.DataFrame(found)
+
+    def expanded(self, name: str, width: int, place: str) -> list[str]:
+        """The `width` columns of an array that is named as a whole."""
+        path = self._find(name, place)
+        shape = self.shapes[path]
+        if len(shape) != 2 or width not in shape:
+            raise BadData(f"{place}: {name} in {self.path.name} has shape {shape}; (n, {width}) is needed")
+        return [f"{name}[{k}]" for k in range(width)]
+
+    def _column(self, name: str, place: str) -> np.ndarray:
+        part = re.fullmatch(r"(.*)\[(\d+)\]", name)
+        path = self._find(part[1] if part else name, place)
+        values = self._array(path)
+        if values.ndim == 2 and (values.shape[1] > MOST_COLUMNS or values.shape[0] == 1):
+            values = values.T  # MATLAB's v7.3 turns arrays round
+        if part is None:
+            if values.ndim == 2 and values.shape[1] == 1:
+                values = values[:, 0]
+            if values.ndim != 1:
+                raise BadData(f"{place}: {name} in {self.path.name} has shape {values.shape}; name a column: {name}[0]")
+            return values
+        k = int(part[2])
+        if values.ndim != 2 or k >= values.shape[1]:
+            raise UnknownColumn(f"{place}: no column {k} in {part[1]} of {self.path.name}, its shape is {values.shape}")
+        return np.ascontiguousarray(values[:, k])
+
+    def _find(self, name: str, place: str) -> str:
+        path = "/" + name.replace(".", "/").strip("/")
+        if path not in self.shapes:
+            raise UnknownColumn(f"{place}: no array '{name}' in {self.path.name}; {one_of(self.shapes, path)}")
+        return path
+
+    def _array(self, path: str) -> np.ndarray:
+        if path not in self._loaded:
+            with _reading(self.path), _h5py(self.path).File(self.path) as file:
+                self._loaded[path] = np.asarray(file[path], dtype=float)
+        return self._loaded[path]
+
+    def _hdf5_shapes(self) -> dict[str, tuple[int, ...]]:
+        h5py = _h5py(self.path)
+        shapes: dict[str, tuple[int, ...]] = {}
+
+        def visit(name: str, thing: Any) -> None:
+            if isinstance(thing, h5py.Dataset) and thing.dtype.kind in "fiu" and 1 <= len(thing.shape) <= 2:
+                shapes[f"/{name}"] = tuple(int(size) for size in thing.shape)
+
+        with _reading(self.path), h5py.File(self.path) as file:
+            file.visititems(visit)
+        return shapes
+
+    def _matlab_shapes(self) -> dict[str, tuple[int, ...]]:
+        from scipy.io import loadmat
+
+        with _reading(self.path):
+            content = loadmat(self.path, simplify_cells=True)
+
+        def walk(name: str, thing: Any) -> None:
+            if isinstance(thing, dict):
+                for key, value in thing.items():
+                    if not key.startswith("__"):
+                        walk(f"{name}/{key}", value)
+            elif isinstance(thing, np.ndarray) and thing.dtype.kind in "fiu" and 1 <= thing.ndim <= 2:
+                self._loaded[name] = np.asarray(thing, dtype=float)
+
+        walk("", content)
+        return {name: values.shape for name, values in self._loaded.items()}
+
+
+def _h5py(path: Path) -> Any:
+    try:
+        import h5py
+    except ImportError:
+        raise BadData(
+            f"{path}: is HDF5 (MATLAB's v7.3 is too), which h5py reads: pip install 'wepose-pin[hdf5]'"
+        ) from None
+    return h5py
+
+
+class _reading:
+    """A library's errors on a damaged file as one line of ours."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, Exception) and not isinstance(error, BadData):
+            # h5py and SciPy raise many kinds: what is wrong is in the text.
+            reason = " ".join(str(error).split())[:120]
+            raise BadData(f"{self.path}: is damaged, cut off, or no MATLAB or HDF5 file: {reason}") from error

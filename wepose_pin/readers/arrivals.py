@@ -1,0 +1,317 @@
+"""Samples in the order of arrival → ticks of one even clock, the same for whoever takes them live or from a file.
+
+What comes out depends on what came in and in which order, on nothing else: not on the time of day, nor on how many
+samples came at once. So a file that holds the arrivals gives the same ticks again, to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..so3 import kernel
+
+# A sample this near to a tick, as a share of a step, is the tick's own.
+SAME = 0.01
+# A longer step than this many usual ones holds a lost sample.
+HOLE = 1.5
+BRIDGE_S = 0.05  # [s] up to which what was lost is bridged, as `clocks.LONGEST_GAP_S`
+REORDER_S = 0.02  # [s] for how long a sample may come after one that is later, while its tick waits
+WAIT_S = 0.1  # [s] for how long a tick waits for a sensor; then the sensor is lost until it comes again
+JUMP_S = 5.0  # [s] a time further ahead of all others is an error, unless the sensor goes on from there
+# What no body sensor measures was not measured (filters.base has the same limits).
+HIGHEST_RATE, HIGHEST_ACCEL = 1e3, 1e4  # [rad/s], [m/s²]
+
+MISSING, LATE, DUPLICATE, BAD, TAKEN = range(5)
+COUNTS = ("missing", "late", "duplicate", "bad", "taken")
+
+# A row of a sensor's room: time, gyro, accel.
+_T, _GX, _AX, _WIDTH = 0, 1, 4, 7
+_OUT = 1024
+_TICK, _NEWEST = 0, 1  # of the scalars: ticks given, the newest time of all
+
+
+class Samples(NamedTuple):
+    """Samples of one sensor in the order in which they came, one or many."""
+
+    sensor: str  # its segment
+    time: np.ndarray  # (m,) [s], all sensors on one clock
+    gyro_S: np.ndarray  # (m, 3) [rad/s], the rate over the interval that ends at the sample
+    accel_S: np.ndarray  # (m, 3) [m/s²], specific force, +g up at rest
+
+
+class Arrivals(NamedTuple):
+    """Samples of all sensors in the order in which they came."""
+
+    which: np.ndarray  # (m,) uint8, number of the sensor
+    time: np.ndarray  # (m,) [s]
+    gyro_S: np.ndarray  # (m, 3) [rad/s]
+    accel_S: np.ndarray  # (m, 3) [m/s²]
+
+
+def arrivals(got: Sequence[Samples], sensors: Sequence[str]) -> Arrivals:
+    """What one read gave, by time: which sensor was asked first says nothing of when its samples came."""
+    which = np.repeat([sensors.index(s.sensor) for s in got], [len(s.time) for s in got]).astype(np.uint8)
+    time, gyro_S, accel_S = (np.concatenate(of, dtype=float) for of in tuple(zip(*got, strict=True))[1:])
+    if len(got) > 1:
+        order = np.argsort(time, kind="stable")
+        return Arrivals(which[order], time[order], gyro_S[order], accel_S[order])
+    return Arrivals(which, time, gyro_S, accel_S)
+
+
+class Ticks(NamedTuple):
+    """Consecutive moments at which all sensors are known, or known to be lost."""
+
+    first: int  # number of the first of them, from 0 on
+    time: np.ndarray  # (m,) [s]
+    gyro_S: np.ndarray  # (m, k, 3) [rad/s], NaN where the sensor was lost
+    accel_S: np.ndarray  # (m, k, 3) [m/s²], the same
+    lost: np.ndarray  # (m, k) bool: the sensor has been silent for longer than ticks wait
+
+
+class Aligner:
+    """Ticks of one even clock from samples that come one after another, out of order, twice, late or not at all.
+
+    A tick goes as soon as every sensor has reached it. It waits `REORDER_S` for a sample that others of its sensor have
+    overtaken and `wait_s` for a silent sensor, measured on the samples' own times; from then on the sensor is lost and
+    none waits for it until it comes again. A sample on its tick is taken as it is; between ticks the rate is the mean
+    over the step (each sample's rate holds for the interval that ends there) and the specific force is interpolated.
+    Holes of up to `BRIDGE_S` are bridged linearly, longer ones are NaN.
+
+    Parameters
+    ----------
+    sensors : segments, in the order of the ticks' columns
+    rate_hz : ticks a second
+    begin : time [s] of tick 0
+    wait_s : how long a tick waits for a silent sensor
+    """
+
+    def __init__(self, sensors: Sequence[str], rate_hz: float, begin: float, wait_s: float = WAIT_S) -> None:
+        self.sensors, self.rate_hz, self.begin, self.wait_s = tuple(sensors), rate_hz, begin, wait_s
+        k = len(self.sensors)
+        self.counts = np.zeros((k, len(COUNTS)), dtype=np.int64)
+        self.lost = np.zeros(k, dtype=np.bool_)
+        room = 64 + int(8.0 * rate_hz * max(wait_s, REORDER_S, BRIDGE_S))
+        self._kept, self._held = np.zeros((k, room, _WIDTH)), np.zeros(k, dtype=np.int64)
+        self._jump = np.zeros((k, 2))  # samples in a row that were too far ahead, and the last of their times
+        self._scalars = np.array([0.0, -np.inf])
+        self._settings = np.array([begin, 1.0 / rate_hz, wait_s])
+        self._out = np.empty((_OUT, k, 6)), np.empty((_OUT, k), dtype=np.bool_)
+        self._none = Ticks(0, np.empty(0), np.empty((0, k, 3)), np.empty((0, k, 3)), np.empty((0, k), dtype=np.bool_))
+
+    @property
+    def next_tick(self) -> int:
+        return int(self._scalars[_TICK])
+
+    @property
+    def newest(self) -> float:
+        """Time [s] of the newest sample of all; −inf before the first."""
+        return float(self._scalars[_NEWEST])
+
+    def push(self, came: Arrivals) -> Ticks:
+        """Take samples; the ticks that are whole by them, often none."""
+        first, parts = self.next_tick, []
+        at = 0
+        values, lost = self._out
+        while True:
+            at, made = _take(
+                self._kept,
+                self._held,
+                self._jump,
+                self._scalars,
+                self._settings,
+                self.counts,
+                self.lost,
+                *came,
+                at,
+                values,
+                lost,
+            )
+            if made:
+                parts.append((values[:made].copy(), lost[:made].copy()))
+            if at == len(came.time) and made < _OUT:
+                break
+        if not parts:
+            return self._none
+        whole, gone = parts[0] if len(parts) == 1 else tuple(map(np.concatenate, zip(*parts, strict=True)))
+        numbers = self.begin + np.arange(first, first + len(whole)) / self.rate_hz
+        return Ticks(first, numbers, whole[:, :, :3], whole[:, :, 3:], gone)
+
+
+@kernel
+def _take(kept, held, jump, scalars, settings, counts, lost, which, time, gyro, accel, at, out, out_lost):  # type: ignore[no-untyped-def]
+    """Samples from `at` on; gives how far it came and how many ticks it made, at most as many as `out` holds."""
+    made = 0
+    while True:
+        while made < len(out) and _due(kept, held, scalars, settings, lost):
+            _tick(kept, held, scalars, settings, counts, lost, out[made], out_lost[made])
+            made += 1
+        if made == len(out) or at == len(time):
+            return at, made
+        _insert(kept, held, jump, scalars, settings, counts, lost, which[at], time[at], gyro[at], accel[at])
+        at += 1
+
+
+@kernel
+def _insert(kept, held, jump, scalars, settings, counts, lost, s, t, gyro, accel):  # type: ignore[no-untyped-def]
+    """One sample into its sensor's room, in order of time."""
+    dt = settings[1]
+    size = gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2]
+    force = accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2]
+    if not (abs(t) < 1e12 and size < HIGHEST_RATE * HIGHEST_RATE and force < HIGHEST_ACCEL * HIGHEST_ACCEL):
+        counts[s, BAD] += 1
+        return
+    if t > scalars[_NEWEST] + JUMP_S and scalars[_NEWEST] > -np.inf:
+        # One wild time must not make hours of ticks; a clock that really went on does so for some samples.
+        goes_on = jump[s, 0] > 0.0 and 0.0 < t - jump[s, 1] < 1.0
+        jump[s, 0] = jump[s, 0] + 1.0 if goes_on else 1.0
+        jump[s, 1] = t
+        if jump[s, 0] < 4.0:
+            counts[s, BAD] += 1
+            return
+    jump[s, 0] = 0.0
+    last = settings[0] + (scalars[_TICK] - 1.0) * dt  # the tick that went last
+    room, n = kept[s], held[s]
+    if t < last + SAME * dt:
+        # Only the first tick has none before it: what lies before the beginning is what its step began with.
+        if n > 0 and abs(room[0, _T] - t) < SAME * dt:
+            counts[s, DUPLICATE] += 1
+            return
+        if scalars[_TICK] > 0.0:
+            counts[s, LATE] += 1
+            if t > scalars[_NEWEST] - settings[2]:
+                lost[s] = False  # it is back: the next tick waits for it
+            return
+    i = n
+    while i > 0 and room[i - 1, _T] > t - SAME * dt:
+        i -= 1
+    if i < n and abs(room[i, _T] - t) <= SAME * dt:
+        counts[s, DUPLICATE] += 1
+        return
+    if n == len(room):  # no tick can go though a sensor is this far ahead: the oldest is given up
+        for j in range(n - 1):
+            for m in range(_WIDTH):
+                room[j, m] = room[j + 1, m]
+        n -= 1
+        i = max(i - 1, 0)
+    for j in range(n, i, -1):
+        for m in range(_WIDTH):
+            room[j, m] = room[j - 1, m]
+    room[i, _T] = t
+    for m in range(3):
+        room[i, _GX + m], room[i, _AX + m] = gyro[m], accel[m]
+    held[s] = n + 1
+    lost[s] = False
+    counts[s, TAKEN] += 1
+    if t > scalars[_NEWEST]:
+        scalars[_NEWEST] = t
+
+
+@kernel
+def _due(kept, held, scalars, settings, lost):  # type: ignore[no-untyped-def]
+    """Whether the next tick can go."""
+    begin, dt, wait = settings[0], settings[1], settings[2]
+    t = begin + scalars[_TICK] * dt
+    newest = scalars[_NEWEST]
+    if newest < t - SAME * dt:
+        return False
+    if newest >= t + wait:
+        return True
+    for s in range(len(held)):
+        if lost[s]:
+            continue
+        room, n = kept[s], held[s]
+        if n == 0 or room[n - 1, _T] < t - SAME * dt:
+            return False
+        if room[n - 1, _T] >= t + REORDER_S:
+            continue
+        i = _reached(room, n, t, dt)
+        if i > 0 and room[i, _T] - room[i - 1, _T] > HOLE * dt and room[i - 1, _T] > t - wait:
+            return False  # what lies in the hole may still come
+    return True
+
+
+@kernel
+def _reached(room, n, t, dt):  # type: ignore[no-untyped-def]
+    """The first sample at or after `t`; n where there is none."""
+    i = 0
+    while i < n and room[i, _T] < t - SAME * dt:
+        i += 1
+    return i
+
+
+@kernel
+def _tick(kept, held, scalars, settings, counts, lost, out, out_lost):  # type: ignore[no-untyped-def]
+    """The next tick into `out` (k, 6); what no later tick needs is forgotten."""
+    dt = settings[1]
+    t = settings[0] + scalars[_TICK] * dt
+    for s in range(len(held)):
+        room, n = kept[s], held[s]
+        i = _reached(room, n, t, dt)
+        if i == n:
+            lost[s] = True
+        if not _value(room, n, i, t, dt, out[s]):
+            counts[s, MISSING] += 1
+            for m in range(6):
+                out[s, m] = np.nan
+        out_lost[s] = lost[s]
+        # The last at or before the tick is where the next step begins.
+        done = i if i < n and room[i, _T] <= t + SAME * dt else i - 1
+        if done > 0:
+            for j in range(n - done):
+                for m in range(_WIDTH):
+                    room[j, m] = room[j + done, m]
+            held[s] = n - done
+    scalars[_TICK] += 1.0
+
+
+@kernel
+def _value(room, n, i, t, dt, out):  # type: ignore[no-untyped-def]
+    """The sensor at `t` into `out` (6,), where `i` is its first sample from there on; false where it is not known."""
+    if i == n:
+        return False
+    first = i == 0
+    step = 0.0 if first else room[i, _T] - room[i - 1, _T]
+    if room[i, _T] - t <= SAME * dt and (first or step >= (1.0 - 2.0 * SAME) * dt):
+        for m in range(6):
+            out[m] = room[i, 1 + m]
+        return True
+    bridged = max(BRIDGE_S, dt) * (1.0 + 1e-6)  # lost time, as in `clocks`: one sample always is
+    if first or step - dt > bridged:
+        return False
+    if step > HOLE * dt:
+        share = (t - room[i - 1, _T]) / step
+        for m in range(6):
+            out[m] = room[i - 1, 1 + m] + share * (room[i, 1 + m] - room[i - 1, 1 + m])
+        return True
+    # Mean rate over (t − dt, t], each sample's rate from the one before to it; mean force of the samples in there,
+    # or, of less than two, the force at t.
+    for m in range(6):
+        out[m] = 0.0
+    covered, inside = 0.0, 0
+    j = i
+    while j > 0 and room[j, _T] > t - dt:
+        begin, end = max(room[j - 1, _T], t - dt), min(room[j, _T], t)
+        width = max(0.0, end - begin)
+        covered += width
+        for m in range(3):
+            out[m] += width * room[j, _GX + m]
+        if room[j, _T] <= t + SAME * dt:
+            inside += 1
+            for m in range(3):
+                out[3 + m] += room[j, _AX + m]
+        j -= 1
+    if covered <= 0.0:
+        return False
+    for m in range(3):
+        out[m] /= covered
+    if inside >= 2:
+        for m in range(3):
+            out[3 + m] /= inside
+    else:
+        share = min(1.0, (t - room[i - 1, _T]) / step)
+        for m in range(3):
+            out[3 + m] = room[i - 1, _AX + m] + share * (room[i, _AX + m] - room[i - 1, _AX + m])
+    return True

@@ -1,0 +1,199 @@
+"""What readers of devices' own files share: a table in SI with a clock, and text with lines before its table."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from ..errors import BadData, MissingFile
+from .tables import columns
+
+# A table begins within this many lines of a file; what comes before it is about the device.
+PREAMBLE_LINES = 100
+SEPARATORS = "\t,;"
+AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
+
+# Words that name a segment in a label or a file's name, after its side.
+PARTS = (
+    ("forearm", r"fore ?arm|lower ?arm|ulna|radius|wrist"),
+    ("upper_arm", r"upper ?arm|humerus|biceps|brachium"),
+    ("hand", r"hand|palm"),
+)
+MIDDLE = (
+    ("torso", r"torso|trunk|chest|sternum|stern|thorax|t ?8"),
+    ("pelvis", r"pelvis|sacrum"),
+    ("head", r"head|forehead"),
+)
+
+
+@dataclass(frozen=True)
+class Device:
+    """What a device wrote, in SI.
+
+    Parameters
+    ----------
+    format : its name, a key of `wepose_pin.readers.formats.FORMATS`
+    table : `time` [s] on the device's clock, and the columns of `names`
+    labels : the file's name of each sensor or segment → our segment, None where the name does not say
+    kind : "raw" for gyro and accel, "orientation"
+    since_power_on : the clock counts from when the device was switched on, or another moment that says nothing
+    wraps_s : such a clock begins anew after so long [s]; None where it does not
+    aligned : the orientations are the segments' own, in one world
+    notes : what was assumed while reading
+    """
+
+    format: str
+    table: pl.DataFrame
+    labels: Mapping[str, str | None]
+    kind: str
+    since_power_on: bool = False
+    wraps_s: float | None = None
+    aligned: bool = False
+    notes: tuple[str, ...] = field(default=())
+
+    def signals(self, label: str) -> dict[str, list[str]]:
+        """Columns by signal."""
+        return {name: names(label, name) for name in (("gyro", "accel") if self.kind == "raw" else ("orientation",))}
+
+
+def names(label: str, signal: str) -> list[str]:
+    return [f"{label} {signal} {axis}" for axis in AXES[signal]]
+
+
+def table_of(time: np.ndarray, values: Mapping[str, Mapping[str, np.ndarray]]) -> pl.DataFrame:
+    """The table of `Device` from times (n,) [s] and label → signal → (n, 3 or 4)."""
+    found = {"time": time}
+    for label, signals in values.items():
+        for signal, array in signals.items():
+            found |= dict(zip(names(label, signal), array.T, strict=True))
+    return pl.DataFrame(found)
+
+
+def segment_of(label: str) -> str | None:
+    """The segment that a label or a file's name speaks of, as ``humerus_r_imu`` or ``LeftForeArm``; None if unclear."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+|(?<=[a-z])(?=\d)", " ", label).lower()
+    sides = {side for side in ("left", "right") if re.search(rf"\b({side}|{side[0]})(?=\b|hand|fore|upper)", words)}
+    found = {f"{side}_{part}" for part, pattern in PARTS if re.search(pattern, words) for side in sides}
+    found |= {part for part, pattern in MIDDLE if re.search(rf"\b({pattern})\b", words)}
+    return found.pop() if len(found) == 1 else None
+
+
+def first_lines(path: Path, most: int = PREAMBLE_LINES) -> list[str]:
+    """The first lines of a text file, as text whatever the bytes.
+
+    Raises
+    ------
+    MissingFile
+        Not there, or not readable.
+    """
+    try:
+        with path.open("rb") as file:
+            # A line that never ends is no line of text.
+            return [file.readline(2**16).decode("utf-8-sig", errors="replace").rstrip("\r\n") for _ in range(most)]
+    except FileNotFoundError:
+        raise MissingFile(f"{path}: no such file") from None
+    except OSError as error:
+        raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text file of a device: the lines before its table, and the table, all cells text.
+
+    Parameters
+    ----------
+    path : the file
+    about : what stands before the table, `name: value` of each line that has that form
+    cells : the table, without a last line that was cut off
+    """
+
+    path: Path
+    about: Mapping[str, str]
+    cells: pl.DataFrame
+
+    def __contains__(self, wanted: Sequence[str]) -> bool:
+        return all(name in self.cells.columns and self.cells[name].is_not_null().any() for name in wanted)
+
+    def numbers(self, wanted: Sequence[str]) -> np.ndarray:
+        """Columns (n, k); empty cells are NaN."""
+        return columns(self.cells, wanted, str(self.path), str(self.path))
+
+
+def read_text(path: Path, first: str, what: str) -> Text:
+    """The table whose line of names holds the column `first`, separated by tabs, commas or semicolons.
+
+    Raises
+    ------
+    MissingFile, BadData
+        Not there; no such line in it; no line of numbers after it.
+    """
+    lines = first_lines(path)
+    head, separator = _line_of_names(lines, first)
+    if head is None:
+        raise BadData(f"{path}: no line of names with '{first}' in its first {PREAMBLE_LINES} lines; {what} has one")
+    about = {}
+    for line in lines[:head]:
+        name, colon, value = line.strip("/ ").partition(":")
+        if colon:
+            about[name.strip()] = value.strip(f" {SEPARATORS}")
+    with path.open("rb") as file:
+        for _ in range(head):
+            file.readline()
+        rest = file.read()
+    rest = rest.removeprefix(b"\xef\xbb\xbf")
+    header, _, body = rest.partition(b"\n")
+    wanted = [cell.strip(' "\r') for cell in header.decode("utf-8", errors="replace").split(separator)]
+    if len(set(wanted)) < len([name for name in wanted if name]) or b"\0" in rest:
+        why = "zero bytes in it" if b"\0" in rest else "two columns of one name"
+        raise BadData(f"{path}: is no {what}: there are {why}")
+    while wanted and not wanted[-1]:
+        wanted.pop()
+    if not body.strip():
+        raise BadData(
+            f"{path}: has no line of numbers after its names in line {head + 1}; the export is empty or cut off"
+        )
+    schema = {name or f"column {k}": pl.String for k, name in enumerate(wanted)}
+    try:
+        cells = pl.read_csv(
+            body,
+            has_header=False,
+            separator=separator,
+            schema=schema,
+            truncate_ragged_lines=True,
+            encoding="utf8-lossy",
+            quote_char=None,
+        )
+    except pl.exceptions.PolarsError as error:
+        raise BadData(f"{path}: cannot be read as {what}: {' '.join(str(error).split())[:120]}") from error
+    cells = cells.with_columns(pl.all().str.strip_chars(' "\r').replace("", None))
+    if separator != ",":
+        cells = cells.with_columns(pl.all().str.replace(",", ".", literal=True))
+    filled = cells.select(pl.any_horizontal(pl.all().is_not_null()))[:, 0]
+    cells = cells.filter(filled)
+    if cells.height and not body.endswith(b"\n") and cells[-1, cells.width - 1] is None:
+        cells = cells.head(-1)  # the writer was stopped within its last line
+    return Text(path, about, cells)
+
+
+def _line_of_names(lines: Sequence[str], first: str) -> tuple[int | None, str]:
+    for k, line in enumerate(lines):
+        for separator in SEPARATORS:
+            if first in (cell.strip(' "') for cell in line.split(separator)):
+                return k, separator
+    return None, ""
+
+
+def unwrapped(counter: np.ndarray, wraps: float) -> np.ndarray:
+    """A counter (n,) that begins anew at `wraps`, going on instead; NaN stay."""
+    filled = np.where(np.isfinite(counter), counter, 0.0)
+    good = np.isfinite(counter)
+    steps = np.diff(filled[good])
+    turns = np.cumsum(np.concatenate([[0], np.where(steps < -wraps / 2, 1, 0)]))
+    result = np.full(len(counter), np.nan)
+    result[good] = filled[good] + wraps * turns
+    return result

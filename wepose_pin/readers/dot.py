@@ -1,0 +1,80 @@
+"""Movella (Xsens) DOT CSV, one file a sensor: of the app, of the SDK's logger, and of the data exporter.
+
+Lines such as ``DeviceTag:,D422CD00`` come before the line of names, or none. Acc [m/s²], Gyr [deg/s], or the increments
+dq and dv [m/s] over a sample; Quat (W X Y Z) or Euler [deg] to a world with z up. SampleTimeFine counts microseconds,
+begins anew at 2³², and is one clock for sensors that were synchronised.
+
+Source: Xsens DOT User Manual, data outputs; headers of the SDK's logger.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import BadData
+from .device import Device, Text, read_text, segment_of, table_of, unwrapped
+from .mt_manager import RAW, orientation
+
+FINE_S, WRAPS = 1e-6, 2.0**32
+INCREMENTS = (
+    ("dq_W", "dq_X", "dq_Y", "dq_Z", "dv[1]", "dv[2]", "dv[3]"),
+    ("dq_W", "dq_X", "dq_Y", "dq_Z", "dv_X", "dv_Y", "dv_Z"),
+)
+
+
+def read_dot(path: Path, use: str | None = None) -> Device:
+    """The sensor's rates or increments where the file has them, else its orientation; `use` asks for one of the two.
+
+    Raises
+    ------
+    MissingFile, BadData
+        Not there; no DOT CSV; no time in it; not what `use` asks for.
+    """
+    text = read_text(path, "PacketCounter", "a CSV of a DOT")
+    time, wraps_s = _time(text)
+    increments = next((names for names in INCREMENTS if names in text), None)
+    kind = "orientation" if use == "orientation" or (RAW not in text and increments is None) else "raw"
+    if use == "raw" and kind != "raw":
+        raise BadData(
+            f"{path}: neither Acc and Gyr nor dq and dv; record in a mode with rate or delta quantities, or leave out "
+            f"data.use and its orientation is read"
+        )
+    if kind == "orientation":
+        values = {"orientation": orientation(text)}
+    elif RAW in text:
+        numbers = text.numbers(RAW)
+        values = {"accel": numbers[:, :3], "gyro": np.deg2rad(numbers[:, 3:])}
+    else:
+        assert increments is not None
+        values = _rates(text.numbers(increments), float(np.nanmedian(np.diff(time))))
+    # Nobody sets a clock by sensors that were not: each has run since it was switched on.
+    synced = text.about.get("SyncStatus", "").lower().startswith("synced")
+    notes = () if synced or "SyncStatus" not in text.about else (f"{path.name}: SyncStatus says that it is not synced",)
+    label = text.about.get("DeviceTag") or path.stem
+    labels = {label: segment_of(label) or segment_of(path.stem)}
+    table = table_of(time, {label: values})
+    return Device("dot", table, labels, kind, since_power_on=True, wraps_s=wraps_s, notes=notes)
+
+
+def _rates(increments: np.ndarray, step: float) -> dict[str, np.ndarray]:
+    """Mean rate and mean specific force over each sample of `step` [s], from dq (w x y z) and dv."""
+    turn = np.full((len(increments), 3), np.nan)
+    good = np.linalg.norm(np.nan_to_num(increments[:, :4]), axis=1) > 0.5
+    if good.any():
+        turn[good] = Rotation.from_quat(increments[good][:, [1, 2, 3, 0]]).as_rotvec()
+    return {"gyro": turn / step, "accel": increments[:, 4:] / step}
+
+
+def _time(text: Text) -> tuple[np.ndarray, float | None]:
+    """Times (n,) [s] on the device's clock, and after how long it begins anew."""
+    if ["SampleTimeFine"] in text:
+        time = FINE_S * unwrapped(text.numbers(["SampleTimeFine"])[:, 0], WRAPS)
+        return time, FINE_S * WRAPS
+    number = re.match(r"\d+(\.\d+)?", text.about.get("OutputRate", ""))
+    if number is None or float(number[0]) <= 0.0:
+        raise BadData(f"{text.path}: no SampleTimeFine and no OutputRate to tell the time by; export one of the two")
+    return text.numbers(["PacketCounter"])[:, 0] / float(number[0]), None

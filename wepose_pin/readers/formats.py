@@ -1,0 +1,78 @@
+"""The files of devices and other programs that are read as they are, and how one is told from another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from ..errors import MissingFile
+from .device import Device, first_lines
+from .dot import read_dot
+from .mt_manager import read_mt_manager
+from .mvnx import read_mvnx
+from .opensim import read_opensim
+from .ximu3 import INERTIAL, QUATERNION, read_ximu3
+
+FORMATS: Mapping[str, Callable[[Path, str | None], Device]] = {
+    "mvnx": read_mvnx,
+    "mt_manager": read_mt_manager,
+    "dot": read_dot,
+    "ximu3": read_ximu3,
+    "opensim": read_opensim,
+}
+TITLES = {
+    "mvnx": "Xsens MVNX",
+    "mt_manager": "text export of Xsens MT Manager",
+    "dot": "CSV of a Movella (Xsens) DOT",
+    "ximu3": "CSV of an x-io x-IMU3",
+    "opensim": "OpenSim table of IMU orientations",
+}
+USES = ("raw", "orientation")
+
+
+def format_of(path: Path) -> str | None:
+    """The key of `FORMATS` for a file or folder, by its ending and its first lines; None if it is none of these.
+
+    Raises
+    ------
+    MissingFile
+        Not there, or not readable.
+    """
+    if path.is_dir():
+        return "ximu3" if any((path / name).is_file() for name in (INERTIAL, QUATERNION)) else None
+    suffix = path.suffix.lower()
+    if suffix in (".mvnx", ".sto"):
+        return {".mvnx": "mvnx", ".sto": "opensim"}[suffix]
+    if suffix not in (".csv", ".txt", ".xml"):
+        return None
+    lines = first_lines(path, 40)
+    start = "\n".join(lines)
+    if "<mvnx" in start:
+        return "mvnx"
+    if lines[0].startswith(("Timestamp (us),", "Time (s),")) and (
+        "(deg/s)" in lines[0] or lines[0].endswith("W,X,Y,Z")
+    ):
+        return "ximu3"
+    if "PacketCounter" not in start:
+        return None
+    if start.startswith("sep=") or "DeviceTag:" in start:
+        return "dot"
+    if start.startswith("//") or any(name in start for name in ("Quat_q0", "Mat[1][1]")):
+        return "mt_manager"
+    # Rates without a word on their maker could be in deg/s (DOT) or rad/s (MT Manager): data.format must say.
+    return "dot" if any(name in start for name in ("dq_W", "Quat_W", "FreeAcc_X")) and suffix == ".csv" else None
+
+
+def read_device(path: Path, format: str, use: str | None = None) -> Device:
+    """The file read as `format`; `use` "raw" or "orientation" where it holds both.
+
+    Raises
+    ------
+    MissingFile, BadData
+        Not there; damaged, or not of this format.
+    """
+    if not path.exists():
+        raise MissingFile(f"{path}: no such file or folder; a {TITLES[format]} is wanted here")
+    if path.is_dir() and format != "ximu3":
+        raise MissingFile(f"{path}: is a folder; a {TITLES[format]} is wanted here")
+    return FORMATS[format](path, use)

@@ -1,0 +1,115 @@
+"""What columns of an unknown table are, by their names: a proposal for the user to check, never read by itself."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+from .device import segment_of
+
+AXIS = re.compile(r"(?P<stem>.*?)[ _.\-\[(]*(?P<axis>[xyzw0-3])[\])]?\s*(?P<unit>[\[(].*[\])])?", re.IGNORECASE)
+# What is measured, in the order in which the words are looked for; (?![a-z]) for names such as gx, ax.
+SIGNALS = (
+    ("gyro", r"gyr|ang(ular)?[ _]?vel|omega|rot(ation)?[ _]?rate|(^|[^a-z])[gw]$"),
+    ("accel", r"acc|(^|[^a-z])a$"),
+    ("orientation", r"quat|ori(entation)?|rotation|(^|[^a-z])q$"),
+)
+NOT = r"mag|free|linear|lin[ _]?acc|earth|std|cov"  # no raw data, whatever else the name says
+TIME = r"(time|time ?stamp|t|timestamps?|seconds|sec|clock)\s*([\[(].*[\])])?"
+ORDER = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
+
+
+class Guess(NamedTuple):
+    """What the names of columns say."""
+
+    time: str | None
+    sensors: Mapping[str, Mapping[str, list[str]]]  # segment, or ?name where it is not known → signal → columns
+    sure: bool  # no name stands for a segment without saying so
+    degrees: bool  # a name said deg/s
+    g: bool  # a name said g
+
+
+def guess_columns(names: Iterable[str]) -> Guess:
+    """Groups of three or four columns that differ in their axis alone."""
+    names = list(names)
+    groups: dict[tuple[str, str], dict[str, str]] = {}
+    for name in names:
+        match = AXIS.fullmatch(name)
+        signal = signal_of(match["stem"]) if match else None
+        if match and signal:
+            groups.setdefault((match["stem"], signal), {})[match["axis"].lower()] = name
+    found: dict[str, dict[str, list[str]]] = {}
+    for (stem, signal), axes in groups.items():
+        order = ORDER[signal]
+        if set("0123") <= set(axes) and signal == "orientation":
+            order = "1230"  # numbered quaternions begin with w
+        elif not set(order) <= set(axes) and set("012") <= set(axes) and signal != "orientation":
+            order = "012"
+        if set(order) <= set(axes):
+            found.setdefault(_owner(stem), {}).setdefault(signal, [axes[axis] for axis in order])
+    return _guess(names, found)
+
+
+def guess_arrays(shapes: Mapping[str, tuple[int, ...]]) -> Guess:
+    """Arrays (n, 3) and (n, 4) whose path says what they are."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for path, shape in shapes.items():
+        signal = signal_of(path)
+        if signal and len(shape) == 2 and len(ORDER[signal]) in shape:
+            found.setdefault(_owner(path), {}).setdefault(signal, [path])
+    times = {path.rpartition("/")[2]: path for path, shape in shapes.items() if max(shape, default=0) == _size(shape)}
+    guess = _guess(list(times), found)
+    return guess._replace(time=times.get(guess.time or ""))
+
+
+def signal_of(stem: str) -> str | None:
+    """The signal that a column's name without its axis speaks of."""
+    text = stem.lower()
+    if re.search(NOT, text):
+        return None
+    return next((signal for signal, pattern in SIGNALS if re.search(pattern, text)), None)
+
+
+def _size(shape: tuple[int, ...]) -> int:
+    size = 1
+    for k in shape:
+        size *= k
+    return size
+
+
+def _owner(stem: str) -> str:
+    """The segment, or what is left of the name without its signal: one sensor's signals have it in common."""
+    segment = segment_of(stem)
+    if segment:
+        return segment
+    text = stem.lower()
+    for _, pattern in SIGNALS:
+        text = re.sub(pattern + r"[a-z]*", "", text)
+    return f"?{text.strip(' _./-')}"
+
+
+def _guess(names: list[str], found: dict[str, dict[str, list[str]]]) -> Guess:
+    time = next((name for name in names if re.fullmatch(TIME, name.strip().lower())), None)
+    whole = {who: signals for who, signals in found.items() if "orientation" in signals or len(signals) == 2}
+    sensors = {
+        who: {
+            k: v
+            for k, v in signals.items()
+            if (k == "orientation") == ("gyro" not in signals or "accel" not in signals)
+        }
+        for who, signals in whole.items()
+    }
+    first = next((who for who in sensors if who.startswith("?")), None)
+    sure = first is None or len(sensors) > 1 and not all(who.startswith("?") for who in sensors)
+    if first is not None and not sure:
+        # One sensor without a name can be tried; of the others nobody can say which is which.
+        sensors = {"torso" if who == first else who: signals for who, signals in sensors.items()}
+    text = " ".join(names).lower()
+    return Guess(
+        time,
+        sensors,
+        sure,
+        bool(re.search(r"dps|deg ?/ ?s|deg_s|deg/s", text)),
+        bool(re.search(r"[\[( ]g[\]) ]", f"{text} ")),
+    )

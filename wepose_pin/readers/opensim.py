@@ -1,0 +1,71 @@
+"""OpenSim ``.sto`` tables of IMU orientations, as OpenSense reads and writes them.
+
+Lines ``key=value`` up to ``endheader``, among them ``DataType=Quaternion``; then names and rows separated by tabs, each
+cell a quaternion ``w,x,y,z`` of the sensor to its world, z up as the device had it.
+
+Source: OpenSim documentation, OpenSense; the headers of OpenSense's example files.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from ..errors import BadData
+from .device import Device, first_lines, segment_of, table_of
+from .tables import columns
+
+
+def read_opensim(path: Path, use: str | None = None) -> Device:
+    """The orientations of each column but time.
+
+    Raises
+    ------
+    MissingFile, BadData
+        Not there; no .sto of quaternions; raw data asked for, which it has not.
+    """
+    if use == "raw":
+        raise BadData(f"{path}: an OpenSim .sto holds orientations, no gyroscope and accelerometer; leave out data.use")
+    lines = first_lines(path)
+    end = next((k for k, line in enumerate(lines) if line.strip().lower() == "endheader"), None)
+    if end is None:
+        raise BadData(f"{path}: no line 'endheader' in its first {len(lines)} lines; an OpenSim .sto file has one")
+    about = {key.strip().lower(): value.strip() for key, _, value in (line.partition("=") for line in lines[:end])}
+    kind = about.get("datatype", "")
+    if kind.lower() != "quaternion":
+        raise BadData(
+            f"{path}: DataType={kind or 'none'}; orientations are needed, DataType=Quaternion (OpenSense's "
+            f"…_orientations.sto)"
+        )
+    rows = [
+        [cell.strip() for cell in line.split("\t")]
+        for line in path.read_bytes().decode("utf-8-sig", errors="replace").splitlines()[end + 1 :]
+        if line.strip()
+    ]
+    if len(rows) < 2 or rows[0][0].lower() != "time":
+        raise BadData(f"{path}: a line of names that begins with time, and rows, are needed after endheader")
+    names, rows = rows[0], rows[1:]
+    for k, row in enumerate(rows):
+        if len(row) != len(names):
+            raise BadData(f"{path}: row {k + 1} has {len(row)} cells, the line of names has {len(names)}; mend the row")
+    labels = names[1:]
+    if len(set(labels)) < len(labels):
+        raise BadData(f"{path}: two columns have one name; each needs its own: {', '.join(labels)}")
+    time = columns(pl.DataFrame({"time": [row[0] for row in rows]}), ["time"], str(path), str(path))[:, 0]
+    values = {label: {"orientation": _quat(path, label, [row[k] for row in rows])} for k, label in enumerate(labels, 1)}
+    return Device("opensim", table_of(time, values), {label: segment_of(label) for label in labels}, "orientation")
+
+
+def _quat(path: Path, label: str, cells: list[str]) -> np.ndarray:
+    """(n, 4) xyzw of cells ``w,x,y,z``; ``nan`` is a lost sample."""
+    quat = np.empty((len(cells), 4))
+    for k, cell in enumerate(cells):
+        try:
+            quat[k] = [float(part) for part in cell.strip("~[]()").split(",")]
+        except ValueError:
+            raise BadData(
+                f"{path}: column '{label}' holds '{cell[:40]}' in row {k + 1}; a quaternion w,x,y,z is needed"
+            ) from None
+    return quat[:, [1, 2, 3, 0]]

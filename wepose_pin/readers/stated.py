@@ -1,0 +1,102 @@
+"""What a session's keys say of a sensor, its phases, its truth: checked by themselves, before any data is read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import BadPhase, BadSession, MissingFile, one_of
+from ..recording import AXES, Intervals, mount_from_axes
+from .device import Device
+from .keys import Keys, is_number
+
+WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
+
+
+class Stated(NamedTuple):
+    """What a sensor's table says of its values."""
+
+    signals: Mapping[str, list[str]] | None  # columns, or one array; None where the file's own format knows them
+    mount: np.ndarray | None
+    aligned: bool | None
+
+
+def sensor_stated(keys: Keys) -> Stated:
+    """Columns by signal, the mount, and whether the orientations are the segment's own."""
+    keys.allow(
+        *("gyro", "accel", "orientation", "mount", "file", "time", "rate_hz", "offset_s", "format", "label", "aligned")
+    )
+    mount = _mount(keys.table("mount")) if "mount" in keys else None
+    aligned = keys.values.get("aligned")
+    if aligned is not None and not isinstance(aligned, bool):
+        raise BadSession(f"{keys.at('aligned')} = {aligned!r} is neither true nor false")
+    named = [key for key in WIDTHS if key in keys]
+    if not named:
+        return Stated(None, mount, aligned)
+    if "label" in keys:
+        raise BadSession(
+            f"{keys.at('label')} stands beside {named[0]}; a known format has a label, a table has columns"
+        )
+    if "orientation" not in keys:
+        return Stated({"gyro": _names(keys, "gyro"), "accel": _names(keys, "accel")}, mount, aligned)
+    if "gyro" in keys or "accel" in keys:
+        raise BadSession(f"{keys.at('orientation')} stands beside gyro or accel; a sensor has one or the other")
+    return Stated({"orientation": _names(keys, "orientation")}, mount, aligned)
+
+
+def _names(keys: Keys, signal: str) -> list[str]:
+    """The columns of a signal, or the one array that holds them all."""
+    value = keys.values.get(signal)
+    return [value] if isinstance(value, str) and value else keys.names(signal, WIDTHS[signal])
+
+
+def label_stated(keys: Keys, device: Device, segment: str, path: Path) -> str:
+    """Which of the file's sensors is strapped to the segment: as stated, the only one, or the one that is named so."""
+    label = keys.text("label", None)
+    if label is not None:
+        if label not in device.labels:
+            raise BadSession(f"{keys.at('label')} = '{label}' is not in {path.name}; {one_of(device.labels, label)}")
+        return label
+    fitting = [name for name, its in device.labels.items() if its == segment or len(device.labels) == 1]
+    if len(fitting) != 1:
+        raise BadSession(f"{keys.at('label')} is missing; which of {path.name} is it? {one_of(device.labels)}")
+    return fitting[0]
+
+
+def _mount(keys: Keys) -> np.ndarray:
+    keys.allow("up", "forward")
+    up, forward = keys.choice("up", AXES), keys.choice("forward", AXES)
+    if abs(AXES[up] @ AXES[forward]) > 0.5:
+        raise BadSession(
+            f"{keys.at('forward')} = '{forward}' is parallel to up = '{up}'; name two different sensor axes"
+        )
+    return mount_from_axes(up, forward)
+
+
+def phases_stated(keys: Keys) -> dict[str, Intervals]:
+    phases: dict[str, Intervals] = {}
+    for name, value in keys.values.items():
+        well = isinstance(value, list) and all(
+            isinstance(pair, list) and len(pair) == 2 and all(is_number(v) for v in pair) for pair in value
+        )
+        if not well:
+            raise BadSession(f"{keys.at(name)} = {value!r} is not a list of intervals; write [[from, to]] in seconds")
+        phases[name] = tuple((float(a), float(b)) for a, b in value)
+        for first, last in phases[name]:
+            if not first < last:
+                raise BadPhase(f"{keys.at(name)}: [{first:g}, {last:g}] is empty; the earlier time comes first")
+    return phases
+
+
+def truth_stated(path: Path, data: Keys) -> Path | None:
+    name = data.text("truth", None)
+    if name is None:
+        return None
+    if not (path.parent / name).is_file():
+        raise MissingFile(
+            f"{data.at('truth')}: no such file '{name}' beside {path.name}; name it rightly or not at all"
+        )
+    return path.parent / name

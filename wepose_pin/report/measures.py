@@ -1,0 +1,188 @@
+"""What the report of a tracked recording measures: the sensors' signals, rest, headings, elbows, hands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..pose import Pose, spread
+from ..readers.clocks import runs
+from ..readers.plausibility import SATURATED_ACCEL, SATURATED_GYRO, cut_off
+from ..recording import Recording, Sensor
+from ..subject import Subject
+from ..tracking import TrackedPose
+
+# Segments that meet in a joint, from the trunk outwards: their headings make an angle of that joint.
+JOINTS = (
+    ("neck", "torso", "head"),
+    ("waist", "pelvis", "torso"),
+    *(
+        (f"{side} {joint}", "torso" if above == "torso" else f"{side}_{above}", f"{side}_{below}")
+        for side in ("left", "right")
+        for joint, above, below in (
+            ("shoulder", "torso", "upper_arm"),
+            ("elbow", "upper_arm", "forearm"),
+            ("wrist", "forearm", "hand"),
+        )
+    ),
+)
+BENT = np.deg2rad(20.0)  # from which on a forearm shows the plane of its elbow
+PEAK_OVER_S = 0.1  # a hand's speed is that of its mean over so long
+
+
+class Signal(NamedTuple):
+    """One sensor's signal."""
+
+    rate: np.ndarray  # (n,) [rad/s], how fast it turns
+    peak_accel: float  # [m/s²], NaN for ready orientations
+    cut: np.ndarray  # (n,) bool, an axis is cut off at the end of its range
+    gap: np.ndarray  # (n,) bool, bridged over a long gap
+    rest: np.ndarray | None  # (n,) bool, still by the filter's test; None for ready orientations
+    gyro_noise: float  # [rad/s], root mean square of an axis in the still phase
+    accel_noise: float  # [m/s²], the same
+    gravity: float  # [m/s²]
+    bias: tuple[np.ndarray, np.ndarray] | None  # (3,) [rad/s] at the beginning and at the end
+
+
+def signal_of(recording: Recording, name: str, pose: TrackedPose) -> Signal:
+    """The signal of a sensor, and what its filter found."""
+    sensor: Sensor = recording.sensors[name]
+    nothing = np.zeros(len(recording), dtype=bool)
+    gap = sensor.gap if sensor.gap is not None else nothing
+    if sensor.gyro_S is None or sensor.accel_S is None:
+        R = Rotation.from_quat(sensor.quat_WS)
+        rate = (R[:-1].inv() * R[1:]).magnitude() * recording.rate_hz
+        nan = float("nan")
+        return Signal(np.concatenate([rate[:1], rate]), nan, nothing, gap, None, nan, nan, nan, None)
+    assert pose.segments is not None
+    of = pose.segments.orientation[name]
+    cut = cut_off(sensor.gyro_S, SATURATED_GYRO) | cut_off(sensor.accel_S, SATURATED_ACCEL)
+    return Signal(
+        np.linalg.norm(sensor.gyro_S, axis=1),
+        float(np.linalg.norm(sensor.accel_S, axis=1).max()),
+        cut.any(axis=1),
+        gap,
+        of.static,
+        _rms(of.noise.gyro_cov),
+        of.noise.gravity * _rms(of.noise.accel_cov),
+        of.noise.gravity,
+        (of.noise.gyro_bias, of.gyro_bias[-1]),
+    )
+
+
+def longest(which: np.ndarray, rate_hz: float) -> float:
+    """The longest run of true values [s]."""
+    return max((b - a for a, b in runs(which)), default=0) / rate_hz
+
+
+# Headings -------------------------------------------------------------------------------------------------------------
+
+
+class Budget(NamedTuple):
+    """What a segment's heading may be off by, one standard deviation [rad]."""
+
+    std: np.ndarray  # (n,) with all that is known of it
+    filter_end: float  # at the end by the filter alone
+    growth: float  # of the filter's, a minute of motion; NaN where it was never in motion
+
+
+def heading_budgets(pose: TrackedPose) -> dict[str, Budget]:
+    """Segment → its budget, from the covariances; none where the filter has none."""
+    assert pose.segments is not None
+    assert pose.recording is not None
+    found = {}
+    for name, cov_W in pose.segment_cov.items():
+        of = pose.segments.orientation[name]
+        ends = np.array([0, -1])
+        up_S = Rotation.from_quat(of.quat_WS[ends]).inv().apply([0.0, 0.0, 1.0])
+        assert of.attitude_cov is not None
+        variance = np.einsum("na,nab,nb->n", up_S, of.attitude_cov[ends], up_S)
+        first, last = np.sqrt(np.maximum(variance, 0.0))
+        minutes = float(np.count_nonzero(~of.static)) / pose.recording.rate_hz / 60.0
+        growth = max(float(last - first), 0.0) / minutes if minutes > 0.0 else float("nan")
+        found[name] = Budget(np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), float(last), growth)
+    return found
+
+
+def between(budgets: Mapping[str, Budget]) -> dict[str, np.ndarray]:
+    """Joint → (n,) [rad], one standard deviation of the heading between its segments, as if they were independent."""
+    return {
+        joint: np.hypot(budgets[above].std, budgets[below].std)
+        for joint, above, below in JOINTS
+        if above in budgets and below in budgets
+    }
+
+
+# Elbows ---------------------------------------------------------------------------------------------------------------
+
+
+class Elbow(NamedTuple):
+    """An elbow over time, from the directions of upper arm and forearm."""
+
+    bend: np.ndarray  # (n,) [rad] between the two, 0 in line
+    std: np.ndarray | None  # (n,) [rad]; None where the filter has no covariance
+    forward: np.ndarray  # (n,) [rad], the bend in the plane of the hinge; negative: backward
+    aside: np.ndarray  # (n,) [rad], the forearm out of that plane
+
+
+def elbow_of(pose: Pose, side: str, subject: Subject | None = None) -> Elbow | None:
+    """An elbow; None where a segment is not known. Without a calibrated hinge its axis is the upper arm's y."""
+    names = f"{side}_upper_arm", f"{side}_forearm"
+    if not set(names) <= set(pose.quat_WL):
+        return None
+    R_U, R_F = (Rotation.from_quat(pose.quat_WL[name]) for name in names)
+    upper_W, fore_W = (R.apply([0.0, 0.0, -1.0]) for R in (R_U, R_F))
+    axis_W = np.cross(upper_W, fore_W)
+    sine = np.linalg.norm(axis_W, axis=1)
+    bend = np.arctan2(sine, np.sum(upper_W * fore_W, axis=1))
+    std = None
+    if set(names) <= set(pose.segment_cov):
+        # Errors turn each about W: what they do to the angle is their part about the axis across both.
+        both = pose.segment_cov[names[0]] + pose.segment_cov[names[1]]
+        along = axis_W / np.maximum(sine, 1e-9)[:, None]
+        std = np.sqrt(np.einsum("na,nab,nb->n", along, both, along))
+    axis_U = np.array([0.0, 1.0, 0.0])
+    if subject is not None and side in subject.hinges:
+        axis_U = subject.hinges[side].axis
+    ahead_U = np.cross(axis_U, [0.0, 0.0, 1.0])
+    fore_U = R_U.inv().apply(fore_W)
+    forward = np.arctan2(fore_U @ (ahead_U / np.linalg.norm(ahead_U)), -fore_U[:, 2])
+    return Elbow(bend, std, forward, np.arcsin(np.clip(fore_U @ axis_U, -1.0, 1.0)))
+
+
+# Hands ----------------------------------------------------------------------------------------------------------------
+
+
+class Hand(NamedTuple):
+    """Where a hand went."""
+
+    reach: np.ndarray  # (n, 3) [m] from the middle of the shoulders, in the torso's frame
+    std: np.ndarray | None  # (n,) [m], one axis, from the root; None where the filter has no covariance
+    peak_speed: float  # [m/s]
+
+
+def hands_of(pose: Pose, rate_hz: float) -> dict[str, Hand]:
+    """Hand → where it went; hands that are not known are not in it."""
+    points = pose.points
+    if not {"left_shoulder", "right_shoulder"} <= set(points) or "torso" not in pose.quat_WL:
+        return {}
+    middle = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
+    R_LW = Rotation.from_quat(pose.quat_WL["torso"]).inv()
+    found = {}
+    for name in ("left_hand", "right_hand"):
+        if name not in points:
+            continue
+        reach = R_LW.apply(points[name] - middle)
+        size = max(1, round(PEAK_OVER_S * rate_hz))
+        moved = reach[size:] - reach[:-size]
+        peak = float(np.linalg.norm(moved, axis=1).max(initial=0.0)) * rate_hz / size
+        std = spread(pose.point_cov[name]) if name in pose.point_cov else None
+        found[name] = Hand(reach, std, peak)
+    return found
+
+
+def _rms(cov: np.ndarray) -> float:
+    return float(np.sqrt(np.trace(cov) / 3.0))

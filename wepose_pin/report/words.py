@@ -1,0 +1,58 @@
+"""Words of the reports: names, numbers with their units, lists."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+
+import numpy as np
+
+from .. import __version__
+
+
+def plain(name: str) -> str:
+    """A segment's or point's name as people write it."""
+    return name.replace("_", " ")
+
+
+def listed(parts: Sequence[str]) -> str:
+    """``a, b and c``."""
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+
+
+def degrees(value: float) -> str:
+    """An angle in degrees, to a tenth."""
+    return f"{value:.1f}°" if np.isfinite(value) else "not known"
+
+
+def intervals(spans: Sequence[tuple[float, float]]) -> str:
+    """Intervals [s]."""
+    return ", ".join(f"{a:g} to {b:g} s" for a, b in spans)
+
+
+def plus_minus(value: float, std: float, unit: str, digits: int = 1) -> str:
+    """A number with its standard deviation and its unit."""
+    if not np.isfinite(value):
+        return "not known"
+    text = f"{value:.{digits}f}"
+    return f"{text} ± {std:.{digits}f} {unit}" if np.isfinite(std) else f"{text} {unit}, ± not known"
+
+
+def signed(value: float) -> str:
+    """A number with its sign, to a tenth."""
+    return f"{value:+.1f}".replace("-", "−") if abs(value) >= 0.05 else "0.0"
+
+
+def whole(value: float) -> str:
+    """A number without decimals, its minus a minus."""
+    return f"{round(float(value)):d}".replace("-", "−")
+
+
+def versions() -> str:
+    """What a report was made with."""
+    packages = ("pin", "casadi", "numpy", "scipy")
+    found = {"wepose-pin": __version__, "python": platform.python_version()} | {
+        name: version(name) for name in packages
+    }
+    return ", ".join(f"{name} {number}" for name, number in found.items())

@@ -1,0 +1,93 @@
+// What the page of a recording and the live page share: meshcat's viewer in a box, ribbons, the camera.
+const THREE = MeshCat.THREE;
+const $ = (id) => document.getElementById(id);
+
+function bytes(base64) {
+  const text = atob(base64), out = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) out[i] = text.charCodeAt(i);
+  return out;
+}
+
+function openViewer(stage) {
+  let viewer;
+  try {
+    viewer = new MeshCat.Viewer(stage, false);                           // false: the page's loop draws
+  } catch (error) {
+    stage.insertAdjacentHTML("beforeend", '<p id="trouble">This browser offers no WebGL, which the picture needs.</p>');
+    throw error;
+  }
+  const resize = viewer.set_3d_pane_size.bind(viewer);                   // meshcat takes the window's height
+  viewer.set_3d_pane_size = () => resize(stage.clientWidth, stage.clientHeight);
+  return viewer;
+}
+
+function obey(viewer, commands) {
+  commands.forEach((command) => viewer.handle_command_bytearray(bytes(command)));
+  const ground = viewer.scene_tree.find(["meshcat", "ground", "<object>"]).object;
+  ground.castShadow = false;
+}
+
+// A trail that faces the camera, as WebGL draws lines one pixel wide.
+class Ribbon {
+  constructor(viewer, colour, most, seconds, width) {                    // most: points it ever has; width: [m]
+    this.colour = new THREE.Color(colour);
+    this.seconds = seconds;
+    this.width = width;
+    this.position = new THREE.BufferAttribute(new Float32Array(6 * most), 3);
+    this.rgba = new THREE.BufferAttribute(new Float32Array(8 * most), 4);
+    this.index = new THREE.BufferAttribute(new Uint32Array(6 * most), 1);
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", this.position);
+    geometry.setAttribute("color", this.rgba);
+    geometry.setIndex(this.index);
+    const material = new THREE.MeshBasicMaterial({ vertexColors: true, transparent: true, depthWrite: false,
+                                                   side: THREE.DoubleSide });
+    this.mesh = new THREE.Mesh(geometry, material);
+    this.mesh.frustumCulled = false;
+    viewer.scene.add(this.mesh);
+  }
+
+  draw(path, now, eye) {                                                 // path: [time [s], Vector3], NaN: a gap
+    let corners = 0;
+    const known = ([, point]) => isFinite(point.x + point.y + point.z);
+    path.forEach(([time, point], i) => {
+      const before = path[Math.max(i - 1, 0)][1], after = path[Math.min(i + 1, path.length - 1)][1];
+      const fresh = Math.max(1 - (now - time) / this.seconds, 0);
+      const side = after.clone().sub(before).cross(eye.clone().sub(point)).normalize();
+      if (!isFinite(side.x)) side.set(0, 0, 0);
+      side.multiplyScalar(this.width * (0.25 + 0.75 * fresh) / 2);
+      const shown = known(path[i]) ? point : new THREE.Vector3();
+      this.position.setXYZ(2 * i, shown.x + side.x, shown.y + side.y, shown.z + side.z);
+      this.position.setXYZ(2 * i + 1, shown.x - side.x, shown.y - side.y, shown.z - side.z);
+      for (const v of [2 * i, 2 * i + 1]) this.rgba.setXYZW(v, this.colour.r, this.colour.g, this.colour.b, 0.9 * fresh);
+      if (i > 0 && known(path[i]) && known(path[i - 1])) {
+        const a = 2 * i - 2;
+        [a, a + 1, a + 2, a + 1, a + 3, a + 2].forEach((v) => this.index.setX(corners++, v));
+      }
+    });
+    this.mesh.geometry.setDrawRange(0, corners);
+    for (const changed of [this.position, this.rgba, this.index]) changed.needsUpdate = true;
+  }
+}
+
+// The camera as near as it can be with every point of the motion in the picture; headroom [px] for a title.
+function fitCamera(viewer, stage, view, headroom) {
+  const axes = view.axes.map((axis) => new THREE.Vector3(...axis));      // right, up, toward the camera, in W
+  const tall = 0.96 * Math.tan(THREE.MathUtils.degToRad(viewer.camera.fov / 2));
+  const wide = tall * stage.clientWidth / stage.clientHeight;
+  const tallUp = tall * (1 - Math.min(headroom / stage.clientHeight, 0.5));
+  // A point (x, y, z) shows when |x - x0| <= wide (d - z), and so on: the camera stands at (x0, y0, d).
+  const most = (f) => Math.max(...view.points.map(f)), least = (f) => Math.min(...view.points.map(f));
+  const right = most(([x, , z]) => x + wide * z), left = least(([x, , z]) => x - wide * z);
+  const top = most(([, y, z]) => y + tallUp * z), bottom = least(([, y, z]) => y - tall * z);
+  const d = Math.max((right - left) / (2 * wide), (top - bottom) / (tall + tallUp));
+  const x0 = (right + left) / 2, y0 = (top - tallUp * d + bottom + tall * d) / 2;
+  const eye = new THREE.Vector3(), target = new THREE.Vector3();
+  [x0, y0, d].forEach((along, i) => eye.addScaledVector(axes[i], along));
+  [x0, y0, 0].forEach((along, i) => target.addScaledVector(axes[i], along));
+  viewer.scene.updateMatrixWorld(true);
+  viewer.camera.position.copy(viewer.scene.localToWorld(eye));
+  viewer.controls.target.copy(viewer.scene.localToWorld(target));
+  viewer.controls.update();
+  viewer.set_dirty();
+}
