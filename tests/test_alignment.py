@@ -13,7 +13,7 @@ from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
 from wepose_pin.recording import Recording, Sensor, axes_from_mount, mount_from_axes
 from wepose_pin.simulation import Simulation, paper_dynamic
-from wepose_pin.subject import Subject, average_subject, mount_rows
+from wepose_pin.subject import StartTilt, Subject, average_subject, mount_rows
 
 
 @pytest.mark.parametrize(("up", "forward"), [("+x", "-z"), ("-y", "+x"), ("+z", "+x"), ("-z", "-y")])
@@ -118,6 +118,33 @@ def test_a_calibrated_mount_that_has_moved_is_said() -> None:
     (warning,) = segment_orientations(recording, subject).warnings
     assert "calibrated mount is 20 deg off" in warning
     assert 'strapping = "new"' in warning
+
+
+def test_a_person_stands_as_in_the_calibration() -> None:
+    """Leaning by 20 deg in both start poses is no mount that moved; by 20 deg in one of them is."""
+    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    lean = np.array([0.0, np.deg2rad(20.0)])
+    subject = replace(
+        average_subject(),
+        mounts={"torso": mount.as_quat()},
+        order=tuple(mount_rows("torso")),
+        covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
+        start_tilt={"torso": StartTilt(lean, np.deg2rad(1.0))},
+    )
+    for tilt, said in ((lean, []), (lean - [0.0, np.deg2rad(9.0)], ["is 9 deg off"]), (0.0 * lean, ["is 20 deg off"])):
+        recording, _ = ready_recording({"torso": 0.0}, {"torso": Rotation.from_rotvec([*tilt, 0.0]) * mount})
+        warnings = segment_orientations(recording, subject).warnings
+        assert len(warnings) == len(said), warnings
+        assert all(text in warning for text, warning in zip(said, warnings, strict=True))
+
+
+def test_a_calibrated_mount_that_cannot_be_names_the_strapping() -> None:
+    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    over = Rotation.from_rotvec([0.0, np.pi, 0.0])
+    recording, _ = ready_recording({"torso": 0.0}, {"torso": over * mount})
+    subject = replace(average_subject(), mounts={"torso": mount.as_quat()})
+    with pytest.raises(BadSession, match=r"sensors\.torso: its calibrated mount is 180 deg off .* strapping = \"new\""):
+        segment_orientations(recording, subject)
 
 
 def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:

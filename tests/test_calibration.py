@@ -206,8 +206,8 @@ def test_hands_that_do_not_move_say_so(exact: tuple[Person, Recording]) -> None:
     clasp = ((float(recording.time[held]), recording.phases["clasp"][0][1]),)
     still = replace(recording, sensors=frozen, phases={**recording.phases, "clasp": clasp})
     gauge = {"shoulder_width": 0.38}
-    assert any("moved too little" in warning for warning in calibrate_lengths(still, gauge=gauge).warnings)
-    assert not any("moved too little" in warning for warning in calibrate_lengths(recording, gauge=gauge).warnings)
+    assert any("too little motion" in warning for warning in calibrate_lengths(still, gauge=gauge).warnings)
+    assert not any("too little motion" in warning for warning in calibrate_lengths(recording, gauge=gauge).warnings)
 
 
 def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:

@@ -427,7 +427,7 @@ def test_gigantic_numbers_are_refused(format: str, tmp_path: Path) -> None:
     cells[{"mt_manager": 2, "dot": 7, "ximu3": 4}[format]] = "1e300"
     lines[-40] = cell.join(cells)
     path.write_text("\n".join(lines) + "\n", encoding="latin-1")
-    with pytest.raises(BadData, match=r"no sensor measures above"):
+    with pytest.raises(BadData, match=r"in row 361; no sensor measures as much"):
         load(tmp_path, f'[data]\nfile = "{path.relative_to(tmp_path)}"\n[sensors.torso]')
 
 
@@ -500,3 +500,15 @@ def test_columns_by_their_names() -> None:
     found = guess_columns(["head_q0", "head_q1", "head_q2", "head_q3"])
     assert found.sensors == {"head": {"orientation": ["head_q1", "head_q2", "head_q3", "head_q0"]}}
     assert guess_columns(["a", "b", "velocity_x"]).sensors == {}
+
+
+PAGES = sorted((Path(__file__).parent.parent / "docs" / "formats").glob("*.md"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_pages_examples_are_sessions_that_lack_their_data_alone(page: Path, tmp_path: Path) -> None:
+    blocks = page.read_text(encoding="utf-8").split("```toml\n")[1:]
+    assert len(blocks) == (page.stem != "README")
+    for block in blocks:
+        with pytest.raises(MissingFile):
+            load(tmp_path, block.partition("```")[0])

@@ -211,6 +211,7 @@ def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simul
         ("a.toml", b"x = 1\n", "neither a session ([data], [sensors.…]) nor a subject"),
         ("a.toml", b"\xff\xfe", "is not UTF-8 text"),
         ("a.csv", b"", "is empty"),
+        ("a.csv", b"a,b\rc,d\n1,2,3\n", "its line of names cannot be read"),
         ("a.csv", b"\x00\x01\x02" * 90, "zero bytes"),
         ("a.parquet", b"PAR1", "cannot be read as a Parquet file"),
         ("a.mat", b"\x00" * 300, "is damaged, cut off, or no MATLAB or HDF5 file"),

@@ -14,6 +14,8 @@ from test_causal import first
 
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
 from wepose_pin.live.loop import Ended, Latencies, LiveLoop
+from wepose_pin.live.session import run_session
+from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, Stage, Status
 from wepose_pin.live.wearing import Wearing
@@ -21,6 +23,7 @@ from wepose_pin.readers.arrivals import Samples
 from wepose_pin.readers.live_log import SAMPLES, blocks, read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import Simulation
+from wepose_pin.subject import LENGTHS, average_subject, mount_rows, subject_of
 from wepose_pin.tracking import track
 from wepose_pin.writers.live_log import LiveLog
 
@@ -98,12 +101,18 @@ def single(recording: Recording, name: str, k: int) -> Samples:
 
 
 def live(
-    recording: Recording, file: Path, source: Chaos | None = None, watcher: Watcher | None = None, method: str = "amekf"
+    recording: Recording,
+    file: Path,
+    source: Source | None = None,
+    watcher: Watcher | None = None,
+    method: str = "amekf",
 ) -> Ended:
     wearing = Wearing.of(recording)
     log = LiveLog(file, wearing.header(tuple(recording.sensors)) | {"method": method})
+    source = source or ReplaySource(recording, math.inf)
+    source.open()
     loop = LiveLoop(
-        source or ReplaySource(recording, math.inf),
+        source,
         wearing,
         method=method,
         log=log,
@@ -128,6 +137,23 @@ def test_live_its_file_and_causal_tracking_give_the_same_bits(
         assert np.array_equal(found.quat_WL[:, i], again.quat_WL[name])
         assert ended.counts[name]["taken"] == len(recording)
         assert ended.counts[name]["missing"] == ended.counts[name]["late"] == 0
+
+
+def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: Simulation, tmp_path: Path) -> None:
+    """Mounts and their covariance decide the headings: all of their bits count."""
+    order = tuple(row for segment in simulation.quat_LS for row in mount_rows(segment))
+    subject = replace(
+        average_subject(),
+        mounts={name: Rotation.from_quat(quat).as_quat() for name, quat in simulation.quat_LS.items()},
+        order=(*LENGTHS, *order),
+        covariance=np.diag([1e-4 / 3.0] * len(LENGTHS) + [np.deg2rad(1.0 / 3.0) ** 2] * len(order)),
+    )
+    source = ReplaySource(recording, math.inf)
+    run_session(source, Wearing.of(recording, subject), record=tmp_path / "a.wepose")
+    found = read_live_log(tmp_path / "a.wepose")
+    again = track(found.recording, subject_of(found.header["subject"], tmp_path), causal=True)
+    assert all(np.array_equal(found.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
+    assert len(found.quat_WL) > 2000
 
 
 def test_a_marked_gap_is_silence_live_and_causally(recording: Recording, tmp_path: Path) -> None:
@@ -301,7 +327,9 @@ def test_a_full_disk_ends_the_recording_and_not_the_session(recording: Recording
         pytest.skip("no /dev/full on this system")
     wearing = Wearing.of(recording)
     log = LiveLog(Path("/dev/full"), wearing.header(tuple(recording.sensors)) | {"method": "amekf"}, force=True)
-    ended = LiveLoop(ReplaySource(recording, math.inf), wearing, log=log, begin=float(recording.time[0])).run()
+    source = ReplaySource(recording, math.inf)
+    source.open()
+    ended = LiveLoop(source, wearing, log=log, begin=float(recording.time[0])).run()
     assert ended.poses > 2000
     assert "the recording ended: No space left" in ended.problem
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import wepose_pin as wp
 from wepose_pin.errors import BadData, BadSession, MissingFile
 from wepose_pin.readers.mvnx import read_mvnx
+from wepose_pin.subject import Hinge
 
 SEGMENTS = ("Pelvis", "T8", "LeftUpperArm", "LeftForeArm", "LeftHand", "RightUpperArm")
 OURS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
@@ -132,6 +133,16 @@ def test_the_torso_faces_x_and_arms_keep_what_they_had_to_it(tracked) -> None:
     torso, arm = (Rotation.from_quat(recording.sensors[name].quat_WS) for name in ("torso", "left_forearm"))
     ours = Rotation.from_quat(pose.quat_WL["torso"]).inv() * Rotation.from_quat(pose.quat_WL["left_forearm"])
     assert (ours.inv() * torso.inv() * arm).magnitude().max() < 1e-9
+
+
+def test_a_subjects_mounts_and_hinges_do_not_touch_aligned_orientations(tracked) -> None:
+    pose, _ = tracked
+    mounts = {name: Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat() for name in OURS}
+    hinges = {"left": Hinge(np.array([0.6, 0.8, 0.0]), 0.02), "right": Hinge(np.array([0.6, 0.8, 0.0]), 0.02)}
+    again = wp.track(pose.recording, replace(pose.subject, mounts=mounts, hinges=hinges))
+    assert again.reset is None
+    for name in OURS:
+        np.testing.assert_array_equal(again.quat_WL[name], pose.quat_WL[name])
 
 
 # Made files --------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import PROTOCOLS, Calibration, calibrate_lengths, load_protocol
+from wepose_pin.calibration import PROTOCOLS, Calibration, calibrate_lengths, judge, load_protocol
 from wepose_pin.calibration.chain import CHAIN, REACHES, links
 from wepose_pin.calibration.problem import Layout, Looks, residuals
 from wepose_pin.calibration.protocols import Closure
@@ -18,6 +18,7 @@ from wepose_pin.cli import main
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
 from wepose_pin.model import load_model
 from wepose_pin.pose import pose_of
+from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (
     MTI_3,
@@ -286,6 +287,24 @@ def test_a_palm_off_its_point_is_found_and_left_out() -> None:
     assert found.rms_gap < 1.3 * whole.rms_gap
 
 
+@pytest.mark.parametrize(("name", "closed"), [("touch_left", "the palm on its point"), ("handle", "the bar")])
+def test_advice_is_of_what_was_done(name: str, closed: str) -> None:
+    """Nine seconds are too few: what to do is said in the words of the protocol, with its own tape."""
+    person, simulation = made(name, 4, real=True)
+    recording = simulation.recording()
+    phase, (begin, _) = next((n, spans[0]) for n, spans in recording.phases.items() if n in ("touch", "handle"))
+    short = replace(recording, phases={**recording.phases, phase: ((begin, begin + 9.0),)})
+    found = calibrate_lengths(short, prior=person.average, protocol=name)
+    words = " ".join(judge(found).in_words())
+    assert "independent looks only" in words
+    assert closed in words
+    assert "joined" not in words
+    assert "palms together" not in words
+    assert found.tape == load_protocol(name).tape
+    scale = next(f for f in judge(found).findings if f.name == "scale")
+    assert scale.do.endswith(found.tape)
+
+
 def test_poses_tell_headings_and_no_length() -> None:
     person, simulation = made("poses", 4, real=True)
     recording = simulation.recording()
@@ -293,7 +312,7 @@ def test_poses_tell_headings_and_no_length() -> None:
     assert found.subject.lengths == pytest.approx(person.average.lengths)
     for name in LENGTHS:
         assert found.subject.std(name) == pytest.approx(person.average.std(name))
-    assert any(text.startswith("N-pose, T-pose and bow tell headings and no length") for text in found.warnings)
+    assert any("(N-pose, T-pose and bow) tells headings and no length" in text for text in found.warnings)
     _, std = mount_errors(found, simulation)
     assert np.all((std[:, 2] > 5.0) & (std[:, 2] < 9.0))  # as well as the poses are held
     taped = calibrate_lengths(recording, prior=person.average, protocol="poses", gauge={"trunk": 0.47})
@@ -387,6 +406,10 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
         ("[[closure]]", POSE.format("{ torso = ['a', 0, 0] }"), r"directions\.torso = .*three numbers are needed"),
         ("[[closure]]", POSE.format("{ head = [0, 0, 1] }"), r"directions: 'head' is not known"),
         ("needs =", "needs ==", r"not valid TOML"),
+        ("needs =", "needs = 3 #", r"needs = 3; a list of names is needed"),
+        ("needs =", "needs = [3] #", r"needs: 3 is not known"),
+        ("points =", "points = 'left_wrist' #", r"closure 1: points = 'left_wrist'; a list of names"),
+        ("points =", "points = [['left_wrist'], 'right_wrist'] #", r"points: \['left_wrist'\] is not known"),
     ):
         own.write_text(OWN.replace(old, new))
         with pytest.raises(BadOption, match=match) as caught:
@@ -398,6 +421,14 @@ def command(*argv: str) -> int:
     with pytest.raises(SystemExit) as stopped:
         main(list(argv))
     return int(stopped.value.code or 0)
+
+
+def test_a_protocol_is_simulated_and_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = tmp_path / "made"
+    assert command("simulate", "-o", str(made), "--protocol", "poses") == 0
+    assert set(load_session(made).phases) >= {"start", "t_pose", "bow"}
+    assert command("calibrate", str(made), "--protocol", "poses", "--gaps", "-o", str(tmp_path / "out")) == 3
+    assert "tells headings and no length" in capsys.readouterr().err
 
 
 def test_the_command_takes_protocols(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

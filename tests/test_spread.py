@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.alignment import ATTITUDE_STD, START_POSE_STD, Filtered
-from wepose_pin.calibration import lengths, load_protocol
+from wepose_pin.calibration import load_protocol, weighing
 from wepose_pin.calibration.known import (
     DRIFT_STD,
     HINGE_COMMON_STD,
@@ -19,6 +19,7 @@ from wepose_pin.calibration.known import (
     HINGE_TILT_STD,
     SAG_STD,
     SHOULDERS_STD,
+    TORSO_SAG_STD,
 )
 from wepose_pin.calibration.lengths import Calibration, _solve
 from wepose_pin.calibration.weighing import LEAST_CORRELATION_S
@@ -109,7 +110,7 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
         for name in SENSORS:
             psi, drift = rng.uniform(-np.pi, np.pi), rng.normal(scale=DRIFT_STD)
             tilt = Rotation.from_rotvec([*rng.normal(scale=START_POSE_STD, size=2), 0.0])
-            sag = rng.normal(scale=SAG_STD, size=(3, 3))
+            sag = rng.normal(scale=TORSO_SAG_STD if name == "torso" else SAG_STD, size=(3, 3))
             turned = R_WL[name]
             for _ in range(8):
                 turned = R_WL[name] * Rotation.from_rotvec((turned.inv().apply(UP) - UP) @ sag.T).inv()
@@ -194,7 +195,7 @@ def test_the_spread_is_what_is_stated(motion: Motion) -> None:
 
 def test_many_looks_are_solved_by_way_of_few(motion: Motion, monkeypatch: pytest.MonkeyPatch) -> None:
     at_once = next(draws(motion, 1)).found.subject
-    monkeypatch.setattr(lengths, "MANY_LOOKS", len(motion.time) // 2)
+    monkeypatch.setattr(weighing, "MANY_LOOKS", len(motion.time) // 2)
     found = next(draws(motion, 1)).found.subject
     for name in LENGTHS:
         assert found.lengths[name] == pytest.approx(at_once.lengths[name], abs=0.15 * at_once.std(name))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wepose_pin.errors import BadOption, BadSubject, MissingFile
-from wepose_pin.subject import LENGTHS, Subject, average_subject, load_subject, subject_toml
+from wepose_pin.subject import LENGTHS, Drift, StartTilt, Subject, average_subject, load_subject, subject_toml
 
 
 def test_the_average_man_of_de_leva() -> None:
@@ -45,7 +45,14 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     order = (*LENGTHS, "mounts.torso.x", "mounts.torso.y", "mounts.torso.z")
     root = rng.normal(scale=0.01, size=(len(order), len(order)))
     subject = Subject(
-        'Ann "A" Ö', average.lengths, order, root @ root.T, {"torso": np.array([0.5, -0.5, 0.5, 0.5])}, "by hand"
+        'Ann "A" Ö',
+        average.lengths,
+        order,
+        root @ root.T,
+        {"torso": np.array([0.5, -0.5, 0.5, 0.5])},
+        "by hand",
+        start_tilt={"torso": StartTilt(np.array([0.01, -0.07]), 0.02)},
+        drift={"torso": Drift(np.deg2rad(-0.7) / 60.0, np.deg2rad(0.3) / 60.0)},
     )
     (tmp_path / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
     for path in (tmp_path, tmp_path / "subject.toml"):
@@ -55,6 +62,10 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
         assert again.order == order
         np.testing.assert_allclose(again.covariance, subject.covariance, rtol=1e-8)
         np.testing.assert_allclose(again.mounts["torso"], subject.mounts["torso"], atol=1e-9)
+        np.testing.assert_allclose(again.start_tilt["torso"].tilt, [0.01, -0.07], atol=1e-6)
+        assert again.start_tilt["torso"].std == pytest.approx(0.02, rel=1e-3)
+        assert again.drift["torso"] == pytest.approx(subject.drift["torso"], rel=1e-3)
+    assert "rate_deg_min = -0.7000" in subject_toml(subject)
     assert np.isnan(again.std("left_palm"))
 
 
@@ -78,6 +89,10 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
         ("ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0", "mounts.torso is no unit quaternion"),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [[1.0, 2.0]]", "covariance.matrix is (1, 2)"),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [['a']]", "holds something that is no number"),
+        ("ALL\n[start_tilt.tors]\nx_deg = 1", "start_tilt.tors is not a segment; did you mean 'torso'"),
+        ("ALL\n[start_tilt.torso]\nx_deg = 1", "it needs x_deg, y_deg, std_deg"),
+        ("ALL\n[drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1", "it needs rate_deg_min, std_deg_min"),
+        ("ALL\n[drift]\ntorso = 1", "drift.torso = 1; it needs rate_deg_min"),
         (
             "ALL\n[covariance]\norder = ['trunk', 'left_hand']\nmatrix = [[1.0, 2.0], [2.0, 1.0]]",
             "positive semidefinite",

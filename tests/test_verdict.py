@@ -20,6 +20,7 @@ from wepose_pin.recording import Recording
 from wepose_pin.simulation import REALISTIC, Imperfections, Person, Simulation, simulate, simulated_person
 from wepose_pin.simulation import motion as motions
 from wepose_pin.simulation.tasks import TASKS
+from wepose_pin.subject import LENGTHS
 from wepose_pin.writers import write_session
 
 ANY = replace(REALISTIC, mount="any")
@@ -144,6 +145,36 @@ def test_without_a_gauge_the_scale_is_the_average_persons(anywhere: Simulation, 
     assert [f.name for f in verdict.reasons] == ["scale"]
     assert "nothing was taped" in verdict.reasons[0].said
     assert "--gauge shoulder_width" in verdict.reasons[0].do
+
+
+def test_a_tape_that_contradicts_all_else_is_named_once(anywhere: Simulation, person: Person) -> None:
+    recording = anywhere.recording()
+    good = solved(recording, person)
+    assert good.tapes["shoulder_width"].off < 2.0
+    assert good.tapes["shoulder_width"].expected == pytest.approx(person.lengths["shoulder_width"], rel=0.1)
+    wrong = calibrate_lengths(recording, gauge={"shoulder_width": 0.20}, prior=person.average)
+    verdict = judge(wrong)
+    assert verdict.grade == "fail"
+    assert [f.name for f in verdict.reasons] == ["tape.shoulder_width"]
+    assert "shoulder_width = 200 mm is" in verdict.in_words()[0]
+    assert "measure it anew" in verdict.in_words()[0]
+    assert sum("standard deviations" in text for text in wrong.warnings) == 1
+    # Without the tape the solution expects what it said that it would.
+    tape, free = wrong.tapes["shoulder_width"], solved(recording, person, gauge=False).subject
+    assert tape.expected == pytest.approx(free.lengths["shoulder_width"], abs=free.std("shoulder_width"))
+    assert tape.std == pytest.approx(free.std("shoulder_width"), rel=0.3)
+
+
+def test_of_sensors_that_sit_elsewhere_nothing_is_learned(anywhere: Simulation, person: Person) -> None:
+    found = solved(exchanged(anywhere.recording(), ("left_upper_arm", "left_forearm")), person)
+    assert found.labels.moved
+    for name in LENGTHS:
+        assert found.subject.std(name) >= 0.5 * person.average.std(name) or name == "shoulder_width"
+    assert found.subject.std("left_upper_arm") > 0.8 * person.average.std("left_upper_arm")
+    assert found.subject.lengths["shoulder_width"] == pytest.approx(person.taped["shoulder_width"], abs=1e-3)
+    assert found.subject.std("mounts.left_forearm.z") > 1.5
+    assert not found.subject.hinges
+    assert not found.subject.start_tilt
 
 
 @pytest.mark.parametrize(

@@ -195,16 +195,20 @@ def segment_orientations(
         if known is not None:
             # The tilt's misfit is the pose's error and the mount's together; each takes its share. Of the heading,
             # which was made to fit, the start pose says nothing but through the mount's own correlations.
-            pose = _stands(subject, segment)
-            misfit = (R_LS * R_stated.inv()).as_rotvec()[:2] - pose.tilt
-            both = pose.share**2 * known[:2, :2] + pose.std**2 * np.eye(2)
-            R_LS = Rotation.from_rotvec(pose.share * known[:, :2] @ np.linalg.solve(both, misfit)) * R_stated
+            misfit = (R_LS * R_stated.inv()).as_rotvec()[:2]
+            both = known[:2, :2] + START_POSE_STD**2 * np.eye(2)
+            R_LS = Rotation.from_rotvec(known[:, :2] @ np.linalg.solve(both, misfit)) * R_stated
             psi = heading_to(at_start, R_LS)
             turn = Rotation.from_rotvec([0.0, 0.0, psi])
+            stood = subject.start_tilt.get(segment) if subject is not None else None
+            if stood is not None:
+                # Tilt and mount of the calibration come from one start pose: what one is off by, the other is too.
+                misfit, both = misfit - stood.tilt, REPEATED_START_STD**2 * np.eye(2)
             if misfit @ np.linalg.solve(both, misfit) > MOVED_MOUNT**2:
+                off = np.degrees(np.linalg.norm(misfit))
                 warnings.append(
-                    f"sensors.{segment}: its calibrated mount is {np.degrees(np.linalg.norm(misfit)):.0f} deg off what "
-                    f'gravity says in the start pose; strapped on anew? then state strapping = "new"'
+                    f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "
+                    f'pose; strapped on anew? then state strapping = "new"'
                 )
         quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
         quat_LS[segment] = R_LS.as_quat()
@@ -260,33 +264,10 @@ def covariance_of(
         # into Rz(δ) R_WL Rz(δ)ᵀ, which is nothing in the start pose; the pose weighed in on its tilt.
         R_WL = (R_WS * R_LS.inv()).as_matrix()
         lever = R_WL - np.array([0.0, 0.0, 1.0])[:, None] * np.array([0.0, 0.0, 1.0])
-        pose, tilt = _stands(subject, segment), known[:2]
-        both = pose.share**2 * tilt[:, :2] + pose.std**2 * np.eye(2)
-        left = known - pose.share**2 * tilt.T @ np.linalg.solve(both, tilt)
+        tilt = known[:2]
+        left = known - tilt.T @ np.linalg.solve(tilt[:, :2] + START_POSE_STD**2 * np.eye(2), tilt)
         cov_W += lever @ left @ lever.swapaxes(1, 2)
     return cov_W
-
-
-class _Stands(NamedTuple):
-    """What is known of a segment's tilt in the start pose: it differs from the mount's own misfit by share · error."""
-
-    tilt: np.ndarray  # (2,) [rad] expected of the misfit
-    share: float  # of the mount's error that the misfit shows
-    std: float  # [rad]
-
-
-def _stands(subject: Subject | None, segment: str) -> _Stands:
-    """How a person stands: anyhow, or as in the calibration.
-
-    The calibrated tilt ε̂ and the mount come from one start pose: what the mount is off by, m, the tilt is off by −m.
-    Two start poses of a person correlate by c, so that the misfit in the next one, ε + m with ε = c (ε̂ − m) + ν, is
-    c ε̂ + (1 − c) m + ν: of the mount it shows next to nothing, and in the same recording nothing, as it must.
-    """
-    known = subject.start_tilt.get(segment) if subject is not None else None
-    if known is None:
-        return _Stands(np.zeros(2), 1.0, float(START_POSE_STD))
-    c = 1.0 - 0.5 * (REPEATED_START_STD / START_POSE_STD) ** 2
-    return _Stands(c * known.tilt, 1.0 - c, float(START_POSE_STD * np.sqrt(1.0 - c**2)))
 
 
 def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:

@@ -23,6 +23,7 @@ from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of
 
 if TYPE_CHECKING:
     from .calibration import Calibration, Verdict
+    from .live import Output
     from .simulation import Imperfections
     from .subject import Subject
     from .validation import Document
@@ -411,6 +412,108 @@ def simulate(
     _say(f"Truth: {out / 'truth.parquet'}  {out / 'subject.toml'}")
 
 
+def live(
+    *,
+    source: Annotated[str, arg(metavar="SPEC")],
+    subject: OptionalPath = None,
+    session: Annotated[Path | None, arg(metavar="SESSION")] = None,
+    record: Annotated[Path | None, arg(metavar="FILE")] = None,
+    method: Literal["amekf", "smekf", "ncf", "gdc"] = "amekf",
+    model: OptionalPath = None,
+    speed: Annotated[str, arg(metavar="FACTOR")] = "1",
+    no_page: bool = False,
+    no_open: bool = False,
+    port: int = 0,
+    udp: Annotated[str | None, arg(metavar="[HOST:]PORT")] = None,
+    lsl: Annotated[str | None, arg(metavar="NAME")] = None,
+    force: bool = False,
+) -> None:
+    """The pose while it happens: from a stream to a page in the browser, the terminal, other programs and a file.
+
+    Stand still in the start pose until you are told that it is ready. Then r sets the headings anew while you stand so
+    again, and q ends (Ctrl-C too). What --record wrote up to any end is whole but for its last second.
+
+    Example: wepose live --source udp:9000 --subject anna --record morning.wepose
+
+    Args:
+        source: Where samples come from: replay:SESSION, udp:[HOST:]PORT, lsl:NAME, mti:DEVICE=SEGMENT,…
+            (docs/live-sources.md).
+        subject: subject.toml of `wepose calibrate`, or its folder; without it lengths are an average person's and
+            mounts those that --session states.
+        session: A session file that states how the sensors are mounted; what it says of data is not read.
+        record: Write all that is received and the poses there; `wepose track FILE` gives the same poses again.
+        method: The orientation filter.
+        model: A body's URDF, or a TOML that names it and its links (docs/models.md); without it ours.
+        speed: Of a replay: 1 its own, 4 four times that, max as fast as it is read.
+        no_page: Serve no page, only the terminal's view.
+        no_open: Do not open the page in the browser.
+        port: Of the page, on this machine only; without it any free one.
+        udp: Send each pose as JSON to this port, of this machine where no host is named (docs/live-page.md).
+        lsl: Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
+        force: Replace the file of --record.
+    """
+    import webbrowser
+
+    from .live import open_source, run_session, wearing_of
+    from .live.loop import wearer_model
+    from .live.terminal import TerminalView
+    from .model import load_model
+
+    stated = None if session is None else wearing_of(None, subject, session)
+    named = None if stated is None or source.startswith("replay:") else list(stated.mounts)
+    stream = open_source(source, sensors=named or None, speed=speed)
+    wearing = stated or wearing_of(stream, subject, None)
+    body = wearer_model(wearing.subject, load_model(model) if model else None)
+    outputs: list[Output] = []
+    try:
+        if udp is not None:
+            from .live.out import udp_out
+
+            outputs.append(udp_out(udp))
+        if lsl is not None:
+            from .live.out import LslOut
+
+            outputs.append(LslOut(lsl))
+        if not no_page:
+            from .live.page import LivePage
+
+            page = LivePage(body, port=port, title=wearing.name)
+            page.open()
+            outputs.append(page)
+            _say(f"Page: {page.url}  (this machine only)")
+            if not no_open and not webbrowser.open(page.url):
+                _warn(["no browser could be started; open the page by hand"])
+        outputs.append(TerminalView())
+        with _asked_to_stop() as asked:
+            ended = run_session(
+                stream,
+                wearing,
+                method=method,
+                model=body,
+                record=record,
+                force=force,
+                outputs=outputs,
+                until=asked,
+            )
+    finally:
+        for output in outputs:
+            output.close()
+    _warn(ended.warnings)
+    _print_table(
+        f"{ended.poses} poses in {ended.seconds:.1f} s; from the newest sample to its pose "
+        f"{1e3 * ended.latency.quantile(0.5):.2f} ms (p50), {1e3 * ended.latency.quantile(0.99):.2f} ms (p99)",
+        ("sensor", "samples", "ticks without", "late", "twice", "unsound"),
+        [
+            (name, *(str(of[key]) for key in ("taken", "missing", "late", "duplicate", "bad")))
+            for name, of in ended.counts.items()
+        ],
+    )
+    if ended.problem:
+        _warn([ended.problem])
+    if record is not None:
+        _say(f"Recorded: {record}  (wepose track {record} -o DIR gives these poses again)")
+
+
 def view(
     result: Result,
     /,
@@ -454,6 +557,39 @@ def view(
     _say(f"Motion to look at:  {page}")
     if not no_open and not webbrowser.open(page.absolute().as_uri()):
         _warn(["no browser could be started; open the page by hand"])
+
+
+def export(
+    result: Result,
+    /,
+    *,
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE")],
+    format: Annotated[str | None, arg(metavar="FORMAT")] = None,
+    names: Annotated[str | None, arg(metavar="{opensim,isb}")] = None,
+    rate_hz: Annotated[float | None, arg(metavar="HZ")] = None,
+    force: bool = False,
+) -> None:
+    """The motion of a result for other programs: CSV, Parquet, OpenSim, BVH, C3D, URDF (docs/formats/export.md).
+
+    Example: wepose export result -o circles.trc
+
+    Args:
+        result: Folder that `wepose track` wrote.
+        out: File to write.
+        format: csv, parquet: pose and joint angles; mot: joint angles for OpenSim; sto: orientations for OpenSense, and
+            placement: the sample for its IMU Placer; trc, c3d: points; bvh: skeleton and motion; urdf: the subject.
+            Left out, it is the file's suffix.
+        names: Columns of a .mot: coordinates of OpenSim's Rajagopal model, the default, or the ISB's angles.
+        rate_hz: Resample to this many samples a second.
+        force: Replace an existing file.
+    """
+    from .writers.export import export as write
+
+    with _steps(1) as step:
+        step("writing")
+        written = write(result, out, format, names=names, rate_hz=rate_hz, force=force)
+    _warn(written.notes)
+    _say(f"Written: {out}  ({written.format})")
 
 
 def validate(
@@ -516,6 +652,7 @@ def validate(
 def bench(
     *,
     quick: bool = False,
+    live: bool = False,
     data: OptionalPath = None,
     save: Annotated[Path | None, arg(metavar="FILE")] = None,
     compare: Annotated[Path | None, arg(metavar="FILE")] = None,
@@ -529,6 +666,8 @@ def bench(
 
     Args:
         quick: Less than half a minute in place of two: shorter data, fewer rounds, nothing compiled anew.
+        live: Nothing but a live session: five sensors at 1 kHz, five minutes with a file and five with the page too, of
+            which --quick makes half a minute each.
         data: Folder of real recordings (broad/, wepose_hr/) to measure accuracy on; WEPOSE_DATA names one too.
         save: Write the figures there, with versions, machine and date, as JSON.
         compare: A file that --save wrote: then/now shows how much slower each was then, by its ratio to VQF.
@@ -536,7 +675,7 @@ def bench(
     """
     import json
 
-    from .bench import FULL, QUICK, document, read_document, sections, then_by_now
+    from .bench import FULL, QUICK, document, live_sections, read_document, sections, then_by_now
     from .writers.result import versions
 
     if data is None and os.environ.get("WEPOSE_DATA"):
@@ -546,7 +685,7 @@ def bench(
         raise ExistingOutput(f"{save}: exists; --force replaces it, --save names another file")
     if save is not None and (save.is_dir() or not save.absolute().parent.is_dir()):
         raise ExistingOutput(f"{save}: not a file that can be written; --save names a JSON file in an existing folder")
-    todo, tables = sections(QUICK if quick else FULL, data), {}
+    todo, tables = live_sections(quick) if live else sections(QUICK if quick else FULL, data), {}
     with _steps(len(todo)) as step:
         for name, measure in todo.items():
             step(f"measuring {name.replace('_', ' ')}")
@@ -608,7 +747,9 @@ def info(
         raise ExistingOutput(f"{target}: exists; --force replaces it, -o names another file")
     if target is not None and (target.is_dir() or not target.absolute().parent.is_dir()):
         raise ExistingOutput(f"{target}: not a file that can be written; -o names a .toml file in an existing folder")
-    found = describe(file, target.absolute().parent if target is not None else beside)
+    with _steps(1) as step:
+        step("reading")
+        found = describe(file, target.absolute().parent if target is not None else beside)
     if target is not None and found.session is None:
         raise BadOption(f"--write: there is no session to write for {found.what}")
     _say(found.what)
@@ -637,7 +778,9 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "simulate": simulate,
     "calibrate": calibrate,
     "track": track,
+    "live": live,
     "view": view,
+    "export": export,
     "info": info,
     "evaluate": evaluate,
     "validate": validate,
@@ -688,6 +831,24 @@ def _stop(number: int, _frame: Any) -> None:
     """Remember the signal: libraries that call back into Python swallow the exception."""
     _stopped.append(number)
     raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def _asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Signals only ask, so that nothing is cut off in the middle; asked twice, it stops at once."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: Any) -> None:
+        if asked:
+            _stop(number, frame)
+        asked.append(number)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _parse_and_run(argv: list[str]) -> None:

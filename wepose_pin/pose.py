@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from . import so3
 from .errors import BadData, BadModel, one_of
 from .model import POINTS, BodyModel, chains
-from .model.chains import about, axis_in_joint, conjugate, multiply, solve
+from .model.follow import follow, groups
 from .recording import SEGMENTS
 from .so3 import kernel
 from .subject import LENGTHS
@@ -90,13 +90,23 @@ def known_links(model: BodyModel, segments: Iterable[str]) -> list[str]:
     return [frame.name for frame in model.pin.frames[1:] if known_joint[frame.parentJoint]]
 
 
-def configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:
+def configuration(
+    model: BodyModel,
+    quat_WL: Mapping[str, np.ndarray],
+    *,
+    limits: bool = True,
+    weights: Mapping[str, float] | None = None,
+) -> np.ndarray:
     """Configuration `q` (n, nq) in which the segments have their measured orientations, or come nearest to them.
 
-    A segment behind a spherical joint has its orientation exactly; behind fewer axes the one at the smallest angle
-    from it, which `deviation` gives. Each is brought there from where the one above really stands, so that what one
-    misses is not handed on. `wepose_pin.model.chains` says which joints move. Segments without an orientation are rigid
-    with the one above.
+    What hangs on spherical joints only has its orientations exactly. An arm with fewer axes somewhere has the sum of its
+    segments' squared angles to what was measured at its least, which `deviation` gives one by one. Segments without an
+    orientation are rigid with the one above. `wepose_pin.model.chains` says which joints move.
+
+    Parameters
+    ----------
+    limits : keep the limits of joints with one axis; those of spherical joints are not kept
+    weights : segment → weight of its squared angle within its arm; 1 where not named
 
     Raises
     ------
@@ -105,50 +115,21 @@ def configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray]) -> np.nda
     """
     if not quat_WL:
         raise BadData("no segment has an orientation: there is nothing to pose")
-    n = len(next(iter(quat_WL.values())))
     found = chains(model.pin)
     for segment in quat_WL:
         if segment not in found:
             raise BadModel(f"{model.pin.name}: the model has no link for segment '{segment}'; {one_of(found, segment)}")
-    begins = {chain.joints[0]: segment for segment, chain in found.items() if chain.joints and segment in quat_WL}
-    q = np.tile(pin.neutral(model.pin), (n, 1))
-    identity = np.array([0.0, 0.0, 0.0, 1.0])
-    world = [identity]  # orientation in W of each joint's moving frame, (n, 4) or (4,)
-    turns: dict[int, np.ndarray] = {}  # joint → its own rotation, the same
-    for joint in range(1, model.pin.njoints):
-        above = model.pin.parents[joint]
-        if joint in begins:
-            chain = found[begins[joint]]
-            values = solve(chain, multiply(conjugate(world[chain.above]), quat_WL[begins[joint]]))
-            for moved, value in zip(chain.joints, values, strict=True):
-                turns[moved] = _set(model, q, moved, value)
-        placement = pin.Quaternion(model.pin.jointPlacements[joint].rotation).coeffs()
-        world.append(multiply(world[above], multiply(placement, turns.get(joint, identity))))
-    return q
-
-
-def _set(model: BodyModel, q: np.ndarray, joint: int, value: np.ndarray) -> np.ndarray:
-    """Write a joint's value into `q`: an angle (n,) [rad] or a rotation (n, 4); gives its rotation."""
-    first = model.pin.idx_qs[joint]
-    if value.ndim == 2:
-        value = so3.continuous(value / np.linalg.norm(value, axis=1)[:, None])
-        q[:, first : first + 4] = value
-        return value
-    if model.pin.nqs[joint] == 1:
-        q[:, first] = value
-    else:  # without limits: cosine and sine
-        q[:, first], q[:, first + 1] = np.cos(value), np.sin(value)
-    axis = axis_in_joint(model.pin, joint)
-    assert axis is not None
-    return about(axis, value)
+    return follow(model, quat_WL, limits=limits, weights=weights)
 
 
 def deviation(model: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Segment → angle (n,) [rad] by which the model in `q` misses its measured orientation.
 
-    Only segments that cannot follow every orientation: behind one or two axes, or rigid with another.
+    Only segments that may miss one: behind one or two axes, in an arm with such, or rigid with another.
     """
-    lame = [segment for segment, chain in chains(model.pin).items() if segment in quat_WL and not chain.exact]
+    found = chains(model.pin)
+    fitted = {segment for group in groups(found, quat_WL) for segment in group.segments}
+    lame = [name for name, chain in found.items() if name in quat_WL and (name in fitted or not chain.exact)]
     R_WL, _ = forward_kinematics(model, q, lame)
     is_at = {segment: Rotation.from_matrix(R_WL[:, k]) for k, segment in enumerate(lame)}
     return {segment: (is_at[segment].inv() * Rotation.from_quat(quat_WL[segment])).magnitude() for segment in lame}

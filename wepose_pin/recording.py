@@ -26,6 +26,7 @@ SEGMENTS = (
     "right_hand",
 )
 START_POSES = ("n_pose",)
+CONFIGURATION = "configuration"  # the start pose of any other chain: values of its joints; sensors are named by links
 
 # The sensor axes that a mount can be stated with.
 AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) for k, axis in enumerate("xyz")}
@@ -90,6 +91,7 @@ class Recording:
     source : the file it was read from, for messages
     truth : file with the reference, where there is one
     resets : samples before which headings were set anew, live: the person stood in the start pose
+    joints : joint → its value [rad or m] in the start pose, where that is `CONFIGURATION`; the others are at zero
     notes : what was assumed or mended while reading, for the summary
     """
 
@@ -103,6 +105,7 @@ class Recording:
     source: Path | None = None
     truth: Path | None = None
     resets: tuple[int, ...] = ()
+    joints: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:

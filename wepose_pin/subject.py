@@ -212,8 +212,22 @@ def load_subject(path: str | Path) -> Subject:
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; `wepose calibrate` writes one")
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return subject_of(path.read_text(encoding="utf-8"), path)
+    except UnicodeDecodeError as error:
+        raise BadSubject(f"{path}: not valid TOML: {error}") from error
+
+
+def subject_of(text: str, path: Path) -> Subject:
+    """The subject that ``subject.toml`` says; `path` is where it stands, for messages.
+
+    Raises
+    ------
+    BadSubject
+        As `load_subject`.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
         raise BadSubject(f"{path}: not valid TOML: {error}") from error
     if "sensors" in table:
         raise BadSubject(f"{path}: is a session; a subject is wanted here, as `wepose calibrate` writes one")

@@ -27,7 +27,7 @@ from ..readers.arrivals import (
     arrivals,
 )
 from ..readers.live_log import recording_of
-from ..recording import Recording, Sensor
+from ..recording import SEGMENTS, Recording, Sensor
 from ..subject import Subject, average_subject
 from ..tracking.causal import HOLD_S, CausalTracker, StartGuide, until_start
 from ..writers.live_log import LiveLog
@@ -103,7 +103,7 @@ class LiveLoop:
 
     Parameters
     ----------
-    source : opened and closed by `run`
+    source : opened already; `run` closes it
     model : a body; None for ours with the subject's lengths
     log : where all is recorded; closed by `run`
     begin : time [s] of the first tick; None: when every sensor has come
@@ -126,7 +126,8 @@ class LiveLoop:
         begin: float | None = None,
         wait_s: float = WAIT_S,
     ) -> None:
-        self.source, self.wearing, self.method, self.log, self.outputs = source, wearing, method, log, tuple(outputs)
+        self.source, self.method, self.log, self.outputs = source, method, log, tuple(outputs)
+        self.wearing = wearing.as_recorded()
         self.model = wearer_model(wearing.subject, model)
         self.kinematics = LiveKinematics(self.model, source.sensors)
         self._begin, self._wait = begin, wait_s
@@ -144,12 +145,10 @@ class LiveLoop:
         self._first_pose = self._last_pose = 0.0
         self._taken: deque[tuple[float, np.ndarray]] = deque(maxlen=round(1.0 / STATUS_S) + 1)
         self._ended = False
-        _warm(source.sensors, wearing, method)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> Ended:
         """Go on until the source ends, someone presses q, or `until` says so."""
         next_status = 0.0
-        self.source.open()
         try:
             while not until():
                 got = self.source.read(READ_S)
@@ -418,25 +417,25 @@ def _measured_rate(times: Sequence[np.ndarray]) -> float:
     return max(1.0, round(min(rates), 1)) if rates else 100.0
 
 
-def _warm(sensors: Sequence[str], wearing: Wearing, method: str) -> None:
+def warm(method: str) -> None:
     """Run a tracker once: what is compiled or read from disk then is there when the person holds the pose."""
-    n, rng = 200, np.random.default_rng(0)
-    level = np.array([0.0, 0.0, 0.0, 1.0])
+    n, rng, sensors = 200, np.random.default_rng(0), SEGMENTS[:2]
     made = Recording(
-        wearing.name,
+        "warm",
         np.arange(n) / 100.0,
         100.0,
         {
             name: Sensor(
                 gyro_S=1e-3 * rng.standard_normal((n, 3)),
                 accel_S=[0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3)),
-                stated_quat_LS=level,
+                stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]),
             )
             for name in sensors
         },
         {"start": ((0.0, 1.9),)},
     )
     tracker = CausalTracker(made, method=method)
-    tracker.step(np.zeros((len(sensors), 3)), np.tile([0.0, 0.0, 9.81], (len(sensors), 1)))
+    tracker.step(np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
+    tracker.std()
     aligner = Aligner(sensors, 100.0, 0.0)
-    aligner.push(arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], tuple(sensors)))
+    aligner.push(arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))

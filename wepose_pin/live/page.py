@@ -23,6 +23,7 @@ from .server import Server
 from .state import LivePose, Stage, Status
 
 LOOPBACK = "127.0.0.1"
+FINGERS = 0.1  # [m] from the middle of the palm
 MOST_KEYS = 16  # not yet taken; more are thrown away
 
 
@@ -125,6 +126,6 @@ def _reach(model: BodyModel) -> np.ndarray:
     for side, left in (("left", 1.0), ("right", -1.0)):
         if f"{side}_hand" in p_W:
             p_shoulder = p_W[f"{side}_shoulder"]
-            ways = np.array([[1.0, 0.0, 0.0], [0.0, left, 0.0], [0.0, 0.6 * left, 0.8]])
-            ends += list(p_shoulder + np.linalg.norm(p_W[f"{side}_hand"] - p_shoulder) * ways)
+            ways = np.array([[1.0, 0.0, 0.0], [0.7, 0.7 * left, 0.0], [0.0, left, 0.0], [0.0, 0.6 * left, 0.8]])
+            ends += list(p_shoulder + (np.linalg.norm(p_W[f"{side}_hand"] - p_shoulder) + FINGERS) * ways)
     return np.array(ends)

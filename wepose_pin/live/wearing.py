@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from ..errors import BadSession, one_of
 from ..readers.keys import Keys, read_toml
 from ..readers.stated import phases_stated, sensor_stated
 from ..recording import SEGMENTS, START_POSES, Intervals, Recording
-from ..subject import Subject
+from ..subject import Subject, subject_of, subject_toml
 
 
 @dataclass(frozen=True)
@@ -23,31 +23,41 @@ class Wearing:
     Parameters
     ----------
     subject : lengths and calibrated mounts; None: the average person and stated mounts
+    subject_text : the ``subject.toml`` it was read from, if any
     mounts : segment → stated `quat_LS` (4,) xyzw
     phases : of a replay: `start` and `still` [s], else the start pose is found
     """
 
     name: str = "live"
     subject: Subject | None = None
+    subject_text: str = ""
     mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, Intervals] = field(default_factory=dict)
     start_pose: str = "n_pose"
     strapping: str = "as_calibrated"
 
     @classmethod
-    def of(cls, recording: Recording, subject: Subject | None = None) -> Wearing:
+    def of(cls, recording: Recording, subject: Subject | None = None, subject_text: str = "") -> Wearing:
         """As a recording has it that is replayed."""
         return cls(
             recording.name,
             subject,
+            subject_text,
             {n: s.stated_quat_LS for n, s in recording.sensors.items() if s.stated_quat_LS is not None},
             recording.phases,
             recording.start_pose,
             recording.strapping,
         )
 
+    def as_recorded(self) -> Wearing:
+        """With the subject as who reads the session's recording will have it: decimals of a text are not all."""
+        if self.subject is None or self.subject_text:
+            return self
+        text = subject_toml(self.subject)
+        return replace(self, subject=subject_of(text, Path("subject.toml")), subject_text=text)
+
     def header(self, sensors: Sequence[str]) -> dict[str, Any]:
-        """What the recording of a live session begins with, the subject and method apart."""
+        """What the recording of a live session begins with, the method apart."""
         return {
             "name": self.name,
             "sensors": list(sensors),
@@ -55,10 +65,11 @@ class Wearing:
             "phases": {name: [list(span) for span in spans] for name, spans in self.phases.items()},
             "start_pose": self.start_pose,
             "strapping": self.strapping,
+            "subject": self.subject_text or None,
         }
 
 
-def read_wearing(path: Path, subject: Subject | None = None) -> Wearing:
+def read_wearing(path: Path, subject: Subject | None = None, subject_text: str = "") -> Wearing:
     """What a session file says of the sensors' mounts; what it says of data and phases is of another recording.
 
     Raises
@@ -81,6 +92,7 @@ def read_wearing(path: Path, subject: Subject | None = None) -> Wearing:
     return Wearing(
         top.text("name", None) or path.absolute().parent.name,
         subject,
+        subject_text,
         mounts,
         start_pose=top.choice("start_pose", START_POSES, "n_pose"),
         strapping=top.choice("strapping", ("as_calibrated", "new"), "as_calibrated"),

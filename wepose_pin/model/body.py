@@ -122,7 +122,7 @@ def load_model(
         table = table_from(given, str(path))
     elif points is not None or root is not None or (up, forward) != ("+z", "+x"):
         raise BadModel(f"{path}: points, up, forward and root are part of a table; give segments with them")
-    robot = _read(path)
+    robot = read_urdf(path)
     tree = tree_of(robot, str(path))
     table = table or find_table(path, tree.below)
     if table is not None:
@@ -138,7 +138,14 @@ def load_model(
     return body.with_lengths(lengths) if lengths else body
 
 
-def _read(path: Path) -> Any:
+def read_urdf(path: Path) -> Any:
+    """The URDF as yourdfpy has it.
+
+    Raises
+    ------
+    MissingFile, BadModel
+        Not there; not a URDF.
+    """
     import yourdfpy
 
     if not path.is_file():

@@ -9,7 +9,7 @@ orientations; how they share it is decided here:
   person who turns round does not twist the spine): the segment follows exactly;
 - one or two axes come as near as they can, in closed form; three and more by Levenberg-Marquardt.
 
-Near means the smallest angle. Limits of joints are not kept: a person may be more supple than a URDF.
+Near means the smallest angle. Limits of joints are not looked at here; `follow` keeps those of hinges.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .. import so3
 from ..errors import BadModel
 from ..recording import SEGMENTS
 
-_AXIAL = ("torso", "pelvis", "head")
+AXIAL = ("torso", "pelvis", "head")
 _MEET_TOLERANCE = 1e-6  # [m]
 _ROUNDS = 60  # Levenberg-Marquardt; about 6 are the rule
 _CLOSE = 1e-24  # [rad²]
@@ -77,7 +77,7 @@ def chains(model: pin.Model) -> dict[str, Chain]:
     found = {}
     for segment, frame in sorted(frames.items(), key=lambda item: item[1].parentJoint):
         free = [j for j in between.get(segment, []) if times[j] == 1 and "Prismatic" not in model.joints[j].shortname()]
-        if segment not in _AXIAL:
+        if segment not in AXIAL:
             free = _nearest_three(model, free)
         found[segment] = _chain(model, frame, free)
     return found

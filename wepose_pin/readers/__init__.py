@@ -2,6 +2,30 @@
 
 from __future__ import annotations
 
-from .session import iter_session, load_session
+from pathlib import Path
 
-__all__ = ["iter_session", "load_session"]
+from ..recording import Recording
+from . import session
+from .live_log import is_live_log, read_live_log
+from .session import iter_session
+
+__all__ = ["is_live_log", "iter_session", "load_session", "read_live_log"]
+
+
+def load_session(path: str | Path, gaps: bool = False) -> Recording:
+    """Read ``session.toml`` and the data it names, or what `wepose live` recorded.
+
+    Parameters
+    ----------
+    path : the session file, or its folder; a file of `wepose live --record`
+    gaps : accept lost samples for longer than 50 ms: they are bridged, and marked in `Sensor.gap`. Of a live recording
+        they always are
+
+    Raises
+    ------
+    WeposeError
+        With one line that names the file, the key or column, the value found and what would be right.
+    """
+    if is_live_log(Path(path)):
+        return read_live_log(Path(path)).recording
+    return session.load_session(path, gaps)

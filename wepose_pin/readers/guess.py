@@ -100,11 +100,11 @@ def _guess(names: list[str], found: dict[str, dict[str, list[str]]]) -> Guess:
         }
         for who, signals in whole.items()
     }
-    first = next((who for who in sensors if who.startswith("?")), None)
-    sure = first is None or len(sensors) > 1 and not all(who.startswith("?") for who in sensors)
-    if first is not None and not sure:
+    unnamed = [who for who in sensors if who.startswith("?")]
+    sure = not unnamed or len(unnamed) < len(sensors)
+    if not sure:
         # One sensor without a name can be tried; of the others nobody can say which is which.
-        sensors = {"torso" if who == first else who: signals for who, signals in sensors.items()}
+        sensors = {"torso" if who == unnamed[0] else who: signals for who, signals in sensors.items()}
     text = " ".join(names).lower()
     return Guess(
         time,

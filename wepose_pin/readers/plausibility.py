@@ -179,7 +179,7 @@ def _saturation(values: np.ndarray, least: float, place: str) -> list[str]:
 
 
 def cut_off(values: np.ndarray, least: float) -> np.ndarray:
-    """(n, 3) bool: where an axis of `values` (n, 3) stays at its extreme value, `least` or more, as if cut off there."""
+    """(n, 3) bool: where an axis of `values` (n, 3) stays at its extreme, `least` or more, as if cut off there."""
     cut = np.zeros(values.shape, dtype=bool)
     for axis, x in enumerate(values.T):
         for extreme in (float(x.max()), float(x.min())):

@@ -11,20 +11,22 @@ import numpy as np
 import polars as pl
 
 from ..errors import BadData, BadOption, BadSession, MissingFile, one_of
-from ..recording import SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases
+from ..recording import CONFIGURATION, SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases
 from .arrays import ArrayFile, is_array_file
 from .clocks import BRIDGED, LONG, Clock, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time, runs
 from .device import Device
 from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
 from .plausibility import sensor_notes
-from .stated import WIDTHS, Stated, label_stated, phases_stated, sensor_stated, truth_stated
+from .stated import WIDTHS, Stated, joints_stated, label_stated, phases_stated, sensor_stated, truth_stated
 from .tables import Rows, columns, one_column, read_table
 
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "g": 9.80665}
 # How far a quaternion's norm may be off 1: decimals that were cut.
 NORM_OFF = 1e-2
+# Beyond this no number is a measurement in any unit; squares of smaller ones are still numbers.
+HUGE = 1e30
 SI = {"gyro": 1.0, "accel": 1.0}
 
 
@@ -109,11 +111,12 @@ class SessionReader:
         self.path = path / "session.toml" if path.is_dir() else path
         self.gaps = gaps
         top = Keys(read_toml(self.path, "a session file") if values is None else values, str(self.path))
-        top.allow("name", "start_pose", "strapping", "data", "phases", "sensors")
+        top.allow("name", "start_pose", "strapping", "data", "phases", "sensors", "joints")
         data, sensors = top.table("data"), top.table("sensors", {})
         data.allow("file", "time", "rate_hz", "gyro_unit", "accel_unit", "truth", "format", "use")
+        start_pose = top.choice("start_pose", (*START_POSES, CONFIGURATION), "n_pose")
         for segment in sensors.values:
-            if segment not in SEGMENTS:
+            if segment not in SEGMENTS and start_pose != CONFIGURATION:  # else links, of a model that is not known here
                 raise BadSession(f"{self.path}: sensors.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
         if not sensors.values:
             raise BadSession(
@@ -125,7 +128,8 @@ class SessionReader:
             rate_hz=0.0,
             sensors={},
             phases=phases_stated(top.table("phases", {})),
-            start_pose=top.choice("start_pose", START_POSES, "n_pose"),
+            start_pose=start_pose,
+            joints=joints_stated(top, start_pose),
             strapping=top.choice("strapping", ("as_calibrated", "new"), "as_calibrated"),
             source=self.path,
             truth=truth_stated(self.path, data),
@@ -356,6 +360,12 @@ class SessionReader:
             values = np.full((len(clock.row), read.shape[1]), np.nan)
             values[there] = read[clock.row[there] - first_row]
         good = np.isfinite(values).all(axis=1)
+        huge = np.flatnonzero((np.abs(values) > HUGE).any(axis=1))
+        if huge.size:
+            raise BadData(
+                f"{plan.path}: {plan.place}.{name} holds {np.nanmax(np.abs(values[huge[0]])):.3g} in row "
+                f"{clock.row[huge[0]] + 1}; no sensor measures as much, leave cells of lost samples empty"
+            )
         if name != "orientation":
             return plan.units[name] * values, good
         norm = np.linalg.norm(values, axis=1)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import BadPhase, BadSession, MissingFile, one_of
-from ..recording import AXES, Intervals, mount_from_axes
+from ..recording import AXES, CONFIGURATION, Intervals, mount_from_axes
 from .device import Device
 from .keys import Keys, is_number
 
@@ -89,6 +89,18 @@ def phases_stated(keys: Keys) -> dict[str, Intervals]:
             if not first < last:
                 raise BadPhase(f"{keys.at(name)}: [{first:g}, {last:g}] is empty; the earlier time comes first")
     return phases
+
+
+def joints_stated(top: Keys, start_pose: str) -> dict[str, float]:
+    """Values of joints in the start pose of a chain that is not a person's arms."""
+    if "joints" in top and start_pose != CONFIGURATION:
+        raise BadSession(
+            f'{top.at("joints")} stands beside start_pose = "{start_pose}"; joints have values where start_pose = '
+            f'"{CONFIGURATION}"'
+        )
+    joints = top.table("joints", {})
+    values = {name: joints.number(name, None) for name in joints.values}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def truth_stated(path: Path, data: Keys) -> Path | None:

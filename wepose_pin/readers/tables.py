@@ -206,7 +206,10 @@ def _header(path: Path) -> list[str]:
     for separator, name in ((";", "semicolons"), ("\t", "tabs")):
         if header.count(separator) > header.count(","):
             raise BadData(f"{path}: columns are separated by {name}; commas, and points in decimals, are needed")
-    return next(csv.reader([header]))
+    try:
+        return next(csv.reader([header]))
+    except csv.Error as error:
+        raise BadData(f"{path}: its line of names cannot be read: {error}; save it as CSV in UTF-8") from error
 
 
 def _parsed(path: Path, names: list[str], part: bytes = b"", first_row: int = 0) -> pl.DataFrame:

@@ -48,6 +48,7 @@ ADVICE = (
     (r"^no sensor on", "Strap a sensor on, or do without those points."),
     (r"joints are too few", "Use a body model with as many joints there (`--model`), or do without that segment."),
 )
+HARMLESS = r"short gaps|^resampled|several intervals|the scale is taken from it|^no sensor on"
 
 
 class Concern(NamedTuple):
@@ -82,8 +83,7 @@ def concerns(
 
 def _of_warning(text: str) -> Concern:
     do = next((advice for pattern, advice in ADVICE if re.search(pattern, text)), "")
-    harmless = "short gaps" in text or "resampled" in text or "several intervals" in text
-    return Concern(not harmless, text, do)
+    return Concern(not re.search(HARMLESS, text), text, do)
 
 
 def _of_signals(pose: TrackedPose, signals: Mapping[str, Signal], told: str) -> Iterator[Concern]:

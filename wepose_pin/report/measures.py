@@ -78,6 +78,13 @@ def longest(which: np.ndarray, rate_hz: float) -> float:
     return max((b - a for a, b in runs(which)), default=0) / rate_hz
 
 
+def stated_mounts(pose: TrackedPose) -> bool:
+    """The mounts are the session's and not calibrated ones."""
+    assert pose.subject is not None
+    assert pose.recording is not None
+    return not pose.subject.mounts or pose.recording.strapping == "new"
+
+
 # Headings -------------------------------------------------------------------------------------------------------------
 
 

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..angles import JointAngles, joint_angles, summary
-from ..errors import BadData
 from ..page import Banner, Block, Bullets, Facts, Frame, Heading, Table, as_html
 from ..pose import deviation
 from ..recording import Recording, Sensor
 from ..tracking import TrackedPose
 from ..viewer import pose_html
 from .concerns import GRAVITY_OFF, concerns, hold
+from .joints import joint_angle_section
 from .measures import (
     Budget,
     Elbow,
@@ -25,10 +24,9 @@ from .measures import (
     heading_budgets,
     longest,
     signal_of,
+    stated_mounts,
 )
 from .track_figures import (
-    Angle,
-    angles_picture,
     headings_picture,
     noise_picture,
     paths_picture,
@@ -39,7 +37,6 @@ from .words import degrees, intervals, listed, plain, versions, whole
 
 FRAMES_A_SECOND = 20.0  # of the 3D view
 MOST_FRAMES = 5000  # of the 3D view
-FULL_TURN = 2.0 * np.pi - 1e-9
 LARGEST_VIEW = 3_000_000  # of a view that comes ready, in characters
 
 
@@ -70,7 +67,7 @@ def track_report(pose: TrackedPose, *, view: str | None = None) -> str:
         *_noise(signals),
         *_drift(pose, budgets),
         *_hands(pose, hands),
-        *_joints(pose),
+        *joint_angle_section(pose),
         *_view(pose, view),
         *_run(pose),
     ]
@@ -105,8 +102,8 @@ def _in_short(pose: TrackedPose, signals: Mapping[str, Signal], budgets: Mapping
     if pairs:
         worst = max(pairs, key=lambda joint: float(pairs[joint].max()))
         said.append(
-            f"Headings: at no joint off by more than **± {np.degrees(pairs[worst].max()):.1f}°** (the {worst}); "
-            f"tilt is held by gravity."
+            f"Headings: known at every joint to **± {np.degrees(pairs[worst].max()):.1f}°** or better (worst: the "
+            f"{worst}); tilt is held by gravity."
         )
     stds = {name: np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3.0) for name, cov in pose.point_cov.items()}
     seen = [name for name in ("left_hand", "right_hand") if name in stds]
@@ -197,7 +194,7 @@ def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> list[Block]:
     text.append(
         "A mount that is stated and not calibrated counts as exact: a sensor turned by 5° about the vertical turns its "
         "segment by 5° more than is said here."
-        if not (pose.subject and pose.subject.mounts) or recording.strapping == "new"
+        if stated_mounts(pose)
         else "The mounts' own uncertainty is in it, and so it changes with the posture too."
     )
     lines = [
@@ -285,73 +282,6 @@ def _hands(pose: TrackedPose, hands: Mapping[str, Hand]) -> list[Block]:
     ]
 
 
-def _joints(pose: TrackedPose) -> list[Block]:
-    try:
-        angles = joint_angles(pose)
-    except BadData:  # no joint has both of its segments
-        return []
-    text = (
-        "After the recommendations of the International Society of Biomechanics (Wu et al. 2005), left and right with "
-        "the same signs. A name says which way is positive; elevation alone is negative where the arm is raised, as "
-        "the Society has it, and pronation is 90° with the palms at the thighs. What the arms did in the start pose "
-        "counts as the N-pose: who stood with elbows bent by 10° reads 10° too little."
-    )
-    blocks: list[Block] = [Heading("Joint angles"), text]
-    groups: dict[str, list[str]] = {}
-    for joint in angles.joints:
-        groups.setdefault(joint.removeprefix("left_").removeprefix("right_"), []).append(joint)
-    for group, members in groups.items():
-        names = angles[members[0]].names
-        panels = {}
-        for k, name in enumerate(names):
-            panels[f"{plain(name)} [deg]"] = [
-                Angle(joint.removesuffix(f"_{group}"), np.degrees(_shown(angles[joint], k))) for joint in members
-            ]
-        of = [angles[joint] for joint in members]
-        broken = ""
-        if any((joint.near_lock | joint.gap).any() for joint in of):
-            broken = " Lines break where a sensor gave nothing, and near gimbal lock, where the angle says little."
-        caption = f"The {group if len(members) == 1 else group + 's'} over time.{broken}"
-        blocks.append(angles_picture(angles.time, panels, f"angles-{group}", caption))
-    lines = []
-    for joint, found in summary(angles).items():
-        stds = angles[joint].std
-        for k, name in enumerate(angles[joint].names):
-            usual = f"± {np.degrees(np.nanmedian(stds[:, k])):.1f}°" if stds is not None else "not known"
-            ends = [f"{whole(np.degrees(value))}°" for value in (found.lowest[k], found.highest[k], found.range[k])]
-            if not np.isfinite(found.range[k]):
-                ends = ["", "", ""]
-            elif found.range[k] >= FULL_TURN and found.near_lock:
-                ends = ["", "", "all round"]
-            lines.append(
-                [
-                    f"{plain(joint)}, {plain(name)}",
-                    *ends,
-                    f"{np.degrees(found.peak_rate[k]):.0f} °/s" if np.isfinite(found.peak_rate[k]) else "",
-                    usual,
-                    f"{100 * found.near_lock:.0f} %" if k != 1 else "",
-                ]
-            )
-    header = ["angle", "least", "most", "range", "fastest", "usual ±", "near gimbal lock"]
-    after = (
-        "Of an angle about the long axis of an arm the heading makes the most of the error. Near gimbal lock (10°) the "
-        "first and the third angle of a joint trade places and are left out; the quaternions in pose.parquet have no "
-        "such place."
-    )
-    return [*blocks, Table(header, lines), after]
-
-
-def _shown(joint: JointAngles, k: int) -> np.ndarray:
-    """An angle with its line broken where it says little; within ± half a turn where it passed the lock."""
-    hidden = joint.gap if k == 1 else joint.gap | joint.near_lock
-    values = np.where(hidden, np.nan, joint.values[:, k])
-    if hidden.all() or not joint.near_lock.any() or np.nanmax(values) - np.nanmin(values) < FULL_TURN:
-        return values  # who turned round did so
-    values = (values + np.pi) % FULL_TURN - np.pi
-    values[1:][np.abs(np.diff(values)) > np.pi] = np.nan
-    return values
-
-
 def _view(pose: TrackedPose, view: str | None) -> list[Block]:
     assert pose.model is not None
     assert pose.recording is not None
@@ -370,7 +300,7 @@ def _run(pose: TrackedPose) -> list[Block]:
     assert subject is not None
     assert pose.segments is not None
     assert pose.model is not None
-    mounts = "as calibrated" if subject.mounts and recording.strapping != "new" else "as the session states them"
+    mounts = "as the session states them" if stated_mounts(pose) else "as calibrated"
     lengths = ", ".join(f"{plain(name)} {1e3 * value:.0f} mm" for name, value in subject.lengths.items())
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),

@@ -42,9 +42,10 @@ def track(
     """
     if causal:
         rest, segments = causal_segments(recording, subject, method=method, static_test=static_test)
-        return tracked_pose(rest, segments, subject, model, method)
+        return tracked_pose(rest, segments, subject, model, method, causal=True)
     segments = segment_orientations(recording, subject, method=method, static_test=static_test)
     reset = None
-    if hold_headings and subject is not None and subject.mounts and recording.strapping != "new":
+    own = any(sensor.aligned for sensor in recording.sensors.values())  # frames that no calibration of ours knows
+    if hold_headings and subject is not None and subject.mounts and recording.strapping != "new" and not own:
         segments, reset = held_together(recording, segments, subject)
     return tracked_pose(recording, segments, subject, model, method, reset)

@@ -27,6 +27,7 @@ class TrackedPose(Pose):
     segments: Segments | None = None
     method: str = ""
     reset: Reset | None = None
+    causal: bool = False
 
     def summary(self) -> dict[str, Any]:
         """What was run on what, in numbers and words, for ``summary.json``."""
@@ -59,6 +60,7 @@ class TrackedPose(Pose):
             "recording": self.recording.name,
             "session": str(self.recording.source) if self.recording.source else None,
             "method": self.method if self.segments.orientation else "ready orientations",
+            "causal": self.causal,
             "model": self.model.robot.name if self.model else None,
             "subject": {"name": self.subject.name, "note": self.subject.note},
             "samples": len(self.time),
@@ -107,6 +109,7 @@ def tracked_pose(
     model: BodyModel | None,
     method: str,
     reset: Reset | None = None,
+    causal: bool = False,
 ) -> TrackedPose:
     """The pose of segments that are known: a body of the subject's lengths, and its kinematics."""
     who = subject or average_subject()
@@ -131,4 +134,5 @@ def tracked_pose(
         segments=segments,
         method=method,
         reset=reset,
+        causal=causal,
     )

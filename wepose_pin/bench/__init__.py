@@ -27,17 +27,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from . import so3
-from .calibration.lengths import LOOK_RATE_HZ
-from .errors import BadData, MissingFile
-from .evaluation import attitude_error
-from .filters import METHODS, OFFLINE, Smekf, run_filter
-from .filters.bank import LiveBank
-from .filters.base import in_parallel, processors
-from .noise import SensorNoise, noise_of
-from .readers.trials import read_authors_trial, read_broad
-from .simulation import REALISTIC, paper_dynamic, simulate, simulated_person
-from .static import StaticDetector, StaticTest
+from .. import so3
+from ..calibration.lengths import LOOK_RATE_HZ
+from ..errors import BadData, MissingFile
+from ..evaluation import attitude_error
+from ..filters import METHODS, OFFLINE, Smekf, run_filter
+from ..filters.bank import LiveBank
+from ..filters.base import in_parallel, processors
+from ..noise import SensorNoise, noise_of
+from ..readers.trials import read_authors_trial, read_broad
+from ..simulation import REALISTIC, paper_dynamic, simulate, simulated_person
+from ..static import StaticDetector, StaticTest
 
 FORMAT = 1
 NO_PEERS = "No ratios: VQF is not installed; pip install 'wepose-pin[peers]' brings it and imufusion."
@@ -124,6 +124,13 @@ def sections(effort: Effort = FULL, data: Path | None = None) -> dict[str, Calla
     if effort.compiling:
         found["first_use"] = first_use
     return found
+
+
+def live_sections(quick: bool = False) -> dict[str, Callable[[], Table]]:
+    """As `sections`, of a live session."""
+    from .session import live_session
+
+    return {"a live session": lambda: live_session(30.0 if quick else 300.0)}
 
 
 # Timing ------------------------------------------------------------------------------------------------------------
@@ -400,7 +407,7 @@ def sensors(effort: Effort) -> Table:
 
 def calibration(effort: Effort) -> Table:
     """The solve of a hands-together calibration beside SciPy's."""
-    from .calibration.timed import OURS, building, peak_memory, posed, solvers
+    from ..calibration.timed import OURS, building, peak_memory, posed, solvers
 
     person = simulated_person(3)
     made = simulate(person.lengths, seed=3, imperfections=REALISTIC, clasp_s=effort.clasp_s, circles=0)

@@ -1,0 +1,140 @@
+"""The closest pose within limits: against brute force, the limits, and the recording of a person."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.model import BodyModel, load_model
+from wepose_pin.model.fit import fit, limits_of, unseen
+from wepose_pin.pose import configuration, deviation, forward_kinematics, placements
+from wepose_pin.readers import load_session
+from wepose_pin.tracking import track
+
+ARM = ["left_upper_arm", "left_forearm", "left_hand"]
+HINGES = ("jLeftElbow_roty", "jLeftElbow_rotz", "jLeftWrist_rotx", "jLeftWrist_rotz")
+
+
+@pytest.fixture(scope="module")
+def body(data: Path) -> BodyModel:
+    """Elbows and wrists of two axes."""
+    return load_model(data / "human_urdf" / "humanSubject01_48dof.urdf")
+
+
+def places(model: pin.Model, names: tuple[str, ...] = HINGES) -> list[int]:
+    return [model.idx_qs[model.getJointId(name)] for name in names]
+
+
+def motion(body: BodyModel, n: int, seed: int, off_deg: float, reach: float = 0.6) -> dict[str, np.ndarray]:
+    """A smooth motion of torso and left arm inside its limits, measured `off_deg` off in each axis."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 2.0 * np.pi, n)
+    q = np.tile(pin.neutral(body.pin), (n, 1))
+    at = places(body.pin)
+    low, high = body.pin.lowerPositionLimit[at], body.pin.upperPositionLimit[at]
+    swing = np.sin(np.outer(t, rng.uniform(1.0, 3.0, 4)) + rng.uniform(0.0, 6.0, 4))
+    q[:, at] = (low + high) / 2.0 + reach * (high - low) / 2.0 * swing
+    first = body.pin.idx_qs[body.joints["LeftUpperArm"]]
+    q[:, first : first + 4] = Rotation.from_rotvec(np.sin(np.outer(t, [1.0, 1.3, 0.7]))).as_quat()
+    quat_WL = {name: quat for name, (quat, _) in placements(body, q, ["torso", *ARM]).items()}
+    off = {name: Rotation.from_rotvec(np.deg2rad(off_deg) * rng.normal(size=3)) for name in ARM}
+    return quat_WL | {name: (Rotation.from_quat(quat_WL[name]) * off[name]).as_quat() for name in ARM}
+
+
+def cost(body: BodyModel, q: np.ndarray, quat_WL: dict[str, np.ndarray], weights: dict[str, float]) -> float:
+    """What is to be least, by forward kinematics and SciPy alone."""
+    R, _ = forward_kinematics(body, q[None], ARM)
+    return sum(
+        weights.get(name, 1.0) * float((Rotation.from_matrix(R[0, k]).inv() * Rotation.from_quat(quat)).magnitude()) ** 2
+        for k, (name, quat) in enumerate((name, quat_WL[name]) for name in ARM)
+    )
+
+
+@pytest.mark.parametrize("weights", [{}, {"left_upper_arm": 9.0, "left_hand": 0.1}])
+@pytest.mark.parametrize("limits", [True, False])
+def test_nothing_is_nearer_by_another_minimiser(body: BodyModel, limits: bool, weights: dict[str, float]) -> None:
+    quat_WL = motion(body, 40, 1, 15.0, reach=1.3)
+    found = configuration(body, quat_WL, limits=limits, weights=weights)
+    model, at = body.pin, places(body.pin)
+    first = model.idx_vs[body.joints["LeftUpperArm"]]
+    columns = [*range(first, first + 3), *(model.idx_vs[model.getJointId(name)] for name in HINGES)]
+    for k in (0, 7, 13, 26, 39):
+        target = {name: quat[k] for name, quat in quat_WL.items()}
+
+        def left(step: np.ndarray, k: int = k, target: dict[str, np.ndarray] = target) -> float:
+            v = np.zeros(model.nv)
+            v[columns] = step
+            return cost(body, pin.integrate(model, found[k], v), target, weights)
+
+        free = [(-3.0, 3.0)] * 7
+        if limits:
+            low, high = model.lowerPositionLimit[at] - found[k, at], model.upperPositionLimit[at] - found[k, at]
+            free[3:] = [(min(a, 0.0), max(b, 0.0)) for a, b in zip(low, high, strict=True)]
+        best = minimize(left, np.zeros(7), bounds=free, options={"ftol": 1e-15, "gtol": 1e-9})
+        assert cost(body, found[k], target, weights) < best.fun + 1e-9
+
+
+def test_limits_are_kept_and_the_rest_of_the_arm_takes_its_share(body: BodyModel) -> None:
+    quat_WL = motion(body, 200, 2, 5.0, reach=1.5)
+    kept, passed = configuration(body, quat_WL), configuration(body, quat_WL, limits=False)
+    at, lower, upper = limits_of(body.pin, [body.pin.getJointId(name) for name in HINGES])
+    assert np.all((kept[:, at] >= lower) & (kept[:, at] <= upper))
+    assert np.any((passed[:, at] < lower - 0.1) | (passed[:, at] > upper + 0.1))
+    free, bound = ({k: np.sqrt(np.mean(v**2)) for k, v in deviation(body, q, quat_WL).items()} for q in (passed, kept))
+    assert set(bound) == set(ARM)
+    assert all(np.rad2deg(bound[name]) > 2.0 for name in ARM)
+    assert sum(v**2 for v in bound.values()) > sum(v**2 for v in free.values())
+
+
+def test_a_heavy_segment_is_missed_by_less(body: BodyModel) -> None:
+    quat_WL = motion(body, 60, 3, 10.0)
+    even = deviation(body, configuration(body, quat_WL), quat_WL)["left_forearm"]
+    heavy = deviation(body, configuration(body, quat_WL, weights={"left_forearm": 100.0}), quat_WL)["left_forearm"]
+    assert heavy.mean() < 0.1 * even.mean()
+
+
+def test_what_can_be_followed_within_limits_is_followed_exactly(body: BodyModel) -> None:
+    quat_WL = motion(body, 200, 4, 0.0, reach=0.9)
+    q = configuration(body, quat_WL)
+    assert max(angle.max() for angle in deviation(body, q, quat_WL).values()) < 1e-7
+    assert np.abs(np.diff(q, axis=0)).max() < 0.2  # it does not jump
+
+
+def test_a_fit_of_its_own_finds_the_configuration_that_made_the_orientations(body: BodyModel) -> None:
+    """From the neutral configuration on, each frame from the one before."""
+    quat_WL = motion(body, 300, 5, 0.0)
+    joints = [body.joints["LeftUpperArm"], *(body.pin.getJointId(name) for name in HINGES)]
+    arm = {name: quat_WL[name] for name in ARM}
+    q = fit(body.pin, arm, joints, pin.neutral(body.pin)[None])
+    assert max(angle.max() for angle in deviation(body, q, arm).values()) < 1e-6
+
+
+def test_which_joints_the_known_links_leave_open(body: BodyModel) -> None:
+    open_ones = unseen(body.pin, ["LeftUpperArm", "LeftForeArm"], pin.neutral(body.pin))
+    assert {"jLeftWrist_rotx", "jLeftC7Shoulder_rotx", "LeftUpperArm", "RightUpperArm"} <= set(open_ones)
+    assert not {"jLeftElbow_roty", "jLeftElbow_rotz"} & set(open_ones)
+
+
+def test_a_person_on_48_degrees_of_freedom(data: Path, body: BodyModel) -> None:
+    """The arms hang in both standing phases, though the elbows have two axes and an end."""
+    recording = load_session(data / "upper_body" / "session.toml")
+    pose = track(recording, model=body)
+    missed = pose.summary()["not_followed_rms_deg"]
+    print("\nmissed, rms [deg]:", missed)
+    assert set(missed) == {f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm", "hand")}
+    assert max(missed.values()) < 20.0
+    arms = [f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")]
+    for interval, most in (((40.2, 44.4), 3.0), ((84.5, 88.0), 15.0)):
+        span = recording.span(interval)
+        assert pose.q is not None
+        R, _ = forward_kinematics(body, pose.q[span], arms)
+        down = np.degrees(np.arccos(np.clip(R[:, :, 2, 2].mean(axis=0), -1.0, 1.0)))
+        print(interval, dict(zip(arms, down.round(1).tolist(), strict=True)))
+        assert np.all(down < most)
+    at, lower, upper = limits_of(body.pin, [body.pin.getJointId(name) for name in HINGES])
+    assert np.all((pose.q[:, at] >= lower) & (pose.q[:, at] <= upper))

@@ -1,0 +1,148 @@
+"""What a live session costs: five sensors at 1 kHz through the whole loop, replayed at their own pace."""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..live import LivePose, Output, Stage, Status, Wearing, run_session
+from ..live.sources.replay import ReplaySource
+from ..recording import Recording
+from ..simulation import simulate, simulated_person
+from . import Column, Table
+
+RATE_HZ = 1000.0
+PIECE_S = 60.0  # [s] of motion that is repeated
+LATENCY_MS, LATENCY_99_MS, SHARE = 1.0, 5.0, 50.0  # what is wanted: [ms], [ms], [%] of one core
+
+
+# A browser by what it takes: in a process of its own, as browsers are.
+_READER = """
+import asyncio, sys
+from tornado.websocket import websocket_connect
+async def read(url):
+    socket = await websocket_connect(url)
+    while await socket.read_message() is not None:
+        await socket.write_message("taken")
+asyncio.run(read(sys.argv[1]))
+"""
+
+
+@contextmanager
+def _reader(url: str) -> Iterator[None]:
+    command = [sys.executable, "-c", _READER, url.replace("http:", "ws:") + "stream"]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+class _Meter:
+    """An output that notes processor time and memory at the first pose and at the end."""
+
+    def __init__(self) -> None:
+        self.before: tuple[float, float, float] | None = None
+        self.after: tuple[float, float, float] | None = None
+
+    def start(self, stage: Stage) -> None:
+        pass
+
+    def show(self, pose: LivePose) -> None:
+        pass
+
+    def status(self, status: Status) -> None:
+        now = time.perf_counter(), time.process_time(), _resident()
+        if status.state == "ready" and self.before is None:
+            gc.collect()
+            self.before = now
+        self.after = now
+
+    def take_keys(self) -> list[str]:
+        return []
+
+    def close(self) -> None:
+        pass
+
+
+def live_session(seconds: float) -> Table:
+    """Loop, file and page for `seconds` each."""
+    recording = _recording(seconds)
+    table = Table(
+        f"A live session: five sensors at {RATE_HZ:g} Hz for {seconds:g} s, replayed at their own pace",
+        (
+            Column("ticks", "ticks", 0),
+            Column("lost", "lost samples", 0),
+            Column("p50", "latency p50 [ms]", 2),
+            Column("p99", "p99 [ms]", 2),
+            Column("share", "of one core [%]", 1),
+            Column("grown", "memory grown [MB]", 1),
+        ),
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        table.rows["poses and file"] = _measured(recording, Path(folder) / "a.wepose", [])
+        from ..live.page import LivePage
+        from ..model import load_model
+
+        page = LivePage(load_model())
+        page.open()
+        with _reader(page.url):
+            table.rows["and page, with a browser"] = _measured(recording, Path(folder) / "b.wepose", [page])
+    table.notes.append(
+        "Latency is from the moment at which the newest sample was due to its pose. Wanted: p50 under "
+        f"{LATENCY_MS:g} ms, p99 under {LATENCY_99_MS:g} ms, under {SHARE:g} % of one core, no sample lost, memory flat."
+    )
+    table.notes.append("Other work on the machine shows in the 99th percentile first.")
+    return table
+
+
+def _recording(seconds: float) -> Recording:
+    """A person who stands, then moves, the motion repeated as often as it takes."""
+    person = simulated_person(1)
+    made = simulate(person.lengths, seed=1, rate_hz=RATE_HZ, clasp_s=PIECE_S, circles=0).recording("live")
+    start, n = made.span(made.phases["start"][0]).stop, round(seconds * RATE_HZ)
+    rows = np.concatenate([np.arange(start), start + np.arange(n) % (len(made) - start)])
+    sensors = {}
+    for name, sensor in made.sensors.items():
+        assert sensor.gyro_S is not None
+        assert sensor.accel_S is not None
+        sensors[name] = replace(sensor, gyro_S=sensor.gyro_S[rows], accel_S=sensor.accel_S[rows])
+    time_s = np.arange(len(rows)) / RATE_HZ
+    return replace(made, time=time_s, rate_hz=RATE_HZ, sensors=sensors, phases={"start": made.phases["start"]})
+
+
+def _measured(recording: Recording, file: Path, outputs: Sequence[Output]) -> dict[str, float]:
+    meter = _Meter()
+    ended = run_session(ReplaySource(recording), Wearing.of(recording), record=file, outputs=[*outputs, meter])
+    assert meter.before is not None
+    assert meter.after is not None
+    wall, busy, grown = (after - before for before, after in zip(meter.before, meter.after, strict=True))
+    lost = sum(of["missing"] + of["late"] + of["bad"] + len(recording) - of["taken"] for of in ended.counts.values())
+    return {
+        "ticks": float(ended.poses),
+        "lost": float(lost),
+        "p50": 1e3 * ended.latency.quantile(0.5),
+        "p99": 1e3 * ended.latency.quantile(0.99),
+        "share": 100.0 * busy / wall,
+        "grown": grown / 1e6,
+    }
+
+
+def _resident() -> float:
+    """Memory [bytes] of this process; NaN where the system does not tell as Linux does."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return float("nan")
+    return float(pages * os.sysconf("SC_PAGE_SIZE"))

@@ -1,0 +1,86 @@
+"""The joint angles in the report of a tracked recording."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..angles import JointAngles, joint_angles, summary
+from ..errors import BadData
+from ..page import Block, Heading, Table
+from ..tracking import TrackedPose
+from .measures import stated_mounts
+from .track_figures import Angle, angles_picture
+from .words import plain, whole
+
+FULL_TURN = 2.0 * np.pi - 1e-9
+
+
+def joint_angle_section(pose: TrackedPose) -> list[Block]:
+    """Heading, figures and table; nothing where no joint has both of its segments."""
+    try:
+        angles = joint_angles(pose)
+    except BadData:  # no joint has both of its segments
+        return []
+    text = (
+        "After the recommendations of the International Society of Biomechanics (Wu et al. 2005), left and right with "
+        "the same signs. A name says which way is positive; elevation alone is negative where the arm is raised, as "
+        "the Society has it, and pronation is 90° with the palms at the thighs."
+    )
+    if stated_mounts(pose):
+        text += (
+            " What the arms did in the start pose counts as the N-pose: who stood with elbows bent by 10° reads 10° "
+            "too little."
+        )
+    blocks: list[Block] = [Heading("Joint angles"), text]
+    groups: dict[str, list[str]] = {}
+    for joint in angles.joints:
+        groups.setdefault(joint.removeprefix("left_").removeprefix("right_"), []).append(joint)
+    for group, members in groups.items():
+        names = angles[members[0]].names
+        panels = {}
+        for k, name in enumerate(names):
+            panels[f"{plain(name)} [deg]"] = [
+                Angle(joint.removesuffix(f"_{group}"), np.degrees(_shown(angles[joint], k))) for joint in members
+            ]
+        of = [angles[joint] for joint in members]
+        broken = ""
+        if any((joint.near_lock | joint.gap).any() for joint in of):
+            broken = " Lines break where a sensor gave nothing, and near gimbal lock, where the angle says little."
+        caption = f"The {group if len(members) == 1 else group + 's'} over time.{broken}"
+        blocks.append(angles_picture(angles.time, panels, f"angles-{group}", caption))
+    lines = []
+    for joint, found in summary(angles).items():
+        stds = angles[joint].std
+        for k, name in enumerate(angles[joint].names):
+            usual = f"± {np.degrees(np.nanmedian(stds[:, k])):.1f}°" if stds is not None else "not known"
+            ends = [f"{whole(np.degrees(value))}°" for value in (found.lowest[k], found.highest[k], found.range[k])]
+            if not np.isfinite(found.range[k]):
+                ends = ["", "", ""]
+            elif found.range[k] >= FULL_TURN and found.near_lock:
+                ends = ["", "", "all round"]
+            lines.append(
+                [
+                    f"{plain(joint)}, {plain(name)}",
+                    *ends,
+                    f"{np.degrees(found.peak_rate[k]):.0f} °/s" if np.isfinite(found.peak_rate[k]) else "",
+                    usual,
+                    f"{100 * found.near_lock:.0f} %" if k != 1 else "",
+                ]
+            )
+    header = ["angle", "least", "most", "range", "fastest", "usual ±", "near gimbal lock"]
+    after = (
+        "Near gimbal lock (10°) the first and the third angle of a joint trade places and are left out; the "
+        "quaternions in pose.parquet have no such place."
+    )
+    return [*blocks, Table(header, lines), after]
+
+
+def _shown(joint: JointAngles, k: int) -> np.ndarray:
+    """An angle with its line broken where it says little; within ± half a turn where it passed the lock."""
+    hidden = joint.gap if k == 1 else joint.gap | joint.near_lock
+    values = np.where(hidden, np.nan, joint.values[:, k])
+    if hidden.all() or not joint.near_lock.any() or np.nanmax(values) - np.nanmin(values) < FULL_TURN:
+        return values  # who turned round did so
+    values = (values + np.pi) % FULL_TURN - np.pi
+    values[1:][np.abs(np.diff(values)) > np.pi] = np.nan
+    return values

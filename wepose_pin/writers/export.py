@@ -1,0 +1,120 @@
+"""One result, one file, in a format of others."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from ..errors import BadData, BadOption, ExistingOutput, MissingFile, one_of
+from .bvh import write_bvh
+from .c3d import write_c3d
+from .motion import Motion, resampled
+from .opensim import write_mot, write_placement, write_sto, write_trc
+from .result import read_result
+from .tables import write_csv, write_parquet
+
+Writer = Callable[[Path, Motion], list[str]]  # gives notes on what the file cannot hold
+
+WRITERS: dict[str, Writer] = {
+    "csv": write_csv,
+    "parquet": write_parquet,
+    "mot": write_mot,
+    "sto": write_sto,
+    "placement": write_placement,
+    "trc": write_trc,
+    "bvh": write_bvh,
+    "c3d": write_c3d,
+}
+FORMATS = (*WRITERS, "urdf")
+NAMES = ("opensim", "isb")
+
+
+class Exported(NamedTuple):
+    """What was written: the format, and notes on what it cannot hold."""
+
+    format: str
+    notes: list[str]
+
+
+def export(
+    result: Path,
+    file: Path,
+    format: str | None = None,
+    *,
+    names: str | None = None,
+    rate_hz: float | None = None,
+    force: bool = False,
+) -> Exported:
+    """Write the motion of a result folder, or its subject, to a file, which appears whole or not at all.
+
+    Parameters
+    ----------
+    format : one of `FORMATS`; None: that of the file's suffix
+    names : of a .mot's columns, one of `NAMES`; None: "opensim"
+    rate_hz : resample the motion first
+
+    Raises
+    ------
+    BadOption
+        A format that is not known, or an option that it has not.
+    MissingFile, BadData
+        No result, or nothing in it that the format could hold.
+    ExistingOutput
+        The file is there and `force` is not given, or it cannot be written.
+    """
+    format = _format(file, format)
+    if names is not None and format != "mot":
+        raise BadOption(f"--names {names}: only a .mot has names to choose, and the format is {format}")
+    if names not in (None, *NAMES):
+        raise BadOption(f"--names {names}: not known; {one_of(NAMES, names)}")
+    if rate_hz is not None and format in ("urdf", "placement"):
+        raise BadOption(f"--rate-hz {rate_hz:g}: there is no motion in a file of format {format}")
+    with whole_file(file, force) as partial:
+        if format == "urdf":
+            if not (result / "subject.urdf").is_file():
+                raise MissingFile(f"{result}: no subject.urdf in it; a folder that `wepose track` wrote is wanted here")
+            shutil.copyfile(result / "subject.urdf", partial)
+            return Exported(format, [])
+        pose, model, summary = read_result(result)
+        if len(pose.time) < 2:
+            raise BadData(f"{result / 'pose.parquet'}: {len(pose.time)} samples; a motion has at least 2")
+        motion = Motion(pose, model, str(summary.get("recording") or result.name), str(result))
+        if rate_hz is not None:
+            motion = resampled(motion, rate_hz)
+        write = WRITERS[format] if names is None else functools.partial(write_mot, names=names)
+        return Exported(format, write(partial, motion))
+
+
+def _format(file: Path, format: str | None) -> str:
+    if format is None:
+        format = file.suffix.lower().removeprefix(".")
+        if format not in FORMATS:
+            raise BadOption(f"-o {file}: '{file.suffix}' is no format's suffix; --format says which; {one_of(FORMATS)}")
+    if format not in FORMATS:
+        raise BadOption(f"--format {format}: not known; {one_of(FORMATS, format)}")
+    return format
+
+
+@contextmanager
+def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
+    """A path beside `file` to write to; what stands there becomes `file` when the block ends well, else vanishes.
+
+    Raises
+    ------
+    ExistingOutput
+        `file` is there and `force` is not given, or it cannot be written.
+    """
+    if file.exists() and not force:
+        raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
+    if file.is_dir() or not file.absolute().parent.is_dir():
+        raise ExistingOutput(f"{file}: not a file that can be written; -o names a file in an existing folder")
+    partial = file.with_name(f".{file.name}.partial")
+    try:
+        yield partial
+        partial.replace(file)
+    finally:
+        partial.unlink(missing_ok=True)

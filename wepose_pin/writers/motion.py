@@ -1,0 +1,136 @@
+"""What is exported: a pose with its body, on even times where a format knows only a rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from ..errors import BadData, BadOption
+from ..model import BodyModel
+from ..pose import Pose, pose_of
+
+# Times count as even while none is off the even grid by more than this share of a step.
+EVEN = 0.1
+# What moves a point: the segments on its way from the root.
+_WAY = {"shoulder": (), "elbow": ("upper_arm",), "wrist": ("upper_arm", "forearm")}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A result, read back.
+
+    Parameters
+    ----------
+    pose, model : as `read_result` gives them
+    name : of the recording
+    where : the result's folder, for error texts
+    """
+
+    pose: Pose
+    model: BodyModel
+    name: str
+    where: str
+
+    @property
+    def rate_hz(self) -> float:
+        """One over the usual time step, to six digits: steps are differences of rounded times."""
+        return float(f"{1.0 / float(np.median(np.diff(self.pose.time))):.6g}")
+
+
+def even(motion: Motion) -> tuple[Motion, list[str]]:
+    """The motion on even times, and a note if that meant new ones."""
+    time = motion.pose.time
+    grid = time[0] + np.arange(len(time)) * (time[-1] - time[0]) / (len(time) - 1)
+    off = float(np.max(np.abs(time - grid))) * motion.rate_hz
+    if off <= EVEN:
+        return motion, []
+    rate_hz = motion.rate_hz
+    note = f"times are up to {off:.2g} samples off even ones, which this format needs: resampled at {rate_hz:g} Hz"
+    return resampled(motion, rate_hz), [note]
+
+
+def resampled(motion: Motion, rate_hz: float) -> Motion:
+    """The motion at another rate: orientations by the shortest way between two samples, points from the body in them.
+
+    No filter comes before: what is faster than half the new rate is folded.
+
+    Raises
+    ------
+    BadOption
+        No rate that a recording has.
+    BadData
+        An orientation is not known.
+    """
+    if not 1.0 <= rate_hz <= 10000.0:
+        raise BadOption(f"--rate-hz {rate_hz:g}: between 1 and 10000 samples a second")
+    whole(motion, "resampling")
+    pose = motion.pose
+    old = pose.time
+    time = old[0] + np.arange(int(np.floor((old[-1] - old[0]) * rate_hz + 1e-6)) + 1) / rate_hz
+    time = np.minimum(time, old[-1])
+    after = np.clip(np.searchsorted(old, time, side="left"), 1, len(old) - 1)
+    share = (time - old[after - 1]) / (old[after] - old[after - 1])
+
+    def between(cov: np.ndarray) -> np.ndarray:
+        w = share[:, None, None]
+        return (1.0 - w) * cov[after - 1] + w * cov[after]
+
+    quat_WL = {name: Slerp(old, Rotation.from_quat(quat))(time).as_quat() for name, quat in pose.quat_WL.items()}
+    new = replace(
+        pose_of(motion.model, time, quat_WL),
+        segment_cov={name: between(cov) for name, cov in pose.segment_cov.items()},
+        point_cov={name: between(cov) for name, cov in pose.point_cov.items()},
+        gap={name: np.where(share > 0.0, gap[after - 1], False) | gap[after] for name, gap in pose.gap.items()},
+    )
+    return replace(motion, pose=new)
+
+
+def whole(motion: Motion, what: str) -> None:
+    """Every sample of every segment has an orientation.
+
+    Raises
+    ------
+    BadData
+        One has none, and `what` cannot leave it out.
+    """
+    for segment, quat in motion.pose.quat_WL.items():
+        lost = ~np.isfinite(quat).all(axis=1)
+        if lost.any():
+            raise BadData(
+                f"{motion.where}: {segment} has no orientation in row {int(np.argmax(lost)) + 1} of pose.parquet; "
+                f"{what} needs one in every row, csv and parquet do not"
+            )
+
+
+def bridged(motion: Motion) -> list[str]:
+    """A note on gaps that a format has no way to mark; empty without any."""
+    gaps = {segment: int(np.count_nonzero(gap)) for segment, gap in motion.pose.gap.items() if gap.any()}
+    if not gaps:
+        return []
+    said = ", ".join(f"{segment} {count}" for segment, count in gaps.items())
+    return [f"samples bridged over a gap of the sensor, which this format cannot mark and which are kept: {said}"]
+
+
+def seen_points(motion: Motion) -> dict[str, np.ndarray]:
+    """Point → (n, 3) [m] in W, NaN where a segment on its way from the root was bridged over a gap.
+
+    Raises
+    ------
+    BadData
+        No point is known.
+    """
+    pose = motion.pose
+    if not pose.points:
+        raise BadData(
+            f"{motion.where}: no points in pose.parquet, for want of a torso's sensor; there is none to write"
+        )
+    found = {}
+    for point, p_W in pose.points.items():
+        side, part = point.split("_", 1)
+        hand = ("hand",) if f"{side}_hand" in pose.quat_WL else ()
+        way = ("torso", *(f"{side}_{of}" for of in _WAY.get(part, (*_WAY["wrist"], *hand))))
+        lost = [pose.gap[segment] for segment in way if segment in pose.gap]
+        found[point] = np.where(np.any(lost, axis=0)[:, None], np.nan, p_W) if lost else p_W
+    return found

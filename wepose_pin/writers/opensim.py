@@ -1,0 +1,145 @@
+"""OpenSim's tables: joint angles (.mot), orientations for OpenSense (.sto), points (.trc).
+
+In OpenSim's ground G (x forward, y up, z right), the angles and the bodies those of Rajagopal's model (`rajagopal`).
+
+What OpenSim's readers demand (opensim-core, OpenSim/Common):
+
+- DelimFileAdapter.h, for .mot and .sto: lines ``key=value`` up to one that holds ``endheader`` alone, ``DataType`` as the
+  table that is read; then the labels, the first of them ``time``; tabs between cells, commas within; rows as long as
+  the labels; an empty line ends the data.
+- Storage.cpp, for .mot: the first line is the name; ``nRows`` and ``nColumns`` (with time) are there and are not zero;
+  ``inDegrees=yes``.
+- TRCFileAdapter.cpp: ``PathFileType`` first; then the eight keys of `_TRC_KEYS` in this order, and their eight values;
+  ``Frame#``, ``Time`` and ``NumMarkers`` names, a name every third cell; ``X1 Y1 Z1 X2 …``; rows of 2 + 3 NumMarkers
+  cells. A marker with an empty cell is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from ..angles import joint_angles
+from ..errors import BadData
+from .motion import Motion, bridged, even, seen_points, whole
+from .rajagopal import coordinates, in_ground, orientations
+
+_TRC_KEYS = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate", "OrigDataStartFrame")
+_TRC_KEYS += ("OrigNumFrames",)
+_WORTH_A_NOTE_DEG = 1.0
+
+
+def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[str]:
+    """Joint angles in degrees: `names` "opensim" are those of Rajagopal's model, "isb" those of `wepose_pin.angles`.
+
+    Raises
+    ------
+    BadData
+        No joint has both of its segments, or a sample has no orientation.
+    """
+    whole(motion, "a .mot")
+    notes = bridged(motion)
+    if names == "isb":
+        angles = joint_angles(motion.pose)
+        columns = {
+            f"{joint}_{angle}": of.values[:, k]
+            for joint, of in angles.joints.items()
+            for k, angle in enumerate(of.names)
+        }
+    else:
+        columns, missed = coordinates(orientations(motion.pose.quat_WL))
+        off = ", ".join(f"{body} {np.degrees(angle):.1f}" for body, angle in missed.items())
+        if any(np.degrees(angle) > _WORTH_A_NOTE_DEG for angle in missed.values()):
+            notes.append(
+                f"elbows and wrists of the model have two axes; its bodies miss the segments by, rms [deg]: {off}"
+            )
+    if not columns:
+        raise BadData(
+            f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles to write"
+        )
+    rows = pl.DataFrame({"time": motion.pose.time, **{name: np.degrees(of) for name, of in columns.items()}})
+    header = {"version": 1, "nRows": rows.height, "nColumns": rows.width, "inDegrees": "yes"}
+    name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
+    _write(path, [name, *(f"{key}={value}" for key, value in header.items()), "endheader"], rows)
+    return notes
+
+
+# Orientations -----------------------------------------------------------------------------------------------------
+
+
+def write_sto(path: Path, motion: Motion) -> list[str]:
+    """Orientations of the model's bodies in G, as sensors of OpenSense: ``<body>_imu``, cells ``w,x,y,z``.
+
+    Raises
+    ------
+    BadData
+        No segment is a body of the model, or a sample has no orientation.
+    """
+    whole(motion, "a .sto")
+    _write_quaternions(path, motion, motion.pose.time, _bodies(motion))
+    return bridged(motion)
+
+
+def write_placement(path: Path, motion: Motion) -> list[str]:
+    """One sample for OpenSense's IMU Placer: the same sensors while all coordinates of the model are zero."""
+    upright = {body: np.array([[0.0, 0.0, 0.0, 1.0]]) for body in _bodies(motion)}
+    _write_quaternions(path, motion, np.zeros(1), upright)
+    return []
+
+
+def _bodies(motion: Motion) -> dict[str, np.ndarray]:
+    found = orientations(motion.pose.quat_WL)
+    if not found:
+        raise BadData(f"{motion.where}: no segment in pose.parquet is a body of the model; there is none to write")
+    return found
+
+
+def _write_quaternions(path: Path, motion: Motion, time: np.ndarray, quat_GB: Mapping[str, np.ndarray]) -> None:
+    cells = {
+        f"{body}_imu": [f"{w:.9f},{x:.9f},{y:.9f},{z:.9f}" for x, y, z, w in quat.tolist()]
+        for body, quat in quat_GB.items()
+    }
+    header = [f"DataRate={motion.rate_hz:f}", "DataType=Quaternion", "version=3", "endheader"]
+    _write(path, header, pl.DataFrame({"time": time, **cells}))
+
+
+# Points -----------------------------------------------------------------------------------------------------------
+
+
+def write_trc(path: Path, motion: Motion) -> list[str]:
+    """Points in G, in mm; a point in a gap has empty cells.
+
+    Raises
+    ------
+    BadData
+        No point is known.
+    """
+    motion, notes = even(motion)
+    points = seen_points(motion)
+    n, rate = len(motion.pose.time), f"{motion.rate_hz:g}"
+    keys = "\t".join(_TRC_KEYS)
+    values = "\t".join((rate, rate, str(n), str(len(points)), "mm", rate, "1", str(n)))
+    labels = "Frame#\tTime\t" + "\t\t\t".join(points) + "\t\t"
+    axes = "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, len(points) + 1) for axis in "XYZ")
+    columns = {
+        f"{point}_{axis}": p_G for point, p_W in points.items() for axis, p_G in zip("XYZ", _mm(p_W), strict=True)
+    }
+    rows = pl.DataFrame({"Frame#": np.arange(1, n + 1), "Time": motion.pose.time, **columns})
+    header = [f"PathFileType\t4\t(X/Y/Z)\t{path.name.removeprefix('.').removesuffix('.partial')}", keys, values]
+    _write(path, [*header, labels, axes, ""], rows, labels=False)
+    return notes
+
+
+def _mm(p_W: np.ndarray) -> np.ndarray:
+    return 1e3 * in_ground(p_W).T
+
+
+def _write(path: Path, header: list[str], rows: pl.DataFrame, labels: bool = True) -> None:
+    with path.open("wb") as file:
+        file.write(("\n".join(header) + "\n").encode())
+        rows.fill_nan(None).write_csv(
+            file, separator="\t", include_header=labels, float_precision=6, quote_style="never", line_terminator="\n"
+        )

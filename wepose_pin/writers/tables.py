@@ -1,0 +1,34 @@
+"""CSV and Parquet: the pose with its joint angles, a row a sample (columns: docs/formats/export-csv.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import polars as pl
+
+from ..angles import angle_table, joint_angles
+from ..errors import BadData
+from ..pose import pose_table
+from .motion import Motion
+
+
+def table(motion: Motion) -> pl.DataFrame:
+    """`pose_table`, and beside it `angle_table` where a joint has both of its segments."""
+    pose = pose_table(motion.pose)
+    try:
+        angles = angle_table(joint_angles(motion.pose))
+    except BadData:
+        return pose
+    return pl.concat([pose, angles.drop("time")], how="horizontal")
+
+
+def write_parquet(path: Path, motion: Motion) -> list[str]:
+    """Every number to its last bit; what is not known is NaN."""
+    table(motion).write_parquet(path)
+    return []
+
+
+def write_csv(path: Path, motion: Motion) -> list[str]:
+    """Every number to its last bit (the shortest text that reads back as it); what is not known is empty."""
+    table(motion).fill_nan(None).write_csv(path)
+    return []
