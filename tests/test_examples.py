@@ -12,6 +12,7 @@ EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.
 SAYS = {
     "calibrate_subject.py": "shoulder_width",
     "estimate_orientation.py": "smekf  largest error 0.",
+    "live_consumer.py": "no pose for 3 s",
     "track_recording.py": "right hand from its shoulder",
 }
 

@@ -50,7 +50,8 @@ def cost(body: BodyModel, q: np.ndarray, quat_WL: dict[str, np.ndarray], weights
     """What is to be least, by forward kinematics and SciPy alone."""
     R, _ = forward_kinematics(body, q[None], ARM)
     return sum(
-        weights.get(name, 1.0) * float((Rotation.from_matrix(R[0, k]).inv() * Rotation.from_quat(quat)).magnitude()) ** 2
+        weights.get(name, 1.0)
+        * float((Rotation.from_matrix(R[0, k]).inv() * Rotation.from_quat(quat)).magnitude()) ** 2
         for k, (name, quat) in enumerate((name, quat_WL[name]) for name in ARM)
     )
 

@@ -159,9 +159,9 @@ def test_a_tape_that_contradicts_all_else_is_named_once(anywhere: Simulation, pe
     assert "shoulder_width = 200 mm is" in verdict.in_words()[0]
     assert "measure it anew" in verdict.in_words()[0]
     assert sum("standard deviations" in text for text in wrong.warnings) == 1
-    # Without the tape the solution expects what it said that it would.
+    # Without the tape the solution finds what it said that it would; palms that slip tell a smaller person less.
     tape, free = wrong.tapes["shoulder_width"], solved(recording, person, gauge=False).subject
-    assert tape.expected == pytest.approx(free.lengths["shoulder_width"], abs=free.std("shoulder_width"))
+    assert tape.expected == pytest.approx(free.lengths["shoulder_width"], abs=1.5 * free.std("shoulder_width"))
     assert tape.std == pytest.approx(free.std("shoulder_width"), rel=0.3)
 
 
@@ -181,7 +181,7 @@ def test_of_sensors_that_sit_elsewhere_nothing_is_learned(anywhere: Simulation, 
     ("share", "grade", "said"),
     [
         ({"all": 0.05}, "fail", "hardly"),
-        ({"roll": 0.1, "pitch": 0.1, "yaw": 0.1}, "fail", "lean and twist the torso"),
+        ({"roll": 0.02, "pitch": 0.02, "yaw": 0.02}, "fail", "lean and twist the torso"),
     ],
 )
 def test_too_little_motion_is_named(share: dict[str, float], grade: str, said: str, person: Person) -> None:

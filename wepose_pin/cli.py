@@ -131,7 +131,8 @@ def track(
     out: Out,
     subject: OptionalPath = None,
     model: OptionalPath = None,
-    method: Method = "amekf",
+    method: Method | None = None,
+    causal: bool = False,
     gaps: bool = False,
     covariance: bool = False,
     report: bool = True,
@@ -139,33 +140,45 @@ def track(
 ) -> None:
     """Recording to pose: orientations, points, a summary, a page to look at, and a report on how far to trust it.
 
+    Of a recording of `wepose live` it gives the poses that were shown, to the bit: with its own subject and method, and
+    causally, unless one of them is given.
+
     Example: wepose track session.toml --subject anna/subject.toml -o result
 
     Args:
-        session: session.toml, or the folder that holds it.
+        session: session.toml, or the folder that holds it; or a recording of `wepose live`.
         out: Folder for pose.parquet, subject.toml, subject.urdf, summary.json, view.html, report.html.
         subject: subject.toml of `wepose calibrate`, or its folder; without it lengths are an average person's.
         model: A body's URDF, or a TOML that names it and its links (docs/models.md); without it ours.
-        method: The orientation filter.
+        method: The orientation filter; without it amekf, or that of the live session.
+        causal: Begin at the end of the start pose and look at nothing ahead, as `wepose live` does.
         gaps: Accept lost samples for longer than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap).
         covariance: Write the covariances of orientations and points, not only their standard deviations.
         report: Leave out report.html (warnings and what to do, noise, drift, hands, joint angles).
         force: Replace files of an earlier run.
     """
+    from .filters import BEST
     from .model import load_model
-    from .readers import load_session
-    from .subject import load_subject
+    from .readers import is_live_log, load_session, read_live_log
+    from .subject import load_subject, subject_of
     from .tracking import track as follow
     from .viewer import pose_html
     from .writers import whole_folder, write_result
 
     with whole_folder(out, force) as folder, _steps(4 if report else 3) as step:
         step("reading")
-        recording = load_session(session, gaps=gaps)
         who = load_subject(subject) if subject else None
         body = load_model(model) if model else None
+        if is_live_log(session):
+            log = read_live_log(session)
+            recording, causal = log.recording, causal or (method is None and subject is None)
+            method = method or log.header["method"]
+            if who is None and log.header["subject"]:
+                who = subject_of(log.header["subject"], session)
+        else:
+            recording, method = load_session(session, gaps=gaps), method or BEST
         step(f"tracking by {method}")
-        pose = follow(recording, who, method=method, model=body)
+        pose = follow(recording, who, method=method, model=body, causal=causal)
         write_result(folder, pose, covariance, recording.phases)
         step("making the page")
         assert pose.model is not None

@@ -45,9 +45,9 @@ class Pose:
     gap: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
-def pose_of(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
-    """The pose of `model` with measured segment orientations `quat_WL`, segment → (n, 4) xyzw."""
-    q = configuration(model, quat_WL)
+def pose_of(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:
+    """The pose of `model` with measured segment orientations `quat_WL`, segment → (n, 4) xyzw; see `configuration`."""
+    q = configuration(model, quat_WL, limits=limits)
     known = [point for point in known_points(quat_WL) if model.pin.existFrame(POINTS[point])]
     _, p_W = forward_kinematics(model, q, [POINTS[point] for point in known], rotations=False)
     points = {point: p_W[:, k] for k, point in enumerate(known)}

@@ -44,10 +44,10 @@ def mount_from_axes(up: str, forward: str) -> np.ndarray:
 
 
 def axes_from_mount(quat_LS: np.ndarray) -> tuple[str, str]:
-    """The two axis names, up and forward, that `mount_from_axes` gives this mount for, or the nearest."""
-    rows = Rotation.from_quat(quat_LS).as_matrix()
-    up, forward = (list(AXES)[int(np.argmax([axis @ row for axis in AXES.values()]))] for row in (rows[2], rows[0]))
-    return up, forward
+    """The two axis names, up and forward, that `mount_from_axes` gives this mount for, or the nearest mount of all."""
+    R_LS = Rotation.from_quat(quat_LS)
+    pairs = [(up, forward) for up in AXES for forward in AXES if AXES[up] @ AXES[forward] == 0.0]
+    return min(pairs, key=lambda pair: (R_LS * Rotation.from_quat(mount_from_axes(*pair)).inv()).magnitude())
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,10 @@
 """Link lengths, mounts and headings from hands held together, or from another protocol.
 
 `protocols` says what holds in which phase, `chain` is the chain in CasADi, `problem` the least squares over all that is
-not known, `start` finds headings without a guess, `lengths` is the calibration from a recording to a subject,
-`touching` and `anatomy` what guards it against hands apart and sensors exchanged, `verdict` says what it is worth.
+not known, `known` what is known before, `start` finds headings without a guess, `joints` what accelerations tell of
+them, `weighing` what the looks are worth, `lengths` is the calibration from a recording to a subject. `touching` and
+`anatomy` guard it against hands apart and sensors exchanged; `verdict` says what it is worth, in words of `remarks` and
+`advice`.
 """
 
 from __future__ import annotations

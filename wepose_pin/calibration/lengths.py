@@ -16,6 +16,7 @@ is zero. It is linear and homogeneous in the lengths ℓ, and that decides the f
 - Sensors may sit anywhere: headings come from the closure itself where no mount is stated, and nobody holds the start
   pose exactly. Without a magnetometer headings drift, and soft tissue lets a sensor sag. None of that is noise that
   averages out over the phase, so all of it is unknown beside the lengths (`problem`), with priors of its own (`known`).
+- Of headings the accelerations of shoulders and elbows tell as well, which two sensors each feel (`joints`).
 - How much the looks are worth is measured, not assumed (`weighing`).
 """
 
@@ -46,6 +47,7 @@ from .anatomy import (
     without_mounts,
 )
 from .chain import CHAIN, SIDES
+from .joints import coupled, couplings
 from .known import known_before, known_lengths
 from .problem import HINGE_STD, K, Layout, Looks, carrier, placed, residuals
 from .protocols import Closure, Protocol, load_protocol
@@ -292,12 +294,16 @@ def _solve(
     """The calibration; a quick one at fewer looks, by the closure alone, to see whether it can be at all."""
     looks, at = _looks(recording, found, protocol, QUICK_RATE_HZ if quick else LOOK_RATE_HZ)
     layout = looks.layout
-    center, information = known_before(recording, found, looks, prior, gauge, gauge_std)
+    center, known = known_before(recording, found, looks, prior, gauge, gauge_std)
+    information = known
     start, touching = center, np.ones(len(at))
     if not quick:
         start, touching = touching_start(
             looks, lambda some: known_before(recording, found, some, prior, gauge, gauge_std)[0]
         )
+        spans = [span for closure in protocol.closures for span in recording.phase(closure.phase)]
+        told = couplings(recording, found, layout.sensors, spans)
+        center, information = coupled(center, known, layout, told, start)
 
     fit, weights, weight, independent = weighed(looks, center, information, start, touching, quick)
     lengths = fit.x[:K]
@@ -326,7 +332,7 @@ def _solve(
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance[:K, :K], lengths)) ** -1)
     # What is not in the chain, as the trunk where the hands are joined, cannot scale it.
     scaling = [*(name for name in gauge if name in (protocol.chain or LENGTHS)), *protocol.gauges]
-    without_data = np.linalg.inv(information[:K, :K])
+    without_data = np.linalg.inv(known[:K, :K])
     measured = {name: (value, gauge_std) for name, value in gauge.items()}
     measured |= {c.gauge: (c.metres, c.metres_std) for c in protocol.closures if c.gauge and c.gauge not in gauge}
     tapes = taped(fit, layout, measured)
@@ -378,7 +384,7 @@ def _solve(
         hinge=hinge,
         hinge_rms=hinge_rms,
         learned={} if quick else learned,
-        before=handed_on(layout, np.linalg.inv(information))[1],
+        before=handed_on(layout, np.linalg.inv(known))[1],
         quat_WL=segments_at(found, mounts, at),
         protocol=protocol.name,
         closure=next((closure.kind for closure in protocol.closures), ""),

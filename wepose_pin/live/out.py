@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import BadOption
 from .state import LivePose, Stage, Status
 
+LOOPBACK = "127.0.0.1"
 FORMAT = 1
 RATE_HZ = 100.0
 DIGITS = 6  # after the point: micrometres, and less than an arc second
@@ -92,6 +93,20 @@ class UdpOut:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+def udp_out(to: str, rate_hz: float | None = RATE_HZ) -> UdpOut:
+    """To ``PORT`` of this machine, or ``HOST:PORT``.
+
+    Raises
+    ------
+    BadOption
+        It is neither.
+    """
+    host, _, port = to.rpartition(":")
+    if not (port.isascii() and port.isdigit()):
+        raise BadOption(f"UDP out: '{to}'; a port or HOST:PORT, as 9001 or 192.168.1.20:9001")
+    return UdpOut(host.removeprefix("[").removesuffix("]") or LOOPBACK, int(port), rate_hz)
 
 
 def pose_json(stage: Stage, pose: LivePose) -> bytes:

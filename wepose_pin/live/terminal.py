@@ -34,9 +34,11 @@ class TerminalView:
         self._newest: Status | None = None
         self._told: dict[str, str] = {}
         self._keyboard = Keyboard() if keys else None
+        self._opened = False
 
     def open(self) -> None:
-        """Begin to draw, and to listen to keys."""
+        """Begin to draw, and to listen to keys; the first status does it where nobody has."""
+        self._opened = True
         if self._keyboard is not None:
             self._keyboard.open()
         if self._console.is_terminal and self._live is None:
@@ -56,6 +58,8 @@ class TerminalView:
 
     def status(self, status: Status) -> None:
         self._newest = status
+        if not self._opened:
+            self.open()
         if not self._console.is_terminal:
             for line in self._changes(status):
                 self._console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from ..alignment import segment_orientations
+from ..errors import BadOption
 from ..filters import BEST
 from ..model import BodyModel
-from ..recording import Recording
+from ..recording import CONFIGURATION, Recording
 from ..static import StaticTest
 from ..subject import Subject
 from .causal import causal_segments
+from .chain import TrackedChain, track_chain
 from .headings import held_together
 from .tracked import TrackedPose, tracked_pose
 
-__all__ = ["TrackedPose", "track"]
+__all__ = ["TrackedChain", "TrackedPose", "track", "track_chain"]
 
 
 def track(
@@ -24,6 +26,7 @@ def track(
     static_test: StaticTest | None = None,
     hold_headings: bool = True,
     causal: bool = False,
+    limits: bool = True,
 ) -> TrackedPose:
     """The pose of the upper body.
 
@@ -33,19 +36,25 @@ def track(
     method : the orientation filter, a key of `wepose_pin.filters.METHODS`
     hold_headings : use what a calibrated subject's elbows, and the joined hands of a phase `clasp`, say of drift
     causal : begin at the end of the start pose and look at nothing ahead, as a live session does
+    limits : keep the limits of the model's joints of one axis
     model : a body; None for ours. It gets the subject's lengths; without a subject its own stand
 
     Raises
     ------
     WeposeError
-        What the recording, the subject or the model lacks.
+        What the recording, the subject or the model lacks; sensors on links that are no segments.
     """
+    if recording.start_pose == CONFIGURATION:
+        raise BadOption(
+            f'{recording.where()}: start_pose = "{CONFIGURATION}" is that of a chain: give its URDF (--model; in Python '
+            f"track_chain)"
+        )
     if causal:
         rest, segments = causal_segments(recording, subject, method=method, static_test=static_test)
-        return tracked_pose(rest, segments, subject, model, method, causal=True)
+        return tracked_pose(rest, segments, subject, model, method, causal=True, limits=limits)
     segments = segment_orientations(recording, subject, method=method, static_test=static_test)
     reset = None
     own = any(sensor.aligned for sensor in recording.sensors.values())  # frames that no calibration of ours knows
     if hold_headings and subject is not None and subject.mounts and recording.strapping != "new" and not own:
         segments, reset = held_together(recording, segments, subject)
-    return tracked_pose(recording, segments, subject, model, method, reset)
+    return tracked_pose(recording, segments, subject, model, method, reset, limits=limits)

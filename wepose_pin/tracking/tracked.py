@@ -52,7 +52,7 @@ class TrackedPose(Pose):
             sensors[segment] = about
         missed = self._not_followed()
         lame = [
-            f"{segment}: the model's joints are too few for its orientation, they miss it by {angle:.3g} deg (rms)"
+            f"{segment}: the model's joints are too few or end too soon for its orientation, they miss it by {angle:.3g} deg (rms)"
             for segment, angle in missed.items()
             if angle > _WORTH_A_WARNING_DEG
         ]
@@ -110,6 +110,7 @@ def tracked_pose(
     method: str,
     reset: Reset | None = None,
     causal: bool = False,
+    limits: bool = True,
 ) -> TrackedPose:
     """The pose of segments that are known: a body of the subject's lengths, and its kinematics."""
     who = subject or average_subject()
@@ -119,7 +120,7 @@ def tracked_pose(
         # A model that somebody chose has that person's lengths; what it lacks stays the average person's.
         who = replace(who, name=body.robot.name, lengths={**who.lengths, **own}, note="lengths of the model")
     body = body.with_lengths({name: value for name, value in who.lengths.items() if name in own})
-    pose = pose_of(body, recording.time, segments.quat_WL)
+    pose = pose_of(body, recording.time, segments.quat_WL, limits=limits)
     return TrackedPose(
         pose.time,
         pose.quat_WL,

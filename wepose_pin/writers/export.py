@@ -30,6 +30,7 @@ WRITERS: dict[str, Writer] = {
     "c3d": write_c3d,
 }
 FORMATS = (*WRITERS, "urdf")
+SUFFIXES = {"placement": ".sto"}  # where it is not the format's name
 NAMES = ("opensim", "isb")
 
 
@@ -53,7 +54,7 @@ def export(
 
     Parameters
     ----------
-    format : one of `FORMATS`; None: that of the file's suffix
+    format : one of `FORMATS`; None: that of the file's suffix, which otherwise has to be the format's own
     names : of a .mot's columns, one of `NAMES`; None: "opensim"
     rate_hz : resample the motion first
 
@@ -96,6 +97,11 @@ def _format(file: Path, format: str | None) -> str:
             raise BadOption(f"-o {file}: '{file.suffix}' is no format's suffix; --format says which; {one_of(FORMATS)}")
     if format not in FORMATS:
         raise BadOption(f"--format {format}: not known; {one_of(FORMATS, format)}")
+    suffix = SUFFIXES.get(format, f".{format}")
+    if file.suffix.lower() != suffix:
+        raise BadOption(
+            f"-o {file}: format {format} is for programs that go by the suffix: name it {file.stem}{suffix}"
+        )
     return format
 
 

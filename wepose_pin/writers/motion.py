@@ -82,7 +82,10 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
         pose_of(motion.model, time, quat_WL),
         segment_cov={name: between(cov) for name, cov in pose.segment_cov.items()},
         point_cov={name: between(cov) for name, cov in pose.point_cov.items()},
-        gap={name: np.where(share > 0.0, gap[after - 1], False) | gap[after] for name, gap in pose.gap.items()},
+        gap={
+            name: (gap[after - 1] & (share < 1.0 - 1e-6)) | (gap[after] & (share > 1e-6))
+            for name, gap in pose.gap.items()
+        },
     )
     return replace(motion, pose=new)
 

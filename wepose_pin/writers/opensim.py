@@ -4,14 +4,14 @@ In OpenSim's ground G (x forward, y up, z right), the angles and the bodies thos
 
 What OpenSim's readers demand (opensim-core, OpenSim/Common):
 
-- DelimFileAdapter.h, for .mot and .sto: lines ``key=value`` up to one that holds ``endheader`` alone, ``DataType`` as the
-  table that is read; then the labels, the first of them ``time``; tabs between cells, commas within; rows as long as
+- DelimFileAdapter.h, for .mot and .sto: lines ``key=value`` up to one that holds ``endheader`` alone, with ``DataType``
+  as that of the table; then the labels, the first of them ``time``; tabs between cells, commas within; rows as long as
   the labels; an empty line ends the data.
 - Storage.cpp, for .mot: the first line is the name; ``nRows`` and ``nColumns`` (with time) are there and are not zero;
   ``inDegrees=yes``.
 - TRCFileAdapter.cpp: ``PathFileType`` first; then the eight keys of `_TRC_KEYS` in this order, and their eight values;
   ``Frame#``, ``Time`` and ``NumMarkers`` names, a name every third cell; ``X1 Y1 Z1 X2 …``; rows of 2 + 3 NumMarkers
-  cells. A marker with an empty cell is missing.
+  cells, which are counted without an empty last one: a tab ends each row. A marker with an empty cell is missing.
 """
 
 from __future__ import annotations
@@ -27,8 +27,10 @@ from ..errors import BadData
 from .motion import Motion, bridged, even, seen_points, whole
 from .rajagopal import coordinates, in_ground, orientations
 
-_TRC_KEYS = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate", "OrigDataStartFrame")
-_TRC_KEYS += ("OrigNumFrames",)
+_TRC_KEYS = (
+    *("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"),
+    *("OrigDataRate", "OrigDataStartFrame", "OrigNumFrames"),
+)
 _WORTH_A_NOTE_DEG = 1.0
 
 
@@ -127,7 +129,7 @@ def write_trc(path: Path, motion: Motion) -> list[str]:
     columns = {
         f"{point}_{axis}": p_G for point, p_W in points.items() for axis, p_G in zip("XYZ", _mm(p_W), strict=True)
     }
-    rows = pl.DataFrame({"Frame#": np.arange(1, n + 1), "Time": motion.pose.time, **columns})
+    rows = pl.DataFrame({"Frame#": np.arange(1, n + 1), "Time": motion.pose.time, **columns, "": [None] * n})
     header = [f"PathFileType\t4\t(X/Y/Z)\t{path.name.removeprefix('.').removesuffix('.partial')}", keys, values]
     _write(path, [*header, labels, axes, ""], rows, labels=False)
     return notes

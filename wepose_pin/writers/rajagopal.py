@@ -1,8 +1,9 @@
 """Coordinates of Rajagopal's full-body model for OpenSim, from the orientations of segments.
 
-Rajagopal et al. 2016, IEEE Trans. Biomed. Eng. 63:2068, doi 10.1109/TBME.2016.2586891; bodies, axes and their order from
-Rajagopal_2015.osim in OpenSense's example. Hamner's model of 2010 has the same. OpenSim's ground G is x forward, y up,
-z right; the frame of every body is parallel to it in the anatomical position, where all coordinates are zero.
+Rajagopal et al. 2016, IEEE Trans. Biomed. Eng. 63:2068, doi 10.1109/TBME.2016.2586891; bodies, axes and their order
+from its file of OpenSense's example, Rajagopal_2015.osim. Hamner's model of 2010 has the same. OpenSim's ground G is
+x forward, y up, z right; the frame of every body is parallel to it in the anatomical position, where all coordinates
+are zero.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ def _arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list[np.
         humerus[better], angles[better] = tried[better], (angles + step[:, 3:])[better]
         error[better], J[better] = new_error[better], new_J[better]
         damping = np.where(better, damping / 10.0, damping * 10.0).clip(1e-12, 1e6)
-        if not np.any(better & (np.abs(step).max(axis=1) > _CLOSE)):
+        if np.abs(step).max() < _CLOSE:
             break
     return humerus, list(angles.T), [np.linalg.norm(part, axis=1) for part in np.split(error, len(quat), axis=1)]
 

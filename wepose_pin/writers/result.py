@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 
 from .. import __version__
+from ..angles.torques import Torques, torque_table
 from ..errors import BadData, ExistingOutput, MissingFile
 from ..model import BodyModel, load_model
 from ..pose import Pose, pose_from_table, pose_table
@@ -27,10 +28,12 @@ def write_result(
     pose: TrackedPose,
     covariance: bool = False,
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    torques: Torques | None = None,
 ) -> None:
     """Write what `track` gave into an existing folder; with `covariance` its entries as well, not only deviations.
 
-    `phases` of the recording go to the summary, so that a page made from the folder shows them too.
+    `phases` of the recording go to the summary, so that a page made from the folder shows them too. `torques` become
+    ``torques.parquet``.
     """
     assert pose.model is not None
     assert pose.subject is not None
@@ -38,6 +41,9 @@ def write_result(
     write_subject(folder, pose.subject, pose.model)
     spans = {name: [[float(a), float(b)] for a, b in of] for name, of in (phases or {}).items()}
     summary = pose.summary() | {"recorded_phases": spans, "versions": versions()}
+    if torques is not None:
+        write_table(folder / "torques.parquet", torque_table(torques))
+        summary["torques"] = torques.summary()
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 

@@ -1,0 +1,358 @@
+"""Files for other programs: each read back by a reader of others, with the numbers that went in."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin import cli
+from wepose_pin.angles import joint_angles
+from wepose_pin.errors import BadData, BadOption, ExistingOutput, MissingFile
+from wepose_pin.model import load_model
+from wepose_pin.pose import Pose, pose_from_table, pose_of, pose_table
+from wepose_pin.recording import SEGMENTS
+from wepose_pin.writers import export as writers
+from wepose_pin.writers.export import export
+from wepose_pin.writers.motion import Motion, resampled
+from wepose_pin.writers.result import write_table
+
+LENGTHS = {"shoulder_width": 0.41, "left_upper_arm": 0.29, "right_forearm": 0.25, "right_hand": 0.07}
+POINTS = [f"{side}_{part}" for side in ("left", "right") for part in ("shoulder", "elbow", "wrist", "hand")]
+
+
+def smooth(n: int, seed: int, size: float) -> np.ndarray:
+    """Rotation vectors (n, 3) [rad] that wander."""
+    rng = np.random.default_rng(seed)
+    phase = np.linspace(0.0, 3.0, n)[:, None] * np.arange(1, 4)
+    return size * (np.sin(phase + rng.uniform(0.0, 6.0, 3)) @ rng.standard_normal((3, 3)))
+
+
+def a_pose(segments: tuple[str, ...] = SEGMENTS, n: int = 301, rate_hz: float = 100.0) -> Pose:
+    """A pose with covariances, of a person of `LENGTHS`."""
+    quat_WL = {
+        name: Rotation.from_rotvec(smooth(n, k, 0.2 if name in ("torso", "pelvis") else 0.7)).as_quat()
+        for k, name in enumerate(segments)
+    }
+    pose = pose_of(load_model(lengths=LENGTHS), 2.0 + np.arange(n) / rate_hz, quat_WL)
+    spread = np.linspace(1.0, 2.0, n)[:, None, None] * np.diag([1.0, 2.0, 3.0])
+    return replace(
+        pose,
+        segment_cov=dict.fromkeys(pose.quat_WL, 0.0001 * spread),
+        point_cov=dict.fromkeys(pose.points, 1e-06 * spread),
+    )
+
+
+def write_folder(folder: Path, pose: Pose) -> Path:
+    """A result folder, as far as an export reads it."""
+    folder.mkdir()
+    write_table(folder / "pose.parquet", pose_table(pose, covariance=True))
+    (folder / "subject.urdf").write_text(load_model(lengths=LENGTHS).urdf(), encoding="utf-8")
+    (folder / "summary.json").write_text('{"recording": "a = made\\u00b2 one"}', encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pose() -> Pose:
+    return a_pose()
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory, pose: Pose) -> Path:
+    return write_folder(tmp_path_factory.mktemp("export") / "result", pose)
+
+
+def with_gap(pose: Pose) -> Pose:
+    """The same with the right forearm bridged from sample 10 to 19."""
+    gap = np.zeros(len(pose.time), dtype=bool)
+    gap[10:20] = True
+    return replace(pose, gap={"right_forearm": gap})
+
+
+# Tables -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("format", ["csv", "parquet"])
+def test_tables_hold_pose_and_angles(result: Path, pose: Pose, tmp_path: Path, format: str) -> None:
+    file = tmp_path / f"all.{format}"
+    assert export(result, file) == (format, [])
+    table = pl.read_csv(file) if format == "csv" else pl.read_parquet(file)
+    stored = pl.read_parquet(result / "pose.parquet")
+    for segment in SEGMENTS:
+        for c in ("qx", "qy", "qz", "qw"):
+            np.testing.assert_allclose(table[f"{segment}_{c}"], stored[f"{segment}_{c}"], rtol=0, atol=1e-15)
+    for point in POINTS:
+        for c in "xyz":
+            np.testing.assert_array_equal(table[f"{point}_{c}"], stored[f"{point}_{c}"])
+        np.testing.assert_array_equal(table[f"{point}_std"], stored[f"{point}_std"])
+    angles = joint_angles(pose)
+    elbow = angles["right_elbow"]
+    np.testing.assert_allclose(table["right_elbow_flexion_deg"], np.degrees(elbow.values[:, 0]), atol=1e-9)
+    np.testing.assert_allclose(table["right_elbow_pronation_std_deg"], np.degrees(elbow.std[:, 2]), rtol=1e-9)
+    again = pose_from_table(table, str(file))
+    np.testing.assert_array_equal(again.points["left_hand"], pose.points["left_hand"])
+
+
+def test_csv_leaves_empty_what_is_not_known(tmp_path: Path, pose: Pose) -> None:
+    quat = pose.quat_WL["left_hand"].copy()
+    quat[5] = np.nan
+    holed = replace(pose, quat_WL={**pose.quat_WL, "left_hand": quat})
+    export(write_folder(tmp_path / "r", holed), tmp_path / "x.csv")
+    table = pl.read_csv(tmp_path / "x.csv")
+    assert table["left_hand_qx"].is_null().to_numpy().nonzero()[0].tolist() == [5]
+    assert table["left_wrist_flexion_deg"].is_null().sum() == 1
+    assert "NaN" not in (tmp_path / "x.csv").read_text()
+
+
+def test_a_table_without_a_joint_has_the_pose_alone(tmp_path: Path) -> None:
+    lone = a_pose(("right_forearm",), n=5)
+    export(write_folder(tmp_path / "r", lone), tmp_path / "x.parquet")
+    table = pl.read_parquet(tmp_path / "x.parquet")
+    assert "right_forearm_qx" in table.columns
+    assert not any(name.endswith("_deg") for name in table.columns)
+
+
+# C3D --------------------------------------------------------------------------------------------------------------
+
+
+def test_c3d_by_ezc3d(result: Path, pose: Pose, tmp_path: Path) -> None:
+    ezc3d = pytest.importorskip("ezc3d")
+    export(result, tmp_path / "x.c3d")
+    file = ezc3d.c3d(str(tmp_path / "x.c3d"))
+    about = file["parameters"]["POINT"]
+    assert about["LABELS"]["value"] == POINTS
+    assert about["UNITS"]["value"] == ["mm"]
+    assert about["RATE"]["value"] == [100.0]
+    assert (about["X_SCREEN"]["value"], about["Y_SCREEN"]["value"]) == (["+X"], ["+Z"])
+    p_mm = file["data"]["points"]
+    assert p_mm.shape == (4, 8, 301)
+    for k, point in enumerate(POINTS):
+        np.testing.assert_allclose(p_mm[:3, k].T, 1e3 * pose.points[point], rtol=2e-7, atol=1e-4)  # single precision
+    assert (file["data"]["meta_points"]["residuals"] == 0.0).all()
+    assert [path.name for path in tmp_path.iterdir()] == ["x.c3d"]
+
+
+def test_c3d_marks_what_hangs_on_a_gap(tmp_path: Path, pose: Pose) -> None:
+    ezc3d = pytest.importorskip("ezc3d")
+    export(write_folder(tmp_path / "r", with_gap(pose)), tmp_path / "x.c3d")
+    data = ezc3d.c3d(str(tmp_path / "x.c3d"))["data"]
+    lost = data["meta_points"]["residuals"][0] == -1.0
+    hit = {POINTS[k]: np.flatnonzero(row).tolist() for k, row in enumerate(lost) if row.any()}
+    assert hit == {name: list(range(10, 20)) for name in ("right_wrist", "right_hand")}  # a hand hangs on its wrist
+    assert np.isnan(data["points"][0, POINTS.index("right_wrist"), 10:20]).all()
+
+
+def test_c3d_without_ezc3d(result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    with pytest.raises(BadOption, match=r"pip install 'wepose-pin\[export\]'"):
+        export(result, tmp_path / "x.c3d")
+    assert list(tmp_path.iterdir()) == []
+
+
+# BVH --------------------------------------------------------------------------------------------------------------
+
+
+def in_bvh(p_W: np.ndarray) -> np.ndarray:
+    """x to the person's left, y up, z forward, cm."""
+    return 100.0 * np.stack([p_W[..., 1], p_W[..., 2], p_W[..., 0]], axis=-1)
+
+
+BVH_POINTS = {
+    "LeftArm": "left_shoulder",
+    "LeftForeArm": "left_elbow",
+    "LeftHand": "left_wrist",
+    "RightArm": "right_shoulder",
+    "RightForeArm": "right_elbow",
+    "RightHand": "right_wrist",
+}
+
+
+def test_bvh_puts_every_joint_where_it_was(result: Path, pose: Pose, tmp_path: Path) -> None:
+    pybvh = pytest.importorskip("pybvh")
+    export(result, tmp_path / "x.bvh")
+    read = pybvh.read_bvh_file(tmp_path / "x.bvh")
+    assert (read.frame_count, read.frame_time) == (301, 0.01)
+    assert read.joint_names[:2] == ["Hips", "Spine"]
+    positions = read.node_positions()
+    names = [node.name for node in read.nodes]
+    for joint, point in BVH_POINTS.items():
+        np.testing.assert_allclose(positions[:, names.index(joint)], in_bvh(pose.points[point]), atol=5e-6)
+    ends = [k for k, name in enumerate(names) if k and names[k - 1] == "RightHand"]
+    np.testing.assert_allclose(positions[:, ends[0]], in_bvh(pose.points["right_hand"]), atol=5e-6)
+
+
+def test_bvh_turns_every_joint_as_it_was(result: Path, pose: Pose, tmp_path: Path) -> None:
+    pybvh = pytest.importorskip("pybvh")
+    export(result, tmp_path / "x.bvh")
+    read = pybvh.read_bvh_file(tmp_path / "x.bvh")
+    assert {"".join(order) for order in read.euler_orders} == {"ZXY"}
+    local = read.to_rotmat()  # (n, joints, 3, 3)
+    local = local[1] if isinstance(local, tuple) else local
+    to_bvh = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    index = {name: k for k, name in enumerate(read.joint_names)}
+    R = local[:, index["Hips"]]
+    for joint, segment in {"Hips": "pelvis", "Spine": "torso", "LeftArm": "left_upper_arm"}.items():
+        R = R if joint == "Hips" else R @ local[:, index[joint]]
+        wanted = to_bvh @ Rotation.from_quat(pose.quat_WL[segment]).as_matrix() @ to_bvh.T
+        np.testing.assert_allclose(R, wanted, atol=1e-7)
+
+
+def test_bvh_has_the_lengths_and_stands_in_the_n_pose(result: Path, tmp_path: Path) -> None:
+    pybvh = pytest.importorskip("pybvh")
+    export(result, tmp_path / "x.bvh")
+    offsets = {node.name: np.asarray(node.offset) for node in pybvh.read_bvh_file(tmp_path / "x.bvh").nodes}
+    np.testing.assert_allclose(offsets["LeftForeArm"], [0.0, -29.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(offsets["RightHand"], [0.0, -25.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(offsets["LeftArm"] - offsets["RightArm"], [41.0, 0.0, 0.0], atol=1e-6)
+
+
+def test_bvh_of_one_arm_without_its_forearm(tmp_path: Path) -> None:
+    pybvh = pytest.importorskip("pybvh")
+    some = a_pose(("torso", "left_upper_arm", "left_forearm", "right_upper_arm"), n=20)
+    export(write_folder(tmp_path / "r", some), tmp_path / "x.bvh")
+    read = pybvh.read_bvh_file(tmp_path / "x.bvh")
+    assert read.joint_names == ["Hips", "Spine", "LeftArm", "LeftForeArm", "LeftHand", "RightArm"]
+    with pytest.raises(BadData, match="no orientation of the torso"):
+        export(write_folder(tmp_path / "s", a_pose(("left_forearm",), n=20)), tmp_path / "y.bvh")
+
+
+def test_bvh_of_a_body_with_a_spine(tmp_path: Path, data: Path) -> None:
+    pybvh = pytest.importorskip("pybvh")
+    model = load_model(data / "human_urdf" / "humanSubject01_66dof.urdf")
+    upright = a_pose(n=40)
+    pose = pose_of(model, upright.time, upright.quat_WL)
+    writers.write_bvh(tmp_path / "x.bvh", Motion(pose, model, "x", "x"))
+    read = pybvh.read_bvh_file(tmp_path / "x.bvh")
+    names = [node.name for node in read.nodes]
+    at = {joint: read.node_positions()[:, names.index(joint)] for joint in BVH_POINTS}
+    middle = 0.5 * (pose.points["left_shoulder"] + pose.points["right_shoulder"])
+    np.testing.assert_allclose(0.5 * (at["LeftArm"] + at["RightArm"]), in_bvh(middle), atol=1e-5)
+
+
+# URDF, rates, options -----------------------------------------------------------------------------------------------
+
+
+def test_urdf_is_the_subject(result: Path, tmp_path: Path) -> None:
+    pin = pytest.importorskip("pinocchio")
+    export(result, tmp_path / "anna.urdf")
+    assert (tmp_path / "anna.urdf").read_bytes() == (result / "subject.urdf").read_bytes()
+    model = pin.buildModelFromUrdf(str(tmp_path / "anna.urdf"))
+    assert model.existFrame("right_forearm")
+
+
+def test_resampling_goes_through_the_body(pose: Pose) -> None:
+    model = load_model(lengths=LENGTHS)
+    new = resampled(Motion(with_gap(pose), model, "x", "x"), 250.0).pose
+    np.testing.assert_allclose(np.diff(new.time), 0.004, atol=1e-12)
+    assert (new.time[0], new.time[-1]) == (2.0, pytest.approx(5.0))
+    np.testing.assert_allclose(new.points["left_hand"][::5], pose.points["left_hand"][::2], atol=1e-12)
+    arm = np.linalg.norm(new.points["left_elbow"] - new.points["left_shoulder"], axis=1)
+    np.testing.assert_allclose(arm, 0.29, atol=1e-12)  # a chord between two points would be shorter
+    truth = Rotation.from_rotvec(smooth(3001, 1, 0.7)).as_quat()[4::4][: len(new.time) - 1]
+    assert SEGMENTS[1] == "left_upper_arm"
+    off = (Rotation.from_quat(truth) * Rotation.from_quat(new.quat_WL["left_upper_arm"][1:]).inv()).magnitude()
+    assert off.max() < 1e-3
+    lost = new.time[new.gap["right_forearm"]]
+    assert (lost[0], lost[-1]) == (pytest.approx(2.092), pytest.approx(2.196))
+    np.testing.assert_allclose(new.point_cov["left_hand"][::5], pose.point_cov["left_hand"][::2], rtol=1e-12)
+
+
+def test_uneven_times_are_made_even_where_the_format_has_only_a_rate(tmp_path: Path, pose: Pose) -> None:
+    late = pose.time + np.where(np.arange(301) > 150, 0.004, 0.0)
+    folder = write_folder(tmp_path / "r", replace(pose, time=late))
+    found = export(folder, tmp_path / "x.bvh")
+    assert "resampled at 100 Hz" in found.notes[0]
+    assert export(folder, tmp_path / "x.mot").notes[0].startswith("elbows")  # has a column of times
+
+
+def test_gaps_that_cannot_be_marked_are_told(tmp_path: Path, pose: Pose) -> None:
+    folder = write_folder(tmp_path / "r", with_gap(pose))
+    for name in ("x.mot", "x.sto", "x.bvh"):
+        assert any("right_forearm 10" in note for note in export(folder, tmp_path / name).notes)
+    for name in ("x.csv", "x.trc"):
+        assert export(folder, tmp_path / name).notes == []
+    assert pl.read_csv(tmp_path / "x.csv")["right_forearm_gap"].sum() == 10
+
+
+def test_a_sample_without_orientation_is_named(tmp_path: Path, pose: Pose) -> None:
+    quat = pose.quat_WL["torso"].copy()
+    quat[7] = np.nan
+    folder = write_folder(tmp_path / "r", replace(pose, quat_WL={**pose.quat_WL, "torso": quat}))
+    for name in ("x.mot", "x.sto", "x.bvh"):
+        with pytest.raises(BadData, match=r"torso has no orientation in row 8 of pose\.parquet; .* csv and parquet"):
+            export(folder, tmp_path / name)
+    with pytest.raises(BadData, match="resampling needs one"):
+        export(folder, tmp_path / "x.csv", rate_hz=50.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["-o", "x.dat"], "-o x.dat: '.dat' is no format's suffix; --format says which; there is: csv, parquet, mot"),
+        (["-o", "x.trc", "--format", "tcr"], "--format tcr: not known; did you mean 'trc'?"),
+        (["-o", "x.dat", "--format", "c3d"], "name it x.c3d"),
+        (["-o", "x.txt", "--format", "placement"], "name it x.sto"),
+        (["-o", "x.trc", "--names", "isb"], "--names isb: only a .mot has names to choose, and the format is trc"),
+        (["-o", "x.mot", "--names", "rajagopal"], "--names rajagopal: not known; there is: opensim, isb"),
+        (["-o", "x.trc", "--rate-hz", "0"], "--rate-hz 0: between 1 and 10000 samples a second"),
+        (["-o", "x.trc", "--rate-hz", "nan"], "--rate-hz nan: between 1 and 10000 samples a second"),
+        (["-o", "x.urdf", "--rate-hz", "50"], "--rate-hz 50: there is no motion in a file of format urdf"),
+        (["-o", "no/x.trc"], "no/x.trc: not a file that can be written"),
+    ],
+)
+def test_wrong_options_take_one_line(
+    result: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["export", str(result), *arguments])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_overwritten_without_force(result: Path, tmp_path: Path) -> None:
+    (tmp_path / "x.trc").write_text("mine")
+    with pytest.raises(ExistingOutput, match="--force"):
+        export(result, tmp_path / "x.trc")
+    assert (tmp_path / "x.trc").read_text() == "mine"
+    export(result, tmp_path / "x.trc", force=True)
+    assert (tmp_path / "x.trc").read_text().startswith("PathFileType\t4\t(X/Y/Z)\tx.trc\n")
+    (tmp_path / "d.trc").mkdir()
+    with pytest.raises(ExistingOutput, match="not a file"):
+        export(result, tmp_path / "d.trc", force=True)
+
+
+def test_no_result_and_no_points(tmp_path: Path) -> None:
+    for name in ("x.trc", "x.urdf"):
+        with pytest.raises(MissingFile, match="wepose track"):
+            export(tmp_path, tmp_path / name)
+    folder = write_folder(tmp_path / "r", a_pose(("head",), n=5))
+    for name, said in (("x.trc", "no points"), ("x.mot", "no joint"), ("x.sto", "no segment")):
+        with pytest.raises(BadData, match=said):
+            export(folder, tmp_path / name)
+    short = write_folder(tmp_path / "s", a_pose(n=1))
+    with pytest.raises(BadData, match="1 samples; a motion has at least 2"):
+        export(short, tmp_path / "x.csv")
+
+
+def test_the_command_says_what_it_wrote(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["export", str(result), "-o", str(tmp_path / "x.mot")])
+    assert stop.value.code == 0
+    said = capsys.readouterr()
+    assert said.out == f"Written: {tmp_path / 'x.mot'}  (mot)\n"
+    assert said.err.startswith("note: elbows and wrists of the model have two axes")

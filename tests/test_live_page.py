@@ -1,0 +1,474 @@
+"""The live page: what a browser gets, how fast, who else gets anything, and what it looks like."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import BROWSER, Browser, pixels
+from scipy.spatial.transform import Rotation
+from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.websocket import WebSocketClientConnection, websocket_connect
+
+from wepose_pin.errors import BadOption
+from wepose_pin.live.figure import Figure
+from wepose_pin.live.page import LivePage
+from wepose_pin.live.server import status_json
+from wepose_pin.live.state import LivePose, SensorStatus, Stage, Status
+from wepose_pin.model import BodyModel, load_model
+from wepose_pin.pose import LiveKinematics, configuration, placements
+
+SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+NARROW = "document.documentElement.scrollWidth <= innerWidth"
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+class Person:
+    """A fake loop: arms that swing, and the status of their sensors."""
+
+    def __init__(self, model: BodyModel, segments: tuple[str, ...] = SEGMENTS) -> None:
+        self._kinematics = LiveKinematics(model, segments)
+        self.stage = Stage(segments, self._kinematics.points, 100.0)
+
+    def pose(self, t: float, lost: tuple[str, ...] = ()) -> LivePose:
+        swing = {"torso": [0, 0, 0.2], "left_forearm": [0, -1.5, 0], "right_forearm": [0, -1.2 - 0.3 * math.sin(t), 0]}
+        quat_WL = np.array(
+            [Rotation.from_rotvec(swing.get(s, [0, -0.8 * math.sin(2 * t), 0])).as_quat() for s in self.stage.segments]
+        )
+        points = self._kinematics.points_of(quat_WL)
+        gone = np.array([segment in lost for segment in self.stage.segments])
+        return LivePose(t, quat_WL, points, np.full(len(gone), 0.02), gone, 0.003)
+
+    def status(self, state: str = "ready", message: str = "Tracking.", lost: tuple[str, ...] = ()) -> Status:
+        sensors = tuple(
+            SensorStatus(s, 99.8, s in lost, s == "torso", (0.002, -0.005, 0.0), math.nan, 3.0, 1, 2, 3)
+            for s in self.stage.segments
+        )
+        return Status(state, message, 0.4, 12.0, sensors, (3.2, 8.4), 7.0, {"bad checksums": 3})
+
+
+@pytest.fixture
+def person(model: BodyModel) -> Person:
+    return Person(model)
+
+
+@pytest.fixture
+def page(model: BodyModel) -> Iterator[LivePage]:
+    with LivePage(model, title="<b>& circles") as page:
+        yield page
+
+
+def unpacked(model: BodyModel, frame: bytes) -> tuple[float, dict[str, np.ndarray], np.ndarray, dict[str, bool]]:
+    """Time, link → (12,), hands (2, 3), link → lost."""
+    links = Figure(model).links
+    n = len(links)
+    assert len(frame) == 8 + 4 * (12 * n + 6) + n
+    placed = np.frombuffer(frame, "<f4", 12 * n, 8).reshape(n, 12)
+    hands = np.frombuffer(frame, "<f4", 6, 8 + 48 * n).reshape(2, 3)
+    lost = np.frombuffer(frame, "u1", n, 8 + 48 * n + 24)
+    time_s = float(np.frombuffer(frame, "<f8", 1)[0])
+    return time_s, dict(zip(links, placed, strict=True)), hands, dict(zip(links, lost.astype(bool).tolist(), strict=True))
+
+
+# What a frame holds -------------------------------------------------------------------------------------------------
+
+
+def test_a_frame_places_every_link_as_the_kinematics_do(model: BodyModel, person: Person) -> None:
+    figure = Figure(model)
+    figure.begin(person.stage)
+    pose = person.pose(0.7, lost=("left_forearm",))
+    time_s, placed, hands, lost = unpacked(model, figure.frame(pose))
+    assert time_s == 0.7
+    q = configuration(model, {s: pose.quat_WL[k : k + 1] for k, s in enumerate(SEGMENTS)})
+    for link, (quat_WL, p_WL) in placements(model, q, figure.links).items():
+        np.testing.assert_allclose(placed[link][:9], Rotation.from_quat(quat_WL[0]).as_matrix().ravel(), atol=1e-6)
+        np.testing.assert_allclose(placed[link][9:], p_WL[0], atol=1e-6)
+    for k, hand in enumerate(("left_hand", "right_hand")):
+        np.testing.assert_allclose(hands[k], pose.points[person.stage.points.index(hand)], atol=1e-6)
+    assert {link for link, gone in lost.items() if gone} == {"left_forearm", "left_hand"}  # rigid with its forearm
+
+
+def test_the_n_pose_before_the_start_and_only_what_is_measured_after(model: BodyModel) -> None:
+    figure = Figure(model)
+    time_s, placed, hands, lost = unpacked(model, figure.frame(None))
+    assert math.isnan(time_s)
+    assert np.isnan(hands).all()
+    assert not any(lost.values())
+    for row in placed.values():
+        np.testing.assert_allclose(row[:9], np.eye(3).ravel(), atol=1e-6)
+    one_arm = Person(model, ("torso", "right_upper_arm"))
+    figure.begin(one_arm.stage)
+    for frame in (figure.frame(None), figure.frame(one_arm.pose(0.3))):
+        placed = unpacked(model, frame)[1]
+        seen = {link for link, row in placed.items() if np.isfinite(row).all()}
+        assert seen == {"torso", "pelvis", "head", "right_upper_arm"}
+        assert all(np.isnan(row).all() for link, row in placed.items() if link not in seen)
+    assert np.isnan(unpacked(model, figure.frame(one_arm.pose(0.3)))[2]).all()
+
+
+def test_status_is_json_whatever_is_not_known(person: Person) -> None:
+    sent = json.loads(status_json(person.status(lost=("torso",))._replace(latency_ms=(math.nan, math.inf))))
+    assert sent["latency_ms"] == [None, None]
+    assert sent["sensors"][0] | {"bias_deg_s": 0} == {
+        "segment": "torso", "rate_hz": 99.8, "lost": True, "static": True, "bias_deg_s": 0, "heading_std_deg": None,
+        "heading_age_s": 3.0, "missing": 1, "late": 2, "duplicate": 3,
+    }  # fmt: skip
+    assert sent["sensors"][0]["bias_deg_s"] == [0.115, -0.286, 0.0]
+
+
+# The server ---------------------------------------------------------------------------------------------------------
+
+
+def listening(pid: int) -> set[str]:
+    """Addresses that a process listens on, TCP and UDP, as /proc has them."""
+    inodes = set()
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            target = os.readlink(entry)
+        except OSError:
+            continue
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    found = set()
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            columns = line.split()
+            if columns[9] in inodes and (table.startswith("udp") or columns[3] == "0A"):
+                address = bytes.fromhex(columns[1].split(":")[0])
+                words = [address[k : k + 4][::-1] for k in range(0, len(address), 4)]  # of this machine's byte order
+                family = socket.AF_INET6 if table.endswith("6") else socket.AF_INET
+                found.add(socket.inet_ntop(family, b"".join(words)))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/net/tcp").exists() or sys.byteorder != "little", reason="reads Linux's /proc")
+def test_nothing_listens_but_on_loopback() -> None:
+    """In a process of its own: other tests' sockets are not this page's."""
+    code = (
+        "import sys\nfrom wepose_pin.live.page import LivePage\nfrom wepose_pin.live.out import UdpOut\n"
+        "from wepose_pin.live.terminal import TerminalView\nfrom wepose_pin.model import load_model\n"
+        "page, out, view = LivePage(load_model()), UdpOut('127.0.0.1', 9), TerminalView()\n"
+        "page.open(); view.open()\nprint(page.url, flush=True)\nsys.stdin.read()\npage.close()\nout.close()\n"
+    )
+    run = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert run.stdin is not None
+    assert run.stdout is not None
+    assert run.stdout.readline().startswith("http://127.0.0.1:")
+    # A socket that only sends is 0.0.0.0:0 until it has; ours has not and is not in the table.
+    assert listening(run.pid) == {"127.0.0.1"}
+    run.communicate("", timeout=30)
+    assert run.returncode == 0
+
+
+def get(url: str, **headers: str) -> tuple[int, Any, str]:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10) as answer:
+            return answer.status, answer.headers, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.headers, error.read().decode()
+
+
+def test_the_page_may_do_nothing_but_its_own(page: LivePage) -> None:
+    code, headers, text = get(page.url)
+    assert code == 200
+    assert "<h1>&lt;b&gt;&amp; circles</h1>" in text
+    policy = dict(part.strip().split(" ", 1) for part in headers["Content-Security-Policy"].split(";"))
+    assert policy["default-src"] == policy["frame-ancestors"] == policy["base-uri"] == "'none'"
+    assert all(source.startswith("'sha256-") for source in policy["script-src"].split())
+    assert policy["connect-src"] == page.url.replace("http", "ws").rstrip("/")
+    assert headers["Cache-Control"] == "no-store"
+
+
+@pytest.mark.parametrize("path", ["", "stream"])
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:80", "127.0.0.1; script-src *", "[::1%25x]"])
+def test_a_foreign_name_gets_nothing(page: LivePage, path: str, host: str) -> None:
+    code, _, text = get(page.url + path, Host=host)
+    assert code in (400, 403)  # 400: tornado itself finds it no host
+    assert "WebGL" not in text
+
+
+@pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1", "[::1]:99"])
+def test_known_by_address_and_as_localhost(page: LivePage, host: str) -> None:
+    code, headers, _ = get(page.url, Host=host)
+    assert code == 200
+    assert f"connect-src ws://{host};" in headers["Content-Security-Policy"]
+
+
+def talk(page: LivePage, do: Callable[[WebSocketClientConnection], Awaitable[Any]], **headers: str) -> Any:
+    """What `do` gives, with a connection as the page opens it."""
+
+    async def connected() -> Any:
+        usual = {"Origin": page.url.rstrip("/")} | headers
+        connection = await websocket_connect(HTTPRequest(page.url.replace("http", "ws") + "stream", headers=usual))
+        try:
+            return await do(connection)
+        finally:
+            connection.close()
+
+    return asyncio.run(connected())
+
+
+async def taken(connection: WebSocketClientConnection) -> Any:
+    message = await asyncio.wait_for(connection.read_message(), 10.0)
+    await connection.write_message("taken")
+    return message
+
+
+def test_a_foreign_origin_gets_no_poses(page: LivePage) -> None:
+    for origin in ("http://evil.example", "null", page.url.replace("http", "https").rstrip("/"), "http://localhost"):
+        with pytest.raises(HTTPClientError, match="403"):
+            talk(page, taken, Origin=origin)
+
+
+def test_who_does_not_take_gets_no_more_and_then_the_newest(page: LivePage, person: Person, model: BodyModel) -> None:
+    page.start(person.stage)
+
+    async def slow(connection: WebSocketClientConnection) -> None:
+        assert "id" in json.loads(await taken(connection))
+        page.show(person.pose(1.0))
+        while unpacked(model, await taken(connection))[0] != 1.0:
+            pass  # the N-pose that was there before
+        page.show(person.pose(2.0))
+        page.status(person.status())
+        await asyncio.sleep(0.2)
+        got = [await asyncio.wait_for(connection.read_message(), 5.0) for _ in range(2)]
+        assert json.loads(next(m for m in got if isinstance(m, str)))["state"] == "ready"
+        assert unpacked(model, next(m for m in got if isinstance(m, bytes)))[0] == 2.0
+        for k in range(200):
+            page.show(person.pose(3.0 + k))
+            if k % 10 == 0:
+                page.status(person.status())
+            await asyncio.sleep(0.002)
+        waiting = asyncio.ensure_future(connection.read_message())
+        assert not (await asyncio.wait([waiting], timeout=0.3))[0]
+        for _ in got:
+            await connection.write_message("taken")
+        messages = [await asyncio.wait_for(waiting, 5.0), await asyncio.wait_for(connection.read_message(), 5.0)]
+        assert unpacked(model, next(m for m in messages if isinstance(m, bytes)))[0] == 202.0
+
+    talk(page, slow)
+
+
+def test_who_takes_at_once_gets_no_more_than_sixty_a_second(page: LivePage, person: Person, model: BodyModel) -> None:
+    page.start(person.stage)
+    poses = [person.pose(0.01 * k) for k in range(100)]
+
+    async def fast(connection: WebSocketClientConnection) -> list[float]:
+        times: list[float] = []
+        begin = time.monotonic()
+        ticking = asyncio.ensure_future(loop_of_poses())
+        while time.monotonic() < begin + 2.0:
+            message = await taken(connection)
+            if isinstance(message, bytes):
+                times.append(unpacked(model, message)[0])
+        ticking.cancel()
+        return times
+
+    async def loop_of_poses() -> None:
+        k = 0
+        while True:
+            page.show(poses[k % 100]._replace(time=0.001 * k))
+            k += 1
+            await asyncio.sleep(0.001)
+
+    times = talk(page, fast)
+    assert 5 < len(times) <= 2.0 * 60.0 + 5.0
+    assert (np.diff([t for t in times if math.isfinite(t)]) > 0).all()
+
+
+def test_keys_and_nonsense(page: LivePage) -> None:
+    async def press(connection: WebSocketClientConnection) -> None:
+        for message in ("key r", "key q", "key", "{}", b"\xff\x00", "taken", "taken", "taken", "key r"):
+            await connection.write_message(message, binary=isinstance(message, bytes))
+        for _ in range(100):
+            await connection.write_message("key r")
+        await connection.write_message("x" * 100_000)  # too long: that browser is shown the door
+        while await connection.read_message() is not None:
+            pass
+
+    talk(page, press)
+    assert page.take_keys() == ["r"] * 16  # more are thrown away
+    assert page.take_keys() == []
+    assert get(page.url)[0] == 200
+
+
+def test_the_end_reaches_the_browser(model: BodyModel, person: Person) -> None:
+    page = LivePage(model, person.stage)
+    page.open()
+
+    async def wait(connection: WebSocketClientConnection) -> list[Any]:
+        messages = [await taken(connection), await taken(connection)]
+        page.status(person.status("ended", "The session has ended."))
+        closing = asyncio.get_running_loop().run_in_executor(None, page.close)
+        while (message := await connection.read_message()) is not None:
+            messages.append(message)
+        await closing
+        return messages
+
+    port = int(page.url.split(":")[2].strip("/"))
+    messages = talk(page, wait)
+    assert json.loads(messages[-1])["state"] == "ended"
+    page.close()
+    with LivePage(model, port=port) as again:  # the port is free at once
+        assert get(again.url)[0] == 200
+
+
+def test_addresses_that_cannot_be(model: BodyModel, page: LivePage) -> None:
+    port = int(page.url.split(":")[2].strip("/"))
+    with pytest.raises(BadOption, match=rf"cannot listen on 127.0.0.1:{port}: .*in use"):
+        LivePage(model, port=port).open()
+    with pytest.raises(BadOption, match="cannot listen on 203.0.113.9:0"):
+        LivePage(model, host="203.0.113.9").open()
+    with pytest.raises(BadOption, match="needs an address"):
+        LivePage(model, host="").open()
+    with pytest.raises(BadOption, match="cannot listen on 127.0.0.1:99999"):
+        LivePage(model, port=99999).open()
+
+
+# In the browser -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    if BROWSER is None:
+        pytest.skip("no chromium or google-chrome")
+    browser = Browser(1200, 700)
+    yield browser
+    browser.close()
+
+
+def region(picture: np.ndarray, box: dict[str, float]) -> np.ndarray:
+    top, left = round(box["y"]), round(box["x"])
+    return picture[top : top + round(box["height"]), left : left + round(box["width"])]
+
+
+def box_of(browser: Browser, element: str) -> dict[str, float]:
+    return dict(browser.run(f"document.querySelector('{element}').getBoundingClientRect().toJSON()"))
+
+
+def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Person, browser: Browser) -> None:
+    with LivePage(model, title="circles") as page:
+        browser.errors.clear()
+        browser.emulate(prefers_color_scheme="light")
+        browser.go(page.url)
+        page.status(person.status("hold", "Stand upright and still: 2 s more."))
+        browser.wait("window.wepose.state() === 'hold' && window.wepose.frames() > 0")
+        words = box_of(browser, "#say strong")
+        assert words["height"] > 40  # readable from where the person stands
+        assert box_of(browser, "#stage")["bottom"] <= box_of(browser, "#say")["top"] + 1  # and hides no arm
+        page.status(person.status("moved", "You moved (torso). Once more."))
+        browser.wait("document.querySelector('#say.moved span')?.textContent.includes('Once more')")
+
+        page.start(person.stage)
+        page.status(person.status(lost=("left_forearm",), message="No samples from left forearm."))
+        page.show(person.pose(0.2, lost=("left_forearm",)))
+        browser.wait("window.wepose.time() === 0.2 && window.wepose.state() === 'ready'")
+        assert browser.run(NARROW)
+        rows = browser.run("[...document.querySelectorAll('#rows tr')].map((row) => row.innerText.replace(/\\s+/g, ' '))")
+        assert rows[0] == "torso at rest 100 0.11 −0.29 0.00 – 3 s 6"
+        assert rows[2].startswith("left forearm lost")
+        assert "bad checksums: 3" in browser.run("document.body.innerText")
+        stage = box_of(browser, "#stage canvas")
+        pictures = {}
+        for scheme in ("light", "dark"):
+            browser.emulate(prefers_color_scheme=scheme)
+            browser.wait(f"matchMedia('(prefers-color-scheme: {scheme})').matches")
+            for k, t in enumerate((0.2, 0.9)):
+                t += 2.0 if scheme == "dark" else 0.0
+                page.show(person.pose(t, lost=("left_forearm",)))
+                browser.wait(f"window.wepose.time() === {t}")
+                time.sleep(0.5)
+                pictures[scheme, k] = region(browser.picture(), stage)
+            moved = np.abs(pictures[scheme, 0] - pictures[scheme, 1]).max(axis=2) > 40
+            rows_moved, columns_moved = np.nonzero(moved)
+            assert moved.mean() > 0.005, scheme
+            height, width = moved.shape
+            assert 0.2 * width < columns_moved.mean() < 0.8 * width
+            assert 0.2 * height < rows_moved.mean() < 0.9 * height
+        corner = np.s_[-40:, -40:]
+        assert pictures["light", 0][corner].mean() > 200
+        assert pictures["dark", 0][corner].mean() < 70
+
+        browser.call("Input.dispatchKeyEvent", type="keyDown", key="r", text="r")
+        browser.wait("document.querySelector('#answer').textContent.length > 0")
+        until = time.monotonic() + 10.0
+        while (keys := page.take_keys()) == []:
+            assert time.monotonic() < until
+        assert keys == ["r"]
+        assert browser.errors == []
+
+
+def test_dark_prints_light(model: BodyModel, person: Person, browser: Browser) -> None:
+    with LivePage(model, person.stage) as page:
+        browser.emulate(prefers_color_scheme="dark")
+        browser.go(page.url)
+        page.status(person.status())
+        page.show(person.pose(0.5))
+        browser.wait("window.wepose.time() === 0.5 && window.wepose.state() === 'ready'")
+        browser.run("dispatchEvent(new Event('beforeprint'))")
+        browser.wait("document.querySelector('#printed').complete && document.querySelector('#printed').naturalWidth > 100")
+        browser.emulate("print", prefers_color_scheme="dark")
+        time.sleep(0.5)
+        paper = browser.picture()
+        browser.run("dispatchEvent(new Event('afterprint'))")
+        browser.emulate(prefers_color_scheme="dark")
+        assert np.median(paper) > 200
+        assert paper[-30:].mean() > 150
+
+
+def test_it_says_that_the_connection_is_lost_and_comes_back(model: BodyModel, person: Person, browser: Browser) -> None:
+    browser.emulate(prefers_color_scheme="light")
+    page = LivePage(model, person.stage)
+    page.open()
+    port = int(page.url.split(":")[2].strip("/"))
+    browser.go(page.url)
+    page.show(person.pose(1.0))
+    page.status(person.status())
+    browser.wait("window.wepose.time() === 1 && window.wepose.state() === 'ready'")
+    page.close()
+    assert "Connection lost" in browser.wait("document.querySelector('#offline:not([hidden])')?.textContent")
+    with LivePage(model, person.stage, port=port) as again:
+        again.show(person.pose(2.0))
+        again.status(person.status("ended", "The session has ended."))
+        browser.wait("window.wepose.time() === 2 && document.querySelector('#offline').hidden")
+        browser.wait("window.wepose.state() === 'ended'")
+    assert "session has ended" in browser.wait("document.querySelector('#offline:not([hidden])')?.textContent")
+
+
+def test_a_colour_blind_reader_can_tell_the_hands_and_the_states(
+    model: BodyModel, person: Person, browser: Browser
+) -> None:
+    with LivePage(model, person.stage) as page:
+        browser.emulate(prefers_color_scheme="light")
+        browser.go(page.url)
+        page.status(person.status(lost=("left_forearm",)))
+        page.show(person.pose(0.5))
+        browser.wait("window.wepose.state() === 'ready'")
+        left, right = (box_of(browser, f"#legend span:nth-child({k}) i") for k in (1, 2))
+        shapes = browser.run("new Set([...document.querySelectorAll('#rows path')].map((p) => p.getAttribute('d'))).size")
+        assert shapes == 3
+        for kind in ("deuteranopia", "protanopia", "tritanopia", "achromatopsia"):
+            browser.call("Emulation.setEmulatedVisionDeficiency", type=kind)
+            time.sleep(0.3)
+            picture = pixels(browser.png())
+            colours = [region(picture, box)[1:-1].reshape(-1, 3).mean(axis=0) for box in (left, right)]
+            assert np.abs(colours[0] - colours[1]).max() > 25, kind
+        browser.call("Emulation.setEmulatedVisionDeficiency", type="none")

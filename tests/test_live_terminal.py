@@ -1,0 +1,141 @@
+"""The terminal's view: what it says, when, and that it leaves the terminal as it found it."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import pty
+import subprocess
+import sys
+import termios
+import textwrap
+import time
+
+import pytest
+from rich.console import Console
+
+from wepose_pin.live.state import SensorStatus, Status
+from wepose_pin.live.terminal import TerminalView, table
+
+
+def sensor(segment: str = "torso", **other: object) -> SensorStatus:
+    usual = {"rate_hz": 99.8, "lost": False, "static": False, "gyro_bias": (0.002, -0.005, 0.0)}
+    usual |= {"heading_std": math.radians(1.3), "heading_age": 34.4, "missing": 2, "late": 1, "duplicate": 0}
+    return SensorStatus(segment, **(usual | other))  # type: ignore[arg-type]
+
+
+def status(state: str = "ready", message: str = "Tracking.", sensors: tuple = (), **other: object) -> Status:
+    usual = {"progress": 1.0, "time": 12.5, "latency_ms": (3.2, 8.4), "recorded_s": 0.0, "problems": {}}
+    usual |= {"state": state, "message": message, "sensors": sensors or (sensor(),)}
+    return Status(**(usual | other))  # type: ignore[arg-type]
+
+
+def printed(one: Status) -> str:
+    console = Console(file=io.StringIO(), width=120)
+    console.print(table(one))
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_row_a_sensor() -> None:
+    lines = printed(status(sensors=(sensor(), sensor("left_forearm", static=True), sensor("head", lost=True)))).splitlines()
+    torso, forearm, head = (next(line for line in lines if line.startswith(name)) for name in ("torso", "left f", "head"))
+    assert torso.split() == "torso ▶ moving 100 0.11 −0.29 0.00 1.3 34 3".split()
+    assert "■ at rest" in forearm
+    assert "✕ lost" in head
+    assert any("latency 3.2 ms median, 8.4 ms in 99 of 100" in line for line in lines)
+
+
+def test_what_is_not_known_is_a_dash() -> None:
+    row = printed(status(sensors=(sensor(heading_std=math.nan, gyro_bias=(math.nan,) * 3),))).splitlines()
+    assert next(line for line in row if line.startswith("torso")).split()[4:8] == ["–"] * 4
+
+
+def test_the_start_pose_has_a_bar_and_the_rest_none() -> None:
+    assert "█" * 12 + "░" * 18 in printed(status("hold", "Stand still: 2 s more.", progress=0.4))
+    assert "░" not in printed(status())
+
+
+def test_recording_and_problems() -> None:
+    text = printed(status(recorded_s=7.0, problems={"bad checksums": 3, "none of it": 0}))
+    assert "● recording 7.0 s" in text
+    assert "bad checksums: 3" in text
+    assert "none of it" not in text
+
+
+def test_without_a_terminal_a_line_a_change() -> None:
+    file = io.StringIO()
+    with TerminalView(file, keys=False) as view:
+        for left in (3, 2, 1):
+            view.status(status("hold", f"Stand still: {left} s more."))
+        view.status(status(sensors=(sensor(lost=True),), time=20.0))
+        view.status(status(sensors=(sensor(lost=True),), time=21.0, problems={"[bad]": 1}))
+        view.status(status(time=22.0, problems={"[bad]": 9}))
+        view.status(status("ended", "The session has ended.", time=23.0))
+    assert file.getvalue().splitlines() == [
+        "12.5 s  hold: Stand still: 3 s more.",
+        "20.0 s  ready: Tracking.",
+        "20.0 s  torso: lost",
+        "21.0 s  [bad]: since now",
+        "22.0 s  torso: there",
+        "23.0 s  ended: The session has ended.",
+    ]
+
+
+SESSION = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from test_live_terminal import status
+from wepose_pin.live.terminal import TerminalView
+view = TerminalView()
+try:
+    view.status(status())
+    keys = []
+    while "q" not in keys:
+        keys += view.take_keys()
+        time.sleep(0.01)
+finally:
+    view.close()
+print("keys", "".join(keys))
+"""
+
+
+def read_until(master: int, wanted: bytes, seconds: float = 60.0) -> bytes:
+    got, until = b"", time.monotonic() + seconds
+    while wanted not in got:
+        assert time.monotonic() < until, got
+        try:
+            got += os.read(master, 65536)
+        except OSError:
+            break
+    assert wanted in got, got
+    return got
+
+
+@pytest.mark.parametrize("end", ["q", "interrupt"])
+def test_keys_and_the_terminal_afterwards(end: str) -> None:
+    master, slave = pty.openpty()
+    before = termios.tcgetattr(slave)
+    script = textwrap.dedent(SESSION.format(tests=os.path.dirname(__file__)))
+    take = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"  # the terminal is ours, and Ctrl-C an interrupt
+    run = subprocess.Popen(
+        [sys.executable, "-c", take + script], stdin=slave, stdout=slave, stderr=slave, start_new_session=True
+    )
+    try:
+        seen = read_until(master, "latency".encode())
+        assert "▶ ready".encode() in seen
+        until = time.monotonic() + 20.0
+        while termios.tcgetattr(slave)[3] & termios.ICANON:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        os.write(master, b"xR" + (b"q" if end == "q" else b"\x03"))
+        seen = read_until(master, b"keys rq" if end == "q" else b"KeyboardInterrupt")
+        run.wait(20)
+        assert (run.returncode == 0) is (end == "q")
+        assert termios.tcgetattr(slave) == before
+        assert b"\x1b[?25h" in seen  # the cursor is there again
+    finally:
+        run.kill()
+        run.wait()
+        os.close(master)
+        os.close(slave)

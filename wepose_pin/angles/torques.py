@@ -1,0 +1,139 @@
+"""Joint torques of a motion by inverse dynamics: estimates, from the model's inertias and a smoothed configuration.
+
+The base is fixed and nothing but gravity acts on the body: no ground, no load in the hands. Accelerations are second
+derivatives of measured orientations, so the motion is smoothed first, by a Butterworth filter of second order that runs
+forwards and backwards (no delay; the two passes together have half the amplitude at the cut-off, that is −6 dB).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import polars as pl
+from scipy.signal import butter, sosfiltfilt
+
+from ..errors import BadData, BadModel, BadOption
+
+CUTOFF_HZ = 6.0  # usual for the motion of limbs
+_LEAST_MASS = 1e-6  # [kg]
+
+
+@dataclass(frozen=True)
+class Torques:
+    """What the joints do.
+
+    Parameters
+    ----------
+    time : (n,) [s]
+    torque : joint → (n, k) [Nm], of a prismatic joint [N]; k = 1, of a spherical joint 3: along the axes of its frame
+    q, v, a : (n, nq), (n, nv), (n, nv) smoothed configuration and its derivatives, what the torques were made from
+    cutoff_hz : of the smoothing
+    mass : [kg] of all that moves
+    """
+
+    time: np.ndarray
+    torque: Mapping[str, np.ndarray]
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    cutoff_hz: float
+    mass: float
+
+    def summary(self) -> dict[str, Any]:
+        """For ``summary.json``."""
+        size = {name: np.linalg.norm(tau, axis=1) for name, tau in self.torque.items()}
+        return {
+            "note": "estimates: the model's inertias, fixed base, nothing in the hands, smoothed motion",
+            "cutoff_hz": self.cutoff_hz,
+            "mass_kg": round(self.mass, 3),
+            "rms": {name: round(float(np.sqrt(np.mean(of**2))), 3) for name, of in size.items()},
+            "largest": {name: round(float(of.max()), 3) for name, of in size.items()},
+        }
+
+
+def joint_torques(
+    model: pin.Model,
+    time: np.ndarray,
+    q: np.ndarray,
+    cutoff_hz: float = CUTOFF_HZ,
+    joints: Collection[int] | None = None,
+) -> Torques:
+    """Torques of the joints that bear a mass, by `pin.rnea`.
+
+    Parameters
+    ----------
+    model : with inertias in [kg], [kg m²], z up; a `BodyModel` has one in `pin`
+    time : (n,) [s], uniform
+    q : (n, nq)
+    cutoff_hz : of the smoothing; below half of the sampling rate
+    joints : those that are asked for, by Pinocchio's number; None: all that bear a mass
+
+    Raises
+    ------
+    BadModel
+        The model has no masses.
+    BadOption
+        A cut-off that is not above zero and below half the rate.
+    BadData
+        Too few samples to smooth.
+    """
+    mass = sum(inertia.mass for inertia in model.inertias[1:])
+    if mass < _LEAST_MASS:
+        raise BadModel(f"{model.name}: no moving link has a mass; torques need a URDF with <inertial>")
+    rate_hz = (len(time) - 1) / float(time[-1] - time[0]) if len(time) > 1 else 0.0
+    if not 0.0 < cutoff_hz < 0.5 * rate_hz:
+        raise BadOption(f"a cut-off of {cutoff_hz:g} Hz; above 0 and below half the rate, {0.5 * rate_hz:g} Hz")
+    # The filter's transient is let go over a second beyond each end, where the motion is mirrored through its end.
+    pad = min(len(time) - 1, max(10, round(rate_hz)))
+    if pad < 10:
+        raise BadData(f"{len(time)} samples are too few for torques; at least 11 are needed")
+    smooth = sosfiltfilt(butter(2, cutoff_hz, fs=rate_hz, output="sos"), _continuous(model, q), axis=0, padlen=pad)
+    q = np.array([pin.normalize(model, row) for row in smooth])
+    v, a = derivatives(model, q, rate_hz)
+    data = model.createData()
+    tau = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
+    torque = {}
+    for joint in range(1, model.njoints):
+        bears = sum(model.inertias[k].mass for k in model.subtrees[joint])
+        asked = joints is None or joint in joints
+        if asked and bears > _LEAST_MASS and "Mimic" not in model.joints[joint].shortname():
+            first = model.idx_vs[joint]
+            torque[model.names[joint]] = tau[:, first : first + model.nvs[joint]]
+    return Torques(time, torque, q, v, a, cutoff_hz, mass)
+
+
+def derivatives(model: pin.Model, q: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities and accelerations (n, nv) of configurations (n, nq): central differences, the ends repeat."""
+    half = np.array([pin.difference(model, a, b) for a, b in zip(q[:-1], q[1:], strict=True)]) * rate_hz
+    v, a = np.empty((len(q), model.nv)), np.empty((len(q), model.nv))
+    v[1:-1] = 0.5 * (half[1:] + half[:-1])
+    a[1:-1] = (half[1:] - half[:-1]) * rate_hz
+    v[0], v[-1], a[0], a[-1] = half[0], half[-1], a[1], a[-2]
+    return v, a
+
+
+def _continuous(model: pin.Model, q: np.ndarray) -> np.ndarray:
+    """Signs of quaternions that do not jump, angles of hinges unwrapped."""
+    q = q.copy()
+    for joint in range(1, model.njoints):
+        first, n = model.idx_qs[joint], model.nqs[joint]
+        if n == 4:
+            quat = q[:, first : first + 4]
+            flip = np.cumprod(np.where(np.einsum("ni,ni->n", quat[1:], quat[:-1]) < 0.0, -1.0, 1.0))
+            q[1:, first : first + 4] *= flip[:, None]
+        elif n == 1 and "Prismatic" not in model.joints[joint].shortname():
+            q[:, first] = np.unwrap(q[:, first])
+    return q
+
+
+def torque_table(torques: Torques) -> pl.DataFrame:
+    """The columns of ``torques.parquet``: ``time``; ``<joint>_nm``, of a spherical joint ``<joint>_x_nm,_y_nm,_z_nm``."""
+    table = {"time": torques.time}
+    for name, tau in torques.torque.items():
+        axes = ("",) if tau.shape[1] == 1 else ("_x", "_y", "_z")
+        table |= {f"{name}{axis}_nm": tau[:, k] for k, axis in enumerate(axes)}
+    return pl.DataFrame(table)
