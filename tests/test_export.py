@@ -178,6 +178,7 @@ def test_bvh_puts_every_joint_where_it_was(result: Path, pose: Pose, tmp_path: P
     read = pybvh.read_bvh_file(tmp_path / "x.bvh")
     assert (read.frame_count, read.frame_time) == (301, 0.01)
     assert read.joint_names[:2] == ["Hips", "Spine"]
+    assert (read.world_up, read.rest_forward) == ("+y", "+z")
     positions = read.node_positions()
     names = [node.name for node in read.nodes]
     for joint, point in BVH_POINTS.items():

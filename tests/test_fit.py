@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+import polars as pl
 import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.angles.torques import pose_torques
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.fit import fit, limits_of, unseen
 from wepose_pin.pose import configuration, deviation, forward_kinematics, placements
 from wepose_pin.readers import load_session
+from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track
+from wepose_pin.writers import write_result
 
 ARM = ["left_upper_arm", "left_forearm", "left_hand"]
 HINGES = ("jLeftElbow_roty", "jLeftElbow_rotz", "jLeftWrist_rotx", "jLeftWrist_rotz")
@@ -139,3 +144,20 @@ def test_a_person_on_48_degrees_of_freedom(data: Path, body: BodyModel) -> None:
         assert np.all(down < most)
     at, lower, upper = limits_of(body.pin, [body.pin.getJointId(name) for name in HINGES])
     assert np.all((pose.q[:, at] >= lower) & (pose.q[:, at] <= upper))
+
+
+def test_limits_can_be_let_go_and_torques_are_written_as_estimates(
+    body: BodyModel, simulation: Simulation, tmp_path: Path
+) -> None:
+    pose = track(simulation.recording(), model=body, limits=False)
+    assert pose.q is not None
+    at, lower, upper = limits_of(body.pin, [body.pin.getJointId(name) for name in HINGES])
+    assert np.any((pose.q[:, at] < lower - 0.01) | (pose.q[:, at] > upper + 0.01))
+    write_result(tmp_path, pose, torques=pose_torques(pose))
+    table = pl.read_parquet(tmp_path / "torques.parquet")
+    assert {"time", "LeftUpperArm_x_nm", "jLeftElbow_rotz_nm"} <= set(table.columns)
+    assert not [name for name in table.columns if "Knee" in name]
+    told = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["torques"]
+    assert told["note"].startswith("estimates")
+    assert told["cutoff_hz"] == 6.0
+    assert told["95_percent_below"].keys() == told["rms"].keys() >= {"LeftUpperArm", "jRightElbow_rotz"}

@@ -24,6 +24,7 @@ from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of
 if TYPE_CHECKING:
     from .calibration import Calibration, Verdict
     from .live import Output
+    from .recording import Recording
     from .simulation import Imperfections
     from .subject import Subject
     from .validation import Document
@@ -135,6 +136,8 @@ def track(
     causal: bool = False,
     gaps: bool = False,
     covariance: bool = False,
+    limits: bool = True,
+    torques: bool = False,
     report: bool = True,
     force: bool = False,
 ) -> None:
@@ -149,17 +152,21 @@ def track(
         session: session.toml, or the folder that holds it; or a recording of `wepose live`.
         out: Folder for pose.parquet, subject.toml, subject.urdf, summary.json, view.html, report.html.
         subject: subject.toml of `wepose calibrate`, or its folder; without it lengths are an average person's.
-        model: A body's URDF, or a TOML that names it and its links (docs/models.md); without it ours.
+        model: A body's URDF, or a TOML that names it and its links (docs/models.md); without it ours. Where the
+            sensors are on links of another chain (start_pose = "configuration"), the URDF of that.
         method: The orientation filter; without it amekf, or that of the live session.
         causal: Begin at the end of the start pose and look at nothing ahead, as `wepose live` does.
         gaps: Accept lost samples for longer than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap).
         covariance: Write the covariances of orientations and points, not only their standard deviations.
+        limits: Let elbows and wrists of one or two axes pass the model's limits.
+        torques: Write torques.parquet too, joint torques by the model's inertias and the smoothed motion: estimates.
         report: Leave out report.html (warnings and what to do, noise, drift, hands, joint angles).
         force: Replace files of an earlier run.
     """
     from .filters import BEST
     from .model import load_model
     from .readers import is_live_log, load_session, read_live_log
+    from .recording import CONFIGURATION
     from .subject import load_subject, subject_of
     from .tracking import track as follow
     from .viewer import pose_html
@@ -168,7 +175,6 @@ def track(
     with whole_folder(out, force) as folder, _steps(4 if report else 3) as step:
         step("reading")
         who = load_subject(subject) if subject else None
-        body = load_model(model) if model else None
         if is_live_log(session):
             log = read_live_log(session)
             recording, causal = log.recording, causal or (method is None and subject is None)
@@ -177,9 +183,21 @@ def track(
                 who = subject_of(log.header["subject"], session)
         else:
             recording, method = load_session(session, gaps=gaps), method or BEST
+        if model is not None and recording.start_pose == CONFIGURATION:
+            if who is not None or causal:
+                raise BadOption(f"--{'subject' if who else 'causal'}: for a person; {session} is of another chain")
+            _track_chain(recording, model, folder, step, method=method, limits=limits, torques=torques)
+            _say(f"Chain: {out / 'joints.parquet'}  {out / 'pose.parquet'}  {out / 'summary.json'}")
+            return
+        body = load_model(model) if model else None
         step(f"tracking by {method}")
-        pose = follow(recording, who, method=method, model=body, causal=causal)
-        write_result(folder, pose, covariance, recording.phases)
+        pose = follow(recording, who, method=method, model=body, causal=causal, limits=limits)
+        found = None
+        if torques:
+            from .angles.torques import pose_torques
+
+            found = pose_torques(pose)
+        write_result(folder, pose, covariance, recording.phases, found)
         step("making the page")
         assert pose.model is not None
         page = pose_html(pose.model, pose, phases=recording.phases, title=recording.name)
@@ -953,6 +971,43 @@ def _changed(imperfections: Imperfections, changes: tuple[str, ...]) -> Imperfec
         except ValueError as error:
             raise BadOption(f"--set {text}: {error}") from None
     return imperfections
+
+
+def _track_chain(
+    recording: Recording,
+    urdf: Path,
+    folder: Path,
+    step: Callable[[str], None],
+    *,
+    method: str,
+    limits: bool,
+    torques: bool,
+) -> None:
+    """`track` where the sensors are on links of a chain that is no person's arms."""
+    from .angles.torques import joint_torques
+    from .model.robot import load_robot
+    from .tracking import track_chain
+    from .writers.chain import write_chain
+
+    model = load_robot(urdf)
+    step(f"tracking by {method}")
+    chain = track_chain(recording, model, method=method, limits=limits)
+    write_chain(folder, chain, joint_torques(model, chain.time, chain.q) if torques else None)
+    summary = chain.summary()
+    _warn(summary["warnings"])
+    _print_table(
+        f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {method}, on {model.name}",
+        ("link", "missed by the joints, rms [deg]"),
+        [(link, f"{angle:.2f}") for link, angle in summary["not_followed_rms_deg"].items()],
+    )
+    _print_table(
+        "Joints [rad or m]",
+        ("joint", "least", "greatest", ""),
+        [
+            (name, f"{value.min():.3f}", f"{value.max():.3f}", "left open" if name in chain.open else "")
+            for name, value in chain.joints.items()
+        ],
+    )
 
 
 # What the user sees ------------------------------------------------------------------------------------------------

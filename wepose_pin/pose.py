@@ -99,8 +99,8 @@ def configuration(
 ) -> np.ndarray:
     """Configuration `q` (n, nq) in which the segments have their measured orientations, or come nearest to them.
 
-    What hangs on spherical joints only has its orientations exactly. An arm with fewer axes somewhere has the sum of its
-    segments' squared angles to what was measured at its least, which `deviation` gives one by one. Segments without an
+    What hangs on spherical joints only has its orientations exactly. An arm with fewer axes somewhere has the least sum
+    of its segments' squared angles to what was measured, which `deviation` gives one by one. Segments without an
     orientation are rigid with the one above. `wepose_pin.model.chains` says which joints move.
 
     Parameters

@@ -79,7 +79,10 @@ def pose_html(
     or where nothing hangs on it (head, pelvis); what is not known is not drawn.
     """
     frames = frame_indices(pose.time, fps)
-    q = configuration(model, {segment: quat_WL[frames] for segment, quat_WL in pose.quat_WL.items()})
+    if pose.q is not None:
+        q = pose.q[frames]
+    else:
+        q = configuration(model, {segment: quat_WL[frames] for segment, quat_WL in pose.quat_WL.items()})
     visuals = [visual for visual in model.visuals if visual.link in known_links(model, pose.quat_WL)]
     return view_html(
         visuals,

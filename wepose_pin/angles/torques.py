@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ import polars as pl
 from scipy.signal import butter, sosfiltfilt
 
 from ..errors import BadData, BadModel, BadOption
+from ..model import chains
+from ..tracking import TrackedPose
 
 CUTOFF_HZ = 6.0  # usual for the motion of limbs
 _LEAST_MASS = 1e-6  # [kg]
@@ -51,7 +54,8 @@ class Torques:
             "cutoff_hz": self.cutoff_hz,
             "mass_kg": round(self.mass, 3),
             "rms": {name: round(float(np.sqrt(np.mean(of**2))), 3) for name, of in size.items()},
-            "largest": {name: round(float(of.max()), 3) for name, of in size.items()},
+            # Not the largest: that is where a fit leapt from one valley to another, or a sensor was hit.
+            "95_percent_below": {name: round(float(np.quantile(of, 0.95)), 3) for name, of in size.items()},
         }
 
 
@@ -106,9 +110,21 @@ def joint_torques(
     return Torques(time, torque, q, v, a, cutoff_hz, mass)
 
 
+def pose_torques(pose: TrackedPose, cutoff_hz: float = CUTOFF_HZ) -> Torques:
+    """`joint_torques` of a person, of the joints that follow measured segments.
+
+    Masses are the model's, stretched with the subject's lengths (`BodyModel.with_lengths`), not the person's.
+    """
+    assert pose.model is not None
+    assert pose.q is not None
+    model = pose.model.pin
+    moved = {joint for name, chain in chains(model).items() if name in pose.quat_WL for joint in chain.joints}
+    return joint_torques(model, pose.time, pose.q, cutoff_hz, moved)
+
+
 def derivatives(model: pin.Model, q: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
     """Velocities and accelerations (n, nv) of configurations (n, nq): central differences, the ends repeat."""
-    half = np.array([pin.difference(model, a, b) for a, b in zip(q[:-1], q[1:], strict=True)]) * rate_hz
+    half = np.array([pin.difference(model, a, b) for a, b in pairwise(q)]) * rate_hz
     v, a = np.empty((len(q), model.nv)), np.empty((len(q), model.nv))
     v[1:-1] = 0.5 * (half[1:] + half[:-1])
     a[1:-1] = (half[1:] - half[:-1]) * rate_hz
@@ -131,7 +147,7 @@ def _continuous(model: pin.Model, q: np.ndarray) -> np.ndarray:
 
 
 def torque_table(torques: Torques) -> pl.DataFrame:
-    """The columns of ``torques.parquet``: ``time``; ``<joint>_nm``, of a spherical joint ``<joint>_x_nm,_y_nm,_z_nm``."""
+    """The columns of ``torques.parquet``: ``time``; ``<joint>_nm``, of a spherical joint ``<joint>_x_nm``, _y, _z."""
     table = {"time": torques.time}
     for name, tau in torques.torque.items():
         axes = ("",) if tau.shape[1] == 1 else ("_x", "_y", "_z")

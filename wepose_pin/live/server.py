@@ -8,6 +8,7 @@ import hashlib
 import json
 import math
 import re
+import socket
 import threading
 from collections import deque
 from ipaddress import ip_address
@@ -49,18 +50,19 @@ class Server:
         scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
         digests = [hashlib.sha256(script.encode("utf-8")).digest() for script in scripts]
         self._scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
-        from tornado.netutil import bind_sockets
-
         if not host:  # to the system that would be every interface
             raise BadOption("the live page needs an address to listen on; 127.0.0.1 is this machine only")
+        if not 0 <= port < 65536:
+            raise BadOption(f"the live page: port {port}; a number from 1 to 65535, or 0 for any that is free")
         try:
-            self._sockets = bind_sockets(port, address=host)
-        except (OSError, OverflowError) as error:
-            reason = error.strerror if isinstance(error, OSError) else str(error)
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.create_server((host, port), family=family, backlog=16)
+        except OSError as error:
             raise BadOption(
-                f"the live page cannot listen on {host}:{port}: {reason}; another port, or 0 for any that is free"
+                f"the live page cannot listen on {host}:{port}: {error.strerror}; another port, or 0 for any that is free"
             ) from None
-        self.port = int(self._sockets[0].getsockname()[1])
+        self._socket.setblocking(False)
+        self.port = int(self._socket.getsockname()[1])
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
         self._loop = asyncio.new_event_loop()
         self._end = asyncio.Event()
@@ -87,7 +89,7 @@ class Server:
         from tornado.httpserver import HTTPServer
 
         server = HTTPServer(_application(self), max_header_size=16384)
-        server.add_sockets(self._sockets)
+        server.add_socket(self._socket)
         due = self._loop.time()
         while not self._end.is_set():
             self._feed()
@@ -165,9 +167,13 @@ def _application(server: Server) -> Any:
     from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
     def refuse(handler: RequestHandler) -> None:
-        if not server.knows(handler.request.host):
+        host, origin = handler.request.host, handler.request.headers.get("Origin")
+        if not server.knows(host):
             handler.set_status(403)
             handler.finish("This page is known by address, or as localhost.")
+        elif origin is not None and origin != f"http://{host}":
+            handler.set_status(403)
+            handler.finish("This page speaks to itself only.")
 
     class Page(RequestHandler):
         def prepare(self) -> None:
@@ -197,9 +203,6 @@ def _application(server: Server) -> Any:
 
         def prepare(self) -> None:
             refuse(self)
-
-        def check_origin(self, origin: str) -> bool:
-            return origin == f"http://{self.request.host}"
 
         def open(self) -> None:
             if not server.joined(self):
@@ -253,7 +256,7 @@ def status_json(status: Status) -> str:
                     "rate_hz": _rounded(sensor.rate_hz, 1),
                     "lost": bool(sensor.lost),
                     "static": bool(sensor.static),
-                    "bias_deg_s": [_rounded(math.degrees(axis), 3) for axis in sensor.gyro_bias],
+                    "bias_deg_s": [_rounded(math.degrees(axis), 5) for axis in sensor.gyro_bias],
                     "heading_std_deg": _rounded(math.degrees(sensor.heading_std), 2),
                     "heading_age_s": _rounded(sensor.heading_age, 1),
                     "missing": sensor.missing,

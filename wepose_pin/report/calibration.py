@@ -479,6 +479,8 @@ def _looked_at(name: str, contact: _Contact) -> str:
     what, _, of = name.partition(".")
     if what == "heading":
         return f"± heading, {plain(of)}"
+    if what == "tape":
+        return f"tape of {plain(of)}, against all else that is known"
     return {
         "anatomy": "doubt of the sensors' places, by anatomy",
         "upper_arms": "± upper arm, the scale apart",
@@ -501,6 +503,7 @@ def _shown(value: float, unit: str, digits: str) -> str:
         "relative": (100.0, "%"),
         "share": (100.0, "%"),
         "std of the average person": (1.0, "std"),
+        "std of what is known without it": (1.0, "std"),
         "of one independent look": (1.0, ""),
     }.get(unit, (1.0, unit))
     return f"{scale * value:{digits}} {shown}".replace(" °", "°").strip()

@@ -46,8 +46,8 @@ def track(
     """
     if recording.start_pose == CONFIGURATION:
         raise BadOption(
-            f'{recording.where()}: start_pose = "{CONFIGURATION}" is that of a chain: give its URDF (--model; in Python '
-            f"track_chain)"
+            f'{recording.where()}: start_pose = "{CONFIGURATION}" is that of a chain: give its URDF (--model; in '
+            f"Python track_chain)"
         )
     if causal:
         rest, segments = causal_segments(recording, subject, method=method, static_test=static_test)

@@ -52,7 +52,8 @@ class TrackedPose(Pose):
             sensors[segment] = about
         missed = self._not_followed()
         lame = [
-            f"{segment}: the model's joints are too few or end too soon for its orientation, they miss it by {angle:.3g} deg (rms)"
+            f"{segment}: the model's joints are too few or end too soon for its orientation, they miss it by "
+            f"{angle:.3g} deg (rms)"
             for segment, angle in missed.items()
             if angle > _WORTH_A_WARNING_DEG
         ]

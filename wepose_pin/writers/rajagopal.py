@@ -9,46 +9,35 @@ are zero.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..model.chains import Chain, about, conjugate, multiply, solve
-from ..recording import AXES
 
-
-class Body(NamedTuple):
-    """A body of the model: its name, and where its x, y, z point in our frame of the segment."""
-
-    name: str
-    axes: tuple[str, str, str]
-
-
-# Of a forearm and a hand x is the side of the palm, which in the N-pose is the thigh's: they are pronated by 90° there.
-_UPRIGHT, _RIGHT, _LEFT = ("+x", "+z", "-y"), ("+y", "+z", "+x"), ("-y", "+z", "-x")
+# Segment → body. The model has no head of its own.
 BODIES = {
-    "pelvis": Body("pelvis", _UPRIGHT),
-    "torso": Body("torso", _UPRIGHT),
-    "right_upper_arm": Body("humerus_r", _UPRIGHT),
-    "right_forearm": Body("radius_r", _RIGHT),
-    "right_hand": Body("hand_r", _RIGHT),
-    "left_upper_arm": Body("humerus_l", _UPRIGHT),
-    "left_forearm": Body("radius_l", _LEFT),
-    "left_hand": Body("hand_l", _LEFT),
+    "pelvis": "pelvis",
+    "torso": "torso",
+    "right_upper_arm": "humerus_r",
+    "right_forearm": "radius_r",
+    "right_hand": "hand_r",
+    "left_upper_arm": "humerus_l",
+    "left_forearm": "radius_l",
+    "left_hand": "hand_l",
 }
 # Axes of a right arm's joints with two, in the body above; a left arm's are mirrored on the sagittal plane.
 ELBOW = (np.array([0.22604696, 0.022269, 0.97386183]), np.array([0.05639803, 0.99840646, 0.001952]))
 WRIST = (np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
+# Of each of these joints' angles the middle of its range [rad]: they are given within half a turn of it. Followed over
+# time, an elbow that was once bent as none can be might keep a full turn too much.
+_MIDDLE = {"elbow_flex": np.radians(75.0), "pro_sup": np.radians(90.0), "wrist_flex": 0.0, "wrist_dev": 0.0}
 _MIRRORED = np.array([-1.0, -1.0, 1.0, 1.0])  # xyzw, z → −z
 _STILL = np.array([0.0, 0.0, 0.0, 1.0])
+_QUAT_GW = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).as_quat()
 _ROUNDS = 40  # Levenberg-Marquardt; about ten are the rule
 _CLOSE = 1e-9  # [rad] of the last step
-
-
-def _quat_LB(axes: tuple[str, str, str]) -> np.ndarray:
-    return Rotation.from_matrix(np.column_stack([AXES[axis] for axis in axes])).as_quat()
 
 
 def in_ground(p_W: np.ndarray) -> np.ndarray:
@@ -57,21 +46,26 @@ def in_ground(p_W: np.ndarray) -> np.ndarray:
 
 
 def orientations(quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Body → `quat_GB` (n, 4) xyzw, of the segments that are bodies of the model: all but the head."""
-    quat_GW = conjugate(_quat_LB(_UPRIGHT))
-    return {
-        body.name: multiply(multiply(quat_GW, quat_WL[segment]), _quat_LB(body.axes))
-        for segment, body in BODIES.items()
-        if segment in quat_WL
-    }
+    """Body → `quat_GB` (n, 4) xyzw, of the segments that are bodies of the model.
+
+    Who stands in the N-pose, palms to the thighs, is the model with 90° of `pro_sup` and zero of all others.
+    """
+    pronated = about(ELBOW[1] / np.linalg.norm(ELBOW[1]), np.array(np.pi / 2.0))
+    found = {}
+    for segment, body in BODIES.items():
+        if segment in quat_WL:
+            moved = multiply(multiply(_QUAT_GW, quat_WL[segment]), conjugate(_QUAT_GW))
+            turn = pronated if body.startswith(("radius", "hand")) else _STILL
+            found[body] = multiply(moved, turn * _MIRRORED if body.endswith("_l") else turn)
+    return found
 
 
 def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Coordinate → (n,) [rad], followed over time; body → angle [rad], rms, by which the model misses it.
+    """Coordinate → (n,) [rad]; body → angle [rad], rms, by which the model misses it.
 
-    Torso, pelvis and shoulders turn about z, x, y and reach every orientation. Elbow and wrist have two axes: of each
-    arm the sum of the squared angles between the model's bodies and the measured ones is the least, as it is for
-    OpenSense with equal weights. A pelvis without a sensor stands still and upright.
+    Torso, pelvis and shoulders turn about z, x, y, reach every orientation and are followed over time. Elbow and wrist
+    have two axes: of each arm the sum of the squared angles between the model's bodies and the measured ones is the
+    least, as it is for OpenSense with equal weights. A pelvis without a sensor stands still and upright.
     """
     found: dict[str, np.ndarray] = {}
     missed: dict[str, float] = {}
@@ -88,8 +82,7 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
         quat = [quat_GB[name] * mirror for name in arm]
         if len(arm) == 3 or (len(arm) == 2 and arm[1] == f"radius_{side}"):
             quat[0], angles, left = _arm(quat)
-            names = ("elbow_flex", "pro_sup", "wrist_flex", "wrist_dev")
-            found |= {f"{name}_{side}": np.unwrap(value) for name, value in zip(names, angles, strict=False)}
+            found |= {f"{name}_{side}": value for name, value in zip(_MIDDLE, angles, strict=False)}
             missed |= {name: float(np.sqrt(np.mean(angle**2))) for name, angle in zip(arm, left, strict=True)}
         if "torso" in quat_GB:
             shoulder = multiply(conjugate(quat_GB["torso"] * mirror), quat[0])
@@ -128,6 +121,8 @@ def _arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list[np.
         damping = np.where(better, damping / 10.0, damping * 10.0).clip(1e-12, 1e6)
         if np.abs(step).max() < _CLOSE:
             break
+    middle = np.array(list(_MIDDLE.values())[: angles.shape[1]])
+    angles -= 2.0 * np.pi * np.round((angles - middle) / (2.0 * np.pi))
     return humerus, list(angles.T), [np.linalg.norm(part, axis=1) for part in np.split(error, len(quat), axis=1)]
 
 

@@ -1,0 +1,114 @@
+"""`wepose live` as a user runs it: killed, stopped, and told wrong things."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from test_causal import first
+
+from wepose_pin import cli
+from wepose_pin.readers import load_session
+from wepose_pin.readers.live_log import read_live_log
+from wepose_pin.simulation import Simulation
+from wepose_pin.writers import write_session
+
+SPEED = 4.0
+
+
+@pytest.fixture(scope="module")
+def session(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Forty seconds, on disk."""
+    folder = tmp_path_factory.mktemp("session")
+    write_session(folder, first(simulation.recording("forty"), 4000))
+    return folder
+
+
+def run(*arguments: str, code: int = 0) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(list(arguments))
+    assert stop.value.code == code
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_ended_at_any_moment_the_file_holds_what_was_shown(session: Path, tmp_path: Path, number: int) -> None:
+    file = tmp_path / "a.wepose"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.settimeout(120.0)
+        command = [sys.executable, "-m", "wepose_pin.cli", "live", "--source", f"replay:{session}", "--no-page"]
+        command += ["--record", str(file), "--speed", str(SPEED), "--udp", str(listening.getsockname()[1])]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        shown = {}
+        while len(shown) < 400:
+            message = json.loads(listening.recv(65536))
+            shown[message["t"]] = message["segments"]
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+        assert err == "", out
+        assert process.returncode == (-number if number == signal.SIGKILL else 0)
+    found = read_live_log(file)
+    times = found.recording.time[found.first : found.first + len(found.quat_WL)]
+    # What a kill may cost is a second of the day, not of the replay.
+    assert times[-1] > max(shown) - (SPEED * 1.0 if number == signal.SIGKILL else 0.0)
+    for t, segments in list(shown.items())[:300:30]:
+        k = int(np.argmin(np.abs(times - t)))
+        for i, name in enumerate(found.header["sensors"]):
+            np.testing.assert_allclose(found.quat_WL[k, i], segments[name], atol=1e-6)
+    run("track", str(file), "-o", str(tmp_path / "result"), "--no-report")
+    pose = pl.read_parquet(tmp_path / "result" / "pose.parquet")
+    for i, name in enumerate(found.header["sensors"]):
+        for c, part in enumerate(("qx", "qy", "qz", "qw")):
+            assert np.array_equal(pose[f"{name}_{part}"].to_numpy()[: len(times)], found.quat_WL[:, i, c])
+    assert json.loads((tmp_path / "result" / "summary.json").read_text(encoding="utf-8"))["causal"] is True
+
+
+def test_a_replay_and_causal_tracking_give_the_same_table(session: Path, tmp_path: Path) -> None:
+    file = tmp_path / "a.wepose"
+    run("live", "--source", f"replay:{session}", "--speed", "max", "--record", str(file), "--no-page")
+    run("track", str(file), "-o", str(tmp_path / "a"), "--no-report")
+    run("track", str(session), "--causal", "-o", str(tmp_path / "b"), "--no-report")
+    a, b = (pl.read_parquet(tmp_path / name / "pose.parquet") for name in ("a", "b"))
+    assert a.drop("time").equals(b.drop("time"))
+    np.testing.assert_allclose(a["time"].to_numpy(), b["time"].to_numpy(), atol=1e-9)
+    assert a["time"][0] > load_session(session).phases["start"][0][1]
+    # With a method of its own it is tracked anew, as a whole.
+    run("track", str(file), "-o", str(tmp_path / "c"), "--method", "smoother", "--no-report")
+    assert len(pl.read_parquet(tmp_path / "c" / "pose.parquet")) == 4000
+
+
+def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "there.wepose"
+    file.write_bytes(b"something")
+    replay = f"replay:{session}"
+    for arguments, said in (
+        (["--source", "telepathy:9"], "source 'telepathy:9' is none; there is: replay:PATH"),
+        (["--source", "replay:nowhere"], "nowhere: no such file"),
+        (["--source", replay, "--speed", "-1"], "speed: '-1'; a positive number"),
+        (["--source", replay, "--record", str(file)], "there.wepose: exists; --force replaces it"),
+        (["--source", replay, "--record", str(tmp_path / "no" / "a.wepose")], "a.wepose: cannot be written"),
+        (["--source", replay, "--subject", str(tmp_path / "none")], "none: no such file; `wepose calibrate` writes"),
+        (["--source", replay, "--udp", "somewhere"], "UDP out: 'somewhere'; a port or HOST:PORT"),
+        (["--source", replay, "--port", "70000"], "the live page: port 70000; a number from 1 to 65535"),
+        (["--source", replay, "--method", "smoother"], "smoother"),
+    ):
+        run("live", *arguments, *([] if "--port" in arguments else ["--no-page"]), code=2)
+        err = capsys.readouterr().err.strip()
+        assert said in err
+        assert len(err.splitlines()) == 1
+    assert file.read_bytes() == b"something"
+    run("track", str(file), "-o", str(tmp_path / "r"), code=2)
+
+
+def test_unknown_mounts_are_said_before_anybody_stands_still(capsys: pytest.CaptureFixture[str]) -> None:
+    run("live", "--source", "mti:/dev/null=torso", "--no-page", code=2)
+    err = capsys.readouterr().err.strip()
+    assert "how the sensor of torso is mounted is not known: give --subject" in err
+    assert len(err.splitlines()) == 1

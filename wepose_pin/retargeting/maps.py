@@ -1,0 +1,244 @@
+"""A robot's map: which of its links are shoulder, elbow and hand, how it stands, how fast it may change speed."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..assets import asset
+from ..errors import BadModel, MissingFile, one_of
+
+ROBOTS = ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1")
+SIDES = ("left", "right")
+AXES = {
+    f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"
+}
+EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
+_KEYS = ("format", "urdf", "srdf", "about", "up", "forward", "base", "rest", "limits", "arms")
+_ARM_KEYS = ("joints", "shoulder", "elbow", "hand")
+
+
+class LinkPoint(NamedTuple):
+    """A point of the robot: where it lies in a link [m]."""
+
+    link: str
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ArmMap:
+    """One arm of the robot.
+
+    Parameters
+    ----------
+    joints : from the shoulder to the hand; all others stay at rest
+    shoulder : the point that is the person's shoulder; it stays where it is at rest
+    elbow : None for an arm whose elbow is left to the solver
+    hand : the point that is the person's palm
+    fingers, thumb : axes of the hand's link along the fingers, and to the thumb's side
+    """
+
+    joints: tuple[str, ...]
+    shoulder: LinkPoint
+    elbow: LinkPoint | None
+    hand: LinkPoint
+    fingers: str
+    thumb: str
+
+
+@dataclass(frozen=True)
+class RobotMap:
+    """All that retargeting has to know of a robot beyond its URDF.
+
+    Parameters
+    ----------
+    name : of the robot
+    where : for error texts
+    urdf, srdf : its files; without an SRDF what touches at rest, or always, is not looked at
+    base : link whose axes `up` and `forward` are; empty: the root
+    up, forward : axes of the base that point up, and to where the person faces
+    rest : joint → where it rests [rad or m]; zero where not named
+    acceleration : joint → most it may have [rad/s²]
+    about : sources, in words
+    """
+
+    name: str
+    where: str
+    urdf: Path
+    srdf: Path | None
+    base: str
+    up: str
+    forward: str
+    rest: Mapping[str, float]
+    acceleration: Mapping[str, float]
+    arms: Mapping[str, ArmMap]
+    about: str = ""
+
+
+def find_map(robot: str) -> RobotMap:
+    """The map of a robot by name, of a URDF with a map of the same name beside it, or a map file itself.
+
+    Raises
+    ------
+    MissingFile, BadModel
+        No such robot or file; the map lacks something, or has something that is not known.
+    """
+    path = Path(robot)
+    if path.suffix.lower() == ".toml":
+        return read_map(path)
+    if path.suffix.lower() in (".urdf", ".xml"):
+        if not path.is_file():
+            raise MissingFile(f"--robot {robot}: no such file")
+        beside = path.with_suffix(".toml")
+        if not beside.is_file():
+            raise MissingFile(
+                f"--robot {robot}: no {beside.name} beside it; a map says which links are shoulder, elbow and hand"
+                " (docs/retargeting.md)"
+            )
+        return read_map(beside, urdf=path)
+    if robot not in ROBOTS:
+        raise BadModel(f"--robot {robot}: not known; {one_of(ROBOTS, robot)}; or a file, FILE.urdf")
+    return read_map(asset("urdf", f"robots/{robot}.toml"))
+
+
+def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
+    """Read a map; `urdf` in place of the file that it names.
+
+    Raises
+    ------
+    MissingFile, BadModel
+        As `find_map`.
+    """
+    if not path.is_file():
+        raise MissingFile(f"{path}: no such file; a robot's map is wanted (docs/retargeting.md)")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadModel(f"{path}: not valid TOML: {error}") from error
+    where = path.name
+    _known(table, _KEYS, where)
+    if table.get("format") != 1:
+        raise BadModel(f"{where}: format = {table.get('format')!r}; this version reads format = 1")
+    up, forward = _axis(table, "up", where), _axis(table, "forward", where)
+    _across(up, forward, f"{where}: up, forward")
+    arms = _table(table, "arms", where)
+    if not arms:
+        raise BadModel(f"{where}: no arms; at least one of [arms.left] and [arms.right] is needed")
+    for side in arms:
+        if side not in SIDES:
+            raise BadModel(f"{where}: arms.{side} is no side; {one_of(SIDES, side)}")
+    limits = _table(table, "limits", where)
+    _known(limits, ("acceleration", "source"), f"{where}: limits")
+    return RobotMap(
+        name=path.stem,
+        where=where,
+        urdf=urdf or _file(path, table.get("urdf"), "urdf"),
+        srdf=_file(path, table["srdf"], "srdf") if "srdf" in table else None,
+        base=str(table.get("base", "")),
+        up=up,
+        forward=forward,
+        rest=_numbers(_table(table, "rest", where), f"{where}: rest"),
+        acceleration=_numbers(_table(limits, "acceleration", f"{where}: limits"), f"{where}: limits.acceleration"),
+        arms={side: _arm(arms[side], f"{where}: arms.{side}") for side in SIDES if side in arms},
+        about=" ".join(str(text) for text in (table.get("about", ""), limits.get("source", "")) if text),
+    )
+
+
+def example_data() -> Path | None:
+    """The folder with the robots of example-robot-data, None where it is not installed."""
+    for root in map(Path, sys.path):
+        for prefix in (root / "cmeel.prefix", root.parent.parent.parent):
+            if (prefix / EXAMPLE_DATA).is_dir():
+                return prefix / EXAMPLE_DATA
+    return None
+
+
+def _file(path: Path, name: Any, key: str) -> Path:
+    if not isinstance(name, str):
+        raise BadModel(f"{path.name}: {key} = {name!r}; the path of a file is needed")
+    beside = path.parent / name
+    if beside.is_file():
+        return beside
+    data = example_data()
+    if data is not None and (data / name).is_file():
+        return data / name
+    if data is None and "/" in name:
+        raise MissingFile(
+            f"{path.name}: {key} = '{name}' is in example-robot-data, which is not installed; "
+            "pip install --no-deps example-robot-data"
+        )
+    raise MissingFile(f"{path.name}: {key} = '{name}': no such file beside the map or in example-robot-data")
+
+
+def _arm(table: Any, where: str) -> ArmMap:
+    if not isinstance(table, dict):
+        raise BadModel(f"{where} = {table!r} is not a table")
+    _known(table, _ARM_KEYS, where)
+    joints = table.get("joints")
+    if not isinstance(joints, list) or not joints or not all(isinstance(name, str) for name in joints):
+        raise BadModel(f"{where}.joints = {joints!r}; a list of joints from the shoulder to the hand is needed")
+    hand = table.get("hand")
+    if not isinstance(hand, dict):
+        raise BadModel(f"{where}.hand = {hand!r}; {{ link, at, fingers, thumb }} is needed")
+    fingers, thumb = _axis(hand, "fingers", f"{where}.hand"), _axis(hand, "thumb", f"{where}.hand")
+    _across(fingers, thumb, f"{where}.hand: fingers, thumb")
+    return ArmMap(
+        joints=tuple(joints),
+        shoulder=_point(table.get("shoulder"), f"{where}.shoulder"),
+        elbow=_point(table["elbow"], f"{where}.elbow") if "elbow" in table else None,
+        hand=_point({key: hand[key] for key in ("link", "at") if key in hand}, f"{where}.hand"),
+        fingers=fingers,
+        thumb=thumb,
+    )
+
+
+def _point(value: Any, where: str) -> LinkPoint:
+    if not isinstance(value, dict) or not isinstance(value.get("link"), str):
+        raise BadModel(f"{where} = {value!r}; {{ link = \"…\" }} is needed, and at = [x, y, z] in metres where it is not 0")
+    _known(value, ("link", "at"), where)
+    at = value.get("at", [0.0, 0.0, 0.0])
+    if not isinstance(at, list) or len(at) != 3 or not all(_is_number(v) for v in at):
+        raise BadModel(f"{where}.at = {at!r}; three numbers in metres are needed")
+    return LinkPoint(value["link"], (float(at[0]), float(at[1]), float(at[2])))
+
+
+def _axis(table: Mapping[str, Any], key: str, where: str) -> str:
+    value = table.get(key)
+    if value not in AXES:
+        raise BadModel(f"{where}.{key} = {value!r}; {one_of(AXES)}" if value else f"{where}: no {key}; {one_of(AXES)}")
+    return str(value)
+
+
+def _across(a: str, b: str, where: str) -> None:
+    if a[1] == b[1]:
+        raise BadModel(f"{where}: {a} and {b} lie on one line; two axes at right angles are needed")
+
+
+def _table(table: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise BadModel(f"{where}: {key} = {value!r} is not a table")
+    return value
+
+
+def _numbers(table: Mapping[str, Any], where: str) -> dict[str, float]:
+    for name, value in table.items():
+        if not _is_number(value):
+            raise BadModel(f"{where}.{name} = {value!r}; a number is needed")
+    return {name: float(value) for name, value in table.items()}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
+    for key in table:
+        if key not in keys:
+            raise BadModel(f"{where}: '{key}' is not a key; {one_of(keys, key)}")
