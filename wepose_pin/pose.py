@@ -119,7 +119,7 @@ def configuration(
     for segment in quat_WL:
         if segment not in found:
             raise BadModel(f"{model.pin.name}: the model has no link for segment '{segment}'; {one_of(found, segment)}")
-    return follow(model, quat_WL, limits=limits, weights=weights)
+    return follow(model, found, quat_WL, limits=limits, weights=weights)
 
 
 def deviation(model: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

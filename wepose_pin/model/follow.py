@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from .. import so3
 from .body import BodyModel
-from .chains import AXIAL, Chain, about, axis_in_joint, chains, conjugate, multiply, solve
+from .chains import AXIAL, Chain, about, axis_in_joint, conjugate, multiply, solve
 from .fit import fit, limits_of
 
 _MISSED = 1e-9  # [rad] that is nothing
@@ -43,13 +43,13 @@ def groups(found: Mapping[str, Chain], measured: Mapping[str, np.ndarray]) -> li
 
 def follow(
     model: BodyModel,
+    found: Mapping[str, Chain],
     quat_WL: Mapping[str, np.ndarray],
     *,
     limits: bool = True,
     weights: Mapping[str, float] | None = None,
 ) -> np.ndarray:
-    """Configuration `q` (n, nq); see `pose.configuration`."""
-    found = chains(model.pin)
+    """Configuration `q` (n, nq) by the chains `found`; see `pose.configuration`."""
     kept: dict[int, np.ndarray] = {}
     q, quat_WJ = stepwise(model, found, quat_WL, kept)
     to_fit = groups(found, quat_WL)
