@@ -110,7 +110,9 @@ def test_nobody_listens_and_no_network() -> None:
     out.close()
 
 
-@pytest.mark.parametrize(("rate_hz", "of_hz", "share"), [(100.0, 1000.0, 0.1), (100.0, 60.0, 1.0), (100.0, 120.0, 5 / 6)])
+@pytest.mark.parametrize(
+    ("rate_hz", "of_hz", "share"), [(100.0, 1000.0, 0.1), (100.0, 60.0, 1.0), (100.0, 120.0, 5 / 6)]
+)
 def test_pace_on_average(rate_hz: float, of_hz: float, share: float) -> None:
     pace = Pace(rate_hz)
     jitter = np.random.default_rng(1).uniform(-0.1, 0.1, 6000)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import http.client
 import json
 import math
@@ -85,7 +86,12 @@ def unpacked(model: BodyModel, frame: bytes) -> tuple[float, dict[str, np.ndarra
     hands = np.frombuffer(frame, "<f4", 6, 8 + 48 * n).reshape(2, 3)
     lost = np.frombuffer(frame, "u1", n, 8 + 48 * n + 24)
     time_s = float(np.frombuffer(frame, "<f8", 1)[0])
-    return time_s, dict(zip(links, placed, strict=True)), hands, dict(zip(links, lost.astype(bool).tolist(), strict=True))
+    return (
+        time_s,
+        dict(zip(links, placed, strict=True)),
+        hands,
+        dict(zip(links, lost.astype(bool).tolist(), strict=True)),
+    )
 
 
 # What a frame holds -------------------------------------------------------------------------------------------------
@@ -223,8 +229,10 @@ def talk(page: LivePage, do: Callable[[WebSocketClientConnection], Awaitable[Any
             return await do(connection)
         finally:
             connection.close()
-            while await connection.read_message() is not None:
-                pass
+            with contextlib.suppress(TimeoutError):  # one that was told of the end waits for another in vain
+                async with asyncio.timeout(0.5):
+                    while await connection.read_message() is not None:
+                        pass
 
     return asyncio.run(connected())
 
@@ -238,7 +246,13 @@ async def taken(connection: WebSocketClientConnection) -> Any:
 def test_a_foreign_origin_gets_no_poses(page: LivePage) -> None:
     own = page.url.rstrip("/")
     https = own.replace("http", "https")
-    for origin, code in ((own, 101), ("http://evil.example", 403), ("null", 403), (https, 403), ("http://localhost", 403)):
+    for origin, code in (
+        (own, 101),
+        ("http://evil.example", 403),
+        ("null", 403),
+        (https, 403),
+        ("http://localhost", 403),
+    ):
         connection = http.client.HTTPConnection(own.removeprefix("http://"), timeout=10)
         upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
         connection.request("GET", "/stream", headers=upgrade | {"Sec-WebSocket-Key": "A" * 22 + "==", "Origin": origin})
@@ -343,7 +357,7 @@ def test_addresses_that_cannot_be(model: BodyModel, page: LivePage) -> None:
     port = int(page.url.split(":")[2].strip("/"))
     with pytest.raises(BadOption, match=rf"cannot listen on 127.0.0.1:{port}: .*in use"):
         LivePage(model, port=port).open()
-    with pytest.raises(BadOption, match="cannot listen on 203.0.113.9:0"):
+    with pytest.raises(BadOption, match=r"cannot listen on 203\.0\.113\.9:0"):
         LivePage(model, host="203.0.113.9").open()
     with pytest.raises(BadOption, match="needs an address"):
         LivePage(model, host="").open()
@@ -385,12 +399,15 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         page.status(person.status("moved", "You moved (torso). Once more."))
         browser.wait("document.querySelector('#say.moved span')?.textContent.includes('Once more')")
 
+        assert browser.run("document.querySelector('#rows tr').innerText").split()[1:4] == ["there", "100", "–"]
         page.start(person.stage)
         page.status(person.status(lost=("left_forearm",), message="No samples from left forearm."))
         page.show(person.pose(0.2, lost=("left_forearm",)))
         browser.wait("window.wepose.time() === 0.2 && window.wepose.state() === 'ready'")
         assert browser.run(NARROW)
-        rows = browser.run("[...document.querySelectorAll('#rows tr')].map((row) => row.innerText.replace(/\\s+/g, ' '))")
+        rows = browser.run(
+            "[...document.querySelectorAll('#rows tr')].map((row) => row.innerText.replace(/\\s+/g, ' '))"
+        )
         assert rows[0] == "torso at rest 100 0.11 −0.29 0.00 – 3 s 6"
         assert rows[2].startswith("left forearm lost")
         assert "bad checksums: 3" in browser.run("document.body.innerText")
@@ -432,7 +449,9 @@ def test_dark_prints_light(model: BodyModel, person: Person, browser: Browser) -
         page.show(person.pose(0.5))
         browser.wait("window.wepose.time() === 0.5 && window.wepose.state() === 'ready'")
         browser.run("dispatchEvent(new Event('beforeprint'))")
-        browser.wait("document.querySelector('#printed').complete && document.querySelector('#printed').naturalWidth > 100")
+        browser.wait(
+            "document.querySelector('#printed').complete && document.querySelector('#printed').naturalWidth > 100"
+        )
         browser.emulate("print", prefers_color_scheme="dark")
         time.sleep(0.5)
         paper = browser.picture()
@@ -471,7 +490,9 @@ def test_a_colour_blind_reader_can_tell_the_hands_and_the_states(
         page.show(person.pose(0.5))
         browser.wait("window.wepose.state() === 'ready'")
         left, right = (box_of(browser, f"#legend span:nth-child({k}) i") for k in (1, 2))
-        shapes = browser.run("new Set([...document.querySelectorAll('#rows path')].map((p) => p.getAttribute('d'))).size")
+        shapes = browser.run(
+            "new Set([...document.querySelectorAll('#rows path')].map((p) => p.getAttribute('d'))).size"
+        )
         assert shapes == 3
         for kind in ("deuteranopia", "protanopia", "tritanopia", "achromatopsia"):
             browser.call("Emulation.setEmulatedVisionDeficiency", type=kind)

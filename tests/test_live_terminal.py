@@ -38,8 +38,12 @@ def printed(one: Status) -> str:
 
 
 def test_a_row_a_sensor() -> None:
-    lines = printed(status(sensors=(sensor(), sensor("left_forearm", static=True), sensor("head", lost=True)))).splitlines()
-    torso, forearm, head = (next(line for line in lines if line.startswith(name)) for name in ("torso", "left f", "head"))
+    lines = printed(
+        status(sensors=(sensor(), sensor("left_forearm", static=True), sensor("head", lost=True)))
+    ).splitlines()
+    torso, forearm, head = (
+        next(line for line in lines if line.startswith(name)) for name in ("torso", "left f", "head")
+    )
     assert torso.split() == "torso ▶ moving 100 0.11 −0.29 0.00 1.3 34 3".split()
     assert "■ at rest" in forearm
     assert "✕ lost" in head
@@ -54,6 +58,15 @@ def test_what_is_not_known_is_a_dash() -> None:
 def test_the_start_pose_has_a_bar_and_the_rest_none() -> None:
     assert "█" * 12 + "░" * 18 in printed(status("hold", "Stand still: 2 s more.", progress=0.4))
     assert "░" not in printed(status())
+
+
+def test_before_the_start_nothing_is_said_of_what_is_not_estimated() -> None:
+    text = printed(status("waiting", "Waiting for head."))
+    assert (
+        next(line for line in text.splitlines() if line.startswith("torso")).split()[1:8]
+        == "● there 100 – – – 1.3".split()
+    )
+    assert "latency" not in text
 
 
 def test_recording_and_problems() -> None:
@@ -117,12 +130,14 @@ def test_keys_and_the_terminal_afterwards(end: str) -> None:
     master, slave = pty.openpty()
     before = termios.tcgetattr(slave)
     script = textwrap.dedent(SESSION.format(tests=os.path.dirname(__file__)))
-    take = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"  # the terminal is ours, and Ctrl-C an interrupt
+    take = (
+        "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"  # the terminal is ours, and Ctrl-C an interrupt
+    )
     run = subprocess.Popen(
         [sys.executable, "-c", take + script], stdin=slave, stdout=slave, stderr=slave, start_new_session=True
     )
     try:
-        seen = read_until(master, "latency".encode())
+        seen = read_until(master, b"latency")
         assert "▶ ready".encode() in seen
         until = time.monotonic() + 20.0
         while termios.tcgetattr(slave)[3] & termios.ICANON:

@@ -178,20 +178,20 @@ def track(
         if is_live_log(session):
             log = read_live_log(session)
             recording, causal = log.recording, causal or (method is None and subject is None)
-            method = method or log.header["method"]
+            by = str(method or log.header["method"])
             if who is None and log.header["subject"]:
                 who = subject_of(log.header["subject"], session)
         else:
-            recording, method = load_session(session, gaps=gaps), method or BEST
+            recording, by = load_session(session, gaps=gaps), method or BEST
         if model is not None and recording.start_pose == CONFIGURATION:
             if who is not None or causal:
                 raise BadOption(f"--{'subject' if who else 'causal'}: for a person; {session} is of another chain")
-            _track_chain(recording, model, folder, step, method=method, limits=limits, torques=torques)
+            _track_chain(recording, model, folder, step, method=by, limits=limits, torques=torques)
             _say(f"Chain: {out / 'joints.parquet'}  {out / 'pose.parquet'}  {out / 'summary.json'}")
             return
         body = load_model(model) if model else None
-        step(f"tracking by {method}")
-        pose = follow(recording, who, method=method, model=body, causal=causal, limits=limits)
+        step(f"tracking by {by}")
+        pose = follow(recording, who, method=by, model=body, causal=causal, limits=limits)
         found = None
         if torques:
             from .angles.torques import pose_torques
@@ -210,7 +210,7 @@ def track(
     summary = pose.summary()
     _warn(summary["warnings"])
     _print_table(
-        f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {method}, "
+        f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {by}, "
         f"lengths: {summary['subject']['note'] or summary['subject']['name']}",
         ("sensor", "at rest", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
         [
@@ -1132,7 +1132,7 @@ def _validation_tables(document: Document) -> None:
     import textwrap
 
     from .validation import summary
-    from .validation.findings import order, target_line, targets, worse
+    from .validation.findings import anywhere_lines, order, target_line, targets, worse
     from .validation.page import experiment_table, how_many, unit_of
 
     def say(text: str) -> None:
@@ -1148,7 +1148,7 @@ def _validation_tables(document: Document) -> None:
         header = [name if len(name) < 12 else "\n".join(name.rsplit(" ", 1)) for name in header]
         title = f"{experiment}, {how_many(experiment, trials)}" + (f" [{unit}]" if unit else "")
         _print_table(title + ", a quick run" * document.quick, tuple(header), [tuple(line) for line in lines])
-        said = [*order(of), *worse(of)]
+        said = [*order(of), *worse(of), *anywhere_lines(of)]
         for text in said:
             say(text)
         _say("")

@@ -63,9 +63,10 @@ class UdpOut:
         if not 0 < port < 65536:
             raise BadOption(f"UDP out: port {port}; a number from 1 to 65535")
         try:
-            family, kind, _, _, self._to = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except (OSError, UnicodeError) as error:
             raise BadOption(f"UDP out: no host '{host}' ({error}); a name or an address, as 127.0.0.1") from None
+        self._to: Any = address
         self._socket: socket.socket | None = socket.socket(family, kind)
         self._socket.setblocking(False)
         self._stage: Stage | None = None
@@ -126,15 +127,15 @@ def pose_json(stage: Stage, pose: LivePose) -> bytes:
 def _rounded(values: np.ndarray) -> list[Any]:
     """Rows as lists of numbers; None for one that is not finite."""
     rows = np.round(values, DIGITS)
-    known = np.isfinite(rows) if rows.ndim == 1 else np.isfinite(rows).all(axis=1)
-    return [row if is_known else None for row, is_known in zip(rows.tolist(), known.tolist(), strict=True)]
+    unknown = set(np.argwhere(~np.isfinite(rows))[:, 0].tolist())
+    return [None if k in unknown else row for k, row in enumerate(rows.tolist())]
 
 
 class LslOut:
     """An `Output`: the pose as one LSL stream of type "Pose" that other programs find by its name.
 
-    It is announced on this machine only, or as far as the user's own ``LSLAPICFG`` says where that is set. liblsl has no
-    setting for the address of its data ports: they listen on every interface for as long as the stream is there.
+    It is announced on this machine only, or as far as the user's own ``LSLAPICFG`` says where that is set. liblsl has
+    no setting for the address of its data ports: they listen on every interface for as long as the stream is there.
 
     Parameters
     ----------

@@ -59,7 +59,8 @@ class Server:
             self._socket = socket.create_server((host, port), family=family, backlog=16)
         except OSError as error:
             raise BadOption(
-                f"the live page cannot listen on {host}:{port}: {error.strerror}; another port, or 0 for any that is free"
+                f"the live page cannot listen on {host}:{port}: {error.strerror}; "
+                f"another port, or 0 for any that is free"
             ) from None
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
@@ -175,7 +176,7 @@ def _application(server: Server) -> Any:
             handler.set_status(403)
             handler.finish("This page speaks to itself only.")
 
-    class Page(RequestHandler):
+    class Page(RequestHandler):  # type: ignore[misc]
         def prepare(self) -> None:
             refuse(self)
 
@@ -195,7 +196,7 @@ def _application(server: Server) -> Any:
             self.set_header("Content-Type", "text/html; charset=utf-8")
             self.finish(server.page)
 
-    class Stream(WebSocketHandler):
+    class Stream(WebSocketHandler):  # type: ignore[misc]
         awaited = 0  # messages that the browser has not drawn yet
         status: Status | None = None
         pose: Any = ()  # what was sent; () until something was

@@ -104,21 +104,24 @@ def table(status: Status, *, keys: bool = False) -> Any:
     from rich.table import Table
     from rich.text import Text
 
+    begun = status.state in ("ready", "ended")  # before, nothing is estimated
     rows = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name, justify in (("sensor", "left"), ("state", "left")):
         rows.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
     for name in ("rate\n[Hz]", "gyro bias x y z\n[°/s]", "heading\n± [°]", "set ago\n[s]", "missed\nsamples"):
         rows.add_column(Text(name), justify="right", no_wrap=True)
     for sensor in status.sensors:
-        rows.add_row(*map(Text, _row(sensor)), style="bold red" if sensor.lost else "")
-    loud = status.state in ("hold", "moved", "waiting")
-    head = Text.assemble((f"{STATES.get(status.state, '')} {status.state}  ", "bold"), (status.message, "bold" * loud))
+        rows.add_row(*map(Text, _row(sensor, begun)), style="bold red" if sensor.lost else "")
+    head = Text.assemble(
+        (f"{STATES.get(status.state, '')} {status.state}  ", "bold"), (status.message, "" if begun else "bold")
+    )
     parts: list[Any] = [head]
     if status.state in ("hold", "moved"):
         done = round(30 * min(max(status.progress, 0.0), 1.0))
         parts.append(Text("█" * done + "░" * (30 - done)))
     half, most = status.latency_ms
-    facts = f"latency {half:.1f} ms median, {most:.1f} ms in 99 of 100   time {status.time:.1f} s"
+    facts = f"latency {half:.1f} ms median, {most:.1f} ms in 99 of 100   " if begun else ""
+    facts += f"time {status.time:.1f} s"
     if status.recorded_s:
         facts += f"   ● recording {status.recorded_s:.1f} s"
     parts += [rows, Text(facts)]
@@ -130,10 +133,11 @@ def table(status: Status, *, keys: bool = False) -> Any:
     return Group(*parts)
 
 
-def _row(sensor: SensorStatus) -> tuple[str, ...]:
-    state = "✕ lost" if sensor.lost else "■ at rest" if sensor.static else "▶ moving"
-    bias = " ".join(f"{_known(math.degrees(axis), 2):>6}" for axis in sensor.gyro_bias)
-    heading, age = _known(math.degrees(sensor.heading_std), 1), _known(sensor.heading_age, 0)
+def _row(sensor: SensorStatus, begun: bool) -> tuple[str, ...]:
+    state = "✕ lost" if sensor.lost else "● there" if not begun else "■ at rest" if sensor.static else "▶ moving"
+    bias = " ".join(f"{_known(math.degrees(axis) if begun else math.nan, 2):>6}" for axis in sensor.gyro_bias)
+    heading = _known(math.degrees(sensor.heading_std), 1)
+    age = _known(sensor.heading_age if begun else math.nan, 0)
     missed = str(sensor.missing + sensor.late + sensor.duplicate)
     return sensor.segment.replace("_", " "), state, _known(sensor.rate_hz, 0), bias, heading, age, missed
 

@@ -153,7 +153,7 @@ def axis_in_joint(model: pin.Model, joint: int) -> np.ndarray | None:
     moved = model.joints[joint]
     data = moved.createData()  # of this joint alone: of the whole model it takes fifty times as long
     moved.calc(data, pin.neutral(model))
-    return np.array(data.S)[3:, 0].copy()
+    return np.asarray(data.S)[3:].copy()
 
 
 def _chain(model: pin.Model, frame: pin.Frame, free: list[int]) -> Chain:

@@ -21,7 +21,7 @@ AXES = {
 }
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
 _KEYS = ("format", "urdf", "srdf", "about", "up", "forward", "base", "rest", "limits", "arms")
-_ARM_KEYS = ("joints", "shoulder", "elbow", "hand")
+_ARM_KEYS = ("joints", "shoulder", "elbow", "hand", "reach")
 
 
 class LinkPoint(NamedTuple):
@@ -42,6 +42,7 @@ class ArmMap:
     elbow : None for an arm whose elbow is left to the solver
     hand : the point that is the person's palm
     fingers, thumb : axes of the hand's link along the fingers, and to the thumb's side
+    reach : [m] what the person's straight arm becomes; None: 95 % of what the joints allow
     """
 
     joints: tuple[str, ...]
@@ -50,6 +51,7 @@ class ArmMap:
     hand: LinkPoint
     fingers: str
     thumb: str
+    reach: float | None = None
 
 
 @dataclass(frozen=True)
@@ -188,6 +190,9 @@ def _arm(table: Any, where: str) -> ArmMap:
         raise BadModel(f"{where}.hand = {hand!r}; {{ link, at, fingers, thumb }} is needed")
     fingers, thumb = _axis(hand, "fingers", f"{where}.hand"), _axis(hand, "thumb", f"{where}.hand")
     _across(fingers, thumb, f"{where}.hand: fingers, thumb")
+    reach = table.get("reach")
+    if reach is not None and not (_is_number(reach) and reach > 0.0):
+        raise BadModel(f"{where}.reach = {reach!r}; metres above 0 are needed")
     return ArmMap(
         joints=tuple(joints),
         shoulder=_point(table.get("shoulder"), f"{where}.shoulder"),
@@ -195,6 +200,7 @@ def _arm(table: Any, where: str) -> ArmMap:
         hand=_point({key: hand[key] for key in ("link", "at") if key in hand}, f"{where}.hand"),
         fingers=fingers,
         thumb=thumb,
+        reach=None if reach is None else float(reach),
     )
 
 

@@ -16,7 +16,7 @@ from .maps import AXES, ArmMap, LinkPoint, RobotMap, example_data
 
 POSITION_MARGIN = 1e-4  # [rad or m] kept from every limit, so that what is written with fewer digits keeps it too
 SHARE = 0.999  # of velocity and acceleration limits, for the same reason
-_REACH_STARTS = 24
+_REACH_STARTS = 8
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from . import gains, paper, real
+from . import anywhere, gains, paper, real
 from .contenders import Contender, contenders
 from .document import Document, document_text, read_document
 from .jobs import Job, Result, run
@@ -32,7 +32,7 @@ __all__ = [
 
 def experiments(quick: bool = False, data: Path | None = None) -> dict[str, list[Job]]:
     """Name → its trials, a job each; `data`: the folder of the real recordings."""
-    found = paper.experiments(quick)
+    found = paper.experiments(quick) | anywhere.experiments(quick)
     if data is not None:
         found |= real.experiments(data, quick)
     if not quick:

@@ -14,6 +14,13 @@ from .tables import DEGREES, HAND, PAPER_DRIFT, PAPER_HAND, Row, figures, name_a
 OURS = "smekf"
 TARGETS = {"upper body, realistic": 18.0, "upper body, MTi-3 noise alone": 12.0}  # [mm], at most
 WATERFALL = "where the millimetres come from"
+ANYWHERE = "sensors strapped on anywhere"
+WANTED = {  # of amekf there, from and to
+    "lengths_rms_mm": (0.0, 8.0),
+    "headings_rms_deg": (0.0, 2.0),
+    "hand": (0.0, 18.0),
+    "errors_by_std_rms": (0.7, 1.5),
+}
 FULL, EMPTY = "all on", "nothing on"  # the waterfall's ends
 MORE = " as stated"  # ends the name of what is known in the waterfall and is not here: it adds
 TILT = {"roll", "pitch", "inclination rmse"}
@@ -66,6 +73,21 @@ def targets(rows: Sequence[Row]) -> list[Target]:
         for name in FROM
         if name in row.figures
     ]
+
+
+def anywhere_lines(rows: Sequence[Row]) -> list[str]:
+    """What was wanted of sensors strapped on anywhere, and what it is, for amekf."""
+    said = []
+    for row in rows:
+        if row.experiment == ANYWHERE and row.method == "amekf":
+            for name, (least, most) in WANTED.items():
+                if name in row.figures:
+                    value, (text, unit) = row.figures[name], name_and_unit(name)
+                    limits = f"at most {most:g}" if least == 0.0 else f"{least:g} to {most:g}"
+                    met = "met" if least <= value <= most else "missed"
+                    said.append(f"{_plain(name) if name in HAND.values() else text}: {value:.2f} {unit}".rstrip())
+                    said[-1] += f", {limits} wanted: {met}."
+    return said
 
 
 def target_line(target: Target) -> str:

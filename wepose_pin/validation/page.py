@@ -15,6 +15,7 @@ from .findings import (
     OURS,
     TARGETS,
     WATERFALL,
+    anywhere_lines,
     at_a_glance,
     beaten,
     order,
@@ -61,7 +62,7 @@ def page(document: Document) -> list[Block]:
         said = [*order(of), *worse(of), *beaten(of, document.results, document.gains)]
         found = waterfall(document.results) if experiment == WATERFALL else None
         said += waterfall_lines(found) if found else []
-        said += [target_line(target) for target in targets(of)]
+        said += [target_line(target) for target in targets(of)] + anywhere_lines(of)
         blocks += [Bullets(said)] if said else []
         blocks += drawn.get(experiment, [])
     return blocks

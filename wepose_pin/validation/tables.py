@@ -29,6 +29,7 @@ SHORT = {
     for key, name in (("nees", "nees"), ("within_1", "in 1σ"), ("within_2", "in 2σ"))
 }
 DEGREES = {*AXES, *(name.replace("_", " ") for name in SPLIT)}
+_RMS = ("_rms", "_rms_mm", "_rms_deg")
 UNITS = {"_deg_min": "deg/min", "_deg_s": "deg/s", "_deg": "deg", "_percent": "%", "_mm": "mm", "_s": "s"}
 
 
@@ -122,7 +123,8 @@ def _mean(trials: Sequence[Mapping[str, float]]) -> dict[str, float]:
     mean: dict[str, float] = {}
     for name in dict.fromkeys(name for trial in trials for name in trial):
         values = [trial[name] for trial in trials if name in trial]
-        mean[name] = float(np.mean(values))
+        # Of root mean squares the mean is that of all trials together.
+        mean[name] = float(np.sqrt(np.mean(np.square(values))) if name.endswith(_RMS) else np.mean(values))
         if len(values) > 1 and not name.endswith(" std"):
             mean[f"{name} between"] = float(np.std(values, ddof=1))
     return mean

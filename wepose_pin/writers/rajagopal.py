@@ -80,13 +80,15 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
             continue
         mirror = _MIRRORED if side == "l" else 1.0
         quat = [quat_GB[name] * mirror for name in arm]
-        if len(arm) == 3 or (len(arm) == 2 and arm[1] == f"radius_{side}"):
+        below: dict[str, np.ndarray] = {}
+        if arm[1:2] == [f"radius_{side}"]:
             quat[0], angles, left = _arm(quat)
-            found |= {f"{name}_{side}": value for name, value in zip(_MIDDLE, angles, strict=False)}
+            below = {f"{name}_{side}": value for name, value in zip(_MIDDLE, angles, strict=False)}
             missed |= {name: float(np.sqrt(np.mean(angle**2))) for name, angle in zip(arm, left, strict=True)}
         if "torso" in quat_GB:
             shoulder = multiply(conjugate(quat_GB["torso"] * mirror), quat[0])
-            found |= _three(shoulder, tuple(f"arm_{of}_{side}" for of in ("flex", "add", "rot")))
+            found |= _three(shoulder, [f"arm_{of}_{side}" for of in ("flex", "add", "rot")])
+        found |= below
     return found, missed
 
 

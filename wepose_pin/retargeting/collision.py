@@ -1,0 +1,235 @@
+"""Self-collision: which shapes may touch, how far apart the near ones are, and how that changes with the joints."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from ..errors import BadModel
+from .robot import Robot
+
+CLEARANCE = 0.02  # [m] that the solver keeps between hulls
+NEAR = 0.15  # [m] from where on a pair is watched
+_SAMPLES = 1000  # random configurations that tell what touches always, or never; fewer where pairs are many
+_MOST_TESTS = 400_000
+_FEW = 3  # joints between two shapes that can be sampled densely
+_ALWAYS = 0.95  # share of them in which such a pair does
+
+
+class Near(NamedTuple):
+    """Pairs that are near: distances (m,) [m] and how each grows with the joints (m, n)."""
+
+    distance: np.ndarray
+    growth: np.ndarray
+
+
+class Shapes:
+    """What may touch, each shape as its convex hull: quick, and the nearest points move smoothly.
+
+    A pair is left out that cannot come together or always is: on one joint, of links that follow each other, excused by
+    the SRDF, touching at rest, touching wherever the joints are, or, few joints apart on one arm, touching nowhere.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.hulls, body = hulls(robot)
+        self.pairs = sorted({(min(a, b), max(a, b)) for i, j in allowed_pairs(robot) for a, b in [(body[i], body[j])]})
+        for i, j in self.pairs:
+            self.hulls.addCollisionPair(pin.CollisionPair(i, j))
+        self.data = self.hulls.createData()
+        objects = self.hulls.geometryObjects
+        for shape in objects:
+            shape.geometry.computeLocalAABB()
+        self._joint = np.array([shape.parentJoint for shape in objects], dtype=int)
+        self._centre = np.array([shape.placement.act(shape.geometry.aabb_center) for shape in objects]).reshape(-1, 3)
+        self._radius = np.array([shape.geometry.aabb_radius for shape in objects])
+        self._first, self._second = (np.array([pair[k] for pair in self.pairs], dtype=int) for k in (0, 1))
+        self._apart = self._radius[self._first] + self._radius[self._second] + NEAR
+        self._moves = _supports(robot.model)
+        self._viewed: Any = None
+        self._rotations: list[np.ndarray] = []
+        self._translations: list[np.ndarray] = []
+
+    def near(self, data: Any) -> Near:
+        """Pairs within `NEAR`; `data` of the model holds the joints' placements and Jacobian."""
+        n = self.robot.model.nv
+        if not len(self.pairs):
+            return Near(np.empty(0), np.empty((0, n)))
+        if data is not self._viewed:  # views into Pinocchio's memory: asking for them anew costs more than the rest
+            self._viewed = data
+            self._rotations = [placement.rotation for placement in data.oMi]
+            self._translations = [placement.translation for placement in data.oMi]
+        R, p = np.array(self._rotations), np.array(self._translations)
+        centre = np.einsum("kij,kj->ki", R[self._joint], self._centre) + p[self._joint]
+        gap = centre[self._first] - centre[self._second]
+        close = np.flatnonzero(np.einsum("ki,ki->k", gap, gap) < self._apart**2)
+        if not len(close):
+            return Near(np.empty(0), np.empty((0, n)))
+        pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
+        found, which = [], []
+        for k in close.tolist():
+            result = pin.computeDistance(self.hulls, self.data, k)
+            d = result.min_distance
+            if d < NEAR:
+                found.append((d, *result.getNearestPoint1(), *result.getNearestPoint2()))
+                which.append(k)
+        if not found:
+            return Near(np.empty(0), np.empty((0, n)))
+        table = np.array(found)
+        distance, a, b = table[:, 0], table[:, 1:4], table[:, 4:7]
+        away = a - b
+        size = np.sqrt(np.einsum("ki,ki->k", away, away))
+        away /= np.where(distance < 0.0, -1.0, 1.0)[:, None] * np.maximum(size, 1e-9)[:, None]
+        J = data.J
+        linear = away @ J[:3]
+        first, second = self._moves[self._joint[self._first[which]]], self._moves[self._joint[self._second[which]]]
+        growth = first * (linear + _cross(a, away) @ J[3:]) - second * (linear + _cross(b, away) @ J[3:])
+        return Near(distance, growth)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a × b of rows; NumPy's own takes five times as long for a few."""
+    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
+
+
+def hulls(robot: Robot) -> tuple[Any, list[int]]:
+    """Convex hulls, and of each shape of the robot which it is in; all that is rigid with a hand is in one."""
+    made, body = pin.GeometryModel(), []
+    last = {int(robot.model.frames[arm.hand].parentJoint) for arm in robot.arms}
+    hand: dict[int, list[Any]] = {}
+    for shape in robot.shapes.geometryObjects:
+        if shape.parentJoint in last and shape.parentJoint in hand:
+            hand[shape.parentJoint].append(shape)
+            body.append(made.getGeometryId(f"hand {shape.parentJoint}"))
+            continue
+        geometry = shape.geometry
+        name, placement = shape.name, shape.placement
+        if shape.parentJoint in last:
+            hand[shape.parentJoint] = [shape]
+            name = f"hand {shape.parentJoint}"
+        elif hasattr(geometry, "buildConvexHull"):
+            geometry.buildConvexHull(True, "Qt")
+            geometry = geometry.convex
+        body.append(made.addGeometryObject(pin.GeometryObject(name, shape.parentJoint, shape.parentFrame, placement, geometry)))
+    for joint, shapes in hand.items():
+        whole = made.geometryObjects[made.getGeometryId(f"hand {joint}")]
+        points = np.vstack([_corners(shape) for shape in shapes])
+        corners = coal.StdVec_Vec3s()
+        corners.extend(list(points))
+        whole.geometry = coal.Convex.convexHull(corners, True, "Qt")
+        whole.placement = pin.SE3.Identity()
+    return made, body
+
+
+def _corners(shape: Any) -> np.ndarray:
+    """Points in the joint's frame whose hull holds the shape; of round ones the box around them."""
+    geometry = shape.geometry
+    if hasattr(geometry, "buildConvexHull"):
+        points = np.asarray(geometry.vertices())
+    else:
+        geometry.computeLocalAABB()
+        box = geometry.aabb_local
+        points = np.array(list(product(*zip(box.min_, box.max_, strict=True))))
+    return points @ shape.placement.rotation.T + shape.placement.translation
+
+
+def allowed_pairs(robot: Robot) -> list[tuple[int, int]]:
+    """Pairs of shapes that must not touch."""
+    objects, full = robot.shapes.geometryObjects, robot.full
+    links = [full.frames[full.getFrameId(_link(shape.name))].name for shape in objects]
+    excused = _excused(robot.map.srdf) if robot.map.srdf else set()
+    after = _following(full)
+    candidates = [
+        (i, j)
+        for i in range(len(objects))
+        for j in range(i + 1, len(objects))
+        if objects[i].parentJoint != objects[j].parentJoint
+        and frozenset((links[i], links[j])) not in excused
+        and frozenset((links[i], links[j])) not in after
+    ]
+    if not candidates:
+        return []
+    shapes = pin.GeometryModel(robot.shapes)
+    for i, j in candidates:
+        shapes.addCollisionPair(pin.CollisionPair(i, j))
+    data, geometry = robot.model.createData(), shapes.createData()
+    rng = np.random.default_rng(0)
+    low, high = np.clip(robot.lower, -np.pi, np.pi), np.clip(robot.upper, -np.pi, np.pi)
+    touching, samples = np.zeros(len(candidates)), min(_SAMPLES, _MOST_TESTS // len(candidates))
+    for _ in range(samples):
+        pin.computeCollisions(robot.model, data, shapes, geometry, robot.q(rng.uniform(low, high)), False)
+        touching += [result.isCollision() for result in geometry.collisionResults]
+    pin.computeCollisions(robot.model, data, shapes, geometry, robot.q(robot.rest), False)
+    at_rest = [result.isCollision() for result in geometry.collisionResults]
+    return [
+        pair
+        for pair, often, rests in zip(candidates, touching, at_rest, strict=True)
+        if often < _ALWAYS * samples and not rests and not (often == 0 and _in_line(robot, objects, pair))
+    ]
+
+
+def _in_line(robot: Robot, objects: Any, pair: tuple[int, int]) -> bool:
+    """Whether at most `_FEW` joints lie between the shapes, on one arm: then random samples see all there is."""
+    a, b = sorted(int(objects[k].parentJoint) for k in pair)
+    joints = 1
+    while b > a and robot.model.parents[b] != a:
+        b, joints = robot.model.parents[b], joints + 1
+    return b > a and joints <= _FEW
+
+
+def _link(shape: str) -> str:
+    """Pinocchio names a shape after its link: LINK_0, LINK_1, …"""
+    return shape.rpartition("_")[0]
+
+
+def _following(full: Any) -> set[frozenset[str]]:
+    """Links with one moving joint between them, through links fixed to either."""
+    bodies = [frame for frame in full.frames if frame.type == pin.FrameType.BODY]
+    on: dict[int, list[str]] = {}
+    for frame in bodies:
+        on.setdefault(frame.parentJoint, []).append(frame.name)
+    return {
+        frozenset((a, b))
+        for joint in range(1, full.njoints)
+        if full.parents[joint] > 0
+        for a in on.get(joint, [])
+        for b in on.get(full.parents[joint], [])
+    } | {
+        frozenset((a, full.frames[_root_side(full, joint)].name))
+        for joint in range(1, full.njoints)
+        if full.parents[joint] == 0
+        for a in on.get(joint, [])
+    }
+
+
+def _root_side(full: Any, joint: int) -> int:
+    """The link that carries a joint of the root's."""
+    frame = full.frames[full.getFrameId(full.names[joint])].parentFrame
+    while full.frames[frame].type != pin.FrameType.BODY:
+        frame = full.frames[frame].parentFrame
+    return int(frame)
+
+
+def _excused(srdf: Path) -> set[frozenset[str]]:
+    try:
+        root = ElementTree.parse(srdf).getroot()
+    except ElementTree.ParseError as error:
+        raise BadModel(f"{srdf}: not valid XML: {error}") from error
+    return {
+        frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in root.iter("disable_collisions")
+    }
+
+
+def _supports(model: Any) -> np.ndarray:
+    """(njoints, nv): 1 where a joint's placement depends on a velocity."""
+    found = np.zeros((model.njoints, model.nv))
+    for joint in range(1, model.njoints):
+        found[joint] = found[model.parents[joint]]
+        found[joint, model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = 1.0
+    return found

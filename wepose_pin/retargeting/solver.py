@@ -1,0 +1,272 @@
+"""One step: where the hands are, where they are to be, the next joint velocities by one quadratic programme.
+
+The tasks are those of differential inverse kinematics (hand, elbow swivel, posture, damping), written for the next
+velocity v' of all joints at once. Over a step the velocity changes evenly, so that positions, velocities and
+accelerations of the trajectory are those of one motion, and every limit on v' is a simple bound
+(`limits.velocity_bounds`). What is near in space adds a row each. Pink's tasks are the same sums; building its objects
+anew at each step costs more than the whole step here, and its limits know no braking way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from ..errors import WeposeError
+from .collision import CLEARANCE, Shapes
+from .limits import velocity_bounds
+from .person import ArmTarget
+from .robot import Arm, Robot
+
+
+@dataclass(frozen=True)
+class Tasks:
+    """How much each task counts, against 1 m/s of the hand, and how fast an error is made good."""
+
+    position: float = 1.0  # a hand's velocity [m/s]
+    orientation: float = 0.02  # its rate [rad/s]: 1 rad/s counts as 0.14 m/s
+    swivel: float = 0.05  # the elbow's velocity about the line shoulder-hand [m/s]
+    posture: float = 2e-4  # a joint's velocity [rad/s] away from the rest posture
+    still: float = 5e-4  # a joint's velocity [rad/s]
+    smooth: float = 2e-3  # a joint's velocity step beyond that of the step before [rad/s]
+    gain: float = 12.0  # [1/s] of hand and elbow
+    posture_gain: float = 0.5  # [1/s]
+    brake: float = 8.0  # [m/s², rad/s²]: an error is made good no faster than this stops it
+    straight: float = 0.06  # [m] of the hand per rad/s: below it the arm counts as singular, and is damped
+    damping: float = 0.05  # at most, where it is singular
+
+
+class Aim(NamedTuple):
+    """What one hand is to do now; as `ArmTarget`, of one moment."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    rotation: np.ndarray
+    rate: np.ndarray
+    bend: np.ndarray
+    weight: float
+
+
+@dataclass
+class Counts:
+    """What happened, in steps."""
+
+    steps: int = 0
+    singular: int = 0
+    near: int = 0
+    held: int = 0  # the programme had no solution: all joints braked
+
+
+@dataclass
+class State:
+    """Where the robot is: values [rad or m], velocities and accelerations of its joints (n,)."""
+
+    u: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+
+
+@dataclass
+class Stepper:
+    """Takes the robot from one step to the next; `positions` or `orientations` may be left out of the tasks.
+
+    Parameters
+    ----------
+    dt : [s] of a step
+    loose : velocity and acceleration limits are so many times wider: to see what a motion would ask for
+    """
+
+    robot: Robot
+    shapes: Shapes
+    dt: float
+    tasks: Tasks = field(default_factory=Tasks)
+    loose: float = 1.0
+    counts: Counts = field(default_factory=Counts)
+    closest: float = np.inf  # [m] between hulls in the last step; inf where nothing was near
+
+    def __post_init__(self) -> None:
+        try:
+            import daqp
+        except ImportError:
+            raise WeposeError("retargeting needs daqp: pip install 'wepose-pin[retarget]'") from None
+        self._solve = daqp.solve
+        self.data: Any = self.robot.model.createData()
+        n = len(self.robot.names)
+        self._low, self._high = np.empty(n), np.empty(n)
+        self._plain = np.array_equal(self.robot.coupling, np.eye(len(self.robot.coupling), n))
+        self._follow = [_Follower(self.robot, arm, self.data) for arm in self.robot.arms]
+
+    def look(self, u: np.ndarray) -> np.ndarray:
+        """Jacobian (6, n) in the root of all joints at `u`; hands and elbows are where `place` then says."""
+        pin.computeJointJacobians(self.robot.model, self.data, self.robot.q(u))
+        for follower in self._follow:
+            follower.update()
+        J = self.data.J
+        return J if self._plain else J @ self.robot.coupling
+
+    def place(self, arm: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Hand (3,), its rotation (3, 3) and elbow (3,) of an arm, in the root; copies."""
+        follower = self._follow[arm]
+        return follower.p.copy(), follower.R.copy(), follower.elbow.copy()
+
+    def step(self, state: State, aims: tuple[Aim, ...], speed: float = 1.0) -> State:
+        """The state one step on. `speed` < 1 asks for slower joints, as far as braking allows."""
+        robot, tasks, dt, n = self.robot, self.tasks, self.dt, len(self.robot.names)
+        self.counts.steps += 1
+        self.look(state.u)
+        H, f = np.zeros((n, n)), np.zeros(n)
+        for follower, aim in zip(self._follow, aims, strict=True):
+            singular = follower.add(H, f, aim, tasks, dt, state.v)
+            self.counts.singular += singular
+        smooth = state.v + dt * state.a
+        H[np.diag_indices(n)] += tasks.posture + tasks.still + tasks.smooth
+        f += tasks.posture * tasks.posture_gain * (robot.rest - state.u) + tasks.smooth * smooth
+        velocity_bounds(
+            state.u, state.v, robot.lower, robot.upper, self.loose * speed * robot.v_most, self.loose * robot.a_most, dt,
+            self._low, self._high,
+        )  # fmt: skip
+        rows, bound = self._apart(state)
+        v = self._programme(H, f, rows, bound, state)
+        v = np.clip(v, self._low, self._high)
+        return State(state.u + 0.5 * dt * (state.v + v), v, (v - state.v) / dt)
+
+    def _apart(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Rows @ v' ≥ bound: near shapes come no closer than they can stop."""
+        near = self.shapes.near(self.data)
+        self.closest = float(near.distance.min()) if len(near.distance) else np.inf
+        growth = near.growth if self._plain else near.growth @ self.robot.coupling
+        left = near.distance - CLEARANCE + 0.5 * self.dt * (growth @ state.v)
+        # Half of what all joints together could brake: the other half is theirs for their own limits.
+        brake = 0.5 * np.abs(growth) @ self.robot.a_most
+        closing = np.where(left > 0.0, -np.minimum(8.0 * left, np.sqrt(np.maximum(2.0 * brake * left, 0.0))), -4.0 * left)
+        self.counts.near += bool((left < 0.01).any())
+        return growth, closing
+
+    def _programme(
+        self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray, state: State
+    ) -> np.ndarray:
+        m = len(rows)
+        upper = np.concatenate([self._high, np.full(m, 1e30)])
+        lower = np.concatenate([self._low, bound])
+        sense = np.zeros(len(upper), dtype=np.int32)
+        v, _, flag, _ = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
+        if flag == 1:
+            return np.asarray(v)
+        sense[len(self._high) :] = 8  # soft: as far apart as the joints' limits allow
+        v, _, flag, _ = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
+        self.counts.held += 1
+        if flag > 0 and np.isfinite(v).all():
+            return np.asarray(v)
+        return np.clip(0.0, self._low, self._high)
+
+
+class _Follower:
+    """One arm's rows of the programme; views into Pinocchio's memory are looked up once."""
+
+    def __init__(self, robot: Robot, arm: Arm, data: Any) -> None:
+        self.arm, self.robot, self.data = arm, robot, data
+        frame = robot.model.frames[arm.hand]
+        self._R_JH, self._p_JH = frame.placement.rotation.copy(), frame.placement.translation.copy()
+        self._R_J, self._p_J = (getattr(data.oMi[frame.parentJoint], part) for part in ("rotation", "translation"))
+        self._elbowed = arm.elbow >= 0
+        if self._elbowed:
+            elbow = robot.model.frames[arm.elbow]
+            self._p_JE = elbow.placement.translation.copy()
+            self._R_E, self._p_E = (getattr(data.oMi[elbow.parentJoint], part) for part in ("rotation", "translation"))
+            self._above = _moved_by(robot, elbow.parentJoint)
+        self._moved = _moved_by(robot, frame.parentJoint)
+        self.p, self.R, self.elbow = np.zeros(3), np.eye(3), np.full(3, np.nan)
+
+    def update(self) -> None:
+        self.R = self._R_J @ self._R_JH
+        self.p = self._R_J @ self._p_JH + self._p_J
+        if self._elbowed:
+            self.elbow = self._R_E @ self._p_JE + self._p_E
+
+    def add(self, H: np.ndarray, f: np.ndarray, aim: Aim, tasks: Tasks, dt: float, v: np.ndarray) -> bool:
+        """Add hand, orientation and swivel; whether the arm is straight, or else cannot move its hand in a direction."""
+        J = self.data.J if self.robot.model.nv == H.shape[0] else self.data.J @ self.robot.coupling
+        spin = J[3:] * self._moved
+        slide = J[:3] * self._moved + _turned(spin, self.p)
+        ahead = 0.5 * dt * v  # half of the coming step is already decided
+        error = aim.position - self.p - slide @ ahead
+        want = aim.velocity + _capped(tasks.gain * error, tasks.brake, error)
+        square = slide.T @ slide
+        weight = tasks.position * aim.weight
+        H += weight * square
+        f += weight * (want @ slide)
+        turn = pin.log3(aim.rotation @ self.R.T) - spin @ ahead
+        want = aim.rate + _capped(tasks.gain * turn, tasks.brake, turn)
+        weight = tasks.orientation * aim.weight
+        H += weight * (spin.T @ spin)
+        f += weight * (want @ spin)
+        if self._elbowed:
+            self._swivel(H, f, aim, tasks, J, slide)
+        gram = slide @ slide.T
+        least = float(np.sqrt(max(np.linalg.eigvalsh(gram)[0], 0.0)))
+        if least >= tasks.straight:
+            return False
+        damping = tasks.damping * (1.0 - least / tasks.straight) ** 2  # Nakamura and Hanafusa 1986
+        H[self.arm.joints, self.arm.joints] += damping
+        f[self.arm.joints] += damping * 0.9 * v[self.arm.joints]
+        return True
+
+    def _swivel(self, H: np.ndarray, f: np.ndarray, aim: Aim, tasks: Tasks, J: np.ndarray, slide: np.ndarray) -> None:
+        """The elbow about the line from shoulder to hand, as the person's; it fades where either arm is straight."""
+        offset = self.p - self.arm.shoulder
+        far = np.sqrt(offset @ offset)
+        if far < 0.05:
+            return
+        axis = offset / far
+        upper = self.elbow - self.arm.shoulder
+        along = upper @ axis
+        bend = upper - along * axis
+        r = np.sqrt(bend @ bend)
+        wanted = aim.bend - (aim.bend @ axis) * axis
+        size = np.sqrt(wanted @ wanted)
+        if r < 0.01 or size < 0.01:
+            return
+        tangent = _cross(axis, bend / r)
+        angle = np.arctan2(wanted @ tangent, (wanted @ bend) / r)
+        own = J[:3] * self._above + _turned(J[3:] * self._above, self.elbow)
+        row = tangent @ own - (along / far) * (tangent @ slide)
+        sure = min(1.0, size / 0.05) * min(1.0, r / 0.05)
+        weight = tasks.swivel * aim.weight * sure
+        want = r * np.clip(0.5 * tasks.gain * angle, -3.0, 3.0)
+        H += weight * np.outer(row, row)
+        f += weight * want * row
+
+
+def aims_at(targets: tuple[ArmTarget, ...], k: int) -> tuple[Aim, ...]:
+    """What the hands are to do at sample `k`."""
+    return tuple(
+        Aim(t.position[k], t.velocity[k], t.rotation[k], t.rate[k], t.bend[k], float(t.weight[k])) for t in targets
+    )
+
+
+def _moved_by(robot: Robot, joint: int) -> np.ndarray:
+    """(n,) 1 where a value moves what hangs on a joint. Followers stand in the columns of what they follow."""
+    found = np.zeros(robot.model.nv)
+    while joint > 0:
+        found[robot.model.idx_vs[joint]] = 1.0
+        joint = robot.model.parents[joint]
+    return (np.abs(robot.coupling.T) @ found > 0.0).astype(float)
+
+
+def _turned(spin: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """spin × p of columns (3, n)."""
+    x, y, z = p
+    return np.stack([spin[1] * z - spin[2] * y, spin[2] * x - spin[0] * z, spin[0] * y - spin[1] * x])
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _capped(velocity: np.ndarray, brake: float, error: np.ndarray) -> np.ndarray:
+    """The velocity, no faster than `brake` stops it within the error."""
+    speed, most = np.sqrt(velocity @ velocity), np.sqrt(2.0 * brake * np.sqrt(error @ error))
+    return velocity if speed <= most else velocity * (most / speed)

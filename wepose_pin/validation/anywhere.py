@@ -1,0 +1,68 @@
+"""Sensors strapped on in any rotation: what a minute of joined hands finds of lengths, mounts and headings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..calibration import calibrate
+from ..evaluation import evaluate
+from ..simulation import REALISTIC, Person, Simulation, simulate, simulated_person
+from ..subject import LENGTHS, Subject, mount_rows
+from ..tracking import track
+from .findings import ANYWHERE
+from .jobs import Job, Result
+
+METHODS = ("amekf", "smekf")
+
+
+def experiments(quick: bool = False) -> dict[str, list[Job]]:
+    """Name → jobs; `quick`: one trial."""
+    return {ANYWHERE: [Job(ANYWHERE, str(k), _anywhere, (k,)) for k in range(1 if quick else 10)]}
+
+
+def _anywhere(experiment: str, trial: str, seed: int) -> list[Result]:
+    """Nothing of the mounts is stated; shoulder width and trunk are taped; then six circles with what was found."""
+    person = simulated_person(seed)
+    simulation = simulate(person.lengths, seed=seed, imperfections=replace(REALISTIC, mount="any"))
+    recording, truth = simulation.recording(), simulation.truth()
+    results = []
+    for method in METHODS:
+        subject = calibrate(
+            recording, gauge=person.taped, prior=person.average, method=method, gauge_std=person.taped_std
+        )
+        errors = evaluate(track(recording, subject, method=method), truth, simulation.phases["circles"][0])
+        found = _found(subject, person, simulation) | {
+            "hand_mm": errors.position["right_hand"]._asdict(),
+            "hand_from_shoulders_mm": errors.position_from_shoulders["right_hand"]._asdict(),
+        }
+        results.append(Result(experiment, trial, method, found))
+    return results
+
+
+def _found(subject: Subject, person: Person, simulation: Simulation) -> dict[str, float]:
+    """Errors of the calibration; all of them by the standard deviations that it states, too."""
+    names = [name for name in LENGTHS if name != "trunk"]  # which joined hands do not show
+    lengths = np.array([subject.lengths[name] - person.lengths[name] for name in names])
+    order = list(simulation.quat_LS)
+    mounts = np.array(
+        [
+            (Rotation.from_quat(subject.mounts[name]) * Rotation.from_quat(quat).inv()).as_rotvec()
+            for name, quat in simulation.quat_LS.items()
+        ]
+    )
+    stated = np.array([[subject.std(row) for row in mount_rows(name)] for name in order])
+    by_std = [*(lengths / [subject.std(name) for name in names]), *(mounts / stated).ravel()]
+    return {
+        "lengths_rms_mm": 1e3 * _rms(lengths),
+        "headings_rms_deg": float(np.degrees(_rms(mounts[:, 2]))),
+        "torso_heading_rms_deg": float(np.degrees(abs(mounts[order.index("torso"), 2]))),
+        "tilts_rms_deg": float(np.degrees(_rms(mounts[:, :2]))),
+        "errors_by_std_rms": _rms(np.array(by_std)),
+    }
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
