@@ -147,6 +147,30 @@ def test_c3d_marks_what_hangs_on_a_gap(tmp_path: Path, pose: Pose) -> None:
     assert np.isnan(data["points"][0, POINTS.index("right_wrist"), 10:20]).all()
 
 
+def test_c3d_with_more_frames_than_it_counts(tmp_path: Path) -> None:
+    pytest.importorskip("ezc3d")
+    n = 65536
+    long = Pose(0.01 * np.arange(n), {}, {"left_hand": np.zeros((n, 3))})
+    with pytest.raises(BadData, match=r"65536 samples; a \.c3d holds 65535, which --rate-hz 99 makes fewer than"):
+        writers.write_c3d(tmp_path / "x.c3d", Motion(long, load_model(), "x", "x"))
+    short = replace(long, time=long.time[:-1], points={"left_hand": np.zeros((n - 1, 3))})
+    assert writers.write_c3d(tmp_path / "x.c3d", Motion(short, load_model(), "x", "x")) == []
+
+
+def test_c3d_that_ends_early_is_no_file(result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ezc3d = pytest.importorskip("ezc3d")
+    write = ezc3d.c3d.write
+
+    def cut(self: object, path: str) -> None:
+        write(self, path)
+        Path(path).write_bytes(Path(path).read_bytes()[:4096])
+
+    monkeypatch.setattr(ezc3d.c3d, "write", cut)
+    with pytest.raises(ExistingOutput, match="is the disk full"):
+        export(result, tmp_path / "x.c3d")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_c3d_without_ezc3d(result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     with pytest.raises(BadOption, match=r"pip install 'wepose-pin\[export\]'"):

@@ -27,7 +27,7 @@ Outlet = Callable[..., Any]
 def pylsl(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     pytest.importorskip("pylsl")
     monkeypatch.delenv("LSLAPICFG", raising=False)
-    return lsl._pylsl(None)[0]
+    return lsl.pylsl_within(None)[0]
 
 
 @pytest.fixture
@@ -190,7 +190,7 @@ def test_wrong_channels_say_what_is_right(
 SENDER = """
 import sys, time
 from wepose_pin.live.sources import lsl
-pylsl = lsl._pylsl("machine")[0]
+pylsl = lsl.pylsl_within("machine")[0]
 out = pylsl.StreamOutlet(pylsl.StreamInfo("far-torso", "IMU", 6, 100.0, "float32", ""))
 print("ready", flush=True)
 while True:

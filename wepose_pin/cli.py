@@ -607,8 +607,8 @@ def export(
     Args:
         result: Folder that `wepose track` wrote.
         out: File to write.
-        format: csv, parquet: pose and joint angles; mot: joint angles for OpenSim; sto: orientations for OpenSense, and
-            placement: the sample for its IMU Placer; trc, c3d: points; bvh: skeleton and motion; urdf: the subject.
+        format: csv, parquet (pose and joint angles), mot (joint angles for OpenSim), sto (orientations for OpenSense),
+            placement (the sample for its IMU Placer), trc, c3d (points), bvh (skeleton and motion), urdf (the subject).
             Left out, it is the file's suffix.
         names: Columns of a .mot: coordinates of OpenSim's Rajagopal model, the default, or the ISB's angles.
         rate_hz: Resample to this many samples a second.

@@ -149,12 +149,12 @@ class LslOut:
     """
 
     def __init__(self, name: str = "WeposePose", rate_hz: float | None = RATE_HZ) -> None:
-        from .sources.lsl import _pylsl
+        from .sources.lsl import pylsl_within
 
         if not name:
             raise BadOption("LSL out: a stream needs a name, as WeposePose")
         self._name, self._rate, self._pace = name, rate_hz, Pace(rate_hz)
-        self._lsl, _ = _pylsl(None)
+        self._lsl, _ = pylsl_within(None)
         self._outlet: Any = None
 
     def start(self, stage: Stage) -> None:

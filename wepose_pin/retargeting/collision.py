@@ -23,10 +23,11 @@ _ALWAYS = 0.95  # share of them in which such a pair does
 
 
 class Near(NamedTuple):
-    """Pairs that are near: distances (m,) [m] and how each grows with the joints (m, n)."""
+    """Pairs that are near."""
 
-    distance: np.ndarray
-    growth: np.ndarray
+    distance: np.ndarray  # (m,) [m]
+    growth: np.ndarray  # (m, nv) of the distance with the joints
+    clearance: np.ndarray  # (m,) [m] that is to be kept
 
 
 class Shapes:
@@ -52,6 +53,7 @@ class Shapes:
         self._first, self._second = (np.array([pair[k] for pair in self.pairs], dtype=int) for k in (0, 1))
         self._apart = self._radius[self._first] + self._radius[self._second] + NEAR
         self._moves = _supports(robot.model)
+        self.clearance = self._clearances()
         self._viewed: Any = None
         self._rotations: list[np.ndarray] = []
         self._translations: list[np.ndarray] = []
@@ -60,7 +62,7 @@ class Shapes:
         """Pairs within `NEAR`; `data` of the model holds the joints' placements and Jacobian."""
         n = self.robot.model.nv
         if not len(self.pairs):
-            return Near(np.empty(0), np.empty((0, n)))
+            return Near(np.empty(0), np.empty((0, n)), np.empty(0))
         if data is not self._viewed:  # views into Pinocchio's memory: asking for them anew costs more than the rest
             self._viewed = data
             self._rotations = [placement.rotation for placement in data.oMi]
@@ -70,7 +72,7 @@ class Shapes:
         gap = centre[self._first] - centre[self._second]
         close = np.flatnonzero(np.einsum("ki,ki->k", gap, gap) < self._apart**2)
         if not len(close):
-            return Near(np.empty(0), np.empty((0, n)))
+            return Near(np.empty(0), np.empty((0, n)), np.empty(0))
         pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
         found, which = [], []
         for k in close.tolist():
@@ -80,7 +82,7 @@ class Shapes:
                 found.append((d, *result.getNearestPoint1(), *result.getNearestPoint2()))
                 which.append(k)
         if not found:
-            return Near(np.empty(0), np.empty((0, n)))
+            return Near(np.empty(0), np.empty((0, n)), np.empty(0))
         table = np.array(found)
         distance, a, b = table[:, 0], table[:, 1:4], table[:, 4:7]
         away = a - b
@@ -90,7 +92,16 @@ class Shapes:
         linear = away @ J[:3]
         first, second = self._moves[self._joint[self._first[which]]], self._moves[self._joint[self._second[which]]]
         growth = first * (linear + _cross(a, away) @ J[3:]) - second * (linear + _cross(b, away) @ J[3:])
-        return Near(distance, growth)
+        return Near(distance, growth, self.clearance[which])
+
+
+    def _clearances(self) -> np.ndarray:
+        """(pairs,) [m] `CLEARANCE`; of hulls nearer than that at rest half of what is there, or none."""
+        data = self.robot.model.createData()
+        pin.forwardKinematics(self.robot.model, data, self.robot.q(self.robot.rest))
+        pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
+        found = [pin.computeDistance(self.hulls, self.data, k).min_distance for k in range(len(self.pairs))]
+        return np.array([min(CLEARANCE, 0.5 * d if d > 0.0 else d) for d in found])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

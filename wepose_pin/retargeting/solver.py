@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from ..errors import WeposeError
-from .collision import CLEARANCE, Shapes
+from .collision import Shapes
 from .limits import velocity_bounds
 from .person import ArmTarget
 from .robot import Arm, Robot
@@ -138,7 +138,7 @@ class Stepper:
         near = self.shapes.near(self.data)
         self.closest = float(near.distance.min()) if len(near.distance) else np.inf
         growth = near.growth if self._plain else near.growth @ self.robot.coupling
-        left = near.distance - CLEARANCE + 0.5 * self.dt * (growth @ state.v)
+        left = near.distance - near.clearance + 0.5 * self.dt * (growth @ state.v)
         # Half of what all joints together could brake: the other half is theirs for their own limits.
         brake = 0.5 * np.abs(growth) @ self.robot.a_most
         closing = np.where(left > 0.0, -np.minimum(8.0 * left, np.sqrt(np.maximum(2.0 * brake * left, 0.0))), -4.0 * left)

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import BadOption
+from ..errors import BadData, BadOption, ExistingOutput
 from .motion import Motion, even, seen_points
+
+MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
 
 
 def write_c3d(path: Path, motion: Motion) -> list[str]:
@@ -22,7 +24,9 @@ def write_c3d(path: Path, motion: Motion) -> list[str]:
     BadOption
         ezc3d is not installed.
     BadData
-        No point is known.
+        No point is known, or there are more frames than the format counts.
+    ExistingOutput
+        It cannot be written whole.
     """
     try:
         import ezc3d
@@ -30,6 +34,13 @@ def write_c3d(path: Path, motion: Motion) -> list[str]:
         raise BadOption("--format c3d: needs ezc3d, which is not installed: pip install 'wepose-pin[export]'") from None
     motion, notes = even(motion)
     points = seen_points(motion)
+    n = len(motion.pose.time)
+    if n > MOST_FRAMES:
+        rate_hz = np.floor(motion.rate_hz * MOST_FRAMES / n)
+        raise BadData(
+            f"{motion.where}: {n} samples; a .c3d holds {MOST_FRAMES}, which --rate-hz {rate_hz:g} makes fewer than; "
+            f"a .trc holds all"
+        )
     p_W = np.stack([p.T for p in points.values()], axis=1)  # (3, points, n)
     file = ezc3d.c3d()
     parameters = file["parameters"]["POINT"]
@@ -44,7 +55,16 @@ def write_c3d(path: Path, motion: Motion) -> list[str]:
     named = path.with_name(f"{path.name}.c3d")  # ezc3d adds the suffix where it is missing
     try:
         file.write(str(named))
+        _check(named, p_W.shape[1] * p_W.shape[2])
         named.replace(path)
     finally:
         named.unlink(missing_ok=True)
     return notes
+
+
+def _check(file: Path, points: int) -> None:
+    """Complain of a file that ends early: ezc3d says nothing of a full disk."""
+    with file.open("rb") as opened:
+        first_block = int.from_bytes(opened.read(18)[16:], "little")  # word 9 of the header, counted from 1
+    if file.stat().st_size < 512 * (first_block - 1) + 16 * points:
+        raise ExistingOutput(f"{file.name}: cannot be written whole; is the disk full? nothing was written")

@@ -10,6 +10,7 @@ from ..angles import angle_table, joint_angles
 from ..errors import BadData
 from ..pose import pose_table
 from .motion import Motion
+from .result import write_table
 
 
 def table(motion: Motion) -> pl.DataFrame:
@@ -24,7 +25,7 @@ def table(motion: Motion) -> pl.DataFrame:
 
 def write_parquet(path: Path, motion: Motion) -> list[str]:
     """Every number to its last bit; what is not known is NaN."""
-    table(motion).write_parquet(path)
+    write_table(path, table(motion))
     return []
 
 

@@ -140,7 +140,7 @@ class LslSource:
         BadSource
             liblsl is missing, no such stream is found, or one has other channels than it should.
         """
-        self._lsl, scope = _pylsl(self._scope)
+        self._lsl, scope = pylsl_within(self._scope)
         self._flags = 0 if scope == "machine" else int(self._lsl.proc_clocksync)
         self._stop.clear()
         there: list[str] = []
@@ -286,7 +286,7 @@ def _described(info: Any) -> tuple[list[str], list[str]]:
     return labels, units
 
 
-def _pylsl(scope: str | None) -> tuple[Any, str]:
+def pylsl_within(scope: str | None) -> tuple[Any, str]:
     """The module, set to look as far as `scope`; and how far that is."""
     global _scope
     try:
