@@ -65,6 +65,37 @@ def test_sample_by_sample_gives_the_bits_of_a_run_through_resets_and_gaps(record
     assert recording.phases["start"][0][1] < pose.time[0]
 
 
+def test_resets_at_once_and_before_the_first_pose(recording: Recording) -> None:
+    """Who presses twice between two ticks asks for one reset, and may do so as soon as the start pose is over."""
+    until, begin = start_of(recording)
+    pose = track(replace(recording, resets=(begin, 2000, 2000)), causal=True)
+    tracker = CausalTracker(until)
+    gyro, accel = columns(recording)
+    for k in range(begin, 2500):
+        for _ in range({begin: 1, 2000: 2}.get(k, 0)):
+            tracker.reset()
+        stepped = tracker.step(gyro[k], accel[k])
+        assert all(np.array_equal(stepped[i], pose.quat_WL[name][k - begin]) for i, name in enumerate(tracker.names))
+
+
+def test_a_gap_in_the_start_pose_is_bridged_by_what_is_left_of_it(recording: Recording) -> None:
+    """Neither by what the file has there, nor by what came after."""
+    _, begin = start_of(recording)
+    gap = np.zeros(len(recording), dtype=bool)
+    gap[begin - 100 : begin + 100] = True
+    torso = recording.sensors["torso"]
+    assert torso.gyro_S is not None
+    poses = []
+    for value in (0.0, 0.3):
+        gyro_S = np.where(gap[:, None], value, torso.gyro_S)
+        sensors = {**recording.sensors, "torso": replace(torso, gyro_S=gyro_S, gap=gap)}
+        poses.append(track(replace(recording, sensors=sensors), causal=True))
+    assert np.array_equal(poses[0].quat_WL["torso"], poses[1].quat_WL["torso"])
+    silent = replace(torso, gap=np.arange(len(recording)) < begin + 10)
+    with pytest.raises(BadPhase, match=r"sensors\.torso sent nothing in it"):
+        track(replace(recording, sensors={**recording.sensors, "torso": silent}), causal=True)
+
+
 def test_what_comes_later_changes_nothing(recording: Recording) -> None:
     whole, part = track(recording, causal=True), track(first(recording, 2500), causal=True)
     for name, quat in part.quat_WL.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -20,6 +21,8 @@ from test_export import LENGTHS, POINTS, a_pose, smooth, with_gap, write_folder
 from wepose_pin.angles import joint_angles
 from wepose_pin.model import load_model
 from wepose_pin.pose import Pose, pose_of
+from wepose_pin.readers import load_session
+from wepose_pin.readers.describe import describe
 from wepose_pin.writers.export import export
 from wepose_pin.writers.rajagopal import coordinates, orientations
 
@@ -102,13 +105,31 @@ def test_mot_keeps_the_rules(result: Path, tmp_path: Path) -> None:
 def test_sto_keeps_the_rules(result: Path, tmp_path: Path) -> None:
     export(result, tmp_path / "x.sto")
     lines = (tmp_path / "x.sto").read_text().split("\n")
-    assert lines[:4] == ["DataRate=100.000000", "DataType=Quaternion", "version=3", "endheader"]
-    assert lines[4].split("\t") == ["time", *(f"{body}_imu" for body in SEGMENT_OF)]
-    for line in lines[5:-1]:
+    head = lines.index("endheader")
+    assert lines[:3] == ["DataRate=100.000000", "DataType=Quaternion", "version=3"]
+    assert all(re.fullmatch("[^=\t]+=[^=\t]+", line) for line in lines[:head])
+    assert lines[head + 1].split("\t") == ["time", *(f"{body}_imu" for body in SEGMENT_OF)]
+    for line in lines[head + 2 : -1]:
         time, *cells = line.split("\t")
         assert 2.0 <= float(time) <= 5.0
         quat = np.array([[float(part) for part in cell.split(",")] for cell in cells])
         np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-8)
+
+
+def test_sto_is_read_back_as_it_was(result: Path, tmp_path: Path) -> None:
+    """As segments of the body, with nothing to state but which way they faced."""
+    export(result, tmp_path / "x.sto")
+    session = describe(tmp_path / "x.sto").session
+    assert session is not None
+    (tmp_path / "session.toml").write_text(session)
+    recording = load_session(tmp_path)
+    pose = a_pose()
+    assert set(recording.sensors) == set(SEGMENT_OF.values())
+    for segment, sensor in recording.sensors.items():
+        assert sensor.aligned
+        assert sensor.quat_WS is not None
+        same = np.einsum("nc,nc->n", sensor.quat_WS, pose.quat_WL[segment])
+        np.testing.assert_allclose(np.abs(same), 1.0, atol=1e-8)
 
 
 def test_trc_keeps_the_rules(tmp_path: Path) -> None:

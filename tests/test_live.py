@@ -170,6 +170,18 @@ def test_a_marked_gap_is_silence_live_and_causally(recording: Recording, tmp_pat
     np.testing.assert_array_equal(np.flatnonzero(lost), np.flatnonzero(gap))
 
 
+@pytest.mark.parametrize(("begin", "end"), [(20, 120), (200, 300), (350, 600)])
+def test_a_gap_in_a_named_start_pose(recording: Recording, tmp_path: Path, begin: int, end: int) -> None:
+    gap = np.zeros(len(recording), dtype=bool)
+    gap[begin:end] = True
+    sensors = {**recording.sensors, "torso": replace(recording.sensors["torso"], gap=gap)}
+    recording = replace(recording, sensors=sensors)
+    live(recording, tmp_path / "a.wepose")
+    found = read_live_log(tmp_path / "a.wepose")
+    for again in (track(found.recording, causal=True), track(recording, causal=True)):
+        assert all(np.array_equal(found.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
+
+
 def test_heading_resets_are_in_the_file(recording: Recording, tmp_path: Path) -> None:
     watcher = Watcher([(12.0, "r"), (20.0, "r"), (28.0, "q")])
     ended = live(recording, tmp_path / "a.wepose", watcher=watcher)

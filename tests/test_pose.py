@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadModel
 from wepose_pin.model import POINTS, BodyModel, chains, load_model
-from wepose_pin.model.follow import stepwise
+from wepose_pin.model.follow import Follower
 from wepose_pin.pose import (
+    LiveKinematics,
     configuration,
     deviation,
     forward_kinematics,
@@ -179,7 +180,7 @@ def test_two_axes_come_as_near_as_they_can(data: Path) -> None:
     body = gazebo(data, 48)
     rng = np.random.default_rng(5)
     quat_WL = orientations(SEGMENTS, 5, n=12)
-    q, _ = stepwise(body, chains(body.pin), quat_WL, {})
+    q, _ = Follower(body, chains(body.pin), quat_WL).stepwise(quat_WL, {})
     missed = deviation(body, q, quat_WL)
     grid = np.linspace(-np.pi, np.pi, 61)
     for segment, joints in (
@@ -331,3 +332,20 @@ def test_one_hinge_takes_its_twist_and_a_continuous_one_has_no_end(tmp_path: Pat
     first = body.pin.idx_qs[body.pin.getJointId("left_w")]
     np.testing.assert_allclose(q[:, first], np.cos(2.0 * turned), atol=1e-9)
     np.testing.assert_allclose(q[:, first + 1], np.sin(2.0 * turned), atol=1e-9)
+
+
+def test_a_body_with_hinges_is_followed_live_as_in_a_recording(data: Path, simulation: Simulation) -> None:
+    """Pose after pose, each fit from the one before."""
+    body = gazebo(data, 48)
+    pose = track(simulation.recording("live"), model=body, causal=True)
+    live = LiveKinematics(body, list(pose.quat_WL))
+    rows = range(2000, 2100)
+    points = np.stack([live.points_of(np.array([quat[k] for quat in pose.quat_WL.values()])) for k in rows])
+    assert live.points
+    for i, name in enumerate(live.points):
+        np.testing.assert_allclose(points[:, i], pose.points[name][rows], atol=1e-6)
+
+
+def test_a_segment_that_the_model_lacks_is_said_before_the_first_pose(data: Path) -> None:
+    with pytest.raises(BadModel, match="no link for segment 'pelvis'"):
+        LiveKinematics(load_model(), ["torso", "pelvis"])

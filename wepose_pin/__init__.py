@@ -28,12 +28,15 @@ _WHERE = {
     "calibrate": "calibration",
     "estimate_orientation": "filters",
     "evaluate": "evaluation",
+    "export": "writers.export",
     "joint_angles": "angles",
     "load_model": "model",
+    "load_robot": "model.robot",
     "load_session": "readers",
     "load_subject": "subject",
     "simulate": "simulation",
     "track": "tracking",
+    "track_chain": "tracking",
 }
 __all__ = ["__version__", *sorted(_WHERE)]
 __version__ = "0.1.0"

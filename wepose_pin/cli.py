@@ -590,6 +590,97 @@ def view(
         _warn(["no browser could be started; open the page by hand"])
 
 
+def retarget(
+    result: Result,
+    /,
+    *,
+    robot: Annotated[str, arg(metavar="NAME|FILE.urdf")],
+    out: Out,
+    arm: Literal["left", "right", "both"] | None = None,
+    rate_hz: float = 100.0,
+    task: Literal["both", "position", "orientation"] = "both",
+    scale: float | None = None,
+    smoothing_hz: float = 6.0,
+    strict: bool = False,
+    episode: bool = False,
+    view: bool = True,
+    force: bool = False,
+) -> None:
+    """A person's arms to a robot's: a joint trajectory within its limits that does not hit itself.
+
+    Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (of example-robot-data). Any other by its URDF with a map
+    beside it that says which links are shoulder, elbow and hand (docs/retargeting.md).
+
+    Example: wepose retarget result --robot panda -o panda
+
+    Args:
+        result: Folder that `wepose track` wrote.
+        robot: One of the names above, a URDF with a map beside it (ARM.urdf, ARM.toml), or the map.
+        out: Folder for trajectory.parquet and .csv, joint_trajectory.json and .yaml, summary.json, view.html.
+        arm: Which arms; without it all that the robot has.
+        rate_hz: Of the trajectory, as the controller wants it.
+        task: What the hands follow: the person's position, orientation, or both.
+        scale: The robot's metres for one of the person's; without it a straight arm becomes a straight arm.
+        smoothing_hz: Of the low-pass on what was measured; 0: none.
+        strict: Refuse a motion that is too fast for the robot, in place of slowing it.
+        episode: Write episode/ too: a data set of one episode as LeRobot reads it.
+        view: Leave out view.html.
+        force: Replace files of an earlier run.
+    """
+    import json
+    from dataclasses import replace
+
+    from .retargeting import Tasks, find_map, kept, load, summary, table, touching, write_episode, write_trajectory
+    from .retargeting import retarget as follow
+    from .writers import whole_folder
+    from .writers.result import as_json, read_result
+
+    sides = None if arm is None else ("left", "right") if arm == "both" else (arm,)
+    tasks = replace(Tasks(), **{name: 0.0 for name in ("position", "orientation") if task not in ("both", name)})
+    with whole_folder(out, force) as folder, _steps(104) as step:
+        step("reading")
+        pose, body, _ = read_result(result)
+        model = load(find_map(robot), sides)
+        seen = 0
+
+        def progress(text: str, share: float) -> None:
+            nonlocal seen
+            at = int(50 * share) + (50 if text == "solving" else 0)
+            while seen < at:
+                seen += 1
+                step(text)
+
+        trajectory = follow(
+            pose,
+            model,
+            rate_hz=rate_hz,
+            tasks=tasks,
+            scale=scale,
+            smoothing_hz=smoothing_hz,
+            strict=strict,
+            progress=progress,
+        )
+        step("checking")
+        held = kept(table(trajectory), model.map.urdf, model.map.acceleration)
+        touched = touching(model, trajectory.time, trajectory.u)
+        step("writing")
+        write_trajectory(folder, trajectory)
+        if episode:
+            write_episode(folder / "episode", trajectory, f"follow the arms of {result.name}")
+        found = summary(trajectory, held, touched)
+        (folder / "summary.json").write_text(json.dumps(as_json(found), indent=2) + "\n", encoding="utf-8")
+        if view:
+            step("making the page")
+            from .viewer import retarget_html
+
+            page = retarget_html(body, pose, trajectory, title=f"{result.name} on {model.map.name}")
+            (folder / "view.html").write_text(page, encoding="utf-8")
+    _retarget_tables(found)
+    _say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
+    if view:
+        _say(f"Motion to look at: {out / 'view.html'}")
+
+
 def export(
     result: Result,
     /,
@@ -811,6 +902,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "track": track,
     "live": live,
     "view": view,
+    "retarget": retarget,
     "export": export,
     "info": info,
     "evaluate": evaluate,
@@ -1160,6 +1252,39 @@ def _validation_tables(document: Document) -> None:
     _say("± is one standard deviation over time, averaged over the trials. The still phase's bias is removed for")
     _say("every filter but those as they come; the heading is aligned once, where nothing is scored, and never")
     _say("fitted to the truth afterwards.")
+
+
+def _retarget_tables(found: dict[str, Any]) -> None:
+    """How well the hands follow, and what the trajectory keeps."""
+    rows = []
+    for side, of in found["arms"].items():
+        inside, turn, swivel = of["hand_error_mm"], of["hand_error_deg"], of["swivel_error_deg"]
+        rows.append(
+            (
+                side,
+                f"{of['scale']:.2f}",
+                *((f"{inside[key]:.1f}" for key in ("median", "p90")) if inside else ("", "")),
+                f"{turn['median']:.1f}",
+                f"{swivel['median']:.0f}" if swivel else "",
+                f"{100 * of['inside_reach_share']:.0f}",
+            )
+        )
+    header = ("arm", "scale", "hand [mm] median", "90 %", "turn [deg]", "elbow swivel [deg]", "inside the reach [%]")
+    _print_table(f"{found['robot']}: {found['duration_s']:.1f} s for {found['recorded_s']:.1f} s recorded", header, rows)
+    margins, touched = found["limit_margins"], found["self_collision"]
+    _say(
+        f"Limits {'kept' if found['limits_kept'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, velocity "
+        f"{100 * margins['velocity_share']:.1f} %, acceleration {100 * margins['acceleration_share']:.1f} % to spare"
+    )
+    slow = found["slowest"]
+    if slow is not None:
+        _say(f"Slowed most for {slow['joint']} at {slow['time']:.1f} s of the recording ({slow['what']})")
+    if touched["samples_touching"]:
+        _warn([f"the robot touches itself in {touched['samples_touching']} samples, first {touched['first']}"])
+    else:
+        closest = touched["closest_hulls_mm"]
+        _say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
+    _say(f"Solved in {found['solve_ms']['p50']:.2f} ms (p50), {found['solve_ms']['p99']:.2f} ms (p99) a step")
 
 
 def _mean_std(error: Any) -> str:

@@ -9,9 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+LONGEST = 2000  # letters of an error's text
+_END = 500  # of these, what is kept of the end, where it says what would be right
+
 
 class WeposeError(Exception):
     """Wrong input; the base of all errors this package raises on purpose."""
+
+    def __str__(self) -> str:
+        text = printable(super().__str__())
+        return text if len(text) <= LONGEST else f"{text[: LONGEST - _END]} … {text[-_END:]}"
 
 
 class MissingFile(WeposeError):
@@ -54,8 +61,23 @@ class BadSource(WeposeError):
     """A live source cannot be opened: no port, no stream, no device that answers."""
 
 
+class BadPlan(WeposeError):
+    """A plan of many recordings lacks something, or its table does."""
+
+
+class LostWorker(WeposeError):
+    """Workers died at an item, again and again: too little memory, say."""
+
+
 class NoSolution(WeposeError):
     """A problem that was well posed by its form has no solution on these data."""
+
+
+def printable(text: str) -> str:
+    """The text in one line, control characters escaped: what a file holds must not steer a terminal."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
 
 
 def one_of(names: Iterable[str], found: str | None = None, most: int = 12) -> str:

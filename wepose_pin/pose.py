@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from . import so3
 from .errors import BadData, BadModel, one_of
 from .model import POINTS, BodyModel, chains
-from .model.follow import follow, groups
+from .model.follow import Follower, groups
 from .recording import SEGMENTS
 from .so3 import kernel
 from .subject import LENGTHS
@@ -115,11 +115,18 @@ def configuration(
     """
     if not quat_WL:
         raise BadData("no segment has an orientation: there is nothing to pose")
+    return _follower(model, quat_WL, limits, weights).run(quat_WL)
+
+
+def _follower(
+    model: BodyModel, segments: Collection[str], limits: bool = True, weights: Mapping[str, float] | None = None
+) -> Follower:
+    """Raises `BadModel` where the model has no link for a segment."""
     found = chains(model.pin)
-    for segment in quat_WL:
+    for segment in segments:
         if segment not in found:
             raise BadModel(f"{model.pin.name}: the model has no link for segment '{segment}'; {one_of(found, segment)}")
-    return follow(model, found, quat_WL, limits=limits, weights=weights)
+    return Follower(model, found, segments, limits=limits, weights=weights)
 
 
 def deviation(model: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -156,7 +163,7 @@ def forward_kinematics(
 
 
 class LiveKinematics:
-    """Points of one pose after another; what does not change is looked up once.
+    """Points of one pose after another; what does not change is looked up once, a fit begins at the pose before.
 
     Parameters
     ----------
@@ -167,6 +174,11 @@ class LiveKinematics:
     ----------
     points : names of the points that are known
     data : Pinocchio's, of the last pose
+
+    Raises
+    ------
+    BadModel
+        The model has no link for a measured segment.
     """
 
     def __init__(self, model: BodyModel, segments: Sequence[str]) -> None:
@@ -175,6 +187,8 @@ class LiveKinematics:
         self._model, self.data, self._q = model, model.pin.createData(), pin.neutral(model.pin)
         self._views = [self.data.oMf[model.pin.getFrameId(POINTS[point])].translation for point in self.points]
         self._joints = self._spherical()
+        self._follower = None if self._joints is not None else _follower(model, self.segments)
+        self._before: np.ndarray | None = None
 
     def _spherical(self) -> list[tuple[int, int, int]] | None:
         """Of each measured segment its place in q, its row and that of the one above (−1: W); None: not so simple."""
@@ -189,7 +203,8 @@ class LiveKinematics:
             for segment, chain in found.items():
                 if segment not in self.segments or joint not in chain.joints:
                     continue
-                if chain.axes != (None,) or not all(np.allclose(q, identity) for q in (*chain.quat, chain.quat_AL)):
+                spherical = len(chain.axes) == 1 and chain.axes[0] is None
+                if not spherical or not all(np.allclose(q, identity) for q in (*chain.quat, chain.quat_AL)):
                     return None
                 row = self.segments.index(segment)
                 joints.append((self._model.pin.idx_qs[joint], row, above))
@@ -198,12 +213,11 @@ class LiveKinematics:
 
     def points_of(self, quat_WL: np.ndarray) -> np.ndarray:
         """(p, 3) [m] in W, of `quat_WL` (k, 4) xyzw."""
-        if self._joints is None:
+        if self._follower is not None:
             rows = {segment: quat_WL[i : i + 1] for i, segment in enumerate(self.segments)}
-            self._q = configuration(self._model, rows)[0]
-        else:
-            for at, row, above in self._joints:
-                relative(quat_WL, row, above, self._q, at)
+            self._q = self._before = self._follower.run(rows, self._before)[0]
+        for at, row, above in self._joints or ():
+            relative(quat_WL, row, above, self._q, at)
         pin.framesForwardKinematics(self._model.pin, self.data, self._q)
         return np.array(self._views)
 

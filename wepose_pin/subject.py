@@ -13,6 +13,7 @@ import numpy as np
 
 from .assets import asset
 from .errors import BadOption, BadSubject, MissingFile, one_of
+from .readers.keys import parsed_toml
 from .recording import SEGMENTS
 
 LENGTHS = (
@@ -226,8 +227,8 @@ def subject_of(text: str, path: Path) -> Subject:
         As `load_subject`.
     """
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        table = parsed_toml(text)
+    except ValueError as error:
         raise BadSubject(f"{path}: not valid TOML: {error}") from error
     if "sensors" in table:
         raise BadSubject(f"{path}: is a session; a subject is wanted here, as `wepose calibrate` writes one")

@@ -15,13 +15,16 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .model import BodyModel, Visual
 from .pose import Pose, configuration, known_links, placements
+
+if TYPE_CHECKING:
+    from .retargeting import Trajectory
 
 FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips
 GRID_CELL = 0.25  # [m]
@@ -47,6 +50,15 @@ class Backdrop(NamedTuple):
 
 LIGHT = Backdrop((0.985, 0.99, 0.995), (0.89, 0.91, 0.935), (0.70, 0.74, 0.79))
 DARK = Backdrop((0.085, 0.105, 0.130), (0.135, 0.160, 0.190), (0.30, 0.34, 0.39))
+
+
+class Mesh(NamedTuple):
+    """Triangles that a link looks like, in its frame."""
+
+    link: str
+    vertices: np.ndarray  # (n, 3) [m]
+    triangles: np.ndarray  # (m, 3)
+    rgba: tuple[float, float, float, float]
 
 
 class CommandList:
@@ -95,11 +107,41 @@ def pose_html(
     )
 
 
+def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "", fps: float = 30.0) -> str:
+    """The page on which a person and the robot that does as they do move together, on the robot's time."""
+    from .retargeting.looks import parts, stands_at
+    from .retargeting.looks import placements as robot_placements
+
+    frames = frame_indices(trajectory.time, fps)
+    nearest = np.abs(pose.time[:, None] - trajectory.recorded[frames][None, :]).argmin(axis=0)
+    q = configuration(model, {segment: quat_WL[nearest] for segment, quat_WL in pose.quat_WL.items()})
+    visuals = [visual for visual in model.visuals if visual.link in known_links(model, pose.quat_WL)]
+    placed = placements(model, q, dict.fromkeys(visual.link for visual in visuals))
+    robot = trajectory.robot
+    drawn = parts(robot)
+    shoulder_z = float(np.nanmedian([pose.points[f"{arm.side}_shoulder"][:, 2] for arm in robot.arms]))
+    R_WB, p_WB = stands_at(robot, drawn, shoulder_z, FLOOR_Z)
+    moved = robot_placements(trajectory, drawn, frames, R_WB, p_WB)
+    trails = {f"{arm.side}_hand": pose.points[f"{arm.side}_hand"][nearest] for arm in robot.arms}
+    trails |= {f"{arm.side}_robot_hand": trajectory.hand[arm.side][frames] @ R_WB.T + p_WB for arm in robot.arms}
+    return view_html(
+        visuals,
+        trajectory.time[frames],
+        placed | {f"robot {joint}": at for joint, at in moved.items()},
+        meshes=[Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in drawn],
+        trails=trails,
+        phases={"approach": [(0.0, float(trajectory.time[trajectory.approach]))]},
+        title=title,
+        fps=fps,
+    )
+
+
 def view_html(
     visuals: Sequence[Visual],
     time: np.ndarray,
     placements: Mapping[str, tuple[np.ndarray, np.ndarray]],
     *,
+    meshes: Sequence[Mesh] = (),
     trails: Mapping[str, np.ndarray] | None = None,
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     title: str = "",
@@ -118,6 +160,8 @@ def view_html(
         (n,) [s], n >= 1, rising.
     placements
         Link -> (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]). A link is hidden while its placement is NaN.
+    meshes
+        More of what links look like.
     trails
         Point -> (n, 3) [m] in W, may hold NaN: the last seconds are drawn behind the point. A name that
         begins with left or right takes the colour of that arm.
@@ -139,7 +183,8 @@ def view_html(
     frames = frame_indices(time, fps)
     trails = {name: np.asarray(points, dtype=float)[frames] for name, points in (trails or {}).items()}
     drawn = visible(v for v in visuals if v.link in placements)
-    links = list(dict.fromkeys(v.link for v in drawn))
+    meshes = [mesh for mesh in meshes if mesh.link in placements]
+    links = list(dict.fromkeys([*(v.link for v in drawn), *(mesh.link for mesh in meshes)]))
     motion = np.empty((len(links), len(frames), 7), dtype="<f4")  # quat_WL xyzw, p_WL
     for k, link in enumerate(links):
         quat_WL, p_WL = placements[link]
@@ -159,8 +204,8 @@ def view_html(
             {"name": name, "spans": [[float(begin), float(end)] for begin, end in spans]}
             for name, spans in (phases or {}).items()
         ],
-        "view": view(drawn, links, motion, list(trails.values())),
-        "commands": as_base64([*scene(drawn, links), *backdrop(LIGHT, floor_z)]),
+        "view": view([*drawn, *map(_box_of, meshes)], links, motion, list(trails.values())),
+        "commands": as_base64([*scene(drawn, links, meshes), *backdrop(LIGHT, floor_z)]),
     }
     return filled(Path(__file__).with_name("viewer_page.html"), data, title)
 
@@ -199,7 +244,7 @@ def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
     return np.unique(np.searchsorted(nearest_changes, clock))
 
 
-def scene(drawn: Sequence[Visual], links: Sequence[str]) -> list[bytes]:
+def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[Mesh] = ()) -> list[bytes]:
     """meshcat's commands for lights, camera and body; `links` are groups that the page moves."""
     import meshcat
     import meshcat.geometry as g
@@ -219,6 +264,10 @@ def scene(drawn: Sequence[Visual], links: Sequence[str]) -> list[bytes]:
         part = root[path]
         part.set_object(_named(g.Mesh(_geometry(visual), _material(visual.rgba)), path))
         part.set_transform(_transform(visual))
+    for k, mesh in enumerate(meshes):
+        path = f"body/{links.index(mesh.link)}/mesh{k}"
+        shape = g.TriangularMeshGeometry(mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32))
+        root[path].set_object(_named(g.Mesh(shape, _material(mesh.rgba, flat=True)), path))
     return window.commands
 
 
@@ -253,12 +302,20 @@ def _geometry(visual: Visual) -> Any:
     return g.Sphere(float(visual.size[0]))
 
 
-def _material(rgba: tuple[float, float, float, float]) -> Any:
+def _box_of(mesh: Mesh) -> Visual:
+    """The box around a mesh, for the camera."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2] - low[2]))
+    return Visual(mesh.link, "box", size, np.array([0.0, 0.0, 0.0, 1.0]), 0.5 * (low + high), mesh.rgba)
+
+
+def _material(rgba: tuple[float, float, float, float], flat: bool = False) -> Any:
     import meshcat.geometry as g
 
     red, green, blue = (round(255 * min(max(c, 0.0), 1.0)) for c in rgba[:3])
     colour = (red << 16) + (green << 8) + blue
-    return g.MeshPhongMaterial(color=colour, opacity=float(rgba[3]), side=0, specular=0x1C1C1C, shininess=24)
+    more = {"flatShading": True, "side": 2} if flat else {"side": 0}
+    return g.MeshPhongMaterial(color=colour, opacity=float(rgba[3]), specular=0x1C1C1C, shininess=24, **more)
 
 
 def _transform(visual: Visual) -> np.ndarray:

@@ -12,7 +12,6 @@ How well a pose is held cannot be seen in its own residual, so its weight is sta
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import numpy as np
 from ..alignment import SLIP_STD
 from ..assets import asset
 from ..errors import BadOption, MissingFile, one_of
+from ..readers.keys import parsed_toml
 from ..recording import SEGMENTS
 from ..subject import LENGTHS
 from .chain import CHAIN, REACHES
@@ -163,9 +163,10 @@ def load_protocol(name: str | Path) -> Protocol:
     if not path.is_file():
         raise MissingFile(f"{path}: no such protocol file")
     try:
-        return _protocol(tomllib.loads(path.read_text(encoding="utf-8")), path)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        table = parsed_toml(path.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise BadOption(f"{path}: not valid TOML: {error}") from error
+    return _protocol(table, path)
 
 
 def _protocol(table: dict[str, Any], path: Path) -> Protocol:

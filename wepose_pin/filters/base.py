@@ -88,7 +88,9 @@ def in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads: in
 
 
 def processors() -> int:
-    """Processors that this process may use."""
+    """Processors that this process may use; WEPOSE_THREADS says fewer, as where processes share the machine."""
+    if (said := os.environ.get("WEPOSE_THREADS", "")).isdecimal():
+        return max(1, int(said))
     if hasattr(os, "sched_getaffinity"):  # Linux: a container or taskset may have fewer than the machine
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -57,11 +57,11 @@ def fit(
     weights : of the links' squared angles; 1 where not named
     limits : keep the limits of joints with one axis
     """
-    return _Fit(model, list(quat_WL), joints, weights or {}, limits).run(quat_WL, start)
+    return Fit(model, list(quat_WL), joints, weights or {}, limits).run(quat_WL, start)
 
 
-class _Fit:
-    """One problem with what does not change from frame to frame."""
+class Fit:
+    """One problem with what does not change from frame to frame; parameters as of `fit`."""
 
     def __init__(
         self, model: pin.Model, links: Sequence[str], joints: Sequence[int], weights: Mapping[str, float], limits: bool
@@ -86,12 +86,13 @@ class _Fit:
         column = {int(c): k for k, c in enumerate(self.columns)}
         self._bounded = np.array([column[model.idx_vs[j]] for j in bounded], dtype=int)
 
-    def run(self, quat_WL: Mapping[str, np.ndarray], start: np.ndarray) -> np.ndarray:
+    def run(self, quat_WL: Mapping[str, np.ndarray], start: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+        """As `fit`; the first frame begins at `before` (nq,) where that is given."""
         targets = np.stack([Rotation.from_quat(quat).as_matrix() for quat in quat_WL.values()], axis=1) @ self._R_LJ
         n = len(targets)
         own = len(start) == n
         out = np.empty((n, self.model.nq))
-        q = self._within(start[0].copy())
+        q = self._within((start[0] if before is None else before).copy())
         for k, R in enumerate(targets):
             other = start[k] if own else start[0]
             before, q = q, other.copy()

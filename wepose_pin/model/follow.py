@@ -1,13 +1,13 @@
 """Segment orientations → the configuration of a body: exactly where its joints can, else as near as they come.
 
 First every segment by itself, from the root outwards (`chains`). A spherical joint has done its work with that. Where a
-segment of an arm hangs on fewer axes, or on hinges that have ends, what they cannot do is shared: `fit` over all
+segment of an arm hangs on fewer axes, or on hinges that have ends, what they cannot do is shared: `Fit` over all
 measured segments of that arm, in the frames in which something is missed or a limit passed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ import pinocchio as pin
 from .. import so3
 from .body import BodyModel
 from .chains import AXIAL, Chain, about, axis_in_joint, conjugate, multiply, solve
-from .fit import fit, limits_of
+from .fit import Fit, Limits, limits_of
 
 _MISSED = 1e-9  # [rad] that is nothing
 
@@ -28,7 +28,7 @@ class Group(NamedTuple):
     joints: tuple[int, ...]
 
 
-def groups(found: Mapping[str, Chain], measured: Mapping[str, np.ndarray]) -> list[Group]:
+def groups(found: Mapping[str, Chain], measured: Collection[str]) -> list[Group]:
     """What has to be fitted: an arm, or a segment of the trunk, with a chain that cannot follow everything."""
     together: dict[str, list[str]] = {}
     for segment in found:
@@ -41,102 +41,117 @@ def groups(found: Mapping[str, Chain], measured: Mapping[str, np.ndarray]) -> li
     ]
 
 
-def follow(
-    model: BodyModel,
-    found: Mapping[str, Chain],
-    quat_WL: Mapping[str, np.ndarray],
-    *,
-    limits: bool = True,
-    weights: Mapping[str, float] | None = None,
-) -> np.ndarray:
-    """Configuration `q` (n, nq) by the chains `found`; see `pose.configuration`."""
-    kept: dict[int, np.ndarray] = {}
-    q, quat_WJ = stepwise(model, found, quat_WL, kept)
-    to_fit = groups(found, quat_WL)
-    for group in sorted(to_fit, key=lambda group: group.segments[0] not in AXIAL):
-        wanted = {segment: quat_WL[segment] for segment in group.segments}
-        rows = np.flatnonzero(_astray(model, q, quat_WJ, wanted, group, limits))
-        if not len(rows):
-            continue
-        wanted = {segment: quat[rows] for segment, quat in wanted.items()}
-        q[rows] = fit(model.pin, wanted, group.joints, q[rows], weights=weights, limits=limits)
-        for joint in group.joints:
-            if model.pin.nqs[joint] == 4:
-                first = model.pin.idx_qs[joint]
-                q[:, first : first + 4] = so3.continuous(q[:, first : first + 4])
-        if group.segments[0] in AXIAL:  # what hangs on it stands elsewhere now
-            kept |= {joint: _value(model, q, joint) for joint in group.joints}
-            q, quat_WJ = stepwise(model, found, quat_WL, kept)
-    return q
+class Follower:
+    """Configurations that follow orientations; what does not change from call to call is looked up once.
 
-
-def stepwise(
-    model: BodyModel, found: Mapping[str, Chain], quat_WL: Mapping[str, np.ndarray], kept: Mapping[int, np.ndarray]
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """`q` (n, nq) with every segment at the smallest angle from its orientation, from where the one above stands.
-
-    Limits are not looked at. `kept`: joints whose value is known already. Second: orientations in W of the joints'
-    moving frames, (n, 4) or (4,) xyzw each.
+    Parameters
+    ----------
+    found : `chains` of the model
+    segments : the measured ones
+    limits, weights : as in `pose.configuration`
     """
-    n = len(next(iter(quat_WL.values())))
-    begins = {chain.joints[0]: segment for segment, chain in found.items() if chain.joints and segment in quat_WL}
-    q = np.tile(pin.neutral(model.pin), (n, 1))
-    identity = np.array([0.0, 0.0, 0.0, 1.0])
-    world = [identity]
-    turns: dict[int, np.ndarray] = {}  # joint → its own rotation
-    for joint in range(1, model.pin.njoints):
-        above = model.pin.parents[joint]
-        if joint in kept:
-            turns[joint] = _set(model, q, joint, kept[joint])
-        elif joint in begins:
-            chain = found[begins[joint]]
-            values = solve(chain, multiply(conjugate(world[chain.above]), quat_WL[begins[joint]]))
-            for moved, value in zip(chain.joints, values, strict=True):
-                turns[moved] = _set(model, q, moved, value)
-        placement = pin.Quaternion(model.pin.jointPlacements[joint].rotation).coeffs()
-        world.append(multiply(world[above], multiply(placement, turns.get(joint, identity))))
-    return q, world
+
+    def __init__(
+        self,
+        model: BodyModel,
+        found: Mapping[str, Chain],
+        segments: Collection[str],
+        *,
+        limits: bool = True,
+        weights: Mapping[str, float] | None = None,
+    ) -> None:
+        self.model, self.found = model.pin, found
+        self._limits, self._weights = limits, weights
+        to_fit = sorted(groups(found, segments), key=lambda group: group.segments[0] not in AXIAL)
+        self._fits = [(group, Fit(self.model, group.segments, group.joints, weights or {}, limits)) for group in to_fit]
+        self._ends = [limits_of(self.model, group.joints) for group in to_fit]
+        self._begins = {chain.joints[0]: name for name, chain in found.items() if chain.joints and name in segments}
+        self._neutral = pin.neutral(self.model)
+        placed = [placement.rotation for placement in self.model.jointPlacements]
+        self._placements = [pin.Quaternion(R).coeffs() for R in placed]
+        frames = [self.model.frames[self.model.getFrameId(name)] for group in to_fit for name in group.segments]
+        self._stands = {frame.name: (frame.parentJoint, pin.Quaternion(frame.placement.rotation)) for frame in frames}
+        self._axes: dict[int, np.ndarray] = {}
+
+    def run(self, quat_WL: Mapping[str, np.ndarray], before: np.ndarray | None = None) -> np.ndarray:
+        """`q` (n, nq) by segment → (n, 4) xyzw; `before` (nq,): the frame before the first."""
+        kept: dict[int, np.ndarray] = {}
+        q, quat_WJ = self.stepwise(quat_WL, kept)
+        for (group, fit), ends in zip(self._fits, self._ends, strict=True):
+            rows = np.flatnonzero(self._astray(q, quat_WJ, quat_WL, group, ends))
+            if not len(rows):
+                continue
+            q[rows] = fit.run({segment: quat_WL[segment][rows] for segment in group.segments}, q[rows], before)
+            for joint in group.joints:
+                if self.model.nqs[joint] == 4:
+                    first = self.model.idx_qs[joint]
+                    q[:, first : first + 4] = so3.continuous(q[:, first : first + 4])
+            if group.segments[0] in AXIAL:  # what hangs on it stands elsewhere now
+                kept |= {joint: _value(self.model, q, joint) for joint in group.joints}
+                q, quat_WJ = self.stepwise(quat_WL, kept)
+        return q
+
+    def stepwise(
+        self, quat_WL: Mapping[str, np.ndarray], kept: Mapping[int, np.ndarray]
+    ) -> tuple[np.ndarray, list[np.ndarray]]:
+        """`q` (n, nq) with every segment at the smallest angle from its orientation, from where the one above stands.
+
+        Limits are not looked at. `kept`: joints whose value is known already. Second: orientations in W of the joints'
+        moving frames, (n, 4) or (4,) xyzw each.
+        """
+        n = len(next(iter(quat_WL.values())))
+        q = np.tile(self._neutral, (n, 1))
+        world = [np.array([0.0, 0.0, 0.0, 1.0])]
+        turns: dict[int, np.ndarray] = {}  # joint → its own rotation
+        for joint in range(1, self.model.njoints):
+            above = self.model.parents[joint]
+            if joint in kept:
+                turns[joint] = self._set(q, joint, kept[joint])
+            elif joint in self._begins:
+                chain = self.found[self._begins[joint]]
+                wanted = quat_WL[self._begins[joint]]
+                values = solve(chain, multiply(conjugate(world[chain.above]), wanted))
+                for moved, value in zip(chain.joints, values, strict=True):
+                    turns[moved] = self._set(q, moved, value)
+            turned = self._placements[joint]
+            world.append(multiply(world[above], multiply(turned, turns[joint]) if joint in turns else turned))
+        return q, world
+
+    def _astray(
+        self, q: np.ndarray, quat_WJ: list[np.ndarray], quat_WL: Mapping[str, np.ndarray], group: Group, ends: Limits
+    ) -> np.ndarray:
+        """(n,) bool: frames in which a segment is missed, or a limit passed."""
+        astray = np.zeros(len(q), dtype=bool)
+        for segment in group.segments:
+            joint, quat_JL = self._stands[segment]
+            stands = multiply(quat_WJ[joint], quat_JL.coeffs())
+            missed = multiply(conjugate(stands), quat_WL[segment])
+            astray |= np.linalg.norm(missed[..., :3], axis=-1) > 0.5 * _MISSED
+        if self._limits:
+            astray |= ((q[:, ends.at] < ends.lower) | (q[:, ends.at] > ends.upper)).any(axis=1)
+        return astray
+
+    def _set(self, q: np.ndarray, joint: int, value: np.ndarray) -> np.ndarray:
+        """Write a joint's value into `q`: an angle (n,) [rad] or a rotation (n, 4); gives its rotation."""
+        first = self.model.idx_qs[joint]
+        if value.ndim == 2:
+            value = so3.continuous(value / np.linalg.norm(value, axis=1)[:, None])
+            q[:, first : first + 4] = value
+            return value
+        if self.model.nqs[joint] == 1:
+            q[:, first] = value
+        else:  # without limits: cosine and sine
+            q[:, first], q[:, first + 1] = np.cos(value), np.sin(value)
+        if joint not in self._axes:
+            axis = axis_in_joint(self.model, joint)
+            assert axis is not None
+            self._axes[joint] = axis
+        return about(self._axes[joint], value)
 
 
-def _astray(
-    model: BodyModel,
-    q: np.ndarray,
-    quat_WJ: list[np.ndarray],
-    wanted: Mapping[str, np.ndarray],
-    group: Group,
-    limits: bool,
-) -> np.ndarray:
-    """(n,) bool: frames in which a segment is missed, or a limit passed."""
-    astray = np.zeros(len(q), dtype=bool)
-    for segment, quat in wanted.items():
-        frame = model.pin.frames[model.pin.getFrameId(segment)]
-        stands = multiply(quat_WJ[frame.parentJoint], pin.Quaternion(frame.placement.rotation).coeffs())
-        astray |= np.linalg.norm(multiply(conjugate(stands), quat)[..., :3], axis=-1) > 0.5 * _MISSED
-    if limits:
-        at, lower, upper = limits_of(model.pin, group.joints)
-        astray |= ((q[:, at] < lower) | (q[:, at] > upper)).any(axis=1)
-    return astray
-
-
-def _value(model: BodyModel, q: np.ndarray, joint: int) -> np.ndarray:
-    """What `_set` takes: an angle (n,) [rad] or a rotation (n, 4)."""
-    first, n = model.pin.idx_qs[joint], model.pin.nqs[joint]
+def _value(model: pin.Model, q: np.ndarray, joint: int) -> np.ndarray:
+    """What `Follower._set` takes: an angle (n,) [rad] or a rotation (n, 4)."""
+    first, n = model.idx_qs[joint], model.nqs[joint]
     if n == 4:
         return q[:, first : first + 4].copy()
     return q[:, first].copy() if n == 1 else np.arctan2(q[:, first + 1], q[:, first])
-
-
-def _set(model: BodyModel, q: np.ndarray, joint: int, value: np.ndarray) -> np.ndarray:
-    """Write a joint's value into `q`: an angle (n,) [rad] or a rotation (n, 4); gives its rotation."""
-    first = model.pin.idx_qs[joint]
-    if value.ndim == 2:
-        value = so3.continuous(value / np.linalg.norm(value, axis=1)[:, None])
-        q[:, first : first + 4] = value
-        return value
-    if model.pin.nqs[joint] == 1:
-        q[:, first] = value
-    else:  # without limits: cosine and sine
-        q[:, first], q[:, first + 1] = np.cos(value), np.sin(value)
-    axis = axis_in_joint(model.pin, joint)
-    assert axis is not None
-    return about(axis, value)

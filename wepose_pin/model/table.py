@@ -7,7 +7,6 @@ that follows, and every reader of the URDF that comes out, finds the segments wi
 from __future__ import annotations
 
 import copy
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..assets import asset
 from ..errors import BadModel, MissingFile, one_of
+from ..readers.keys import is_number, parsed_toml
 from ..recording import AXES, SEGMENTS, mount_from_axes
 from .tree import Tree, tree_of
 
@@ -106,7 +106,7 @@ def table_from(values: Mapping[str, Any], where: str) -> LinkTable:
             raise BadModel(f"{at}: no such point; {one_of(POINTS, name)}")
         entry = _entry(value, ("link", "at"), at)
         place = entry.get("at", (0.0, 0.0, 0.0))
-        if not (isinstance(place, list | tuple) and len(place) == 3 and all(isinstance(v, int | float) for v in place)):
+        if not (isinstance(place, list | tuple) and len(place) == 3 and all(is_number(v, 1e3) for v in place)):
             raise BadModel(f"{at}: at = {place!r}; three numbers [m] in the link are wanted")
         points[name] = PointLink(entry["link"], (float(place[0]), float(place[1]), float(place[2])))
     up, forward, root = values.get("up", "+z"), values.get("forward", "+x"), values.get("root") or ()
@@ -128,8 +128,8 @@ def read_table(path: Path) -> tuple[LinkTable, Path | None]:
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a table of links is wanted here")
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        values = parsed_toml(path.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise BadModel(f"{path}: is no TOML: {error}") from error
     urdf = values.pop("urdf", None)
     if urdf is not None and not isinstance(urdf, str):

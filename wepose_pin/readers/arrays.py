@@ -1,7 +1,7 @@
 """HDF5 and MATLAB files: arrays by their path, as ``/imu/torso/gyro``, and single columns of them, ``/imu/gyro[0]``.
 
 An array is (n,), (n, k) or (k, n) with n samples; the fields of a MATLAB struct are a path's parts. HDF5, and with it
-MATLAB's v7.3, is read by h5py, which is optional.
+MATLAB's v7.3, is read by h5py, which is optional; what lies in other files, by links or otherwise, is not read.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ import numpy as np
 import polars as pl
 
 from ..errors import BadData, MissingFile, UnknownColumn, one_of
+from .mat5 import is_level_5, read_mat5
+from .tables import most_bytes, too_large
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -48,6 +50,8 @@ class ArrayFile:
             reason = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
             raise MissingFile(f"{self.path}: {reason}; an HDF5 or MATLAB file is wanted here") from None
         self._hdf5 = HDF5_MAGIC in (start[:8], start[512:520])  # MATLAB puts 512 bytes of its own before it
+        self._level_5 = is_level_5(start)
+        self._most = most_bytes(self.path)
         self._loaded: dict[str, np.ndarray] = {}
         self.shapes = self._hdf5_shapes() if self._hdf5 else self._matlab_shapes()
         if not self.shapes:
@@ -101,6 +105,9 @@ class ArrayFile:
 
     def _array(self, path: str) -> np.ndarray:
         if path not in self._loaded:
+            self._most -= 8 * int(np.prod(self.shapes[path], dtype=object))
+            if self._most < 0:
+                raise BadData(f"{self.path}: {path} is {self.shapes[path]}, {too_large(self.path)}")
             with _reading(self.path), _h5py(self.path).File(self.path) as file:
                 self._loaded[path] = np.asarray(file[path], dtype=float)
         return self._loaded[path]
@@ -110,7 +117,9 @@ class ArrayFile:
         shapes: dict[str, tuple[int, ...]] = {}
 
         def visit(name: str, thing: Any) -> None:
-            if isinstance(thing, h5py.Dataset) and thing.dtype.kind in "fiu" and 1 <= len(thing.shape) <= 2:
+            if not isinstance(thing, h5py.Dataset) or thing.external or thing.is_virtual:
+                return  # its numbers stand in another file
+            if thing.dtype.kind in "fiu" and 1 <= len(thing.shape) <= 2:
                 shapes[f"/{name}"] = tuple(int(size) for size in thing.shape)
 
         with _reading(self.path), h5py.File(self.path) as file:
@@ -118,20 +127,11 @@ class ArrayFile:
         return shapes
 
     def _matlab_shapes(self) -> dict[str, tuple[int, ...]]:
-        from scipy.io import loadmat
-
         with _reading(self.path):
-            content = loadmat(self.path, simplify_cells=True)
-
-        def walk(name: str, thing: Any) -> None:
-            if isinstance(thing, dict):
-                for key, value in thing.items():
-                    if not key.startswith("__"):
-                        walk(f"{name}/{key}", value)
-            elif isinstance(thing, np.ndarray) and thing.dtype.kind in "fiu" and 1 <= thing.ndim <= 2:
-                self._loaded[name] = np.asarray(thing, dtype=float)
-
-        walk("", content)
+            if not self._level_5:
+                raise BadData(f"{self.path}: is neither HDF5 nor a MATLAB file of version 5 to 7.3; save it anew")
+            found = read_mat5(self.path, self._most)
+        self._loaded = {name: np.asarray(values, dtype=float) for name, values in found.items()}
         return {name: values.shape for name, values in self._loaded.items()}
 
 

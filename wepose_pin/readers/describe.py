@@ -96,11 +96,16 @@ def _result(path: Path) -> Description:
     facts = [
         f"of {said['recording']}, by {said['method']}: {said['samples']} samples, {said['duration_s']} s at "
         f"{said['rate_hz']} Hz",
+        *(f"note: {warning}" for warning in summary.get("warnings", [])),
+    ]
+    if (path / "joints.parquet").is_file():
+        facts[1:1] = [f"of a chain, sensors on: {', '.join(summary.get('not_followed_rms_deg', {}))}"]
+        return Description(f"{path}: a result of `wepose track`", (*facts, "its motion: joints.parquet"), (), None)
+    facts[1:1] = [
         f"sensors: {', '.join(summary.get('sensors', {}))}",
         f"points: {', '.join(summary.get('points', []))}",
-        *(f"note: {warning}" for warning in summary.get("warnings", [])),
-        f"look at it: wepose view {path}",
     ]
+    facts.append(f"look at it: wepose view {path}")
     return Description(f"{path}: a result of `wepose track`", tuple(facts), (), None)
 
 

@@ -16,6 +16,8 @@ from .tables import columns
 # A table begins within this many lines of a file; what comes before it is about the device.
 PREAMBLE_LINES = 100
 SEPARATORS = "\t,;"
+# Beyond this no number is a measurement in any unit; squares of smaller ones are still numbers.
+HUGE = 1e30
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 
 # Words that name a segment in a label or a file's name, after its side.
@@ -74,6 +76,14 @@ def table_of(time: np.ndarray, values: Mapping[str, Mapping[str, np.ndarray]]) -
     return pl.DataFrame(found)
 
 
+def must_be_measured(path: Path, values: np.ndarray, what: str) -> None:
+    """Raise an error on numbers (n, k) beyond `HUGE`."""
+    huge = np.flatnonzero((np.abs(values) > HUGE).any(axis=1))
+    if huge.size:
+        found = np.nanmax(np.abs(values[huge[0]]))
+        raise BadData(f"{path}: {what} holds {found:.3g} in row {huge[0] + 1}; no device measures as much")
+
+
 def segment_of(label: str) -> str | None:
     """The segment that a label or a file's name speaks of, as ``humerus_r_imu`` or ``LeftForeArm``; None if unclear."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+|(?<=[a-z])(?=\d)", " ", label).lower()
@@ -121,7 +131,9 @@ class Text:
 
     def numbers(self, wanted: Sequence[str]) -> np.ndarray:
         """Columns (n, k); empty cells are NaN."""
-        return columns(self.cells, wanted, str(self.path), str(self.path))
+        values = columns(self.cells, wanted, str(self.path), str(self.path))
+        must_be_measured(self.path, values, ", ".join(wanted))
+        return values
 
 
 def read_text(path: Path, first: str, what: str) -> Text:

@@ -50,7 +50,7 @@ def read_dot(path: Path, use: str | None = None) -> Device:
         values = {"accel": numbers[:, :3], "gyro": np.deg2rad(numbers[:, 3:])}
     else:
         assert increments is not None
-        values = _rates(text.numbers(increments), float(np.nanmedian(np.diff(time))))
+        values = _rates(text.numbers(increments), _usual_step(text, time))
     # Nobody sets a clock by sensors that were not: each has run since it was switched on.
     synced = text.about.get("SyncStatus", "").lower().startswith("synced")
     notes = () if synced or "SyncStatus" not in text.about else (f"{path.name}: SyncStatus says that it is not synced",)
@@ -67,6 +67,14 @@ def _rates(increments: np.ndarray, step: float) -> dict[str, np.ndarray]:
     if good.any():
         turn[good] = Rotation.from_quat(increments[good][:, [1, 2, 3, 0]]).as_rotvec()
     return {"gyro": turn / step, "accel": increments[:, 4:] / step}
+
+
+def _usual_step(text: Text, time: np.ndarray) -> float:
+    steps = np.diff(time)
+    step = float(np.median(steps[np.isfinite(steps)])) if np.isfinite(steps).any() else 0.0
+    if not step > 0.0:
+        raise BadData(f"{text.path}: its time does not grow from row to row, so that dq and dv tell no rate")
+    return step
 
 
 def _time(text: Text) -> tuple[np.ndarray, float | None]:

@@ -30,15 +30,23 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
             f"{path.name} --write` writes one)"
         )
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+        return parsed_toml(path.read_bytes().decode("utf-8-sig"))
     except FileNotFoundError:
         raise MissingFile(f"{path}: no such file; {what} is wanted here") from None
     except OSError as error:
         raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise MissingFile(f"{path}: is not UTF-8 text (byte {error.start}); {what} is wanted here") from error
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise BadSession(f"{path}: not valid TOML: {' '.join(str(error).split())}") from error
+
+
+def parsed_toml(text: str) -> dict[str, Any]:
+    """The contents of a TOML text; raises ValueError, whatever is wrong with it."""
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("tables or lists within each other to no end") from None
 
 
 @dataclass(frozen=True)
@@ -109,9 +117,9 @@ class Keys:
         return f"; {found}" if found.startswith("did") else ""
 
 
-def is_number(value: Any) -> bool:
-    """A finite int or float; a boolean is none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+def is_number(value: Any, below: float = 1e300) -> bool:
+    """A finite int or float smaller than `below`; a boolean is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < below
 
 
 def _toml(value: Any) -> str:

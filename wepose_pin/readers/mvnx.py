@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..errors import BadData, MissingFile
-from .device import Device, table_of
+from .device import Device, must_be_measured, table_of
 
 SEGMENT_OF = {
     "T8": "torso",
@@ -197,6 +197,7 @@ def _values(path: Path, tag: str, rows: list[str], count: int, frames: int) -> n
                 f"{path}: <{tag}> of frame {k} holds {len(row)} numbers; {WIDTH[tag]} for each of {count} are needed"
             )
         values[k] = row
+    must_be_measured(path, values, f"<{tag}>")
     return values.reshape(frames, count, WIDTH[tag])
 
 

@@ -1,7 +1,8 @@
 """OpenSim ``.sto`` tables of IMU orientations, as OpenSense reads and writes them.
 
 Lines ``key=value`` up to ``endheader``, among them ``DataType=Quaternion``; then names and rows separated by tabs, each
-cell a quaternion ``w,x,y,z`` of the sensor to its world, z up as the device had it.
+cell a quaternion ``w,x,y,z`` of the sensor to its world, z up as the device had it. What `wepose export` wrote holds the
+model's bodies in OpenSim's ground in place of that, and a line of its header says so.
 
 Source: OpenSim documentation, OpenSense; the headers of OpenSense's example files.
 """
@@ -12,10 +13,26 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from scipy.spatial.transform import Rotation
 
 from ..errors import BadData
-from .device import Device, first_lines, segment_of, table_of
+from .device import Device, first_lines, must_be_measured, segment_of, table_of
 from .tables import columns
+
+# The header line of our own files. OpenSim takes it for a remark.
+OWN = ("Frames", "bodies of Rajagopal's model in ground")
+# OpenSim's ground G: x forward, y up, z right.
+R_GW = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+# The axis of `pro_sup_r` in the humerus (Rajagopal_2015.osim); the left one is mirrored on the sagittal plane.
+PRONATION = np.array([0.05639803, 0.99840646, 0.001952])
+
+
+def in_n_pose(body: str) -> Rotation:
+    """A body of the model to G while the person stands in the N-pose, palms to the thighs: 90° of `pro_sup`."""
+    if not body.startswith(("radius", "hand")):
+        return Rotation.identity()
+    mirror = np.array([-1.0, -1.0, 1.0]) if body.endswith("_l") else 1.0
+    return Rotation.from_rotvec(np.pi / 2.0 * mirror * PRONATION / np.linalg.norm(PRONATION))
 
 
 def read_opensim(path: Path, use: str | None = None) -> Device:
@@ -54,8 +71,25 @@ def read_opensim(path: Path, use: str | None = None) -> Device:
     if len(set(labels)) < len(labels):
         raise BadData(f"{path}: two columns have one name; each needs its own: {', '.join(labels)}")
     time = columns(pl.DataFrame({"time": [row[0] for row in rows]}), ["time"], str(path), str(path))[:, 0]
-    values = {label: {"orientation": _quat(path, label, [row[k] for row in rows])} for k, label in enumerate(labels, 1)}
-    return Device("opensim", table_of(time, values), {label: segment_of(label) for label in labels}, "orientation")
+    quats = {label: _quat(path, label, [row[k] for row in rows]) for k, label in enumerate(labels, 1)}
+    own = about.get(OWN[0].lower()) == OWN[1]
+    if own:
+        quats = {label: _segment_quat(label.removesuffix("_imu"), quat) for label, quat in quats.items()}
+    return Device(
+        "opensim",
+        table_of(time, {label: {"orientation": quat} for label, quat in quats.items()}),
+        {label: segment_of(label) for label in labels},
+        "orientation",
+        aligned=own,
+    )
+
+
+def _segment_quat(body: str, quat_GB: np.ndarray) -> np.ndarray:
+    """`quat_WL` (n, 4) xyzw of our segment from that of the model's body; a lost sample stays one."""
+    quat_WL = np.full(quat_GB.shape, np.nan)
+    known = np.linalg.norm(np.nan_to_num(quat_GB), axis=1) > 0.5
+    quat_WL[known] = (R_GW.inv() * Rotation.from_quat(quat_GB[known]) * in_n_pose(body).inv() * R_GW).as_quat()
+    return quat_WL
 
 
 def _quat(path: Path, label: str, cells: list[str]) -> np.ndarray:
@@ -68,4 +102,5 @@ def _quat(path: Path, label: str, cells: list[str]) -> np.ndarray:
             raise BadData(
                 f"{path}: column '{label}' holds '{cell[:40]}' in row {k + 1}; a quaternion w,x,y,z is needed"
             ) from None
+    must_be_measured(path, quat, f"column '{label}'")
     return quat[:, [1, 2, 3, 0]]

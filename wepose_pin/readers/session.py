@@ -14,7 +14,7 @@ from ..errors import BadData, BadOption, BadSession, MissingFile, one_of
 from ..recording import CONFIGURATION, SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases
 from .arrays import ArrayFile, is_array_file
 from .clocks import BRIDGED, LONG, Clock, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time, runs
-from .device import Device
+from .device import HUGE, Device
 from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
 from .plausibility import sensor_notes
@@ -25,8 +25,6 @@ GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "g": 9.80665}
 # How far a quaternion's norm may be off 1: decimals that were cut.
 NORM_OFF = 1e-2
-# Beyond this no number is a measurement in any unit; squares of smaller ones are still numbers.
-HUGE = 1e30
 SI = {"gyro": 1.0, "accel": 1.0}
 
 
@@ -194,7 +192,7 @@ class SessionReader:
             self._tables[str(path)] = table
 
     def _plan(self, keys: Keys, data: Keys, stated: Stated) -> _Plan:
-        path, segment = self._file(keys, data), keys.place.split(".")[1]
+        path, segment = self._file(keys, data), keys.place.removeprefix("sensors.")[:-1]
         device = self.devices.get(path) if stated.signals is None else None
         # A file of its own has a clock of its own.
         own = keys if any(key in keys for key in ("file", "time", "rate_hz")) else data

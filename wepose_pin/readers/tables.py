@@ -20,6 +20,8 @@ FORMATS = (".csv", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 # Lines of a CSV that are parsed at once where it is read in pieces.
 BLOCK_ROWS = 50_000
+# A packed file holds at most so many bytes of numbers, or this many times its own: sensors' noise packs to a tenth.
+MOST_BYTES, MOST_GROWTH = 1 << 28, 50
 # What a line without any value consists of.
 EMPTY = b", \t\r\n"
 
@@ -37,6 +39,8 @@ def read_table(path: Path) -> pl.DataFrame:
     _must_be_table(path)
     if _is_parquet(path):
         with _polars_errors(path):
+            lazy = pl.scan_parquet(path)
+            _check_size(path, int(lazy.select(pl.len()).collect().item()), len(lazy.collect_schema().names()))
             return pl.read_parquet(path)
     table = _parsed(path, _header(path))
     return table.head(table.height - _empty_end(path)) if table.height else table
@@ -125,6 +129,7 @@ def one_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.
             names = [name]
         with _polars_errors(path):
             height = int(pl.scan_parquet(path).select(pl.len()).collect().item())
+            _check_size(path, height, 1)
             table = pl.scan_parquet(path).select(names).collect() if name is not None else None
         return (columns(table, [name], file, place)[:, 0] if table is not None and name else np.empty(0)), height
     parts, height = [np.empty(0)], 0
@@ -165,6 +170,21 @@ def _is_parquet(path: Path) -> bool:
     return path.suffix.lower() == ".parquet"
 
 
+def most_bytes(path: Path) -> int:
+    """How many bytes of numbers a packed file may hold."""
+    return max(MOST_BYTES, MOST_GROWTH * path.stat().st_size)
+
+
+def too_large(path: Path) -> str:
+    """For an error's end: what a packed file says it holds is more than `most_bytes`."""
+    return f"in a file of {path.stat().st_size} bytes: no recording packs so well; write it anew without compression"
+
+
+def _check_size(path: Path, rows: int, width: int) -> None:
+    if 8 * rows * width > most_bytes(path):
+        raise BadData(f"{path}: says that it holds {rows} rows of {width} columns, {too_large(path)}")
+
+
 def _must_be_table(path: Path) -> None:
     if path.is_dir():
         raise MissingFile(f"{path}: is a folder; a {' or '.join(FORMATS)} file is wanted here")
@@ -185,7 +205,8 @@ class _polars_errors:
         return None
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, pl.exceptions.PolarsError | OSError):
+        # A panic is no Exception: polars came upon what it had taken for impossible.
+        if isinstance(error, pl.exceptions.PolarsError | pl.exceptions.PanicException | OSError):
             what = "Parquet file" if _is_parquet(self.path) else "table"
             reason = " ".join(str(error).split("\n")[0].split())
             raise BadData(f"{self.path}: cannot be read as a {what}: {reason}") from error

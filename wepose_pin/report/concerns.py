@@ -46,7 +46,11 @@ ADVICE = (
     (r"mount is \d+ deg off what gravity", "Check which of its axes points up and which forward, or calibrate."),
     (r"mounts and headings are uncertain", "Choose quieter seconds, or let the person lean on a wall for the pose."),
     (r"^no sensor on", "Strap a sensor on, or do without those points."),
-    (r"joints are too few", "Use a body model with as many joints there (`--model`), or do without that segment."),
+    (
+        r"joints are too few or end too soon",
+        "Use a body model with as many joints there (`--model`), let its limits go (`--no-limits`), or do without that "
+        "segment.",
+    ),
 )
 HARMLESS = r"short gaps|^resampled|several intervals|the scale is taken from it|^no sensor on"
 

@@ -320,7 +320,7 @@ def _run(pose: TrackedPose) -> list[Block]:
         rows[8:8] = [
             (
                 f"{plain(name)} missed by",
-                f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° (the model's joints are too few)",
+                f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° (the model's joints are too few or end too soon)",
             )
             for name, angle in missed.items()
         ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from ..assets import asset
 from ..errors import BadModel, MissingFile, one_of
+from ..readers.keys import parsed_toml
 
 ROBOTS = ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1")
 SIDES = ("left", "right")
@@ -120,8 +120,8 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a robot's map is wanted (docs/retargeting.md)")
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        table = parsed_toml(path.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise BadModel(f"{path}: not valid TOML: {error}") from error
     where = path.name
     _known(table, _KEYS, where)

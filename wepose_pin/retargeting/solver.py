@@ -86,6 +86,7 @@ class Stepper:
     loose: float = 1.0
     counts: Counts = field(default_factory=Counts)
     closest: float = np.inf  # [m] between hulls in the last step; inf where nothing was near
+    lean: tuple[np.ndarray, np.ndarray] | None = None  # posture and its velocity in place of the rest
 
     def __post_init__(self) -> None:
         try:
@@ -123,7 +124,8 @@ class Stepper:
             self.counts.singular += singular
         smooth = state.v + dt * state.a
         H[np.diag_indices(n)] += tasks.posture + tasks.still + tasks.smooth
-        f += tasks.posture * tasks.posture_gain * (robot.rest - state.u) + tasks.smooth * smooth
+        posture, pull = (robot.rest, 0.0) if self.lean is None else self.lean
+        f += tasks.posture * (tasks.posture_gain * (posture - state.u) + pull) + tasks.smooth * smooth
         velocity_bounds(
             state.u, state.v, robot.lower, robot.upper, self.loose * speed * robot.v_most, self.loose * robot.a_most, dt,
             self._low, self._high,
@@ -140,7 +142,7 @@ class Stepper:
         growth = near.growth if self._plain else near.growth @ self.robot.coupling
         left = near.distance - near.clearance + 0.5 * self.dt * (growth @ state.v)
         # Half of what all joints together could brake: the other half is theirs for their own limits.
-        brake = 0.5 * np.abs(growth) @ self.robot.a_most
+        brake = 0.5 * self.loose * (np.abs(growth) @ self.robot.a_most)
         closing = np.where(left > 0.0, -np.minimum(8.0 * left, np.sqrt(np.maximum(2.0 * brake * left, 0.0))), -4.0 * left)
         self.counts.near += bool((left < 0.01).any())
         return growth, closing
@@ -240,10 +242,15 @@ class _Follower:
         f += weight * want * row
 
 
-def aims_at(targets: tuple[ArmTarget, ...], k: int) -> tuple[Aim, ...]:
-    """What the hands are to do at sample `k`."""
+def aims_at(targets: tuple[ArmTarget, ...], k: int, dt: float) -> tuple[Aim, ...]:
+    """What the hands are to do in the step from sample `k`: its velocity is met at its end, its position in its middle."""
+    n = min(k + 1, len(targets[0].weight) - 1)
     return tuple(
-        Aim(t.position[k], t.velocity[k], t.rotation[k], t.rate[k], t.bend[k], float(t.weight[k])) for t in targets
+        Aim(
+            t.position[k] + 0.5 * dt * t.velocity[k], t.velocity[n], t.rotation[k], t.rate[n], t.bend[k],
+            float(t.weight[k]),
+        )  # fmt: skip
+        for t in targets
     )
 
 

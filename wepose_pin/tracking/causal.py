@@ -28,7 +28,8 @@ from ..filters import BEST, OFFLINE, Orientation, check_method
 from ..filters.bank import bank_of
 from ..filters.base import in_parallel
 from ..pose import spread
-from ..recording import Intervals, Recording
+from ..readers.clocks import GOOD, LONG, Clock, bridge
+from ..recording import Intervals, Recording, Sensor
 from ..so3 import kernel
 from ..static import StaticTest
 from ..subject import Subject
@@ -278,7 +279,10 @@ def causal_segments(
         # A long bridge was made by what came after it: it is no look ahead only as a gap.
         gyro[:, i] = np.where(lost[:, None], np.nan, sensor.gyro_S[first:])
         accel[:, i] = np.where(lost[:, None], np.nan, sensor.accel_S[first:])
-    edges = [0, *(tick - first for tick in recording.resets if first < tick < len(recording)), len(gyro)]
+    resets = {tick - first for tick in recording.resets if first <= tick < len(recording)}  # two at once are one
+    if 0 in resets:
+        tracker.reset()
+    edges = sorted({0, *resets, len(gyro)})
     runs: list[Run] = []
     covariances: list[list[np.ndarray]] = []
     for begin, end in pairwise(edges):
@@ -349,7 +353,15 @@ def start_of(recording: Recording) -> tuple[Recording, int]:
 
 
 def until_start(recording: Recording, interval: tuple[float, float]) -> Recording:
-    """From the start pose's begin, or that of a phase `still` before its end, to its end."""
+    """From the start pose's begin, or that of a phase `still` before its end, to its end.
+
+    What was lost in it is bridged by what is left of it: whoever reads a whole recording bridges with what came later.
+
+    Raises
+    ------
+    BadPhase
+        A sensor that sent nothing in it.
+    """
     before: dict[str, Intervals] = {"start": (interval,)}
     still = recording.phases.get("still", ())
     span = recording.span(interval)
@@ -357,7 +369,22 @@ def until_start(recording: Recording, interval: tuple[float, float]) -> Recordin
     if still and still[0][1] <= interval[1]:
         before["still"] = still[:1]
         begin = min(begin, recording.span(still[0]).start)
-    return replace(_part(recording, slice(begin, span.stop)), phases=before)
+    part = _part(recording, slice(begin, span.stop))
+    clock = Clock(np.arange(len(part)) / part.rate_hz, np.arange(len(part)), 1.0 / part.rate_hz)
+    sensors = {name: _bridged(part, name, clock) for name in part.sensors}
+    return replace(part, phases=before, sensors=sensors)
+
+
+def _bridged(part: Recording, name: str, clock: Clock) -> Sensor:
+    """A sensor with its gaps filled anew."""
+    sensor = part.sensors[name]
+    if sensor.gap is None or not sensor.gap.any() or sensor.gyro_S is None or sensor.accel_S is None:
+        return sensor
+    if sensor.gap.all():
+        raise BadPhase(f"{part.where()}: phases.start: sensors.{name} sent nothing in it; name seconds in which all do")
+    marks = np.where(sensor.gap, LONG, GOOD).astype(np.int8)
+    gyro_S, accel_S = bridge(sensor.gyro_S, marks, clock, rate=True), bridge(sensor.accel_S, marks, clock)
+    return replace(sensor, gyro_S=gyro_S, accel_S=accel_S)
 
 
 def _part(recording: Recording, span: slice) -> Recording:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ..calibration import Calibration, Verdict, document
 from .result import as_json, versions
 
 
-def write_calibration(folder: Path, calibration: Calibration, verdict: Verdict) -> None:
-    """Write ``calibration.json`` into an existing folder."""
+def write_calibration(
+    folder: Path, calibration: Calibration, verdict: Verdict, made_by: Mapping[str, Any] | None = None
+) -> None:
+    """Write ``calibration.json`` into an existing folder; `made_by` (see `provenance`) becomes part of it."""
     content = as_json(document(calibration, verdict)) | {"versions": versions()}
+    if made_by is not None:
+        content["made_by"] = dict(made_by)
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")

@@ -24,6 +24,7 @@ import polars as pl
 
 from ..angles import joint_angles
 from ..errors import BadData
+from ..readers.opensim import OWN
 from .motion import Motion, bridged, even, seen_points, whole
 from .rajagopal import coordinates, in_ground, orientations
 
@@ -104,7 +105,7 @@ def _write_quaternions(path: Path, motion: Motion, time: np.ndarray, quat_GB: Ma
         f"{body}_imu": [f"{w:.9f},{x:.9f},{y:.9f},{z:.9f}" for x, y, z, w in quat.tolist()]
         for body, quat in quat_GB.items()
     }
-    header = [f"DataRate={motion.rate_hz:f}", "DataType=Quaternion", "version=3", "endheader"]
+    header = [f"DataRate={motion.rate_hz:f}", "DataType=Quaternion", "version=3", "=".join(OWN), "endheader"]
     _write(path, header, pl.DataFrame({"time": time, **cells}))
 
 

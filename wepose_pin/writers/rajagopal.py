@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..model.chains import Chain, about, conjugate, multiply, solve
+from ..readers.opensim import PRONATION, R_GW, in_n_pose
 
 # Segment → body. The model has no head of its own.
 BODIES = {
@@ -28,14 +29,14 @@ BODIES = {
     "left_hand": "hand_l",
 }
 # Axes of a right arm's joints with two, in the body above; a left arm's are mirrored on the sagittal plane.
-ELBOW = (np.array([0.22604696, 0.022269, 0.97386183]), np.array([0.05639803, 0.99840646, 0.001952]))
+ELBOW = (np.array([0.22604696, 0.022269, 0.97386183]), PRONATION)
 WRIST = (np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
 # Of each of these joints' angles the middle of its range [rad]: they are given within half a turn of it. Followed over
 # time, an elbow that was once bent as none can be might keep a full turn too much.
 _MIDDLE = {"elbow_flex": np.radians(75.0), "pro_sup": np.radians(90.0), "wrist_flex": 0.0, "wrist_dev": 0.0}
 _MIRRORED = np.array([-1.0, -1.0, 1.0, 1.0])  # xyzw, z → −z
 _STILL = np.array([0.0, 0.0, 0.0, 1.0])
-_QUAT_GW = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).as_quat()
+_QUAT_GW = R_GW.as_quat()
 _ROUNDS = 40  # Levenberg-Marquardt; about ten are the rule
 _CLOSE = 1e-9  # [rad] of the last step
 
@@ -50,13 +51,11 @@ def orientations(quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     Who stands in the N-pose, palms to the thighs, is the model with 90° of `pro_sup` and zero of all others.
     """
-    pronated = about(ELBOW[1] / np.linalg.norm(ELBOW[1]), np.array(np.pi / 2.0))
     found = {}
     for segment, body in BODIES.items():
         if segment in quat_WL:
             moved = multiply(multiply(_QUAT_GW, quat_WL[segment]), conjugate(_QUAT_GW))
-            turn = pronated if body.startswith(("radius", "hand")) else _STILL
-            found[body] = multiply(moved, turn * _MIRRORED if body.endswith("_l") else turn)
+            found[body] = multiply(moved, in_n_pose(body).as_quat())
     return found
 
 

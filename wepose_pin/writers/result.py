@@ -29,11 +29,12 @@ def write_result(
     covariance: bool = False,
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     torques: Torques | None = None,
+    made_by: Mapping[str, Any] | None = None,
 ) -> None:
     """Write what `track` gave into an existing folder; with `covariance` its entries as well, not only deviations.
 
     `phases` of the recording go to the summary, so that a page made from the folder shows them too. `torques` become
-    ``torques.parquet``.
+    ``torques.parquet``, `made_by` (see `provenance`) part of the summary.
     """
     assert pose.model is not None
     assert pose.subject is not None
@@ -44,6 +45,8 @@ def write_result(
     if torques is not None:
         write_table(folder / "torques.parquet", torque_table(torques))
         summary["torques"] = torques.summary()
+    if made_by is not None:
+        summary["made_by"] = dict(made_by)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
@@ -86,6 +89,8 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
     """
     if not (folder / "pose.parquet").is_file():
         raise MissingFile(f"{folder}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
+    if (folder / "joints.parquet").is_file():
+        raise BadData(f"{folder}: of a chain, its motion is in joints.parquet; a person's result is wanted here")
     pose = pose_from_table(read_table(folder / "pose.parquet"), str(folder / "pose.parquet"))
     summary_file = folder / "summary.json"
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import polars as pl
@@ -18,6 +19,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     lines = [
         f"name = {json.dumps(recording.name, ensure_ascii=False)}",
         f'start_pose = "{recording.start_pose}"',
+        *([f'strapping = "{recording.strapping}"'] if recording.strapping == "new" else []),
         "",
         "[data]",
         'file = "recording.parquet"',
@@ -30,8 +32,11 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     ]
     for name, spans in recording.phases.items():
         lines.append(f"{name} = [{', '.join(f'[{first:.3f}, {last:.3f}]' for first, last in spans)}]")
+    if recording.joints:
+        lines += ["", "[joints]   # rad, m for a prismatic joint"]
+        lines += [f"{_key(name)} = {float(value)!r}" for name, value in recording.joints.items()]
     for segment, sensor in recording.sensors.items():
-        lines += ["", f"[sensors.{segment}]"]
+        lines += ["", f"[sensors.{_key(segment)}]"]
         signals = {"gyr": sensor.gyro_S, "acc": sensor.accel_S} if not sensor.ready else {"q": sensor.quat_WS}
         keys = {"gyr": "gyro", "acc": "accel", "q": "orientation"}
         for short, values in signals.items():
@@ -48,3 +53,8 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     if truth is not None:
         write_table(folder / "truth.parquet", pose_table(truth))
     (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _key(name: str) -> str:
+    """As TOML has a key: links and joints of a URDF may be called anything."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)

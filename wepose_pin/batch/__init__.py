@@ -1,0 +1,7 @@
+"""Many recordings on Dask: a plan, its items each by itself, a table of results and a page over the study."""
+
+from __future__ import annotations
+
+from .plan import Item, Plan, read_plan
+
+__all__ = ["Item", "Plan", "read_plan"]

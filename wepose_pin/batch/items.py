@@ -1,0 +1,207 @@
+"""One item, made whole or not at all: its steps in a new folder, `done.json` last, what is done left as it is."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ..errors import BadData, ExistingOutput, WeposeError
+from ..writers.provenance import code, file_hashes, made_by
+from .plan import Item
+from .steps import Given, Work
+from .storage import DONE, fetch, is_remote, new_folder, read_bytes, stamps
+
+COMMAND = "batch item"
+Row = dict[str, Any]
+
+
+def make_items(items: Sequence[Item], place: str, force: bool = False, same_code: str | None = None) -> list[Row]:
+    """A row an item, in their order; errors become rows too. What a worker is asked for.
+
+    Parameters
+    ----------
+    place : folder or URL that holds the items' folders
+    force : make what was made from other inputs, options or version again; without it that is an error
+    same_code : the hash of the code that asks; a worker with another refuses
+    """
+    # Workers share the machine: a second thread in one would take the processor of the other.
+    os.environ.setdefault("WEPOSE_THREADS", "1")
+    mine = code()["code"]
+    if same_code not in (None, mine):
+        raise BadData(f"this worker has another wepose-pin ({code()['version']}, code {mine[:12] if mine else ''})")
+    return [_row(item, place, force) for item in items]
+
+
+def _row(item: Item, place: str, force: bool) -> Row:
+    begun = time.perf_counter()
+    row: Row = {"item": item.name, "session": item.session, "subject": item.subject, "status": "failed"}
+    try:
+        return row | make_item(item, place, force)
+    except WeposeError as error:
+        row |= {"error": type(error).__name__, "message": str(error)}
+    except MemoryError:
+        row |= {"error": "MemoryError", "message": f"{item.session}: not enough memory for it on this worker"}
+    except Exception as error:  # ours to mend: the others go on, and the table says where it was
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        what = " ".join(str(error).split())
+        row |= {"error": type(error).__name__, "message": f"{what} ({Path(last.filename).name}:{last.lineno})"}
+    return row | {"seconds": time.perf_counter() - begun}
+
+
+def make_item(item: Item, place: str, force: bool = False) -> Row:
+    """Make an item's folder, unless it is there already, and give its columns of the table.
+
+    Raises
+    ------
+    ExistingOutput
+        It was made from other inputs, options or version, and `force` is not given.
+    WeposeError
+        Of any of its steps.
+    """
+    target = f"{place}/{item.name}"
+    key = key_of(item)
+    done = _done(target)
+    if done is not None:
+        changed = _changed(item, key, done)
+        if changed is None:
+            return done["row"] | {"status": "done", "kept": True}
+        if not force:
+            raise ExistingOutput(f"{target}: was made from {changed}; --force makes it again, -o names another folder")
+    begun = time.perf_counter()
+    with new_folder(target) as folder:
+        row, block = make_into(folder, item)
+        row |= {"seconds": time.perf_counter() - begun}
+        content = {"key": key, "made_by": block, "stamps": _stamps(item), "row": row}
+        with (folder / DONE).open("w", encoding="utf-8") as file:
+            json.dump(content, file, indent=1, ensure_ascii=False)
+            file.flush()
+            os.fsync(file.fileno())
+    return row | {"status": "done", "kept": False}
+
+
+def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
+    """The item's steps into an existing folder: its columns of the table, and the block that says what made it.
+
+    Raises
+    ------
+    WeposeError
+        Of any of its steps.
+    """
+    with tempfile.TemporaryDirectory(prefix="wepose-") as fetched:
+        local = {
+            name: fetch(url, Path(fetched), name == "session" and "evaluate" in item.steps)
+            for name, url in _inputs(item).items()
+        }
+        block = _block(item, local)
+        given = Given(
+            folder, local["session"], local.get("subject_file"), local.get("truth"), item.body, block
+        )
+        work, row, took = Work(given), {}, {}
+        for step, options in item.steps.items():
+            begun = time.perf_counter()
+            row |= work.run(step, options)
+            took[f"{step}_s"] = time.perf_counter() - begun
+    return row | took, block
+
+
+def key_of(item: Item) -> str:
+    """Hash of what makes an item but its inputs' contents: steps, options, person, code."""
+    told = {"steps": list(item.steps.items()), "body": asdict(item.body), **code()}
+    told.pop("commit")  # says less than the hash of the code
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+def item_of(block: Mapping[str, Any]) -> Item:
+    """The item that a block of provenance tells of.
+
+    Raises
+    ------
+    BadData
+        The block is of something else, or damaged.
+    """
+    from .plan import Body
+
+    try:
+        about, paths = block["options"], {name: entry["path"] for name, entry in block["inputs"].items()}
+        steps = {
+            step: {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
+            for step, options in about["steps"].items()
+        }
+        known = {name: paths.get(name) for name in ("subject_file", "truth")}
+        return Item(about["name"], paths["session"], steps, about["subject"], **known, body=Body(**about["body"]))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise BadData(f"made_by: not that of a batch's item: {type(error).__name__} {error}") from None
+
+
+def _inputs(item: Item) -> dict[str, str]:
+    """Name → path or URL of what the item is made from."""
+    named = {"session": item.session, "subject_file": item.subject_file, "truth": item.truth}
+    for step, options in item.steps.items():
+        for name in ("model", "protocol", "robot"):
+            value = options.get(name)
+            if isinstance(value, str) and Path(value).is_file():
+                named[f"{step}.{name}"] = value
+    return {name: url for name, url in named.items() if url is not None}
+
+
+def _block(item: Item, local: Mapping[str, Path]) -> dict[str, Any]:
+    """Provenance; inputs by where they lie, not by where they were fetched to."""
+    truth = "evaluate" in item.steps
+    options = {"name": item.name, "subject": item.subject, "body": asdict(item.body), "steps": dict(item.steps)}
+    block = made_by(COMMAND, options)
+    block["inputs"] = {
+        name: {
+            "path": url if is_remote(url) else str(Path(url).absolute()),
+            "files": file_hashes(local[name], truth and name == "session"),
+        }
+        for name, url in _inputs(item).items()
+    }
+    return block
+
+
+def _stamps(item: Item) -> dict[str, Any]:
+    truth = "evaluate" in item.steps
+    return {name: stamps(url, truth and name == "session") for name, url in _inputs(item).items()}
+
+
+def _done(target: str) -> dict[str, Any] | None:
+    """What `done.json` says; None where the folder is not whole."""
+    content = read_bytes(f"{target}/{DONE}")
+    if content is None:
+        return None
+    try:
+        done = json.loads(content)
+    except ValueError:
+        return None
+    whole = isinstance(done, dict) and all(isinstance(done.get(key), dict) for key in ("made_by", "stamps", "row"))
+    return done if whole else None
+
+
+def _changed(item: Item, key: str, done: Mapping[str, Any]) -> str | None:
+    """What has changed since an item was done; None: nothing."""
+    was, now = done["made_by"], code()
+    if was.get("code") != now["code"]:
+        return f"other code, version {was.get('version')}" + (f" ({was['commit']})" if was.get("commit") else "")
+    if done.get("key") != key:
+        return "other options"
+    inputs = _inputs(item)
+    if inputs != {name: entry["path"] for name, entry in was["inputs"].items()}:
+        return "other inputs"
+    found = json.loads(json.dumps(_stamps(item)))
+    if found == done["stamps"] and None not in found.values():
+        return None
+    with tempfile.TemporaryDirectory(prefix="wepose-") as fetched:
+        truth = "evaluate" in item.steps
+        for name, url in inputs.items():
+            of_session = truth and name == "session"
+            if file_hashes(fetch(url, Path(fetched), of_session), of_session) != was["inputs"][name]["files"]:
+                return f"another {name.replace('_', ' ')}: {url} has changed since"
+    return None

@@ -1,0 +1,350 @@
+"""The plan (``PLAN.toml``): which sessions, whose, and which steps with which options."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import BadPlan, BadSession, one_of
+from ..filters import BEST, METHODS
+from ..readers.keys import Keys, read_toml
+from ..readers.tables import read_table
+from ..subject import LENGTHS
+from .storage import find, is_remote
+
+SESSION = "session.toml"
+REQUIRED = object()
+# Step → option → its default, in the order in which they run. Those of the commands of the same name.
+STEPS: dict[str, dict[str, Any]] = {
+    "calibrate": {"protocol": "clasp", "method": BEST, "gaps": False, "report": True},
+    "track": {
+        **{"method": BEST, "causal": False, "gaps": False, "covariance": False, "limits": True, "torques": False},
+        **{"model": None, "view": True, "report": True},
+    },
+    "retarget": {
+        **{"robot": REQUIRED, "arm": None, "rate_hz": 100.0, "task": "both", "scale": None, "smoothing_hz": 6.0},
+        **{"strict": False, "view": True},
+    },
+    "export": {"formats": REQUIRED, "names": None, "rate_hz": None},
+    "evaluate": {"interval": None},
+}
+_FILES = ("model", "protocol", "robot")  # options that may name a file beside the plan
+_NUMBERS = ("scale", "rate_hz")  # of those without a default
+_COLUMNS = ("session", "name", "subject", "truth", "stature", "sex")
+_GAUGE = "gauge."
+
+
+@dataclass(frozen=True)
+class Body:
+    """What is known of a person before calibration: metres, and "f" or "m"."""
+
+    stature: float | None = None
+    sex: str | None = None
+    gauge: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Item:
+    """One session and what is done to it; each is made by itself.
+
+    Parameters
+    ----------
+    name : of its folder, unique in the plan
+    session, subject_file, truth : paths or URLs
+    subject : whose it is, a name of the plan
+    steps : step → its options, all of them
+    """
+
+    name: str
+    session: str
+    steps: Mapping[str, Mapping[str, Any]]
+    subject: str | None = None
+    subject_file: str | None = None
+    truth: str | None = None
+    body: Body = Body()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Items in the order in which they are named; `first` are the subjects' calibrations that others wait for."""
+
+    name: str
+    first: tuple[Item, ...]
+    items: tuple[Item, ...]
+
+
+@dataclass(frozen=True)
+class _Subject:
+    calibration: str | None
+    file: str | None
+    body: Body
+
+
+def read_plan(path: Path, items_at: str) -> Plan:
+    """Read a plan and find its sessions; `items_at` is where the items' folders will lie.
+
+    Raises
+    ------
+    MissingFile, BadPlan
+        With one line that names the file, the key, the value found and what would be right.
+    """
+    try:
+        return _plan(path, items_at)
+    except BadSession as error:  # of `Keys`, which reads sessions otherwise
+        raise BadPlan(str(error)) from None
+
+
+def _plan(path: Path, items_at: str) -> Plan:
+    top = Keys(read_toml(path, "a plan"), str(path))
+    top.allow("name", "sessions", "subjects", "steps")
+    steps = _steps(top, path.parent)
+    subjects = {name: _subject(Keys(entry, str(path), f"subjects.{name}."), path) for name, entry in _named(top)}
+    found = [
+        _tied(path, entry, steps, subjects, items_at)
+        for at, keys in _entries(top, path)
+        for entry in _sessions(at, keys, path)
+    ]
+    if not found:
+        raise BadPlan(f"{path}: sessions: no session at all; files or table are needed")
+    items = _apart(path, found)
+    first = []
+    for name, subject in subjects.items():
+        if subject.calibration is None or not any(item.subject == name for item in items):
+            continue
+        if "calibrate" not in steps:
+            raise BadPlan(f"{top.at(f'subjects.{name}')}.calibration: needs the step [steps.calibrate], which is missing")
+        only = {"calibrate": steps["calibrate"]}
+        first.append(Item(f"subject-{_safe(name)}", subject.calibration, only, name, body=subject.body))
+    if taken := {item.name for item in items} & {item.name for item in first}:
+        raise BadPlan(f"{path}: '{min(taken)}' is both a session's and a subject's item; give the session a name")
+    return Plan(top.text("name", None) or path.stem, tuple(first), tuple(items))
+
+
+# Steps ---------------------------------------------------------------------------------------------------------------
+
+
+def _steps(top: Keys, folder: Path) -> dict[str, dict[str, Any]]:
+    table = top.table("steps")
+    table.allow(*STEPS)
+    if not table.values:
+        raise BadPlan(f"{top.at('steps')}: no step; {one_of(STEPS)}")
+    steps: dict[str, dict[str, Any]] = {}
+    for step, known in STEPS.items():  # in the order in which they run, however they are written
+        if step not in table:
+            continue
+        keys = table.table(step)
+        keys.allow(*known)
+        steps[step] = {name: _option(keys, name, default, folder) for name, default in known.items()}
+    for step in ("retarget", "export", "evaluate"):
+        if step in steps and "track" not in steps:
+            raise BadPlan(f"{top.at('steps')}.{step}: needs the step [steps.track], which is missing")
+    return steps
+
+
+def _option(keys: Keys, name: str, default: Any, folder: Path) -> Any:
+    if name not in keys:
+        if default is REQUIRED:
+            raise BadPlan(f"{keys.at(name)} is missing")
+        return default
+    value = keys.values[name]
+    if name == "formats":
+        from ..writers.export import FORMATS
+
+        if not isinstance(value, list) or not value:
+            raise BadPlan(f'{keys.at(name)} = {value!r} is not a list of formats, such as ["trc", "mot"]')
+        for each in value:
+            if each not in FORMATS:
+                raise BadPlan(f"{keys.at(name)}: '{each}' is no format; {one_of(FORMATS, str(each))}")
+        return tuple(dict.fromkeys(value))
+    if name == "interval":
+        if not isinstance(value, list) or len(value) != 2 or not value[0] < value[1]:
+            raise BadPlan(f"{keys.at(name)} = {value!r} is not two times in seconds, such as [10.0, 70.0]")
+        return (float(value[0]), float(value[1]))
+    if name == "method":
+        return keys.choice(name, METHODS)
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise BadPlan(f"{keys.at(name)} = {value!r} is neither true nor false")
+        return value
+    if isinstance(default, float) or name in _NUMBERS:
+        return keys.number(name, None)
+    text = keys.text(name, None)
+    assert text is not None
+    beside = folder / text
+    return str(beside.absolute()) if name in _FILES and beside.is_file() else text
+
+
+# Subjects ------------------------------------------------------------------------------------------------------------
+
+
+def _named(top: Keys) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    table = top.table("subjects", {})
+    for name in table.values:
+        yield name, table.table(name).values
+
+
+def _subject(keys: Keys, path: Path) -> _Subject:
+    keys.allow("calibration", "file", "stature", "sex", "gauge")
+    calibration, file = keys.text("calibration", None), keys.text("file", None)
+    if calibration is not None and file is not None:
+        raise BadPlan(f"{keys.at('file')}: a subject has a file or a calibration, not both")
+    gauge = keys.table("gauge", {})
+    gauge.allow(*LENGTHS)
+    taped = {name: gauge.number(name, None, positive=True) for name in gauge.values}
+    sex = keys.choice("sex", ("f", "m")) if "sex" in keys else None
+    body = Body(keys.number("stature", None, True), sex, {name: v for name, v in taped.items() if v is not None})
+    return _Subject(_resolved(calibration, path), _resolved(file, path), body)
+
+
+# Sessions ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A session as the plan names it; `row` says where, for errors."""
+
+    session: str
+    row: str
+    name: str | None = None
+    subject: str | None = None
+    truth: str | None = None
+    body: Body | None = None
+
+
+def _entries(top: Keys, path: Path) -> list[tuple[str, Keys]]:
+    """[sessions], or several [[sessions]]."""
+    value = top.values.get("sessions")
+    if isinstance(value, dict):
+        value = [value]
+    if not isinstance(value, list) or not value or not all(isinstance(entry, dict) for entry in value):
+        raise BadPlan(f"{top.at('sessions')}: a table [sessions], or several [[sessions]], with files or table is needed")
+    places = [f"sessions[{k}]" if len(value) > 1 else "sessions" for k in range(len(value))]
+    return [(place, Keys(entry, str(path), f"{place}.")) for place, entry in zip(places, value, strict=True)]
+
+
+def _sessions(place: str, keys: Keys, path: Path) -> list[_Entry]:
+    keys.allow("files", "table", "subject")
+    if ("files" in keys) == ("table" in keys):
+        raise BadPlan(f"{path}: {place}: either files (globs) or table is needed")
+    subject = keys.text("subject", None)
+    if "table" in keys:
+        if subject is not None:
+            raise BadPlan(f"{keys.at('subject')}: a table has a column for it")
+        return _table(str(keys.text("table", None)), path)
+    patterns = keys.values["files"]
+    patterns = [patterns] if isinstance(patterns, str) else patterns
+    if not isinstance(patterns, list) or not all(isinstance(pattern, str) and pattern for pattern in patterns):
+        raise BadPlan(f'{keys.at("files")} = {patterns!r} is not a list of globs, such as ["data/*/session.toml"]')
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        urls = find(str(_resolved(pattern, path)))
+        if not urls:
+            raise BadPlan(f"{keys.at('files')}: '{pattern}' finds nothing; it is a path or glob from the plan's folder")
+        found |= dict.fromkeys(urls)
+    return [_Entry(url, f"{path}: {place}: {url}", subject=subject) for url in found]
+
+
+def _table(name: str, path: Path) -> list[_Entry]:
+    file = path.parent / name
+    table = read_table(file)
+    if "session" not in table.columns:
+        raise BadPlan(f"{file}: no column 'session'; {one_of(table.columns, 'session')}")
+    for column in table.columns:
+        if column not in _COLUMNS and not (column.startswith(_GAUGE) and column.removeprefix(_GAUGE) in LENGTHS):
+            known = (*_COLUMNS, *(f"{_GAUGE}{length}" for length in LENGTHS))
+            raise BadPlan(f"{file}: column '{column}' is not known; {one_of(known, column, len(known))}")
+    entries = []
+    for k, row in enumerate(table.iter_rows(named=True), 1):
+        where = f"{file}: row {k}"
+        said = {column: value for column, value in row.items() if value is not None and value != ""}
+        if "session" not in said:
+            raise BadPlan(f"{where}: session is empty")
+        metres = {c: _metres(where, c, v) for c, v in said.items() if c == "stature" or c.startswith(_GAUGE)}
+        sex = said.get("sex")
+        if sex not in (None, "f", "m"):
+            raise BadPlan(f"{where}: sex = '{sex}'; f, m or nothing")
+        gauge = {c.removeprefix(_GAUGE): value for c, value in metres.items() if c != "stature"}
+        body = Body(metres.get("stature"), sex, gauge) if metres or sex else None
+        text = {key: str(said[key]) for key in ("name", "subject") if key in said}
+        session, truth = (_resolved(str(said[key]), file) if key in said else None for key in ("session", "truth"))
+        entries.append(_Entry(str(session), where, truth=truth, body=body, **text))
+    return entries
+
+
+def _metres(where: str, column: str, value: Any) -> float:
+    try:
+        metres = float(value)
+    except (TypeError, ValueError):
+        metres = -1.0
+    if not 0.0 < metres < 3.0:
+        raise BadPlan(f"{where}: {column} = '{value}' is not a length in metres")
+    return metres
+
+
+def _tied(
+    path: Path, entry: _Entry, steps: dict[str, dict[str, Any]], subjects: Mapping[str, _Subject], items_at: str
+) -> tuple[_Entry, Item]:
+    """The item of a session: calibrated by itself, or tracked with what its subject was calibrated to."""
+    own, body, file = dict(steps), entry.body or Body(), None
+    if entry.subject is not None and (subjects or "calibrate" not in steps):
+        if entry.subject not in subjects:
+            raise BadPlan(f"{entry.row}: subject '{entry.subject}' is not in the plan; {one_of(subjects, entry.subject)}")
+        subject = subjects[entry.subject]
+        if entry.body is None:
+            body = subject.body
+        file = subject.file
+        if subject.calibration is not None:
+            file = f"{items_at}/subject-{_safe(entry.subject)}/calibrate/subject.toml"
+        if file is not None:
+            own.pop("calibrate", None)
+    if not own:
+        raise BadPlan(f"{entry.row}: nothing to do: its subject is calibrated elsewhere, and there is no step but that")
+    name = _safe(entry.name) if entry.name else _name_of(entry.session, path)
+    return entry, Item(name, entry.session, own, entry.subject, file, entry.truth, body)
+
+
+def _apart(path: Path, found: Sequence[tuple[_Entry, Item]]) -> list[Item]:
+    """Each item a name of its own, which does not depend on what else is in the plan but on those of the same name."""
+    by_name: dict[str, list[str]] = {}
+    for _, item in found:
+        by_name.setdefault(item.name, []).append(item.session)
+    items = []
+    for entry, item in found:
+        if len(by_name[item.name]) > 1:
+            if entry.name or by_name[item.name].count(item.session) > 1:
+                what = f"name '{entry.name}'" if entry.name else f"session {item.session}"
+                raise BadPlan(f"{entry.row}: {what} is there twice in {path.name}; each item needs one of its own")
+            item = replace(item, name=f"{item.name}-{hashlib.sha256(item.session.encode()).hexdigest()[:6]}")
+        items.append(item)
+    return items
+
+
+def _name_of(session: str, path: Path) -> str:
+    """A session's name from where it lies: its folders below the plan's, or below the bucket."""
+    if is_remote(session):
+        parts = session.partition("://")[2].split("/")[1:]
+    else:
+        place, base = Path(session).absolute(), path.parent.absolute()
+        while base not in place.parents:
+            base = base.parent
+        parts = list(place.relative_to(base).parts)
+    if parts and parts[-1] == SESSION:
+        parts = parts[:-1]
+    elif parts and parts[-1].endswith(".toml"):
+        parts = [*parts[:-1], parts[-1].removesuffix(".toml")]
+    return _safe("-".join(parts)) or "session"
+
+
+def _safe(text: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII).lstrip(".")[:100]
+
+
+def _resolved(text: str | None, path: Path) -> str | None:
+    """A path from the folder of the file that names it; URLs stay."""
+    if text is None or is_remote(text):
+        return text
+    return str((path.parent / text).absolute())
