@@ -218,3 +218,22 @@ def test_random_arrivals_never_stop_the_ticks() -> None:
         name = NAMES[int(rng.integers(3))]
         made += len(aligner.push(arrivals([Samples(name, np.array([t]), values[:1], values[1:])], NAMES)).time)
     assert made > 900
+
+
+def test_after_a_long_silence_ticks_come_in_pieces() -> None:
+    """So that whoever follows them needs no memory for an hour of them."""
+    zero = np.zeros((1, 3))
+
+    def at(t: float) -> Arrivals:
+        return arrivals([Samples(name, np.array([t]), zero, zero) for name in NAMES], NAMES)
+
+    whole, parts = (Aligner(NAMES, RATE, BEGIN) for _ in range(2))
+    made = []
+    for t in [tick_time(0), *(tick_time(6000 + k) for k in range(5))]:
+        ticks, pieces = whole.push(at(t)), list(parts.pieces(at(t)))
+        assert sum(len(piece.time) for piece in pieces) == len(ticks.time)
+        for field in Ticks._fields[1:] if pieces else ():
+            np.testing.assert_array_equal(np.concatenate([getattr(p, field) for p in pieces]), getattr(ticks, field))
+        made += pieces
+    assert max(len(piece.time) for piece in made) < 2000 < 5000 < sum(len(piece.time) for piece in made)
+    assert all(a.first + len(a.time) == b.first for a, b in pairwise(made))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,12 @@ from wepose_pin.cli import main
 from wepose_pin.errors import BadModel, BadOption, BadSession, WeposeError
 from wepose_pin.model.robot import joint_values, load_robot, start_configuration
 from wepose_pin.readers import load_session
+from wepose_pin.readers.describe import describe
 from wepose_pin.readers.trials import UR5_SENSORS, read_ur5
 from wepose_pin.recording import CONFIGURATION, Recording, Sensor, mount_from_axes
 from wepose_pin.tracking import track, track_chain
 from wepose_pin.validation.real import UNSCORED_S, UR5_OFF
+from wepose_pin.writers import write_session
 
 RATE = 100.0
 # The axes of a UR5's joints while all are at zero, the arm stretched out along x.
@@ -172,7 +175,9 @@ def test_a_ur5_beside_its_encoders(data: Path, urdf: Path, tmp_path: Path, metho
     assert fitted_ < 0.7 * alone
 
 
-def test_the_command_writes_joints_orientations_and_torques(urdf: Path, data: Path, tmp_path: Path) -> None:
+def test_the_command_writes_joints_orientations_and_torques(
+    urdf: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     ur5_session(data, "circle-250", tmp_path)
     out = tmp_path / "out"
     with pytest.raises(SystemExit) as end:
@@ -191,6 +196,28 @@ def test_the_command_writes_joints_orientations_and_torques(urdf: Path, data: Pa
     assert joints.columns == ["time", *UR5]
     assert {"forearm_link_qw", "wrist_1_link_measured_qx", "wrist_1_link_std"} <= set(pose.columns)
     assert len(joints) == len(pose) == len(pl.read_parquet(out / "torques.parquet"))
+
+    for words in (["export", str(out), "-o", str(tmp_path / "x.trc")], ["view", str(out), "--no-open"]):
+        with pytest.raises(SystemExit) as end:
+            main(words)
+        assert end.value.code == 2
+        assert "of a chain, its motion is in joints.parquet; a person's result" in capsys.readouterr().err
+    said = describe(out)
+    assert "of a chain, sensors on: wrist_1_link, forearm_link" in said.facts
+    assert not any("wepose view" in fact for fact in said.facts)
+
+
+def test_a_session_that_is_written_gives_the_recording_back(urdf: Path, tmp_path: Path) -> None:
+    recording, _ = made(load_robot(urdf), ["forearm_link", "wrist_1_link"], 6.0)
+    odd = {"forearm.link": recording.sensors["forearm_link"], "wrist 1": recording.sensors["wrist_1_link"]}
+    recording = replace(recording, sensors=odd, joints={**HOME, "elbow/1": 0.1}, strapping="new")
+    write_session(tmp_path, recording)
+    again = load_session(tmp_path)
+    assert (again.start_pose, again.joints, again.strapping) == (CONFIGURATION, recording.joints, "new")
+    assert list(again.sensors) == list(odd)
+    for link, sensor in odd.items():
+        np.testing.assert_array_equal(again.sensors[link].gyro_S, sensor.gyro_S)
+        np.testing.assert_allclose(again.sensors[link].stated_quat_LS, sensor.stated_quat_LS)
 
 
 SESSION = """name = "arm"

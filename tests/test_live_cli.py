@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -112,3 +113,46 @@ def test_unknown_mounts_are_said_before_anybody_stands_still(capsys: pytest.Capt
     err = capsys.readouterr().err.strip()
     assert "how the sensor of torso is mounted is not known: give --subject" in err
     assert len(err.splitlines()) == 1
+
+
+def test_ctrl_c_stops_the_wait_for_senders_at_once(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+    command = [sys.executable, "-c", _WAITING, f"udp:{port}"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "open\n"
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert err == "wepose: stopped; nothing was written\n"
+    assert process.returncode == 130
+
+
+# Says when it waits, so that the interrupt comes neither before nor after.
+_WAITING = """
+import sys
+from wepose_pin import cli
+from wepose_pin.live.sources.udp import UdpSource
+find = UdpSource._find_sensors
+def say(self):
+    print("open", flush=True)
+    find(self)
+UdpSource._find_sensors = say
+sys.argv[1:] = ["live", "--source", sys.argv[1], "--no-page"]
+cli.main()
+"""
+
+
+def test_a_session_without_a_start_pose_promises_no_poses(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = load_session(session)
+    (tmp_path / "short").mkdir()
+    write_session(tmp_path / "short", replace(first(recording, 250), phases={}))
+    record = ["--record", str(tmp_path / "a.wepose")]
+    run("live", "--source", f"replay:{tmp_path / 'short'}", "--speed", "max", "--no-page", *record)
+    out = capsys.readouterr().out
+    assert "no poses: the start pose was not held" in out
+    assert "nan" not in out
+    assert "gives these poses again" not in out

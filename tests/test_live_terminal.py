@@ -69,6 +69,19 @@ def test_before_the_start_nothing_is_said_of_what_is_not_estimated() -> None:
     assert "latency" not in text
 
 
+@pytest.mark.parametrize("width", [80, 79, 60, 58, 57, 50, 49, 44, 43, 36, 35, 30])
+def test_a_narrow_terminal_shows_fewer_columns_and_those_whole(width: int) -> None:
+    console = Console(file=io.StringIO(), width=width)
+    many = sensor("right_upper_arm", rate_hz=1000.0, heading_age=1000.0, missing=1203, late=0, duplicate=0, lost=True)
+    console.print(table(status(sensors=(many,)), width=width))
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert not any("…" in line for line in lines)
+    row = next(line for line in lines if line.startswith("right upper arm"))
+    assert "✕ lost" in row
+    assert ("1203" in row) == (width >= 44)
+    assert ("°/s" in "".join(lines)) == (width >= 80)
+
+
 def test_recording_and_problems() -> None:
     text = printed(status(recorded_s=7.0, problems={"bad checksums": 3, "none of it": 0}))
     assert "● recording 7.0 s" in text

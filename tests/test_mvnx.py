@@ -112,6 +112,27 @@ def test_elbow_and_wrist_stand_to_the_shoulder_as_in_xsens(tracked, side: str, n
         assert np.linalg.norm(ours - theirs, axis=1).max() < 1e-3  # 0.17 mm found
 
 
+@pytest.mark.parametrize(("side", "name"), [("left", "Left"), ("right", "Right")])
+def test_elbow_and_wrist_have_the_joint_angles_of_xsens(data: Path, tmp_path: Path, side: str, name: str) -> None:
+    """Of MVN's three, z, x, y of a Z-X-Y sequence as the ISB has it, abduction (x) has the other sign."""
+    path = data / "mvnx" / "test_mocap.mvnx"
+    angles = wp.joint_angles(wp.track(wp.load_session(session(tmp_path, path, (*OURS, "left_hand", "right_hand")))))
+    root = ElementTree.parse(path).getroot()
+    xmlns = "{http://www.xsens.com/mvn/mvnx}"
+    labels = [joint.get("label") for joint in root.iter(f"{xmlns}joint")]
+    frames = [frame for frame in root.iter(f"{xmlns}frame") if frame.get("type") == "normal"]
+    theirs = np.array([(frame.findtext(f"{xmlns}jointAngle") or "").split() for frame in frames], dtype=float)
+    theirs = theirs.reshape(len(frames), len(labels), 3)
+    for joint in ("elbow", "wrist"):
+        x, y, z = theirs[:, labels.index(f"j{name}{joint.capitalize()}")].T
+        turn = Rotation.from_euler("ZXY", np.column_stack([z, -x, y]), degrees=True)
+        off = (turn.inv() * Rotation.from_quat(angles[f"{side}_{joint}"].quat)).magnitude()
+        print(f"{side} {joint}: {np.degrees(off.max()):.5f} deg at most")
+        assert np.degrees(off.max()) < 0.001
+    if side == "right":  # the left elbow goes through gimbal lock
+        np.testing.assert_allclose(np.degrees(angles["right_wrist"].values), np.column_stack([z, -x, y]), atol=0.001)
+
+
 def test_one_rigid_trunk_costs_millimetres_at_the_shoulders(tracked) -> None:
     """Against Xsens's spine of four joints and its moving shoulder girdle, the line between the shoulders aside."""
     pose, xsens = tracked

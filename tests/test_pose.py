@@ -252,7 +252,9 @@ def test_the_summary_says_what_was_not_followed(data: Path, simulation: Simulati
     recording = simulation.recording()
     summary = track(recording, model=gazebo(data, 48)).summary()
     assert summary["not_followed_rms_deg"]["left_forearm"] > 1.0
-    assert any(text.startswith("left_forearm: the model's joints are too few") for text in summary["warnings"])
+    lame = [text for text in summary["warnings"] if "joints are too few or end too soon" in text]
+    assert len(lame) == 1
+    assert "left_forearm" in lame[0]
     assert track(recording, model=gazebo(data, 66)).summary()["not_followed_rms_deg"] == {}
     assert track(recording).summary()["not_followed_rms_deg"] == {}
 
@@ -346,6 +348,6 @@ def test_a_body_with_hinges_is_followed_live_as_in_a_recording(data: Path, simul
         np.testing.assert_allclose(points[:, i], pose.points[name][rows], atol=1e-6)
 
 
-def test_a_segment_that_the_model_lacks_is_said_before_the_first_pose(data: Path) -> None:
-    with pytest.raises(BadModel, match="no link for segment 'pelvis'"):
-        LiveKinematics(load_model(), ["torso", "pelvis"])
+def test_a_segment_that_the_model_lacks_is_said_before_the_first_pose() -> None:
+    with pytest.raises(BadModel, match="no link for segment 'left_foot'"):
+        LiveKinematics(load_model(), ["torso", "left_foot"])

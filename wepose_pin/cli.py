@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of
+from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of, printable
 
 if TYPE_CHECKING:
     from .calibration import Calibration, Verdict
@@ -49,6 +49,7 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
         seed: Another number is another person and another motion.
         force: Replace files of an earlier run.
     """
+    given = dict(locals())
     import json
     from dataclasses import asdict
 
@@ -60,6 +61,7 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
     from .tracking import track as follow
     from .viewer import pose_html
     from .writers import whole_folder, write_result, write_session
+    from .writers.provenance import made_by, write_made_by
     from .writers.result import as_json, write_subject
 
     if seed < 0:
@@ -106,6 +108,7 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
             "errors": {method: asdict(error) for method, error in errors.items()},
         }
         (folder / "demo.json").write_text(json.dumps(as_json(report), indent=2) + "\n", encoding="utf-8")
+        write_made_by(folder, made_by("demo", given))
     _lengths_table("Lengths from the joined hands", found[BEST].subject, person.average, person.lengths, person.taped)
     _print_table(
         "Right hand while drawing six circles: distance to the truth [mm], mean ± std",
@@ -163,6 +166,7 @@ def track(
         report: Leave out report.html (warnings and what to do, noise, drift, hands, joint angles).
         force: Replace files of an earlier run.
     """
+    given = dict(locals())
     from .filters import BEST
     from .model import load_model
     from .readers import is_live_log, load_session, read_live_log
@@ -171,6 +175,7 @@ def track(
     from .tracking import track as follow
     from .viewer import pose_html
     from .writers import whole_folder, write_result
+    from .writers.provenance import made_by, write_made_by
 
     with whole_folder(out, force) as folder, _steps(4 if report else 3) as step:
         step("reading")
@@ -187,7 +192,9 @@ def track(
             if who is not None or causal:
                 raise BadOption(f"--{'subject' if who else 'causal'}: for a person; {session} is of another chain")
             _track_chain(recording, model, folder, step, method=by, limits=limits, torques=torques)
-            _say(f"Chain: {out / 'joints.parquet'}  {out / 'pose.parquet'}  {out / 'summary.json'}")
+            write_made_by(folder, made_by("track", given))
+            files = ["joints.parquet", *(["torques.parquet"] if torques else []), "pose.parquet", "summary.json"]
+            _say(f"Chain: {'  '.join(str(out / file) for file in files)}")
             return
         body = load_model(model) if model else None
         step(f"tracking by {by}")
@@ -197,7 +204,7 @@ def track(
             from .angles.torques import pose_torques
 
             found = pose_torques(pose)
-        write_result(folder, pose, covariance, recording.phases, found)
+        write_result(folder, pose, covariance, recording.phases, found, made_by("track", given))
         step("making the page")
         assert pose.model is not None
         page = pose_html(pose.model, pose, phases=recording.phases, title=recording.name)
@@ -229,6 +236,8 @@ def track(
         _say(f"Report to look at:  {out / 'report.html'}")
     _say(f"Motion to look at:  {out / 'view.html'}")
     _say(f"Pose: {out / 'pose.parquet'}  ({len(pose.quat_WL)} segments, {len(pose.points)} points)")
+    if torques:
+        _say(f"Torques, estimates: {out / 'torques.parquet'}")
 
 
 def calibrate(
@@ -268,6 +277,7 @@ def calibrate(
         gaps: Accept lost samples for longer than 50 ms, which are bridged.
         force: Replace files of an earlier run.
     """
+    given = dict(locals())
     from .calibration import calibrate_lengths, judge, load_protocol
     from .model import load_model
     from .readers import load_session
@@ -275,6 +285,7 @@ def calibrate(
     from .subject import average_subject
     from .writers import whole_folder
     from .writers.calibration import write_calibration
+    from .writers.provenance import made_by
     from .writers.result import write_subject
 
     what = load_protocol(protocol)
@@ -287,7 +298,7 @@ def calibrate(
         found = calibrate_lengths(recording, gauge=taped, prior=average, protocol=what, method=method)
         verdict = judge(found)
         write_subject(folder, found.subject, load_model(lengths=found.subject.lengths))
-        write_calibration(folder, found, verdict)
+        write_calibration(folder, found, verdict, made_by("calibrate", given))
         step("writing the report")
         report = calibration_report(found, recording, method=method, protocol=what, verdict=verdict)
         (folder / "report.html").write_text(report, encoding="utf-8")
@@ -405,6 +416,7 @@ def simulate(
             g_sensitivity_deg_s, gyro_range_deg_s, accel_range_g, bits, clock_jitter [s], clock_offset [s], dropped.
         force: Replace files of an earlier run.
     """
+    given = dict(locals())
     from dataclasses import replace
 
     import numpy as np
@@ -413,6 +425,7 @@ def simulate(
     from .simulation import simulate as make
     from .subject import LENGTHS, mount_rows, subject_toml
     from .writers import whole_folder, write_session
+    from .writers.provenance import made_by, write_made_by
 
     if seed < 0:
         raise BadOption(f"--seed {seed}: a whole number from 0 on")
@@ -438,6 +451,7 @@ def simulate(
             note="simulated: the true lengths and mounts",
         )
         (folder / "subject.toml").write_text(subject_toml(true), encoding="utf-8")
+        write_made_by(folder, made_by("simulate", given))
     taped = " ".join(f"{name}={value:.4f}" for name, value in person.taped.items())
     _say(f"Session: {out / 'session.toml'}  (taped: {taped}, stature {person.stature:.2f} m, sex {person.sex})")
     _say(f"Truth: {out / 'truth.parquet'}  {out / 'subject.toml'}")
@@ -532,7 +546,9 @@ def live(
     _warn(ended.warnings)
     _print_table(
         f"{ended.poses} poses in {ended.seconds:.1f} s; from the newest sample to its pose "
-        f"{1e3 * ended.latency.quantile(0.5):.2f} ms (p50), {1e3 * ended.latency.quantile(0.99):.2f} ms (p99)",
+        f"{1e3 * ended.latency.quantile(0.5):.2f} ms (p50), {1e3 * ended.latency.quantile(0.99):.2f} ms (p99)"
+        if ended.poses
+        else "no poses: the start pose was not held",
         ("sensor", "samples", "ticks without", "late", "twice", "unsound"),
         [
             (name, *(str(of[key]) for key in ("taken", "missing", "late", "duplicate", "bad")))
@@ -541,8 +557,9 @@ def live(
     )
     if ended.problem:
         _warn([ended.problem])
-    if record is not None:
-        _say(f"Recorded: {record}  (wepose track {record} -o DIR gives these poses again)")
+    if record is not None and not ended.problem:
+        again = f"  (wepose track {record} -o DIR gives these poses again)" if ended.poses else ""
+        _say(f"Recorded: {record}{again}")
 
 
 def view(
@@ -627,12 +644,14 @@ def retarget(
         view: Leave out view.html.
         force: Replace files of an earlier run.
     """
+    given = dict(locals())
     import json
     from dataclasses import replace
 
     from .retargeting import Tasks, find_map, kept, load, summary, table, touching, write_episode, write_trajectory
     from .retargeting import retarget as follow
     from .writers import whole_folder
+    from .writers.provenance import made_by
     from .writers.result import as_json, read_result
 
     sides = None if arm is None else ("left", "right") if arm == "both" else (arm,)
@@ -668,7 +687,8 @@ def retarget(
         if episode:
             write_episode(folder / "episode", trajectory, f"follow the arms of {result.name}")
         found = summary(trajectory, held, touched)
-        (folder / "summary.json").write_text(json.dumps(as_json(found), indent=2) + "\n", encoding="utf-8")
+        text = json.dumps(as_json(found) | {"made_by": made_by("retarget", given)}, indent=2)
+        (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
         if view:
             step("making the page")
             from .viewer import retarget_html
@@ -705,11 +725,14 @@ def export(
         rate_hz: Resample to this many samples a second.
         force: Replace an existing file.
     """
+    given = dict(locals())
     from .writers.export import export as write
+    from .writers.provenance import made_by, write_made_by
 
     with _steps(1) as step:
         step("writing")
         written = write(result, out, format, names=names, rate_hz=rate_hz, force=force)
+        write_made_by(out, made_by("export", given))
     _warn(written.notes)
     _say(f"Written: {out}  ({written.format})")
 
@@ -895,6 +918,82 @@ def info(
     _say(f"Session: {target}  (check the lines marked CHECK, then: wepose track {target} -o result)")
 
 
+def batch(
+    plan: Annotated[Positional[Path], arg(metavar="PLAN")],
+    /,
+    *,
+    out: Annotated[str, arg(aliases=["-o"], metavar="DIR|URL")],
+    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None,
+    workers: int | None = None,
+    force: bool = False,
+) -> None:
+    """Many recordings: a plan of sessions, subjects and steps, on all processors or on a Dask cluster.
+
+    Each item is made by itself: one that fails leaves its error in the table, the others go on. The same command goes
+    on where it was stopped and repeats nothing that is done. Sessions and DIR may lie on s3:// (docs/batch.md).
+
+    Exit code: 0 all items are done, 3 some have failed.
+
+    Example: wepose batch plan.toml -o study
+
+    Args:
+        plan: PLAN.toml: which sessions, whose, and the steps calibrate, track, retarget, export, evaluate.
+        out: Folder or URL for items/, a folder an item, results.parquet and report.html.
+        scheduler: Address of a running Dask scheduler, tcp://HOST:8786; without it workers are started here.
+        workers: How many are started here; without it one a processor.
+        force: Make items again whose inputs, options or version have changed since they were made.
+    """
+    from .batch import run_study
+
+    if workers is not None and (workers < 1 or scheduler is not None):
+        why = "they run at the scheduler, which knows how many" if scheduler else "at least 1"
+        raise BadOption(f"--workers {workers}: {why}")
+    try:
+        with _items() as progress:
+            study = run_study(plan, out, scheduler=scheduler, workers=workers, force=force, progress=progress)
+    except KeyboardInterrupt:
+        print("wepose: stopped; what is done stays, and the same command goes on from there", file=sys.stderr)
+        sys.exit(130)
+    failed = study.table.filter(study.table["status"] == "failed")
+    if failed.height:
+        causes = [(cause, str(count)) for cause, count in failed["error"].value_counts(sort=True).iter_rows()]
+        _print_table("Failed", ("cause", "items"), causes)
+        for item, message in failed.select("item", "message").head(3).iter_rows():
+            _say(f"  {item}: {message}")
+    kept = f", {study.kept} of them before" if study.kept else ""
+    _say(f"{study.table.height - failed.height} of {study.table.height} items done{kept}")
+    _say(f"Report to look at:  {out.rstrip('/')}/report.html")
+    _say(f"Table: {out.rstrip('/')}/results.parquet")
+    if failed.height:
+        sys.exit(3)
+
+
+def rerun(result: Result, /) -> None:
+    """Make a result again from what it says made it, and say whether it is the same: tables exactly, to the last bit.
+
+    Nothing is changed. Exit code: 0 the same, 3 different, 2 it cannot be made again: an input is gone or has changed.
+
+    Example: wepose rerun result
+
+    Args:
+        result: Folder of wepose track, calibrate, simulate, retarget or demo, an item of wepose batch, or a file of
+            wepose export.
+    """
+    from .batch.rerun import rerun as again
+
+    with _steps(1) as step:
+        step("making it again")
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            found = again(result, COMMANDS)
+    _warn(found.notes)
+    if found.differences:
+        _say(f"{result}: different, made again by wepose {found.command}:")
+        for line in found.differences:
+            _say(f"  {line}")
+        sys.exit(3)
+    _say(f"{result}: the same, made again by wepose {found.command}")
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "simulate": simulate,
@@ -907,6 +1006,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "info": info,
     "evaluate": evaluate,
     "validate": validate,
+    "batch": batch,
+    "rerun": rerun,
     "bench": bench,
 }
 
@@ -934,17 +1035,23 @@ def main(argv: list[str] | None = None) -> None:
     except (KeyboardInterrupt, Exception) as error:
         # A library may turn the interrupt into an error of its own.
         if _stopped or isinstance(error, KeyboardInterrupt):
-            print("wepose: stopped; nothing was written", file=sys.stderr)
+            print(f"wepose: stopped; {_what_there_is()}", file=sys.stderr)
             sys.exit(130)
         if isinstance(error, WeposeError):
             print(f"wepose: {error}", file=sys.stderr)
             sys.exit(2)
         if isinstance(error, OSError):
             where = error.filename or "output"
-            print(f"wepose: {where}: {error.strerror or error}; nothing was written", file=sys.stderr)
+            print(f"wepose: {where}: {error.strerror or error}; {_what_there_is()}", file=sys.stderr)
             sys.exit(2)
         raise
     sys.exit(0)
+
+
+def _what_there_is() -> str:
+    """What a command that ends early has written all the same, whole."""
+    folders = getattr(sys.modules.get("wepose_pin.writers.folder"), "written", ())
+    return f"{', '.join(map(str, folders))} was written before" if folders else "nothing was written"
 
 
 _stopped: list[int] = []
@@ -958,17 +1065,23 @@ def _stop(number: int, _frame: Any) -> None:
 
 @contextlib.contextmanager
 def _asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Signals only ask, so that nothing is cut off in the middle; asked twice, it stops at once."""
+    """Signals only ask, so that nothing is cut off in the middle; asked twice, or before anyone looks, it stops."""
     asked: list[int] = []
+    looks = False
 
     def ask(number: int, frame: Any) -> None:
-        if asked:
+        if asked or not looks:
             _stop(number, frame)
         asked.append(number)
 
+    def is_asked() -> bool:
+        nonlocal looks
+        looks = True
+        return bool(asked)
+
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: bool(asked)
+        yield is_asked
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -1106,12 +1219,17 @@ def _track_chain(
 
 
 def _say(text: str) -> None:
-    print(text)
+    print(_shown(text))
+
+
+def _shown(text: str) -> str:
+    """The text without control characters, which a file's names may hold."""
+    return "\n".join(map(printable, text.split("\n")))
 
 
 def _warn(warnings: Any) -> None:
     for warning in warnings:
-        print(f"note: {warning}", file=sys.stderr)
+        print(f"note: {_shown(str(warning))}", file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -1144,6 +1262,27 @@ def _steps(total: int) -> Iterator[Callable[[str], None]]:
         check()
 
 
+@contextlib.contextmanager
+def _items() -> Iterator[Callable[[int, int, int], None]]:
+    """A progress bar over many items, told how many are done, failed, and there; none when not on a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda *_: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*parts, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("starting workers", total=None)
+
+        def told(done: int, failed: int, total: int) -> None:
+            description = f"{failed} failed" if failed else "items"
+            if done or total == 0:
+                progress.update(task, description=description, completed=done, total=total)
+
+        yield told
+
+
 def _print_table(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
     from rich import box
     from rich.console import Console
@@ -1154,10 +1293,10 @@ def _print_table(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]
     for k, name in enumerate(header):
         table.add_column(escape(name), justify="left" if k == 0 else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(_shown, row))
     # Wide enough for every table: rich would cut numbers off to fit a narrow terminal, which wraps by itself.
     console = Console(width=160)
-    console.print(escape(title), style="bold", highlight=False)
+    console.print(escape(_shown(title)), style="bold", highlight=False)
     console.print(table)
 
 
@@ -1270,11 +1409,13 @@ def _retarget_tables(found: dict[str, Any]) -> None:
             )
         )
     header = ("arm", "scale", "hand [mm] median", "90 %", "turn [deg]", "elbow swivel [deg]", "inside the reach [%]")
-    _print_table(f"{found['robot']}: {found['duration_s']:.1f} s for {found['recorded_s']:.1f} s recorded", header, rows)
+    _print_table(
+        f"{found['robot']}: {found['duration_s']:.1f} s for {found['recorded_s']:.1f} s recorded", header, rows
+    )
     margins, touched = found["limit_margins"], found["self_collision"]
     _say(
-        f"Limits {'kept' if found['limits_kept'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, velocity "
-        f"{100 * margins['velocity_share']:.1f} %, acceleration {100 * margins['acceleration_share']:.1f} % to spare"
+        f"Limits {'kept' if found['limits_kept'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "
+        f"velocity {100 * margins['velocity_share']:.1f} %, acceleration {100 * margins['acceleration_share']:.1f} % to spare"
     )
     slow = found["slowest"]
     if slow is not None:

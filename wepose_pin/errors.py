@@ -6,7 +6,10 @@ exits with 2; from Python it is an ordinary exception.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+import os
+import threading
+from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 
 LONGEST = 2000  # letters of an error's text
@@ -78,6 +81,35 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
+
+
+_muting = threading.Lock()
+_stderr: list[int] = []  # what it was, once for each thread that wants it quiet
+
+
+@contextlib.contextmanager
+def native_stderr_muted() -> Iterator[None]:
+    """What libraries in C++ and Rust print on stderr meanwhile is dropped: their errors are told in a line of ours."""
+    with _muting:
+        if _stderr:
+            _stderr.append(_stderr[0])
+        else:
+            try:
+                _stderr.append(os.dup(2))
+            except OSError:  # there is none
+                _stderr.append(-1)
+            else:
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, 2)
+                os.close(nowhere)
+    try:
+        yield
+    finally:
+        with _muting:
+            kept = _stderr.pop()
+            if not _stderr and kept >= 0:
+                os.dup2(kept, 2)
+                os.close(kept)
 
 
 def one_of(names: Iterable[str], found: str | None = None, most: int = 12) -> str:

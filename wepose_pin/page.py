@@ -175,7 +175,8 @@ def _inline(text: str) -> str:
     text = html.escape(text)
     text = re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
     text = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", text)
-    return re.sub(r"\[([^\]]+)\]\((https://[^)]+)\)", r'<a href="\2">\1</a>', text)
+    # Elsewhere on the web, or a page that lies beside this one.
+    return re.sub(r"\[([^\]]+)\]\((https://[^)]+|[\w%-][\w./%-]*\.html)\)", r'<a href="\2">\1</a>', text)
 
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"

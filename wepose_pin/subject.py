@@ -13,7 +13,7 @@ import numpy as np
 
 from .assets import asset
 from .errors import BadOption, BadSubject, MissingFile, one_of
-from .readers.keys import parsed_toml
+from .readers.keys import is_number, parsed_toml
 from .recording import SEGMENTS
 
 LENGTHS = (
@@ -284,12 +284,12 @@ def _covariance(path: Path, table: Mapping, std: Mapping) -> tuple[tuple[str, ..
     order = tuple(order)
     try:
         matrix = np.array(table.get("matrix"), dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise BadSubject(f"{path}: covariance.matrix holds something that is no number, or rows that differ") from None
     if matrix.shape != (len(order), len(order)):
         raise BadSubject(f"{path}: covariance.matrix is {matrix.shape}; {len(order)} names in order need as many rows")
     if (
-        not np.isfinite(matrix).all()
+        not (np.abs(matrix) < 1e6).all()
         or not np.allclose(matrix, matrix.T, atol=1e-12)
         or np.linalg.eigvalsh(matrix)[0] < -1e-9
     ):
@@ -301,7 +301,7 @@ def _read_hinge(path: Path, side: str, table: Any) -> Hinge:
     if side not in ("left", "right"):
         raise BadSubject(f"{path}: hinges.{side} is no side; left or right")
     parts = [table.get(key) for key in ("x", "y", "z", "std_deg")] if isinstance(table, dict) else [None]
-    if not all(isinstance(part, int | float) and not isinstance(part, bool) for part in parts):
+    if not all(is_number(part, 1e6) for part in parts):
         raise BadSubject(f"{path}: hinges.{side} needs four numbers, x, y, z, std_deg")
     axis, std = np.array(parts[:3], dtype=float), float(np.radians(parts[3]))  # type: ignore[arg-type]
     if not abs(np.linalg.norm(axis) - 1.0) < 1e-3 or not 0.0 < std < 1.0:
@@ -327,7 +327,7 @@ def _mount(path: Path, segment: str, table: Any) -> np.ndarray:
     if segment not in SEGMENTS:
         raise BadSubject(f"{path}: mounts.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
     parts = [table.get(key) for key in ("qx", "qy", "qz", "qw")] if isinstance(table, dict) else [None]
-    if not all(isinstance(part, int | float) for part in parts):
+    if not all(is_number(part, 1e6) for part in parts):
         raise BadSubject(f"{path}: mounts.{segment} needs four numbers, qx, qy, qz, qw")
     quat = np.array(parts, dtype=float)
     norm = np.linalg.norm(quat)

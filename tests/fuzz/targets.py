@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -177,13 +178,27 @@ def _streams(_folder: Path, data: bytes) -> object:
 
 
 def _live(path: Path) -> object:
+    """With checksums that are right: else nothing but checksums would be tested."""
     from wepose_pin.readers import read_live_log
     from wepose_pin.subject import subject_of
 
+    path.write_bytes(_checked(path.read_bytes()))
     found = read_live_log(path)
     if found.header["subject"]:
         subject_of(found.header["subject"], path)
     return found
+
+
+def _checked(data: bytes) -> bytes:
+    from wepose_pin.readers.live_log import BLOCK, MAGIC
+
+    made, at = data[: len(MAGIC)], len(MAGIC)
+    while at + BLOCK.size <= len(data):
+        tag, size, _ = BLOCK.unpack_from(data, at)
+        payload = data[at + BLOCK.size : at + BLOCK.size + size]
+        made += BLOCK.pack(tag, len(payload), zlib.crc32(payload, zlib.crc32(tag))) + payload
+        at += BLOCK.size + size
+    return made
 
 
 def _pose(path: Path) -> object:
@@ -243,7 +258,7 @@ XML = (
 )  # fmt: skip
 JSON = (*NUMBERS, b"NaN", b"-Infinity", b"[" * 2000, b"null", b'"\\ud800"', b"{", b"}", b"[", b"]", b":", b"true")
 
-SMALL_TABLE = b'''urdf = "upper_body.urdf"
+SMALL_TABLE = b"""urdf = "upper_body.urdf"
 up = "+z"
 forward = "+x"
 [segments]
@@ -255,7 +270,7 @@ right_forearm = "right_forearm"
 left_hand = "left_hand"
 [points]
 right_wrist = { link = "right_hand", at = [0.0, 0.0, 0.0] }
-'''
+"""
 LSL = b"imu-torso\n" + b"".join(b"gyr_%s\nrad/s\n" % a for a in (b"x", b"y", b"z")) + b"acc_x\ng\nacc_y\ng\nacc_z\ng"
 SUMMARY = b'{"recording": "a", "sensors": {"torso": {}}, "points": ["left_hand"], "warnings": ["b"]}'
 _ROBOTS = ("urdf/robots/ur5.toml", "urdf/robots/baxter.toml")

@@ -3,5 +3,6 @@
 from __future__ import annotations
 
 from .plan import Item, Plan, read_plan
+from .study import Study, run_study
 
-__all__ = ["Item", "Plan", "read_plan"]
+__all__ = ["Item", "Plan", "Study", "read_plan", "run_study"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -21,13 +22,13 @@ AHEAD = 2  # tasks a worker: one runs, one waits
 DEATHS = 3  # of workers at one task, after which it is not tried again
 WAIT_S = 60.0
 # Workers share the machine: one thread each, in whatever would take all.
-_ONE_THREAD = {
-    name: "1"
-    for name in (
+_ONE_THREAD = dict.fromkeys(
+    (
         *("WEPOSE_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"),
         *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"),
-    )
-}
+    ),
+    "1",
+)
 _SETTINGS = {
     "distributed.scheduler.allowed-failures": DEATHS,
     "distributed.scheduler.http.routes": [],
@@ -68,7 +69,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
                     security=Security.temporary(),
                     dashboard_address=None,
                     scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-                    silence_logs="critical",
+                    silence_logs=logging.CRITICAL,
                 )
             )
             yield stack.enter_context(Client(cluster))
@@ -143,6 +144,8 @@ def _timed(items: list[Item], place: str, force: bool, code: str | None) -> tupl
 
 
 def _lost(item: Item, error: Any) -> Row:
-    message = f"{item.session}: {DEATHS + 1} workers died at it, the last at {error.last_worker.address}; too little memory?"
+    message = (
+        f"{item.session}: {DEATHS + 1} workers died at it, the last at {error.last_worker.address}; too little memory?"
+    )
     row: Row = {"item": item.name, "session": item.session, "subject": item.subject, "status": "failed"}
     return row | {"error": LostWorker.__name__, "message": message}

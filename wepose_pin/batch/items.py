@@ -20,6 +20,7 @@ from .steps import Given, Work
 from .storage import DONE, fetch, is_remote, new_folder, read_bytes, stamps
 
 COMMAND = "batch item"
+PAGES = ("report.html", "view.html")  # what a row of the study leads to
 Row = dict[str, Any]
 
 
@@ -101,15 +102,16 @@ def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
             for name, url in _inputs(item).items()
         }
         block = _block(item, local)
-        given = Given(
-            folder, local["session"], local.get("subject_file"), local.get("truth"), item.body, block
-        )
-        work, row, took = Work(given), {}, {}
+        given = Given(folder, local["session"], local.get("subject_file"), local.get("truth"), item.body, block)
+        work, row, took = Work(given), Row(), Row()
         for step, options in item.steps.items():
             begun = time.perf_counter()
             row |= work.run(step, options)
             took[f"{step}_s"] = time.perf_counter() - begun
-    return row | took, block
+    pages = [
+        f"{step}/{name}" for step in reversed(list(item.steps)) for name in PAGES if (folder / step / name).is_file()
+    ]
+    return row | {"page": next(iter(pages), None)} | took, block
 
 
 def key_of(item: Item) -> str:

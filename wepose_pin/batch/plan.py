@@ -116,7 +116,9 @@ def _plan(path: Path, items_at: str) -> Plan:
         if subject.calibration is None or not any(item.subject == name for item in items):
             continue
         if "calibrate" not in steps:
-            raise BadPlan(f"{top.at(f'subjects.{name}')}.calibration: needs the step [steps.calibrate], which is missing")
+            raise BadPlan(
+                f"{top.at(f'subjects.{name}')}.calibration: needs the step [steps.calibrate], which is missing"
+            )
         only = {"calibrate": steps["calibrate"]}
         first.append(Item(f"subject-{_safe(name)}", subject.calibration, only, name, body=subject.body))
     if taken := {item.name for item in items} & {item.name for item in first}:
@@ -221,7 +223,9 @@ def _entries(top: Keys, path: Path) -> list[tuple[str, Keys]]:
     if isinstance(value, dict):
         value = [value]
     if not isinstance(value, list) or not value or not all(isinstance(entry, dict) for entry in value):
-        raise BadPlan(f"{top.at('sessions')}: a table [sessions], or several [[sessions]], with files or table is needed")
+        raise BadPlan(
+            f"{top.at('sessions')}: a table [sessions], or several [[sessions]], with files or table is needed"
+        )
     places = [f"sessions[{k}]" if len(value) > 1 else "sessions" for k in range(len(value))]
     return [(place, Keys(entry, str(path), f"{place}.")) for place, entry in zip(places, value, strict=True)]
 
@@ -292,7 +296,9 @@ def _tied(
     own, body, file = dict(steps), entry.body or Body(), None
     if entry.subject is not None and (subjects or "calibrate" not in steps):
         if entry.subject not in subjects:
-            raise BadPlan(f"{entry.row}: subject '{entry.subject}' is not in the plan; {one_of(subjects, entry.subject)}")
+            raise BadPlan(
+                f"{entry.row}: subject '{entry.subject}' is not in the plan; {one_of(subjects, entry.subject)}"
+            )
         subject = subjects[entry.subject]
         if entry.body is None:
             body = subject.body

@@ -1,4 +1,4 @@
-"""The steps of an item: each what the command of its name does, into a folder of its name, and its figures for the table."""
+"""The steps of an item: each does what the command of its name does, into a folder of its name, and gives figures."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ class Work:
         truth = self.given.truth or self.pose.recording.truth
         if truth is None:
             raise MissingFile(
-                f"{self.given.session}: data.truth is missing; evaluate needs a reference, there or in the table's truth"
+                f"{self.given.session}: data.truth is missing; evaluate needs a reference, there or in a table's truth"
             )
         errors = evaluate(self.pose, pose_from_table(read_table(truth), str(truth)), interval)
         text = json.dumps(as_json(asdict(errors)), indent=2)

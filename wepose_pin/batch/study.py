@@ -21,7 +21,7 @@ from .storage import is_remote, only_one, read_bytes, sweep, write_bytes
 ITEMS, RESULTS, REPORT, STUDY = "items", "results.parquet", "report.html", "study.json"
 # What every row has, before the figures of its steps.
 _FIRST = {
-    **dict.fromkeys(("item", "session", "subject", "status", "error", "message"), pl.String),
+    **dict.fromkeys(("item", "session", "subject", "status", "error", "message", "page"), pl.String),
     "seconds": pl.Float64,
 }
 
@@ -95,7 +95,8 @@ def _rows(
     progress: Callable[[int, int, int], None],
 ) -> dict[str, Row]:
     """Item → its row; subjects first, since sessions wait for them."""
-    total, rows = len(plan.first) + len(plan.items), {}
+    total = len(plan.first) + len(plan.items)
+    rows: dict[str, Row] = {}
     progress(0, 0, total)
     with connected(scheduler, workers) as client:
         for items in (plan.first, plan.items):
@@ -129,9 +130,7 @@ def table_of(rows: list[Row]) -> pl.DataFrame:
     schema: dict[str, Any] = _FIRST | {
         name: pl.String if any(isinstance(row.get(name), str) for row in rows) else pl.Float64 for name in names
     }
-    return pl.DataFrame(
-        {name: [_cell(row.get(name)) for row in rows] for name in schema}, schema=schema, strict=False
-    )
+    return pl.DataFrame({name: [_cell(row.get(name)) for row in rows] for name in schema}, schema=schema, strict=False)
 
 
 def _cell(value: Any) -> Any:

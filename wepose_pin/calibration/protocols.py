@@ -21,7 +21,7 @@ import numpy as np
 from ..alignment import SLIP_STD
 from ..assets import asset
 from ..errors import BadOption, MissingFile, one_of
-from ..readers.keys import parsed_toml
+from ..readers.keys import is_number, parsed_toml
 from ..recording import SEGMENTS
 from ..subject import LENGTHS
 from .chain import CHAIN, REACHES
@@ -188,12 +188,11 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
             raise BadOption(f"{place}: directions = {directions!r}; of each segment x, y, z, as in directions.torso")
         for segment, value in directions.items():
             _among(segment, CHAIN, f"{place}: directions")
-            try:
-                x, y, z = (np.array(value, dtype=float) / np.linalg.norm(value)).tolist()
-            except (TypeError, ValueError):
-                x = float("nan")
-            if not np.isfinite(x):
+            numbers = isinstance(value, list) and len(value) == 3 and all(is_number(v, 1e6) for v in value)
+            length = float(np.linalg.norm(value)) if numbers else 0.0
+            if not length > 1e-6:
                 raise BadOption(f"{place}: directions.{segment} = {value}; three numbers are needed: x, y, z")
+            x, y, z = (float(v) / length for v in value)
             conditions.append(Direction(str(_get(entry, "phase", place)), segment, (x, y, z), std))
     for i, entry in enumerate(table.get("axis", [])):
         place = f"{path}: axis {i + 1}"

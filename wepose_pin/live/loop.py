@@ -187,7 +187,11 @@ class LiveLoop:
             self._waiting.append(came)
             self._set_clock()
             return
-        pose = self._follow(self._aligner.push(came))
+        pose = None
+        for ticks in self._aligner.pieces(came):
+            pose = self._follow(ticks) or pose
+            if self.log is not None:
+                self.log.due()
         if pose is not None:
             for output in self.outputs:
                 output.show(pose)

@@ -15,6 +15,16 @@ from .state import LivePose, SensorStatus, Stage, Status
 REFRESH_HZ = 4
 KEYS = ("r", "q")
 STATES = {"waiting": "…", "hold": "■", "moved": "✕", "ready": "▶", "ended": "■"}
+# What a row tells, and the width of the terminal from which there is room for it.
+COLUMNS = (
+    ("sensor", 0),
+    ("state", 0),
+    ("rate\n[Hz]", 36),
+    ("gyro bias x y z\n[°/s]", 80),
+    ("heading\n± [°]", 50),
+    ("set ago\n[s]", 58),
+    ("missed\nsamples", 44),
+)
 
 
 class TerminalView:
@@ -95,23 +105,25 @@ class TerminalView:
     def _drawn(self) -> Any:
         from rich.text import Text
 
-        return Text("Connecting …") if self._newest is None else table(self._newest, keys=self._keyboard is not None)
+        if self._newest is None:
+            return Text("Connecting …")
+        return table(self._newest, keys=self._keyboard is not None, width=self._console.width)
 
 
-def table(status: Status, *, keys: bool = False) -> Any:
-    """A status for a terminal."""
+def table(status: Status, *, keys: bool = False, width: int = 80) -> Any:
+    """A status for a terminal of `width` letters; what there is no room for is left out, the bias first."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
     begun = status.state in ("ready", "ended")  # before, nothing is estimated
     rows = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name, justify in (("sensor", "left"), ("state", "left")):
-        rows.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
-    for name in ("rate\n[Hz]", "gyro bias x y z\n[°/s]", "heading\n± [°]", "set ago\n[s]", "missed\nsamples"):
-        rows.add_column(Text(name), justify="right", no_wrap=True)
+    shown = [k for k, (_, least) in enumerate(COLUMNS) if width >= least]
+    for k in shown:
+        rows.add_column(Text(COLUMNS[k][0]), justify="left" if k < 2 else "right", no_wrap=True)
     for sensor in status.sensors:
-        rows.add_row(*map(Text, _row(sensor, begun)), style="bold red" if sensor.lost else "")
+        cells = _row(sensor, begun)
+        rows.add_row(*(Text(cells[k]) for k in shown), style="bold red" if sensor.lost else "")
     head = Text.assemble(
         (f"{STATES.get(status.state, '')} {status.state}  ", "bold"), (status.message, "" if begun else "bold")
     )

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
+from xml.parsers import expat
 
 import pinocchio as pin
 
@@ -151,15 +151,26 @@ def read_urdf(path: Path) -> Any:
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a URDF is wanted here")
     try:
-        # yourdfpy's parser mends broken XML in silence: half a body would be read as a body.
-        ElementTree.parse(path)
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        # yourdfpy's parser mends broken XML in silence: half a body would be read as a body. And it reads what entities
+        # name, on disk too.
+        _check_xml(path)
+    except (expat.ExpatError, ValueError) as error:
         raise BadModel(f"{path}: is no whole XML file, as a URDF is: {error}") from error
     try:
         return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # yourdfpy and lxml raise many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadModel(f"{path}: cannot be read as a URDF: {reason}") from error
+
+
+def _check_xml(path: Path) -> None:
+    def refuse(name: str, *_: object) -> None:
+        raise BadModel(f"{path}: declares an entity, '{name}', which no URDF needs; write out what it stands for")
+
+    parser = expat.ParserCreate()
+    parser.EntityDeclHandler = refuse
+    with path.open("rb") as file:
+        parser.ParseFile(file)
 
 
 def _body(robot: Any, where: str) -> BodyModel:

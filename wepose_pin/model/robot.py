@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from ..errors import BadModel, BadSession, one_of
+from ..errors import BadModel, BadSession, native_stderr_muted, one_of
 from .body import read_urdf
 from .tree import tree_of
 
@@ -24,7 +24,8 @@ def load_robot(path: str | Path) -> pin.Model:
     path = Path(path)
     tree_of(read_urdf(path), str(path))
     try:
-        model = pin.buildModelFromUrdf(str(path))
+        with native_stderr_muted():
+            model = pin.buildModelFromUrdf(str(path))
     except Exception as error:  # what C++ throws
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadModel(f"{path}: Pinocchio cannot build it: {reason}") from error

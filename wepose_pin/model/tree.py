@@ -12,6 +12,7 @@ import pinocchio as pin
 from ..errors import BadModel
 
 _TURNS = ("revolute", "continuous")
+DEEPEST = 200  # joints in a row; a person has 20
 _PARALLEL_TOLERANCE = 1e-6
 _MEET_TOLERANCE = 1e-9  # [m]
 
@@ -90,10 +91,15 @@ def tree_of(robot: Any, where: str) -> Tree:
     if len(roots) != 1:
         found = ", ".join(roots) if roots else "none"
         raise BadModel(f"{where}: {len(roots)} links without a joint above them ({found}); a body has one root")
-    reached, to_do = set(), [roots[0]]
+    reached, to_do = {roots[0]: 0}, [roots[0]]
     while to_do:
-        reached.add(link := to_do.pop())
-        to_do += [joint.child for joint in below[link]]
+        link = to_do.pop()
+        for joint in below[link]:
+            reached[joint.child] = reached[link] + 1
+            to_do.append(joint.child)
+    deepest = max(reached, key=lambda link: reached[link])
+    if reached[deepest] > DEEPEST:
+        raise BadModel(f"{where}: {reached[deepest]} joints in a row down to '{deepest}'; {DEEPEST} at most are read")
     lost = [name for name in below if name not in reached]
     if lost:
         raise BadModel(f"{where}: link '{lost[0]}' hangs in a loop of joints, apart from the root; a body is a tree")

@@ -6,7 +6,7 @@ samples came at once. So a file that holds the arrivals gives the same ticks aga
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -112,10 +112,17 @@ class Aligner:
 
     def push(self, came: Arrivals) -> Ticks:
         """Take samples; the ticks that are whole by them, often none."""
-        first, parts = self.next_tick, []
-        at = 0
+        parts = list(self.pieces(came))
+        if len(parts) < 2:
+            return parts[0] if parts else self._none
+        return Ticks(parts[0].first, *map(np.concatenate, tuple(zip(*parts, strict=True))[1:]))
+
+    def pieces(self, came: Arrivals) -> Iterator[Ticks]:
+        """As `push`, a thousand at a time: after an hour of silence there are millions. To be taken to their end."""
         values, lost = self._out
-        while True:
+        at, made = 0, _OUT
+        while at < len(came.time) or made == _OUT:
+            first = self.next_tick
             at, made = _take(
                 self._kept,
                 self._held,
@@ -130,14 +137,8 @@ class Aligner:
                 lost,
             )
             if made:
-                parts.append((values[:made].copy(), lost[:made].copy()))
-            if at == len(came.time) and made < _OUT:
-                break
-        if not parts:
-            return self._none
-        whole, gone = parts[0] if len(parts) == 1 else tuple(map(np.concatenate, zip(*parts, strict=True)))
-        numbers = self.begin + np.arange(first, first + len(whole)) / self.rate_hz
-        return Ticks(first, numbers, whole[:, :, :3], whole[:, :, 3:], gone)
+                time, whole = self.begin + np.arange(first, first + made) / self.rate_hz, values[:made].copy()
+                yield Ticks(first, time, whole[:, :, :3], whole[:, :, 3:], lost[:made].copy())
 
 
 @kernel

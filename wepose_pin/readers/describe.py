@@ -20,7 +20,7 @@ from .clocks import SLOWEST_STEP_S, TIME_UNITS, runs
 from .device import Device
 from .formats import TITLES, format_of, read_device
 from .guess import Guess, guess_arrays, guess_columns
-from .keys import read_toml
+from .keys import is_number, read_toml
 from .session import SessionReader
 from .tables import FORMATS as TABLES
 from .tables import Rows, columns, read_table
@@ -90,23 +90,29 @@ def describe(path: Path, folder: Path | None = None) -> Description:
 def _result(path: Path) -> Description:
     try:
         summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
+        summary = None
+    if not isinstance(summary, dict):
         return Description(f"{path}: a result of `wepose track`, without a summary.json that can be read", (), (), None)
     said = {key: summary.get(key) for key in ("recording", "method", "rate_hz", "duration_s", "samples")}
     facts = [
         f"of {said['recording']}, by {said['method']}: {said['samples']} samples, {said['duration_s']} s at "
         f"{said['rate_hz']} Hz",
-        *(f"note: {warning}" for warning in summary.get("warnings", [])),
+        *(f"note: {warning}" for warning in _texts(summary.get("warnings"))),
     ]
     if (path / "joints.parquet").is_file():
-        facts[1:1] = [f"of a chain, sensors on: {', '.join(summary.get('not_followed_rms_deg', {}))}"]
+        facts[1:1] = [f"of a chain, sensors on: {', '.join(_texts(summary.get('not_followed_rms_deg')))}"]
         return Description(f"{path}: a result of `wepose track`", (*facts, "its motion: joints.parquet"), (), None)
     facts[1:1] = [
-        f"sensors: {', '.join(summary.get('sensors', {}))}",
-        f"points: {', '.join(summary.get('points', []))}",
+        f"sensors: {', '.join(_texts(summary.get('sensors')))}",
+        f"points: {', '.join(_texts(summary.get('points')))}",
     ]
     facts.append(f"look at it: wepose view {path}")
     return Description(f"{path}: a result of `wepose track`", tuple(facts), (), None)
+
+
+def _texts(value: object) -> list[str]:
+    return [str(item) for item in value] if isinstance(value, list | dict) else []
 
 
 def _toml(path: Path) -> Description:
@@ -117,9 +123,9 @@ def _toml(path: Path) -> Description:
         what = f"{path}: a session, '{whole.name}'"
         return Description(what, _facts(whole), _rows(whole, {}), None)
     if isinstance(values.get("lengths"), dict):
-        lengths = {name: length for name, length in values["lengths"].items() if isinstance(length, int | float)}
+        lengths = {name: length for name, length in values["lengths"].items() if is_number(length)}
         facts = ["lengths [mm]: " + ", ".join(f"{name} {1e3 * length:.0f}" for name, length in lengths.items())]
-        mounts = ", ".join(values.get("mounts", {}))
+        mounts = ", ".join(_texts(values.get("mounts")))
         facts.append(f"mounts: {mounts}" if mounts else "no calibrated mounts")
         return Description(f"{path}: a subject, '{values.get('name', '')}'", tuple(facts), (), None)
     raise BadData(f"{path}: TOML, but neither a session ([data], [sensors.…]) nor a subject ([lengths])")

@@ -63,7 +63,7 @@ def read_dot(path: Path, use: str | None = None) -> Device:
 def _rates(increments: np.ndarray, step: float) -> dict[str, np.ndarray]:
     """Mean rate and mean specific force over each sample of `step` [s], from dq (w x y z) and dv."""
     turn = np.full((len(increments), 3), np.nan)
-    good = np.linalg.norm(np.nan_to_num(increments[:, :4]), axis=1) > 0.5
+    good = np.isfinite(increments[:, :4]).all(axis=1) & (np.linalg.norm(increments[:, :4], axis=1) > 0.5)
     if good.any():
         turn[good] = Rotation.from_quat(increments[good][:, [1, 2, 3, 0]]).as_rotvec()
     return {"gyro": turn / step, "accel": increments[:, 4:] / step}

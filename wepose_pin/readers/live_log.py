@@ -25,6 +25,8 @@ from ..errors import BadData, MissingFile
 from ..recording import SEGMENTS, Recording, Sensor, check
 from .arrivals import Aligner, Arrivals, Ticks
 from .clocks import GOOD, LONG, Clock, bridge
+from .keys import Keys, is_number
+from .stated import phases_stated
 
 MAGIC = b"WEPOSE-LIVE-1\n"
 SUFFIX = ".wepose"
@@ -32,6 +34,9 @@ BLOCK = struct.Struct("<4sII")
 HEAD, SAMPLES, EVENT, POSES = b"HEAD", b"SMPL", b"EVNT", b"POSE"
 _NUMBERS = ((1, 1), (3, 9), (3, 33))  # of a block of samples: numbers a sample, bytes a sample before them
 LONGEST_BLOCK = 1 << 28  # [bytes] none that we write is so long
+# Ticks in which no sample came: more than in eight hours at 100 Hz, and times of samples are no times.
+MOST_SILENT = 3_000_000
+MOST_RATE, MOST_WAIT_S = 10_000.0, 10.0
 
 
 class LiveRecording(NamedTuple):
@@ -71,6 +76,7 @@ def read_live_log(path: Path) -> LiveRecording:
     ticks: list[Ticks] = []
     start: tuple[int, int] | None = None
     resets, poses = [], []
+    end_s, late = 0.0, 0
     broken_off = True
     for tag, payload in blocks(path):
         if tag == b"":
@@ -80,26 +86,27 @@ def read_live_log(path: Path) -> LiveRecording:
         elif header is None:
             raise BadData(f"{path}: begins without a header; the file is damaged")
         elif tag == SAMPLES:
-            came = _arrivals(path, payload, len(header["sensors"]))
-            if aligner is None:
-                waiting.append(came)
-            else:
-                ticks.append(aligner.push(came))
+            waiting.append(_arrivals(path, payload, len(header["sensors"])))
         elif tag == EVENT:
-            event = json.loads(payload)
-            if event["kind"] == "clock":
+            kind, event = _event(path, payload)
+            if kind == "clock":
                 aligner = Aligner(header["sensors"], event["rate_hz"], event["begin"], event["wait_s"])
-                ticks += [aligner.push(came) for came in waiting]
-            elif event["kind"] == "start":
-                start = event["begin"], event["end"]
-            elif event["kind"] == "reset":
+                end_s = aligner.begin + (MOST_SILENT + path.stat().st_size / 57) / aligner.rate_hz
+            elif kind == "start":
+                start = int(event["begin"]), int(event["end"])
+            elif kind == "reset":
                 resets.append(int(event["tick"]))
         elif tag == POSES:
-            first, count = struct.unpack_from("<QI", payload)
-            quat = np.frombuffer(payload, "<f8", offset=12).reshape(count, len(header["sensors"]), 4)
-            poses.append((first, quat))
+            poses.append(_poses(path, payload, len(header["sensors"])))
+        while aligner is not None and waiting:
+            came, far = waiting[0], waiting.pop(0).time > end_s
+            late += int(far.sum())
+            if late > 3:  # as many in a row are a clock that went on
+                raise BadData(f"{path}: samples at {came.time[far][0]:g} s, where the file holds no as long recording")
+            ticks.append(aligner.push(Arrivals(*(part[~far] for part in came)) if far.any() else came))
     if header is None or aligner is None or start is None:
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
+    resets = [tick for tick in resets if tick < aligner.next_tick]
     if aligner.next_tick <= start[1] + 1:
         raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
     recording = check(recording_of(header, aligner.rate_hz, ticks, start, path, tuple(resets)))
@@ -126,15 +133,63 @@ def blocks(path: Path) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _header(path: Path, payload: bytes) -> dict[str, Any]:
-    header = json.loads(payload)
+    header = _json(path, payload)
     sensors = header.get("sensors")
-    if header.get("format") != 1 or not isinstance(sensors, list) or not sensors or not set(sensors) <= set(SEGMENTS):
+    named = isinstance(sensors, list) and sensors and all(name in SEGMENTS for name in sensors)
+    if header.get("format") != 1 or not named or len(set(sensors or ())) < len(sensors or ()):
         raise BadData(f"{path}: format {header.get('format')!r} with sensors {sensors!r}; this version reads format 1")
-    return dict(header)
+    texts = [header.get(key) for key in ("name", "start_pose", "strapping", "method")]
+    mounts, phases = header.get("mounts"), header.get("phases")
+    if not (all(isinstance(text, str) for text in texts) and isinstance(header.get("subject") or "", str)):
+        raise BadData(f"{path}: its header lacks name, start_pose, strapping or method; the file is damaged")
+    if not (isinstance(mounts, dict) and all(_is_quat(mount) for mount in mounts.values())):
+        raise BadData(f"{path}: mounts = {mounts!r} in its header; a unit quaternion x, y, z, w each is needed")
+    phases_stated(Keys(phases if isinstance(phases, dict) else {"phases": phases}, str(path), "phases."))
+    return header
+
+
+def _is_quat(value: Any) -> bool:
+    numbers = isinstance(value, list) and len(value) == 4 and all(is_number(v, 2.0) for v in value)
+    return numbers and abs(float(np.linalg.norm(value)) - 1.0) < 1e-6
+
+
+def _json(path: Path, payload: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise BadData(f"{path}: holds JSON that is none: {error}; the file is damaged") from error
+    if not isinstance(found, dict):
+        raise BadData(f"{path}: holds {str(found)[:40]!r} in place of an object; the file is damaged")
+    return found
+
+
+def _event(path: Path, payload: bytes) -> tuple[str, dict[str, float]]:
+    """Kind and numbers of an event; of one that is not known, no numbers."""
+    event = _json(path, payload)
+    kind = str(event.get("kind"))
+    wanted = {"clock": ("rate_hz", "begin", "wait_s"), "start": ("begin", "end"), "reset": ("tick",)}.get(kind, ())
+    values = {name: event.get(name) for name in wanted}
+    well = all(is_number(value, 1e12) for value in values.values())
+    if well and kind == "clock":
+        well = 0.1 <= values["rate_hz"] <= MOST_RATE and 0.0 <= values["wait_s"] <= MOST_WAIT_S  # type: ignore[operator]
+    elif well:
+        whole = [int(value) for value in values.values() if value == int(value)]  # type: ignore[arg-type]
+        well = len(whole) == len(values) and whole == sorted(set(whole)) and min(whole, default=0) >= 0
+    if not well:
+        raise BadData(f"{path}: an event '{kind}' with {values!r}; the file is damaged")
+    return kind, {name: float(value) for name, value in values.items()}  # type: ignore[arg-type]
+
+
+def _poses(path: Path, payload: bytes, sensors: int) -> tuple[int, np.ndarray]:
+    """Tick of the first pose, and the poses (m, k, 4) xyzw."""
+    first, count = struct.unpack_from("<QI", payload) if len(payload) >= 12 else (0, 0)
+    if len(payload) != 12 + 32 * count * sensors:
+        raise BadData(f"{path}: a block of {count} poses has {len(payload)} bytes; the file is damaged")
+    return first, np.frombuffer(payload, "<f8", offset=12).reshape(count, sensors, 4)
 
 
 def _arrivals(path: Path, payload: bytes, sensors: int) -> Arrivals:
-    (count,) = struct.unpack_from("<I", payload)
+    (count,) = struct.unpack_from("<I", payload) if len(payload) >= 4 else (0,)
     if len(payload) != 4 + count * 57:
         raise BadData(f"{path}: a block of {count} samples has {len(payload)} bytes; the file is damaged")
     which = np.frombuffer(payload, "u1", count, 4)

@@ -1,8 +1,8 @@
 """OpenSim ``.sto`` tables of IMU orientations, as OpenSense reads and writes them.
 
 Lines ``key=value`` up to ``endheader``, among them ``DataType=Quaternion``; then names and rows separated by tabs, each
-cell a quaternion ``w,x,y,z`` of the sensor to its world, z up as the device had it. What `wepose export` wrote holds the
-model's bodies in OpenSim's ground in place of that, and a line of its header says so.
+cell a quaternion ``w,x,y,z`` of the sensor to its world, z up as the device had it. What `wepose export` wrote holds
+bodies of a model in OpenSim's ground in place of that, and a line of its header says so.
 
 Source: OpenSim documentation, OpenSense; the headers of OpenSense's example files.
 """

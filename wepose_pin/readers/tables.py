@@ -6,6 +6,7 @@ import contextlib
 import csv
 import io
 import itertools
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from ..errors import BadData, MissingFile, UnknownColumn, one_of
+from ..errors import BadData, MissingFile, UnknownColumn, native_stderr_muted, one_of
 
 FORMATS = (".csv", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
@@ -39,9 +40,9 @@ def read_table(path: Path) -> pl.DataFrame:
     _must_be_table(path)
     if _is_parquet(path):
         with _polars_errors(path):
-            lazy = pl.scan_parquet(path)
+            lazy = pl.scan_parquet(_source(path))
             _check_size(path, int(lazy.select(pl.len()).collect().item()), len(lazy.collect_schema().names()))
-            return pl.read_parquet(path)
+            return pl.read_parquet(_source(path))
     table = _parsed(path, _header(path))
     return table.head(table.height - _empty_end(path)) if table.height else table
 
@@ -128,9 +129,9 @@ def one_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.
         if name is not None and name in (names := _parquet_names(path)):
             names = [name]
         with _polars_errors(path):
-            height = int(pl.scan_parquet(path).select(pl.len()).collect().item())
+            height = int(pl.scan_parquet(_source(path)).select(pl.len()).collect().item())
             _check_size(path, height, 1)
-            table = pl.scan_parquet(path).select(names).collect() if name is not None else None
+            table = pl.scan_parquet(_source(path)).select(names).collect() if name is not None else None
         return (columns(table, [name], file, place)[:, 0] if table is not None and name else np.empty(0)), height
     parts, height = [np.empty(0)], 0
     for block in _csv_blocks(path, _header(path)):
@@ -142,7 +143,7 @@ def one_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.
 
 def _parquet_names(path: Path) -> list[str]:
     with _polars_errors(path):
-        return pl.scan_parquet(path).collect_schema().names()
+        return pl.scan_parquet(_source(path)).collect_schema().names()
 
 
 def _csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
@@ -164,6 +165,15 @@ def _csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
 
 
 # What a file can be wrong in ---------------------------------------------------------------------------------------
+
+
+def _source(path: Path) -> Path | bytes:
+    """The file as polars takes it, which knows no paths but those in UTF-8."""
+    try:
+        os.fspath(path).encode("utf-8")
+    except UnicodeEncodeError:
+        return path.read_bytes()
+    return path
 
 
 def _is_parquet(path: Path) -> bool:
@@ -200,11 +210,14 @@ class _polars_errors:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        # polars prints what its panics say, line upon line.
+        self._quiet = native_stderr_muted() if _is_parquet(path) else contextlib.nullcontext()
 
     def __enter__(self) -> None:
-        return None
+        self._quiet.__enter__()
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self._quiet.__exit__(None, None, None)
         # A panic is no Exception: polars came upon what it had taken for impossible.
         if isinstance(error, pl.exceptions.PolarsError | pl.exceptions.PanicException | OSError):
             what = "Parquet file" if _is_parquet(self.path) else "table"
@@ -235,7 +248,7 @@ def _header(path: Path) -> list[str]:
 
 def _parsed(path: Path, names: list[str], part: bytes = b"", first_row: int = 0) -> pl.DataFrame:
     """A CSV, or a `part` of it that begins with the line of names and goes on with `first_row`."""
-    source: Path | bytes = part or path
+    source: Path | bytes = part or _source(path)
     options: dict[str, Any] = {"null_values": NO_VALUE, "comment_prefix": "#"}
     numbers: dict[str, Any] = dict.fromkeys(names, pl.Float64)
     table = None

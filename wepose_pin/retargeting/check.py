@@ -1,4 +1,4 @@
-"""What a written trajectory keeps, found without the solver: NumPy on the table, the URDF's limits, coal on its shapes."""
+"""What a written trajectory keeps, found without the solver: the table, the URDF's limits, coal on its shapes."""
 
 from __future__ import annotations
 
@@ -65,13 +65,12 @@ def touching(robot: Robot, time: np.ndarray, u: np.ndarray) -> Touching:
     for i, j in allowed_pairs(robot):
         shapes.addCollisionPair(pin.CollisionPair(i, j))
     data, geometry = robot.model.createData(), shapes.createData()
-    count, first = 0, ""
-    for k in range(len(u)):
-        if pin.computeCollisions(robot.model, data, shapes, geometry, robot.q(u[k]), True):
-            count += 1
-            if not first:
-                first = _which(shapes, geometry, float(time[k]))
-    return Touching(count, first)
+    boxes = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(robot.model, shapes, geometry)
+    hits = [k for k in range(len(u)) if pin.computeCollisions(robot.model, data, boxes, robot.q(u[k]), True)]
+    if not hits:
+        return Touching(0, "")
+    pin.computeCollisions(robot.model, data, shapes, geometry, robot.q(u[hits[0]]), True)
+    return Touching(len(hits), _which(shapes, geometry, float(time[hits[0]])))
 
 
 def _which(shapes: Any, geometry: Any, time: float) -> str:

@@ -94,7 +94,6 @@ class Shapes:
         growth = first * (linear + _cross(a, away) @ J[3:]) - second * (linear + _cross(b, away) @ J[3:])
         return Near(distance, growth, self.clearance[which])
 
-
     def _clearances(self) -> np.ndarray:
         """(pairs,) [m] `CLEARANCE`; of hulls nearer than that at rest half of what is there, or none."""
         data = self.robot.model.createData()
@@ -127,7 +126,9 @@ def hulls(robot: Robot) -> tuple[Any, list[int]]:
         elif hasattr(geometry, "buildConvexHull"):
             geometry.buildConvexHull(True, "Qt")
             geometry = geometry.convex
-        body.append(made.addGeometryObject(pin.GeometryObject(name, shape.parentJoint, shape.parentFrame, placement, geometry)))
+        body.append(
+            made.addGeometryObject(pin.GeometryObject(name, shape.parentJoint, shape.parentFrame, placement, geometry))
+        )
     for joint, shapes in hand.items():
         whole = made.geometryObjects[made.getGeometryId(f"hand {joint}")]
         points = np.vstack([_corners(shape) for shape in shapes])
@@ -155,7 +156,7 @@ def allowed_pairs(robot: Robot) -> list[tuple[int, int]]:
     objects, full = robot.shapes.geometryObjects, robot.full
     links = [full.frames[full.getFrameId(_link(shape.name))].name for shape in objects]
     excused = _excused(robot.map.srdf) if robot.map.srdf else set()
-    after = _following(full)
+    after = _following(full, set(links))
     candidates = [
         (i, j)
         for i in range(len(objects))
@@ -199,24 +200,20 @@ def _link(shape: str) -> str:
     return shape.rpartition("_")[0]
 
 
-def _following(full: Any) -> set[frozenset[str]]:
-    """Links with one moving joint between them, through links fixed to either."""
-    bodies = [frame for frame in full.frames if frame.type == pin.FrameType.BODY]
+def _following(full: Any, shaped: set[str]) -> set[frozenset[str]]:
+    """Links that follow each other: only joints between them, and links without a shape (`shaped` have one)."""
     on: dict[int, list[str]] = {}
-    for frame in bodies:
-        on.setdefault(frame.parentJoint, []).append(frame.name)
-    return {
-        frozenset((a, b))
-        for joint in range(1, full.njoints)
-        if full.parents[joint] > 0
-        for a in on.get(joint, [])
-        for b in on.get(full.parents[joint], [])
-    } | {
-        frozenset((a, full.frames[_root_side(full, joint)].name))
-        for joint in range(1, full.njoints)
-        if full.parents[joint] == 0
-        for a in on.get(joint, [])
-    }
+    for frame in full.frames:
+        if frame.type == pin.FrameType.BODY and frame.name in shaped:
+            on.setdefault(frame.parentJoint, []).append(frame.name)
+    found = set()
+    for joint in range(1, full.njoints):
+        top, above = joint, full.parents[joint]
+        while above > 0 and above not in on:
+            top, above = above, full.parents[above]
+        before = on[above] if above > 0 else [full.frames[_root_side(full, top)].name]
+        found |= {frozenset((a, b)) for a in on.get(joint, []) for b in before}
+    return found
 
 
 def _root_side(full: Any, joint: int) -> int:
@@ -232,9 +229,7 @@ def _excused(srdf: Path) -> set[frozenset[str]]:
         root = ElementTree.parse(srdf).getroot()
     except ElementTree.ParseError as error:
         raise BadModel(f"{srdf}: not valid XML: {error}") from error
-    return {
-        frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in root.iter("disable_collisions")
-    }
+    return {frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in root.iter("disable_collisions")}
 
 
 def _supports(model: Any) -> np.ndarray:

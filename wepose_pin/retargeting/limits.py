@@ -70,7 +70,7 @@ def _number(element: ElementTree.Element | None, key: str) -> float:
 
 @kernel
 def fastest(room, a_step, dt):  # type: ignore[no-untyped-def]
-    """Largest next velocity after which a joint still stops within `room`, in steps that each take off at most `a_step`.
+    """Largest next velocity from which a joint still stops within `room`, each step taking off `a_step` at most.
 
     The velocity changes evenly over each step of `dt` [s]. `room` [rad or m] is what is left to the limit, less what
     the present velocity takes of the coming step. Braking from m·a_step takes ½ m² a_step dt, and between whole numbers
@@ -78,6 +78,8 @@ def fastest(room, a_step, dt):  # type: ignore[no-untyped-def]
     """
     if room <= 0.0:
         return 2.0 * room / dt  # already beyond: back by half a step's mean velocity
+    if np.isinf(room):
+        return room  # a joint without end
     unit = a_step * dt
     m = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * room / unit) - 1.0))
     return m * a_step + (room - 0.5 * unit * m * (m + 1.0)) / ((m + 1.0) * dt)

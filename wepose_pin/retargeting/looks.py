@@ -39,7 +39,7 @@ def parts(robot: Robot) -> list[Part]:
     _, shapes = pin.buildReducedModel(robot.full, whole, locked, robot.rest_full)
     by_joint: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     for shape in shapes.geometryObjects:
-        vertices, triangles = _triangles(shape.geometry, np.asarray(shape.meshScale))
+        vertices, triangles = _triangles(shape.geometry)
         if len(triangles):
             placed = vertices @ shape.placement.rotation.T + shape.placement.translation
             by_joint.setdefault(int(shape.parentJoint), []).append((placed, triangles))
@@ -72,7 +72,9 @@ def stands_at(robot: Robot, drawn: list[Part], shoulder_z: float, floor_z: float
     return R, np.array([p[0], p[1] + BESIDE, z])
 
 
-def placements(trajectory: Trajectory, drawn: list[Part], frames: np.ndarray, R: np.ndarray, p: np.ndarray) -> dict[int, Any]:
+def placements(
+    trajectory: Trajectory, drawn: list[Part], frames: np.ndarray, R: np.ndarray, p: np.ndarray
+) -> dict[int, Any]:
     """Joint → (quat_WJ (m, 4) xyzw, p_WJ (m, 3)) at samples `frames`, the root at `R`, `p` in W."""
     robot, joints = trajectory.robot, sorted({part.joint for part in drawn})
     data = robot.model.createData()
@@ -96,13 +98,15 @@ def _colour(robot: Robot, joint: int) -> tuple[float, float, float, float]:
     return BODY
 
 
-def _triangles(geometry: Any, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _triangles(geometry: Any) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of a mesh, or of a round or square shape."""
     import trimesh
 
     kind = type(geometry).__name__
     if hasattr(geometry, "num_tris") and hasattr(geometry, "tri_indices"):
-        triangles = np.array([[t[0], t[1], t[2]] for t in map(geometry.tri_indices, range(geometry.num_tris))], dtype=int)
+        triangles = np.array(
+            [[t[0], t[1], t[2]] for t in map(geometry.tri_indices, range(geometry.num_tris))], dtype=int
+        )
         return np.asarray(geometry.vertices(), dtype=float), triangles.reshape(-1, 3)
     if kind == "Box":
         made = trimesh.creation.box(2.0 * np.asarray(geometry.halfSide).ravel())
@@ -117,7 +121,9 @@ def _triangles(geometry: Any, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def _coarse(vertices: np.ndarray, triangles: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Vertices of one cell become their mean; triangles that lose a corner go."""
-    _, which, count = np.unique(np.round(vertices / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+    _, which, count = np.unique(
+        np.round(vertices / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
     which = which.ravel()
     mean = np.stack([np.bincount(which, vertices[:, k]) for k in range(3)], axis=1) / count[:, None]
     kept = which[triangles]

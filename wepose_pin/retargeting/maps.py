@@ -12,13 +12,11 @@ import numpy as np
 
 from ..assets import asset
 from ..errors import BadModel, MissingFile, one_of
-from ..readers.keys import parsed_toml
+from ..readers.keys import is_number, parsed_toml
 
 ROBOTS = ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1")
 SIDES = ("left", "right")
-AXES = {
-    f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"
-}
+AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
 _KEYS = ("format", "urdf", "srdf", "about", "up", "forward", "base", "rest", "limits", "arms")
 _ARM_KEYS = ("joints", "shoulder", "elbow", "hand", "reach")
@@ -206,7 +204,9 @@ def _arm(table: Any, where: str) -> ArmMap:
 
 def _point(value: Any, where: str) -> LinkPoint:
     if not isinstance(value, dict) or not isinstance(value.get("link"), str):
-        raise BadModel(f"{where} = {value!r}; {{ link = \"…\" }} is needed, and at = [x, y, z] in metres where it is not 0")
+        raise BadModel(
+            f'{where} = {value!r}; {{ link = "…" }} is needed, and at = [x, y, z] in metres where it is not 0'
+        )
     _known(value, ("link", "at"), where)
     at = value.get("at", [0.0, 0.0, 0.0])
     if not isinstance(at, list) or len(at) != 3 or not all(_is_number(v) for v in at):
@@ -216,7 +216,7 @@ def _point(value: Any, where: str) -> LinkPoint:
 
 def _axis(table: Mapping[str, Any], key: str, where: str) -> str:
     value = table.get(key)
-    if value not in AXES:
+    if not isinstance(value, str) or value not in AXES:
         raise BadModel(f"{where}.{key} = {value!r}; {one_of(AXES)}" if value else f"{where}: no {key}; {one_of(AXES)}")
     return str(value)
 
@@ -241,7 +241,7 @@ def _numbers(table: Mapping[str, Any], where: str) -> dict[str, float]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    return is_number(value, 1e6)
 
 
 def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline, interp1d
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..errors import BadData
+from ..errors import BadData, BadOption
 from ..pose import Pose, spread
 from .robot import Arm, Robot
 
@@ -64,14 +64,20 @@ def wish(pose: Pose, robot: Robot, *, scale: float | None = None, smoothing_hz: 
 
     Parameters
     ----------
-    scale : robot's metres for one of the person's; None: a straight arm of the person is one of the robot, `REACH_SHARE`
+    scale : robot's metres for one of the person's; None: a straight arm becomes `robot_reach`
     smoothing_hz : of the zero-phase low-pass on what was measured; 0: none
 
     Raises
     ------
     BadData
         The pose has not the arms that the robot needs, or nothing in it is known.
+    BadOption
+        A scale or smoothing that is none.
     """
+    if scale is not None and not 0.0 < scale < np.inf:
+        raise BadOption(f"--scale {scale:g}: the robot's metres for one of the person's, above 0")
+    if not 0.0 <= smoothing_hz < np.inf:
+        raise BadOption(f"--smoothing-hz {smoothing_hz:g}: from 0 on, which is none")
     time = np.asarray(pose.time, dtype=float)
     if len(time) < 10:
         raise BadData(f"{len(time)} samples in the pose; a motion has at least 10")
@@ -81,7 +87,13 @@ def wish(pose: Pose, robot: Robot, *, scale: float | None = None, smoothing_hz: 
     for arm in robot.arms:
         side = arm.side
         points = {name: pose.points[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist", "hand")}
-        parts = (points["elbow"] - points["shoulder"], points["wrist"] - points["elbow"], points["hand"] - points["wrist"])
+        parts = (
+            points["elbow"] - points["shoulder"],
+            points["wrist"] - points["elbow"],
+            points["hand"] - points["wrist"],
+        )
+        if not all(np.isfinite(part).all(axis=1).any() for part in parts):
+            raise BadData(f"the {side} arm is not known anywhere in the pose: its points are missing")
         length = sum(float(np.nanmedian(np.linalg.norm(part, axis=1))) for part in parts)
         by = scales[side] = scale or robot_reach(robot, arm) / length
         from_T = R_WT.inv()
@@ -94,7 +106,7 @@ def wish(pose: Pose, robot: Robot, *, scale: float | None = None, smoothing_hz: 
         known &= np.isfinite(rotation.as_quat()).all(axis=1) & ~_gaps(pose, side)
         known &= ~_jumps(time, reach / by)
         if known.sum() < 2:
-            raise BadData(f"the {side} arm is not known anywhere in the pose: its orientations or points are missing")
+            raise BadData(f"the {side} arm is not known anywhere in the pose: its orientations are missing, or lost")
         std = _std(pose, side, known)
         targets.append(_target(time, arm, reach, upper, rotation, known, std, smoothing_hz))
         slow = np.maximum(slow, 1.0 + (SLOWEST - 1.0) * (1.0 - targets[-1].weight))
@@ -108,7 +120,7 @@ def robot_reach(robot: Robot, arm: Arm) -> float:
 
 
 def drawn_in(offset: np.ndarray, reach: float) -> np.ndarray:
-    """Offsets (…, 3) from the shoulder inside the reach: unchanged up to a sphere, then bent into the next, smoothly."""
+    """Offsets (…, 3) from the shoulder inside the reach: unchanged in a sphere, beyond it drawn in smoothly."""
     inner, outer = CLAMP_FROM * reach, CLAMP_TO * reach
     distance = np.linalg.norm(offset, axis=-1, keepdims=True)
     beyond = np.maximum(distance - inner, 0.0)
@@ -160,7 +172,9 @@ def _needed(pose: Pose, robot: Robot) -> None:
         points = tuple(f"{arm.side}_{name}" for name in ("shoulder", "elbow", "wrist", "hand"))
         missing = [name for name in segments if name not in pose.quat_WL] + [n for n in points if n not in pose.points]
         if missing:
-            raise BadData(f"the {arm.side} arm is not in the pose: {', '.join(missing)} is missing; --arm names the other")
+            raise BadData(
+                f"the {arm.side} arm is not in the pose: {', '.join(missing)} is missing; --arm names the other"
+            )
 
 
 def _gaps(pose: Pose, side: str) -> np.ndarray:

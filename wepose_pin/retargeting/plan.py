@@ -1,7 +1,7 @@
 """From a recorded pose to a trajectory: approach, what the motion asks for, slower where the robot cannot, and the run.
 
-The motion is solved twice. The first run has wide limits on velocity and acceleration and shows which joint would have to
-be how fast where; from that follows how much longer each moment takes. The second run has the true limits, on the
+The motion is solved twice. The first run has wide limits on velocity and acceleration and shows which joint would have
+to be how fast where; from that follows how much longer each moment takes. The second run has the true limits, on the
 stretched time, and leans on the path of the first.
 """
 

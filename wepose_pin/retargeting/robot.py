@@ -107,7 +107,7 @@ def load(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
         raise BadModel(f"{robot.urdf}: Pinocchio cannot build it: {reason}") from error
     joints = [name for arm in chosen.values() for name in arm.joints]
     _check(robot, chosen, full, said)
-    followers = [name for name in full.names[1:] if said[name].mimic and said[name].mimic[0] in joints]
+    followers = [name for name in full.names[1:] if _driven(said[name], joints)]
     moving = [name for name in full.names[1:] if name in joints or name in followers]
     rest_full = _rest(robot, full, said)
     shapes_full = _shapes(robot, full)
@@ -157,23 +157,26 @@ def _check(robot: RobotMap, arms: dict[str, ArmMap], full: Any, said: dict[str, 
             if limit.kind != "continuous" and not limit.lower < limit.upper:
                 raise BadModel(
                     f"{robot.urdf}: joint '{name}' has no position limits (lower {limit.lower:g}, upper "
-                    f"{limit.upper:g}); write <limit lower=\"…\" upper=\"…\" velocity=\"…\"/>"
+                    f'{limit.upper:g}); write <limit lower="…" upper="…" velocity="…"/>'
                 )
             if not 0.0 < limit.velocity < np.inf:
                 raise BadModel(
-                    f"{robot.urdf}: joint '{name}' has no velocity limit ({limit.velocity:g}); write <limit velocity=\"…\"/>"
+                    f"{robot.urdf}: joint '{name}' has no velocity limit ({limit.velocity:g}); "
+                    'write <limit velocity="…"/>'
                 )
             if not _driven(limit, [name for arm in arms.values() for name in arm.joints]):
                 value = robot.acceleration.get(name)
                 if value is None or not value > 0.0:
                     said_value = "has none" if value is None else f"is {value:g}"
                     raise BadModel(
-                        f"{robot.where}: limits.acceleration: joint '{name}' {said_value}; no URDF holds it, a number above "
-                        "0 is needed [rad/s²]"
+                        f"{robot.where}: limits.acceleration: joint '{name}' {said_value}; no URDF holds it, "
+                        "a number above 0 is needed [rad/s²]"
                     )
     for name in robot.rest:
         if name not in said:
-            raise BadModel(f"{robot.where}: rest.{name}: no joint that moves in {robot.urdf.name}; {one_of(said, name)}")
+            raise BadModel(
+                f"{robot.where}: rest.{name}: no joint that moves in {robot.urdf.name}; {one_of(said, name)}"
+            )
     if robot.base and robot.base not in links:
         raise BadModel(f"{robot.where}: base: no link '{robot.base}' in {robot.urdf.name}; {one_of(links, robot.base)}")
 
@@ -285,6 +288,7 @@ def _reach(robot: Robot, own: np.ndarray, shoulder: np.ndarray, hand: int) -> fl
         return -far, -(p / far) @ J @ robot.coupling[:, own]
 
     starts = rng.uniform(low, high, (_REACH_STARTS, len(own)))
-    best = [minimize(distance, x, jac=True, bounds=list(zip(low, high, strict=True)), method="L-BFGS-B") for x in starts]
+    best = [
+        minimize(distance, x, jac=True, bounds=list(zip(low, high, strict=True)), method="L-BFGS-B") for x in starts
+    ]
     return -min(float(found.fun) for found in best)
-

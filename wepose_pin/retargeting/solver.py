@@ -3,8 +3,8 @@
 The tasks are those of differential inverse kinematics (hand, elbow swivel, posture, damping), written for the next
 velocity v' of all joints at once. Over a step the velocity changes evenly, so that positions, velocities and
 accelerations of the trajectory are those of one motion, and every limit on v' is a simple bound
-(`limits.velocity_bounds`). What is near in space adds a row each. Pink's tasks are the same sums; building its objects
-anew at each step costs more than the whole step here, and its limits know no braking way.
+(`limits.velocity_bounds`). What is near in space adds a row each. The sums are those of Pink (a test holds them against
+it), whose limits on acceleration and position together leave its programme without a solution sooner or later.
 """
 
 from __future__ import annotations
@@ -126,12 +126,10 @@ class Stepper:
         H[np.diag_indices(n)] += tasks.posture + tasks.still + tasks.smooth
         posture, pull = (robot.rest, 0.0) if self.lean is None else self.lean
         f += tasks.posture * (tasks.posture_gain * (posture - state.u) + pull) + tasks.smooth * smooth
-        velocity_bounds(
-            state.u, state.v, robot.lower, robot.upper, self.loose * speed * robot.v_most, self.loose * robot.a_most, dt,
-            self._low, self._high,
-        )  # fmt: skip
+        v_most, a_most = self.loose * speed * robot.v_most, self.loose * robot.a_most
+        velocity_bounds(state.u, state.v, robot.lower, robot.upper, v_most, a_most, dt, self._low, self._high)
         rows, bound = self._apart(state)
-        v = self._programme(H, f, rows, bound, state)
+        v = self._programme(H, f, rows, bound)
         v = np.clip(v, self._low, self._high)
         return State(state.u + 0.5 * dt * (state.v + v), v, (v - state.v) / dt)
 
@@ -143,13 +141,13 @@ class Stepper:
         left = near.distance - near.clearance + 0.5 * self.dt * (growth @ state.v)
         # Half of what all joints together could brake: the other half is theirs for their own limits.
         brake = 0.5 * self.loose * (np.abs(growth) @ self.robot.a_most)
-        closing = np.where(left > 0.0, -np.minimum(8.0 * left, np.sqrt(np.maximum(2.0 * brake * left, 0.0))), -4.0 * left)
+        closing = np.where(
+            left > 0.0, -np.minimum(8.0 * left, np.sqrt(np.maximum(2.0 * brake * left, 0.0))), -4.0 * left
+        )
         self.counts.near += bool((left < 0.01).any())
         return growth, closing
 
-    def _programme(
-        self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray, state: State
-    ) -> np.ndarray:
+    def _programme(self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray) -> np.ndarray:
         m = len(rows)
         upper = np.concatenate([self._high, np.full(m, 1e30)])
         lower = np.concatenate([self._low, bound])
@@ -189,7 +187,7 @@ class _Follower:
             self.elbow = self._R_E @ self._p_JE + self._p_E
 
     def add(self, H: np.ndarray, f: np.ndarray, aim: Aim, tasks: Tasks, dt: float, v: np.ndarray) -> bool:
-        """Add hand, orientation and swivel; whether the arm is straight, or else cannot move its hand in a direction."""
+        """Add hand, orientation and swivel; whether the hand cannot move in some direction."""
         J = self.data.J if self.robot.model.nv == H.shape[0] else self.data.J @ self.robot.coupling
         spin = J[3:] * self._moved
         slide = J[:3] * self._moved + _turned(spin, self.p)
@@ -243,13 +241,17 @@ class _Follower:
 
 
 def aims_at(targets: tuple[ArmTarget, ...], k: int, dt: float) -> tuple[Aim, ...]:
-    """What the hands are to do in the step from sample `k`: its velocity is met at its end, its position in its middle."""
+    """What the hands are to do in the step from sample `k`: the velocity at its end, the position in its middle."""
     n = min(k + 1, len(targets[0].weight) - 1)
     return tuple(
         Aim(
-            t.position[k] + 0.5 * dt * t.velocity[k], t.velocity[n], t.rotation[k], t.rate[n], t.bend[k],
+            t.position[k] + 0.5 * dt * t.velocity[k],
+            t.velocity[n],
+            t.rotation[k],
+            t.rate[n],
+            t.bend[k],
             float(t.weight[k]),
-        )  # fmt: skip
+        )
         for t in targets
     )
 

@@ -51,12 +51,9 @@ class TrackedPose(Pose):
                 about["gap_s"] = round(float(np.count_nonzero(lost)) / self.recording.rate_hz, 3)
             sensors[segment] = about
         missed = self._not_followed()
-        lame = [
-            f"{segment}: the model's joints are too few or end too soon for its orientation, they miss it by "
-            f"{angle:.3g} deg (rms)"
-            for segment, angle in missed.items()
-            if angle > _WORTH_A_WARNING_DEG
-        ]
+        lame = [f"{segment} {angle:.3g}" for segment, angle in missed.items() if angle > _WORTH_A_WARNING_DEG]
+        if lame:
+            lame = [f"the model's joints are too few or end too soon and miss segments by, rms [deg]: {', '.join(lame)}"]
         return {
             "recording": self.recording.name,
             "session": str(self.recording.source) if self.recording.source else None,

@@ -76,7 +76,11 @@ class LiveLog:
 
     def due(self) -> None:
         """Write what waits, if it has waited for long."""
-        if self._waiting >= FLUSH_SAMPLES or time.monotonic() - self._flushed > FLUSH_S:
+        if (
+            self._waiting >= FLUSH_SAMPLES
+            or len(self._poses) >= FLUSH_SAMPLES
+            or time.monotonic() - self._flushed > FLUSH_S
+        ):
             self.flush()
 
     def flush(self) -> None:

@@ -88,7 +88,7 @@ def _as_input(name: str, value: Any) -> Path | None:
     """The path that an option names, if it is that of something read."""
     if name in _NOT_OPTIONS or not isinstance(value, str | Path):
         return None
-    if isinstance(value, str) and not value.endswith(".toml"):  # text that may name a file, as --protocol
+    if isinstance(value, str) and not value.endswith((".toml", ".urdf")):  # text that may name a file, as --protocol
         return None
     return Path(value) if Path(value).exists() else None
 
@@ -122,7 +122,7 @@ def named_in(path: Path, truth: bool = False) -> list[str]:
         return []
     try:
         content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+    except (OSError, ValueError, RecursionError):
         return []  # whoever reads it says what is wrong with it
     data, sensors = content.get("data"), content.get("sensors")
     tables = [data, *(sensors.values() if isinstance(sensors, dict) else ())]

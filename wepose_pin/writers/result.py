@@ -59,7 +59,8 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
         It cannot be written: a full disk, say.
     """
     try:
-        table.write_parquet(path)
+        with path.open("wb") as file:  # polars takes no path that is not in UTF-8
+            table.write_parquet(file)
     except (pl.exceptions.PolarsError, OSError) as error:
         reason = str(error).splitlines()[0]
         raise ExistingOutput(f"{path.name}: cannot be written: {reason}; nothing was written") from error
@@ -95,8 +96,10 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
     summary_file = folder / "summary.json"
     try:
         summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.is_file() else {}
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BadData(f"{summary_file}: is damaged, no JSON: {error}") from error
+    if not isinstance(summary, dict):
+        raise BadData(f"{summary_file}: is damaged: {str(summary)[:40]!r} in place of an object")
     return pose, load_model(folder / "subject.urdf"), summary
 
 

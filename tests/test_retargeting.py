@@ -1,0 +1,506 @@
+"""Retargeting on an arm of our own: limits, collisions, targets out of reach, jumps, losses, other forms of robots."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from arms import HAND, JOINTS, UPPER, person, write_arm
+from scipy.spatial.transform import Rotation
+
+from wepose_pin import cli
+from wepose_pin.errors import BadData, BadModel, BadOption, MissingFile, NoSolution
+from wepose_pin.pose import Pose
+from wepose_pin.retargeting import (
+    Trajectory,
+    find_map,
+    kept,
+    load,
+    retarget,
+    summary,
+    table,
+    touching,
+    wish,
+    write_episode,
+    write_trajectory,
+)
+from wepose_pin.retargeting.collision import Shapes
+from wepose_pin.retargeting.limits import fastest, urdf_limits, velocity_bounds
+from wepose_pin.retargeting.person import CLAMP_FROM, CLAMP_TO, drawn_in
+from wepose_pin.retargeting.solver import Aim, State, Stepper, Tasks
+
+pytest.importorskip("daqp")
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory):
+    return load(find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
+
+
+@pytest.fixture(scope="module")
+def swung(arm) -> Trajectory:
+    return retarget(person(), arm)
+
+
+def is_sound(trajectory: Trajectory) -> None:
+    """Limits against the URDF and the map, and no contact; none of it by the solver's code."""
+    robot = trajectory.robot
+    found = kept(table(trajectory), robot.map.urdf, robot.map.acceleration)
+    assert found.all, found
+    assert touching(robot, trajectory.time, trajectory.u).samples == 0
+    assert np.isfinite(trajectory.u).all()
+
+
+def error(trajectory: Trajectory, side: str = "right") -> np.ndarray:
+    target = trajectory.targets[[arm.side for arm in trajectory.robot.arms].index(side)]
+    return np.linalg.norm(trajectory.hand[side] - target.position, axis=1)[trajectory.approach :]
+
+
+# Limits ------------------------------------------------------------------------------------------------------------
+
+
+def test_whoever_goes_as_fast_as_the_bounds_allow_still_keeps_every_limit() -> None:
+    rng, dt, n = np.random.default_rng(3), 0.01, 40
+    lower, upper = -rng.uniform(0.05, 2.0, n), rng.uniform(0.05, 2.0, n)  # at most 14 s from end to end
+    v_most, a_most = rng.uniform(0.3, 4.0, n), rng.uniform(0.5, 30.0, n)
+    u, v, low, high = np.zeros(n), np.zeros(n), np.empty(n), np.empty(n)
+    nearest = np.full(n, np.inf)
+    for k in range(8000):
+        velocity_bounds(u, v, lower, upper, v_most, a_most, dt, low, high)
+        assert (low <= high).all()
+        assert (high <= v + a_most * dt + 1e-12).all()
+        assert (low >= v - a_most * dt - 1e-12).all()
+        share = rng.uniform(0.0, 1.0, n) if (k // 2000) % 3 == 2 else np.full(n, float((k // 2000) % 3))
+        after = low + share * (high - low)
+        u, v = u + 0.5 * dt * (v + after), after
+        assert (np.abs(v) <= v_most + 1e-9).all()
+        assert (u >= lower - 1e-9).all()
+        assert (u <= upper + 1e-9).all()
+        nearest = np.minimum(nearest, upper - u)
+    assert (nearest < 1e-4).all()  # and the bounds do not hold it off the limit
+
+
+@pytest.mark.parametrize("room", [1e-9, 1e-6, 4e-4, 5e-4, 6e-4, 0.01, 0.3])
+def test_the_fastest_velocity_just_stops_in_its_room(room: float) -> None:
+    dt, step = 0.01, 0.05
+    v = fastest(room, step, dt)
+    way = 0.5 * dt * v
+    while v > 0.0:
+        slower = max(v - step, 0.0)
+        way += 0.5 * dt * (v + slower)
+        v = slower
+    assert way == pytest.approx(room, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        ("elbow.limit", "joint 'elbow' has no position limits"),
+        ("elbow.velocity", "joint 'elbow' has no velocity limit"),
+        ("pitch.acceleration", "limits.acceleration: joint 'pitch' has none"),
+    ],
+)
+def test_a_robot_without_limits_is_refused_with_the_joint_named(tmp_path: Path, key: str, text: str) -> None:
+    with pytest.raises(BadModel, match=text):
+        load(find_map(str(write_arm(tmp_path, without=key))))
+
+
+def test_limits_are_read_from_the_urdf_itself(tmp_path: Path) -> None:
+    said = urdf_limits(write_arm(tmp_path, continuous="roll", mimic=True))
+    assert said["flexion"] == ("revolute", -3.0, 1.5, 3.0, None)
+    assert (said["roll"].lower, said["roll"].upper) == (-np.inf, np.inf)
+    assert said["elbow_copy"].mimic == ("elbow", 1.0, 0.0)
+
+
+@pytest.mark.parametrize("spoil", ["position", "velocity", "acceleration", "even"])
+def test_the_check_sees_what_is_not_kept(swung: Trajectory, spoil: str) -> None:
+    whole, robot = table(swung), swung.robot
+    assert kept(whole, robot.map.urdf, robot.map.acceleration).all
+    k = len(whole) // 2
+    row = np.arange(len(whole)) == k
+    changed = {
+        "position": (pl.col("elbow") + pl.Series(9.0 * row)).alias("elbow"),
+        "velocity": (pl.col("pitch_velocity") + pl.Series(4.0 * row)).alias("pitch_velocity"),
+        "acceleration": (pl.col("yaw_acceleration") + pl.Series(30.0 * row)).alias("yaw_acceleration"),
+        "even": (pl.col("roll") + pl.Series(1e-3 * row)).alias("roll"),
+    }[spoil]
+    found = kept(whole.with_columns(changed), robot.map.urdf, robot.map.acceleration)
+    assert not found.all
+    if spoil != "even":
+        assert getattr(found, spoil) < 0.0
+    else:
+        assert not found.even
+
+
+# Following ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_robot_follows_hand_turn_and_elbow(swung: Trajectory) -> None:
+    is_sound(swung)
+    assert np.median(error(swung)) < 5e-3
+    assert np.quantile(error(swung), 0.95) < 0.02
+    found = summary(swung, kept(table(swung), swung.robot.map.urdf, swung.robot.map.acceleration), touching(
+        swung.robot, swung.time, swung.u))["arms"]["right"]  # fmt: skip
+    assert found["hand_error_deg"]["median"] < 3.0
+    assert found["swivel_error_deg"]["median"] < 15.0
+    assert found["inside_reach_share"] == 1.0
+
+
+def test_it_begins_at_rest_and_shows_the_recording_to_its_end(swung: Trajectory) -> None:
+    assert np.array_equal(swung.u[0], swung.robot.rest)
+    assert not swung.v[0].any()
+    assert (np.diff(swung.recorded) >= -1e-12).all()
+    assert swung.recorded[0] == swung.recorded[swung.approach - 1] == 0.0
+    assert swung.recorded[-1] == pytest.approx(7.99, abs=0.02)
+
+
+def test_a_small_person_and_a_tall_one_move_the_robot_alike(arm) -> None:
+    small, tall = (retarget(person(4.0, size=size), arm) for size in (0.8, 1.2))
+    assert small.wish.scale["right"] == pytest.approx(1.5 * tall.wish.scale["right"])
+    n = min(len(small.time), len(tall.time))
+    assert np.abs(small.u[:n] - tall.u[:n]).max() < 1e-6
+
+
+def test_turned_bases_move_alike(arm, tmp_path: Path) -> None:
+    straight = retarget(person(4.0), arm)
+    turned = load(find_map(str(write_arm(tmp_path, turned=(0.5 * np.pi, 0.2, -1.1)))))
+    found = retarget(person(4.0), turned)
+    assert np.abs(found.u - straight.u).max() < 1e-6
+    # Said of the root's axes in place of the base's: y of the root is where z of the base points to −z, z up is +y.
+    (tmp_path / "root").mkdir()
+    by_root = load(find_map(str(write_arm(tmp_path / "root", turned=(0.5 * np.pi, 0.0, 0.0), base="", up="-y"))))
+    assert np.abs(retarget(person(4.0), by_root).u - straight.u).max() < 1e-6
+
+
+def test_a_joint_without_end_and_one_that_copies_another(tmp_path: Path) -> None:
+    (tmp_path / "c").mkdir()
+    endless = load(find_map(str(write_arm(tmp_path / "c", continuous="roll"))))
+    assert endless.model.nq == endless.model.nv + 1
+    found = retarget(person(4.0), endless)
+    is_sound(found)
+    assert np.median(error(found)) < 5e-3
+    copied = load(find_map(str(write_arm(tmp_path, mimic=True))))
+    assert copied.names == JOINTS
+    assert copied.model.nv == len(JOINTS) + 1
+    found = retarget(person(4.0), copied)
+    is_sound(found)
+    assert np.median(error(found)) < 5e-3
+    q = copied.q(found.u[-1])
+    joint = copied.model.names.tolist().index("elbow") - 1
+    assert q[joint] == q[joint + 1] == found.u[-1][JOINTS.index("elbow")]
+
+
+@pytest.mark.parametrize("only", ["position", "orientation"])
+def test_a_task_can_be_left_out(arm, only: str) -> None:
+    other = {"position": "orientation", "orientation": "position"}[only]
+    found = retarget(person(4.0), arm, tasks=replace(Tasks(), **{other: 0.0}))
+    is_sound(found)
+    target, begin = found.targets[0], found.approach
+    asked = Rotation.from_matrix(target.rotation[begin:])
+    turn = (Rotation.from_matrix(found.turn["right"][begin:]).inv() * asked).magnitude()
+    if only == "position":
+        assert np.median(error(found)) < 3e-3
+    else:
+        assert np.median(turn) < np.radians(2.0)
+        assert np.median(error(found)) > 0.02
+
+
+def test_the_programme_is_that_of_pink(arm) -> None:
+    pink = pytest.importorskip("pink")
+    import pinocchio as pin
+
+    free = replace(arm, shapes=pin.GeometryModel(), arms=(replace(arm.arms[0], elbow=-1),))
+    tasks = Tasks(smooth=0.0, straight=0.0, still=0.0, posture=1e-3, gain=10.0, posture_gain=10.0, brake=1e9)
+    stepper = Stepper(free, Shapes(free), 0.01, tasks, loose=1e6)
+    state = State(arm.rest + 0.1, np.zeros(7), np.zeros(7))
+    stepper.look(state.u)
+    hand, turn, _ = stepper.place(0)
+    goal = pin.SE3(turn @ pin.exp3(np.array([0.02, -0.01, 0.03])), hand + [0.01, -0.02, 0.015])
+    aim = Aim(goal.translation, np.zeros(3), goal.rotation, np.zeros(3), np.zeros(3), 1.0)
+    ours = stepper.step(state, (aim,)).v
+    configuration = pink.Configuration(arm.model, arm.model.createData(), arm.q(state.u))
+    task = pink.tasks.FrameTask(arm.model.frames[arm.arms[0].hand].name, 1.0, float(np.sqrt(tasks.orientation)))
+    task.set_target(goal)
+    posture = pink.tasks.PostureTask(cost=float(np.sqrt(tasks.posture)))
+    posture.set_target(arm.q(arm.rest))
+    task.gain = posture.gain = tasks.gain * 0.01
+    theirs = pink.solve_ik(configuration, [task, posture], 0.01, solver="daqp", limits=[], damping=0.0)
+    # Pink's error is the logarithm in SE(3), ours that of place and turn apart: alike to the product of both.
+    assert np.abs(ours).max() > 0.1
+    assert np.abs(ours - theirs).max() < 0.03 * np.abs(ours).max()
+
+
+# What goes wrong ---------------------------------------------------------------------------------------------------
+
+
+def test_the_reach_is_left_smoothly() -> None:
+    reach, far = 0.7, np.linspace(0.3, 3.0, 2000)
+    kept_to = np.linalg.norm(drawn_in(far[:, None] * np.array([0.6, 0.0, -0.8]), reach), axis=1)
+    inner = far < CLAMP_FROM * reach
+    assert np.allclose(kept_to[inner], far[inner])
+    assert kept_to.max() <= CLAMP_TO * reach + 1e-12
+    slope = np.gradient(kept_to, far)
+    assert (slope > -1e-9).all()
+    assert np.abs(np.diff(slope)).max() < 0.06  # no corner
+
+
+def far_away(pose: Pose, span: tuple[float, float], by: float) -> Pose:
+    """The arm stretched out `by` times its length, forward and up, over a span."""
+    inside = (pose.time >= span[0]) & (pose.time < span[1])
+    points = dict(pose.points)
+    hand = points["right_hand"].copy()
+    hand[inside] = points["right_shoulder"][inside] + by * (UPPER + 0.27 + HAND) * np.array([0.8, -0.3, 0.2])
+    return replace(pose, points=points | {"right_hand": hand})
+
+
+def test_five_seconds_out_of_reach(arm, swung: Trajectory) -> None:
+    pose = far_away(person(11.0, swing=0.0), (3.0, 8.0), 1.6)
+    found = retarget(pose, arm, scale=swung.wish.scale["right"])
+    is_sound(found)
+    target = found.targets[0]
+    outside = np.linalg.norm(target.position - target.wish, axis=1) > 1e-3
+    assert outside[found.approach :].mean() > 0.3
+    settled = (found.recorded > 5.5) & (found.recorded < 7.5)
+    assert np.abs(found.v[settled]).max() < 0.02  # still at the reach: it does not shake
+    assert np.abs(np.diff(found.a[settled], axis=0)).max() < 0.05 * 12.0
+    back = found.recorded > 9.5
+    assert np.linalg.norm(found.hand["right"] - target.position, axis=1)[back].max() < 0.02
+
+
+def test_no_jerk_where_a_moving_target_passes_the_reach(arm, swung: Trajectory) -> None:
+    inside = retarget(person(6.0, flexion=20.0, swing=15.0), arm, scale=0.9 * swung.wish.scale["right"])
+    across = retarget(person(6.0, flexion=20.0, swing=15.0), arm, scale=1.12 * swung.wish.scale["right"])
+    drawn = np.linalg.norm(across.targets[0].position - across.targets[0].wish, axis=1) > 1e-3
+    assert drawn[across.approach :].mean() > 0.1
+    is_sound(across)
+    jerk = [np.abs(np.diff(found.a[found.approach :], axis=0)).max() * 100.0 for found in (inside, across)]
+    assert jerk[1] < 3.0 * max(jerk[0], 100.0)
+
+
+def test_a_jump_of_a_metre_is_no_jump_of_the_robot(arm) -> None:
+    pose = person(8.0)
+    points = dict(pose.points)
+    for name in ("right_elbow", "right_wrist", "right_hand"):
+        moved = points[name].copy()
+        moved[400:] += [0.0, 0.0, 1.0]
+        points[name] = moved
+    found = retarget(replace(pose, points=points), arm)
+    is_sound(found)
+    at = np.searchsorted(found.recorded, 4.0)
+    speed = np.linalg.norm(np.diff(found.hand["right"], axis=0), axis=1) * 100.0
+    assert speed[at - 100 : at + 100].max() < 3.0
+    assert found.targets[0].lost[found.approach :].any()
+
+
+def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
+    pose = person(8.0)
+    points = {name: p.copy() for name, p in pose.points.items()}
+    for name in ("right_elbow", "right_wrist", "right_hand"):
+        points[name][300:420] = np.nan
+    nan = retarget(replace(pose, points=points), arm)
+    lost = np.zeros(len(pose.time), dtype=bool)
+    lost[300:420] = True
+    gone = retarget(replace(pose, gap={"right_forearm": lost}), arm)
+    for found in (nan, gone):
+        is_sound(found)
+        during = ((found.recorded > 3.1) & (found.recorded < 4.1)).sum()
+        usual = ((swung.recorded > 3.1) & (swung.recorded < 4.1)).sum()
+        assert during > 2 * usual
+        assert np.quantile(error(found), 0.95) < 0.03
+    assert summary(gone, kept(table(gone), arm.map.urdf, arm.map.acceleration), touching(arm, gone.time, gone.u))[
+        "arms"]["right"]["lost_share"] > 0.1  # fmt: skip
+
+
+def test_uncertain_hands_weigh_less_and_slow_the_robot(arm) -> None:
+    pose = person(4.0)
+    std = np.where((pose.time > 1.5) & (pose.time < 2.5), 0.2, 0.02)
+    unsure = replace(pose, point_cov={"right_hand": std[:, None, None] ** 2 * np.eye(3)})
+    asked = wish(unsure, arm)
+    assert asked.arms[0].weight[200] < 0.2
+    assert asked.arms[0].weight[20] > 0.95
+    assert len(retarget(unsure, arm).time) > 1.2 * len(retarget(pose, arm).time)
+
+
+def test_an_arm_that_is_never_known_is_refused(arm) -> None:
+    pose = person(2.0)
+    nowhere = {name: np.full_like(p, np.nan) for name, p in pose.points.items()}
+    with pytest.raises(BadData, match="right arm is not known anywhere"):
+        retarget(replace(pose, points=nowhere), arm)
+    with pytest.raises(BadData, match=r"right arm is not in the pose: right_upper_arm.*--arm"):
+        retarget(person(2.0, side="left"), arm)
+
+
+def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
+    pose = person(6.0, flexion=80.0, swing=10.0)
+    points = dict(pose.points)
+    hand = points["right_hand"].copy()
+    inside = np.array([0.0, 0.0, 0.20])
+    blend = np.clip((pose.time - 2.0) / 1.5, 0.0, 1.0)[:, None]
+    points["right_hand"] = hand + blend * (inside - hand)
+    found = retarget(replace(pose, points=points), arm)
+    is_sound(found)
+    assert error(found)[-1] > 0.05  # it could not get there
+    assert found.counts.near > 0
+
+
+def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
+    slow = load(find_map(str(write_arm(tmp_path, acceleration=2.0))))
+    pose = person(4.0, swing=45.0)
+    found = retarget(pose, slow)
+    is_sound(found)
+    assert found.time[-1] - found.time[found.approach] > 1.3 * 4.0
+    assert found.slowest is not None
+    assert found.slowest.joint in JOINTS
+    with pytest.raises(NoSolution, match=r"too fast at \d.*s of the recording: \w+ would need"):
+        retarget(pose, slow, strict=True)
+
+
+# Maps --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("format = 1", "format = 2", "format = 2; this version reads format = 1"),
+        ('up = "+z"', 'up = "z"', r"arm.toml.up = 'z'; there is: \+x, -x"),
+        ('up = "+z"', 'up = "+x"', r"up, forward: \+x and \+x lie on one line"),
+        (
+            'link = "forearm"',
+            'link = "foream"',
+            "arms.right.elbow: no link 'foream' in arm.urdf; did you mean 'forearm'",
+        ),
+        ('"yaw"]', '"jaw"]', "arms.right.joints: no joint 'jaw' that moves in arm.urdf; did you mean 'yaw'"),
+        ("[arms.right]", "[arms.middle]", "arms.middle is no side"),
+        ("shoulder =", "schoulder =", "'schoulder' is not a key; did you mean 'shoulder'"),
+        ("elbow = -1.2", "elbow = 1.2", "rest.elbow = 1.2 is outside its limits, -2.6 to -0.02"),
+        ("elbow = -1.2", "elbo = -1.2", "rest.elbo: no joint that moves in arm.urdf; did you mean 'elbow'"),
+        ("at = [0.0, 0.0, -0.1]", "at = [0.0, 0.0]", r"hand.at = \[0.0, 0.0\]; three numbers in metres"),
+        ("yaw = 12.0", "yaw = -1.0", "limits.acceleration: joint 'yaw' is -1; no URDF holds it"),
+        ("[rest]", "[rest", "not valid TOML"),
+    ],
+)
+def test_a_map_that_is_wrong_says_where(tmp_path: Path, old: str, new: str, text: str) -> None:
+    urdf = write_arm(tmp_path)
+    said = urdf.with_suffix(".toml").read_text()
+    assert old in said
+    urdf.with_suffix(".toml").write_text(said.replace(old, new, 1))
+    with pytest.raises(BadModel, match=text):
+        load(find_map(str(urdf)))
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    with pytest.raises(BadModel, match="--robot pandas: not known; did you mean 'panda'"):
+        find_map("pandas")
+    with pytest.raises(BadOption, match=r"--arm left: arm has no left arm; there is: right"):
+        load(find_map(str(urdf)), ("left",))
+    urdf.with_suffix(".toml").unlink()
+    with pytest.raises(MissingFile, match=r"no arm.toml beside it; a map says which links"):
+        find_map(str(urdf))
+
+
+# Files and the command ---------------------------------------------------------------------------------------------
+
+
+def test_the_files_say_the_same(swung: Trajectory, tmp_path: Path) -> None:
+    write_trajectory(tmp_path, swung)
+    whole = pl.read_parquet(tmp_path / "trajectory.parquet")
+    assert whole.columns[:5] == ["time", "recorded_time", "flexion", "flexion_velocity", "flexion_acceleration"]
+    text = pl.read_csv(tmp_path / "trajectory.csv")
+    assert text.columns == whole.columns
+    assert np.abs(text.to_numpy() - whole.to_numpy()).max() < 1e-8
+    message = json.loads((tmp_path / "joint_trajectory.json").read_text())
+    assert (tmp_path / "joint_trajectory.yaml").read_text() == (tmp_path / "joint_trajectory.json").read_text()
+    assert message["joint_names"] == list(JOINTS)
+    times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
+    assert np.allclose(times, swung.time)
+    assert np.allclose([p["positions"] for p in message["points"]], swung.u, atol=1e-8)
+    write_episode(tmp_path / "episode", swung, "swing")
+    data = pl.read_parquet(tmp_path / "episode" / "data" / "chunk-000" / "episode_000000.parquet")
+    state, action = (np.array(data[name].to_list()) for name in ("observation.state", "action"))
+    assert np.array_equal(action[:-1], state[1:])
+    info = json.loads((tmp_path / "episode" / "meta" / "info.json").read_text())
+    assert info["total_frames"] == len(data) == len(swung.time)
+    assert info["fps"] == 100
+
+
+def test_the_same_motion_at_another_rate(arm) -> None:
+    found = retarget(person(), arm, rate_hz=250.0)
+    is_sound(found)
+    assert found.time[1] == pytest.approx(0.004)
+    assert np.median(error(found)) < 5e-3
+    with pytest.raises(BadOption, match="--rate-hz 5: from 10 to 2000"):
+        retarget(person(), arm, rate_hz=5.0)
+
+
+def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(list(argv))
+    text = capsys.readouterr()
+    return int(stop.value.code or 0), text.out + text.err
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from wepose_pin.simulation import simulate, simulated_person
+    from wepose_pin.tracking import track
+    from wepose_pin.writers import write_result
+
+    folder = tmp_path_factory.mktemp("result")
+    made = simulate(simulated_person(2).lengths, seed=2)
+    pose = track(made.recording("made"))
+    keep = slice(0, 600)
+    short = replace(
+        pose,
+        time=pose.time[keep],
+        quat_WL={name: quat[keep] for name, quat in pose.quat_WL.items()},
+        points={name: p[keep] for name, p in pose.points.items()},
+        segment_cov={name: cov[keep] for name, cov in pose.segment_cov.items()},
+        point_cov={name: cov[keep] for name, cov in pose.point_cov.items()},
+    )
+    write_result(folder, short)
+    return folder
+
+
+def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    urdf = write_arm(tmp_path)
+    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"), "--episode")
+    assert code == 0, text
+    made = {path.name for path in (tmp_path / "out").iterdir()}
+    assert made == {"trajectory.parquet", "trajectory.csv", "joint_trajectory.json", "joint_trajectory.yaml",
+                    "summary.json", "view.html", "episode"}  # fmt: skip
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert found["limits_kept"] is True
+    assert found["self_collision"]["samples_touching"] == 0
+    assert "Limits kept" in text
+    page = (tmp_path / "out" / "view.html").read_text()
+    assert '"robot 0"' in page
+    assert '"right_robot_hand"' in page
+    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
+    assert (code, "--force replaces" in text) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("robot", "more", "text"),
+    [
+        ("nobody", (), "--robot nobody: not known"),
+        ("missing.urdf", (), "missing.urdf: no such file"),
+        ("arm.urdf", ("--arm", "both"), "--arm left: arm has no left arm"),
+        ("arm.urdf", ("--scale", "-1"), "--scale -1"),
+        ("arm.urdf", ("--smoothing-hz", "-1"), "--smoothing-hz -1"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_writes_nothing(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], robot: str, more: tuple[str, ...], text: str
+) -> None:
+    write_arm(tmp_path)
+    where = str(tmp_path / robot) if "." in robot else robot
+    code, said = run(capsys, "retarget", str(result), "--robot", where, "-o", str(tmp_path / "out"), *more)
+    assert code == 2
+    assert text in said
+    assert len(said.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()

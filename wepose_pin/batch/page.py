@@ -1,0 +1,222 @@
+"""``report.html`` over a study: what failed and why, how figures are distributed, which items stand apart."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+import polars as pl
+from matplotlib import rc_context
+
+from ..page import ACCENT, STYLE, Banner, Block, Facts, Heading, Picture, Table, as_html, new_figure, png_of
+from .plan import Plan
+
+APART = 5.0  # robust deviations: of 10 000 normal figures not one is so far off
+FEWEST = 8  # figures, of which one can stand apart
+MOST_ROWS = 2000  # of a table in the page; results.parquet has all
+MOST_PICTURES = 12
+# What says most, first; others follow in the order in which steps give them.
+_TELLING = ("gap_mm", "right_hand_arm_error_mm", "left_hand_arm_error_mm", "right_hand_error_mm", "left_hand_error_mm")
+_TOLD = ("item", "session", "subject", "status", "error", "message", "page", "grade")
+_UNITS = {"mm": "mm", "deg": "deg", "hz": "Hz", "s": "s"}
+_WORDS = {
+    "seconds": "time it took [s]",
+    "gap_mm": "palm-to-palm gap [mm]",
+    "independent": "independent looks of the calibration",
+    "static_share": "share of time at rest",
+}
+
+
+class Apart(NamedTuple):
+    """A figure far off the others'."""
+
+    item: str
+    column: str
+    value: float
+    median: float
+    deviations: float  # robust standard deviations off the median
+
+
+def study_page(plan: Plan, table: pl.DataFrame) -> str:
+    """The page of a study; `table` as in ``results.parquet``, items' folders in ``items/`` beside it."""
+    failed, done = table.filter(pl.col("status") == "failed"), table.filter(pl.col("status") == "done")
+    columns = _figures(done)
+    return as_html(
+        [
+            Heading(f"Study {plan.name}", 1),
+            _verdict(done.height, failed.height),
+            Facts(_facts(plan, table, done)),
+            *_failures(failed),
+            *_distributions(done, columns),
+            *_outliers(done, columns),
+            *_all(table, columns),
+        ],
+        f"{plan.name}: {table.height} items",
+    )
+
+
+def apart(done: pl.DataFrame, columns: Sequence[str]) -> list[Apart]:
+    """Figures that lie more than `APART` robust deviations (1.4826 times the median one) off, farthest first."""
+    found = []
+    for column in columns:
+        some = done.select("item", column).drop_nulls().filter(pl.col(column).is_finite())
+        values = some[column].to_numpy()
+        if len(values) < FEWEST:
+            continue
+        median = float(np.median(values))
+        spread = 1.4826 * float(np.median(np.abs(values - median)))
+        if spread <= 1e-9 * max(1.0, abs(median)):
+            continue
+        off = (values - median) / spread
+        found += [
+            Apart(some["item"][k], column, float(values[k]), median, float(off[k]))
+            for k in map(int, np.flatnonzero(np.abs(off) > APART))
+        ]
+    return sorted(found, key=lambda each: -abs(each.deviations))
+
+
+def _figures(done: pl.DataFrame) -> list[str]:
+    known = [
+        name
+        for name in done.columns
+        if name not in _TOLD and done[name].dtype.is_numeric() and done[name].drop_nulls().len()
+    ]
+    first = [name for name in _TELLING if name in known]
+    timed = [name for name in known if name == "seconds" or (name.endswith("_s") and name != "duration_s")]
+    return [*first, *(name for name in known if name not in (*first, *timed)), *timed]
+
+
+def _verdict(done: int, failed: int) -> Banner:
+    if failed == 0:
+        return Banner("pass", f"All {done} items are done.", [])
+    kind = "poor" if done else "fail"
+    return Banner(kind, f"{done} of {done + failed} items are done; {failed} failed, see below.", [])
+
+
+def _facts(plan: Plan, table: pl.DataFrame, done: pl.DataFrame) -> list[tuple[str, str]]:
+    steps = dict.fromkeys(step for item in (*plan.first, *plan.items) for step in item.steps)
+    subjects = table["subject"].drop_nulls().n_unique()
+    facts = [("steps", ", ".join(steps)), ("sessions", str(len(plan.items)))]
+    if subjects:
+        facts.append(("subjects", str(subjects)))
+    if "grade" in done.columns:
+        counts = dict(done["grade"].drop_nulls().value_counts().iter_rows())
+        told = ", ".join(f"{counts[grade]} {grade}" for grade in ("pass", "poor", "fail") if grade in counts)
+        facts.append(("calibrations", told or "none"))
+    if "duration_s" in done.columns:
+        facts.append(("recorded", f"{float(done['duration_s'].sum()) / 3600.0:.2f} h"))
+    facts.append(("worked", f"{float(done['seconds'].sum()) / 60.0:.1f} min of one processor"))
+    return facts
+
+
+def _failures(failed: pl.DataFrame) -> list[Block]:
+    if failed.is_empty():
+        return []
+    causes = failed.group_by("error", maintain_order=True).agg(pl.len(), pl.col("message").first())
+    causes = causes.sort("len", descending=True, maintain_order=True)
+    listed = failed.head(MOST_ROWS).select("item", "error", "message").iter_rows()
+    return [
+        Heading("Failures by cause"),
+        Table(["cause", "items", "the first of them"], [[c, str(n), _cut(text)] for c, n, text in causes.iter_rows()]),
+        Table(["item", "cause", "what was wrong"], [[item, cause, _cut(text)] for item, cause, text in listed]),
+        *_more(failed.height),
+    ]
+
+
+def _distributions(done: pl.DataFrame, columns: Sequence[str]) -> list[Block]:
+    if done.height < 2 or not columns:
+        return []
+    rows = []
+    for column in columns:
+        values = _values(done, column)
+        told = [f"{value:.4g}" for value in np.quantile(values, (0.5, 0.05, 0.95, 0.0, 1.0))] if len(values) else []
+        rows.append([_in_words(column), str(len(values)), *(told or [""] * 5)])
+    header = ["figure", "items", "median", "5 %", "95 %", "least", "greatest"]
+    pictured = [column for column in columns if len(_values(done, column)) > 1][:MOST_PICTURES]
+    return [Heading("Distributions"), _histograms(done, pictured), Table(header, rows)]
+
+
+def _histograms(done: pl.DataFrame, columns: Sequence[str]) -> Picture:
+    lines = -(-len(columns) // 3)
+    with rc_context(STYLE):
+        figure = new_figure(0.4 + 1.7 * lines)
+        for k, column in enumerate(columns):
+            axes = figure.add_subplot(lines, 3, k + 1)
+            values = _values(done, column)
+            axes.hist(values, bins=min(40, max(5, round(2 * len(values) ** 0.5))), color=ACCENT)
+            axes.axvline(float(np.median(values)), color="#d9772b", linewidth=1.2)
+            axes.set_title(_in_words(column), loc="left")
+            axes.locator_params(nbins=5)
+        return Picture("distributions", "Items by figure; the line is the median.", png_of(figure))
+
+
+def _outliers(done: pl.DataFrame, columns: Sequence[str]) -> list[Block]:
+    found = apart(done, columns)
+    if not found:
+        return []
+    rows = [
+        [
+            _link(done, each.item),
+            _in_words(each.column),
+            f"{each.value:.4g}",
+            f"{each.median:.4g}",
+            f"{each.deviations:+.1f}",
+        ]
+        for each in found[:MOST_ROWS]
+    ]
+    return [
+        Heading("Outliers"),
+        f"Figures more than {APART:g} robust standard deviations off the median.",
+        Table(["item", "figure", "value", "median", "deviations off"], rows),
+        *_more(len(found)),
+    ]
+
+
+def _all(table: pl.DataFrame, columns: Sequence[str]) -> list[Block]:
+    shown = [*(name for name in ("grade",) if name in table.columns), *columns[:6]]
+    shown += ["seconds"] if "seconds" not in shown else []
+    header = ["item", *(["subject"] if table["subject"].drop_nulls().len() else []), "status"]
+    rows = []
+    for row in table.head(MOST_ROWS).iter_rows(named=True):
+        cells = [
+            _link(table, row["item"], row),
+            *([row["subject"] or ""] if "subject" in header else []),
+            row["status"],
+        ]
+        rows.append([*cells, *(_cell(row[name]) for name in shown)])
+    return [Heading("All items"), Table([*header, *map(_in_words, shown)], rows), *_more(table.height)]
+
+
+def _more(count: int) -> list[Block]:
+    return [f"The first {MOST_ROWS} of {count}; `results.parquet` has all."] if count > MOST_ROWS else []
+
+
+def _link(table: pl.DataFrame, item: str, row: dict[str, object] | None = None) -> str:
+    """An item's name, which leads to its own page where it has one."""
+    row = row or table.row(by_predicate=pl.col("item") == item, named=True)
+    page = row.get("page")
+    return f"[{item}](items/{quote(item)}/{page})" if page else item
+
+
+def _values(done: pl.DataFrame, column: str) -> np.ndarray:
+    values = done[column].drop_nulls().to_numpy()
+    return values[np.isfinite(values)]
+
+
+def _cell(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value or "")
+
+
+def _cut(text: str | None) -> str:
+    return re.sub(r"[`*\[\]]", "", text or "")[:400]
+
+
+def _in_words(column: str) -> str:
+    """A column's name as a reader wants it: ``left_forearm_std_mm`` → "left forearm std [mm]"."""
+    if column in _WORDS:
+        return _WORDS[column]
+    name, _, unit = column.rpartition("_")
+    return f"{name.replace('_', ' ')} [{_UNITS[unit]}]" if name and unit in _UNITS else column.replace("_", " ")
