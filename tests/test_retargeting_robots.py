@@ -35,7 +35,7 @@ def touches(trajectory: Trajectory) -> list[int]:
         a, b = (shapes.geometryObjects[i].parentJoint for i in (pair.first, pair.second))
         neighbours = robot.model.parents[a] == b or robot.model.parents[b] == a
         if neighbours or geometry.collisionResults[k].isCollision():
-            shapes.removeCollisionPair(pin.CollisionPair(pair))
+            shapes.removeCollisionPair(pin.CollisionPair(pair.first, pair.second))
     geometry = shapes.createData()
     boxes = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(robot.model, shapes, geometry)
     return [

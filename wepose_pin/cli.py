@@ -956,7 +956,8 @@ def batch(
         sys.exit(130)
     failed = study.table.filter(study.table["status"] == "failed")
     if failed.height:
-        causes = [(cause, str(count)) for cause, count in failed["error"].value_counts(sort=True).iter_rows()]
+        counts = failed["error"].value_counts(sort=True).iter_rows()
+        causes: list[tuple[str, ...]] = [(cause, str(count)) for cause, count in counts]
         _print_table("Failed", ("cause", "items"), causes)
         for item, message in failed.select("item", "message").head(3).iter_rows():
             _say(f"  {item}: {message}")
@@ -1016,6 +1017,8 @@ def main(argv: list[str] | None = None) -> None:
     """Entry point of ``wepose``; ends by `SystemExit`: 0, or 2 after one line on what was wrong."""
     if argv is None:
         argv = sys.argv[1:]
+        # The last bits of BLAS depend on its number of threads, and `wepose rerun` looks at them. Before numpy loads.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         signal.signal(signal.SIGINT, _stop)
         signal.signal(signal.SIGTERM, _stop)
     if argv in (["--version"], ["-V"]):

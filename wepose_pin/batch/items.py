@@ -37,7 +37,10 @@ def make_items(items: Sequence[Item], place: str, force: bool = False, same_code
     os.environ.setdefault("WEPOSE_THREADS", "1")
     mine = code()["code"]
     if same_code not in (None, mine):
-        raise BadData(f"this worker has another wepose-pin ({code()['version']}, code {mine[:12] if mine else ''})")
+        raise BadData(
+            f"a worker has another wepose-pin than this ({code()['version']}, commit {code()['commit'] or 'not known'}): "
+            f"install the same one on both"
+        )
     return [_row(item, place, force) for item in items]
 
 
@@ -108,10 +111,8 @@ def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
             begun = time.perf_counter()
             row |= work.run(step, options)
             took[f"{step}_s"] = time.perf_counter() - begun
-    pages = [
-        f"{step}/{name}" for step in reversed(list(item.steps)) for name in PAGES if (folder / step / name).is_file()
-    ]
-    return row | {"page": next(iter(pages), None)} | took, block
+    pages = [f"{step}/{page}" for step in reversed(list(item.steps)) for page in PAGES]
+    return row | {"page": next((page for page in pages if (folder / page).is_file()), None)} | took, block
 
 
 def key_of(item: Item) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import BadPlan, BadSession, one_of
 from ..filters import BEST, METHODS
-from ..readers.keys import Keys, read_toml
+from ..readers.keys import Keys, is_number, read_toml
 from ..readers.tables import read_table
 from ..subject import LENGTHS
 from .storage import find, is_remote
@@ -163,7 +163,7 @@ def _option(keys: Keys, name: str, default: Any, folder: Path) -> Any:
                 raise BadPlan(f"{keys.at(name)}: '{each}' is no format; {one_of(FORMATS, str(each))}")
         return tuple(dict.fromkeys(value))
     if name == "interval":
-        if not isinstance(value, list) or len(value) != 2 or not value[0] < value[1]:
+        if not isinstance(value, list) or len(value) != 2 or not all(map(is_number, value)) or value[0] >= value[1]:
             raise BadPlan(f"{keys.at(name)} = {value!r} is not two times in seconds, such as [10.0, 70.0]")
         return (float(value[0]), float(value[1]))
     if name == "method":

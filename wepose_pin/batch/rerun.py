@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import BadData, MissingFile
-from ..writers.provenance import code, file_hash, read_made_by
+from ..writers.provenance import code, file_hash, machine, read_made_by
+from ..writers.result import versions
 from .compare import differences
 from .items import COMMAND, item_of, make_into
 from .storage import DONE, fetch
@@ -120,4 +121,10 @@ def _notes(block: Mapping[str, Any]) -> list[str]:
     if block.get("code") != now["code"]:
         was = f"{block.get('version')} ({block.get('commit') or 'commit not known'})"
         notes.append(f"made by wepose-pin {was}; this is {now['version']} ({now['commit'] or 'commit not known'})")
+    if block.get("machine") not in (None, machine()):
+        notes.append(f"made on {block['machine']}; this is {machine()}, which may round the last bits otherwise")
+    packages = block.get("packages")
+    changed = {name: of for name, of in versions().items() if isinstance(packages, dict) and packages.get(name) != of}
+    if changed:
+        notes.append(f"other versions now: {', '.join(f'{name} {of}' for name, of in changed.items())}")
     return notes

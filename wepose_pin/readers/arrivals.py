@@ -20,7 +20,7 @@ HOLE = 1.5
 BRIDGE_S = 0.05  # [s] up to which what was lost is bridged, as `clocks.LONGEST_GAP_S`
 REORDER_S = 0.02  # [s] for how long a sample may come after one that is later, while its tick waits
 WAIT_S = 0.1  # [s] for how long a tick waits for a sensor; then the sensor is lost until it comes again
-JUMP_S = 5.0  # [s] a time further ahead of all others is an error, unless the sensor goes on from there
+JUMP_S = 1.0  # [s] a time further ahead of all others is an error, unless the sensor goes on from there
 # What no body sensor measures was not measured (filters.base has the same limits).
 HIGHEST_RATE, HIGHEST_ACCEL = 1e3, 1e4  # [rad/s], [m/s²]
 
@@ -93,7 +93,8 @@ class Aligner:
         k = len(self.sensors)
         self.counts = np.zeros((k, len(COUNTS)), dtype=np.int64)
         self.lost = np.zeros(k, dtype=np.bool_)
-        room = 64 + int(8.0 * rate_hz * max(wait_s, REORDER_S, BRIDGE_S))
+        # A sensor may be much faster than the ticks.
+        room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, BRIDGE_S))
         self._kept, self._held = np.zeros((k, room, _WIDTH)), np.zeros(k, dtype=np.int64)
         self._jump = np.zeros((k, 2))  # samples in a row that were too far ahead, and the last of their times
         self._scalars = np.array([0.0, -np.inf])

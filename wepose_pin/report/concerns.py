@@ -48,8 +48,8 @@ ADVICE = (
     (r"^no sensor on", "Strap a sensor on, or do without those points."),
     (
         r"joints are too few or end too soon",
-        "Use a body model with as many joints there (`--model`), let its limits go (`--no-limits`), or do without those "
-        "segments.",
+        "Use a body model with as many joints there (`--model`), let its limits go (`--no-limits`), or do without "
+        "those segments.",
     ),
 )
 HARMLESS = r"short gaps|^resampled|several intervals|the scale is taken from it|^no sensor on"

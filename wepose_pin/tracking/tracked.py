@@ -53,7 +53,9 @@ class TrackedPose(Pose):
         missed = self._not_followed()
         lame = [f"{segment} {angle:.3g}" for segment, angle in missed.items() if angle > _WORTH_A_WARNING_DEG]
         if lame:
-            lame = [f"the model's joints are too few or end too soon and miss segments by, rms [deg]: {', '.join(lame)}"]
+            lame = [
+                f"the model's joints are too few or end too soon and miss segments by, rms [deg]: {', '.join(lame)}"
+            ]
         return {
             "recording": self.recording.name,
             "session": str(self.recording.source) if self.recording.source else None,

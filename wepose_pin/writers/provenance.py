@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+import platform
 import subprocess
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -34,6 +36,16 @@ def code() -> dict[str, str | None]:
         for file in sorted(file for file in files if file.parts[0] != "_assets"):  # a wheel has the data in the package
             digest.update(file.as_posix().encode() + b"\0" + (folder / file).read_bytes() + b"\0")
     return {"version": __version__, "commit": _commit(), "code": digest.hexdigest()}
+
+
+@lru_cache(maxsize=1)
+def machine() -> str:
+    """System and processor: another kind of processor may round the last bits otherwise."""
+    name = platform.processor()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    return f"{platform.system()} {platform.machine()}" + (f", {name}" if name else "")
 
 
 def _commit() -> str | None:
@@ -81,6 +93,7 @@ def made_by(
             for name, path in {**named, **(inputs or {})}.items()
         },
         "packages": versions(),
+        "machine": machine(),
     }
 
 

@@ -1,0 +1,421 @@
+"""`wepose batch`: each item by itself, whole or not at all, once; on workers that die, and on S3."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+
+from wepose_pin.batch import Item, items, read_plan, run_study
+from wepose_pin.batch.cluster import connected, made
+from wepose_pin.batch.items import make_items
+from wepose_pin.batch.page import apart, study_page
+from wepose_pin.batch.plan import STEPS
+from wepose_pin.batch.storage import DONE, new_folder
+from wepose_pin.batch.study import table_of
+from wepose_pin.errors import BadData, BadOption, ExistingOutput
+from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.writers import write_session
+
+QUICK = {"track": {**STEPS["track"], "view": False, "report": False}, "evaluate": {"interval": None}}
+PLAN = """
+[sessions]
+files = ["data/*/session.toml"]
+[steps.track]
+view = false
+report = false
+[steps.evaluate]
+"""
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three short sessions, one/ to three/."""
+    folder = tmp_path_factory.mktemp("recorded")
+    for seed, name in enumerate(("one", "two", "three"), 1):
+        made_up = simulate(simulated_person(seed).lengths, seed=seed, clasp_s=8.0, circles=0)
+        (folder / name).mkdir()
+        write_session(folder / name, made_up.recording(name), made_up.truth())
+    return folder
+
+
+@pytest.fixture
+def study(recorded: Path, tmp_path: Path) -> Path:
+    shutil.copytree(recorded, tmp_path / "data")
+    (tmp_path / "plan.toml").write_text(PLAN)
+    return tmp_path
+
+
+def item(study: Path, name: str = "one", **changes: Any) -> Item:
+    return Item(**{"name": name, "session": str(study / "data" / name), "steps": QUICK} | changes)
+
+
+def files(folder: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+# One item ------------------------------------------------------------------------------------------------------------
+
+
+def test_an_item_is_made_once_and_kept(study: Path) -> None:
+    (row,) = make_items([item(study)], str(study / "items"))
+    assert (row["status"], row["kept"]) == ("done", False)
+    assert row["right_hand_error_mm"] < 100.0
+    before = files(study / "items")
+    (again,) = make_items([item(study)], str(study / "items"))
+    assert again["kept"] is True
+    assert {key: again[key] for key in row if key != "kept"} == {key: row[key] for key in row if key != "kept"}
+    assert files(study / "items") == before
+
+
+def test_a_file_that_was_only_touched_is_the_same(study: Path) -> None:
+    make_items([item(study)], str(study / "items"))
+    os.utime(study / "data" / "one" / "recording.parquet")
+    assert make_items([item(study)], str(study / "items"))[0]["kept"] is True
+
+
+@pytest.mark.parametrize("change", ["recording", "truth", "options", "code", "subject"])
+def test_what_has_changed_is_made_again_by_force_only(
+    study: Path, change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, changed = str(study / "items"), item(study)
+    make_items([changed], place)
+    before = files(study / "items")
+    if change in ("recording", "truth"):
+        file = study / "data" / "one" / f"{change}.parquet"
+        table = pl.read_parquet(file)
+        table.head(table.height - 5).write_parquet(file)
+        said = "another session"
+    elif change == "options":
+        changed = item(study, steps=QUICK | {"evaluate": {"interval": (6.0, 10.0)}})
+        said = "other options"
+    elif change == "subject":
+        shutil.copy(study / "items" / "one" / "track" / "subject.toml", study)
+        changed = item(study, subject_file=str(study / "subject.toml"))
+        said = "other inputs"
+    else:
+        now = items.code() | {"code": "0" * 64, "version": "0.2.0"}
+        monkeypatch.setattr(items, "code", lambda: now)
+        said = "other code, version 0.1.0"
+    (row,) = make_items([changed], place)
+    assert (row["status"], row["error"]) == ("failed", "ExistingOutput")
+    assert said in row["message"]
+    assert "--force" in row["message"]
+    assert files(study / "items") == before
+    (row,) = make_items([changed], place, force=True)
+    assert (row["status"], row["kept"]) == ("done", False)
+
+
+def test_one_that_fails_is_named_and_the_others_go_on(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (study / "data" / "one" / "session.toml").write_text("[data]\nfile = 3\n")
+    (study / "data" / "two" / "truth.parquet").unlink()
+    rows = make_items([item(study, name) for name in ("one", "two", "three", "four")], str(study / "items"))
+    assert [row["status"] for row in rows] == ["failed", "failed", "done", "failed"]
+    assert [row.get("error") for row in rows] == ["BadSession", "MissingFile", None, "MissingFile"]
+    assert all(str(study) in row["message"] and "\n" not in row["message"] for row in rows if row["status"] != "done")
+    assert sorted(path.name for path in (study / "items").iterdir()) == ["three"]
+
+    def wrong(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("of ours\nand more")
+
+    monkeypatch.setattr("wepose_pin.batch.steps.track", wrong)
+    (row,) = make_items([item(study, session=str(study / "data" / "three"))], str(study / "items"))
+    assert row["error"] == "ZeroDivisionError"
+    assert row["message"].startswith("of ours and more (test_batch.py:")
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    with contextlib.suppress(ZeroDivisionError), new_folder(str(tmp_path / "items" / "a")) as folder:
+        (folder / "half").write_text("")
+        raise ZeroDivisionError
+    assert list((tmp_path / "items").iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ExistingOutput, match="cannot be written"), new_folder(str(tmp_path / "file" / "a")):
+        pass
+
+
+def test_a_done_file_cut_off_is_no_done_file(study: Path) -> None:
+    make_items([item(study)], str(study / "items"))
+    done = study / "items" / "one" / DONE
+    done.write_text(done.read_text()[:100])
+    assert make_items([item(study)], str(study / "items"))[0]["kept"] is False
+    assert json.loads(done.read_text())["row"]["samples"] > 0
+
+
+def test_steps_give_what_the_commands_give(study: Path) -> None:
+    """The same bits, where the same BLAS threads are used: here one process."""
+    from wepose_pin.cli import main
+
+    steps = {"calibrate": STEPS["calibrate"], **QUICK, "export": {"formats": ("trc",), "names": None, "rate_hz": None}}
+    session = study / "data" / "one"
+    (row,) = make_items([item(study, steps=steps)], str(study / "items"))
+    for words in (
+        ["calibrate", session, "-o", study / "s"],
+        ["track", session, "--subject", study / "s", "-o", study / "r", "--report"],
+        ["export", study / "r", "-o", study / "motion.trc"],
+    ):
+        with pytest.raises(SystemExit):
+            main([str(word) for word in words])
+    place = study / "items" / "one"
+    assert pl.read_parquet(place / "track" / "pose.parquet").equals(pl.read_parquet(study / "r" / "pose.parquet"))
+    for made_so, made_there in (("s", "calibrate"), ("r", "track")):
+        for name in ("subject.toml", "subject.urdf"):
+            assert (study / made_so / name).read_bytes() == (place / made_there / name).read_bytes()
+    assert (study / "motion.trc").read_bytes() == (place / "export" / "motion.trc").read_bytes()
+    assert row["grade"] in ("pass", "poor", "fail")
+    assert row["page"] == "calibrate/report.html"
+
+
+# On workers ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_study_on_this_machine(study: Path) -> None:
+    (study / "data" / "bad").mkdir()
+    (study / "data" / "bad" / "session.toml").write_text("")
+    text = PLAN.replace("report = false", "report = true")
+    (study / "plan.toml").write_text(
+        f'{text}[subjects.x]\ncalibration = "data/three"\n[steps.calibrate]\n'.replace(
+            '["data/*/session.toml"]', '["data/*/session.toml"]\nsubject = "x"'
+        )
+    )
+    told = []
+    done = run_study(study / "plan.toml", str(study / "out"), workers=2, progress=lambda *of: told.append(of))
+    assert told[0] == (0, 0, 5)
+    assert told[-1] == (5, 1, 5)
+    table = pl.read_parquet(study / "out" / "results.parquet")
+    assert table.equals(done.table)
+    assert table["item"].to_list() == ["subject-x", "data-bad", "data-one", "data-three", "data-two"]
+    assert table["status"].to_list() == ["done", "failed", "done", "done", "done"]
+    assert (table["error"][1], table["subject"].to_list()) == ("BadSession", ["x"] * 5)
+    page = (study / "out" / "report.html").read_text()
+    for word in ("4 of 5 items are done", "BadSession", '<a href="items/data-one/track/report.html">data-one</a>'):
+        assert word in page
+    assert (study / "out" / "items" / "data-one" / "track" / "report.html").is_file()
+    before = files(study / "out" / "items")
+    assert run_study(study / "plan.toml", str(study / "out"), workers=1).kept == 4
+    assert files(study / "out" / "items") == before
+
+    (study / "data" / "three" / "session.toml").write_text("")
+    shutil.rmtree(study / "out" / "items" / "subject-x")
+    table = run_study(study / "plan.toml", str(study / "out"), workers=1).table
+    assert table["status"].to_list() == ["failed"] * 5
+    assert "its subject 'x' could not be calibrated" in table["message"][2]
+
+
+def test_workers_listen_on_this_machine_only() -> None:
+    if not Path("/proc/net/tcp").exists():
+        pytest.skip("no /proc/net/tcp to look at")
+
+    def listening() -> dict[str, str]:
+        lines = [
+            line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()
+        ]
+        return {line[9]: line[1].split(":")[0] for line in lines[1:] if line[3] == "0A"}  # inode → address
+
+    def mine(pids: list[int]) -> set[str]:
+        links = [link for pid in pids for link in Path(f"/proc/{pid}/fd").iterdir()]
+        return {os.readlink(link)[8:-1] for link in links if link.exists() or "socket" in os.readlink(link)}
+
+    with connected(workers=1) as client:
+        assert client.scheduler.address.startswith("tls://127.0.0.1:")
+        pids = [os.getpid(), *client.run(os.getpid).values()]
+        found = listening()
+        addresses = [found[inode] for inode in mine(pids) if inode in found]
+    assert len(addresses) >= 2
+    assert set(addresses) == {"0100007F"}
+
+
+def held_up(study: Path) -> Path:
+    """A session whose reading does not end until somebody writes it: a named pipe."""
+    pipe = study / "data" / "one" / "session.toml"
+    pipe.unlink()
+    os.mkfifo(pipe)
+    return pipe
+
+
+def kill_the_one_that_waits(client: Any, pipe: Path, but: set[int]) -> int:
+    """Kill the worker that has opened the pipe, or waits to."""
+    until = time.monotonic() + 60.0
+    while time.monotonic() < until:
+        with contextlib.suppress(OSError):
+            for address, keys in client.processing().items():
+                pid = client.run(os.getpid, workers=[address])[address]
+                if keys and pid not in but and "pipe" in Path(f"/proc/{pid}/wchan").read_text() + "pipe":
+                    os.kill(pid, signal.SIGKILL)
+                    return pid
+        time.sleep(0.1)
+    raise AssertionError("no worker took the item")
+
+
+def test_an_item_runs_again_when_its_worker_dies(study: Path, recorded: Path) -> None:
+    pipe, place = held_up(study), str(study / "items")
+    with connected(workers=1) as client:
+        rows = made(client, [item(study), item(study, "two")], place)
+        from threading import Timer
+
+        def kill_and_mend() -> None:
+            kill_the_one_that_waits(client, pipe, set())
+            pipe.unlink()
+            shutil.copy(recorded / "one" / "session.toml", pipe)
+
+        timer = Timer(2.0, kill_and_mend)
+        timer.start()
+        found = [row for some in rows for row in some]
+        timer.join()
+    assert sorted(row["item"] for row in found) == ["one", "two"]
+    assert {row["status"] for row in found} == {"done"}
+    assert sorted(path.name for path in (study / "items").iterdir() if not path.name.startswith(".")) == ["one", "two"]
+
+
+def test_a_run_that_was_killed_goes_on_where_it_stopped(study: Path) -> None:
+    held_up(study)
+    command = [
+        sys.executable,
+        "-m",
+        "wepose_pin.cli",
+        "batch",
+        study / "plan.toml",
+        "-o",
+        study / "out",
+        "--workers",
+        "2",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    until = time.monotonic() + 120.0
+    while len(list((study / "out" / "items").glob(f"*/{DONE}"))) < 2 and time.monotonic() < until:
+        time.sleep(0.05)
+    process.kill()
+    process.communicate()
+    before = files(study / "out" / "items")
+    assert sum(path.endswith(DONE) for path in before) == 2
+    (study / "data" / "one" / "session.toml").unlink()
+    shutil.copy(study / "data" / "two" / "session.toml", study / "data" / "one" / "session.toml")
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert "3 of 3 items done, 2 of them before" in run.stdout
+    after = files(study / "out" / "items")
+    assert {path: after[path] for path in before if "/." not in path} == {
+        p: t for p, t in before.items() if "/." not in p
+    }
+    assert [path.name for path in (study / "out" / "items").glob(".*")] == []
+
+
+def test_where_a_study_may_not_go(study: Path) -> None:
+    with pytest.raises(ExistingOutput, match="no study of wepose batch"):
+        run_study(study / "plan.toml", str(study / "data"))
+    with pytest.raises(ExistingOutput, match="is there and no study"):
+        run_study(study / "plan.toml", str(study / "plan.toml"))
+    from wepose_pin.batch.storage import only_one
+
+    with (
+        only_one(str(study)),
+        pytest.raises(ExistingOutput, match="another wepose batch writes there"),
+        only_one(str(study)),
+    ):
+        pass
+
+
+def test_no_scheduler_at_an_address() -> None:
+    for address in ("tcp://127.0.0.1:9", "nonsense"):
+        with pytest.raises(BadOption, match=f"--scheduler {address}: no scheduler there"), connected(address):
+            pass
+
+
+def test_a_worker_with_another_version_is_refused(study: Path) -> None:
+    with pytest.raises(BadData, match="another wepose-pin"):
+        make_items([item(study)], str(study / "items"), same_code="0" * 64)
+
+
+# The page ------------------------------------------------------------------------------------------------------------
+
+
+def test_figures_that_stand_apart() -> None:
+    rows = [{"item": f"i{k}", "status": "done", "gap_mm": 10.0 + 0.1 * (k % 7), "same": 1.0} for k in range(40)]
+    rows[7]["gap_mm"], rows[9]["gap_mm"] = 30.0, float("nan")
+    found = apart(table_of(rows), ["gap_mm", "same"])
+    assert [(each.item, each.column) for each in found] == [("i7", "gap_mm")]
+    assert found[0].deviations == pytest.approx((30.0 - found[0].median) / (1.4826 * 0.2), rel=0.3)
+
+
+def test_the_page_escapes_what_comes_from_files(study: Path) -> None:
+    plan = read_plan(study / "plan.toml", "items")
+    row = {"item": "a", "status": "failed", "error": "BadData", "message": "<script>x</script> [y](javascript:z)"}
+    page = study_page(
+        plan, table_of([row, {"item": "b", "status": "done", "page": "track/report.html", "seconds": 1.0}])
+    )
+    assert "<script>" not in page
+    assert 'href="javascript' not in page
+    assert '<a href="items/b/track/report.html">b</a>' in page
+
+
+# S3 ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch, recorded: Path) -> Iterator[str]:
+    """s3://lab on a server of this machine, with the sessions in data/."""
+    moto = pytest.importorskip("moto.server")
+    s3fs = pytest.importorskip("s3fs")
+    server = moto.ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "DEFAULT_REGION": "us-east-1"}.items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    s3fs.S3FileSystem.clear_instance_cache()
+    system = s3fs.S3FileSystem()
+    system.mkdir("lab")
+    system.put(str(recorded), "lab/data", recursive=True)
+    yield "s3://lab"
+    s3fs.S3FileSystem.clear_instance_cache()
+    server.stop()
+
+
+def test_a_study_on_s3(bucket: str, tmp_path: Path, recorded: Path) -> None:
+    (tmp_path / "plan.toml").write_text(PLAN.replace("data/*", f"{bucket}/data/*"))
+    done = run_study(tmp_path / "plan.toml", f"{bucket}/out", workers=2)
+    assert done.table["item"].to_list() == ["data-one", "data-three", "data-two"]
+    assert done.table["status"].to_list() == ["done"] * 3, done.table["message"].to_list()
+    import s3fs
+
+    system = s3fs.S3FileSystem()
+    assert {path.rpartition("/")[2] for path in system.ls("lab/out")} == {
+        *("items", "study.json", "results.parquet", "report.html")
+    }
+    with system.open("lab/out/results.parquet") as file:
+        assert pl.read_parquet(file.read()).equals(done.table)
+    here = Item("one", str(recorded / "one"), QUICK)
+    make_items([here], str(tmp_path / "items"))
+    system.get_file("lab/out/items/data-one/track/pose.parquet", str(tmp_path / "pose.parquet"))
+    local = pl.read_parquet(tmp_path / "items" / "one" / "track" / "pose.parquet")
+    assert pl.read_parquet(tmp_path / "pose.parquet").equals(local)
+    assert run_study(tmp_path / "plan.toml", f"{bucket}/out", workers=1).kept == 3
+    # Without its done.json an item is not whole, and a changed recording is another one.
+    system.rm_file("lab/out/items/data-one/done.json")
+    system.pipe_file("lab/data/two/recording.parquet", b"nothing")
+    table = run_study(tmp_path / "plan.toml", f"{bucket}/out", workers=1).table
+    assert table["status"].to_list() == ["done", "done", "failed"]
+    assert "another session" in table["message"][2]
+
+
+def test_what_is_not_there_on_s3_is_named(bucket: str, tmp_path: Path) -> None:
+    lost = Item("lost", f"{bucket}/nobody/session.toml", QUICK)
+    (row,) = make_items([lost], str(tmp_path / "items"))
+    assert (row["error"], row["message"]) == ("MissingFile", f"{bucket}/nobody/session.toml: no such file")
+    (tmp_path / "session.toml").write_text('[data]\nfile = "../secret.csv"\n')
+    import s3fs
+
+    s3fs.S3FileSystem().put_file(str(tmp_path / "session.toml"), "lab/out/session.toml")
+    (row,) = make_items([Item("out", f"{bucket}/out", QUICK)], str(tmp_path / "items"))
+    assert (row["error"], "outside its own folder" in row["message"]) == ("BadData", True)

@@ -1,0 +1,155 @@
+"""`PLAN.toml`: what it may say, whose sessions are whose, and what is said of mistakes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from wepose_pin.batch import Plan, read_plan
+from wepose_pin.batch.plan import Body
+from wepose_pin.errors import BadPlan, MissingFile, WeposeError
+
+STEPS = "[steps.calibrate]\n[steps.track]\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("anna/one", "anna/two", "ben/one"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "session.toml").write_text("")
+    return tmp_path
+
+
+def planned(folder: Path, text: str) -> Plan:
+    (folder / "plan.toml").write_text(text)
+    return read_plan(folder / "plan.toml", "OUT/items")
+
+
+def test_globs_give_items_named_by_their_folders(folder: Path) -> None:
+    plan = planned(folder, f'[sessions]\nfiles = ["*/one", "anna/two/session.toml"]\n{STEPS}')
+    assert [item.name for item in plan.items] == ["anna-one", "ben-one", "anna-two"]
+    assert [Path(item.session).is_absolute() for item in plan.items] == [True] * 3
+    assert list(plan.items[0].steps) == ["calibrate", "track"]
+    assert plan.items[0].steps["track"]["method"] == "amekf"
+    assert plan.name == "plan"
+    assert plan.first == ()
+
+
+def test_steps_run_in_their_order_however_they_are_written(folder: Path) -> None:
+    plan = planned(
+        folder,
+        '[sessions]\nfiles = "ben/one"\n[steps.evaluate]\ninterval = [1, 2]\n[steps.export]\nformats = ["trc", "mot"]\n'
+        "rate_hz = 50\n[steps.track]\ncovariance = true\n",
+    )
+    assert list(plan.items[0].steps) == ["track", "export", "evaluate"]
+    assert plan.items[0].steps["export"] == {"formats": ("trc", "mot"), "names": None, "rate_hz": 50.0}
+    assert plan.items[0].steps["evaluate"] == {"interval": (1.0, 2.0)}
+    assert plan.items[0].steps["track"]["covariance"] is True
+
+
+def test_a_subject_calibrated_once_goes_first_and_its_sessions_are_not_calibrated(folder: Path) -> None:
+    plan = planned(
+        folder,
+        f"""
+        [[sessions]]
+        files = ["anna/two"]
+        subject = "anna"
+        [[sessions]]
+        files = ["ben/*"]
+        subject = "ben"
+        [subjects.anna]
+        calibration = "anna/one"
+        stature = 1.7
+        gauge = {{ shoulder_width = 0.36 }}
+        [subjects.ben]
+        sex = "m"
+        {STEPS}""",
+    )
+    (first,) = plan.first
+    assert (first.name, list(first.steps), first.body) == (
+        "subject-anna",
+        ["calibrate"],
+        Body(1.7, None, {"shoulder_width": 0.36}),
+    )
+    anna, ben = plan.items
+    assert list(anna.steps) == ["track"]
+    assert anna.subject_file == "OUT/items/subject-anna/calibrate/subject.toml"
+    assert list(ben.steps) == ["calibrate", "track"]
+    assert (ben.subject_file, ben.body) == (None, Body(sex="m"))
+
+
+def test_a_table_ties_sessions_to_subjects_and_lengths(folder: Path) -> None:
+    table = {"session": ["anna/one", "ben/one"], "name": ["a", None], "truth": [None, "t.parquet"]}
+    table |= {"stature": [1.7, None], "sex": ["f", None], "gauge.trunk": [0.5, None]}
+    pl.DataFrame(table).write_csv(folder / "sessions.csv")
+    plan = planned(folder, f'[sessions]\ntable = "sessions.csv"\n{STEPS}')
+    assert [item.name for item in plan.items] == ["a", "ben-one"]
+    assert plan.items[0].body == Body(1.7, "f", {"trunk": 0.5})
+    assert plan.items[1].truth == str(folder / "t.parquet")
+
+
+def test_items_keep_their_names_when_others_join(folder: Path) -> None:
+    few = planned(folder, f'[sessions]\nfiles = ["anna/one"]\n{STEPS}')
+    many = planned(folder, f'[sessions]\nfiles = ["**/session.toml"]\n{STEPS}')
+    assert few.items[0].name in {item.name for item in many.items}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (STEPS, "sessions: a table [sessions]"),
+        (f"[sessions]\n{STEPS}", "either files (globs) or table is needed"),
+        (f'[sessions]\nfiles = ["nobody/*"]\n{STEPS}', "'nobody/*' finds nothing"),
+        (f"[sessions]\nfiles = [3]\n{STEPS}", "is not a list of globs"),
+        (f'[sessions]\nfile = "a"\n{STEPS}', "sessions.file is not a known key; did you mean 'files'?"),
+        ('[sessions]\nfiles = ["anna/*"]\n', "steps is missing"),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps]\n', "no step"),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.trak]\n', "did you mean 'track'?"),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\nmethod = "amek"\n', "did you mean 'amekf'?"),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\ngaps = 1\n', "gaps = 1 is neither true nor false"),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.evaluate]\n', "needs the step [steps.track]"),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\n[steps.export]\n', "steps.export.formats is missing"),
+        ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.export]\nformats = ["trx"]', "'trx' is no format"),
+        ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.evaluate]\ninterval = [2, 1]', "is not two times"),
+        ('[sessions]\nfiles = "anna/*"\nsubject = "ben"\n[subjects.anna]\n[steps.track]', "subject 'ben' is not in"),
+        ('[sessions]\nfiles = "anna/*"\n[subjects.anna]\nfile = "a"\ncalibration = "b"\n[steps.track]', "not both"),
+        ('[sessions]\nfiles = "anna/*"\n[subjects.a]\ngauge = { arm = 1 }\n[steps.track]', "gauge.arm is not a known"),
+        (
+            '[sessions]\nfiles = "anna/*"\nsubject = "a"\n[subjects.a]\ncalibration = "x"\n[steps.track]',
+            "needs the step [steps.calibrate]",
+        ),
+    ],
+)
+def test_a_mistake_gets_one_line_that_names_it(folder: Path, text: str, said: str) -> None:
+    with pytest.raises(BadPlan) as error:
+        planned(folder, text)
+    assert said in str(error.value)
+    assert "plan.toml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ("sesion\na", "no column 'session'; did you mean 'sesion'?"),
+        ("session,age\na,3", "column 'age' is not known"),
+        ("session,stature\na,178", "row 1: stature = '178' is not a length in metres"),
+        ("session,sex\na,x", "row 1: sex = 'x'"),
+        ("session,name\na,x\nb,x", "row 1: name 'x' is there twice"),
+        ("session\na\na", "is there twice"),
+        ("session,name\n,x", "row 1: session is empty"),
+    ],
+)
+def test_a_mistake_in_the_table_gets_its_row(folder: Path, table: str, said: str) -> None:
+    (folder / "sessions.csv").write_text(table)
+    with pytest.raises(WeposeError) as error:
+        planned(folder, f'[sessions]\ntable = "sessions.csv"\n{STEPS}')
+    assert said in str(error.value)
+    assert "sessions.csv" in str(error.value)
+
+
+def test_a_plan_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(MissingFile, match="a plan is wanted here"):
+        read_plan(tmp_path / "plan.toml", "OUT")
