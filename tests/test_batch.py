@@ -12,12 +12,13 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import polars as pl
 import pytest
 
-from wepose_pin.batch import Item, items, read_plan, run_study
+from wepose_pin.batch import Item, cluster, items, read_plan, run_study
 from wepose_pin.batch.cluster import connected, made
 from wepose_pin.batch.items import make_items
 from wepose_pin.batch.page import apart, study_page
@@ -37,6 +38,12 @@ view = false
 report = false
 [steps.evaluate]
 """
+
+
+@pytest.fixture(autouse=True)
+def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As workers have it, who set it for themselves."""
+    monkeypatch.setenv("WEPOSE_THREADS", "1")
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +169,7 @@ def test_steps_give_what_the_commands_give(study: Path) -> None:
     (row,) = make_items([item(study, steps=steps)], str(study / "items"))
     for words in (
         ["calibrate", session, "-o", study / "s"],
-        ["track", session, "--subject", study / "s", "-o", study / "r", "--report"],
+        ["track", session, "--subject", study / "s", "-o", study / "r", "--no-report"],
         ["export", study / "r", "-o", study / "motion.trc"],
     ):
         with pytest.raises(SystemExit):
@@ -221,7 +228,7 @@ def test_workers_listen_on_this_machine_only() -> None:
         lines = [
             line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()
         ]
-        return {line[9]: line[1].split(":")[0] for line in lines[1:] if line[3] == "0A"}  # inode → address
+        return {line[9]: line[1].split(":")[0] for line in lines if line[3] == "0A"}  # inode → address
 
     def mine(pids: list[int]) -> set[str]:
         links = [link for pid in pids for link in Path(f"/proc/{pid}/fd").iterdir()]
@@ -244,38 +251,44 @@ def held_up(study: Path) -> Path:
     return pipe
 
 
-def kill_the_one_that_waits(client: Any, pipe: Path, but: set[int]) -> int:
-    """Kill the worker that has opened the pipe, or waits to."""
+def kill_a_worker_at_work(client: Any) -> None:
     until = time.monotonic() + 60.0
     while time.monotonic() < until:
-        with contextlib.suppress(OSError):
-            for address, keys in client.processing().items():
-                pid = client.run(os.getpid, workers=[address])[address]
-                if keys and pid not in but and "pipe" in Path(f"/proc/{pid}/wchan").read_text() + "pipe":
-                    os.kill(pid, signal.SIGKILL)
-                    return pid
+        for address, keys in client.processing().items():
+            if keys:
+                os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
+                return
         time.sleep(0.1)
     raise AssertionError("no worker took the item")
 
 
 def test_an_item_runs_again_when_its_worker_dies(study: Path, recorded: Path) -> None:
-    pipe, place = held_up(study), str(study / "items")
+    pipe = held_up(study)
     with connected(workers=1) as client:
-        rows = made(client, [item(study), item(study, "two")], place)
-        from threading import Timer
 
         def kill_and_mend() -> None:
-            kill_the_one_that_waits(client, pipe, set())
+            kill_a_worker_at_work(client)
             pipe.unlink()
             shutil.copy(recorded / "one" / "session.toml", pipe)
 
-        timer = Timer(2.0, kill_and_mend)
-        timer.start()
-        found = [row for some in rows for row in some]
-        timer.join()
-    assert sorted(row["item"] for row in found) == ["one", "two"]
-    assert {row["status"] for row in found} == {"done"}
-    assert sorted(path.name for path in (study / "items").iterdir() if not path.name.startswith(".")) == ["one", "two"]
+        killer = Thread(target=kill_and_mend)
+        killer.start()
+        found = [row for some in made(client, [item(study), item(study, "two")], str(study / "items")) for row in some]
+        killer.join()
+    assert sorted((row["item"], row["status"]) for row in found) == [("one", "done"), ("two", "done")]
+    assert {path.name for path in (study / "items").glob("*/")} >= {"one", "two"}
+
+
+def test_an_item_that_kills_its_workers_is_given_up_by_name(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(cluster.SETTINGS, "distributed.scheduler.allowed-failures", 0)
+    held_up(study)
+    with connected(workers=1) as client:
+        killer = Thread(target=kill_a_worker_at_work, args=(client,))
+        killer.start()
+        (rows,) = made(client, [item(study)], str(study / "items"))
+        killer.join()
+    assert (rows[0]["status"], rows[0]["error"]) == ("failed", "LostWorker")
+    assert "workers died at it" in rows[0]["message"]
 
 
 def test_a_run_that_was_killed_goes_on_where_it_stopped(study: Path) -> None:
@@ -297,7 +310,7 @@ def test_a_run_that_was_killed_goes_on_where_it_stopped(study: Path) -> None:
         time.sleep(0.05)
     process.kill()
     process.communicate()
-    before = files(study / "out" / "items")
+    before = {path: time for path, time in files(study / "out" / "items").items() if "/." not in path}
     assert sum(path.endswith(DONE) for path in before) == 2
     (study / "data" / "one" / "session.toml").unlink()
     shutil.copy(study / "data" / "two" / "session.toml", study / "data" / "one" / "session.toml")

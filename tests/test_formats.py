@@ -427,7 +427,7 @@ def test_gigantic_numbers_are_refused(format: str, tmp_path: Path) -> None:
     cells[{"mt_manager": 2, "dot": 7, "ximu3": 4}[format]] = "1e300"
     lines[-40] = cell.join(cells)
     path.write_text("\n".join(lines) + "\n", encoding="latin-1")
-    with pytest.raises(BadData, match=r"in row 361; no sensor measures as much"):
+    with pytest.raises(BadData, match=r"in row 361; no device measures as much"):
         load(tmp_path, f'[data]\nfile = "{path.relative_to(tmp_path)}"\n[sensors.torso]')
 
 

@@ -214,7 +214,7 @@ def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simul
         ("a.csv", b"a,b\rc,d\n1,2,3\n", "its line of names cannot be read"),
         ("a.csv", b"\x00\x01\x02" * 90, "zero bytes"),
         ("a.parquet", b"PAR1", "cannot be read as a Parquet file"),
-        ("a.mat", b"\x00" * 300, "is damaged, cut off, or no MATLAB or HDF5 file"),
+        ("a.mat", b"\x00" * 300, "is neither HDF5 nor a MATLAB file"),
         ("a.h5", b"\x89HDF\r\n\x1a\n" + b"\x00" * 90, "is damaged, cut off, or no MATLAB or HDF5 file"),
         ("a.mvnx", b"<mvnx", "is damaged or cut off"),
         ("a.sto", b"time\t1\n", "no line 'endheader'"),

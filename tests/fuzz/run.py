@@ -1,7 +1,7 @@
 """Coverage-guided fuzzing of all that is parsed, by atheris: ``python tests/fuzz/run.py [TARGET …] --seconds 60``.
 
-Each target runs in a process of its own, from the seeds and what earlier runs came upon (``.fuzz/corpus``). A finding is
-kept in ``.fuzz/found``, and the exit code is 1. With ``--runs`` and ``--seed`` a run is the same every time.
+Each target runs in a process of its own, from the seeds and what earlier runs came upon (``.fuzz/corpus``). A finding
+is kept in ``.fuzz/found``, and the exit code is 1. With ``--runs`` and ``--seed`` a run is the same every time.
 """
 
 from __future__ import annotations
@@ -96,7 +96,8 @@ def main() -> int:
         limits = [f"-max_total_time={options.seconds}", f"-runs={options.runs}", f"-seed={options.seed}"]
         limits += [f"-max_len={LONGEST}", f"-rss_limit_mb={MEMORY_MB}", f"-timeout={SECONDS_EACH}"]
         limits += [f"-artifact_prefix={found}/{name}-", "-len_control=20"]
-        code = f"import sys; sys.path[:0] = {sys.path[:2]!r}; from fuzz.run import fuzz\nfuzz({name!r}, {[*limits, str(corpus)]!r})"
+        begin = f"import sys; sys.path[:0] = {sys.path[:2]!r}; from fuzz.run import fuzz"
+        code = f"{begin}; fuzz({name!r}, {[*limits, str(corpus)]!r})"
         run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, errors="replace")
         tried = re.findall(r"^#(\d+)\s.*cov: (\d+)", run.stderr, re.MULTILINE)
         inputs, edges = tried[-1] if tried else ("0", "0")

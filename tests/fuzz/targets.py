@@ -303,7 +303,7 @@ TARGETS = (
     Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML),
     Target("udp", seeds.datagrams, _datagram, JSON),
     Target("xbus", lambda: [seeds.serial()], _serial),
-    Target("lsl", lambda: [LSL, b"imu\ntorso_gyr_x\ndeg/s\n"], _streams),
+    Target("lsl", lambda: [LSL], _streams),
     Target("live_log", lambda: [seeds.live_log()], file("a.wepose", _live), JSON),
     Target("pose", lambda: [seeds.pose()], file("pose.parquet", _pose)),
     Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON),

@@ -24,7 +24,7 @@ WAIT_S = 60.0
 # Workers share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
 _THREADED = "WEPOSE_THREADS NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
 _ONE_THREAD = dict.fromkeys(_THREADED.split(), "1")
-_SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "distributed.scheduler.allowed-failures": DEATHS,
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
@@ -50,7 +50,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
     except ImportError as error:
         raise BadOption(f"{error}; pip install 'wepose-pin[batch]' brings what wepose batch needs") from None
     with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(_SETTINGS))
+        stack.enter_context(dask.config.set(SETTINGS))
         if scheduler is None:
             cluster = stack.enter_context(
                 LocalCluster(

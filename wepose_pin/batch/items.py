@@ -38,8 +38,8 @@ def make_items(items: Sequence[Item], place: str, force: bool = False, same_code
     mine = code()["code"]
     if same_code not in (None, mine):
         raise BadData(
-            f"a worker has another wepose-pin than this ({code()['version']}, commit {code()['commit'] or 'not known'}): "
-            f"install the same one on both"
+            f"a worker has another wepose-pin than this one: version {code()['version']}, commit "
+            f"{code()['commit'] or 'not known'}; install the same everywhere"
         )
     return [_row(item, place, force) for item in items]
 

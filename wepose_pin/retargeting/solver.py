@@ -20,6 +20,9 @@ from .collision import Shapes
 from .limits import velocity_bounds
 from .person import ArmTarget
 from .robot import Arm, Robot
+from .rows import add_arm
+
+_NONE = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,8 @@ class Stepper:
         n = len(self.robot.names)
         self._low, self._high = np.empty(n), np.empty(n)
         self._plain = np.array_equal(self.robot.coupling, np.eye(len(self.robot.coupling), n))
+        t = self.tasks
+        self._numbers = np.array([t.position, t.orientation, t.swivel, t.gain, t.brake, t.straight, t.damping])
         self._follow = [_Follower(self.robot, arm, self.data) for arm in self.robot.arms]
 
     def look(self, u: np.ndarray) -> np.ndarray:
@@ -120,7 +125,7 @@ class Stepper:
         self.look(state.u)
         H, f = np.zeros((n, n)), np.zeros(n)
         for follower, aim in zip(self._follow, aims, strict=True):
-            singular = follower.add(H, f, aim, tasks, dt, state.v)
+            singular = follower.add(H, f, aim, self._numbers, dt, state.v)
             self.counts.singular += singular
         smooth = state.v + dt * state.a
         H[np.diag_indices(n)] += tasks.posture + tasks.still + tasks.smooth
@@ -178,6 +183,7 @@ class _Follower:
             self._R_E, self._p_E = (getattr(data.oMi[elbow.parentJoint], part) for part in ("rotation", "translation"))
             self._above = _moved_by(robot, elbow.parentJoint)
         self._moved = _moved_by(robot, frame.parentJoint)
+        self._plain = np.array_equal(robot.coupling, np.eye(*robot.coupling.shape))
         self.p, self.R, self.elbow = np.zeros(3), np.eye(3), np.full(3, np.nan)
 
     def update(self) -> None:
@@ -186,58 +192,19 @@ class _Follower:
         if self._elbowed:
             self.elbow = self._R_E @ self._p_JE + self._p_E
 
-    def add(self, H: np.ndarray, f: np.ndarray, aim: Aim, tasks: Tasks, dt: float, v: np.ndarray) -> bool:
+    def add(self, H: np.ndarray, f: np.ndarray, aim: Aim, numbers: np.ndarray, dt: float, v: np.ndarray) -> bool:
         """Add hand, orientation and swivel; whether the hand cannot move in some direction."""
-        J = self.data.J if self.robot.model.nv == H.shape[0] else self.data.J @ self.robot.coupling
-        spin = J[3:] * self._moved
-        slide = J[:3] * self._moved + _turned(spin, self.p)
-        ahead = 0.5 * dt * v  # half of the coming step is already decided
-        error = aim.position - self.p - slide @ ahead
-        want = aim.velocity + _capped(tasks.gain * error, tasks.brake, error)
-        square = slide.T @ slide
-        weight = tasks.position * aim.weight
-        H += weight * square
-        f += weight * (want @ slide)
-        turn = pin.log3(aim.rotation @ self.R.T) - spin @ ahead
-        want = aim.rate + _capped(tasks.gain * turn, tasks.brake, turn)
-        weight = tasks.orientation * aim.weight
-        H += weight * (spin.T @ spin)
-        f += weight * (want @ spin)
-        if self._elbowed:
-            self._swivel(H, f, aim, tasks, J, slide)
-        gram = slide @ slide.T
-        least = float(np.sqrt(max(np.linalg.eigvalsh(gram)[0], 0.0)))
-        if least >= tasks.straight:
-            return False
-        damping = tasks.damping * (1.0 - least / tasks.straight) ** 2  # Nakamura and Hanafusa 1986
-        H[self.arm.joints, self.arm.joints] += damping
-        f[self.arm.joints] += damping * 0.9 * v[self.arm.joints]
-        return True
-
-    def _swivel(self, H: np.ndarray, f: np.ndarray, aim: Aim, tasks: Tasks, J: np.ndarray, slide: np.ndarray) -> None:
-        """The elbow about the line from shoulder to hand, as the person's; it fades where either arm is straight."""
-        offset = self.p - self.arm.shoulder
-        far = np.sqrt(offset @ offset)
-        if far < 0.05:
-            return
-        axis = offset / far
-        upper = self.elbow - self.arm.shoulder
-        along = upper @ axis
-        bend = upper - along * axis
-        r = np.sqrt(bend @ bend)
-        wanted = aim.bend - (aim.bend @ axis) * axis
-        size = np.sqrt(wanted @ wanted)
-        if r < 0.01 or size < 0.01:
-            return
-        tangent = _cross(axis, bend / r)
-        angle = np.arctan2(wanted @ tangent, (wanted @ bend) / r)
-        own = J[:3] * self._above + _turned(J[3:] * self._above, self.elbow)
-        row = tangent @ own - (along / far) * (tangent @ slide)
-        sure = min(1.0, size / 0.05) * min(1.0, r / 0.05)
-        weight = tasks.swivel * aim.weight * sure
-        want = r * np.clip(0.5 * tasks.gain * angle, -3.0, 3.0)
-        H += weight * np.outer(row, row)
-        f += weight * want * row
+        J = self.data.J
+        hand, above = J * self._moved, J * self._above if self._elbowed else _NONE
+        if not self._plain:
+            hand, above = hand @ self.robot.coupling, above @ self.robot.coupling if self._elbowed else _NONE
+        turn = pin.log3(aim.rotation @ self.R.T)
+        return bool(
+            add_arm(
+                H, f, hand, above, self.p, self.elbow, self.arm.shoulder, turn, aim.position, aim.velocity, aim.rate,
+                aim.bend, aim.weight, v, dt, numbers, self.arm.joints,
+            )
+        )  # fmt: skip
 
 
 def aims_at(targets: tuple[ArmTarget, ...], k: int, dt: float) -> tuple[Aim, ...]:
@@ -257,25 +224,9 @@ def aims_at(targets: tuple[ArmTarget, ...], k: int, dt: float) -> tuple[Aim, ...
 
 
 def _moved_by(robot: Robot, joint: int) -> np.ndarray:
-    """(n,) 1 where a value moves what hangs on a joint. Followers stand in the columns of what they follow."""
+    """(nv,) 1 where a joint of the model moves what hangs on another."""
     found = np.zeros(robot.model.nv)
     while joint > 0:
         found[robot.model.idx_vs[joint]] = 1.0
         joint = robot.model.parents[joint]
-    return (np.abs(robot.coupling.T) @ found > 0.0).astype(float)
-
-
-def _turned(spin: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """spin × p of columns (3, n)."""
-    x, y, z = p
-    return np.stack([spin[1] * z - spin[2] * y, spin[2] * x - spin[0] * z, spin[0] * y - spin[1] * x])
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
-def _capped(velocity: np.ndarray, brake: float, error: np.ndarray) -> np.ndarray:
-    """The velocity, no faster than `brake` stops it within the error."""
-    speed, most = np.sqrt(velocity @ velocity), np.sqrt(2.0 * brake * np.sqrt(error @ error))
-    return velocity if speed <= most else velocity * (most / speed)
+    return found

@@ -62,8 +62,8 @@ EXPERIMENTS: dict[str, Words] = {
         "come from a minute of joined hands, shoulder width and trunk taped (off by 3 mm, one standard deviation).",
         "Nothing in the paper, which refines lengths only and leaves the headings open.",
         "Lengths but for the trunk; mounts about the vertical (headings) and across it (tilts); all these errors by "
-        "the standard deviations that the calibration states; the right hand during circles and rests. Root mean squares "
-        "are over all trials together.",
+        "the standard deviations that the calibration states; the right hand during circles and rests. Root mean "
+        "squares are over all trials together.",
     ),
     WATERFALL: Words(
         "The realistic upper body, smekf; in each row one imperfection is switched off or one part of the chain is "
