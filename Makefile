@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test check lint types wheel clean
+.PHONY: demo test check lint types wheel fuzz clean
 
 demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 	$(BIN)/wepose demo -o demo --force
@@ -20,6 +20,10 @@ lint: $(READY)
 types: $(READY)
 	$(BIN)/mypy
 
+SECONDS ?= 60
+fuzz: $(READY)            ## fuzz all that is parsed, SECONDS=60 a target; TARGETS="csv body" for some
+	$(BIN)/python tests/fuzz/run.py $(TARGETS) --seconds $(SECONDS)
+
 wheel: $(READY)
 	$(BIN)/python -m build --wheel --outdir dist .
 
@@ -31,4 +35,4 @@ $(READY): pyproject.toml
 	@touch $(READY)
 
 clean:
-	rm -rf $(VENV) build dist demo *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist demo .fuzz *.egg-info .mypy_cache .ruff_cache .pytest_cache

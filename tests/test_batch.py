@@ -231,8 +231,11 @@ def test_workers_listen_on_this_machine_only() -> None:
         return {line[9]: line[1].split(":")[0] for line in lines if line[3] == "0A"}  # inode → address
 
     def mine(pids: list[int]) -> set[str]:
-        links = [link for pid in pids for link in Path(f"/proc/{pid}/fd").iterdir()]
-        return {os.readlink(link)[8:-1] for link in links if link.exists() or "socket" in os.readlink(link)}
+        inodes = set()
+        for link in [link for pid in pids for link in Path(f"/proc/{pid}/fd").iterdir()]:
+            with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+                inodes.add(os.readlink(link).removeprefix("socket:[").removesuffix("]"))
+        return inodes
 
     with connected(workers=1) as client:
         assert client.scheduler.address.startswith("tls://127.0.0.1:")
@@ -375,22 +378,23 @@ def test_the_page_escapes_what_comes_from_files(study: Path) -> None:
 # S3 ------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def bucket(monkeypatch: pytest.MonkeyPatch, recorded: Path) -> Iterator[str]:
+@pytest.fixture(scope="module")
+def bucket(recorded: Path) -> Iterator[str]:
     """s3://lab on a server of this machine, with the sessions in data/."""
     moto = pytest.importorskip("moto.server")
     s3fs = pytest.importorskip("s3fs")
     server = moto.ThreadedMotoServer("127.0.0.1", 0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-    for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "DEFAULT_REGION": "us-east-1"}.items():
-        monkeypatch.setenv(f"AWS_{name}", value)
-    s3fs.S3FileSystem.clear_instance_cache()
-    system = s3fs.S3FileSystem()
-    system.mkdir("lab")
-    system.put(str(recorded), "lab/data", recursive=True)
-    yield "s3://lab"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "DEFAULT_REGION": "us-east-1"}.items():
+            patch.setenv(f"AWS_{name}", value)
+        s3fs.S3FileSystem.clear_instance_cache()
+        system = s3fs.S3FileSystem()
+        system.mkdir("lab")
+        system.put(str(recorded), "lab/data", recursive=True)
+        yield "s3://lab"
     s3fs.S3FileSystem.clear_instance_cache()
     server.stop()
 

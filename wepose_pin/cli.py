@@ -798,6 +798,7 @@ def bench(
     *,
     quick: bool = False,
     live: bool = False,
+    batch: bool = False,
     data: OptionalPath = None,
     save: Annotated[Path | None, arg(metavar="FILE")] = None,
     compare: Annotated[Path | None, arg(metavar="FILE")] = None,
@@ -813,6 +814,8 @@ def bench(
         quick: Less than half a minute in place of two: shorter data, fewer rounds, nothing compiled anew.
         live: Nothing but a live session: five sensors at 1 kHz, five minutes with a file and five with the page too, of
             which --quick makes half a minute each.
+        batch: Nothing but a study of 500 short sessions by wepose batch, on one worker, two, and two of which one is
+            killed; --quick makes it twelve.
         data: Folder of real recordings (broad/, wepose_hr/) to measure accuracy on; WEPOSE_DATA names one too.
         save: Write the figures there, with versions, machine and date, as JSON.
         compare: A file that --save wrote: then/now shows how much slower each was then, by its ratio to VQF.
@@ -830,7 +833,13 @@ def bench(
         raise ExistingOutput(f"{save}: exists; --force replaces it, --save names another file")
     if save is not None and (save.is_dir() or not save.absolute().parent.is_dir()):
         raise ExistingOutput(f"{save}: not a file that can be written; --save names a JSON file in an existing folder")
-    todo, tables = live_sections(quick) if live else sections(QUICK if quick else FULL, data), {}
+    if batch:
+        from .bench.study import study_sections
+
+        todo = study_sections(quick)
+    else:
+        todo = live_sections(quick) if live else sections(QUICK if quick else FULL, data)
+    tables = {}
     with _steps(len(todo)) as step:
         for name, measure in todo.items():
             step(f"measuring {name.replace('_', ' ')}")
@@ -1418,7 +1427,8 @@ def _retarget_tables(found: dict[str, Any]) -> None:
     margins, touched = found["limit_margins"], found["self_collision"]
     _say(
         f"Limits {'kept' if found['limits_kept'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "
-        f"velocity {100 * margins['velocity_share']:.1f} %, acceleration {100 * margins['acceleration_share']:.1f} % to spare"
+        f"velocity {100 * margins['velocity_share']:.1f} %, "
+        f"acceleration {100 * margins['acceleration_share']:.1f} % to spare"
     )
     slow = found["slowest"]
     if slow is not None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import resource
+import sys
 import tempfile
 import time
 import traceback
@@ -82,7 +84,7 @@ def make_item(item: Item, place: str, force: bool = False) -> Row:
     begun = time.perf_counter()
     with new_folder(target) as folder:
         row, block = make_into(folder, item)
-        row |= {"seconds": time.perf_counter() - begun}
+        row |= {"seconds": time.perf_counter() - begun, "memory_mb": _most_memory()}
         content = {"key": key, "made_by": block, "stamps": _stamps(item), "row": row}
         with (folder / DONE).open("w", encoding="utf-8") as file:
             json.dump(content, file, indent=1, ensure_ascii=False)
@@ -113,6 +115,12 @@ def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
             took[f"{step}_s"] = time.perf_counter() - begun
     pages = [f"{step}/{page}" for step in reversed(list(item.steps)) for page in PAGES]
     return row | {"page": next((page for page in pages if (folder / page).is_file()), None)} | took, block
+
+
+def _most_memory() -> float:
+    """Most memory [MB] that this process ever had."""
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most / (1e6 if sys.platform == "darwin" else 1e6 / 1024)
 
 
 def key_of(item: Item) -> str:

@@ -21,10 +21,12 @@ MOST_PICTURES = 12
 # What says most, first; others follow in the order in which steps give them.
 _TELLING = ("gap_mm", "right_hand_arm_error_mm", "left_hand_arm_error_mm", "right_hand_error_mm", "left_hand_error_mm")
 _TOLD = ("item", "session", "subject", "status", "error", "message", "page", "grade")
+_COST = ("seconds", "memory_mb")
 _UNITS = {"mm": "mm", "deg": "deg", "hz": "Hz", "s": "s"}
 _WORDS = {
     "seconds": "time it took [s]",
     "gap_mm": "palm-to-palm gap [mm]",
+    "memory_mb": "memory of the worker [MB]",
     "independent": "independent looks of the calibration",
     "static_share": "share of time at rest",
 }
@@ -85,7 +87,7 @@ def _figures(done: pl.DataFrame) -> list[str]:
         if name not in _TOLD and done[name].dtype.is_numeric() and done[name].drop_nulls().len()
     ]
     first = [name for name in _TELLING if name in known]
-    timed = [name for name in known if name == "seconds" or (name.endswith("_s") and name != "duration_s")]
+    timed = [name for name in known if name in _COST or (name.endswith("_s") and name != "duration_s")]
     return [*first, *(name for name in known if name not in (*first, *timed)), *timed]
 
 

@@ -68,8 +68,8 @@ class Work:
         average = average_subject(body.stature, body.sex)
         found = calibrate_lengths(recording, gauge=dict(body.gauge), prior=average, protocol=what, method=method)
         verdict = judge(found)
-        self.subject = found.subject
         write_subject(folder, found.subject, load_model(lengths=found.subject.lengths))
+        self.subject = load_subject(folder)  # as it stands there: the same as for the commands one by one
         write_calibration(folder, found, verdict, self.given.made_by)
         if report:
             from ..report import calibration_report

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from ..errors import BadData, BadOption, BadSession, MissingFile, one_of
+from ..errors import BadData, BadOption, BadSession, MissingFile, one_of, printable
 from ..recording import CONFIGURATION, SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases
 from .arrays import ArrayFile, is_array_file
 from .clocks import BRIDGED, LONG, Clock, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time, runs
@@ -121,7 +121,7 @@ class SessionReader:
                 f"{self.path}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}"
             )
         self._head = Recording(
-            name=top.text("name", None) or self.path.absolute().parent.name or self.path.stem,
+            name=printable(top.text("name", None) or self.path.absolute().parent.name or self.path.stem),
             time=np.empty(0),
             rate_hz=0.0,
             sensors={},

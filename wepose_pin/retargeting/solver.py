@@ -74,7 +74,7 @@ class State:
 
 @dataclass
 class Stepper:
-    """Takes the robot from one step to the next; `positions` or `orientations` may be left out of the tasks.
+    """Takes the robot from one step to the next.
 
     Parameters
     ----------
@@ -105,21 +105,19 @@ class Stepper:
         self._numbers = np.array([t.position, t.orientation, t.swivel, t.gain, t.brake, t.straight, t.damping])
         self._follow = [_Follower(self.robot, arm, self.data) for arm in self.robot.arms]
 
-    def look(self, u: np.ndarray) -> np.ndarray:
-        """Jacobian (6, n) in the root of all joints at `u`; hands and elbows are where `place` then says."""
+    def look(self, u: np.ndarray) -> None:
+        """Put the robot at `u`: `place` then says where hands and elbows are."""
         pin.computeJointJacobians(self.robot.model, self.data, self.robot.q(u))
         for follower in self._follow:
             follower.update()
-        J = self.data.J
-        return J if self._plain else J @ self.robot.coupling
 
     def place(self, arm: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Hand (3,), its rotation (3, 3) and elbow (3,) of an arm, in the root; copies."""
         follower = self._follow[arm]
         return follower.p.copy(), follower.R.copy(), follower.elbow.copy()
 
-    def step(self, state: State, aims: tuple[Aim, ...], speed: float = 1.0) -> State:
-        """The state one step on. `speed` < 1 asks for slower joints, as far as braking allows."""
+    def step(self, state: State, aims: tuple[Aim, ...]) -> State:
+        """The state one step on."""
         robot, tasks, dt, n = self.robot, self.tasks, self.dt, len(self.robot.names)
         self.counts.steps += 1
         self.look(state.u)
@@ -131,7 +129,7 @@ class Stepper:
         H[np.diag_indices(n)] += tasks.posture + tasks.still + tasks.smooth
         posture, pull = (robot.rest, 0.0) if self.lean is None else self.lean
         f += tasks.posture * (tasks.posture_gain * (posture - state.u) + pull) + tasks.smooth * smooth
-        v_most, a_most = self.loose * speed * robot.v_most, self.loose * robot.a_most
+        v_most, a_most = self.loose * robot.v_most, self.loose * robot.a_most
         velocity_bounds(state.u, state.v, robot.lower, robot.upper, v_most, a_most, dt, self._low, self._high)
         rows, bound = self._apart(state)
         v = self._programme(H, f, rows, bound)

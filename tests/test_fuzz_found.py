@@ -1,0 +1,404 @@
+"""What fuzzing and faults found, each as it is told now; nothing of it may come back."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.io import loadmat, savemat
+from test_bad_input import Files, good_table, refused
+
+from wepose_pin.cli import main
+from wepose_pin.errors import BadData, BadModel, BadOption, BadSession, BadSubject, MissingFile, WeposeError, printable
+from wepose_pin.readers.arrays import ArrayFile
+from wepose_pin.readers.mat5 import read_mat5
+from wepose_pin.writers import whole_folder
+from wepose_pin.writers.folder import written
+
+pytest.importorskip("hypothesis")
+from fuzz import seeds
+from fuzz.targets import TARGETS, try_one
+
+BY_NAME = {target.name: target for target in TARGETS}
+
+
+def told(name: str, folder: Path, data: bytes, kind: type[WeposeError]) -> str:
+    """What a target refuses the input for."""
+    error = try_one(BY_NAME[name], folder, data)
+    assert isinstance(error, kind), repr(error)
+    return str(error)
+
+
+# One line, whatever a file holds -----------------------------------------------------------------------------------
+
+
+def test_an_error_is_one_printable_line_of_bounded_length() -> None:
+    assert str(BadData("a\nb\x1b[31m \udcff é")) == "a\\nb\\x1b[31m \\udcff é"
+    long = str(BadData("x" * 10**6 + "; the end"))
+    assert len(long) < 2100
+    assert long.endswith("; the end")
+    assert printable("± über 10 µm") == "± über 10 µm"
+
+
+def test_names_in_a_file_do_not_steer_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = Files(tmp_path / "in", good_table(), 'name = "\\u001b[31mred"\n' + Files(tmp_path, good_table()).session)
+    files.folder.mkdir()
+    session = files.write()
+    for command in (["info", str(session)], ["track", str(session), "-o", str(tmp_path / "out")]):
+        with pytest.raises(SystemExit) as stop:
+            main(command)
+        said = capsys.readouterr()
+        assert stop.value.code == 0
+        assert "\x1b[31m" not in said.out + said.err
+        assert "\\x1b[31mred" in said.out
+
+
+# TOML --------------------------------------------------------------------------------------------------------------
+
+TOMLS = {"session": BadSession, "subject": BadSubject, "table": BadModel, "robot_map": BadModel, "protocol": BadOption}
+
+
+@pytest.mark.parametrize("name", TOMLS)
+@pytest.mark.parametrize("text", [b"a = " + b"9" * 5000, b"a = " + b"[" * 3000, b"a = '\xff'"])
+def test_toml_that_python_gives_up_on(name: str, text: bytes, tmp_path: Path) -> None:
+    kind = (TOMLS[name], MissingFile)
+    assert isinstance(try_one(BY_NAME[name], tmp_path, text), kind)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (b"matrix = [\n    [", b"matrix = [\n    [" + b"9" * 400 + b",", "covariance.matrix holds something"),
+        (b"qw = 1.0", b"qw = " + b"9" * 400, "mounts.torso needs four numbers"),
+        (b"qw = 1.0", b"qw = 1e200", "mounts.torso needs four numbers"),
+        (b"y = 1.0\n", b"y = 1e200\n", "hinges.left needs four numbers"),
+    ],
+)
+def test_numbers_in_a_subject_that_are_none(old: bytes, new: bytes, says: str, tmp_path: Path) -> None:
+    text = seeds.subject()
+    assert old in text
+    assert says in told("subject", tmp_path, text.replace(old, new, 1), BadSubject)
+
+
+def test_numbers_in_maps_tables_and_protocols_that_are_none(tmp_path: Path) -> None:
+    ur5, _ = BY_NAME["robot_map"].seeds()
+    assert b"[rest]\n" in ur5
+    many = ur5.replace(b"[rest]\n", b"[rest]\na = " + b"9" * 400 + b"\n")
+    assert "a number is needed" in told("robot_map", tmp_path, many, BadModel)
+    table = BY_NAME["table"].seeds()[0]
+    assert "three numbers" in told("table", tmp_path, table.replace(b"[0.0, 0.0, 0.0]", b"[0.0, 1e308, 0.0]"), BadModel)
+    poses = BY_NAME["protocol"].seeds()[1]
+    start = poses.index(b"= [", poses.index(b"directions"))
+    end = poses.index(b"]", start)
+    for numbers in (b"0, 0, 0", b"1e308, 0, 0", b"nan, 0, 0"):
+        spoiled = poses[: start + 3] + numbers + poses[end:]
+        assert "three numbers are needed" in told("protocol", tmp_path, spoiled, BadOption)
+
+
+# Devices' files ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["1e308", "nan"])
+def test_increments_of_a_dot_that_are_no_rotation(cell: str, tmp_path: Path) -> None:
+    lines = seeds.dot()[1].decode().splitlines(keepends=True)
+    cells = lines[8].split(",")
+    lines[8] = ",".join([*cells[:2], cell, *cells[3:]])
+    error = try_one(BY_NAME["dot"], tmp_path, "".join(lines).encode())
+    assert cell == "nan" or "no device measures as much" in str(error)  # one lost sample is bridged
+
+
+def test_a_dot_whose_time_stands_still(tmp_path: Path) -> None:
+    head = "PacketCounter,SampleTimeFine,dq_W,dq_X,dq_Y,dq_Z,dv[1],dv[2],dv[3]\n"
+    text = head + "1,5,1,0,0,0,0,0,0.098\n" * 3
+    assert "its time does not grow" in told("dot", tmp_path, text.encode(), BadData)
+
+
+def test_a_summary_that_is_none(tmp_path: Path) -> None:
+    for text in (b"[1]", b"3", b"[" * 5000):
+        assert "damaged" in told("summary", tmp_path, text, BadData)
+    odd = b'{"sensors": 3, "points": [1.5], "warnings": "x", "recording": null}'
+    assert try_one(BY_NAME["summary"], tmp_path, odd) is None
+
+
+# Archives ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_damaged_parquet_file_is_one_line_and_polars_is_silent(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Pages cut out of the middle: polars panics on some of them, and says so on stderr at length."""
+    good = seeds.parquet()
+    for at in range(4, len(good) - 800, 211):
+        data = good[:at] + bytes(16) + good[at + 16 :]
+        try_one(BY_NAME["parquet"], tmp_path, data)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_parquet_file_that_unpacks_to_far_more_than_it_is(tmp_path: Path) -> None:
+    table = pl.DataFrame({"time": pl.zeros(35_000_000, dtype=pl.Float64, eager=True)})  # 280 MB
+    table.write_parquet(tmp_path / "arm.parquet", compression="zstd")
+    (tmp_path / "session.toml").write_text(seeds.SESSION.split("[sensors.left")[0].replace("csv", "parquet"))
+    from wepose_pin.readers import iter_session, load_session
+
+    for read in (load_session, lambda path: list(iter_session(path))):
+        with pytest.raises(BadData, match="rows of 1 columns, in a file of"):
+            read(tmp_path / "session.toml")
+
+
+def test_an_hdf5_file_that_unpacks_to_far_more_than_it_is(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("gyro", shape=(10**9, 3), dtype="f8", chunks=(10**6, 3), compression="gzip")
+    with pytest.raises(BadData, match=r"/gyro is \(1000000000, 3\), in a file of"):
+        ArrayFile(tmp_path / "a.h5").table({"/gyro[0]": "a"})
+
+
+def test_what_an_hdf5_file_names_outside_is_not_read(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    np.arange(8.0).tofile(tmp_path / "secret")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = np.arange(8.0)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["own"] = np.arange(8.0)
+        file.create_dataset("raw", shape=(8,), dtype="f8", external=[(str(tmp_path / "secret"), 0, 64)])
+        file["link"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/x")
+        layout = h5py.VirtualLayout(shape=(8,), dtype="f8")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "x", shape=(8,))
+        file.create_virtual_dataset("virtual", layout)
+    assert list(ArrayFile(tmp_path / "a.h5").shapes) == ["/own"]
+
+
+def mat_bomb(path: Path, numbers: int) -> None:
+    """One packed array of zeros."""
+    head = struct.pack("<8I", 6, 8, 6, 0, 5, 8, numbers, 1) + struct.pack("<2I4s4x2I", 1, 4, b"gyro", 9, 8 * numbers)
+    packer = zlib.compressobj(9)
+    packed = packer.compress(struct.pack("<2I", 14, len(head) + 8 * numbers) + head)
+    for _ in range(8 * numbers // (1 << 20)):
+        packed += packer.compress(bytes(1 << 20))
+    packed += packer.flush()
+    path.write_bytes(b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + struct.pack("<2I", 15, len(packed)) + packed)
+
+
+def test_a_matlab_file_that_unpacks_to_far_more_than_it_is(tmp_path: Path) -> None:
+    mat_bomb(tmp_path / "small.mat", 1 << 17)
+    assert ArrayFile(tmp_path / "small.mat").shapes == {"/gyro": (1 << 17,)}
+    mat_bomb(tmp_path / "bomb.mat", 1 << 26)  # half a GB
+    assert (tmp_path / "bomb.mat").stat().st_size < 1 << 20
+    with pytest.raises(BadData, match="unpacks to far more than a recording does"):
+        ArrayFile(tmp_path / "bomb.mat")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_matlab_files_are_read_as_scipy_reads_them(packed: bool, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    content = {
+        **{"a": rng.random((5, 3)), "b": np.arange(7, dtype="i2"), "t": rng.random((1, 4)), "z": 1j * rng.random(3)},
+        "s": {"deep": {"e": np.float32([1, 2]), "text": "xxx", "one": 3.0}, "none": [], "c": np.arange(3, dtype="u1")},
+        **{"h": rng.random((2, 2, 2)), "q": rng.random((2, 1, 3)), "flag": np.array([True, False])},
+        **{"cell": np.array([1, "a", rng.random(3)], dtype=object), "many": [{"x": np.arange(3.0)}] * 2},
+    }
+    savemat(tmp_path / "a.mat", content, do_compression=packed)
+    theirs: dict[str, np.ndarray] = {}
+
+    def walk(name: str, thing: object) -> None:
+        if isinstance(thing, dict):
+            for key, value in thing.items():
+                walk(f"{name}/{key}", value) if not key.startswith("__") else None
+        elif isinstance(thing, np.ndarray) and thing.dtype.kind in "fiu" and 1 <= thing.ndim <= 2 and thing.size:
+            theirs[name] = thing
+
+    walk("", loadmat(tmp_path / "a.mat", simplify_cells=True))
+    ours = {name: array for name, array in read_mat5(tmp_path / "a.mat", 1 << 20).items() if array.size}
+    assert ours.keys() == theirs.keys()
+    for name, array in theirs.items():
+        np.testing.assert_array_equal(ours[name], array)
+
+
+def test_a_matlab_file_on_which_scipy_dies(tmp_path: Path) -> None:
+    """Every byte of the unpacked one turned over: SciPy's reader ends the process on some of these."""
+    good = seeds.mat(False)
+    refused_ = 0
+    for at in range(128, len(good)):
+        data = bytearray(good)
+        data[at] ^= 0xFF
+        (tmp_path / "a.mat").write_bytes(data)
+        try:
+            ArrayFile(tmp_path / "a.mat")
+        except BadData:
+            refused_ += 1
+    assert 100 < refused_ < len(good)
+    assert "neither HDF5 nor a MATLAB file" in told("mat", tmp_path, bytes(200), BadData)
+
+
+# URDF --------------------------------------------------------------------------------------------------------------
+
+LAUGHS = b'<?xml version="1.0"?><!DOCTYPE robot [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]><robot name="&b;"/>'
+SECRET = b'<!DOCTYPE robot [<!ENTITY a SYSTEM "file:///etc/hostname">]><robot name="&a;"/>'
+
+
+@pytest.mark.parametrize("text", [LAUGHS, SECRET])
+@pytest.mark.parametrize("name", ["body", "robot"])
+def test_a_urdf_with_entities_is_not_read(name: str, text: bytes, tmp_path: Path) -> None:
+    assert "declares an entity, 'a'" in told(name, tmp_path, text, BadModel)
+
+
+def test_joints_in_a_row_without_end(tmp_path: Path) -> None:
+    n = 2000
+    links = "".join(f'<link name="l{k}"/>' for k in range(n + 1))
+    joint = '<joint name="j{0}" type="fixed"><parent link="l{0}"/><child link="l{1}"/></joint>'
+    text = f'<robot name="a">{links}{"".join(joint.format(k, k + 1) for k in range(n))}</robot>'
+    assert "2000 joints in a row" in told("robot", tmp_path, text.encode(), BadModel)
+
+
+def test_pinocchio_is_silent_on_a_urdf_that_it_refuses(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    try_one(BY_NAME["robot"], tmp_path, seeds.URDF.replace(' effort="10"', "").encode())
+    assert capfd.readouterr().err == ""
+
+
+# Recordings of a live session --------------------------------------------------------------------------------------
+
+
+def test_a_live_recording_that_is_damaged(tmp_path: Path) -> None:
+    good, live = seeds.live_log(), BY_NAME["live_log"]
+    assert try_one(live, tmp_path, good) is None
+    for old, new, says in (
+        (b'"rate_hz": 100.0', b'"rate_hz": 1e300', "an event 'clock'"),
+        (b'"wait_s": 0.5', b'"wait_s": 1e9', "an event 'clock'"),
+        (b'"begin": 0, "end": 50', b'"begin": 50, "end": 0', "an event 'start'"),
+        (b'"kind": "clock"', b'"kind": "clokc"', "broke off before the start pose"),
+        (b'"mounts": {"torso": [0.0, 0.0', b'"mounts": {"torso": [7.0, 0.0', "mounts ="),
+        (b'"name": "live"', b'"name": [1, 2]', "lacks name"),
+        (b'"phases": {}', b'"phases": 3 ', "phases.phases = 3"),
+        (b'["torso"]', b'[["a"]]  ', "this version reads format 1"),
+    ):
+        assert old in good
+        assert says in str(try_one(live, tmp_path, resized(good, old, new))), new
+
+
+def resized(data: bytes, old: bytes, new: bytes) -> bytes:
+    """`new` in the place of `old`, and the length of its block as it must be."""
+    from wepose_pin.readers.live_log import BLOCK, MAGIC
+
+    made, at = data[: len(MAGIC)], len(MAGIC)
+    while at < len(data):
+        tag, size, crc = BLOCK.unpack_from(data, at)
+        payload = data[at + BLOCK.size : at + BLOCK.size + size].replace(old, new)
+        made += BLOCK.pack(tag, len(payload), crc) + payload
+        at += BLOCK.size + size
+    return made
+
+
+def test_times_in_a_live_recording_that_would_make_years_of_ticks(tmp_path: Path) -> None:
+    times = np.arange(100) / 100.0
+    wild = times.copy()
+    wild[60:] += 1e9
+    assert "holds no as long recording" in told(
+        "live_log", tmp_path, seeds.live_log().replace(times.tobytes(), wild.tobytes()), BadData
+    )
+
+
+# Output ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    files = Files(tmp_path / "in", good_table())
+    files.folder.mkdir()
+    return files.write()
+
+
+def test_paths_that_are_not_utf_8(tmp_path: Path, session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    try:
+        session.parent.rename(folder)
+    except OSError:
+        pytest.skip("this file system takes names in UTF-8 only")
+    with pytest.raises(SystemExit) as stop:
+        main(["track", str(folder / "session.toml"), "-o", str(folder / "out")])
+    assert stop.value.code == 0, capsys.readouterr().err
+    assert (folder / "out" / "pose.parquet").stat().st_size > 1000
+    capsys.readouterr()
+    line = refused(["track", str(folder / "none.toml"), "-o", str(folder / "out2")], capsys)
+    assert "caf\\udce9/none.toml: no such file" in line
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_disk_under_stdout(tmp_path: Path, session: Path) -> None:
+    command = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(tmp_path / "out")]
+    with open("/dev/full", "w") as full:
+        run = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert run.returncode == 2
+    assert run.stderr.splitlines()[-1].endswith("No space left on device; " + f"{tmp_path / 'out'} was written before")
+    assert (tmp_path / "out" / "pose.parquet").is_file()
+
+
+def test_a_signal_while_files_move_waits_until_they_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C between the first file and the last of an output folder that is there already."""
+    (tmp_path / "out").mkdir()
+    replace: Callable[[Path, Path], Path] = Path.replace
+
+    def and_stop(path: Path, target: Path) -> Path:
+        os.kill(os.getpid(), signal.SIGINT)
+        return replace(path, target)
+
+    def fill() -> None:
+        with whole_folder(tmp_path / "out") as folder:
+            for name in "abc":
+                (folder / name).write_text(name)
+            monkeypatch.setattr(Path, "replace", and_stop)
+
+    with pytest.raises(KeyboardInterrupt):
+        fill()
+    monkeypatch.undo()
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a", "b", "c"]
+    assert written[-1] == tmp_path / "out"
+
+
+def test_what_a_killed_run_left_is_in_nobodys_way(tmp_path: Path) -> None:
+    code = (
+        "import sys, time; from pathlib import Path; from wepose_pin.writers import whole_folder\n"
+        "with whole_folder(Path(sys.argv[1])) as folder:\n"
+        "    (folder / 'a').write_text('half'); print('now', flush=True); time.sleep(60)"
+    )
+    for out in (tmp_path / "new", tmp_path / "there"):
+        if out.name == "there":
+            out.mkdir()
+        with subprocess.Popen([sys.executable, "-c", code, str(out)], stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "now\n"
+            process.kill()
+        left = [path for path in (*tmp_path.iterdir(), *(tmp_path / "there").glob("*")) if path.name.startswith(".")]
+        assert [path.name.startswith(f".{out.name}.partial-") for path in left if f".{out.name}." in path.name] == [
+            True
+        ]
+        with whole_folder(out) as folder:
+            (folder / "a").write_text("whole")
+        assert (out / "a").read_text() == "whole"
+
+
+def test_an_output_folder_appears_at_once(tmp_path: Path) -> None:
+    """Whoever looks while it appears sees all files or none, and with the rights that the user's folders have."""
+    with whole_folder(tmp_path / "out") as folder:
+        for k in range(50):
+            (folder / str(k)).write_text("")
+        watcher = subprocess.Popen(
+            [sys.executable, "-c", "import os, sys\nprint('now', flush=True)\nwhile not os.path.isdir(sys.argv[1]): pass\n"
+             "print(len(os.listdir(sys.argv[1])))", str(tmp_path / "out")],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert watcher.stdout is not None
+        watcher.stdout.readline()
+        time.sleep(0.05)
+    assert watcher.communicate()[0] == "50\n"
+    (tmp_path / "own").mkdir()
+    assert (tmp_path / "out").stat().st_mode == (tmp_path / "own").stat().st_mode
