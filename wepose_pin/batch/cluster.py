@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -51,6 +52,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
         raise BadOption(f"{error}; pip install 'wepose-pin[batch]' brings what wepose batch needs") from None
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(SETTINGS))
+        stack.callback(_leave_environment, dict(os.environ))
         if scheduler is None:
             cluster = stack.enter_context(
                 LocalCluster(
@@ -78,6 +80,15 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
                 f"--scheduler {scheduler}: has no worker after {WAIT_S:g} s; start one: dask worker {scheduler}"
             ) from None
         yield client
+
+
+def _leave_environment(before: dict[str, str]) -> None:
+    """As it was: Dask gives its workers theirs by way of this process's."""
+    for name in (*_ONE_THREAD, *SETTINGS["distributed.nanny.pre-spawn-environ"]):
+        if name in before:
+            os.environ[name] = before[name]
+        else:
+            os.environ.pop(name, None)
 
 
 def made(

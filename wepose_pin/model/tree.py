@@ -13,6 +13,7 @@ from ..errors import BadModel
 
 _TURNS = ("revolute", "continuous")
 DEEPEST = 200  # joints in a row; a person has 20
+_FAR = 1e6  # [m]
 _PARALLEL_TOLERANCE = 1e-6
 _MEET_TOLERANCE = 1e-9  # [m]
 
@@ -87,6 +88,12 @@ def tree_of(robot: Any, where: str) -> Tree:
             )
         above[joint.child] = joint
         below[joint.parent].append(joint)
+        axis, place = joint.axis, origin_of(joint)
+        numbers = np.concatenate([place.ravel(), np.ravel(axis) if axis is not None else ()]).astype(float)
+        if place.shape != (4, 4) or np.shape(axis) not in ((), (3,)) or not (np.abs(numbers) < _FAR).all():
+            raise BadModel(
+                f"{where}: joint '{joint.name}': origin or axis is not three numbers each, of metres and rad"
+            )
     roots = [name for name in below if name not in above]
     if len(roots) != 1:
         found = ", ".join(roots) if roots else "none"

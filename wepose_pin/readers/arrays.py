@@ -43,6 +43,8 @@ class ArrayFile:
     shapes: dict[str, tuple[int, ...]] = field(init=False)
 
     def __post_init__(self) -> None:
+        if self.path.exists() and not self.path.is_file():
+            raise MissingFile(f"{self.path}: is no regular file; an HDF5 or MATLAB file is wanted here")
         try:
             with self.path.open("rb") as file:
                 start = file.read(1024)

@@ -40,6 +40,8 @@ def format_of(path: Path) -> str | None:
     """
     if path.is_dir():
         return "ximu3" if any((path / name).is_file() for name in (INERTIAL, QUATERNION)) else None
+    if path.exists() and not path.is_file():
+        return None
     suffix = path.suffix.lower()
     if suffix in (".mvnx", ".sto"):
         return {".mvnx": "mvnx", ".sto": "opensim"}[suffix]
@@ -73,6 +75,8 @@ def read_device(path: Path, format: str, use: str | None = None) -> Device:
     """
     if not path.exists():
         raise MissingFile(f"{path}: no such file or folder; a {TITLES[format]} is wanted here")
+    if not (path.is_file() or path.is_dir()):
+        raise MissingFile(f"{path}: is no regular file; a {TITLES[format]} is wanted here")
     if path.is_dir() and format != "ximu3":
         raise MissingFile(f"{path}: is a folder; a {TITLES[format]} is wanted here")
     return FORMATS[format](path, use)

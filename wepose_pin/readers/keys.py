@@ -29,6 +29,8 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
             f"{path}: is a table of data by its name; {what} is wanted here, which names the table (`wepose info "
             f"{path.name} --write` writes one)"
         )
+    if path.exists() and not path.is_file():
+        raise MissingFile(f"{path}: is {'a folder' if path.is_dir() else 'no regular file'}; {what} is wanted here")
     try:
         return parsed_toml(path.read_bytes().decode("utf-8-sig"))
     except FileNotFoundError:

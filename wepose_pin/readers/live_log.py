@@ -145,7 +145,7 @@ def _header(path: Path, payload: bytes) -> dict[str, Any]:
     if not (isinstance(mounts, dict) and all(_is_quat(mount) for mount in mounts.values())):
         raise BadData(f"{path}: mounts = {mounts!r} in its header; a unit quaternion x, y, z, w each is needed")
     phases_stated(Keys(phases if isinstance(phases, dict) else {"phases": phases}, str(path), "phases."))
-    return header
+    return {"subject": None, **header}
 
 
 def _is_quat(value: Any) -> bool:

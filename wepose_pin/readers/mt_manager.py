@@ -98,8 +98,8 @@ def _time(text: Text) -> tuple[np.ndarray, float | None]:
     lost on the air.
     """
     stated = next((value for name, value in text.about.items() if name in ("Update Rate", "Output Rate")), "")
-    number = re.match(r"[\d.]+", stated)
-    rate_hz = float(number[0]) if number and number[0].count(".") < 2 else 0.0
+    number = re.match(r"\d+(\.\d*)?(?![\d.])", stated)
+    rate_hz = float(number[0]) if number else 0.0
     counter = text.numbers(["PacketCounter"])[:, 0]
     if rate_hz > 0.0 and np.isfinite(counter).all() and len(counter) > 1:
         packets = unwrapped(counter, COUNTER_WRAPS)

@@ -81,7 +81,7 @@ class UdpSource:
         self.sensors = SEGMENTS
         deadline = time.monotonic() + self._wait_s
         while not self._waiting and time.monotonic() < deadline:
-            self._waiting = self.read(0.1)
+            self._waiting = self._receive(0.1)
         if not self._waiting:
             self.close()
             seen = "; thrown away: " + ", ".join(f"{n} {what}" for what, n in self.problems.items())
@@ -91,16 +91,20 @@ class UdpSource:
             )
         deadline = time.monotonic() + COLLECT_S
         while time.monotonic() < deadline:
-            self._waiting = self._waiting + self.read(0.1)
+            self._waiting += self._receive(0.1)
         there = {samples.sensor for samples in self._waiting}
         self.sensors = tuple(segment for segment in SEGMENTS if segment in there)
 
     def read(self, timeout_s: float) -> list[Samples]:
         """What came, one `Samples` a sensor and sender."""
-        assert self._socket is not None, "open() first"
         if self._waiting:
             waiting, self._waiting = self._waiting, []
             return waiting
+        return self._receive(timeout_s)
+
+    def _receive(self, timeout_s: float) -> list[Samples]:
+        """What the socket holds, or what comes within `timeout_s`."""
+        assert self._socket is not None, "open() first"
         parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
         deadline = time.monotonic() + timeout_s
         while not parts:
