@@ -213,7 +213,8 @@ def _cell(value: object) -> str:
 
 
 def _cut(text: str | None) -> str:
-    return re.sub(r"[`*\[\]]", "", text or "")[:400]
+    """A message as plain text: nothing in it is markup or a link of ours."""
+    return re.sub(r"[`*]", "", text or "").replace("](", "] (")[:400]
 
 
 def _in_words(column: str) -> str:
