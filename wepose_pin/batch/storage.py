@@ -34,7 +34,7 @@ def _filesystem(url: str) -> tuple[Any, str]:
 
         return fsspec.core.url_to_fs(url)
     except ImportError as error:
-        raise BadOption(f"{url}: {error}; pip install 'wepose-pin[batch]' brings fsspec and s3fs") from None
+        raise BadOption(f"{url}: {error}; pip install 'wepose-pin[batch,s3]' brings fsspec and s3fs") from None
     except ValueError as error:
         raise BadOption(f"{url}: {error}") from None
 
