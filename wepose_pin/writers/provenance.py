@@ -131,7 +131,7 @@ def files_of(path: Path, truth: bool = False) -> list[Path]:
 
 def named_in(path: Path, truth: bool = False) -> list[str]:
     """Files and folders that a session, or a model's table, names, as they stand there."""
-    if path.suffix != ".toml":
+    if path.suffix != ".toml" or not path.is_file():  # a pipe would hold us up
         return []
     try:
         content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
@@ -156,6 +156,8 @@ def file_hash(path: Path) -> str:
         if path.is_dir():
             told = "".join(f"{_name(file, path)} {file_hash(file)}\n" for file in sorted(_all(path)))
             return hashlib.sha256(told.encode()).hexdigest()
+        if path.exists() and not path.is_file():
+            raise MissingFile(f"{path}: is no regular file")
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
