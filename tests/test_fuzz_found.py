@@ -381,8 +381,12 @@ def test_a_signal_while_files_move_waits_until_they_have(tmp_path: Path, monkeyp
                 (folder / name).write_text(name)
             monkeypatch.setattr(Path, "replace", and_stop)
 
-    with pytest.raises(KeyboardInterrupt):
-        fill()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            fill()
+    finally:
+        signal.signal(signal.SIGINT, before)
     monkeypatch.undo()
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a", "b", "c"]
     assert written[-1] == tmp_path / "out"
