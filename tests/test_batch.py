@@ -1,4 +1,4 @@
-"""`wepose batch`: each item by itself, whole or not at all, once; on workers that die, and on S3."""
+"""`wepose batch`: each item by itself, whole or not at all, once; the page over them; on S3."""
 
 from __future__ import annotations
 
@@ -6,70 +6,29 @@ import contextlib
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Thread
-from typing import Any
 
 import polars as pl
 import pytest
+from studies import PLAN, QUICK, files, item
 
-from wepose_pin.batch import Item, cluster, items, read_plan, run_study
-from wepose_pin.batch.cluster import connected, made
+from wepose_pin.batch import Item, items, read_plan, run_study
+from wepose_pin.batch.compare import differences
 from wepose_pin.batch.items import make_items
 from wepose_pin.batch.page import apart, study_page
 from wepose_pin.batch.plan import STEPS
-from wepose_pin.batch.storage import DONE, new_folder
-from wepose_pin.batch.study import table_of
-from wepose_pin.errors import BadData, BadOption, ExistingOutput
-from wepose_pin.simulation import simulate, simulated_person
-from wepose_pin.writers import write_session
+from wepose_pin.batch.storage import DONE, new_folder, only_one
+from wepose_pin.batch.study import STUDY, _claim, table_of
+from wepose_pin.errors import BadData, ExistingOutput
 
-QUICK = {"track": {**STEPS["track"], "view": False, "report": False}, "evaluate": {"interval": None}}
-PLAN = """
-[sessions]
-files = ["data/*/session.toml"]
-[steps.track]
-view = false
-report = false
-[steps.evaluate]
-"""
+pytest_plugins = ["studies"]
 
 
 @pytest.fixture(autouse=True)
 def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """As workers have it, who set it for themselves."""
     monkeypatch.setenv("WEPOSE_THREADS", "1")
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three short sessions, one/ to three/."""
-    folder = tmp_path_factory.mktemp("recorded")
-    for seed, name in enumerate(("one", "two", "three"), 1):
-        made_up = simulate(simulated_person(seed).lengths, seed=seed, clasp_s=8.0, circles=0)
-        (folder / name).mkdir()
-        write_session(folder / name, made_up.recording(name), made_up.truth())
-    return folder
-
-
-@pytest.fixture
-def study(recorded: Path, tmp_path: Path) -> Path:
-    shutil.copytree(recorded, tmp_path / "data")
-    (tmp_path / "plan.toml").write_text(PLAN)
-    return tmp_path
-
-
-def item(study: Path, name: str = "one", **changes: Any) -> Item:
-    return Item(**{"name": name, "session": str(study / "data" / name), "steps": QUICK} | changes)
-
-
-def files(folder: Path) -> dict[str, int]:
-    return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
 # One item ------------------------------------------------------------------------------------------------------------
@@ -116,12 +75,47 @@ def test_what_has_changed_is_made_again_by_force_only(
         monkeypatch.setattr(items, "code", lambda: now)
         said = "other code, version 0.1.0"
     (row,) = make_items([changed], place)
-    assert (row["status"], row["error"]) == ("failed", "ExistingOutput")
+    assert (row["status"], row["error"]) == ("changed", "ExistingOutput")
     assert said in row["message"]
     assert "--force" in row["message"]
+    assert row["samples"] > 0, "its figures stay in the table, as its folder does"
     assert files(study / "items") == before
     (row,) = make_items([changed], place, force=True)
     assert (row["status"], row["kept"]) == ("done", False)
+
+
+def test_what_changes_while_an_item_is_made_is_seen_the_next_time(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_into = items.make_into
+
+    def meanwhile(folder: Path, one: Item) -> object:
+        found = make_into(folder, one)
+        with (study / "data" / "one" / "session.toml").open("a") as file:
+            file.write("# changed\n")
+        return found
+
+    monkeypatch.setattr(items, "make_into", meanwhile)
+    assert make_items([item(study)], str(study / "items"))[0]["status"] == "done"
+    (row,) = make_items([item(study)], str(study / "items"))
+    assert (row["status"], "another session" in row["message"]) == ("changed", True)
+
+
+def test_of_a_plan_that_changes_only_what_it_concerns_is_made_again(study: Path) -> None:
+    steps = {name: item(study, name) for name in ("one", "two", "three")}
+    make_items(list(steps.values()), str(study / "items"))
+    before = files(study / "items")
+    with (study / "data" / "two" / "session.toml").open("a") as file:
+        file.write("# changed\n")
+    rows = make_items(list(steps.values()), str(study / "items"), force=True)
+    assert [row["kept"] for row in rows] == [True, False, True]
+    after = files(study / "items")
+    assert {path for path in before if after[path] != before[path]} == {
+        path for path in before if "/items/two/" in path
+    }
+
+
+def test_a_task_ends_when_its_time_is_up_and_gives_what_it_has(study: Path) -> None:
+    some = [item(study, name) for name in ("one", "two", "three")]
+    assert [row["item"] for row in make_items(some, str(study / "items"), until=0.0)] == ["one"]
 
 
 def test_one_that_fails_is_named_and_the_others_go_on(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,137 +178,6 @@ def test_steps_give_what_the_commands_give(study: Path) -> None:
     assert row["page"] == "calibrate/report.html"
 
 
-# On workers ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_study_on_this_machine(study: Path) -> None:
-    (study / "data" / "bad").mkdir()
-    (study / "data" / "bad" / "session.toml").write_text("")
-    text = PLAN.replace("report = false", "report = true")
-    (study / "plan.toml").write_text(
-        f'{text}[subjects.x]\ncalibration = "data/three"\n[steps.calibrate]\n'.replace(
-            '["data/*/session.toml"]', '["data/*/session.toml"]\nsubject = "x"'
-        )
-    )
-    told = []
-    done = run_study(study / "plan.toml", str(study / "out"), workers=2, progress=lambda *of: told.append(of))
-    assert told[0] == (0, 0, 5)
-    assert told[-1] == (5, 1, 5)
-    table = pl.read_parquet(study / "out" / "results.parquet")
-    assert table.equals(done.table)
-    assert table["item"].to_list() == ["subject-x", "data-bad", "data-one", "data-three", "data-two"]
-    assert table["status"].to_list() == ["done", "failed", "done", "done", "done"]
-    assert (table["error"][1], table["subject"].to_list()) == ("BadSession", ["x"] * 5)
-    page = (study / "out" / "report.html").read_text()
-    for word in ("4 of 5 items are done", "BadSession", '<a href="items/data-one/track/report.html">data-one</a>'):
-        assert word in page
-    assert (study / "out" / "items" / "data-one" / "track" / "report.html").is_file()
-    before = files(study / "out" / "items")
-    assert run_study(study / "plan.toml", str(study / "out"), workers=1).kept == 4
-    assert files(study / "out" / "items") == before
-
-    (study / "data" / "three" / "session.toml").write_text("")
-    shutil.rmtree(study / "out" / "items" / "subject-x")
-    table = run_study(study / "plan.toml", str(study / "out"), workers=1).table
-    assert table["status"].to_list() == ["failed"] * 5
-    assert "its subject 'x' could not be calibrated" in table["message"][2]
-
-
-def test_workers_listen_on_this_machine_only() -> None:
-    if not Path("/proc/net/tcp").exists():
-        pytest.skip("no /proc/net/tcp to look at")
-
-    def listening() -> dict[str, str]:
-        lines = [
-            line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()
-        ]
-        return {line[9]: line[1].split(":")[0] for line in lines if line[3] == "0A"}  # inode → address
-
-    def mine(pids: list[int]) -> set[str]:
-        inodes = set()
-        for link in [link for pid in pids for link in Path(f"/proc/{pid}/fd").iterdir()]:
-            with contextlib.suppress(FileNotFoundError):  # closed meanwhile
-                inodes.add(os.readlink(link).removeprefix("socket:[").removesuffix("]"))
-        return inodes
-
-    with connected(workers=1) as client:
-        assert client.scheduler.address.startswith("tls://127.0.0.1:")
-        pids = [os.getpid(), *client.run(os.getpid).values()]
-        found = listening()
-        addresses = [found[inode] for inode in mine(pids) if inode in found]
-    assert len(addresses) >= 2
-    assert set(addresses) == {"0100007F"}
-
-
-def killing(client: Any) -> Thread:
-    """Stop the one worker, and kill it when it has been given something to do."""
-    (pid,) = client.run(os.getpid).values()
-    os.kill(pid, signal.SIGSTOP)
-
-    def kill() -> None:
-        until = time.monotonic() + 60.0
-        while not any(client.processing().values()) and time.monotonic() < until:
-            time.sleep(0.05)
-        os.kill(pid, signal.SIGKILL)
-
-    killer = Thread(target=kill)
-    killer.start()
-    return killer
-
-
-def test_an_item_runs_again_when_its_worker_dies(study: Path) -> None:
-    with connected(workers=1) as client:
-        (before,) = client.run(os.getpid).values()
-        killer = killing(client)
-        found = [row for some in made(client, [item(study), item(study, "two")], str(study / "items")) for row in some]
-        killer.join()
-        (after,) = client.run(os.getpid).values()
-    assert sorted((row["item"], row["status"], row["kept"]) for row in found) == [
-        ("one", "done", False),
-        ("two", "done", False),
-    ]
-    assert after != before
-    assert sorted(path.name for path in (study / "items").iterdir()) == ["one", "two"]
-
-
-def test_an_item_that_kills_its_workers_is_given_up_by_name(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(cluster.SETTINGS, "distributed.scheduler.allowed-failures", 0)
-    with connected(workers=1) as client:
-        killer = killing(client)
-        (rows,) = made(client, [item(study)], str(study / "items"))
-        killer.join()
-    assert (rows[0]["status"], rows[0]["error"]) == ("failed", "LostWorker")
-    assert "workers died at it" in rows[0]["message"]
-    assert not (study / "items").exists()
-
-
-def test_a_run_that_was_killed_goes_on_where_it_stopped(study: Path) -> None:
-    command = [sys.executable, "-m", "wepose_pin.cli", "batch", str(study / "plan.toml"), "-o", str(study / "out")]
-    command += ["--workers", "1"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    until = time.monotonic() + 120.0
-    while not list((study / "out" / "items").glob(f"*/{DONE}")) and time.monotonic() < until:
-        time.sleep(0.01)
-    process.kill()
-    process.wait()
-    time.sleep(1.0)  # its worker notices
-    before = {path: time for path, time in files(study / "out" / "items").items() if "/." not in path}
-    done = sum(path.endswith(DONE) for path in before)
-    assert 1 <= done < 3
-    assert not (study / "out" / "results.parquet").exists()
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (run.returncode, run.stderr) == (0, "")
-    assert f"3 of 3 items done, {done} of them before" in run.stdout
-    after = files(study / "out" / "items")
-    assert {path: after[path] for path in before} == before
-    assert [path.name for path in (study / "out" / "items").glob(".*")] == []
-    assert pl.read_parquet(study / "out" / "results.parquet")["item"].to_list() == [
-        "data-one",
-        "data-three",
-        "data-two",
-    ]
-
-
 def test_a_pipe_in_place_of_a_session_holds_nobody_up(study: Path) -> None:
     (study / "data" / "one" / "session.toml").unlink()
     os.mkfifo(study / "data" / "one" / "session.toml")
@@ -327,20 +190,16 @@ def test_where_a_study_may_not_go(study: Path) -> None:
         run_study(study / "plan.toml", str(study / "data"))
     with pytest.raises(ExistingOutput, match="is there and no study"):
         run_study(study / "plan.toml", str(study / "plan.toml"))
-    from wepose_pin.batch.storage import only_one
-
+    _claim(str(study / "killed"), study / "plan.toml")
+    (study / "killed" / STUDY).rename(study / "killed" / f".{STUDY}.partial")  # by a kill at its very beginning
+    _claim(str(study / "killed"), study / "plan.toml")
+    assert (study / "killed" / STUDY).is_file()
     with (
         only_one(str(study)),
         pytest.raises(ExistingOutput, match="another wepose batch writes there"),
         only_one(str(study)),
     ):
         pass
-
-
-def test_no_scheduler_at_an_address() -> None:
-    for address in ("tcp://127.0.0.1:9", "nonsense"):
-        with pytest.raises(BadOption, match=f"--scheduler {address}: no scheduler there"), connected(address):
-            pass
 
 
 def test_a_worker_with_another_version_is_refused(study: Path) -> None:
@@ -417,8 +276,33 @@ def test_a_study_on_s3(bucket: str, tmp_path: Path, recorded: Path) -> None:
     system.rm_file("lab/out/items/data-one/done.json")
     system.pipe_file("lab/data/two/recording.parquet", b"nothing")
     table = run_study(tmp_path / "plan.toml", f"{bucket}/out", workers=1).table
-    assert table["status"].to_list() == ["done", "done", "failed"]
+    assert table["status"].to_list() == ["done", "done", "changed"]
     assert "another session" in table["message"][2]
+
+
+def test_a_study_on_s3_is_that_of_a_local_folder(bucket: str, study: Path) -> None:
+    (study / "there.toml").write_text(PLAN.replace("data/*", f"{bucket}/data/*"))
+    here = run_study(study / "plan.toml", str(study / "out"), workers=1).table
+    there = run_study(study / "there.toml", f"{bucket}/same", workers=1).table
+    differ = [name for name in here.columns if not here[name].equals(there[name])]
+    assert set(differ) <= {"session", "seconds", "memory_mb", "track_s", "evaluate_s"}
+    import s3fs
+
+    s3fs.S3FileSystem().get("lab/same/items", str(study / "fetched"), recursive=True)
+    assert differences(study / "out" / "items", study / "fetched") == []
+
+
+def test_a_long_lived_worker_sees_what_changes_on_s3(bucket: str) -> None:
+    import s3fs
+
+    system = s3fs.S3FileSystem(use_listings_cache=False)
+    system.copy("lab/data/one", "lab/changing/one", recursive=True)
+    one = Item("one", f"{bucket}/changing/one/session.toml", QUICK)
+    place = f"{bucket}/changing-out/items"
+    assert [row["kept"] for _ in range(2) for row in make_items([one], place)] == [False, True]
+    system.pipe_file("lab/changing/one/session.toml", system.cat_file("lab/changing/one/session.toml") + b"# changed\n")
+    (row,) = make_items([one], place)
+    assert (row["status"], "another session" in row["message"]) == ("changed", True)
 
 
 def test_what_is_not_there_on_s3_is_named(bucket: str, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from wepose_pin import cli
 from wepose_pin.errors import BadData, BadModel, BadOption, MissingFile, NoSolution
 from wepose_pin.pose import Pose
 from wepose_pin.retargeting import (
+    Kept,
     Trajectory,
     find_map,
     kept,
@@ -29,7 +30,7 @@ from wepose_pin.retargeting import (
     write_trajectory,
 )
 from wepose_pin.retargeting.collision import Shapes
-from wepose_pin.retargeting.limits import fastest, urdf_limits, velocity_bounds
+from wepose_pin.retargeting.limits import acceleration_bounds, urdf_limits, usable
 from wepose_pin.retargeting.person import CLAMP_FROM, CLAMP_TO, drawn_in
 from wepose_pin.retargeting.solver import Aim, State, Stepper, Tasks
 
@@ -46,10 +47,15 @@ def swung(arm) -> Trajectory:
     return retarget(person(), arm)
 
 
+def checked(trajectory: Trajectory, changed: pl.DataFrame | None = None) -> Kept:
+    of = trajectory.robot.map
+    return kept(table(trajectory) if changed is None else changed, of.urdf, of.acceleration, of.jerk)
+
+
 def is_sound(trajectory: Trajectory) -> None:
     """Limits against the URDF and the map, and no contact; none of it by the solver's code."""
     robot = trajectory.robot
-    found = kept(table(trajectory), robot.map.urdf, robot.map.acceleration)
+    found = checked(trajectory)
     assert found.all, found
     assert touching(robot, trajectory.time, trajectory.u).samples == 0
     assert np.isfinite(trajectory.u).all()
@@ -63,37 +69,46 @@ def error(trajectory: Trajectory, side: str = "right") -> np.ndarray:
 # Limits ------------------------------------------------------------------------------------------------------------
 
 
-def test_whoever_goes_as_fast_as_the_bounds_allow_still_keeps_every_limit() -> None:
-    rng, dt, n = np.random.default_rng(3), 0.01, 40
+def ridden(share, dt: float, seconds: float, n: int = 60):
+    """Joints that take `share` of what the bounds leave at each step; where they were, between the samples too."""
+    rng = np.random.default_rng(3)
     lower, upper = -rng.uniform(0.05, 2.0, n), rng.uniform(0.05, 2.0, n)  # at most 14 s from end to end
     v_most, a_most = rng.uniform(0.3, 4.0, n), rng.uniform(0.5, 30.0, n)
-    u, v, low, high = np.zeros(n), np.zeros(n), np.empty(n), np.empty(n)
-    nearest = np.full(n, np.inf)
-    for k in range(8000):
-        velocity_bounds(u, v, lower, upper, v_most, a_most, dt, low, high)
+    j_most = a_most * rng.choice([10.0, 20.0, 50.0, 500.0], n)
+    a_most = usable(a_most, v_most, j_most, upper - lower, dt)
+    u, v, a, low, high = np.zeros(n), np.zeros(n), np.zeros(n), np.empty(n), np.empty(n)
+    t = np.linspace(0.0, dt, 11)[:, None]
+    for k in range(round(seconds / dt)):
+        acceleration_bounds(u, v, a, lower, upper, v_most, a_most, j_most, dt, low, high)
         assert (low <= high).all()
-        assert (high <= v + a_most * dt + 1e-12).all()
-        assert (low >= v - a_most * dt - 1e-12).all()
-        share = rng.uniform(0.0, 1.0, n) if (k // 2000) % 3 == 2 else np.full(n, float((k // 2000) % 3))
-        after = low + share * (high - low)
-        u, v = u + 0.5 * dt * (v + after), after
-        assert (np.abs(v) <= v_most + 1e-9).all()
-        assert (u >= lower - 1e-9).all()
-        assert (u <= upper + 1e-9).all()
-        nearest = np.minimum(nearest, upper - u)
-    assert (nearest < 1e-4).all()  # and the bounds do not hold it off the limit
+        after = low + share(k * dt, rng, n) * (high - low)
+        jerk = (after - a) / dt
+        places = u + t * (v + t * (a / 2.0 + t * jerk / 6.0))
+        speeds = v + t * (a + 0.5 * t * jerk)
+        assert (np.abs(jerk) <= j_most * (1.0 + 1e-9)).all()
+        assert (np.abs(after) <= a_most + 1e-9).all()
+        assert (np.abs(speeds) <= v_most + 1e-8).all()
+        assert (places >= lower - 1e-8).all()
+        assert (places <= upper + 1e-8).all()
+        u, v, a = places[-1], speeds[-1], after
+        yield upper - places.max(axis=0), v, a
 
 
-@pytest.mark.parametrize("room", [1e-9, 1e-6, 4e-4, 5e-4, 6e-4, 0.01, 0.3])
-def test_the_fastest_velocity_just_stops_in_its_room(room: float) -> None:
-    dt, step = 0.01, 0.05
-    v = fastest(room, step, dt)
-    way = 0.5 * dt * v
-    while v > 0.0:
-        slower = max(v - step, 0.0)
-        way += 0.5 * dt * (v + slower)
-        v = slower
-    assert way == pytest.approx(room, abs=1e-12)
+@pytest.mark.parametrize("dt", [0.002, 0.01, 0.05])
+def test_whoever_goes_as_fast_as_the_bounds_allow_still_keeps_every_limit(dt: float) -> None:
+    def mood(time: float, rng: np.random.Generator, n: int) -> np.ndarray:
+        return (np.zeros(n), np.ones(n), rng.uniform(0.0, 1.0, n), rng.integers(0, 2, n))[int(time // 15.0) % 4]
+
+    nearest = np.min([room for room, _, _ in ridden(mood, dt, 60.0)], axis=0)
+    assert (nearest < 1e-3).all()  # and the bounds do not hold it off the limit
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.01, 0.05])
+def test_a_joint_that_is_pushed_against_its_limit_lies_still_there(dt: float) -> None:
+    """Braking at full strength up to the limit would bounce off it: a brake cannot be let go at once."""
+    end = list(ridden(lambda _time, _rng, n: np.ones(n), dt, 25.0))[-round(1.0 / dt) :]
+    assert max(np.abs(v).max() for _, v, _ in end) < 1e-4
+    assert max(np.abs(a).max() for _, _, a in end) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -116,24 +131,24 @@ def test_limits_are_read_from_the_urdf_itself(tmp_path: Path) -> None:
     assert said["elbow_copy"].mimic == ("elbow", 1.0, 0.0)
 
 
-@pytest.mark.parametrize("spoil", ["position", "velocity", "acceleration", "even"])
+@pytest.mark.parametrize("spoil", ["position", "velocity", "acceleration", "jerk", "even", "rests"])
 def test_the_check_sees_what_is_not_kept(swung: Trajectory, spoil: str) -> None:
-    whole, robot = table(swung), swung.robot
-    assert kept(whole, robot.map.urdf, robot.map.acceleration).all
-    k = len(whole) // 2
-    row = np.arange(len(whole)) == k
+    whole = table(swung)
+    assert checked(swung).all
+    row = np.arange(len(whole)) == len(whole) // 2
     changed = {
-        "position": (pl.col("elbow") + pl.Series(9.0 * row)).alias("elbow"),
-        "velocity": (pl.col("pitch_velocity") + pl.Series(4.0 * row)).alias("pitch_velocity"),
-        "acceleration": (pl.col("yaw_acceleration") + pl.Series(30.0 * row)).alias("yaw_acceleration"),
-        "even": (pl.col("roll") + pl.Series(1e-3 * row)).alias("roll"),
+        "position": ("elbow", 9.0 * row),
+        "velocity": ("pitch_velocity", 4.0 * row),
+        "acceleration": ("yaw_acceleration", 30.0 * row),
+        "jerk": ("flexion_acceleration", 9.0 * row),
+        "even": ("roll", 1e-6 * row),
+        "rests": ("roll_velocity", np.full(len(whole), 1e-6)),
     }[spoil]
-    found = kept(whole.with_columns(changed), robot.map.urdf, robot.map.acceleration)
+    name, more = changed
+    found = checked(swung, whole.with_columns((pl.col(name) + pl.Series(more)).alias(name)))
     assert not found.all
-    if spoil != "even":
-        assert getattr(found, spoil) < 0.0
-    else:
-        assert not found.even
+    value = getattr(found, spoil)
+    assert value is False or value < 0.0
 
 
 # Following ---------------------------------------------------------------------------------------------------------
@@ -143,7 +158,7 @@ def test_the_robot_follows_hand_turn_and_elbow(swung: Trajectory) -> None:
     is_sound(swung)
     assert np.median(error(swung)) < 5e-3
     assert np.quantile(error(swung), 0.95) < 0.02
-    found = summary(swung, kept(table(swung), swung.robot.map.urdf, swung.robot.map.acceleration), touching(
+    found = summary(swung, checked(swung), touching(
         swung.robot, swung.time, swung.u))["arms"]["right"]  # fmt: skip
     assert found["hand_error_deg"]["median"] < 3.0
     assert found["swivel_error_deg"]["median"] < 15.0
@@ -221,7 +236,7 @@ def test_the_programme_is_that_of_pink(arm) -> None:
     hand, turn, _ = stepper.place(0)
     goal = pin.SE3(turn @ pin.exp3(np.array([0.02, -0.01, 0.03])), hand + [0.01, -0.02, 0.015])
     aim = Aim(goal.translation, np.zeros(3), goal.rotation, np.zeros(3), np.zeros(3), 1.0)
-    ours = stepper.step(state, (aim,)).v
+    ours = 0.01 * stepper.step(state, (aim,)).a  # the programme's velocity: half a step on, from rest
     configuration = pink.Configuration(arm.model, arm.model.createData(), arm.q(state.u))
     task = pink.tasks.FrameTask(arm.model.frames[arm.arms[0].hand].name, 1.0, float(np.sqrt(tasks.orientation)))
     task.set_target(goal)
@@ -311,7 +326,7 @@ def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
         usual = ((swung.recorded > 3.1) & (swung.recorded < 4.1)).sum()
         assert during > 2 * usual
         assert np.quantile(error(found), 0.95) < 0.03
-    assert summary(gone, kept(table(gone), arm.map.urdf, arm.map.acceleration), touching(arm, gone.time, gone.u))[
+    assert summary(gone, checked(gone), touching(arm, gone.time, gone.u))[
         "arms"]["right"]["lost_share"] > 0.1  # fmt: skip
 
 

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from . import so3
 from .errors import BadPhase, BadSession, WeposeError
-from .filters import BEST, Orientation, check_method, run_filter
+from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
 from .filters.smekf import ACCEL_BIAS_STD
-from .noise import SensorNoise, noise_of, quietest
+from .noise import noise_of, quietest
 from .recording import SEGMENTS, Recording
 from .static import StaticTest
 from .subject import Subject
@@ -86,6 +86,82 @@ class Filtered(NamedTuple):
     warnings: list[str]
 
 
+class SensorFilters:
+    """The filters of a recording that comes in pieces; `filtered` is one piece.
+
+    Parameters
+    ----------
+    first : the piece that the recording begins with, and in which the phases `start` and `still` are
+    method, static_test : as `filtered`
+
+    Attributes
+    ----------
+    start, still, warnings : as in `Filtered`
+    ahead : the smoother's: `push` gives the piece before, and the last one comes from `finish`
+
+    Raises
+    ------
+    WeposeError
+        A start phase in which there are too few samples; an unknown method.
+    """
+
+    def __init__(self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> None:
+        check_method(method)
+        self.start, self.still, self.warnings = _phases(first)
+        self._window = (static_test or StaticTest()).samples(first.rate_hz)
+        self._first = True
+        self._held: Recording | None = None  # the piece that the smoother has not given yet
+        self._runs: dict[str, SensorRun] = {}
+        for segment, sensor in first.sensors.items():
+            if not sensor.aligned:
+                self.warnings += _motion(first, segment, self.start, "start")
+            if self.still != self.start and not sensor.aligned:
+                self.warnings += _motion(first, segment, self.still, "still")
+            if sensor.ready:
+                continue
+            assert sensor.gyro_S is not None
+            assert sensor.accel_S is not None
+            at_rest = first.span(self.still)
+            try:
+                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz)
+            except WeposeError as error:
+                raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
+            self._runs[segment] = SensorRun(first.rate_hz, noise, method, static_test=static_test, measured_start=True)
+        self.ahead = method in OFFLINE and bool(self._runs)
+
+    def push(self, piece: Recording) -> tuple[Recording, dict[str, Orientation]] | None:
+        """Take a piece; gives a piece and what the filters say of it: this one, or with the smoother the one before."""
+        measured = []
+        for segment in self._runs:
+            sensor = piece.sensors[segment]
+            gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
+            assert gyro_S is not None
+            assert accel_S is not None
+            if sensor.gap is not None:
+                # A long bridge is a guess that no filter may take for measured: lost, its covariance grows over it.
+                # The first window starts the filter and has to be there.
+                lost = sensor.gap.copy()
+                if self._first:
+                    lost[: self._window] = False
+                gyro_S, accel_S = (np.where(lost[:, None], np.nan, values) for values in (gyro_S, accel_S))
+            measured.append((gyro_S, accel_S))
+        self._first = False
+        before, self._held = self._held, piece
+        done = in_parallel(lambda run, of: run.push(*of), self._runs.values(), measured)
+        found = {segment: of for segment, of in zip(self._runs, done, strict=True) if of is not None}
+        if len(found) < len(self._runs):
+            return None
+        of_piece = before if self.ahead else piece
+        assert of_piece is not None
+        return of_piece, found
+
+    def finish(self) -> tuple[Recording, dict[str, Orientation]]:
+        """The smoother's last piece."""
+        assert self._held is not None
+        found = in_parallel(SensorRun.finish, self._runs.values())
+        return self._held, dict(zip(self._runs, found, strict=True))
+
+
 def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> Filtered:
     """Filter every sensor; the start pose, and how still it was.
 
@@ -94,45 +170,45 @@ def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTes
     WeposeError
         A start phase in which there are too few samples; an unknown method.
     """
-    check_method(method)
-    start, still, warnings = _phases(recording)
-    R_VS = {}
-    raw: dict[str, tuple[np.ndarray, np.ndarray, SensorNoise]] = {}
-    for segment, sensor in recording.sensors.items():
-        if not sensor.aligned:
-            warnings += _motion(recording, segment, start, "start")
-        if still != start and not sensor.aligned:
-            warnings += _motion(recording, segment, still, "still")
-        if sensor.quat_WS is not None:
-            R_VS[segment] = Rotation.from_quat(sensor.quat_WS)
-        else:
-            assert sensor.gyro_S is not None
-            assert sensor.accel_S is not None
-            at_rest = recording.span(still)
-            try:
-                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], recording.rate_hz)
-            except WeposeError as error:
-                raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
-            gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
-            if sensor.gap is not None:
-                # A long bridge is a guess that no filter may take for measured: lost, its covariance grows over it.
-                # The first window starts the filter and has to be there.
-                lost = sensor.gap.copy()
-                lost[: (static_test or StaticTest()).samples(recording.rate_hz)] = False
-                gyro_S, accel_S = (np.where(lost[:, None], np.nan, measured) for measured in (gyro_S, accel_S))
-            raw[segment] = gyro_S, accel_S, noise
+    filters = SensorFilters(recording, method=method, static_test=static_test)
+    _, orientation = filters.push(recording) or filters.finish()
+    return filtered_piece(filters, recording, orientation)
 
-    def oriented(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise) -> Orientation:
-        return run_filter(
-            gyro_S, accel_S, recording.rate_hz, noise, method, static_test=static_test, measured_start=True
-        )
 
-    found = in_parallel(oriented, *zip(*raw.values(), strict=True)) if raw else []
-    orientation = dict(zip(raw, found, strict=True))
-    R_VS |= {segment: Rotation.from_quat(of.quat_WS) for segment, of in orientation.items()}
-    R_VS = {segment: R_VS[segment] for segment in recording.sensors}
-    at_start = {segment: R[recording.span(start)].mean() for segment, R in R_VS.items()}
-    return Filtered(R_VS, at_start, orientation, start, still, warnings)
+def filtered_piece(filters: SensorFilters, piece: Recording, orientation: Mapping[str, Orientation]) -> Filtered:
+    """A piece that `filters` gave, if the start pose is in it."""
+    R_VS = _in_sensor_worlds(piece, orientation)
+    at_start = {segment: R[piece.span(filters.start)].mean() for segment, R in R_VS.items()}
+    return Filtered(R_VS, at_start, dict(orientation), filters.start, filters.still, filters.warnings)
+
+
+def _in_sensor_worlds(piece: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:
+    """Segment → n orientations of its sensor, each in a world of its own."""
+    return {
+        segment: Rotation.from_quat(sensor.quat_WS if sensor.quat_WS is not None else orientation[segment].quat_WS)
+        for segment, sensor in piece.sensors.items()
+    }
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How sensors sit on their segments and where their worlds' headings are, from one start pose.
+
+    Parameters
+    ----------
+    mount : segment → R_LS, sensor to segment
+    turn : segment → Rz(ψ), the sensor's world to W
+    heading : segment → ψ [rad]
+    start, still : intervals [s] used for headings, and for noise and bias
+    warnings : what the user should know
+    """
+
+    mount: Mapping[str, Rotation]
+    turn: Mapping[str, Rotation]
+    heading: Mapping[str, float]
+    start: tuple[float, float]
+    still: tuple[float, float]
+    warnings: tuple[str, ...]
 
 
 def segment_orientations(
@@ -153,32 +229,46 @@ def segment_orientations(
     WeposeError
         No mount is known for a sensor; a start phase in which there are too few samples; an unknown method.
     """
-    stated = {segment: nominal_mount(recording, segment, subject) for segment in recording.sensors}
-    missing = [segment for segment, mount in stated.items() if mount is None]
+    need_mounts(recording, subject)
+    found = filtered(recording, method=method, static_test=static_test)
+    return oriented_segments(recording, align(recording, subject, found), found.orientation, subject)
+
+
+def need_mounts(recording: Recording, subject: Subject | None) -> None:
+    """Raises `BadSession` where neither the subject nor the session knows the mount of a sensor."""
+    missing = [segment for segment in recording.sensors if nominal_mount(recording, segment, subject) is None]
     if missing:
         raise BadSession(
             f'{recording.where()}: sensors.{missing[0]}.mount is not known: state it, as in mount = {{ up = "+x", '
             f'forward = "-z" }}, or give a subject with calibrated mounts (`wepose calibrate` finds them)'
         )
-    found = filtered(recording, method=method, static_test=static_test)
-    start, warnings = found.start, found.warnings
-    quat_WL, quat_LS, heading, covariance_W = {}, {}, {}, {}
+
+
+def align(recording: Recording, subject: Subject | None, found: Filtered) -> Alignment:
+    """Mounts and headings; `recording` is that which was filtered, or its piece with the start pose.
+
+    Raises
+    ------
+    BadSession
+        A mount that gravity contradicts.
+    """
+    start, warnings = found.start, list(found.warnings)
+    mount, turn, heading = {}, {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
         # The torso faces x; where it is not among them the most central of the others does.
         facing = min(aligned, key=SEGMENTS.index)
         psi_aligned = heading_to(found.at_start[facing], Rotation.identity())
-    for segment, R_VS in found.R_VS.items():
-        at_start = found.at_start[segment]
+    for segment, at_start in found.at_start.items():
         if recording.sensors[segment].aligned:
-            quat_WL[segment] = (Rotation.from_rotvec([0.0, 0.0, psi_aligned]) * R_VS).as_quat()
-            quat_LS[segment] = Rotation.identity().as_quat()
-            heading[segment] = psi_aligned
+            turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi_aligned])
+            mount[segment], heading[segment] = Rotation.identity(), psi_aligned
             continue
-        R_stated = Rotation.from_quat(stated[segment])
+        stated = nominal_mount(recording, segment, subject)
+        assert stated is not None
+        R_stated = Rotation.from_quat(stated)
         psi = heading_to(at_start, R_stated)
-        turn = Rotation.from_rotvec([0.0, 0.0, psi])
-        R_LS = turn * at_start
+        R_LS = Rotation.from_rotvec([0.0, 0.0, psi]) * at_start
         off = np.degrees((R_LS * R_stated.inv()).magnitude())
         if off > STATED_LIMIT_DEG:
             calibrated = subject is not None and segment in subject.mounts and recording.strapping != "new"
@@ -199,7 +289,6 @@ def segment_orientations(
             both = known[:2, :2] + START_POSE_STD**2 * np.eye(2)
             R_LS = Rotation.from_rotvec(known[:, :2] @ np.linalg.solve(both, misfit)) * R_stated
             psi = heading_to(at_start, R_LS)
-            turn = Rotation.from_rotvec([0.0, 0.0, psi])
             stood = subject.start_tilt.get(segment) if subject is not None else None
             if stood is not None:
                 # Tilt and mount of the calibration come from one start pose: what one is off by, the other is too.
@@ -210,22 +299,35 @@ def segment_orientations(
                     f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "
                     f'pose; strapped on anew? then state strapping = "new"'
                 )
+        mount[segment], heading[segment] = R_LS, psi
+        turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi])
+    return Alignment(mount, turn, heading, start, found.still, tuple(warnings))
+
+
+def oriented_segments(
+    piece: Recording, alignment: Alignment, orientation: Mapping[str, Orientation], subject: Subject | None
+) -> Segments:
+    """A recording's segments, or those of a piece of it, from what its sensors' filters gave."""
+    quat_WL, covariance_W = {}, {}
+    for segment, R_VS in _in_sensor_worlds(piece, orientation).items():
+        turn, R_LS = alignment.turn[segment], alignment.mount[segment]
+        if piece.sensors[segment].aligned:
+            quat_WL[segment] = (turn * R_VS).as_quat()
+            continue
         quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
-        quat_LS[segment] = R_LS.as_quat()
-        heading[segment] = psi
-        ours = found.orientation.get(segment)
+        ours = orientation.get(segment)
         if ours is not None and ours.attitude_cov is not None:
-            covariance_W[segment] = covariance_of(recording, segment, subject, turn * R_VS, R_LS, ours)
+            covariance_W[segment] = covariance_of(piece, segment, subject, turn * R_VS, R_LS, ours)
     return Segments(
-        recording.time,
+        piece.time,
         quat_WL,
-        quat_LS,
-        heading,
-        found.orientation,
+        {segment: R_LS.as_quat() for segment, R_LS in alignment.mount.items()},
+        alignment.heading,
+        orientation,
         covariance_W,
-        start,
-        found.still,
-        tuple(warnings),
+        alignment.start,
+        alignment.still,
+        alignment.warnings,
     )
 
 

@@ -24,6 +24,7 @@ from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of,
 if TYPE_CHECKING:
     from .calibration import Calibration, Verdict
     from .live import Output
+    from .live.robot import Driven, RobotOut
     from .recording import Recording
     from .simulation import Imperfections
     from .subject import Subject
@@ -142,6 +143,7 @@ def track(
     limits: bool = True,
     torques: bool = False,
     report: bool = True,
+    pieces: Annotated[float | None, arg(metavar="SECONDS")] = None,
     force: bool = False,
 ) -> None:
     """Recording to pose: orientations, points, a summary, a page to look at, and a report on how far to trust it.
@@ -164,19 +166,28 @@ def track(
         limits: Let elbows and wrists of one or two axes pass the model's limits.
         torques: Write torques.parquet too, joint torques by the model's inertias and the smoothed motion: estimates.
         report: Leave out report.html (warnings and what to do, noise, drift, hands, joint angles).
+        pieces: Track in pieces of so many seconds, in the same memory however long the recording is, without
+            report.html (docs/long-recordings.md). Files of 500 MB and more always are; 0: not even those.
         force: Replace files of an earlier run.
     """
     given = dict(locals())
     from .filters import BEST
     from .model import load_model
-    from .readers import is_live_log, load_session, read_live_log
+    from .readers import data_bytes, is_live_log, load_session, read_live_log
     from .recording import CONFIGURATION
     from .subject import load_subject, subject_of
+    from .tracking import LARGE
     from .tracking import track as follow
     from .viewer import pose_html
     from .writers import whole_folder, write_result
     from .writers.provenance import made_by, write_made_by
 
+    if pieces is not None and pieces and (causal or torques or is_live_log(session)):
+        what = "--causal" if causal else "--torques" if torques else f"{session}, a recording of wepose live,"
+        raise BadOption(f"--pieces {pieces:g}: {what} is tracked as a whole; leave --pieces out")
+    if pieces or (pieces is None and not causal and not torques and data_bytes(session) >= LARGE):
+        _track_pieces(session, out, subject, model, method or BEST, pieces, gaps, covariance, limits, given)
+        return
     with whole_folder(out, force) as folder, _steps(4 if report else 3) as step:
         step("reading")
         who = load_subject(subject) if subject else None
@@ -214,24 +225,7 @@ def track(
 
             step("writing the report")
             (folder / "report.html").write_text(track_report(pose, view=page), encoding="utf-8")
-    summary = pose.summary()
-    _warn(summary["warnings"])
-    _print_table(
-        f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {by}, "
-        f"lengths: {summary['subject']['note'] or summary['subject']['name']}",
-        ("sensor", "at rest", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
-        [
-            (
-                segment,
-                f"{100 * about['static_share']:.0f} %",
-                f"{_norm(about['gyro_bias_start_deg_s']):.3f} → {_norm(about['gyro_bias_end_deg_s']):.3f}",
-                f"{about['gravity_m_s2']:.3f}",
-            )
-            if "static_share" in about
-            else (segment, "", "orientations from the recording", "")
-            for segment, about in summary["sensors"].items()
-        ],
-    )
+    _tracked_table(pose.summary())
     if report:
         _say(f"Report to look at:  {out / 'report.html'}")
     _say(f"Motion to look at:  {out / 'view.html'}")
@@ -471,6 +465,13 @@ def live(
     port: int = 0,
     udp: Annotated[str | None, arg(metavar="[HOST:]PORT")] = None,
     lsl: Annotated[str | None, arg(metavar="NAME")] = None,
+    robot: Annotated[str | None, arg(metavar="NAME|FILE.urdf")] = None,
+    arm: Literal["left", "right", "both"] | None = None,
+    map: OptionalPath = None,
+    to: Annotated[str | None, arg(metavar="[HOST:]PORT")] = None,
+    robot_hz: float = 100.0,
+    hold_after: float = 0.1,
+    stop_after: float = 1.0,
     force: bool = False,
 ) -> None:
     """The pose while it happens: from a stream to a page in the browser, the terminal, other programs and a file.
@@ -495,22 +496,42 @@ def live(
         port: Of the page, on this machine only; without it any free one.
         udp: Send each pose as JSON to this port, of this machine where no host is named (docs/live-page.md).
         lsl: Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
+        robot: Send commands for this robot (as `wepose retarget`) that follows the person (docs/live-robot.md).
+        arm: Which of the robot's arms; without it all that it has.
+        map: The map of a URDF in --robot, where it does not lie beside it.
+        to: Where the robot's commands go, as JSON; without it port 9002 of this machine.
+        robot_hz: Commands a second.
+        hold_after: Seconds without a pose after which the robot brakes.
+        stop_after: Seconds without a pose after which it stops, until r is pressed.
         force: Replace the file of --record.
     """
     import webbrowser
 
     from .live import open_source, run_session, wearing_of
-    from .live.loop import wearer_model
+    from .live.loop import warm, wearer_model
     from .live.terminal import TerminalView
     from .model import load_model
 
+    for option, value in (("arm", arm), ("map", map), ("to", to)):
+        if value is not None and robot is None:
+            raise BadOption(f"--{option} {value}: goes with --robot, which is not given")
     stated = None if session is None else wearing_of(None, subject, session)
     named = None if stated is None or source.startswith("replay:") else list(stated.mounts)
     stream = open_source(source, sensors=named or None, speed=speed)
     wearing = stated or wearing_of(stream, subject, None)
     body = wearer_model(wearing.subject, load_model(model) if model else None)
     outputs: list[Output] = []
+    follower: RobotOut | None = None
     try:
+        if robot is not None:
+            from .live.robot import Watched, follower_of
+
+            sides = None if arm is None else ("left", "right") if arm == "both" else (arm,)
+            times = {"rate_hz": robot_hz, "hold_after": hold_after, "stop_after": stop_after}
+            if source.startswith("replay:"):
+                times["speed"] = float(speed.replace("max", "inf"))
+            follower, stream = follower_of(robot, stream, wearing, arms=sides, map_file=map, to=to, **times)
+            outputs.append(follower)
         if udp is not None:
             from .live.out import udp_out
 
@@ -524,11 +545,15 @@ def live(
 
             page = LivePage(body, port=port, title=wearing.name)
             page.open()
-            outputs.append(page)
+            outputs.append(Watched(page, follower) if follower else page)
             _say(f"Page: {page.url}  (this machine only)")
             if not no_open and not webbrowser.open(page.url):
                 _warn(["no browser could be started; open the page by hand"])
-        outputs.append(TerminalView())
+        terminal = TerminalView()
+        outputs.append(Watched(terminal, follower) if follower else terminal)
+        if follower is not None:
+            warm(method)  # what is compiled then does not hold up commands
+            follower.open()
         with _asked_to_stop() as asked:
             ended = run_session(
                 stream,
@@ -555,6 +580,8 @@ def live(
             for name, of in ended.counts.items()
         ],
     )
+    if follower is not None:
+        _driven_table(follower.summary())
     if ended.problem:
         _warn([ended.problem])
     if record is not None and not ended.problem:
@@ -680,7 +707,7 @@ def retarget(
             progress=progress,
         )
         step("checking")
-        held = kept(table(trajectory), model.map.urdf, model.map.acceleration)
+        held = kept(table(trajectory), model.map.urdf, model.map.acceleration, model.map.jerk)
         touched = touching(model, trajectory.time, trajectory.u)
         step("writing")
         write_trajectory(folder, trajectory)
@@ -727,12 +754,12 @@ def export(
     """
     given = dict(locals())
     from .writers.export import export as write
-    from .writers.provenance import made_by, write_made_by
+    from .writers.provenance import made_by
 
     with _steps(1) as step:
         step("writing")
-        written = write(result, out, format, names=names, rate_hz=rate_hz, force=force)
-        write_made_by(out, made_by("export", given))
+        block = made_by("export", given)
+        written = write(result, out, format, names=names, rate_hz=rate_hz, force=force, made_by=block)
     _warn(written.notes)
     _say(f"Written: {out}  ({written.format})")
 
@@ -799,6 +826,8 @@ def bench(
     quick: bool = False,
     live: bool = False,
     batch: bool = False,
+    sessions: int | None = None,
+    day: bool = False,
     data: OptionalPath = None,
     save: Annotated[Path | None, arg(metavar="FILE")] = None,
     compare: Annotated[Path | None, arg(metavar="FILE")] = None,
@@ -815,7 +844,10 @@ def bench(
         live: Nothing but a live session: five sensors at 1 kHz, five minutes with a file and five with the page too, of
             which --quick makes half a minute each.
         batch: Nothing but a study of 500 short sessions by wepose batch, on one worker, two, and two of which one is
-            killed; --quick makes it twelve.
+            killed; --quick makes it twelve. Stopped, the same command goes on from there.
+        sessions: Of --batch: so many.
+        day: Nothing but a recording of 24 hours, and shorter ones, tracked in pieces: time, memory, and whether it gives
+            what the whole gives; --quick makes it one hour.
         data: Folder of real recordings (broad/, wepose_hr/) to measure accuracy on; WEPOSE_DATA names one too.
         save: Write the figures there, with versions, machine and date, as JSON.
         compare: A file that --save wrote: then/now shows how much slower each was then, by its ratio to VQF.
@@ -833,10 +865,16 @@ def bench(
         raise ExistingOutput(f"{save}: exists; --force replaces it, --save names another file")
     if save is not None and (save.is_dir() or not save.absolute().parent.is_dir()):
         raise ExistingOutput(f"{save}: not a file that can be written; --save names a JSON file in an existing folder")
+    if sessions is not None and (not batch or sessions < 2):
+        raise BadOption(f"--sessions {sessions}: {'at least 2' if batch else 'goes with --batch'}")
     if batch:
         from .bench.study import study_sections
 
-        todo = study_sections(quick)
+        todo = study_sections(quick, sessions)
+    elif day:
+        from .bench.day import day_sections
+
+        todo = day_sections(quick)
     else:
         todo = live_sections(quick) if live else sections(QUICK if quick else FULL, data)
     tables = {}
@@ -941,7 +979,7 @@ def batch(
     Each item is made by itself: one that fails leaves its error in the table, the others go on. The same command goes
     on where it was stopped and repeats nothing that is done. Sessions and DIR may lie on s3:// (docs/batch.md).
 
-    Exit code: 0 all items are done, 3 some have failed.
+    Exit code: 0 all items are done, 3 some are not.
 
     Example: wepose batch plan.toml -o study
 
@@ -963,12 +1001,13 @@ def batch(
     except KeyboardInterrupt:
         print("wepose: stopped; what is done stays, and the same command goes on from there", file=sys.stderr)
         sys.exit(130)
-    failed = study.table.filter(study.table["status"] == "failed")
+    failed = study.table.filter(study.table["status"] != "done")
     if failed.height:
         counts = failed["error"].value_counts(sort=True).iter_rows()
         causes: list[tuple[str, ...]] = [(cause, str(count)) for cause, count in counts]
-        _print_table("Failed", ("cause", "items"), causes)
-        for item, message in failed.select("item", "message").head(3).iter_rows():
+        _print_table("Not done", ("cause", "items"), causes)
+        first = failed.unique("error", keep="first", maintain_order=True)
+        for item, message in first.select("item", "message").iter_rows():
             _say(f"  {item}: {message}")
     kept = f", {study.kept} of them before" if study.kept else ""
     _say(f"{study.table.height - failed.height} of {study.table.height} items done{kept}")
@@ -986,15 +1025,14 @@ def rerun(result: Result, /) -> None:
     Example: wepose rerun result
 
     Args:
-        result: Folder of wepose track, calibrate, simulate, retarget or demo, an item of wepose batch, or a file of
-            wepose export.
+        result: Folder of wepose track, calibrate, simulate, retarget or demo, a study of wepose batch or an item of it,
+            or a file of wepose export.
     """
+    from .batch.rerun import parts
     from .batch.rerun import rerun as again
 
-    with _steps(1) as step:
-        step("making it again")
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            found = again(result, COMMANDS)
+    with _steps(parts(result)) as step:
+        found = again(result, COMMANDS, step)
     _warn(found.notes)
     if found.differences:
         _say(f"{result}: different, made again by wepose {found.command}:")
@@ -1190,6 +1228,73 @@ def _changed(imperfections: Imperfections, changes: tuple[str, ...]) -> Imperfec
     return imperfections
 
 
+def _tracked_table(summary: Mapping[str, Any]) -> None:
+    """What `track` found of the sensors."""
+    _warn(summary["warnings"])
+    _print_table(
+        f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {summary['method']}, "
+        f"lengths: {summary['subject']['note'] or summary['subject']['name']}",
+        ("sensor", "at rest", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
+        [
+            (
+                segment,
+                f"{100 * about['static_share']:.0f} %",
+                f"{_norm(about['gyro_bias_start_deg_s']):.3f} → {_norm(about['gyro_bias_end_deg_s']):.3f}",
+                f"{about['gravity_m_s2']:.3f}",
+            )
+            if "static_share" in about
+            else (segment, "", "orientations from the recording", "")
+            for segment, about in summary["sensors"].items()
+        ],
+    )
+
+
+def _track_pieces(
+    session: Path,
+    out: Path,
+    subject: Path | None,
+    model: Path | None,
+    method: str,
+    seconds: float | None,
+    gaps: bool,
+    covariance: bool,
+    limits: bool,
+    given: Mapping[str, Any],
+) -> None:
+    """`track` in a memory that does not grow with the recording."""
+    from .model import load_model
+    from .readers.session import SessionReader
+    from .subject import load_subject
+    from .tracking import track_pieces
+    from .viewer import pose_html
+    from .writers import whole_folder
+    from .writers.pieces import PieceWriter
+    from .writers.provenance import made_by
+
+    with whole_folder(out, given["force"]) as folder, _shares() as told:
+        told("reading the times", 0.0)
+        who = load_subject(subject) if subject else None
+        body = load_model(model) if model else None
+        reader = SessionReader(session, gaps=gaps, in_memory=False)
+        writer = PieceWriter(folder, len(reader.time), covariance)
+        for piece in track_pieces(
+            reader, who, seconds=seconds, method=method, model=body, limits=limits, told=told
+        ):
+            writer.add(piece)
+        told("making the page", 1.0)
+        last = writer.tally.last
+        assert last is not None
+        assert last.model is not None
+        pose = writer.finish(reader.phases, made_by("track", given))
+        fps = min(30.0, (len(pose.time) - 1) / float(pose.time[-1] - pose.time[0]))
+        name = last.recording.name if last.recording else ""
+        page = pose_html(last.model, pose, phases=reader.phases, title=name, fps=fps)
+        (folder / "view.html").write_text(page, encoding="utf-8")
+    _tracked_table(writer.tally.summary())
+    _say(f"Motion to look at, {fps:.2g} pictures a second:  {out / 'view.html'}")
+    _say(f"Pose: {out / 'pose.parquet'}  ({len(last.quat_WL)} segments, {len(last.points)} points)")
+
+
 def _track_chain(
     recording: Recording,
     urdf: Path,
@@ -1271,6 +1376,33 @@ def _steps(total: int) -> Iterator[Callable[[str], None]]:
             progress.update(task, description=text, completed=done)
 
         yield step
+        check()
+
+
+@contextlib.contextmanager
+def _shares() -> Iterator[Callable[[str, float], None]]:
+    """A progress bar told what is done and which share of it; none when not on a terminal."""
+
+    def check() -> None:
+        if _stopped:
+            raise KeyboardInterrupt
+
+    if not sys.stderr.isatty():
+        yield lambda *_: check()
+        check()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    parts = TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with Progress(*parts, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=1.0)
+
+        def told(what: str, share: float) -> None:
+            check()
+            progress.update(task, description=what, completed=share)
+
+        yield told
         check()
 
 
@@ -1405,6 +1537,26 @@ def _validation_tables(document: Document) -> None:
     _say("fitted to the truth afterwards.")
 
 
+def _driven_table(driven: Driven) -> None:
+    """What became of a robot that followed."""
+    shares = ", ".join(f"{100.0 * share:.1f} % {state}" for state, share in driven.share.items())
+    _print_table(
+        f"{driven.robot}: {driven.commands} commands, {shares}; each took "
+        f"{1e3 * driven.step.quantile(0.5):.2f} ms (p50), {1e3 * driven.step.quantile(0.99):.2f} ms (p99)"
+        if driven.share
+        else f"{driven.robot}: {driven.commands} commands, none with a pose",
+        ("arm", "hand off its aim [mm]", "in 90 % under"),
+        [
+            (side, *(f"{1e3 * error.quantile(share):.1f}" if error.count else "–" for share in (0.5, 0.9)))
+            for side, error in driven.error.items()
+        ],
+    )
+    if driven.skipped:
+        _warn([f"{driven.skipped} commands were skipped: the machine was too slow for them; --robot-hz asks for fewer"])
+    if driven.dropped:
+        _warn([f"{driven.dropped} commands were not taken by the network or by their receiver"])
+
+
 def _retarget_tables(found: dict[str, Any]) -> None:
     """How well the hands follow, and what the trajectory keeps."""
     rows = []
@@ -1428,7 +1580,7 @@ def _retarget_tables(found: dict[str, Any]) -> None:
     _say(
         f"Limits {'kept' if found['limits_kept'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "
         f"velocity {100 * margins['velocity_share']:.1f} %, "
-        f"acceleration {100 * margins['acceleration_share']:.1f} % to spare"
+        f"acceleration {100 * margins['acceleration_share']:.1f} %, jerk {100 * margins['jerk_share']:.1f} % to spare"
     )
     slow = found["slowest"]
     if slow is not None:

@@ -174,7 +174,12 @@ def _rms(values: np.ndarray) -> float:
 
 
 def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
-    """Errors (n, 3) against their stated covariances (n, 3, 3)."""
+    """Errors (n, 3) against their stated covariances (n, 3, 3); what states none is left out. NaN where all do."""
+    stated = np.isfinite(cov).all(axis=(1, 2))
+    stated[stated] = np.linalg.eigvalsh(cov[stated])[:, 0] > 0.0
+    error, cov = error[stated], cov[stated]
+    if not len(error):
+        return Uncertainty(np.nan, np.nan, np.nan)
     normalised = error / np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     return Uncertainty(
         nees=float(np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0]))),

@@ -18,6 +18,8 @@ from .recording import SEGMENTS
 from .so3 import kernel
 from .subject import LENGTHS
 
+_WILD = 1e12  # beyond this a number in a table is no time [s] and no place [m]
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -47,11 +49,33 @@ class Pose:
 
 def pose_of(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:
     """The pose of `model` with measured segment orientations `quat_WL`, segment → (n, 4) xyzw; see `configuration`."""
-    q = configuration(model, quat_WL, limits=limits)
-    known = [point for point in known_points(quat_WL) if model.pin.existFrame(POINTS[point])]
-    _, p_W = forward_kinematics(model, q, [POINTS[point] for point in known], rotations=False)
-    points = {point: p_W[:, k] for k, point in enumerate(known)}
-    return Pose(time, {name: so3.continuous(quat) for name, quat in quat_WL.items()}, points, q)
+    return Poser(model, quat_WL, limits=limits).pose(time, quat_WL)
+
+
+class Poser:
+    """`pose_of` for what comes in pieces: each begins where the one before ended.
+
+    Raises
+    ------
+    BadData, BadModel
+        As `configuration`.
+    """
+
+    def __init__(self, model: BodyModel, segments: Collection[str], *, limits: bool = True) -> None:
+        if not segments:
+            raise BadData("no segment has an orientation: there is nothing to pose")
+        self._model, self._follower = model, _follower(model, segments, limits)
+        self._points = [point for point in known_points(segments) if model.pin.existFrame(POINTS[point])]
+        self._last: dict[str, np.ndarray] = {}
+
+    def pose(self, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
+        """The next piece: `time` (n,) [s], segment → (n, 4) xyzw."""
+        q = self._follower.run(quat_WL, go_on=True)
+        _, p_W = forward_kinematics(self._model, q, [POINTS[point] for point in self._points], rotations=False)
+        points = {point: p_W[:, k] for k, point in enumerate(self._points)}
+        quats = {name: so3.continuous(quat, self._last.get(name)) for name, quat in quat_WL.items()}
+        self._last = {name: quat[-1].copy() for name, quat in quats.items()}
+        return Pose(time, quats, points, q)
 
 
 def known_points(segments: Iterable[str]) -> list[str]:
@@ -358,6 +382,7 @@ def pose_from_table(table: pl.DataFrame, file: str) -> Pose:
         numbers = {name: table[name].cast(pl.Float64).to_numpy() for name in table.columns}
     except pl.exceptions.PolarsError as error:
         raise BadData(f"{file}: a column holds text: {str(error).splitlines()[0]}") from error
+    _check_numbers(numbers, file)
     quat_WL, points = {}, {}
     for segment in SEGMENTS:
         names = [f"{segment}_{c}" for c in ("qx", "qy", "qz", "qw")]
@@ -384,6 +409,22 @@ def pose_from_table(table: pl.DataFrame, file: str) -> Pose:
         point_cov={name: cov for name, cov in point_cov.items() if cov is not None},
         gap=gap,
     )
+
+
+def _check_numbers(numbers: Mapping[str, np.ndarray], file: str) -> None:
+    """Times that grow, and nothing beyond what a body can do; NaN is what is not known."""
+    time = numbers["time"]
+    if not len(time):
+        raise BadData(f"{file}: no rows; a pose has at least one")
+    if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
+        raise BadData(f"{file}: time does not grow from row to row; seconds that do are needed")
+    for name, values in numbers.items():
+        if name != "time" and not name.startswith((*SEGMENTS, *POINTS)):
+            continue
+        wild = np.abs(values) > _WILD
+        if wild.any():
+            row = int(np.argmax(wild))
+            raise BadData(f"{file}: {name} is {values[row]:g} in row {row + 1}; no pose has such a number")
 
 
 def _covariances(numbers: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:

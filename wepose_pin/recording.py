@@ -184,7 +184,7 @@ def check_time(where: str, time: np.ndarray) -> None:
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
         raise BadData(f"{where}: time: not a finite number in row {bad[0] + 1}; every row needs its time in seconds")
-    back = np.flatnonzero(np.diff(time) <= 0.0)
+    back = np.flatnonzero(time[1:] <= time[:-1])
     if back.size:
         k = int(back[0])
         how = "stands still" if time[k + 1] == time[k] else "goes back"

@@ -134,11 +134,16 @@ def heading(quat_WV: ArrayLike) -> np.ndarray:
     return np.angle(np.exp(2j * np.arctan2(quat[..., 2], quat[..., 3])))
 
 
-def continuous(quat: np.ndarray) -> np.ndarray:
-    """The same rotations (n, 4) with signs chosen such that neighbours lie on one side (for files and plots)."""
+def continuous(quat: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+    """The same rotations (n, 4) with signs chosen such that neighbours lie on one side (for files and plots).
+
+    The first keeps its sign, or takes that of `before` (4,).
+    """
     jumps = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))
-    jumps[jumps == 0.0] = 1.0
-    return quat * np.concatenate([[1.0], np.cumprod(jumps)])[:, None]
+    first = 1.0 if before is None else np.sign(quat[0] @ before)
+    signs = np.concatenate([[first], jumps])
+    signs[signs == 0.0] = 1.0
+    return quat * np.cumprod(signs)[:, None]
 
 
 @kernel

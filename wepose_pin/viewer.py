@@ -30,6 +30,7 @@ FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips
 GRID_CELL = 0.25  # [m]
 GRID_RADIUS = 3.0  # [m] where the grid has faded away
 CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
+_SPARSE = 30  # frames a sample, on average, from which on all samples are frames
 FIELD_OF_VIEW_DEG = 28.0  # a long lens: near hands do not look larger than they are
 LIGHTS = (  # meshcat's own; positions in W [m]
     ("AmbientLight", 0.66, None),
@@ -239,6 +240,8 @@ def _lighter(visual: Visual) -> Visual:
 
 def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
     """(m,) int, rising: the samples nearest to a clock of `fps` a second, with the first and the last."""
+    if (time[-1] - time[0]) * fps > _SPARSE * len(time):  # a leap in time: the clock would tick without end
+        return np.arange(len(time))
     clock = np.append(np.arange(time[0], time[-1], 1.0 / fps), time[-1])
     nearest_changes = 0.5 * (time[:-1] + time[1:])
     return np.unique(np.searchsorted(nearest_changes, clock))

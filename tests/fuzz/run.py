@@ -1,78 +1,217 @@
 """Coverage-guided fuzzing of all that is parsed, by atheris: ``python tests/fuzz/run.py [TARGET …] --seconds 60``.
 
-Each target runs in a process of its own, from the seeds and what earlier runs came upon (``.fuzz/corpus``). A finding
-is kept in ``.fuzz/found``, and the exit code is 1. With ``--runs`` and ``--seed`` a run is the same every time.
+Each target runs in a process of its own, from the seeds and what earlier runs came upon (``.fuzz/corpus``), and goes on
+after a finding; the input of each different one is kept in ``.fuzz/found``, and the exit code is 1. With ``--runs`` and
+``--seed`` a run is the same every time. The table says of each target how many inputs were tried, how many different
+findings there were, the edges and features that libFuzzer counts over all of wepose, and how many lines of functions of
+the target's own module the corpus has reached (what numba compiles is not seen).
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import hashlib
+import importlib
 import re
 import subprocess
 import sys
 import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Iterator
 from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
-WATCHED = (
-    "readers",
-    "model",
-    "subject",
-    "errors",
-    "live.sources",
-    "calibration.protocols",
-    "retargeting.maps",
-    "writers.result",
-)
-# numba compiles these, and cannot what atheris makes of them.
-NOT_WATCHED = ("so3", "static", "pose", "filters", "tracking", "readers.arrivals", "retargeting.limits")
 LONGEST = 1 << 16  # [bytes] of an input
 MEMORY_MB, SECONDS_EACH = 2048, 20
+MOST_FOUND = 10  # different findings of a target; then it ends
 ALL = "all"  # one process, the first byte says which target
+REPLAYED = 400  # inputs of a corpus, the smallest, by which lines are counted
+HEADER = f"{'target':<12} {'inputs':>8} {'found':>5} {'edges':>6} {'features':>8}   lines of its module"
 
 
-def fuzz(name: str, arguments: list[str]) -> None:
-    """Fuzz one target, or all by turns, in this process; never returns."""
+def compiled_modules() -> list[str]:
+    """Modules with functions that numba compiles, and cannot once atheris has changed them."""
+    files = (
+        path
+        for path in (ROOT / "wepose_pin").rglob("*.py")
+        if re.search(r"^@?\w*(kernel|compiled|inlined)\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+    )
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in files]
+
+
+def fuzz(name: str, arguments: list[str], found: str, base: Path) -> None:
+    """Fuzz one target, or all by turns, in this process; never returns. Files of findings begin with `found`.
+
+    `base` is an empty folder to work in, which libFuzzer leaves as it ends.
+    """
     import atheris
+    from fuzz.target import try_one
 
-    with atheris.instrument_imports(
-        include=[f"wepose_pin.{room}" for room in WATCHED] + ["tomllib"],
-        exclude=[f"wepose_pin.{room}" for room in NOT_WATCHED],
-    ):
-        import wepose_pin.calibration.protocols
-        import wepose_pin.live.sources.lsl
-        import wepose_pin.live.sources.packets
-        import wepose_pin.live.sources.xbus
-        import wepose_pin.model.robot
-        import wepose_pin.readers.describe
-        import wepose_pin.retargeting.maps
-        import wepose_pin.writers.result  # noqa: F401
-    from fuzz.targets import TARGETS, try_one
+    with atheris.instrument_imports(include=["wepose_pin", "tomllib"], exclude=compiled_modules()):
+        from fuzz.targets import TARGETS
 
-    targets = [target for target in TARGETS if name in (ALL, target.name)]
-    with tempfile.TemporaryDirectory(prefix="wepose-fuzz-") as made:
-        base = Path(made)
-        corpus, words, work = base / "seeds", base / "words", base / "work"
-        corpus.mkdir()
-        work.mkdir()
-        for i, target in enumerate(targets):
-            (work / target.name).mkdir()
-            for k, seed in enumerate(target.seeds()):
-                try_one(target, work / target.name, seed)  # what numba compiles it compiles before the clock runs
-                (corpus / f"{target.name}-{k}").write_bytes((bytes([i]) if name == ALL else b"") + seed)
-        listed = {word for target in targets for word in target.words if len(word) < 128}
-        words.write_text("".join('"' + "".join(f"\\x{b:02x}" for b in word) + '"\n' for word in sorted(listed)))
+        targets = [target for target in TARGETS if name in (ALL, target.name)]
+        for target in targets:
+            importlib.import_module(f"wepose_pin.{target.module}")
+    seen: set[str] = set()
+    corpus, words, work = base / "seeds", base / "words", base / "work"
+    corpus.mkdir()
+    work.mkdir()
+    for i, target in enumerate(targets):
+        (work / target.name).mkdir()
+        for k, seed in enumerate(target.seeds()):
+            try_one(target, work / target.name, seed)  # what numba compiles it compiles before the clock runs
+            (corpus / f"{target.name}-{k}").write_bytes((bytes([i]) if name == ALL else b"") + seed)
+    listed = {word for target in targets for word in target.words if len(word) < 128}
+    words.write_text("".join('"' + "".join(f"\\x{b:02x}" for b in word) + '"\n' for word in sorted(listed)))
 
-        def one(data: bytes) -> None:
-            target = targets[0]
-            if name == ALL:
-                target, data = targets[data[0] % len(targets)] if data else target, data[1:]
+    def one(data: bytes) -> None:
+        target, whole = targets[0], data
+        if name == ALL:
+            target, data = targets[data[0] % len(targets)] if data else target, data[1:]
+        try:
             try_one(target, work / target.name, data)
+        except Exception as error:
+            key = _where(error)
+            if key not in seen:
+                seen.add(key)
+                file = Path(f"{found}{hashlib.sha256(key.encode()).hexdigest()[:12]}")
+                file.write_bytes(whole)
+                print(f"FOUND {key}\n{file}", file=sys.stderr, flush=True)
+            if len(seen) >= MOST_FOUND:
+                raise
 
-        # Seeds that were given first are where new inputs are kept.
-        atheris.Setup(["fuzz", *arguments, *([f"-dict={words}"] if listed else []), str(corpus)], one)
-        atheris.Fuzz()
+    # Seeds that were given first are where new inputs are kept.
+    atheris.Setup(["fuzz", *arguments, *([f"-dict={words}"] if listed else []), str(corpus)], one)
+    atheris.Fuzz()
+
+
+def _where(error: BaseException) -> str:
+    """What tells findings apart: the kind of error, and the innermost lines of wepose on its way."""
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if "wepose_pin" in frame.filename]
+    places = [f"{Path(frame.filename).name}:{frame.lineno}" for frame in own[-2:]]
+    return f"{type(error).__name__} {' '.join(str(error).split())[:160] if not own else ''}{' > '.join(places)}".strip()
+
+
+# Lines -------------------------------------------------------------------------------------------------------------
+
+
+def lines(name: str, corpus: Path) -> tuple[int, int]:
+    """Lines in functions of the target's module that its corpus reaches, and how many there are."""
+    from fuzz.target import try_one
+    from fuzz.targets import TARGETS
+
+    target = next(target for target in TARGETS if target.name == name)
+    module = importlib.import_module(f"wepose_pin.{target.module}")
+    assert module.__file__ is not None
+    code = compile(Path(module.__file__).read_text(encoding="utf-8"), module.__file__, "exec")
+    there = {line for function in _functions(code) for line in _lines_of(function)}
+    reached: set[int] = set()
+
+    def trace(frame: FrameType, event: str, _: Any) -> Any:
+        if frame.f_code.co_filename != module.__file__:
+            return None
+        if event == "line":
+            reached.add(frame.f_lineno)
+        return trace
+
+    inputs = sorted(corpus.iterdir(), key=lambda path: path.stat().st_size)[:REPLAYED]
+    with tempfile.TemporaryDirectory(prefix="wepose-fuzz-") as made:
+        threading.settrace(trace)
+        try:
+            for data in [*target.seeds(), *(path.read_bytes() for path in inputs)]:
+                sys.settrace(trace)  # anew: a RecursionError in `trace` itself takes it off
+                with contextlib.suppress(Exception):
+                    try_one(target, Path(made), data)
+        finally:
+            sys.settrace(None)
+            threading.settrace(None)  # type: ignore[arg-type]
+    return len(reached & there), len(there)
+
+
+def _functions(code: CodeType) -> Iterator[CodeType]:
+    """Functions and methods of a module, and what is in them; not what runs as it is imported."""
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            if inner.co_flags & 0x2:  # CO_NEWLOCALS: a function, not a class's body
+                yield inner
+            yield from _functions(inner)
+
+
+def _lines_of(code: CodeType) -> set[int]:
+    return {line for _, _, line in code.co_lines() if line is not None and line != code.co_firstlineno}
+
+
+# From the command line ---------------------------------------------------------------------------------------------
+
+
+def run(name: str, options: argparse.Namespace) -> int:
+    """One target, begun again where an input ends the whole process, and its row of the table; how much it found."""
+    corpus, found = options.out / "corpus" / name, options.out / "found"
+    corpus.mkdir(parents=True, exist_ok=True)
+    found.mkdir(exist_ok=True)
+    begin = f"import sys; sys.path[:0] = {sys.path[:2]!r}; from fuzz import run"
+    inputs = edges = features = died = 0
+    notes: list[str] = []
+    until = time.monotonic() + options.seconds
+    while True:
+        left = max(1, round(until - time.monotonic()))
+        limits = [
+            f"-max_total_time={left}",
+            f"-runs={options.runs}",
+            f"-seed={options.seed + died if options.seed else 0}",
+        ]
+        limits += [f"-max_len={LONGEST}", f"-rss_limit_mb={MEMORY_MB}", f"-timeout={SECONDS_EACH}"]
+        limits += [f"-artifact_prefix={found}/{name}-", "-len_control=20"]
+        with tempfile.TemporaryDirectory(prefix="wepose-fuzz-") as base:
+            code = (
+                f"{begin}; run.fuzz({name!r}, {[*limits, str(corpus)]!r}, {f'{found}/{name}-'!r}, run.Path({base!r}))"
+            )
+            ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, errors="replace")
+        tried = re.findall(r"^#(\d+)\s.*cov: (\d+) ft: (\d+)", ended.stderr, re.MULTILINE)
+        done = re.findall(r"^(?:#|Done )(\d+)", ended.stderr, re.MULTILINE)
+        inputs += int(done[-1]) if done else 0
+        edges, features = (
+            max(old, int(new)) for old, new in zip((edges, features), tried[-1][1:] if tried else (0, 0), strict=True)
+        )
+        notes += re.findall(r"^FOUND (.*)", ended.stderr, re.MULTILINE)
+        if not ended.returncode:
+            break
+        died += 1
+        said = [
+            line
+            for line in (ended.stdout + ended.stderr).splitlines()
+            if line.strip() and not line.startswith(("#", "INFO"))
+        ]
+        notes.append("the process ended: " + "\n    ".join(said[-12:]))
+        if not tried or died >= MOST_FOUND or time.monotonic() > until - 2:
+            break
+    notes = list(dict.fromkeys(notes))
+    text = ""
+    if name != ALL and not (inputs == 0 and died):
+        code = f"{begin}; print(*run.lines({name!r}, run.Path({str(corpus)!r})))"
+        counted = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, errors="replace")
+        if counted.returncode == 0:
+            hit, there = map(int, counted.stdout.split()[-2:])
+            text = f"{hit:>4} of {there:<4} {_module(name)}"
+        else:
+            text = f"not counted: {counted.stderr.splitlines()[-1]}"
+    print(f"{name:<12} {inputs:>8} {len(notes):>5} {edges:>6} {features:>8}   {text}".rstrip(), flush=True)
+    for note in notes:
+        print(f"    {note}", flush=True)
+    return len(notes)
+
+
+def _module(name: str) -> str:
+    from fuzz.targets import TARGETS
+
+    return next(target.module for target in TARGETS if target.name == name)
 
 
 def main() -> int:
@@ -90,27 +229,8 @@ def main() -> int:
     unknown = [name for name in options.targets if name not in (*known, ALL)]
     if unknown:
         parser.error(f"'{unknown[0]}' is no target; there is: {', '.join(known)}")
-    failed = 0
-    for name in options.targets:
-        corpus, found = options.out / "corpus" / name, options.out / "found"
-        corpus.mkdir(parents=True, exist_ok=True)
-        found.mkdir(exist_ok=True)
-        limits = [f"-max_total_time={options.seconds}", f"-runs={options.runs}", f"-seed={options.seed}"]
-        limits += [f"-max_len={LONGEST}", f"-rss_limit_mb={MEMORY_MB}", f"-timeout={SECONDS_EACH}"]
-        limits += [f"-artifact_prefix={found}/{name}-", "-len_control=20"]
-        begin = f"import sys; sys.path[:0] = {sys.path[:2]!r}; from fuzz.run import fuzz"
-        code = f"{begin}; fuzz({name!r}, {[*limits, str(corpus)]!r})"
-        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, errors="replace")
-        tried = re.findall(r"^#(\d+)\s.*cov: (\d+)", run.stderr, re.MULTILINE)
-        inputs, edges = tried[-1] if tried else ("0", "0")
-        print(
-            f"{name:<12} {inputs:>9} inputs  {edges:>6} edges  {'FOUND' if run.returncode else 'none found'}",
-            flush=True,
-        )
-        if run.returncode:
-            failed = 1
-            print("\n".join([*run.stdout.splitlines()[-30:], *run.stderr.splitlines()[-12:]]), flush=True)
-    return failed
+    print(HEADER, flush=True)
+    return 1 if sum([run(name, options) for name in options.targets]) else 0
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import struct
@@ -55,6 +56,37 @@ URDF = """<?xml version="1.0"?>
 <joint name="elbow" type="continuous"><parent link="upper"/><child link="tool"/><axis xyz="0 0 1"/>
 <mimic joint="shoulder" multiplier="1" offset="0"/></joint></robot>
 """
+# An arm as retargeting takes it, of three joints, and its map.
+ARM = """<robot name="arm">
+<link name="base"><collision><geometry><box size="0.2 0.3 0.6"/></geometry></collision></link>
+<link name="upper"><collision><origin xyz="0 0 -0.15"/><geometry><cylinder radius="0.03" length="0.2"/></geometry>
+</collision></link>
+<link name="fore"><collision><origin xyz="0 0 -0.15"/><geometry><sphere radius="0.04"/></geometry></collision></link>
+<link name="hand"/>
+<joint name="j1" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 -0.4 0"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" velocity="3" effort="9"/></joint>
+<joint name="j2" type="continuous"><parent link="upper"/><child link="fore"/><origin xyz="0 0 -0.3"/>
+<axis xyz="0 1 0"/><limit velocity="3" effort="9"/></joint>
+<joint name="j3" type="revolute"><parent link="fore"/><child link="hand"/><origin xyz="0 0 -0.3"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" velocity="3" effort="9"/><mimic joint="j1" multiplier="0.5"/></joint></robot>
+"""
+ARM_MAP = b"""format = 1
+urdf = "arm.urdf"
+base = "base"
+up = "+z"
+forward = "+x"
+[rest]
+j1 = 0.1
+[limits.acceleration]
+j1 = 9.0
+j2 = 9.0
+[arms.right]
+joints = ["j1", "j2", "j3"]
+shoulder = { link = "upper" }
+elbow = { link = "fore" }
+hand = { link = "hand", at = [0.0, 0.0, -0.1], fingers = "-z", thumb = "+x" }
+"""
+SRDF = b"""<robot name="arm"><disable_collisions link1="base" link2="upper" reason="Adjacent"/></robot>"""
 
 
 def table() -> pl.DataFrame:
@@ -219,3 +251,159 @@ def subject() -> bytes:
 def shipped(*names: str) -> list[bytes]:
     """Files of ours, as they are."""
     return [Path(asset(*name.split("/", 1))).read_bytes() for name in names]
+
+
+# What wepose wrote --------------------------------------------------------------------------------------------------
+
+PLAN = b"""name = "study"
+[sessions]
+files = ["*/session.toml"]
+[subjects.anna]
+file = "anna.toml"
+stature = 1.7
+sex = "f"
+gauge = { shoulder_width = 0.385 }
+[steps.calibrate]
+protocol = "clasp"
+method = "amekf"
+[steps.track]
+covariance = true
+[steps.retarget]
+robot = "panda"
+rate_hz = 50.0
+arm = "left"
+[steps.export]
+formats = ["trc", "mot"]
+[steps.evaluate]
+interval = [1.0, 2.0]
+"""
+PLAN_TABLE = b"""session,name,subject,truth,stature,sex,gauge.shoulder_width
+one,first,anna,truth.parquet,1.7,f,0.385
+two,second,,,,,
+"""
+
+
+def made_by() -> bytes:
+    block = {
+        **{"format": 1, "command": "track", "version": "0.1.0", "commit": None, "code": "0", "machine": "a"},
+        "options": {"method": None, "causal": False, "subject": None, "limits": True},
+        "inputs": {"session": {"path": "FOLDER/session.toml", "files": {"session.toml": session_hash()}}},
+        "packages": {"numpy": "1"},
+    }
+    return json.dumps(block, indent=1).encode()
+
+
+def done() -> bytes:
+    body = {"stature": 1.7, "sex": "f", "gauge": {"shoulder_width": 0.385}}
+    options = {"name": "item", "subject": None, "body": body, "steps": {"track": {"method": "amekf"}}}
+    files = {"path": "FOLDER/session.toml", "files": {"session.toml": session_hash()}}
+    block = {"format": 1, "command": "batch item", "options": options, "inputs": {"session": files}}
+    return json.dumps({"key": "", "made_by": block, "stamps": {"session": {}}, "row": {"item": "item"}}).encode()
+
+
+def session_hash() -> str:
+    return hashlib.sha256(SESSION.encode()).hexdigest()
+
+
+def validation() -> bytes:
+    from wepose_pin.validation import Result, document_text
+
+    dynamic = {"roll": [1.1, 0.5], "pitch": [1.2, 0.5], "yaw": [1.3, 0.5], "total_rmse": 2.0}
+    hand = {key: {"mean": 17.0, "std": 2.0, "rmse": 18.0} for key in ("hand_mm", "hand_from_shoulders_mm")}
+    series = {"time": [0.0, 1.0], "error_mm": [1.0, 2.0]}
+    results = [Result("dynamic 100 Hz", "0", method, dynamic) for method in ("ncf", "gdc", "smekf")]
+    results += [Result("upper body, MTi-3 noise alone", "0", method, hand, series) for method in ("ncf", "smekf")]
+    board = {"inclination_rmse": 0.6, "heading_rmse": 2.0, "total_rmse": 2.5}
+    results += [Result("BROAD", trial, method, board) for trial in "12" for method in ("amekf", "smekf")]
+    return document_text(results, True, {"wepose-pin": "0.1.0"}).encode()
+
+
+def bench() -> bytes:
+    rows = {"amekf": {"us": 1.5, "by": 2}, "vqf": {"us": 1.0}}
+    sections = {"speed": {"title": "a", "rows": rows}}
+    return json.dumps({"format": 1, "date": "2024-01-01", "sections": sections}).encode()
+
+
+def broad(compressed: bool) -> bytes:
+    n = 12
+    out = io.BytesIO()
+    moving = np.arange(n) > 8
+    content = {"imu_gyr": GYRO, "imu_acc": ACCEL, "opt_quat": QUAT[:, [3, 0, 1, 2]], "movement": moving[:, None]}
+    savemat(out, {**content, "sampling_rate": 2.0}, do_compression=compressed)
+    return out.getvalue()
+
+
+def authors() -> bytes:
+    still = [0, 0, 0, 1, 0, 0, 0]
+    lines = [[10 * k, *GYRO[k], *ACCEL[k], *still, *QUAT[k], 1, 2, 3] for k in range(N)]
+    return "".join(" ".join(f"{v:.6f}" for v in line) + " ; \n" for line in lines).encode()
+
+
+def ring() -> bytes:
+    columns: dict[str, np.ndarray] = {}
+    for k, marker in enumerate((2, 2, 1, 2, 4), 1):
+        columns |= {f"seg{k}_quat_{axis}": QUAT[:, j] for axis, j in zip("wxyz", (3, 0, 1, 2), strict=True)}
+        columns |= {f"seg{k}_marker{marker}_{axis}": TIME for axis in "xyz"}
+        columns |= {f"seg{k}_gyr_{axis}": GYRO[:, j] for j, axis in enumerate("xyz")}
+        columns |= {f"seg{k}_acc_{axis}": ACCEL[:, j] for j, axis in enumerate("xyz")}
+    return b"# sampling frequency: 40\n" + pl.DataFrame(columns).head(4).write_csv().encode()
+
+
+def ur5() -> bytes:
+    columns = {f"gyr_{axis}": GYRO[:, j] for j, axis in enumerate("xyz")}
+    columns |= {f"acc_{axis}": ACCEL[:, j] for j, axis in enumerate("xyz")} | {"TIME": 1e6 * TIME}
+    columns |= {f"QUATERNION_{k}": QUAT[:, j] for k, j in enumerate((3, 0, 1, 2))}
+    return pl.DataFrame(columns).write_csv().encode()
+
+
+def pose_csv() -> bytes:
+    """A whole body's pose: both arms, as `wepose track` writes it."""
+    segments = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+    points = [f"{side}_{point}" for side in ("left", "right") for point in ("shoulder", "elbow", "wrist", "hand")]
+    columns: dict[str, np.ndarray] = {"time": TIME}
+    for segment in segments:
+        columns |= {f"{segment}_q{axis}": QUAT[:, j] for j, axis in enumerate("xyzw")}
+        columns[f"{segment}_std"] = np.full(N, 0.01)
+    for point in points:
+        columns |= {f"{point}_{axis}": TIME for axis in "xyz"} | {f"{point}_std": np.full(N, 0.01)}
+    return pl.DataFrame(columns).head(4).write_csv().encode()
+
+
+# What comes over a line --------------------------------------------------------------------------------------------
+
+
+def device() -> list[bytes]:
+    """An MTi that is set up at 100 Hz, then sends; and one that is left as it is. Answers are apart by empty lines."""
+    plain = xbus.output_items(100, False)
+    answers = (xbus.GO_TO_CONFIG, b""), (xbus.SET_OUTPUT, plain), (xbus.GO_TO_MEASUREMENT, b"")
+    set_up = [xbus.frame(mid + 1, data) for mid, data in answers]
+    return [b"\x00" + b"\n\n".join([b"", *set_up, serial()]), b"\x80" + b"\n\n".join([serial(), b"", serial()])]
+
+
+def lsl_rows() -> bytes:
+    return np.hstack([TIME[:, None], GYRO, ACCEL]).astype("<f8").tobytes()
+
+
+def wild() -> bytes:
+    """Samples of two sensors that go on where the still ones end."""
+    from .streams import SAMPLE as ROW
+
+    rows = np.zeros(8, ROW)
+    rows["which"], rows["time"] = np.arange(8) % 2, 1.51 + 0.01 * (np.arange(8) // 2)
+    rows["accel"][:, 2] = 9.8
+    return rows.tobytes()
+
+
+def requests() -> list[bytes]:
+    """A browser's: the page, and the stream with a key pressed."""
+    get = b"GET / HTTP/1.1\r\nHost: localhost:80\r\nAccept: text/html\r\nConnection: close\r\n\r\n"
+    upgrade = (
+        b"GET /stream HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://127.0.0.1\r\nUpgrade: websocket\r\n"
+        b"Connection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+    )
+    return [get, upgrade + b"".join(_masked(word) for word in (b"key r", b"taken", b"key q"))]
+
+
+def _masked(text: bytes) -> bytes:
+    """A WebSocket frame of text from a client, whose mask is zero."""
+    return b"\x81" + bytes([0x80 | len(text)]) + bytes(4) + text

@@ -2,66 +2,41 @@
 
 from __future__ import annotations
 
-import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
-from wepose_pin.errors import WeposeError
+from . import records, seeds, streams
+from .target import NotOneLine, Target, file, try_one
 
-from . import seeds
-
-
-class Target(NamedTuple):
-    """One reader.
-
-    Parameters
-    ----------
-    seeds : well-formed inputs
-    run : takes a folder and an input; raises `WeposeError` on what it does not take
-    words : what inputs are made of, for a fuzzer that knows nothing of the format
-    """
-
-    name: str
-    seeds: Callable[[], list[bytes]]
-    run: Callable[[Path, bytes], object]
-    words: tuple[bytes, ...] = ()
+__all__ = ["NUMBERS", "TARGETS", "NotOneLine", "Target", "try_one"]
 
 
-class NotOneLine(AssertionError):
-    """An error's text that is no line for a user."""
+KINDS = (".csv", ".txt", ".sto", ".mvnx", ".xml", ".mat", ".h5", ".parquet", ".toml", ".wepose")
 
 
-def try_one(target: Target, folder: Path, data: bytes) -> WeposeError | None:
-    """Give the input to the target: what it was refused for, None if it was taken; all else is a finding and raised."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            target.run(folder, data)
-        except WeposeError as error:
-            text = str(error)
-            if not text or not text.isprintable() or len(text) > 4000:
-                raise NotOneLine(repr(text)[:400]) from error
-            return error
-    return None
-
-
-def file(name: str, read: Callable[[Path], object]) -> Callable[[Path, bytes], object]:
-    """The target that reads the input as a file of this name."""
-
-    def run(folder: Path, data: bytes) -> object:
-        path = folder / name
-        path.write_bytes(data)
-        return read(path)
-
-    return run
-
-
-def _described(path: Path) -> object:
+def _described(folder: Path, data: bytes) -> object:
+    """The first byte says what the file's name ends with."""
     from wepose_pin.readers.describe import describe
 
-    return describe(path)
+    path = folder / f"a{KINDS[data[0] % len(KINDS) if data else 0]}"
+    path.write_bytes(data[1:])
+    try:
+        return describe(path)
+    finally:
+        path.unlink()  # what lies beside a file is looked at too
+
+
+def _described_seeds() -> list[bytes]:
+    """One of each kind."""
+    of = {
+        ".csv": [seeds.csv(), *seeds.dot(), *seeds.ximu3()],
+        ".txt": seeds.mt_manager(),
+        **{".sto": [seeds.opensim()], ".mvnx": [seeds.mvnx(True)], ".xml": [seeds.mvnx(False)]},
+        **{".mat": [seeds.mat(True)], ".h5": [seeds.hdf5()], ".parquet": [seeds.parquet(), seeds.pose()]},
+        ".toml": [seeds.subject()],
+    }
+    return [bytes([KINDS.index(kind)]) + text for kind, texts in of.items() for text in texts]
 
 
 def _session(data_file: str, session: str) -> Callable[[Path, bytes], object]:
@@ -95,6 +70,8 @@ def _session_text(folder: Path, data: bytes) -> object:
 def _pieces(path: Path) -> object:
     from wepose_pin.readers import iter_session
 
+    if path.read_bytes()[:4] == b"PAR1":
+        path = path.replace(path.with_suffix(".parquet"))
     (path.parent / "session.toml").write_text(TABLE.replace("arm.csv", path.name), encoding="utf-8")
     return list(iter_session(path.parent / "session.toml", 0.05))
 
@@ -120,6 +97,27 @@ def _robot_map(path: Path) -> object:
     return read_map(path)
 
 
+def _wearing(path: Path) -> object:
+    from wepose_pin.live.wearing import read_wearing
+
+    return read_wearing(path)
+
+
+def _retargeted(path: Path) -> object:
+    """The input is the URDF of an arm whose map is well."""
+    from wepose_pin.retargeting import find_map, load
+    from wepose_pin.retargeting.collision import Shapes
+
+    (path.parent / "arm.toml").write_bytes(seeds.ARM_MAP)
+    return Shapes(load(find_map(str(path))))
+
+
+def _srdf(path: Path) -> object:
+    from wepose_pin.retargeting.collision import _excused
+
+    return _excused(path)
+
+
 def _protocol(path: Path) -> object:
     from wepose_pin.calibration.protocols import load_protocol
 
@@ -136,45 +134,6 @@ def _robot(path: Path) -> object:
     from wepose_pin.model.robot import load_robot
 
     return load_robot(path)
-
-
-def _datagram(_folder: Path, data: bytes) -> object:
-    import numpy as np
-
-    from wepose_pin.live.sources.clocks import HostClock
-    from wepose_pin.live.sources.packets import decode
-
-    batches, problems = decode(data)
-    if not all(problem.isprintable() for problem in problems):
-        raise NotOneLine(repr(problems)[:400])
-    for batch in batches:
-        assert batch.values.shape == (len(batch.time), 6)
-        if np.abs(batch.time).max() < 1e10:  # as UdpSource takes them
-            HostClock().to_host(batch.time, 100.0)
-    return batches
-
-
-def _serial(_folder: Path, data: bytes) -> object:
-    from wepose_pin.live.sources import xbus
-
-    stream, joiner = xbus.Frames(), xbus.Joiner()
-    half = len(data) // 2
-    for frame in stream.feed(data[:half]) + stream.feed(data[half:]):
-        xbus.granted(frame.data)
-        xbus.error_words(frame.data)
-        try:
-            joiner.add(xbus.packet(frame.data))
-        except xbus.Malformed:
-            continue
-    return joiner.take()
-
-
-def _streams(_folder: Path, data: bytes) -> object:
-    from wepose_pin.live.sources.lsl import layout
-
-    stream, *rest = data.decode("utf-8", errors="replace").split("\n")
-    labels, units = rest[::2], rest[1::2]
-    return layout(stream, "imu", labels, units, len(labels))
 
 
 def _live(path: Path) -> object:
@@ -258,6 +217,12 @@ XML = (
 )  # fmt: skip
 JSON = (*NUMBERS, b"NaN", b"-Infinity", b"[" * 2000, b"null", b'"\\ud800"', b"{", b"}", b"[", b"]", b":", b"true")
 
+HTTP = (
+    b"Host: ", b"Origin: ", b"Upgrade: websocket", b"Content-Length: ", b"Transfer-Encoding: chunked", b"\r\n", b"\0",
+    b"GET /stream", b"POST /", b"HEAD /", b"OPTIONS *", b"HTTP/1.0", b"%00", b"[::1]", b"evil.example", b"\x81\xfe",
+    b"\x88\x80", b"\x89\x80", b"\xc1\x80", b"key r", b"taken", b"Sec-WebSocket-Extensions: permessage-deflate",
+)  # fmt: skip
+
 SMALL_TABLE = b"""urdf = "upper_body.urdf"
 up = "+z"
 forward = "+x"
@@ -273,9 +238,7 @@ right_wrist = { link = "right_hand", at = [0.0, 0.0, 0.0] }
 """
 LSL = b"imu-torso\n" + b"".join(b"gyr_%s\nrad/s\n" % a for a in (b"x", b"y", b"z")) + b"acc_x\ng\nacc_y\ng\nacc_z\ng"
 SUMMARY = b'{"recording": "a", "sensors": {"torso": {}}, "points": ["left_hand"], "warnings": ["b"]}'
-_ROBOTS = ("urdf/robots/ur5.toml", "urdf/robots/baxter.toml")
 _PROTOCOLS = ("calibration/clasp.toml", "calibration/poses.toml", "calibration/handle.toml")
-_TEXTS = (seeds.mt_manager, seeds.dot, seeds.ximu3)
 
 
 def _device(name: str, format: str) -> Callable[[Path, bytes], object]:
@@ -283,28 +246,59 @@ def _device(name: str, format: str) -> Callable[[Path, bytes], object]:
 
 
 TARGETS = (
-    Target("csv", lambda: [seeds.csv()], _session("arm.csv", TABLE), LINES),
-    Target("pieces", lambda: [seeds.csv()], file("arm.csv", _pieces), LINES),
-    Target("parquet", lambda: [seeds.parquet()], _session("arm.parquet", TABLE.replace("csv", "parquet"))),
-    Target("mat", lambda: [seeds.mat(False), seeds.mat(True)], _session("arm.mat", ARRAYS.format("arm.mat"))),
-    Target("hdf5", lambda: [seeds.hdf5()], _session("arm.h5", ARRAYS.format("arm.h5"))),
-    Target("mvnx", lambda: [seeds.mvnx(True), seeds.mvnx(False)], _device("a.mvnx", "mvnx"), XML),
-    Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES),
-    Target("dot", seeds.dot, _device("a.csv", "dot"), LINES),
-    Target("ximu3", seeds.ximu3, _device("Inertial.csv", "ximu3"), LINES),
-    Target("opensim", lambda: [seeds.opensim()], _device("a.sto", "opensim"), LINES),
-    Target("info", lambda: [seeds.csv(), *(t for of in _TEXTS for t in of())], file("a.csv", _described), LINES),
-    Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML),
-    Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML),
-    Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML),
-    Target("robot_map", lambda: seeds.shipped(*_ROBOTS), file("map.toml", _robot_map), TOML),
-    Target("protocol", lambda: seeds.shipped(*_PROTOCOLS), file("own.toml", _protocol), TOML),
-    Target("body", lambda: seeds.shipped("urdf/upper_body.urdf"), file("body.urdf", _body), XML),
-    Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML),
-    Target("udp", seeds.datagrams, _datagram, JSON),
-    Target("xbus", lambda: [seeds.serial()], _serial),
-    Target("lsl", lambda: [LSL], _streams),
-    Target("live_log", lambda: [seeds.live_log()], file("a.wepose", _live), JSON),
-    Target("pose", lambda: [seeds.pose()], file("pose.parquet", _pose)),
-    Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON),
+    Target("csv", lambda: [seeds.csv()], _session("arm.csv", TABLE), LINES, "readers.tables"),
+    Target("pieces", lambda: [seeds.csv()], file("arm.csv", _pieces), LINES, "readers.tables"),
+    Target(
+        "parquet",
+        lambda: [seeds.parquet()],
+        _session("arm.parquet", TABLE.replace("csv", "parquet")),
+        (),
+        "readers.tables",
+    ),
+    Target(
+        "mat",
+        lambda: [seeds.mat(False), seeds.mat(True)],
+        _session("arm.mat", ARRAYS.format("arm.mat")),
+        (),
+        "readers.mat5",
+    ),
+    Target("hdf5", lambda: [seeds.hdf5()], _session("arm.h5", ARRAYS.format("arm.h5")), (), "readers.arrays"),
+    Target("mvnx", lambda: [seeds.mvnx(True), seeds.mvnx(False)], _device("a.mvnx", "mvnx"), XML, "readers.mvnx"),
+    Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES, "readers.mt_manager"),
+    Target("dot", seeds.dot, _device("a.csv", "dot"), LINES, "readers.dot"),
+    Target("ximu3", seeds.ximu3, _device("Inertial.csv", "ximu3"), LINES, "readers.ximu3"),
+    Target("opensim", lambda: [seeds.opensim()], _device("a.sto", "opensim"), LINES, "readers.opensim"),
+    Target("info", _described_seeds, _described, LINES, "readers.describe"),
+    Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML, "readers.session"),
+    Target("wearing", lambda: [seeds.SESSION.encode()], file("session.toml", _wearing), TOML, "live.wearing"),
+    Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML, "subject"),
+    Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML, "model.table"),
+    Target("robot_map", lambda: [seeds.ARM_MAP], file("map.toml", _robot_map), TOML, "retargeting.maps"),
+    Target("protocol", lambda: seeds.shipped(*_PROTOCOLS), file("own.toml", _protocol), TOML, "calibration.protocols"),
+    Target("plan", lambda: [seeds.PLAN], records.plan, TOML, "batch.plan"),
+    Target("plan_table", lambda: [seeds.PLAN_TABLE], records.plan_table, LINES, "batch.plan"),
+    Target("body", lambda: seeds.shipped("urdf/upper_body.urdf"), file("body.urdf", _body), XML, "model.tree"),
+    Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML, "model.robot"),
+    Target("retarget", lambda: [seeds.ARM.encode()], file("arm.urdf", _retargeted), XML, "retargeting.robot"),
+    Target("srdf", lambda: [seeds.SRDF], file("arm.srdf", _srdf), XML, "retargeting.collision"),
+    Target("datagram", seeds.datagrams, streams.datagram, JSON, "live.sources.packets"),
+    Target("udp", lambda: [streams.APART.join(seeds.datagrams())], streams.udp, JSON, "live.sources.udp"),
+    Target("xbus", lambda: [seeds.serial()], streams.serial, (), "live.sources.xbus"),
+    Target("mti", seeds.device, streams.mti, (), "live.sources.mti"),
+    Target("lsl", lambda: [LSL], streams.lsl, (), "live.sources.lsl"),
+    Target("lsl_samples", lambda: [seeds.lsl_rows()], streams.lsl_samples, (), "live.sources.lsl"),
+    Target("live_loop", lambda: [seeds.wild()], streams.loop, (), "live.loop"),
+    Target("live_page", seeds.requests, streams.page, HTTP, "live.server"),
+    Target("live_log", lambda: [seeds.live_log()], file("a.wepose", _live), JSON, "readers.live_log"),
+    Target("pose", lambda: [seeds.pose()], file("pose.parquet", _pose), (), "pose"),
+    Target("result", lambda: [seeds.pose_csv()], records.result, LINES, "writers.motion"),
+    Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON, "writers.result"),
+    Target("made_by", lambda: [seeds.made_by()], records.made_by, JSON, "batch.rerun"),
+    Target("done", lambda: [seeds.done()], records.done, JSON, "batch.items"),
+    Target("validation", lambda: [seeds.validation()], records.validation, JSON, "validation.document"),
+    Target("bench", lambda: [seeds.bench()], records.bench, JSON, "bench"),
+    Target("broad", lambda: [seeds.broad(False), seeds.broad(True)], records.broad, (), "readers.trials"),
+    Target("authors", lambda: [seeds.authors()], records.authors, LINES, "readers.trials"),
+    Target("ring", lambda: [seeds.ring()], records.ring, LINES, "readers.trials"),
+    Target("ur5", lambda: [seeds.ur5()], records.ur5, LINES, "readers.trials"),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import os
@@ -12,16 +13,18 @@ from typing import Any
 
 from ..errors import BadOption, LostWorker
 from ..filters.base import processors
-from .items import Row, make_items
+from .apart import make_apart
+from .items import Row, failed, make_items
 from .plan import Item
 
 # A task costs Dask some milliseconds (`wepose bench --batch` measures it): one that takes half a second keeps that
 # under a hundredth. Items that take less go together.
 TASK_S = 0.5
-MOST = 500  # items a task: what a worker that dies has to look through again
+MOST = 500  # items a task
 AHEAD = 2  # tasks a worker: one runs, one waits
-DEATHS = 3  # of workers at one task, after which it is not tried again
-WAIT_S = 60.0
+DEATHS = 1  # of workers at one task, after which each of its items is made in a process of its own
+WAIT_S = 60.0  # without any worker, after which the run ends
+LOOK_S = 2.0  # between two looks at which workers there are
 # Workers share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
 _THREADED = "WEPOSE_THREADS NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
 _ONE_THREAD = dict.fromkeys(_THREADED.split(), "1")
@@ -29,6 +32,9 @@ SETTINGS: dict[str, Any] = {
     "distributed.scheduler.allowed-failures": DEATHS,
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
+    # Nothing lies on workers that could be spilled, and one that has paused for want of memory would never go on: at
+    # 95 % of its share of the machine's memory it is ended and replaced, and its items run again.
+    **dict.fromkeys((f"distributed.worker.memory.{word}" for word in ("target", "spill", "pause")), False),
     "distributed.nanny.pre-spawn-environ": _ONE_THREAD | {"DASK_LOGGING__DISTRIBUTED": "critical"},
 }
 
@@ -96,59 +102,92 @@ def made(
 ) -> Iterator[list[Row]]:
     """Rows of the items as they are made, some at a time, in the order in which they are done.
 
-    A worker that dies is replaced by Dask and its items run again, which leaves what they had done; after `DEATHS` an
-    item is given up by the name of `LostWorker`.
+    A worker that dies is replaced by Dask and its tasks run again, which leaves what they had done. Dask blames its
+    death on all tasks that lay there: after `DEATHS` each of their items is made in a process of its own, and only one
+    that kills this one too is given up, by the name of `LostWorker`.
 
     Raises
     ------
     BadData
         A worker has another wepose-pin than `code`.
     LostWorker
-        The scheduler is gone.
+        The scheduler is gone, or has no worker any more.
     """
-    from distributed import as_completed
     from distributed.scheduler import KilledWorker
 
-    todo, alone = deque(items), deque[Item]()
+    todo, suspects = deque(items), deque[Item]()
     running: dict[Any, list[Item]] = {}
-    finished = as_completed()
-    each, counted, threads = TASK_S, 0.0, 1
-    while todo or alone or running:
-        if time.monotonic() > counted + 1.0:
-            threads, counted = max(1, sum(client.nthreads().values())), time.monotonic()
-        while (todo or alone) and len(running) < AHEAD * threads:
-            size = 1 if alone else max(1, min(MOST, int(TASK_S / each), len(todo) // (AHEAD * threads)))
-            some = [alone.popleft()] if alone else [todo.popleft() for _ in range(size)]
-            future = client.submit(_timed, some, place, force, code, pure=False)
-            running[future] = some
-            finished.add(future)
-        future = next(finished)
-        some = running.pop(future)
-        if future.status == "finished":
-            seconds, rows = future.result()
-            each = 0.5 * each + 0.5 * max(seconds / len(some), 1e-4)
-            yield rows
-        elif future.status == "error" and isinstance(error := future.exception(), KilledWorker):
-            if len(some) > 1:  # which of them it was
-                alone.extend(some)
+    apart: set[Any] = set()
+    each, seen = TASK_S, _Workers(client)
+    while todo or suspects or running:
+        seen.look()
+        while (todo or suspects) and len(running) < AHEAD * seen.threads:
+            if suspects:
+                some = [suspects.popleft()]
+                future = client.submit(make_apart, some[0], place, force, code, pure=False)
+                apart.add(future)
             else:
-                yield [_lost(some[0], error)]
-        elif future.status == "error":
-            raise future.exception()
-        else:
-            raise LostWorker("the scheduler is gone; the same command goes on where it stopped")
-        future.release()
+                size = max(1, min(MOST, int(TASK_S / each), len(todo) // (AHEAD * seen.threads)))
+                some = [todo.popleft() for _ in range(size)]
+                future = client.submit(_timed, some, place, force, code, pure=False)
+            running[future] = some
+        for future in _ended(running):
+            some, alone = running.pop(future), future in apart
+            apart.discard(future)
+            if future.status == "finished" and alone:
+                yield [future.result()]
+            elif future.status == "finished":
+                seconds, rows = future.result()
+                each = 0.5 * each + 0.5 * max(seconds / len(rows), 1e-4)
+                todo.extendleft(reversed(some[len(rows) :]))
+                yield rows
+            elif future.status != "error":
+                raise LostWorker("the scheduler is gone; the same command goes on where it stopped")
+            elif not isinstance(error := future.exception(), KilledWorker):
+                raise error
+            elif alone:
+                yield [
+                    failed(some[0], LostWorker.__name__, f"workers died at it, the last {error.last_worker.address}")
+                ]
+            else:
+                suspects.extend(some)
+            future.release()
+
+
+class _Workers:
+    """How many threads the workers have together, looked up now and then."""
+
+    def __init__(self, client: Any) -> None:
+        self.client = client
+        self.threads = 1
+        self._looked = self._there = 0.0
+
+    def look(self) -> None:
+        """Raise LostWorker where there has been no worker for long."""
+        now = time.monotonic()
+        if self._looked and now < self._looked + LOOK_S:
+            return
+        found = sum(self.client.nthreads().values())
+        self._there = now if found or not self._looked else self._there
+        self._looked, self.threads = now, max(1, found)
+        if now > self._there + WAIT_S:
+            raise LostWorker(
+                f"{self.client.scheduler.address}: has had no worker for {WAIT_S:g} s; start one, and the same command "
+                "goes on where it stopped"
+            )
+
+
+def _ended(running: dict[Any, list[Item]]) -> list[Any]:
+    """Tasks that have ended; none after a while in which none has."""
+    from distributed import wait
+
+    with contextlib.suppress(TimeoutError, asyncio.CancelledError):  # the latter where one of them is cancelled
+        wait(list(running), timeout=LOOK_S, return_when="FIRST_COMPLETED")
+    return [future for future in running if future.status != "pending"]
 
 
 def _timed(items: list[Item], place: str, force: bool, code: str | None) -> tuple[float, list[Row]]:
+    """Rows of as many items as are made in twice the time that a task should take, and the time they took."""
     begun = time.perf_counter()
-    rows = make_items(items, place, force, code)
+    rows = make_items(items, place, force, code, until=begun + 2.0 * TASK_S)
     return time.perf_counter() - begun, rows
-
-
-def _lost(item: Item, error: Any) -> Row:
-    message = (
-        f"{item.session}: {DEATHS + 1} workers died at it, the last at {error.last_worker.address}; too little memory?"
-    )
-    row: Row = {"item": item.name, "session": item.session, "subject": item.subject, "status": "failed"}
-    return row | {"error": LostWorker.__name__, "message": message}

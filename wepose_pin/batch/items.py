@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+import math
 import os
 import resource
-import sys
 import tempfile
 import time
 import traceback
@@ -22,18 +23,27 @@ from .steps import Given, Work
 from .storage import DONE, fetch, is_remote, new_folder, read_bytes, stamps
 
 COMMAND = "batch item"
+MADE, FAILED, CHANGED = "done", "failed", "changed"  # what an item's status may be
 PAGES = ("report.html", "view.html")  # what a row of the study leads to
 Row = dict[str, Any]
 
 
-def make_items(items: Sequence[Item], place: str, force: bool = False, same_code: str | None = None) -> list[Row]:
+def make_items(
+    items: Sequence[Item], place: str, force: bool = False, same_code: str | None = None, until: float = math.inf
+) -> list[Row]:
     """A row an item, in their order; errors become rows too. What a worker is asked for.
 
     Parameters
     ----------
     place : folder or URL that holds the items' folders
-    force : make what was made from other inputs, options or version again; without it that is an error
+    force : make what was made from other inputs, options or version again; without it such an item is `CHANGED`
     same_code : the hash of the code that asks; a worker with another refuses
+    until : of `time.perf_counter`: no item is begun after that but the first; rows are then fewer than items
+
+    Raises
+    ------
+    BadData
+        This is not the code that asks.
     """
     # Workers share the machine: a second thread in one would take the processor of the other.
     os.environ.setdefault("WEPOSE_THREADS", "1")
@@ -43,32 +53,42 @@ def make_items(items: Sequence[Item], place: str, force: bool = False, same_code
             f"a worker has another wepose-pin than this one: version {code()['version']}, commit "
             f"{code()['commit'] or 'not known'}; install the same everywhere"
         )
-    return [_row(item, place, force) for item in items]
+    rows: list[Row] = []
+    for item in items:
+        if rows and time.perf_counter() > until:
+            break
+        rows.append(_row(item, place, force))
+    return rows
+
+
+def failed(item: Item, error: str, message: str) -> Row:
+    """The row of an item that has failed, and why."""
+    row: Row = {"item": item.name, "session": item.session, "subject": item.subject, "status": FAILED}
+    return row | {"error": error, "message": message}
 
 
 def _row(item: Item, place: str, force: bool) -> Row:
     begun = time.perf_counter()
-    row: Row = {"item": item.name, "session": item.session, "subject": item.subject, "status": "failed"}
     try:
-        return row | make_item(item, place, force)
+        return {"item": item.name, "session": item.session, "subject": item.subject} | make_item(item, place, force)
     except WeposeError as error:
-        row |= {"error": type(error).__name__, "message": str(error)}
+        row = failed(item, type(error).__name__, " ".join(str(error).split()))
     except MemoryError:
-        row |= {"error": "MemoryError", "message": f"{item.session}: not enough memory for it on this worker"}
+        row = failed(item, "MemoryError", f"{item.session}: not enough memory for it on this worker")
     except Exception as error:  # ours to mend: the others go on, and the table says where it was
         last = traceback.extract_tb(error.__traceback__)[-1]
         what = " ".join(str(error).split())
-        row |= {"error": type(error).__name__, "message": f"{what} ({Path(last.filename).name}:{last.lineno})"}
+        row = failed(item, type(error).__name__, f"{what} ({Path(last.filename).name}:{last.lineno})")
     return row | {"seconds": time.perf_counter() - begun}
 
 
 def make_item(item: Item, place: str, force: bool = False) -> Row:
     """Make an item's folder, unless it is there already, and give its columns of the table.
 
+    One that was made from other inputs, options or version is left and keeps its figures, as `CHANGED`, unless `force`.
+
     Raises
     ------
-    ExistingOutput
-        It was made from other inputs, options or version, and `force` is not given.
     WeposeError
         Of any of its steps.
     """
@@ -78,19 +98,18 @@ def make_item(item: Item, place: str, force: bool = False) -> Row:
     if done is not None:
         changed = _changed(item, key, done)
         if changed is None:
-            return done["row"] | {"status": "done", "kept": True}
+            return done["row"] | {"status": MADE, "kept": True}
         if not force:
-            raise ExistingOutput(f"{target}: was made from {changed}; --force makes it again, -o names another folder")
+            message = f"{target}: was made from {changed}; --force makes it again, -o names another folder"
+            return done["row"] | {"status": CHANGED, "error": ExistingOutput.__name__, "message": message, "kept": True}
     begun = time.perf_counter()
     with new_folder(target) as folder:
+        stamped = _stamps(item)  # before anything is read: what changes meanwhile is seen the next time
         row, block = make_into(folder, item)
         row |= {"seconds": time.perf_counter() - begun, "memory_mb": _most_memory()}
-        content = {"key": key, "made_by": block, "stamps": _stamps(item), "row": row}
-        with (folder / DONE).open("w", encoding="utf-8") as file:
-            json.dump(content, file, indent=1, ensure_ascii=False)
-            file.flush()
-            os.fsync(file.fileno())
-    return row | {"status": "done", "kept": False}
+        content = {"key": key, "made_by": block, "stamps": stamped, "row": row}
+        (folder / DONE).write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+    return row | {"status": MADE, "kept": False}
 
 
 def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
@@ -119,8 +138,12 @@ def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
 
 def _most_memory() -> float:
     """Most memory [MB] that this process ever had."""
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most / (1e6 if sys.platform == "darwin" else 1e6 / 1024)
+    with contextlib.suppress(
+        OSError, StopIteration, ValueError
+    ):  # Linux's rusage counts that of whoever started us, too
+        lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e6
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
 def key_of(item: Item) -> str:

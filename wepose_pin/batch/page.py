@@ -44,7 +44,7 @@ class Apart(NamedTuple):
 
 def study_page(plan: Plan, table: pl.DataFrame) -> str:
     """The page of a study; `table` as in ``results.parquet``, items' folders in ``items/`` beside it."""
-    failed, done = table.filter(pl.col("status") == "failed"), table.filter(pl.col("status") == "done")
+    failed, done = table.filter(pl.col("status") != "done"), table.filter(pl.col("status") == "done")
     columns = _figures(done)
     return as_html(
         [

@@ -6,14 +6,15 @@ import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ..errors import BadPlan, BadSession, one_of
+from ..errors import BadData, BadPlan, BadSession, MissingFile, WeposeError, one_of
 from ..filters import BEST, METHODS
 from ..readers.keys import Keys, is_number, read_toml
 from ..readers.tables import read_table
-from ..subject import LENGTHS
+from ..subject import LENGTHS, average_subject
 from .storage import find, is_remote
 
 SESSION = "session.toml"
@@ -34,6 +35,7 @@ STEPS: dict[str, dict[str, Any]] = {
 }
 _FILES = ("model", "protocol", "robot")  # options that may name a file beside the plan
 _NUMBERS = ("scale", "rate_hz")  # of those without a default
+_CHOICES = {"method": METHODS, "arm": ("left", "right", "both"), "task": ("both", "position", "orientation")}
 _COLUMNS = ("session", "name", "subject", "truth", "stature", "sex")
 _GAUGE = "gauge."
 
@@ -94,7 +96,7 @@ def read_plan(path: Path, items_at: str) -> Plan:
     """
     try:
         return _plan(path, items_at)
-    except BadSession as error:  # of `Keys`, which reads sessions otherwise
+    except (BadSession, BadData) as error:  # of what reads sessions and tables otherwise
         raise BadPlan(str(error)) from None
 
 
@@ -102,11 +104,12 @@ def _plan(path: Path, items_at: str) -> Plan:
     top = Keys(read_toml(path, "a plan"), str(path))
     top.allow("name", "sessions", "subjects", "steps")
     steps = _steps(top, path.parent)
-    subjects = {name: _subject(Keys(entry, str(path), f"subjects.{name}."), path) for name, entry in _named(top)}
+    gauges = (*LENGTHS, *_distances(steps))
+    subjects = {name: _subject(keys, path, gauges) for name, keys in _named(top)}
     found = [
         _tied(path, entry, steps, subjects, items_at)
         for at, keys in _entries(top, path)
-        for entry in _sessions(at, keys, path)
+        for entry in _sessions(at, keys, path, gauges)
     ]
     if not found:
         raise BadPlan(f"{path}: sessions: no session at all; files or table are needed")
@@ -141,6 +144,7 @@ def _steps(top: Keys, folder: Path) -> dict[str, dict[str, Any]]:
         keys = table.table(step)
         keys.allow(*known)
         steps[step] = {name: _option(keys, name, default, folder) for name, default in known.items()}
+        _check(step, steps[step], keys)
     for step in ("retarget", "export", "evaluate"):
         if step in steps and "track" not in steps:
             raise BadPlan(f"{top.at('steps')}.{step}: needs the step [steps.track], which is missing")
@@ -166,39 +170,80 @@ def _option(keys: Keys, name: str, default: Any, folder: Path) -> Any:
         if not isinstance(value, list) or len(value) != 2 or not all(map(is_number, value)) or value[0] >= value[1]:
             raise BadPlan(f"{keys.at(name)} = {value!r} is not two times in seconds, such as [10.0, 70.0]")
         return (float(value[0]), float(value[1]))
-    if name == "method":
-        return keys.choice(name, METHODS)
+    if name in _CHOICES:
+        return keys.choice(name, _CHOICES[name])
     if isinstance(default, bool):
         if not isinstance(value, bool):
             raise BadPlan(f"{keys.at(name)} = {value!r} is neither true nor false")
         return value
     if isinstance(default, float) or name in _NUMBERS:
-        return keys.number(name, None)
+        number = keys.number(name, None, positive=name != "smoothing_hz")
+        if number is not None and number < 0.0:
+            raise BadPlan(f"{keys.at(name)} = {value!r}: 0, which is none, or more")
+        return number
     text = keys.text(name, None)
     assert text is not None
     beside = folder / text
     return str(beside.absolute()) if name in _FILES and beside.is_file() else text
 
 
+def _check(step: str, options: Mapping[str, Any], keys: Keys) -> None:
+    """What would fail at every item, said once and before any work."""
+    try:
+        if step == "calibrate":
+            from ..calibration.protocols import load_protocol
+
+            load_protocol(options["protocol"])
+        elif step == "retarget":
+            from ..retargeting.maps import find_map
+
+            find_map(options["robot"])
+        elif step == "track" and options["model"] is not None and not Path(options["model"]).is_file():
+            raise MissingFile(f"model = '{options['model']}': no such file; a URDF, or a table that names one")
+        elif step == "export" and options["names"] is not None:
+            from ..writers.export import NAMES
+
+            keys.choice("names", NAMES)
+    except BadSession:
+        raise
+    except WeposeError as error:
+        said = str(error).replace("--robot ", "robot ")
+        raise BadPlan(f"{keys.file}: {keys.place.rstrip('.')}: {said}") from None
+
+
+def _distances(steps: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+    """What can be taped besides the body, by the protocol: the bar between the palms, say."""
+    if "calibrate" not in steps:
+        return ()
+    from ..calibration.protocols import load_protocol
+
+    return tuple(load_protocol(steps["calibrate"]["protocol"]).gauges)
+
+
 # Subjects ------------------------------------------------------------------------------------------------------------
 
 
-def _named(top: Keys) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def _named(top: Keys) -> Iterator[tuple[str, Keys]]:
     table = top.table("subjects", {})
     for name in table.values:
-        yield name, table.table(name).values
+        yield name, table.table(name)
 
 
-def _subject(keys: Keys, path: Path) -> _Subject:
+def _subject(keys: Keys, path: Path, gauges: Sequence[str]) -> _Subject:
     keys.allow("calibration", "file", "stature", "sex", "gauge")
     calibration, file = keys.text("calibration", None), keys.text("file", None)
     if calibration is not None and file is not None:
         raise BadPlan(f"{keys.at('file')}: a subject has a file or a calibration, not both")
+    for key in ("calibration", "file"):
+        place = _resolved(keys.text(key, None), path)
+        if place is not None and not is_remote(place) and not Path(place).exists():
+            raise BadPlan(f"{keys.at(key)} = '{keys.values[key]}': no such file; a path from the plan's folder, or URL")
     gauge = keys.table("gauge", {})
-    gauge.allow(*LENGTHS)
+    gauge.allow(*gauges)
     taped = {name: gauge.number(name, None, positive=True) for name in gauge.values}
     sex = keys.choice("sex", ("f", "m")) if "sex" in keys else None
     body = Body(keys.number("stature", None, True), sex, {name: v for name, v in taped.items() if v is not None})
+    _check_stature(body.stature, keys.at("stature"))
     return _Subject(_resolved(calibration, path), _resolved(file, path), body)
 
 
@@ -230,7 +275,7 @@ def _entries(top: Keys, path: Path) -> list[tuple[str, Keys]]:
     return [(place, Keys(entry, str(path), f"{place}.")) for place, entry in zip(places, value, strict=True)]
 
 
-def _sessions(place: str, keys: Keys, path: Path) -> list[_Entry]:
+def _sessions(place: str, keys: Keys, path: Path, gauges: Sequence[str]) -> list[_Entry]:
     keys.allow("files", "table", "subject")
     if ("files" in keys) == ("table" in keys):
         raise BadPlan(f"{path}: {place}: either files (globs) or table is needed")
@@ -238,7 +283,7 @@ def _sessions(place: str, keys: Keys, path: Path) -> list[_Entry]:
     if "table" in keys:
         if subject is not None:
             raise BadPlan(f"{keys.at('subject')}: a table has a column for it")
-        return _table(str(keys.text("table", None)), path)
+        return _table(str(keys.text("table", None)), path, gauges)
     patterns = keys.values["files"]
     patterns = [patterns] if isinstance(patterns, str) else patterns
     if not isinstance(patterns, list) or not all(isinstance(pattern, str) and pattern for pattern in patterns):
@@ -252,14 +297,14 @@ def _sessions(place: str, keys: Keys, path: Path) -> list[_Entry]:
     return [_Entry(url, f"{path}: {place}: {url}", subject=subject) for url in found]
 
 
-def _table(name: str, path: Path) -> list[_Entry]:
+def _table(name: str, path: Path, gauges: Sequence[str]) -> list[_Entry]:
     file = path.parent / name
     table = read_table(file)
     if "session" not in table.columns:
         raise BadPlan(f"{file}: no column 'session'; {one_of(table.columns, 'session')}")
     for column in table.columns:
-        if column not in _COLUMNS and not (column.startswith(_GAUGE) and column.removeprefix(_GAUGE) in LENGTHS):
-            known = (*_COLUMNS, *(f"{_GAUGE}{length}" for length in LENGTHS))
+        if column not in _COLUMNS and not (column.startswith(_GAUGE) and column.removeprefix(_GAUGE) in gauges):
+            known = (*_COLUMNS, *(f"{_GAUGE}{length}" for length in gauges))
             raise BadPlan(f"{file}: column '{column}' is not known; {one_of(known, column, len(known))}")
     entries = []
     for k, row in enumerate(table.iter_rows(named=True), 1):
@@ -273,10 +318,25 @@ def _table(name: str, path: Path) -> list[_Entry]:
             raise BadPlan(f"{where}: sex = '{sex}'; f, m or nothing")
         gauge = {c.removeprefix(_GAUGE): value for c, value in metres.items() if c != "stature"}
         body = Body(metres.get("stature"), sex, gauge) if metres or sex else None
+        _check_stature(metres.get("stature"), where)
         text = {key: str(said[key]) for key in ("name", "subject") if key in said}
         session, truth = (_resolved(str(said[key]), file) if key in said else None for key in ("session", "truth"))
         entries.append(_Entry(str(session), where, truth=truth, body=body, **text))
     return entries
+
+
+def _check_stature(stature: float | None, where: str) -> None:
+    if complaint := _stature_complaint(stature):
+        raise BadPlan(f"{where}: {complaint}")
+
+
+@lru_cache
+def _stature_complaint(stature: float | None) -> str | None:
+    try:
+        average_subject(stature)
+    except WeposeError as error:
+        return str(error)
+    return None
 
 
 def _metres(where: str, column: str, value: Any) -> float:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
+import io
 import json
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..errors import BadData, MissingFile
+import polars as pl
+
+from ..errors import BadData, MissingFile, WeposeError
 from ..writers.provenance import code, file_hash, machine, read_made_by
 from ..writers.result import versions
 from .compare import differences
-from .items import COMMAND, item_of, make_into
+from .items import COMMAND, FAILED, item_of, make_into
 from .storage import DONE, fetch
+from .study import ITEMS, RESULTS, STUDY
 
 _PAGES = ("report", "view")  # options that make pages, which are not compared
 
@@ -27,13 +32,21 @@ class Rerun(NamedTuple):
     notes: list[str]  # what was not as it was, besides
 
 
-def rerun(result: Path, commands: Mapping[str, Callable[..., None]]) -> Rerun:
+def parts(result: Path) -> int:
+    """How many results `rerun` makes again: of a study all items that were done."""
+    return len(_done(result)[0]) if (result / STUDY).is_file() else 1
+
+
+def rerun(
+    result: Path, commands: Mapping[str, Callable[..., None]], step: Callable[[str], None] = lambda _: None
+) -> Rerun:
     """Make a result again, in a place that is removed afterwards, and compare.
 
     Parameters
     ----------
-    result : a folder, an item of a batch or a part of one, or an exported file
+    result : a folder, a study of wepose batch, an item of it or a part of one, or an exported file
     commands : name → what makes it, given its arguments and `out`
+    step : told what is made next
 
     Raises
     ------
@@ -42,7 +55,10 @@ def rerun(result: Path, commands: Mapping[str, Callable[..., None]]) -> Rerun:
     BadData
         It does not say what made it, or an input has changed; or the command now refuses.
     """
+    if (result / STUDY).is_file():
+        return _study(result, commands, step)
     item = next((folder for folder in (result, result.parent) if (folder / DONE).is_file()), None)
+    step(f"making {result.name} again")
     block = _of_item(item) if item is not None else read_made_by(result)
     command = str(block.get("command"))
     with tempfile.TemporaryDirectory(prefix="wepose-") as made:
@@ -62,7 +78,8 @@ def rerun(result: Path, commands: Mapping[str, Callable[..., None]]) -> Rerun:
             out.parent.mkdir()
             first, options = _arguments(commands[command], block)
             try:
-                commands[command](*first, **options, out=out)
+                with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                    commands[command](*first, **options, out=out)
             except SystemExit as stop:  # of a calibration that is poor: its files are written
                 if not out.exists():
                     raise BadData(f"{result}: wepose {command} ended with {stop.code} and wrote nothing") from None
@@ -70,6 +87,32 @@ def rerun(result: Path, commands: Mapping[str, Callable[..., None]]) -> Rerun:
         else:
             raise BadData(f"{result}: made by '{command}', which cannot be made again one by one")
     return Rerun(command, found, _notes(block))
+
+
+def _study(result: Path, commands: Mapping[str, Callable[..., None]], step: Callable[[str], None]) -> Rerun:
+    """All items of a study that were done, one by one; one that cannot be made again is a difference."""
+    names, failed = _done(result)
+    found, notes = list[str](), dict[str, None]()
+    for name in names:
+        try:
+            again = rerun(result / ITEMS / name, commands, step)
+        except WeposeError as error:
+            again = Rerun(COMMAND, [f"cannot be made again: {error}"], [])
+        found += [f"{name}: {line}" for line in again.differences]
+        notes |= dict.fromkeys(again.notes)
+    if failed:
+        notes[f"{failed} items had failed and are not made again"] = None
+    return Rerun("batch", found, list(notes))
+
+
+def _done(study: Path) -> tuple[list[str], int]:
+    """Names of a study's items that are there, and how many are not."""
+    try:
+        table = pl.read_parquet(study / RESULTS, columns=["item", "status"])
+    except (OSError, pl.exceptions.PolarsError):
+        raise MissingFile(f"{study}: no {RESULTS} in it to go by; wepose batch goes on where it was stopped") from None
+    names = table.filter(pl.col("status") != FAILED)["item"].to_list()
+    return names, table.height - len(names)
 
 
 def _of_item(folder: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import BadOption, MissingFile
+from ..errors import MissingFile
 from ..readers import load_session
 from ..recording import Recording
 from ..subject import Subject, average_subject, load_subject
@@ -140,10 +140,6 @@ class Work:
         from ..writers.result import as_json, read_result
 
         robot, arm, task = options["robot"], options["arm"], options["task"]
-        if arm not in (None, "left", "right", "both"):
-            raise BadOption(f"steps.retarget.arm = '{arm}' is not known; there is: left, right, both")
-        if task not in ("both", "position", "orientation"):
-            raise BadOption(f"steps.retarget.task = '{task}' is not known; there is: both, position, orientation")
         sides = None if arm is None else ("left", "right") if arm == "both" else (arm,)
         off = {name: 0.0 for name in ("position", "orientation") if task not in ("both", name)}
         pose, body, _ = read_result(self.given.folder / "track")

@@ -32,7 +32,8 @@ def _filesystem(url: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        return fsspec.core.url_to_fs(url)
+        # Listings are not kept: a worker lives longer than what it has listed stays true.
+        return fsspec.core.url_to_fs(url, use_listings_cache=False)
     except ImportError as error:
         raise BadOption(f"{url}: {error}; pip install 'wepose-pin[batch,s3]' brings fsspec and s3fs") from None
     except ValueError as error:
@@ -183,6 +184,7 @@ def new_folder(url: str) -> Iterator[Path]:
             _send(folder, url)
         else:
             folder.chmod(0o777 & ~_umask())  # mkdtemp's is for its owner alone
+            _lasting(folder)
             _swap(folder, place)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -200,6 +202,16 @@ def _swap(folder: Path, place: Path) -> None:
     except OSError:
         if not (place / DONE).is_file():  # else a worker that was given up was faster, with the same
             raise
+
+
+def _lasting(folder: Path) -> None:
+    """What is in a folder outlives a power cut, before the folder gets the name by which it counts as done."""
+    for path in (*folder.rglob("*"), folder):
+        about = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(about)
+        finally:
+            os.close(about)
 
 
 def _send(folder: Path, url: str) -> None:

@@ -13,7 +13,7 @@ import polars as pl
 from ..errors import ExistingOutput
 from ..writers.provenance import code, made_by
 from .cluster import connected, made
-from .items import Row
+from .items import FAILED, MADE, Row, failed
 from .page import study_page
 from .plan import Item, Plan, read_plan
 from .storage import is_remote, only_one, read_bytes, sweep, write_bytes
@@ -49,8 +49,8 @@ def run_study(
 
     Parameters
     ----------
-    force : make items again whose inputs, options or version have changed; without it they fail
-    progress : told how many items are done, failed and there are
+    force : make items again whose inputs, options or version have changed; without it they are left, and say so
+    progress : told how many items there are rows of, how many of these are not done, and how many items there are
 
     Raises
     ------
@@ -63,21 +63,24 @@ def run_study(
     _claim(out, path)
     with only_one(out):
         everything = (*plan.first, *plan.items)
-        sweep(place, [item.name for item in everything])
+        names = [item.name for item in everything]
+        sweep(place, names)
         rows = _rows(plan, place, scheduler, workers, force, progress)
+        sweep(place, names)
         table = table_of([rows[item.name] for item in everything])
         content = io.BytesIO()
         table.write_parquet(content)
         write_bytes(f"{out}/{RESULTS}", content.getvalue())
         write_bytes(f"{out}/{REPORT}", study_page(plan, table).encode())
-    return Study(plan, table, sum(bool(row.get("kept")) for row in rows.values()))
+    return Study(plan, table, sum(bool(row.get("kept")) and row["status"] == MADE for row in rows.values()))
 
 
 def _claim(out: str, path: Path) -> None:
     """Mark the place as a study's; what is another's stays untouched."""
     if read_bytes(f"{out}/{STUDY}") is None:
         here = Path(out)
-        if not is_remote(out) and here.exists() and (not here.is_dir() or any(here.iterdir())):
+        ours = (f".{STUDY}.partial",)  # of a run that was killed at its very beginning
+        if not is_remote(out) and here.exists() and (not here.is_dir() or {p.name for p in here.iterdir()} - {*ours}):
             raise ExistingOutput(f"{out}: is there and no study of wepose batch; name another folder")
     try:
         text = json.dumps(made_by("batch", {"plan": path}), indent=1, ensure_ascii=False)
@@ -109,7 +112,7 @@ def _rows(
                     rows[item.name] = cause
             for some in made(client, ready, place, force=force, code=code()["code"]):
                 rows |= {row["item"]: row for row in some}
-                progress(len(rows), sum(row["status"] == "failed" for row in rows.values()), total)
+                progress(len(rows), sum(row["status"] != MADE for row in rows.values()), total)
     return rows
 
 
@@ -117,11 +120,10 @@ def _cause(item: Item, plan: Plan, rows: dict[str, Row]) -> Row | None:
     """The row of a session whose subject's calibration has failed; None where it has not."""
     needed = {first.subject: rows.get(first.name) for first in plan.first}
     before = needed.get(item.subject) if "calibrate" not in item.steps else None
-    if before is None or before["status"] != "failed":
+    if before is None or before["status"] != FAILED:
         return None
-    message = f"{item.session}: its subject '{item.subject}' could not be calibrated: {before['message']}"
-    row: Row = {"item": item.name, "session": item.session, "subject": item.subject, "status": "failed"}
-    return row | {"error": before["error"], "message": message}
+    message = f"{item.session}: its subject '{item.subject}' has no calibration, see item {before['item']}"
+    return failed(item, before["error"], message)
 
 
 def table_of(rows: list[Row]) -> pl.DataFrame:

@@ -35,11 +35,13 @@ __all__ = [
     "NcfParams",
     "Orientation",
     "OrientationFilter",
+    "SensorRun",
     "Smekf",
     "SmekfParams",
     "Smoother",
     "check_method",
     "estimate_orientation",
+    "piece_multiple",
     "run_filter",
 ]
 
@@ -147,6 +149,71 @@ def estimate_orientation(
     )
 
 
+def piece_multiple(method: str, rate_hz: float) -> int:
+    """How many samples the pieces of a recording are a multiple of, the last one excepted."""
+    return max(1, round(AmekfParams().block_s * rate_hz)) if method in OFFLINE else 1
+
+
+class SensorRun:
+    """`run_filter` of a recording that comes in pieces; all that it gives, put together, is that of the whole.
+
+    The smoother alone looks ahead, by one piece: `push` gives the piece before, and what lies further ahead does not
+    count. Its pieces are multiples of `piece_multiple`. Parameters as `run_filter`.
+
+    Raises
+    ------
+    BadData
+        The first piece has no gravity in its first window, in which the filter starts.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float,
+        noise: SensorNoise,
+        method: str,
+        params: Any = None,
+        static_test: StaticTest | None = None,
+        measured_start: bool = False,
+    ) -> None:
+        self.test = static_test or StaticTest()
+        self._noise, self._rate_hz, self._method, self._params = noise, rate_hz, method, params
+        self._measured_start = measured_start
+        self._detector = StaticDetector(noise, rate_hz, self.test)
+        self._filter: Any = None
+        self._held: np.ndarray | None = None  # `static` of the smoother's piece
+
+    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation | None:
+        """Take a piece (n, 3) [rad/s], (n, 3) [m/s²]; gives it filtered, or the one before it smoothed."""
+        static = self._detector.run(gyro_S, accel_S)
+        if self._filter is None:
+            self._begin(accel_S, static)
+        if self._method in OFFLINE:
+            done, self._held, before = self._filter.push(gyro_S, accel_S, static), static, self._held
+            return None if done is None or before is None else self._orientation(done, before)
+        return self._orientation(self._filter.run(gyro_S, accel_S, static), static)
+
+    def finish(self) -> Orientation:
+        """The smoother's last piece."""
+        assert self._held is not None
+        return self._orientation(self._filter.finish(), self._held)
+
+    def _begin(self, accel_S: np.ndarray, static: np.ndarray) -> None:
+        window = self.test.samples(self._rate_hz)
+        first_accel = accel_S[:window].mean(axis=0)
+        if not np.linalg.norm(first_accel) > 0.0:
+            raise BadData(
+                f"accel is zero in the first {self.test.window_s:g} s; the filter starts from the direction of gravity"
+            )
+        quat_start, params = so3.tilt(first_accel), self._params
+        if self._measured_start and params is None and self._method == "smekf":
+            params = starting_params(self._noise, quat_start, still_start=bool(static[window - 1 : window].any()))
+        self._filter = METHODS[self._method](self._noise, self._rate_hz, quat_start, params)
+
+    def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
+        live = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
+        return Orientation(run.quat_WS, run.gyro_bias, static, run.attitude_cov, self._noise, *live)
+
+
 def run_filter(
     gyro_S: np.ndarray,
     accel_S: np.ndarray,
@@ -161,20 +228,5 @@ def run_filter(
 
     `measured_start`: without `params`, smekf takes P₀ from `noise` in place of the paper's (`smekf.starting_params`).
     """
-    test = static_test or StaticTest()
-    detector = StaticDetector(noise, rate_hz, test)
-    static = detector.run(gyro_S, accel_S)
-    window = test.samples(rate_hz)
-    first_accel = accel_S[:window].mean(axis=0)
-    if not np.linalg.norm(first_accel) > 0.0:
-        raise BadData(
-            f"accel is zero in the first {test.window_s:g} s; the filter starts from the direction of gravity"
-        )
-    quat_start = so3.tilt(first_accel)
-    if measured_start and params is None and method == "smekf":
-        params = starting_params(noise, quat_start, still_start=bool(static[window - 1 : window].any()))
-    filter_ = METHODS[method](noise, rate_hz, quat_start, params)
-    quat_WS, bias, cov = filter_.run(gyro_S, accel_S, static)
-    if method in OFFLINE:
-        return Orientation(quat_WS, bias, static, cov, noise)
-    return Orientation(quat_WS, bias, static, cov, noise, filter_, detector)
+    run = SensorRun(rate_hz, noise, method, params, static_test, measured_start)
+    return run.push(gyro_S, accel_S) or run.finish()

@@ -13,9 +13,11 @@ corrections of both ends in proportion. Time is linear in the samples; the tape 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from ..errors import BadOption
+from ..errors import BadData, BadOption
 from ..noise import SensorNoise
 from ..so3 import compiled
 from .amekf import (
@@ -42,10 +44,23 @@ _V, _P, _B, _M, _F, _D, _MOVING = 3, 5, 7, 10, 19, 22, 36  # as in amekf
 _SHARED = len(TAPE_ROWS)
 
 
+class _Forward(NamedTuple):
+    """A piece that the filter has gone through."""
+
+    out: FilterRun  # the filter's
+    static: np.ndarray  # (n,) bool
+    tape: np.ndarray  # (blocks, `TAPE`)
+    start: np.ndarray  # rows of P (9, 25) before it
+
+
 class Smoother:
     """Smoother of one sensor, for whole recordings; parameters are the aMEKF's.
 
     What bad data does is said at `Amekf`; a stretch without gyro is bridged from both sides.
+
+    A recording too long for that comes in pieces: `push` gives a piece once the next one has come, smoothed by what
+    both hold; `finish` gives the last. Of a recording in one piece that is `run`. What the pieces after the next one
+    would have said is lost (docs/long-recordings.md has by how much).
     """
 
     def __init__(
@@ -55,17 +70,50 @@ class Smoother:
         self.noise = noise
         self.rate_hz = rate_hz
         self.quat_WS = np.array(quat_WS, dtype=float)
+        self._filter = Amekf(noise, rate_hz, self.quat_WS, self.params)
+        self._held: _Forward | None = None
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
         """Smooth a whole recording; each call starts anew, so a recording cut in two is two recordings."""
-        forward = Amekf(self.noise, self.rate_hz, self.quat_WS, self.params)
-        start = np.ascontiguousarray(forward.state.P[list(TAPE_ROWS)])
-        tape = np.empty((np.size(static) // forward.block, TAPE))
-        out = forward.taped(gyro_S, accel_S, static, tape)
-        deviation, cov = _backward(tape, start, self.noise.gravity)
+        self._filter, self._held = Amekf(self.noise, self.rate_hz, self.quat_WS, self.params), None
+        self.push(gyro_S, accel_S, static)
+        return self.finish()
+
+    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun | None:
+        """Take a piece; gives the one before it.
+
+        Raises
+        ------
+        BadData
+            The piece before ended within a block of `Amekf.block` samples.
+        """
         at_rest = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
-        _between(tape, deviation, cov, float(np.trace(start[:3, :3])), forward.block, at_rest, *out)
-        return out
+        if self._held is not None and len(self._held.static) % self._filter.block:
+            raise BadData(
+                f"a piece of {len(self._held.static)} samples before another: the smoother's must be multiples of "
+                f"{self._filter.block}"
+            )
+        start = np.ascontiguousarray(self._filter.state.P[list(TAPE_ROWS)])
+        tape = np.empty((len(at_rest) // self._filter.block, TAPE))
+        out = self._filter.taped(gyro_S, accel_S, at_rest, tape)
+        done = None if self._held is None else self._smoothed(self._held, tape)
+        self._held = _Forward(out, at_rest, tape, start)
+        return done
+
+    def finish(self) -> FilterRun:
+        """The last piece."""
+        assert self._held is not None, "nothing was pushed"
+        held, self._held = self._held, None
+        return self._smoothed(held, held.tape[:0])
+
+    def _smoothed(self, held: _Forward, after: np.ndarray) -> FilterRun:
+        """A piece in the light of itself and of the tape `after` it."""
+        tape, start = held.tape, held.start
+        deviation, cov = _backward(np.concatenate([tape, after]) if len(after) else tape, start, self.noise.gravity)
+        if len(after):
+            deviation, cov = deviation[: len(tape) + 1].copy(), cov[: len(tape) + 1].copy()
+        _between(tape, deviation, cov, float(np.trace(start[:3, :3])), self._filter.block, held.static, *held.out)
+        return held.out
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:  # noqa: ARG002
         """There is none.

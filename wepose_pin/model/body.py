@@ -154,7 +154,7 @@ def read_urdf(path: Path) -> Any:
         # yourdfpy's parser mends broken XML in silence: half a body would be read as a body. And it reads what entities
         # name, on disk too.
         _check_xml(path)
-    except (expat.ExpatError, ValueError) as error:
+    except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: of an encoding that nobody knows
         raise BadModel(f"{path}: is no whole XML file, as a URDF is: {error}") from error
     try:
         return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot

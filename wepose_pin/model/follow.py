@@ -72,16 +72,25 @@ class Follower:
         frames = [self.model.frames[self.model.getFrameId(name)] for group in to_fit for name in group.segments]
         self._stands = {frame.name: (frame.parentJoint, pin.Quaternion(frame.placement.rotation)) for frame in frames}
         self._axes: dict[int, np.ndarray] = {}
+        self._solved: dict[int, np.ndarray] = {}  # which fit → the last q that it found
 
-    def run(self, quat_WL: Mapping[str, np.ndarray], before: np.ndarray | None = None) -> np.ndarray:
-        """`q` (n, nq) by segment → (n, 4) xyzw; `before` (nq,): the frame before the first."""
+    def run(
+        self, quat_WL: Mapping[str, np.ndarray], before: np.ndarray | None = None, *, go_on: bool = False
+    ) -> np.ndarray:
+        """`q` (n, nq) by segment → (n, 4) xyzw.
+
+        `before` (nq,): the frame before the first; `go_on`: the frames follow those of the last run, and with those
+        make one motion.
+        """
         kept: dict[int, np.ndarray] = {}
         q, quat_WJ = self.stepwise(quat_WL, kept)
-        for (group, fit), ends in zip(self._fits, self._ends, strict=True):
+        for nth, ((group, fit), ends) in enumerate(zip(self._fits, self._ends, strict=True)):
             rows = np.flatnonzero(self._astray(q, quat_WJ, quat_WL, group, ends))
             if not len(rows):
                 continue
-            q[rows] = fit.run({segment: quat_WL[segment][rows] for segment in group.segments}, q[rows], before)
+            begin = self._solved.get(nth) if go_on else before
+            q[rows] = fit.run({segment: quat_WL[segment][rows] for segment in group.segments}, q[rows], begin)
+            self._solved[nth] = q[rows[-1]].copy()
             for joint in group.joints:
                 if self.model.nqs[joint] == 4:
                     first = self.model.idx_qs[joint]

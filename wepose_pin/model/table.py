@@ -176,7 +176,7 @@ def _entry(value: Any, keys: tuple[str, ...], at: str) -> dict[str, Any]:
 
 def _axes(up: Any, forward: Any, at: str) -> None:
     for key, axis in (("up", up), ("forward", forward)):
-        if axis not in AXES:
+        if not isinstance(axis, str) or axis not in AXES:
             raise BadModel(f"{at}: {key} = {axis!r}; {one_of(AXES)}")
     if abs(AXES[up] @ AXES[forward]) > 0.5:
         raise BadModel(f"{at}: forward = '{forward}' is parallel to up = '{up}'; name two different axes")

@@ -7,9 +7,9 @@ from pathlib import Path
 from ..recording import Recording
 from . import session
 from .live_log import is_live_log, read_live_log
-from .session import iter_session
+from .session import data_bytes, iter_session
 
-__all__ = ["is_live_log", "iter_session", "load_session", "read_live_log"]
+__all__ = ["data_bytes", "is_live_log", "iter_session", "load_session", "read_live_log"]
 
 
 def load_session(path: str | Path, gaps: bool = False) -> Recording:

@@ -133,7 +133,7 @@ class ArrayFile:
             if not self._level_5:
                 raise BadData(f"{self.path}: is neither HDF5 nor a MATLAB file of version 5 to 7.3; save it anew")
             found = read_mat5(self.path, self._most)
-        self._loaded = {name: np.asarray(values, dtype=float) for name, values in found.items()}
+        self._loaded = {name: np.asarray(values, dtype=float) for name, values in found.items() if values.ndim}
         return {name: values.shape for name, values in self._loaded.items()}
 
 

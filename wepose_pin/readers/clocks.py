@@ -7,7 +7,7 @@ longer is an error, or is bridged and marked where the user allows it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +30,8 @@ SAME = 0.01
 # No body sensor measures more slowly [s]: the times are in another unit.
 SLOWEST_STEP_S = 0.5
 TIME_UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
+# So many times are looked at together, so that what is in memory beside them does not grow.
+BLOCK = 1 << 20
 # In a long gap the rate falls to the sensor's rate at rest within this time [s]: a person's motion goes on no longer.
 FADE_S = 0.1
 
@@ -68,29 +70,37 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
     if len(time) < 2:
         raise BadData(f"{place}: {len(time)} samples; a recording has at least 2")
     check_time(place, time)
-    steps = np.diff(time)
-    step = float(np.median(steps))
+    usual = np.diff(time[: BLOCK + 1])  # of a day's times not all are needed to know it
+    step = float(np.median(usual))
     if step > SLOWEST_STEP_S:
         fits = [name for name, unit in TIME_UNITS if 1e-4 < step * unit < SLOWEST_STEP_S]
         guess = f"; looks like {fits[0]}" if fits else ""
         raise BadData(f"{place}: time grows by {step:g} from row to row; it must be in seconds{guess}")
-    lost = np.where(steps > (1.0 + UNEVEN) * step, np.round(steps / step) - 1.0, 0.0)
-    if np.quantile(np.abs(steps / step - 1.0), 0.75) > REGULAR:
+    wide = np.concatenate([first + np.flatnonzero(s > (1.0 + UNEVEN) * step) for first, s in _steps(time)])
+    lost = np.round((time[wide + 1] - time[wide]) / step) - 1.0
+    if np.quantile(np.abs(usual / step - 1.0), 0.75) > REGULAR:
         # No rate to tell lost rows by: up to a long gap, a sample's rate is that of its whole step.
         lost[lost * step <= max(LONGEST_GAP_S, step)] = 0.0
     if lost.sum() > 10 * len(time) + 1000:
-        k = int(np.argmax(steps))
+        k = int(wide[np.argmax(time[wide + 1] - time[wide])])
         raise BadData(
             f"{place}: time jumps from {time[k]:g} to {time[k + 1]:g} s in row {k + 2}, by more than the recording "
             f"is long; cut the recording there"
         )
     if not lost.any():
         return Clock(time, np.arange(len(time)), step)
-    counts = lost.astype(int)
-    row = np.repeat(np.append(np.arange(len(time) - 1), len(time) - 1), np.append(counts + 1, 1))
+    counts = np.zeros(len(time), dtype=int)
+    counts[wide] = lost.astype(int)
+    row = np.repeat(np.arange(len(time)), counts + 1)
     nth = np.arange(len(row)) - np.searchsorted(row, row)  # 0 is the row itself, then the lost ones after it
-    filled = time[row] + nth * np.append(steps / (counts + 1), 0.0)[row]
+    filled = time[row] + nth * np.append(np.diff(time) / (counts[:-1] + 1), 0.0)[row]
     return Clock(filled, np.where(nth == 0, row, -1), step)
+
+
+def _steps(time: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """The steps of so many times at once, and where the first of them is."""
+    for first in range(0, len(time) - 1, BLOCK):
+        yield first, np.diff(time[first : first + BLOCK + 1])
 
 
 def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -105,10 +115,10 @@ def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tu
         The clocks do not overlap.
     """
     first = next(iter(clocks.values()))
-    steps = [np.diff(clock.time) for clock in clocks.values()]
-    uneven = max(float(np.max(np.abs(s / c.step - 1.0))) for s, c in zip(steps, clocks.values(), strict=True))
+    own = list({id(clock): clock for clock in clocks.values()}.values())  # most often one for all
+    uneven = max(float(np.max(np.abs(s / clock.step - 1.0))) for clock in own for _, s in _steps(clock.time))
     shared = all(_same(clock, first) for clock in clocks.values())
-    off = max(_off_even(clock) for clock in clocks.values())
+    off = max(_off_even(clock) for clock in own)
     if shared and uneven <= UNEVEN + 1e-9 and off <= DRIFT:
         return first.time, ()
     begin = max(float(clock.time[0]) for clock in clocks.values())
@@ -121,7 +131,8 @@ def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tu
         )
     dt = 1.0 / float(np.round(1.0 / usual, 3 if usual < 0.1 else 6))
     time = np.minimum(begin + dt * np.arange(int((end - begin) / dt + 1e-6) + 1), end)
-    smallest, largest = min(float(s.min()) for s in steps), max(float(s.max()) for s in steps)
+    smallest = min(float(s.min()) for clock in own for _, s in _steps(clock.time))
+    largest = max(float(s.max()) for clock in own for _, s in _steps(clock.time))
     if not shared:
         why = "the sensors' clocks differ"
     elif uneven > UNEVEN:
@@ -148,8 +159,10 @@ def _off_even(clock: Clock) -> float:
     off = 0.0
     for seconds in (1.0, 10.0):
         size = min(n - 1, max(1, round(seconds / mean)))
-        spans = time[size:] - time[:-size]
-        off = max(off, float(np.max(np.abs(spans - size * mean)) - mean) / (size * mean))
+        for first in range(0, n - size, BLOCK):
+            last = min(first + BLOCK, n - size)
+            spans = time[first + size : last + size] - time[first:last]
+            off = max(off, float(np.max(np.abs(spans - size * mean)) - mean) / (size * mean))
     return off
 
 
@@ -173,11 +186,15 @@ def runs(which: np.ndarray) -> list[tuple[int, int]]:
 def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = False) -> np.ndarray:
     """`values` (n, k) with lost samples filled linearly in time; before the first and after the last they stay.
 
+    Where all are lost, as in a piece of a recording, they are zero.
+
     With `rate` these are angular rates, which in long gaps fall to the rate at rest: the bias, that is.
     """
     lost = marks != GOOD
     if not lost.any():
         return values
+    if lost.all():
+        return np.zeros_like(values)
     time, filled = clock.time, values.copy()
     for k in range(values.shape[1]):
         filled[lost, k] = np.interp(time[lost], time[~lost], values[~lost, k])

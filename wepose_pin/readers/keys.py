@@ -46,7 +46,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 def parsed_toml(text: str) -> dict[str, Any]:
     """The contents of a TOML text; raises ValueError, whatever is wrong with it."""
     try:
-        return tomllib.loads(text)
+        return tomllib.loads(text.removeprefix("\ufeff"))  # which some editors put before
     except RecursionError:
         raise ValueError("tables or lists within each other to no end") from None
 

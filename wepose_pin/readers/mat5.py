@@ -34,6 +34,8 @@ def is_level_5(start: bytes) -> bool:
 def read_mat5(path: Path, most: int) -> dict[str, np.ndarray]:
     """Path → array (n,) or (n, k) of its own kind of numbers, without sides of length one; structs' fields are parts.
 
+    A single number is an array without sides, ().
+
     What is neither a number nor a struct of one element is passed over.
 
     Raises
@@ -104,7 +106,7 @@ def _walk(at: str, data: memoryview, order: str, found: dict[str, np.ndarray], d
         if len(values) != size:
             raise ValueError(f"an array of {size} numbers holds {len(values)}")
         array = values.reshape(shape.tolist(), order="F").squeeze()
-        if 1 <= array.ndim <= 2:
+        if array.ndim <= 2:
             found[where] = array
 
 

@@ -42,8 +42,10 @@ SATURATED_ACCEL = 15.0  # [m/s²]
 PLATEAU = 3  # samples
 
 
-def sensor_notes(recording: Recording, *, whole: bool = True) -> tuple[str, ...]:
-    """What the user should know of the values; a piece that is not the `whole` knows rest only from stated phases.
+def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True) -> tuple[str, ...]:
+    """What the user should know of the values.
+
+    A piece that is not the `whole` knows rest only from stated phases; `units` are checked in the first piece alone.
 
     Raises
     ------
@@ -56,7 +58,8 @@ def sensor_notes(recording: Recording, *, whole: bool = True) -> tuple[str, ...]
             continue
         place = f"{recording.where()}: sensors.{segment}"
         notes += _gravity(recording, sensor, place, whole)
-        _gyro_unit(sensor.gyro_S, sensor.accel_S, recording.rate_hz, place)
+        if units:
+            _gyro_unit(sensor.gyro_S, sensor.accel_S, recording.rate_hz, place)
         _range(recording.time, sensor.gyro_S, MOST_GYRO, "rad/s", f"{place}.gyro")
         _range(recording.time, sensor.accel_S, MOST_ACCEL, "m/s^2", f"{place}.accel")
         for name, values, least in (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from ..errors import BadData, BadOption, BadSession, MissingFile, one_of, printable
+from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, one_of, printable
 from ..recording import CONFIGURATION, SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases
 from .arrays import ArrayFile, is_array_file
 from .clocks import BRIDGED, LONG, Clock, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time, runs
@@ -19,6 +19,7 @@ from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
 from .plausibility import sensor_notes
 from .stated import WIDTHS, Stated, joints_stated, label_stated, phases_stated, sensor_stated, truth_stated
+from .tables import FORMATS as TABLES
 from .tables import Rows, columns, one_column, read_table
 
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
@@ -26,6 +27,7 @@ ACCEL_UNITS = {"m/s^2": 1.0, "g": 9.80665}
 # How far a quaternion's norm may be off 1: decimals that were cut.
 NORM_OFF = 1e-2
 SI = {"gyro": 1.0, "accel": 1.0}
+_BEGINNING_S = 20.0  # [s] of a recording in which somebody stands still for a second
 
 
 def load_session(path: str | Path, gaps: bool = False) -> Recording:
@@ -49,8 +51,7 @@ def iter_session(path: str | Path, seconds: float = 600.0) -> Iterator[Recording
     """A session in pieces of `seconds`, for recordings that do not fit in memory: only its times are held as a whole.
 
     Put together, the pieces are what `load_session` gives: to the bit, or to rounding where clocks differ and it is
-    resampled. A piece has the phases that touch it. What can be said of a whole recording only is not said: units are
-    checked by the phases that a piece has.
+    resampled. A piece has the phases that touch it. Units are checked by the first.
 
     Raises
     ------
@@ -67,6 +68,20 @@ def iter_session(path: str | Path, seconds: float = 600.0) -> Iterator[Recording
         last = n if n - first < size + 2 else first + size  # no piece of a single sample at the end
         yield reader.recording(first, last)
         first = last
+
+
+def data_bytes(path: str | Path) -> int:
+    """Size of the CSV and Parquet files that a session names; 0 where that cannot be told, as its reading will say."""
+    try:
+        path = Path(path)
+        path = path / "session.toml" if path.is_dir() else path
+        values = read_toml(path, "a session file")
+        tables = [values.get("data"), *values.get("sensors", {}).values()]
+        named = {table["file"] for table in tables if isinstance(table, dict) and isinstance(table.get("file"), str)}
+        files = [path.parent / name for name in named if Path(name).suffix.lower() in TABLES]
+        return sum(file.stat().st_size for file in files)
+    except (WeposeError, OSError, ValueError, AttributeError):
+        return 0
 
 
 @dataclass(frozen=True)
@@ -95,6 +110,8 @@ class SessionReader:
     Attributes
     ----------
     time, rate_hz : the common time base (n,) [s], and its rate
+    phases, start_pose, strapping : as of the `Recording`, whole
+    any_aligned : whether a sensor's orientations are its segment's own
     """
 
     def __init__(
@@ -155,6 +172,8 @@ class SessionReader:
         self._notes += tuple(note for device in self.devices.values() for note in device.notes)
         self.rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
         check_phases(str(self.path), self.time, self._head.phases)
+        self.phases, self.start_pose, self.strapping = self._head.phases, start_pose, self._head.strapping
+        self.any_aligned = any(plan.aligned for plan in self._plans.values())
 
     def _file(self, keys: Keys, data: Keys) -> Path:
         file = (keys if "file" in keys else data).text("file", None)
@@ -305,7 +324,9 @@ class SessionReader:
             phases=self._head.phases if whole else _within(self._head.phases, time),
             notes=(*self._notes, *gap_notes),
         )
-        notes = sensor_notes(check(recording), whole=whole)
+        check(recording)
+        begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
+        notes = sensor_notes(recording, whole=begins, units=first == 0)
         return replace(recording, notes=(*recording.notes, *notes))
 
     def _window(self, plan: _Plan, first: int, last: int) -> tuple[int, int]:
@@ -326,7 +347,8 @@ class SessionReader:
         marks = {}
         for name, (_, good) in found.items():
             place = f"{plan.path}: {plan.place}.{name}"
-            if not good.any():
+            lost_a_while = self.gaps and len(clock.time) < len(plan.clock.time) and name != "orientation"
+            if not good.any() and not lost_a_while:
                 columns_ = ", ".join(plan.signals[name])
                 raise BadData(f"{place}: no numbers from {clock.time[0]:g} to {clock.time[-1]:g} s in {columns_}")
             marks[name] = lost_samples(clock, good)

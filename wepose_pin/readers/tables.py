@@ -95,7 +95,7 @@ def _numbers(table: pl.DataFrame, name: str, file: str, place: str, first_row: i
 
 @dataclass
 class Rows:
-    """A table of which stretches of rows are asked for, each beginning no earlier than the one before.
+    """A table of which stretches of rows are asked for; a CSV is read anew for one that begins before the last one.
 
     Holds what was asked for and one block of a CSV, or the row groups that a stretch of a Parquet file touches.
     """
@@ -105,16 +105,20 @@ class Rows:
     def __post_init__(self) -> None:
         _must_be_table(self.path)
         self.names = _parquet_names(self.path) if _is_parquet(self.path) else _header(self.path)
+        self._from_the_top()
+
+    def _from_the_top(self) -> None:
         self._blocks = iter(()) if _is_parquet(self.path) else _csv_blocks(self.path, self.names)
-        self._held = pl.DataFrame()
-        self._first = 0
+        self._held, self._first = pl.DataFrame(), 0
 
     def __getitem__(self, rows: slice) -> pl.DataFrame:
+        if rows.stop <= rows.start:
+            return pl.DataFrame(schema=dict.fromkeys(self.names, pl.Float64))
         if _is_parquet(self.path):
             with _polars_errors(self.path):
                 return pl.scan_parquet(self.path).slice(rows.start, rows.stop - rows.start).collect()
         if rows.start < self._first:
-            raise ValueError(f"row {rows.start} asked for after row {self._first}")
+            self._from_the_top()
         while self._first + self._held.height < rows.stop and (block := next(self._blocks, None)) is not None:
             kept = self._held.slice(max(0, rows.start - self._first))
             self._first += self._held.height - kept.height

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..errors import BadData, MissingFile
-from .tables import columns, read_table
+from .mat5 import read_mat5
+from .tables import columns, most_bytes, read_table
 
 UR5_SENSORS = ("carpus", "radius")
 RING_SEGMENTS = ("seg1", "seg2", "seg3", "seg4", "seg5")
@@ -44,18 +45,25 @@ def read_broad(path: Path) -> Trial:
     MissingFile, BadData
         Not there; not such a file.
     """
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a .mat file of the BROAD benchmark is wanted here")
     try:
-        mat = loadmat(path)
-        gyro, accel = (np.ascontiguousarray(mat[key], dtype=float) for key in ("imu_gyr", "imu_acc"))
-        rate_hz = float(mat["sampling_rate"].squeeze())
-        moving, true = mat["movement"].ravel().astype(bool), so3.xyzw_from_wxyz(mat["opt_quat"])
-    except (KeyError, ValueError, NotImplementedError, MatReadError) as error:
+        mat = read_mat5(path, most_bytes(path))
+        gyro, accel, true = (
+            np.ascontiguousarray(mat[f"/{key}"], dtype=float) for key in ("imu_gyr", "imu_acc", "opt_quat")
+        )
+        rate_hz, moving = float(mat["/sampling_rate"]), mat["/movement"].astype(bool)
+    except (KeyError, ValueError, TypeError) as error:
         raise BadData(f"{path}: is no trial of the BROAD benchmark: {error}") from error
+    n = len(moving) if moving.ndim == 1 else 0
+    shapes = gyro.shape, accel.shape, true.shape
+    if shapes != ((n, 3), (n, 3), (n, 4)) or not (1.0 <= rate_hz < 1e5 and moving.any()):
+        raise BadData(
+            f"{path}: is no trial of the BROAD benchmark: imu_gyr {shapes[0]}, imu_acc {shapes[1]}, opt_quat "
+            f"{shapes[2]}, movement {moving.shape}, sampling_rate {rate_hz:g}; (n, 3), (n, 3), (n, 4), (n,) and a rate "
+            f"are needed"
+        )
+    true = so3.xyzw_from_wxyz(true)
     begin, second = int(np.argmax(moving)), round(rate_hz)
     seen = np.isfinite(true).all(axis=1)
     return Trial(path.stem, rate_hz, gyro, accel, true, slice(second, begin - second), moving & seen)

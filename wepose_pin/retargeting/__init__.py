@@ -4,7 +4,7 @@ Frames: the robot's root is the frame of its URDF; T is the person's torso, x fo
 coordinates into the root's. Values of joints are `u`, one for each joint that moves by itself; `q` is Pinocchio's.
 """
 
-from .check import kept, touching
+from .check import Kept, kept, touching
 from .files import summary, table, write_episode, write_trajectory
 from .maps import ROBOTS, RobotMap, find_map, read_map
 from .person import Wish, wish
@@ -14,6 +14,7 @@ from .solver import Tasks
 
 __all__ = [
     "ROBOTS",
+    "Kept",
     "Robot",
     "RobotMap",
     "Tasks",

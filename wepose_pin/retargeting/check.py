@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 import polars as pl
+from scipy.interpolate import CubicHermiteSpline
 
 from .collision import allowed_pairs
 from .limits import urdf_limits
@@ -20,35 +21,45 @@ class Kept(NamedTuple):
 
     position: float  # [rad or m] to the nearest position limit
     velocity: float  # share of the velocity limits that is never used
-    acceleration: float  # of the acceleration limits, from second differences of the positions too
-    even: bool  # each sample follows from the one before by its own velocity and acceleration
-    jerk: float  # [rad/s³ or m/s³] the largest step of an acceleration over its time
+    acceleration: float  # of the acceleration limits
+    jerk: float  # of the jerk limits
+    even: bool  # velocities and accelerations are those of one curve through the positions: cubics between samples
+    rests: bool  # it begins and ends without velocity and acceleration
 
     @property
     def all(self) -> bool:
         """Whether every limit is kept."""
-        return min(self.position, self.velocity, self.acceleration) >= 0.0 and self.even
+        return min(self.position, self.velocity, self.acceleration, self.jerk) >= 0.0 and self.even and self.rests
 
 
-def kept(table: pl.DataFrame, urdf: Path, acceleration: Mapping[str, float]) -> Kept:
-    """Limits of a table as in ``trajectory.parquet``, against the URDF and the map's accelerations."""
+def kept(
+    table: pl.DataFrame, urdf: Path, acceleration: Mapping[str, float], jerk: Mapping[str, float] | None = None
+) -> Kept:
+    """Limits of a table as in ``trajectory.parquet``, against the URDF and the map's accelerations and jerks.
+
+    Looked at are the samples and ten places between each two, on the cubics through positions and velocities.
+    """
     said, time = urdf_limits(urdf), table["time"].to_numpy()
     joints = [name for name in table.columns if name in said]
-    dt = np.diff(time)[:, None]
     q, v, a = (table.select([f"{j}{end}" for j in joints]).to_numpy() for end in ("", "_velocity", "_acceleration"))
     low, high, fast = (np.array([getattr(said[j], key) for j in joints]) for key in ("lower", "upper", "velocity"))
     hard = np.array([acceleration[j] for j in joints])
-    mean = np.diff(q, axis=0) / dt
-    seen = np.abs(np.diff(mean, axis=0) / dt[1:])
+    sudden = np.array([jerk[j] if jerk else np.inf for j in joints])
+    curve = CubicHermiteSpline(time, q, v)
+    dense = np.unique(
+        np.concatenate([time, (time[:-1, None] + np.diff(time)[:, None] * np.arange(0.1, 1.0, 0.1)).ravel()])
+    )
+    between, moving = curve(dense), curve(dense, 1)
+    cubic, square = 6.0 * curve.c[0], 2.0 * curve.c[1]  # jerk of each step, acceleration at its beginning
+    left, right = square, square + cubic * np.diff(time)[:, None]
+    steps = np.abs(np.diff(a, axis=0)) / np.diff(time)[:, None]
     return Kept(
-        position=float(min((q - low).min(), (high - q).min())),
-        velocity=float(1.0 - max((np.abs(v) / fast).max(), (np.abs(mean) / fast).max())),
-        acceleration=float(1.0 - max((np.abs(a) / hard).max(), (seen / hard).max(initial=0.0))),
-        even=bool(
-            np.allclose(v[1:], v[:-1] + dt * a[:-1], atol=1e-6)
-            and np.allclose(q[1:], q[:-1] + 0.5 * dt * (v[1:] + v[:-1]), atol=1e-6)
-        ),
-        jerk=float((np.abs(np.diff(a, axis=0)) / dt).max(initial=0.0)) if len(a) > 2 else 0.0,
+        position=float(min((between - low).min(), (high - between).min())),
+        velocity=float(1.0 - max((np.abs(v) / fast).max(), (np.abs(moving) / fast).max())),
+        acceleration=float(1.0 - max((np.abs(x) / hard).max() for x in (a, left, right))),
+        jerk=float(1.0 - max((np.abs(x) / sudden).max() for x in (cubic, steps))),
+        even=bool(np.allclose(left, a[:-1], atol=1e-4) and np.allclose(right, a[1:], atol=1e-4)),
+        rests=bool(np.abs(np.concatenate([v[[0, -1]], a[[0, -1]]])).max() < 1e-9),
     )
 
 

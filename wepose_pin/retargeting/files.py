@@ -11,6 +11,7 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from ..writers.result import write_table
+from .causes import DRAWN_IN, FAR, causes, possible
 from .check import Kept, Touching
 from .collision import CLEARANCE
 from .person import robot_reach
@@ -18,7 +19,6 @@ from .plan import Trajectory
 
 DIGITS = 8  # of angles in text
 BENT = 0.03  # [m] from the line shoulder-hand to the elbow: below it the swivel says nothing
-DRAWN_IN = 1e-3  # [m] by which a target was moved: then it was outside the reach
 
 
 def table(trajectory: Trajectory) -> pl.DataFrame:
@@ -114,8 +114,9 @@ def write_episode(folder: Path, trajectory: Trajectory, task: str) -> None:
 def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, Any]:
     """Numbers and words for ``summary.json``."""
     robot, begin = trajectory.robot, trajectory.approach
-    arms = {}
-    for arm, target in zip(robot.arms, trajectory.targets, strict=True):
+    arms: dict[str, Any] = {}
+    frames, reached = possible(trajectory)
+    for i, (arm, target) in enumerate(zip(robot.arms, trajectory.targets, strict=True)):
         side = arm.side
         inside = np.linalg.norm(target.position - target.wish, axis=1)[begin:] < DRAWN_IN
         far = 1e3 * np.linalg.norm(trajectory.hand[side] - target.wish, axis=1)[begin:]
@@ -131,6 +132,8 @@ def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, 
             "inside_reach_share": _share(inside),
             "hand_error_mm": _quantiles(far[inside]),
             "hand_error_everywhere_mm": _quantiles(far),
+            "possible": _possible(far[frames - begin], 1e3 * reached[:, i]),
+            "causes": causes(trajectory, i),
             "hand_error_deg": _quantiles(np.degrees(turn.magnitude())),
             "swivel_error_deg": _quantiles(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
             "lost_share": _share(target.lost[begin:]),
@@ -138,9 +141,10 @@ def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, 
     ms, dt = 1e3 * trajectory.solve_s, float(trajectory.time[1] - trajectory.time[0])
     counts, steps = trajectory.counts, max(trajectory.counts.steps, 1)
     recorded_s = float(trajectory.recorded[-1] - trajectory.recorded[begin])
+    shown_s = float(trajectory.time[np.argmax(trajectory.recorded)] - trajectory.time[begin])
     slow = trajectory.slowest
     nearest = float(trajectory.closest.min())
-    rms = np.sqrt(np.mean((np.diff(trajectory.a[begin:-1], axis=0) / dt) ** 2))
+    jerk = np.abs(np.diff(trajectory.a, axis=0)) / dt
     return {
         "robot": robot.map.name,
         "urdf": robot.map.urdf.name,
@@ -150,7 +154,7 @@ def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, 
         "duration_s": round(float(trajectory.time[-1]), 3),
         "approach_s": round(float(trajectory.time[begin]), 3),
         "recorded_s": round(recorded_s, 3),
-        "slowed": round(float(trajectory.time[-1] - trajectory.time[begin]) / recorded_s, 3) if recorded_s else None,
+        "slowed": round(shown_s / recorded_s, 3) if recorded_s else None,
         "slowest": None if slow is None else slow._asdict(),
         "arms": arms,
         "limits_kept": held.all,
@@ -158,8 +162,9 @@ def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, 
             "position_rad": held.position,
             "velocity_share": held.velocity,
             "acceleration_share": held.acceleration,
+            "jerk_share": held.jerk,
         },
-        "jerk_rad_s3": {"rms": round(float(rms), 2), "largest": round(held.jerk, 1)},
+        "jerk_rad_s3": {"rms": round(float(np.sqrt(np.mean(jerk**2))), 2), "largest": round(float(jerk.max()), 1)},
         "self_collision": {
             "samples_touching": touched.samples,
             "first": touched.first or None,
@@ -168,11 +173,25 @@ def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, 
         },
         "steps": {
             "all": counts.steps,
-            "singular_share": round(counts.singular / steps, 4),
+            "singular_share": round(counts.singular / (steps * len(robot.arms)), 4),
             "near_itself_share": round(counts.near / steps, 4),
             "no_solution_share": round(counts.held / steps, 4),
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
+    }
+
+
+def _possible(far: np.ndarray, reached: np.ndarray) -> dict[str, Any]:
+    """How much of the hand's error [mm] is the robot's form, at some of the samples; see `causes.possible`."""
+    known = np.isfinite(reached)
+    far, reached = far[known], reached[known]
+    within = reached < 1e3 * FAR
+    return {
+        "samples": len(far),
+        "hand_error_mm": _quantiles(reached),
+        "reachable_share": _share(within),
+        "hand_error_where_reachable_mm": _quantiles(far[within]),
+        "hand_error_above_mm": _quantiles(np.maximum(far - reached, 0.0)),
     }
 
 

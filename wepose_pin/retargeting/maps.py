@@ -19,6 +19,7 @@ SIDES = ("left", "right")
 AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
 _KEYS = ("format", "urdf", "srdf", "about", "up", "forward", "base", "rest", "limits", "arms")
+RISE_S = 0.02  # [s] in which a joint reaches its full acceleration, where nothing is said of its jerk
 _ARM_KEYS = ("joints", "shoulder", "elbow", "hand", "reach")
 
 
@@ -64,7 +65,7 @@ class RobotMap:
     base : link whose axes `up` and `forward` are; empty: the root
     up, forward : axes of the base that point up, and to where the person faces
     rest : joint → where it rests [rad or m]; zero where not named
-    acceleration : joint → most it may have [rad/s²]
+    acceleration, jerk : joint → most it may have [rad/s²], [rad/s³]
     about : sources, in words
     """
 
@@ -77,6 +78,7 @@ class RobotMap:
     forward: str
     rest: Mapping[str, float]
     acceleration: Mapping[str, float]
+    jerk: Mapping[str, float]
     arms: Mapping[str, ArmMap]
     about: str = ""
 
@@ -133,8 +135,13 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     for side in arms:
         if side not in SIDES:
             raise BadModel(f"{where}: arms.{side} is no side; {one_of(SIDES, side)}")
+    sides = {side: _arm(arms[side], f"{where}: arms.{side}") for side in SIDES if side in arms}
     limits = _table(table, "limits", where)
-    _known(limits, ("acceleration", "source"), f"{where}: limits")
+    _known(limits, ("acceleration", "jerk", "source"), f"{where}: limits")
+    joints = [name for arm in sides.values() for name in arm.joints]
+    acceleration = _of_joints(limits, "acceleration", joints, f"{where}: limits")
+    jerk = {name: most / RISE_S for name, most in acceleration.items()}
+    jerk |= _of_joints(limits, "jerk", joints, f"{where}: limits")
     return RobotMap(
         name=path.stem,
         where=where,
@@ -144,8 +151,9 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         up=up,
         forward=forward,
         rest=_numbers(_table(table, "rest", where), f"{where}: rest"),
-        acceleration=_numbers(_table(limits, "acceleration", f"{where}: limits"), f"{where}: limits.acceleration"),
-        arms={side: _arm(arms[side], f"{where}: arms.{side}") for side in SIDES if side in arms},
+        acceleration=acceleration,
+        jerk=jerk,
+        arms=sides,
         about=" ".join(str(text) for text in (table.get("about", ""), limits.get("source", "")) if text),
     )
 
@@ -238,6 +246,16 @@ def _numbers(table: Mapping[str, Any], where: str) -> dict[str, float]:
         if not _is_number(value):
             raise BadModel(f"{where}.{name} = {value!r}; a number is needed")
     return {name: float(value) for name, value in table.items()}
+
+
+def _of_joints(table: Mapping[str, Any], key: str, joints: list[str], where: str) -> dict[str, float]:
+    """One number for all joints, or a table with a number for each."""
+    value = table.get(key, {})
+    if _is_number(value):
+        return dict.fromkeys(joints, float(value))
+    if not isinstance(value, dict):
+        raise BadModel(f"{where}.{key} = {value!r}; a number for all joints, or a table with one for each, is needed")
+    return _numbers(value, f"{where}.{key}")
 
 
 def _is_number(value: Any) -> bool:

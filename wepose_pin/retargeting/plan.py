@@ -22,15 +22,21 @@ from ..pose import Pose
 from .collision import Shapes
 from .person import SMOOTHING_HZ, ArmTarget, Wish, bend_of, replace_rates, resampled, wish
 from .robot import Robot
-from .solver import Counts, State, Stepper, Tasks, aims_at
+from .solver import Counts, Held, State, Stepper, Tasks, aims_at
 
 RATE_HZ = 100.0
 LOOSE = 8.0  # how much wider the first run's limits are
 MOST = 6.0  # times longer a moment takes at most; what is still too fast then lags behind
-VELOCITY_SHARE, ACCELERATION_SHARE = 0.85, 0.6  # of the limits that the motion may ask for: the rest is for catching up
+VELOCITY_SHARE, ACCELERATION_SHARE, JERK_SHARE = (
+    0.85,
+    0.6,
+    0.6,
+)  # of the limits that the motion may ask for: the rest is for catching up
 SPREAD_S = 0.15  # [s] to each side over which a slow moment slows its surroundings
 APPROACH_SPEED, APPROACH_RATE = 0.25, 0.6  # [m/s], [rad/s] of the hands on their way from rest
 APPROACH_LEAST_S, SETTLE_S = 2.0, 1.0
+FADE_S = 0.5  # [s] of the motion's end that take twice as long, fading to rest
+HALT_S = 0.3  # [s] in which the very last of it fades
 STRICT = 1.02  # slower than this, and --strict refuses
 
 
@@ -40,7 +46,7 @@ class Slowest(NamedTuple):
     joint: str
     time: float  # [s] of the recording
     factor: float
-    what: str  # "velocity" or "acceleration"
+    what: str  # "velocity", "acceleration" or "jerk"
 
 
 @dataclass(frozen=True)
@@ -52,16 +58,19 @@ class Trajectory:
     time : (n,) [s] from 0, at an even rate
     recorded : (n,) [s] of the recording that each moment shows; the first moment's during the approach
     approach : samples that lead from rest to the recording's first moment
-    u, v, a : (n, joints) positions, velocities, accelerations [rad or m, s]; over a step a is even, so that v is a line
-        and u a parabola: any denser rate has the same limits
+    u, v, a : (n, joints) positions, velocities, accelerations [rad or m, s]; over a step the jerk is even, so that a is
+        a line, v a parabola and u a cubic: any denser rate has the same limits
     targets : what the hands were asked for at these times
     hand, turn, bend : side → position (n, 3) [m] in the root, rotation (n, 3, 3) and elbow's bend (n, 3) that came out
     closest : (n,) [m] between convex hulls; inf where nothing was near
+    held : what held joints and arms in the step from each sample
     solve_s : (n,) [s] that each step took
     slowest : None where nothing had to be slowed for a limit
     """
 
     robot: Robot
+    shapes: Shapes
+    tasks: Tasks
     wish: Wish
     time: np.ndarray
     recorded: np.ndarray
@@ -74,6 +83,7 @@ class Trajectory:
     turn: dict[str, np.ndarray]
     bend: dict[str, np.ndarray]
     closest: np.ndarray
+    held: Held
     solve_s: np.ndarray
     counts: Counts
     slowest: Slowest | None
@@ -116,7 +126,7 @@ def retarget(
     first, approach = _approach(Stepper(robot, shapes, dt, tasks), motion, dt)
     n = len(first.time)
     wide = Stepper(robot, shapes, dt, tasks, loose=LOOSE)
-    path, _ = _run(wide, first, None, lambda share: progress("looking at the motion", share))
+    path, _ = _run(wide, first, None, 0, lambda share: progress("looking at the motion", share))
     factor, slowest = _slower(path, robot, dt, first, approach)
     if strict and slowest is not None and slowest.factor > STRICT:
         raise NoSolution(
@@ -124,15 +134,18 @@ def retarget(
             f"{slowest.factor:.1f} times its {slowest.what} limit; without --strict the motion is slowed there"
         )
     stretched = np.concatenate([[0.0], np.cumsum(0.5 * (factor[1:] + factor[:-1])) * dt])
-    time = np.arange(0.0, stretched[-1] + 0.5 * dt, dt)
+    stretched = _fading(stretched)
+    time = np.arange(0.0, stretched[-1] + SETTLE_S + HALT_S, dt)
     index = np.interp(time, stretched, np.arange(n))
     targets = _on(first, index, time, dt)
     lean = CubicSpline(np.arange(n) * dt, gaussian_filter1d(path[0], 0.03 / dt, axis=0, mode="nearest"))
     reference = lean(np.minimum(index, n - 1) * dt)
     exact = Stepper(robot, shapes, dt, replace(tasks, posture=50.0 * tasks.posture, posture_gain=8.0))
-    found, seen = _run(exact, targets, reference, lambda share: progress("solving", share))
+    found, seen = _run(exact, targets, reference, round(HALT_S / dt), lambda share: progress("solving", share))
     return Trajectory(
         robot=robot,
+        shapes=shapes,
+        tasks=tasks,
         wish=asked,
         time=time,
         recorded=targets.time,
@@ -145,6 +158,7 @@ def retarget(
         turn={arm.side: seen.turn[i] for i, arm in enumerate(robot.arms)},
         bend={arm.side: seen.bend[i] for i, arm in enumerate(robot.arms)},
         closest=seen.closest,
+        held=seen.held,
         solve_s=seen.solve_s,
         counts=exact.counts,
         slowest=slowest,
@@ -156,35 +170,37 @@ class _Seen(NamedTuple):
     turn: list[np.ndarray]
     bend: list[np.ndarray]
     closest: np.ndarray
+    held: Held
     solve_s: np.ndarray
 
 
 def _run(
-    stepper: Stepper, motion: Wish, reference: np.ndarray | None, progress: Callable[[float], None]
+    stepper: Stepper, motion: Wish, reference: np.ndarray | None, halts: int, progress: Callable[[float], None]
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], _Seen]:
-    """Positions, velocities, accelerations (n, joints) from rest on, and what was seen."""
+    """Positions, velocities, accelerations (n, joints) from rest on, and what was seen; the last `halts` samples halt."""
     robot, n, arms = stepper.robot, len(motion.time), len(stepper.robot.arms)
     u, v, a = (np.zeros((n, len(robot.names))) for _ in range(3))
     seen = _Seen(
         [np.empty((n, 3)) for _ in range(arms)], [np.empty((n, 3, 3)) for _ in range(arms)],
-        [np.empty((n, 3)) for _ in range(arms)], np.full(n, np.inf), np.zeros(n),
+        [np.empty((n, 3)) for _ in range(arms)], np.full(n, np.inf),
+        Held(np.zeros(u.shape, dtype=bool), np.zeros((n, arms), dtype=bool)), np.zeros(n),
     )  # fmt: skip
     state = State(robot.rest.copy(), np.zeros(len(robot.names)), np.zeros(len(robot.names)))
     pull = None if reference is None else np.gradient(reference, stepper.dt, axis=0)
     for k in range(n):
-        u[k], v[k] = state.u, state.v
+        u[k], v[k], a[k] = state.u, state.v, state.a
         begin = clock.perf_counter()
         if reference is not None and pull is not None:
             stepper.lean = (reference[k], pull[min(k + 1, n - 1)])
-        after = stepper.step(state, aims_at(motion.arms, k, stepper.dt))
+        left = n - 1 - k
+        after = stepper.halt(state, left) if left < halts else stepper.step(state, aims_at(motion.arms, k, stepper.dt))
         seen.solve_s[k] = clock.perf_counter() - begin
         seen.closest[k] = stepper.closest
+        seen.held.joints[k], seen.held.shapes[k] = stepper.held
         for i in range(arms):
             seen.hand[i][k], seen.turn[i][k], elbow = stepper.place(i)
             offset = seen.hand[i][k] - robot.arms[i].shoulder
             seen.bend[i][k] = bend_of(elbow - robot.arms[i].shoulder, offset)
-        if k < n - 1:
-            a[k] = after.a
         state = after
         if k % 64 == 0:
             progress(k / n)
@@ -234,21 +250,31 @@ def _slower(
     u = gaussian_filter1d(path[0], 0.03 / dt, axis=0, mode="nearest")
     v = np.gradient(u, dt, axis=0)
     a = np.gradient(v, dt, axis=0)
+    jerk = np.gradient(a, dt, axis=0)
     by_v = np.abs(v) / (VELOCITY_SHARE * robot.v_most)
     by_a = np.sqrt(np.abs(a) / (ACCELERATION_SHARE * robot.a_most))
-    need = np.maximum(by_v.max(axis=1), by_a.max(axis=1))
+    by_j = np.cbrt(np.abs(jerk) / (JERK_SHARE * robot.j_most))
+    by = np.stack([by_v, by_a, by_j])
+    need = by.max(axis=(0, 2))
     whole = np.maximum(need, 1.0)
     slowest = None
     k = approach + int(np.argmax(need[approach:]))
-    fast, hard = np.abs(v[k]) / robot.v_most, np.abs(a[k]) / robot.a_most
     if need[k] > 1.0:
-        what, over = ("velocity", fast) if by_v[k].max() >= by_a[k].max() else ("acceleration", hard)
-        j = int(np.argmax(over))
-        slowest = Slowest(robot.names[j], float(motion.time[k]), float(over[j]), what)
+        which, j = np.unravel_index(int(np.argmax(by[:, k])), by[:, k].shape)
+        over = (np.abs(v[k]) / robot.v_most, np.abs(a[k]) / robot.a_most, np.abs(jerk[k]) / robot.j_most)[which][j]
+        slowest = Slowest(
+            robot.names[j], float(motion.time[k]), float(over), ("velocity", "acceleration", "jerk")[which]
+        )
     whole = np.minimum(np.maximum(whole, motion.slow), MOST)
     width = max(1, round(SPREAD_S / dt))
     wide = maximum_filter1d(whole, 2 * width + 1, mode="nearest")
     return np.asarray(gaussian_filter1d(wide, 0.5 * width, mode="nearest")), slowest
+
+
+def _fading(time: np.ndarray) -> np.ndarray:
+    """Times at which the samples pass, the last `FADE_S` of them ever more slowly: their speed falls evenly to none."""
+    share = np.clip((time - (time[-1] - FADE_S)) / FADE_S, 0.0, 1.0)
+    return time + FADE_S * (2.0 * (1.0 - np.sqrt(1.0 - share)) - share)
 
 
 def _on(motion: Wish, index: np.ndarray, time: np.ndarray, dt: float) -> Wish:

@@ -48,7 +48,7 @@ class Robot:
     full, model : Pinocchio's model of the whole robot, and with only the arms' joints
     shapes : what collides, on `model`
     coupling, offset : joints of `model` = coupling @ u + offset; more rows than columns where a joint mimics another
-    lower, upper, v_most, a_most : (n,) limits [rad or m, s], a little inside the URDF's and the map's
+    lower, upper, v_most, a_most, j_most : (n,) limits [rad or m, s], a little inside the URDF's and the map's
     R_BT : turns coordinates of the person's torso into the root's
     """
 
@@ -63,6 +63,7 @@ class Robot:
     upper: np.ndarray
     v_most: np.ndarray
     a_most: np.ndarray
+    j_most: np.ndarray
     rest: np.ndarray
     rest_full: np.ndarray
     R_BT: np.ndarray
@@ -118,10 +119,10 @@ def load(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
     lower, upper, v_most = _limits(list(model.names[1:]), coupling, offset, said)
     data, q = model.createData(), pin.neutral(model)
     rest = np.clip([robot.rest.get(name, 0.0) for name in names], lower + 0.02, upper - 0.02)
+    a_most, j_most = (SHARE * np.array([of[name] for name in names]) for of in (robot.acceleration, robot.jerk))
     made = Robot(
-        robot, tuple(names), full, model, shapes, coupling, offset, lower, upper, SHARE * v_most,
-        SHARE * np.array([robot.acceleration[name] for name in names]), rest, rest_full, _turn(robot, full, rest_full),
-        (),
+        robot, tuple(names), full, model, shapes, coupling, offset, lower, upper, SHARE * v_most, a_most, j_most, rest,
+        rest_full, _turn(robot, full, rest_full), (),
     )  # fmt: skip
     q = made.q(rest)
     pin.framesForwardKinematics(model, data, q)
@@ -165,13 +166,17 @@ def _check(robot: RobotMap, arms: dict[str, ArmMap], full: Any, said: dict[str, 
                     'write <limit velocity="…"/>'
                 )
             if not _driven(limit, [name for arm in arms.values() for name in arm.joints]):
-                value = robot.acceleration.get(name)
-                if value is None or not value > 0.0:
-                    said_value = "has none" if value is None else f"is {value:g}"
-                    raise BadModel(
-                        f"{robot.where}: limits.acceleration: joint '{name}' {said_value}; no URDF holds it, "
-                        "a number above 0 is needed [rad/s²]"
-                    )
+                for key, values, unit in (
+                    ("acceleration", robot.acceleration, "rad/s²"),
+                    ("jerk", robot.jerk, "rad/s³"),
+                ):
+                    value = values.get(name)
+                    if value is None or not value > 0.0:
+                        said_value = "has none" if value is None else f"is {value:g}"
+                        raise BadModel(
+                            f"{robot.where}: limits.{key}: joint '{name}' {said_value}; no URDF holds it, "
+                            f"a number above 0 is needed [{unit}]"
+                        )
     for name in robot.rest:
         if name not in said:
             raise BadModel(

@@ -7,7 +7,7 @@ import numpy as np
 from ..so3 import compiled, inlined
 
 # Where each number of the tasks stands in `numbers`.
-POSITION, ORIENTATION, SWIVEL, GAIN, BRAKE, STRAIGHT, DAMPING = range(7)
+POSITION, ORIENTATION, SWIVEL, GAIN, BRAKE, STRAIGHT, DAMPING, CURVED = range(8)
 _NOTHING = 0.01  # [m] a bend below which an elbow has no direction
 _SURE = 0.05  # [m] a bend from which on it counts in full
 
@@ -50,6 +50,12 @@ def add_arm(H, f, J, above, p, elbow, shoulder, turn, position, velocity, rate, 
             f[a] += w_go * slide[i, a] * go[i] + w_spin * J[3 + i, a] * spin[i]
     if above.shape[0]:
         _add_swivel(H, f, slide, above, p, elbow, shoulder, bend, weight, numbers)
+    # What the Jacobian's own change adds to the Hessian: where an arm is straight and its target farther, the only term
+    # that keeps the elbow from swinging through (Levenberg; Sugihara 2011 weighs it by the error too).
+    gap = np.sqrt(np.sum((position - p - ahead) ** 2))
+    bent = w_go * numbers[CURVED] * gap + w_spin * np.sqrt(np.sum((turn - ahead_turn) ** 2))
+    for j in joints:
+        H[j, j] += bent
     gram = np.zeros((3, 3))
     for a in range(3):
         for b in range(3):

@@ -1,10 +1,11 @@
 """One step: where the hands are, where they are to be, the next joint velocities by one quadratic programme.
 
-The tasks are those of differential inverse kinematics (hand, elbow swivel, posture, damping), written for the next
-velocity v' of all joints at once. Over a step the velocity changes evenly, so that positions, velocities and
-accelerations of the trajectory are those of one motion, and every limit on v' is a simple bound
-(`limits.velocity_bounds`). What is near in space adds a row each. The sums are those of Pink (a test holds them against
-it), whose limits on acceleration and position together leave its programme without a solution sooner or later.
+The tasks are those of differential inverse kinematics (hand, elbow swivel, posture, damping), written for the velocity w
+of all joints half a step after the coming one, were the acceleration to stay what it is at the coming one's end:
+w = v + dt (½ a + a'). Over a step the jerk is even, and a' = (w - v) / dt - ½ a is the one such law that reaches a given
+velocity in two steps, without swinging about it. Every limit on a' is a simple bound (`limits.acceleration_bounds`). What
+is near in space adds a row each. The sums are those of Pink (a test holds them against it), whose limits on acceleration
+and position together leave its programme without a solution sooner or later.
 """
 
 from __future__ import annotations
@@ -17,11 +18,14 @@ import pinocchio as pin
 
 from ..errors import WeposeError
 from .collision import Shapes
-from .limits import velocity_bounds
+from .limits import acceleration_bounds, closing, usable
 from .person import ArmTarget
 from .robot import Arm, Robot
 from .rows import add_arm
 
+HAND_TAKES = 6  # joints that a hand's place and turn need: with no more of them an elbow would pull the hand away
+HALTS = 30.0  # [1/s] at which the last of a velocity fades
+_HARDLY = 1e-3  # [m/rad] by which a joint that has no part in it changes a distance
 _NONE = np.empty((0, 0))
 
 
@@ -40,6 +44,7 @@ class Tasks:
     brake: float = 8.0  # [m/s², rad/s²]: an error is made good no faster than this stops it
     straight: float = 0.06  # [m] of the hand per rad/s: below it the arm counts as singular, and is damped
     damping: float = 0.05  # at most, where it is singular
+    curved: float = 0.2  # [m]: an error damps as much as the path of a hand bends, about a joint so far off
 
 
 class Aim(NamedTuple):
@@ -51,6 +56,13 @@ class Aim(NamedTuple):
     rate: np.ndarray
     bend: np.ndarray
     weight: float
+
+
+class Held(NamedTuple):
+    """What held the robot in a step, or in many."""
+
+    joints: np.ndarray  # (…, n) bool: at a bound of its own
+    shapes: np.ndarray  # (…, arms) bool: an arm that comes no nearer to something
 
 
 @dataclass
@@ -79,7 +91,7 @@ class Stepper:
     Parameters
     ----------
     dt : [s] of a step
-    loose : velocity and acceleration limits are so many times wider: to see what a motion would ask for
+    loose : velocity, acceleration and jerk limits are so many times wider: to see what a motion would ask for
     """
 
     robot: Robot
@@ -89,6 +101,7 @@ class Stepper:
     loose: float = 1.0
     counts: Counts = field(default_factory=Counts)
     closest: float = np.inf  # [m] between hulls in the last step; inf where nothing was near
+    held: Held = field(init=False)  # by what, in the last step
     lean: tuple[np.ndarray, np.ndarray] | None = None  # posture and its velocity in place of the rest
 
     def __post_init__(self) -> None:
@@ -100,9 +113,14 @@ class Stepper:
         self.data: Any = self.robot.model.createData()
         n = len(self.robot.names)
         self._low, self._high = np.empty(n), np.empty(n)
+        v_most, a_most, j_most = (self.loose * of for of in (self.robot.v_most, self.robot.a_most, self.robot.j_most))
+        self._most = (v_most, usable(a_most, v_most, j_most, self.robot.upper - self.robot.lower, self.dt), j_most)
         self._plain = np.array_equal(self.robot.coupling, np.eye(len(self.robot.coupling), n))
         t = self.tasks
-        self._numbers = np.array([t.position, t.orientation, t.swivel, t.gain, t.brake, t.straight, t.damping])
+        self._numbers = np.array(
+            [t.position, t.orientation, t.swivel, t.gain, t.brake, t.straight, t.damping, t.curved]
+        )
+        self.held = Held(np.zeros(n, dtype=bool), np.zeros(len(self.robot.arms), dtype=bool))
         self._follow = [_Follower(self.robot, arm, self.data) for arm in self.robot.arms]
 
     def look(self, u: np.ndarray) -> None:
@@ -125,45 +143,73 @@ class Stepper:
         for follower, aim in zip(self._follow, aims, strict=True):
             singular = follower.add(H, f, aim, self._numbers, dt, state.v)
             self.counts.singular += singular
-        smooth = state.v + dt * state.a
+        decided = state.v + 0.5 * dt * state.a
         H[np.diag_indices(n)] += tasks.posture + tasks.still + tasks.smooth
         posture, pull = (robot.rest, 0.0) if self.lean is None else self.lean
-        f += tasks.posture * (tasks.posture_gain * (posture - state.u) + pull) + tasks.smooth * smooth
-        v_most, a_most = self.loose * robot.v_most, self.loose * robot.a_most
-        velocity_bounds(state.u, state.v, robot.lower, robot.upper, v_most, a_most, dt, self._low, self._high)
+        f += tasks.posture * (tasks.posture_gain * (posture - state.u) + pull)
+        f += tasks.smooth * (decided + dt * state.a)
+        acceleration_bounds(
+            state.u, state.v, state.a, robot.lower, robot.upper, *self._most, dt, self._low, self._high
+        )  # fmt: skip
+        low, high = decided + dt * self._low, decided + dt * self._high
         rows, bound = self._apart(state)
-        v = self._programme(H, f, rows, bound)
-        v = np.clip(v, self._low, self._high)
-        return State(state.u + 0.5 * dt * (state.v + v), v, (v - state.v) / dt)
+        w = np.clip(self._programme(H, f, rows, bound, low, high), low, high)
+        a = np.clip((w - decided) / dt, self._low, self._high)
+        return moved(state, a, dt)
+
+    def halt(self, state: State, steps: int) -> State:
+        """The state one step on, on the way to rest; exactly there when `steps`, the steps left, come to none.
+
+        For a robot that hardly moves any more: shapes that are near are not looked at.
+        """
+        robot, dt, decided = self.robot, self.dt, state.v + 0.5 * self.dt * state.a
+        self.look(state.u)
+        acceleration_bounds(state.u, state.v, state.a, robot.lower, robot.upper, *self._most, dt, self._low, self._high)
+        w = 0.0 if steps <= 2 else (1.0 - HALTS * dt) * state.v
+        return moved(state, np.clip((w - decided) / dt, self._low, self._high), dt)
 
     def _apart(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """Rows @ v' ≥ bound: near shapes come no closer than they can stop."""
+        """Rows @ w ≥ bound: near shapes come no closer than they can stop."""
         near = self.shapes.near(self.data)
         self.closest = float(near.distance.min()) if len(near.distance) else np.inf
         growth = near.growth if self._plain else near.growth @ self.robot.coupling
-        left = near.distance - near.clearance + 0.5 * self.dt * (growth @ state.v)
-        # Half of what all joints together could brake: the other half is theirs for their own limits.
-        brake = 0.5 * self.loose * (np.abs(growth) @ self.robot.a_most)
-        closing = np.where(
-            left > 0.0, -np.minimum(8.0 * left, np.sqrt(np.maximum(2.0 * brake * left, 0.0))), -4.0 * left
-        )
+        dt, (_, a_most, j_most) = self.dt, self._most
+        size = np.abs(growth)
+        # Half of what all joints together could do: the other half is theirs for their own limits.
+        brake, jerk = 0.5 * (size @ a_most) + 1e-9, 0.5 * (size @ j_most) + 1e-9
+        left = near.distance - near.clearance + dt * (growth @ (1.5 * state.v + 0.5 * dt * state.a))
+        nears = -growth @ (state.v + 0.5 * dt * state.a)
+        bound = closing(left, nears, -growth @ state.a, brake, jerk, dt)
         self.counts.near += bool((left < 0.01).any())
-        return growth, closing
+        return growth, -bound
 
-    def _programme(self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray) -> np.ndarray:
+    def _programme(
+        self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray, low: np.ndarray, high: np.ndarray
+    ) -> np.ndarray:
         m = len(rows)
-        upper = np.concatenate([self._high, np.full(m, 1e30)])
-        lower = np.concatenate([self._low, bound])
+        upper = np.concatenate([high, np.full(m, 1e30)])
+        lower = np.concatenate([low, bound])
         sense = np.zeros(len(upper), dtype=np.int32)
-        v, _, flag, _ = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
-        if flag == 1:
-            return np.asarray(v)
-        sense[len(self._high) :] = 8  # soft: as far apart as the joints' limits allow
-        v, _, flag, _ = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
-        self.counts.held += 1
-        if flag > 0 and np.isfinite(v).all():
-            return np.asarray(v)
-        return np.clip(0.0, self._low, self._high)
+        w, _, flag, told = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
+        if flag != 1:
+            sense[len(high) :] = 8  # soft: as far apart as the joints' limits allow
+            w, _, flag, told = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
+            self.counts.held += 1
+        if flag <= 0 or not np.isfinite(w).all():
+            self.held.joints[:] = True
+            return np.clip(0.0, low, high)
+        holds = told["lam"] != 0.0
+        self.held.joints[:] = holds[: len(high)]
+        stopping = rows[holds[len(high) :]]
+        for i, arm in enumerate(self.robot.arms):
+            self.held.shapes[i] = len(stopping) > 0 and bool((np.abs(stopping[:, arm.joints]) > _HARDLY).any())
+        return np.asarray(w)
+
+
+def moved(state: State, a: np.ndarray, dt: float) -> State:
+    """The state one step on, with accelerations `a` there: the jerk between is even."""
+    v = state.v + 0.5 * dt * (state.a + a)
+    return State(state.u + dt * (state.v + dt * (state.a / 3.0 + a / 6.0)), v, a)
 
 
 class _Follower:
@@ -175,6 +221,7 @@ class _Follower:
         self._R_JH, self._p_JH = frame.placement.rotation.copy(), frame.placement.translation.copy()
         self._R_J, self._p_J = (getattr(data.oMi[frame.parentJoint], part) for part in ("rotation", "translation"))
         self._elbowed = arm.elbow >= 0
+        self._swivels = self._elbowed and len(arm.joints) > HAND_TAKES
         if self._elbowed:
             elbow = robot.model.frames[arm.elbow]
             self._p_JE = elbow.placement.translation.copy()
@@ -193,9 +240,9 @@ class _Follower:
     def add(self, H: np.ndarray, f: np.ndarray, aim: Aim, numbers: np.ndarray, dt: float, v: np.ndarray) -> bool:
         """Add hand, orientation and swivel; whether the hand cannot move in some direction."""
         J = self.data.J
-        hand, above = J * self._moved, J * self._above if self._elbowed else _NONE
+        hand, above = J * self._moved, J * self._above if self._swivels else _NONE
         if not self._plain:
-            hand, above = hand @ self.robot.coupling, above @ self.robot.coupling if self._elbowed else _NONE
+            hand, above = hand @ self.robot.coupling, above @ self.robot.coupling if self._swivels else _NONE
         turn = pin.log3(aim.rotation @ self.R.T)
         return bool(
             add_arm(
@@ -206,14 +253,15 @@ class _Follower:
 
 
 def aims_at(targets: tuple[ArmTarget, ...], k: int, dt: float) -> tuple[Aim, ...]:
-    """What the hands are to do in the step from sample `k`: the velocity at its end, the position in its middle."""
+    """What the hands are to do in the step from sample `k`: the velocity half a step after it, the position amid it."""
     n = min(k + 1, len(targets[0].weight) - 1)
+    after = min(k + 2, len(targets[0].weight) - 1)
     return tuple(
         Aim(
             t.position[k] + 0.5 * dt * t.velocity[k],
-            t.velocity[n],
+            0.5 * (t.velocity[n] + t.velocity[after]),
             t.rotation[k],
-            t.rate[n],
+            0.5 * (t.rate[n] + t.rate[after]),
             t.bend[k],
             float(t.weight[k]),
         )

@@ -12,9 +12,19 @@ from ..subject import Subject
 from .causal import causal_segments
 from .chain import TrackedChain, track_chain
 from .headings import held_together
+from .pieces import AHEAD_S, LARGE, PIECE_S, track_pieces
 from .tracked import TrackedPose, tracked_pose
 
-__all__ = ["TrackedChain", "TrackedPose", "track", "track_chain"]
+__all__ = [
+    "AHEAD_S",
+    "LARGE",
+    "PIECE_S",
+    "TrackedChain",
+    "TrackedPose",
+    "track",
+    "track_chain",
+    "track_pieces",
+]
 
 
 def track(

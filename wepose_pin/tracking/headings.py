@@ -12,7 +12,7 @@ all segments, nothing here sees.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import ATTITUDE_STD, SLIP_STD, Segments
-from ..recording import SEGMENTS, Recording
+from ..recording import SEGMENTS, Intervals, Recording
 from ..subject import Subject
 
 CHAIN = SEGMENTS[:5]
@@ -46,61 +46,197 @@ class Reset(NamedTuple):
 
 def held_together(recording: Recording, segments: Segments, subject: Subject) -> tuple[Segments, Reset | None]:
     """Segments with their headings corrected; as they were where neither a clasp nor a hinge is known."""
-    quat_WL = segments.quat_WL
-    if not set(CHAIN) <= set(quat_WL):
+    hold = HeadingHold(recording, segments.quat_WL, segments.start[1], subject, recording.phases.get("clasp", ()))
+    if not hold.has_chain or not hold.can_see:
         return segments, None
-    chain = (*CHAIN, *(hand for hand in HANDS if hand in quat_WL))
-    # A hinge was seen through the mounts of its calibration and holds as long as they do.
-    hinges = subject.hinges if recording.strapping != "new" else {}
-    stride = max(1, round(recording.rate_hz / LOOK_RATE_HZ))
-    at = np.arange(0, len(recording), stride)
-    at = at[recording.time[at] >= segments.start[1]]
-    R = {name: Rotation.from_quat(quat_WL[name][at]) for name in chain}
-    time = recording.time[at]
-    joined = np.zeros(len(at), dtype=bool)
-    for begin, end in recording.phases.get("clasp", ()):
-        joined |= (time >= begin) & (time <= end)
-    rows = [_gaps(R, subject, joined), *(_hinge(R, subject, side) for side in hinges)]
-    rows = [row for row in rows if len(row.look)]
-    if not rows:
+    hold.look(recording, segments)
+    if not hold.solve():
         return segments, None
+    corrected = hold.apply(recording, segments)
+    return corrected, hold.reset()
 
-    begin = float(time[0])
-    knot = np.floor((time - begin) / KNOT_S).astype(int)
-    count = knot[-1] + 1
-    information, pull = np.zeros((count, len(chain), len(chain))), np.zeros((count, len(chain)))
-    share = 1.0 / max(1.0, CORRELATION_S * recording.rate_hz / stride)
-    for row in rows:
-        weight = share * row.weight[:, None]
-        np.add.at(information, knot[row.look], np.einsum("na,nb->nab", weight * row.H, row.H))
-        np.add.at(pull, knot[row.look], -weight * row.H * row.r[:, None])
-    middle = begin + KNOT_S * (np.arange(count) + 0.5)
-    delta, cov = _smoothed(information, pull, _walk(recording, segments, chain, middle))
-    # Constant before the first middle and after the last, and in the start pose exactly zero.
-    knots = np.concatenate([[segments.start[1]], middle])
-    turn = {
-        name: np.interp(recording.time, knots, np.concatenate([[0.0], delta[:, i]])) for i, name in enumerate(chain)
-    }
-    corrected = dict(quat_WL)
-    for name in chain:
-        about_z = Rotation.from_rotvec(turn[name][:, None] * [0.0, 0.0, 1.0])
-        corrected[name] = (about_z * Rotation.from_quat(quat_WL[name])).as_quat()
-    covariance = dict(segments.covariance_W)
-    for i, name in enumerate(chain):
-        if name in covariance:
-            variance = np.interp(recording.time, middle, cov[:, i, i])
-            covariance[name] = _narrowed(covariance[name], *_of_filter(segments, name), variance)
-    after = {name: Rotation.from_quat(corrected[name][at]) for name in chain}
-    reset = Reset(
-        clasp_mm=(_rms_mm(_palms(R, subject)[joined]), _rms_mm(_palms(after, subject)[joined]))
-        if joined.any()
-        else None,
-        hinge_deg={
-            side: (_rms_deg(_elbow(R, subject, side)), _rms_deg(_elbow(after, subject, side))) for side in hinges
-        },
-        largest_deg={name: float(np.degrees(np.abs(turn[name]).max())) for name in chain},
-    )
-    return replace(segments, quat_WL=corrected, covariance_W=covariance), reset
+
+class HeadingHold:
+    """`held_together` for a recording that comes in pieces, and comes twice: `look`, then `solve`, then `apply`.
+
+    Put together, what it gives is to the bit that of the recording as a whole: what is summed is summed knot by knot.
+
+    Parameters
+    ----------
+    piece : the first
+    segments : names of those that are measured
+    begin : [s] end of the start pose, from which on there is drift
+    clasp : intervals [s] of joined hands, of the whole recording
+
+    Attributes
+    ----------
+    has_chain : whether all segments from hand to hand are measured; without it there is nothing to hold
+    can_see : whether there is a hinge, or a clasp that is not over when the start pose is
+    """
+
+    def __init__(
+        self, piece: Recording, segments: Collection[str], begin: float, subject: Subject, clasp: Intervals
+    ) -> None:
+        self.has_chain = set(CHAIN) <= set(segments)
+        self._chain = (*CHAIN, *(hand for hand in HANDS if hand in segments))
+        self._subject, self._start, self._clasp = subject, begin, clasp
+        # A hinge was seen through the mounts of its calibration and holds as long as they do.
+        self._hinges = subject.hinges if piece.strapping != "new" else {}
+        self.can_see = bool(self._hinges) or any(end >= begin for _, end in clasp)
+        self._stride = max(1, round(piece.rate_hz / LOOK_RATE_HZ))
+        self._share = 1.0 / max(1.0, CORRELATION_S * piece.rate_hz / self._stride)
+        self._first: float | None = None  # [s] of the first look
+        self._seen = [0, 0]  # samples so far, of either pass
+        self._open: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # looks of a knot that is not complete
+        self._sums: list[tuple[np.ndarray, np.ndarray]] = []  # information and pull of knots that are
+        self._found = False
+        self._var: dict[str, list[np.ndarray]] = {}  # name → the filter's heading variance [rad²] at `_asked` times
+        self._asked = 0
+        self._last: dict[str, tuple[float, float]] = {}  # name → time and variance of the last sample
+        self._gaps = {when: _Rms() for when in ("before", "after")}
+        self._bends = {when: {side: _Rms() for side in self._hinges} for when in ("before", "after")}
+        self._largest = dict.fromkeys(self._chain, 0.0)
+
+    def look(self, piece: Recording, segments: Segments) -> None:
+        """Take a piece in, the first time that it comes."""
+        time, quats = self._looks(piece, segments, 0)
+        if len(time) and self._first is None:
+            self._first = float(time[0])
+        self._ask(piece, segments)
+        if self._open is not None:
+            time = np.concatenate([self._open[0], time])
+            quats = {name: np.concatenate([self._open[1][name], quat]) for name, quat in quats.items()}
+        if not len(time):
+            return
+        knot = self._knots(time)
+        whole = int(np.searchsorted(knot, knot[-1]))
+        self._open = time[whole:], {name: quat[whole:] for name, quat in quats.items()}
+        if whole:
+            self._take(time[:whole], {name: quat[:whole] for name, quat in quats.items()})
+
+    def solve(self) -> bool:
+        """What the headings were off by; no where nothing saw them."""
+        if self._open is None or self._first is None:
+            return False
+        self._take(*self._open)
+        if not self._found:
+            return False
+        information, pull = (np.concatenate(parts) for parts in zip(*self._sums, strict=True))
+        middle = self._first + KNOT_S * (np.arange(len(pull)) + 0.5)
+        steps = np.full((len(middle), len(self._chain)), UNKNOWN_DRIFT * KNOT_S)
+        for i, name in enumerate(self._chain):
+            if name in self._var:
+                at = np.concatenate(self._var[name])
+                at = np.concatenate([at, np.full(len(middle) + 1 - len(at), self._last[name][1])])
+                steps[:, i] = np.maximum(np.diff(at), 1e-10)
+        delta, self._cov = _smoothed(information, pull, steps)
+        # Constant before the first middle and after the last, and in the start pose exactly zero.
+        self._middle, self._knot_times = middle, np.concatenate([[self._start], middle])
+        self._delta = np.concatenate([np.zeros((1, len(self._chain))), delta])
+        return True
+
+    def apply(self, piece: Recording, segments: Segments) -> Segments:
+        """The piece's segments corrected, the second time that it comes."""
+        corrected, covariance = dict(segments.quat_WL), dict(segments.covariance_W)
+        for i, name in enumerate(self._chain):
+            turn = np.interp(piece.time, self._knot_times, self._delta[:, i])
+            about_z = Rotation.from_rotvec(turn[:, None] * [0.0, 0.0, 1.0])
+            corrected[name] = (about_z * Rotation.from_quat(corrected[name])).as_quat()
+            self._largest[name] = max(self._largest[name], float(np.degrees(np.abs(turn).max())))
+            if name in covariance:
+                variance = np.interp(piece.time, self._middle, self._cov[:, i, i])
+                covariance[name] = _narrowed(covariance[name], *_of_filter(segments, name), variance)
+        held = replace(segments, quat_WL=corrected, covariance_W=covariance)
+        time, quats = self._looks(piece, held, 1)
+        self._measure("after", time, {name: Rotation.from_quat(quat) for name, quat in quats.items()})
+        return held
+
+    def reset(self) -> Reset:
+        """What was held so far, before and after."""
+        gaps, bends = self._gaps, self._bends
+        return Reset(
+            clasp_mm=(1e3 * gaps["before"].value, 1e3 * gaps["after"].value) if gaps["before"].count else None,
+            hinge_deg={
+                side: (
+                    float(np.degrees(bends["before"][side].value)),
+                    float(np.degrees(bends["after"][side].value)),
+                )
+                for side in self._hinges
+            },
+            largest_deg=dict(self._largest),
+        )
+
+    def _looks(self, piece: Recording, segments: Segments, nth: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Times (m,) [s] and orientations (m, 4) at a few samples a second, the `nth` time that the piece comes."""
+        at = np.arange(-self._seen[nth] % self._stride, len(piece), self._stride)
+        self._seen[nth] += len(piece)
+        at = at[piece.time[at] >= self._start]
+        return piece.time[at], {name: segments.quat_WL[name][at] for name in self._chain}
+
+    def _knots(self, time: np.ndarray) -> np.ndarray:
+        return np.floor((time - self._first) / KNOT_S).astype(int)
+
+    def _take(self, time: np.ndarray, quats: Mapping[str, np.ndarray]) -> None:
+        """Information and pull of complete knots from their looks."""
+        R = {name: Rotation.from_quat(quat) for name, quat in quats.items()}
+        joined = self._measure("before", time, R)
+        done = sum(len(pull) for _, pull in self._sums)
+        knot = self._knots(time) - done
+        count, size = int(knot[-1]) + 1, len(self._chain)
+        information, pull = np.zeros((count, size, size)), np.zeros((count, size))
+        for row in (_gaps(R, self._subject, joined), *(_hinge(R, self._subject, side) for side in self._hinges)):
+            weight = self._share * row.weight[:, None]
+            np.add.at(information, knot[row.look], np.einsum("na,nb->nab", weight * row.H, row.H))
+            np.add.at(pull, knot[row.look], -weight * row.H * row.r[:, None])
+            self._found |= len(row.look) > 0
+        self._sums.append((information, pull))
+
+    def _measure(self, when: str, time: np.ndarray, R: Mapping[str, Rotation]) -> np.ndarray:
+        """Palms and elbows, for `reset`; gives where the palms are joined (m,)."""
+        joined = np.zeros(len(time), dtype=bool)
+        for begin, end in self._clasp:
+            joined |= (time >= begin) & (time <= end)
+        if joined.any():
+            self._gaps[when].add(np.sum(_palms(R, self._subject)[joined] ** 2, axis=1))
+        if len(time):
+            for side in self._hinges:
+                self._bends[when][side].add(_elbow(R, self._subject, side) ** 2)
+        return joined
+
+    def _ask(self, piece: Recording, segments: Segments) -> None:
+        """The filters' heading variances at the end of the start pose and in the middles of the knots."""
+        times = np.empty(0)
+        if self._first is not None:
+            last = int(np.floor((piece.time[-1] - self._first) / KNOT_S - 0.5))
+            times = self._first + KNOT_S * (np.arange(self._asked - 1, last + 1) + 0.5)
+            if self._asked == 0:
+                times = np.concatenate([[self._start], times[1:]])
+            times = times[times <= piece.time[-1]]
+        self._asked += len(times)
+        for name in self._chain:
+            if name not in segments.covariance_W:
+                continue
+            _, variance = _of_filter(segments, name)
+            known = piece.time
+            if name in self._last:  # what lies between two pieces
+                known = np.concatenate([[self._last[name][0]], known])
+                variance = np.concatenate([[self._last[name][1]], variance])
+            self._var.setdefault(name, []).append(np.interp(times, known, variance))
+            self._last[name] = float(known[-1]), float(variance[-1])
+
+
+class _Rms:
+    """Root mean square of what is added square by square."""
+
+    def __init__(self) -> None:
+        self.count, self._sum = 0, 0.0
+
+    def add(self, squares: np.ndarray) -> None:
+        self.count, self._sum = self.count + len(squares), self._sum + float(squares.sum())
+
+    @property
+    def value(self) -> float:
+        return float(np.sqrt(self._sum / self.count)) if self.count else float("nan")
 
 
 class _Rows(NamedTuple):
@@ -187,17 +323,6 @@ def _hinge(R: Mapping[str, Rotation], subject: Subject, side: str) -> _Rows:
     return _Rows(look, r[near], H[near], np.full(len(look), std**-2))
 
 
-def _walk(recording: Recording, segments: Segments, chain: tuple[str, ...], middle: np.ndarray) -> np.ndarray:
-    """(knots, k) [rad²]: variance of each heading's step to each knot, by what its filter's covariance grew."""
-    steps = np.full((len(middle), len(chain)), UNKNOWN_DRIFT * KNOT_S)
-    for i, name in enumerate(chain):
-        if name in segments.covariance_W:
-            _, variance = _of_filter(segments, name)
-            at = np.interp(np.concatenate([[segments.start[1]], middle]), recording.time, variance)
-            steps[:, i] = np.maximum(np.diff(at), 1e-10)
-    return steps
-
-
 def _of_filter(segments: Segments, name: str) -> tuple[np.ndarray, np.ndarray]:
     """What the filter's own covariance says of the heading: with each axis of W (n, 3), and of itself (n,) [rad²]."""
     of = segments.orientation[name]
@@ -241,11 +366,3 @@ def _narrowed(cov_W: np.ndarray, filter_W: np.ndarray, filter_var: np.ndarray, h
     narrowed[:, :2, 2] -= less[:, :2]
     narrowed[:, 2, 2] -= (1.0 - share**2) * filter_var
     return narrowed
-
-
-def _rms_mm(gaps: np.ndarray) -> float:
-    return float(1e3 * np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
-
-
-def _rms_deg(angles: np.ndarray) -> float:
-    return float(np.degrees(np.sqrt(np.mean(angles**2))))

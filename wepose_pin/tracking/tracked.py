@@ -9,12 +9,13 @@ import numpy as np
 
 from ..alignment import Segments
 from ..model import POINTS, BodyModel, load_model
-from ..pose import Pose, deviation, point_covariance, pose_of
+from ..pose import Pose, Poser, deviation, point_covariance
 from ..recording import SEGMENTS, Recording
 from ..subject import Subject, average_subject
 from .headings import Reset
 
 _WORTH_A_WARNING_DEG = 1.0
+_MOST_NOTES = 10  # of the later pieces of a long recording
 
 
 @dataclass(frozen=True)
@@ -31,75 +32,123 @@ class TrackedPose(Pose):
 
     def summary(self) -> dict[str, Any]:
         """What was run on what, in numbers and words, for ``summary.json``."""
-        assert self.recording is not None
-        assert self.subject is not None
-        assert self.segments is not None
+        tally = Tally()
+        tally.add(self)
+        return tally.summary()
+
+    def not_followed(self) -> dict[str, np.ndarray]:
+        """Segment → angle (n,) [rad] between its measured orientation and the model's, where joints are too few."""
+        if self.model is None or self.q is None:
+            return {}
+        return deviation(self.model, self.q, self.quat_WL)
+
+
+class Tally:
+    """The summary of a pose that comes in pieces, each added as it comes."""
+
+    def __init__(self) -> None:
+        self.last: TrackedPose | None = None
+        self._begin, self._samples = 0.0, 0
+        self._still: dict[str, int] = {}
+        self._lost: dict[str, tuple[int, int, bool]] = {}  # segment → gaps, lost samples, whether the last one was
+        self._missed: dict[str, float] = {}  # segment → sum of squares [rad²]
+        self._notes: list[str] = []  # what was said while reading, later than in the first piece
+
+    def add(self, pose: TrackedPose) -> None:
+        """The next piece."""
+        assert pose.recording is not None
+        assert pose.segments is not None
+        if self.last is None:
+            self._begin = float(pose.time[0])
+        else:
+            known = (*self._notes, *pose.segments.warnings)
+            self._notes += [note for note in pose.recording.notes if note not in known]
+        self._samples += len(pose.time)
+        for segment, of in pose.segments.orientation.items():
+            self._still[segment] = self._still.get(segment, 0) + int(np.count_nonzero(of.static))
+        for segment, gap in pose.gap.items():
+            gaps, samples, before = self._lost.get(segment, (0, 0, False))
+            begun = int(np.count_nonzero(np.diff(gap, prepend=before) & gap))
+            self._lost[segment] = gaps + begun, samples + int(np.count_nonzero(gap)), bool(gap[-1])
+        for segment, angle in pose.not_followed().items():
+            self._missed[segment] = self._missed.get(segment, 0.0) + float(np.sum(angle**2))
+        self.last = pose
+
+    def summary(self) -> dict[str, Any]:
+        """As `TrackedPose.summary`, of all pieces."""
+        last = self.last
+        assert last is not None
+        assert last.recording is not None
+        assert last.subject is not None
+        assert last.segments is not None
         sensors: dict[str, Any] = {}
-        for segment in self.recording.sensors:
-            about: dict[str, Any] = {"heading_deg": round(float(np.degrees(self.segments.heading[segment])), 3)}
-            orientation = self.segments.orientation.get(segment)
+        for segment in last.recording.sensors:
+            about: dict[str, Any] = {"heading_deg": round(float(np.degrees(last.segments.heading[segment])), 3)}
+            orientation = last.segments.orientation.get(segment)
             if orientation is None:
                 about["orientations"] = "from the recording"
             else:
-                about["static_share"] = round(float(orientation.static.mean()), 4)
+                about["static_share"] = round(self._still[segment] / self._samples, 4)
                 about["gyro_bias_start_deg_s"] = np.degrees(orientation.noise.gyro_bias).round(5).tolist()
                 about["gyro_bias_end_deg_s"] = np.degrees(orientation.gyro_bias[-1]).round(5).tolist()
                 about["gravity_m_s2"] = round(orientation.noise.gravity, 4)
-            if segment in self.gap:
-                lost = self.gap[segment]
-                about["gaps"] = int(np.count_nonzero(np.diff(lost, prepend=False) & lost))
-                about["gap_s"] = round(float(np.count_nonzero(lost)) / self.recording.rate_hz, 3)
+            if segment in self._lost:
+                about["gaps"], lost, _ = self._lost[segment]
+                about["gap_s"] = round(lost / last.recording.rate_hz, 3)
             sensors[segment] = about
-        missed = self._not_followed()
+        missed = {
+            name: round(float(np.degrees(np.sqrt(squares / self._samples))), 3)
+            for name, squares in self._missed.items()
+        }
         lame = [f"{segment} {angle:.3g}" for segment, angle in missed.items() if angle > _WORTH_A_WARNING_DEG]
         if lame:
             lame = [
                 f"the model's joints are too few or end too soon and miss segments by, rms [deg]: {', '.join(lame)}"
             ]
         return {
-            "recording": self.recording.name,
-            "session": str(self.recording.source) if self.recording.source else None,
-            "method": self.method if self.segments.orientation else "ready orientations",
-            "causal": self.causal,
-            "model": self.model.robot.name if self.model else None,
-            "subject": {"name": self.subject.name, "note": self.subject.note},
-            "samples": len(self.time),
-            "rate_hz": round(self.recording.rate_hz, 4),
-            "duration_s": round(float(self.time[-1] - self.time[0]), 3),
-            "phases": {"start": list(self.segments.start), "still": list(self.segments.still)},
+            "recording": last.recording.name,
+            "session": str(last.recording.source) if last.recording.source else None,
+            "method": last.method if last.segments.orientation else "ready orientations",
+            "causal": last.causal,
+            "model": last.model.robot.name if last.model else None,
+            "subject": {"name": last.subject.name, "note": last.subject.note},
+            "samples": self._samples,
+            "rate_hz": round(last.recording.rate_hz, 4),
+            "duration_s": round(float(last.time[-1]) - self._begin, 3),
+            "phases": {"start": list(last.segments.start), "still": list(last.segments.still)},
             "sensors": sensors,
-            "points": sorted(self.points),
+            "points": sorted(last.points),
             "not_followed_rms_deg": missed,
-            "headings_held_together": self._held_together(),
-            "warnings": [*self.segments.warnings, *self._not_known(), *lame],
+            "headings_held_together": _held_together(last.reset),
+            "warnings": [*last.segments.warnings, *self._later(), *_not_known(last), *lame],
         }
 
-    def _held_together(self) -> dict[str, Any] | None:
-        """Residuals of clasp and elbows before and after, and how far each heading was turned."""
-        if self.reset is None:
-            return None
-        about: dict[str, Any] = {
-            "hinge_rms_deg": {side: [round(v, 3) for v in values] for side, values in self.reset.hinge_deg.items()},
-            "largest_turn_deg": {name: round(value, 3) for name, value in self.reset.largest_deg.items()},
-        }
-        if self.reset.clasp_mm is not None:
-            about["clasp_gap_rms_mm"] = [round(value, 2) for value in self.reset.clasp_mm]
-        return about
+    def _later(self) -> list[str]:
+        """Notes of later pieces; a day's would be too many to read."""
+        more = len(self._notes) - _MOST_NOTES
+        return self._notes[:_MOST_NOTES] + ([f"and {more} more notes like these"] if more > 0 else [])
 
-    def _not_known(self) -> list[str]:
-        """A line on the points that have no place for want of a sensor."""
-        missing = [point for point in POINTS if point not in self.points]
-        lacking = [name for name in SEGMENTS[:5] if name not in self.quat_WL]
-        if not missing or not lacking:
-            return []
-        return [f"no sensor on {', '.join(lacking)}: not known and not written: {', '.join(missing)}"]
 
-    def _not_followed(self) -> dict[str, float]:
-        """Segment → rms angle [deg] between its measured orientation and the model's, where joints are too few."""
-        if self.model is None or self.q is None:
-            return {}
-        missed = deviation(self.model, self.q, self.quat_WL)
-        return {name: round(float(np.degrees(np.sqrt(np.mean(angle**2)))), 3) for name, angle in missed.items()}
+def _held_together(reset: Reset | None) -> dict[str, Any] | None:
+    """Residuals of clasp and elbows before and after, and how far each heading was turned."""
+    if reset is None:
+        return None
+    about: dict[str, Any] = {
+        "hinge_rms_deg": {side: [round(v, 3) for v in values] for side, values in reset.hinge_deg.items()},
+        "largest_turn_deg": {name: round(value, 3) for name, value in reset.largest_deg.items()},
+    }
+    if reset.clasp_mm is not None:
+        about["clasp_gap_rms_mm"] = [round(value, 2) for value in reset.clasp_mm]
+    return about
+
+
+def _not_known(pose: TrackedPose) -> list[str]:
+    """A line on the points that have no place for want of a sensor."""
+    missing = [point for point in POINTS if point not in pose.points]
+    lacking = [name for name in SEGMENTS[:5] if name not in pose.quat_WL]
+    if not missing or not lacking:
+        return []
+    return [f"no sensor on {', '.join(lacking)}: not known and not written: {', '.join(missing)}"]
 
 
 def tracked_pose(
@@ -113,14 +162,35 @@ def tracked_pose(
     limits: bool = True,
 ) -> TrackedPose:
     """The pose of segments that are known: a body of the subject's lengths, and its kinematics."""
+    who, body = who_and_body(subject, model)
+    poser = Poser(body, segments.quat_WL, limits=limits)
+    return posed(poser, recording, segments, who, body, method=method, reset=reset, causal=causal)
+
+
+def who_and_body(subject: Subject | None, model: BodyModel | None) -> tuple[Subject, BodyModel]:
+    """The subject as used, the average one for want of another, and a body of those lengths."""
     who = subject or average_subject()
     body = model or load_model()
     own = body.lengths
     if subject is None and model is not None:
         # A model that somebody chose has that person's lengths; what it lacks stays the average person's.
         who = replace(who, name=body.robot.name, lengths={**who.lengths, **own}, note="lengths of the model")
-    body = body.with_lengths({name: value for name, value in who.lengths.items() if name in own})
-    pose = pose_of(body, recording.time, segments.quat_WL, limits=limits)
+    return who, body.with_lengths({name: value for name, value in who.lengths.items() if name in own})
+
+
+def posed(
+    poser: Poser,
+    recording: Recording,
+    segments: Segments,
+    who: Subject,
+    body: BodyModel,
+    *,
+    method: str,
+    reset: Reset | None = None,
+    causal: bool = False,
+) -> TrackedPose:
+    """A recording's pose, or that of the piece which follows what `poser` had last."""
+    pose = poser.pose(recording.time, segments.quat_WL)
     return TrackedPose(
         pose.time,
         pose.quat_WL,

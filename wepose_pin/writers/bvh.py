@@ -103,6 +103,9 @@ def write_bvh(path: Path, motion: Motion) -> list[str]:
 def _root_position(motion: Motion, root: Bone) -> np.ndarray:
     """Where the hips are (n, 3) [m], so that the shoulders are where they were found; a spine of many joints bends."""
     pose = motion.pose
+    for point in ("left_shoulder", "right_shoulder"):
+        if point not in pose.points:
+            raise BadData(f"{motion.where}: no columns {point}_x … in pose.parquet; a .bvh needs both shoulders")
     middle = 0.5 * (pose.points["left_shoulder"] + pose.points["right_shoulder"])
     return middle - Rotation.from_quat(pose.quat_WL["torso"]).apply(root.end)
 

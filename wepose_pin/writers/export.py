@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ..errors import BadData, BadOption, ExistingOutput, MissingFile, one_of
+from ..errors import BadData, BadOption, MissingFile, one_of
 from .bvh import write_bvh
 from .c3d import write_c3d
+from .folder import whole_file
 from .motion import Motion, resampled
 from .opensim import write_mot, write_placement, write_sto, write_trc
+from .provenance import beside, block_text
 from .result import read_result
 from .tables import write_csv, write_parquet
 
@@ -49,6 +51,7 @@ def export(
     names: str | None = None,
     rate_hz: float | None = None,
     force: bool = False,
+    made_by: Mapping[str, Any] | None = None,
 ) -> Exported:
     """Write the motion of a result folder, or its subject, to a file, which appears whole or not at all.
 
@@ -57,6 +60,7 @@ def export(
     format : one of `FORMATS`; None: that of the file's suffix, which otherwise has to be the format's own
     names : of a .mot's columns, one of `NAMES`; None: "opensim"
     rate_hz : resample the motion first
+    made_by : (see `provenance`) written beside the file, before it
 
     Raises
     ------
@@ -74,7 +78,10 @@ def export(
         raise BadOption(f"--names {names}: not known; {one_of(NAMES, names)}")
     if rate_hz is not None and format in ("urdf", "placement"):
         raise BadOption(f"--rate-hz {rate_hz:g}: there is no motion in a file of format {format}")
-    with whole_file(file, force) as partial:
+    with contextlib.ExitStack() as files:
+        partial = files.enter_context(whole_file(file, force))
+        if made_by is not None:
+            files.enter_context(whole_file(beside(file), True)).write_text(block_text(made_by), encoding="utf-8")
         if format == "urdf":
             if not (result / "subject.urdf").is_file():
                 raise MissingFile(f"{result}: no subject.urdf in it; a folder that `wepose track` wrote is wanted here")
@@ -103,24 +110,3 @@ def _format(file: Path, format: str | None) -> str:
             f"-o {file}: format {format} is for programs that go by the suffix: name it {file.stem}{suffix}"
         )
     return format
-
-
-@contextmanager
-def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
-    """A path beside `file` to write to; what stands there becomes `file` when the block ends well, else vanishes.
-
-    Raises
-    ------
-    ExistingOutput
-        `file` is there and `force` is not given, or it cannot be written.
-    """
-    if file.exists() and not force:
-        raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
-    if file.is_dir() or not file.absolute().parent.is_dir():
-        raise ExistingOutput(f"{file}: not a file that can be written; -o names a file in an existing folder")
-    partial = file.with_name(f".{file.name}.partial")
-    try:
-        yield partial
-        partial.replace(file)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -1,8 +1,9 @@
-"""Output folders that appear whole or not at all."""
+"""Output folders and files that appear whole or not at all."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import shutil
 import signal
 import tempfile
@@ -14,6 +15,7 @@ from types import FrameType
 
 from ..errors import ExistingOutput
 
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 written: list[Path] = []  # the folders that appeared, for whoever is stopped and says what there is
 
 
@@ -44,13 +46,49 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
             partial.mkdir()
         except OSError as error:
             raise ExistingOutput(f"{out}: cannot be written: {error.strerror}") from error
-        yield partial
+        with _full_told(out):
+            yield partial
         with _undisturbed():
             _move(partial, out, force)
             written.append(out)
     finally:
         if own is not None:
             shutil.rmtree(own, ignore_errors=True)
+
+
+@contextmanager
+def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
+    """A path beside `file` to write to; what stands there becomes `file` when the block ends well, else vanishes.
+
+    Raises
+    ------
+    ExistingOutput
+        `file` is there and `force` is not given, or it cannot be written.
+    """
+    if file.exists() and not force:
+        raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
+    if file.is_dir() or not file.absolute().parent.is_dir():
+        raise ExistingOutput(f"{file}: not a file that can be written; -o names a file in an existing folder")
+    partial = file.with_name(f".{file.name}.partial")
+    try:
+        with _full_told(file):
+            yield partial
+        partial.replace(file)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def _full_told(out: Path) -> Iterator[None]:
+    """A disk that is full in a line that names the output: the system's own error names no file, or an input."""
+    try:
+        yield
+    except OSError as error:
+        # polars gives the system's words and no number.
+        if error.errno in _FULL or "No space left" in str(error):
+            reason = error.strerror or str(error)
+            raise ExistingOutput(f"{out}: cannot be written: {reason}; nothing was written") from error
+        raise
 
 
 def _move(partial: Path, out: Path, force: bool) -> None:

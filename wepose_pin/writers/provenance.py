@@ -178,10 +178,19 @@ def _name(file: Path, top: Path) -> str:
 # Where it is kept ----------------------------------------------------------------------------------------------------
 
 
-def write_made_by(place: Path, block: Mapping[str, Any]) -> None:
-    """``made_by.json`` in a folder, or ``FILE.made_by.json`` beside a file."""
-    file = place / ALONE if place.is_dir() else place.with_name(f"{place.name}.{ALONE}")
-    file.write_text(json.dumps(block, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+def beside(file: Path) -> Path:
+    """``FILE.made_by.json``, where the block of a file stands."""
+    return file.with_name(f"{file.name}.{ALONE}")
+
+
+def write_made_by(folder: Path, block: Mapping[str, Any]) -> None:
+    """``made_by.json`` in a folder."""
+    (folder / ALONE).write_text(block_text(block), encoding="utf-8")
+
+
+def block_text(block: Mapping[str, Any]) -> str:
+    """A block as a file of its own holds it."""
+    return json.dumps(block, indent=1, ensure_ascii=False) + "\n"
 
 
 def read_made_by(result: Path) -> dict[str, Any]:
@@ -196,12 +205,12 @@ def read_made_by(result: Path) -> dict[str, Any]:
     """
     if not result.exists():
         raise MissingFile(f"{result}: no such result; a folder, or an exported file, is wanted here")
-    alone = result / ALONE if result.is_dir() else result.with_name(f"{result.name}.{ALONE}")
+    alone = result / ALONE if result.is_dir() else beside(result)
     places = [alone, *(result / name for name in INSIDE if result.is_dir())]
     for place in (place for place in places if place.is_file()):
         try:
             content = json.loads(place.read_text(encoding="utf-8"))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise BadData(f"{place}: is damaged, no JSON: {error}") from error
         block = content if place.name.endswith(ALONE) else content.get("made_by") if isinstance(content, dict) else None
         if block is None:

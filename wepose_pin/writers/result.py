@@ -36,18 +36,30 @@ def write_result(
     `phases` of the recording go to the summary, so that a page made from the folder shows them too. `torques` become
     ``torques.parquet``, `made_by` (see `provenance`) part of the summary.
     """
-    assert pose.model is not None
-    assert pose.subject is not None
     write_table(folder / "pose.parquet", pose_table(pose, covariance))
-    write_subject(folder, pose.subject, pose.model)
-    spans = {name: [[float(a), float(b)] for a, b in of] for name, of in (phases or {}).items()}
-    summary = pose.summary() | {"recorded_phases": spans, "versions": versions()}
+    summary = pose.summary()
     if torques is not None:
         write_table(folder / "torques.parquet", torque_table(torques))
         summary["torques"] = torques.summary()
+    write_about(folder, pose, summary, phases, made_by)
+
+
+def write_about(
+    folder: Path,
+    pose: TrackedPose,
+    summary: Mapping[str, Any],
+    phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    made_by: Mapping[str, Any] | None = None,
+) -> None:
+    """What stands in a result folder beside its tables: the subject as used, and ``summary.json``."""
+    assert pose.model is not None
+    assert pose.subject is not None
+    write_subject(folder, pose.subject, pose.model)
+    spans = {name: [[float(a), float(b)] for a, b in of] for name, of in (phases or {}).items()}
+    about = {**summary, "recorded_phases": spans, "versions": versions()}
     if made_by is not None:
-        summary["made_by"] = dict(made_by)
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        about["made_by"] = dict(made_by)
+    (folder / "summary.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
 
 
 def write_table(path: Path, table: pl.DataFrame) -> None:

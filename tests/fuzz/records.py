@@ -1,0 +1,201 @@
+"""What wepose itself wrote earlier, or others for it, and reads again: plans, provenance, figures, trials, results."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import inspect
+import io
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from . import seeds
+from .target import file
+
+RERUN = ("track", "calibrate", "simulate", "retarget", "demo", "export")
+
+
+def plan(folder: Path, data: bytes) -> object:
+    """The input is the plan; two sessions and a table lie beside it."""
+    from wepose_pin.batch.items import key_of
+    from wepose_pin.batch.plan import read_plan
+
+    for name in ("one", "two"):
+        (folder / name).mkdir(exist_ok=True)
+        (folder / name / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
+    (folder / "list.csv").write_bytes(seeds.PLAN_TABLE)
+    (folder / "plan.toml").write_bytes(data)
+    found = read_plan(folder / "plan.toml", "out/items")
+    names = [item.name for item in (*found.first, *found.items)]
+    assert len(set(names)) == len(names)
+    assert all(name and "/" not in name and name not in (".", "..") for name in names), names
+    for item in found.items:
+        key_of(item)
+    return found
+
+
+def plan_table(folder: Path, data: bytes) -> object:
+    """The input is the table that a plan names."""
+    from wepose_pin.batch.plan import read_plan
+
+    (folder / "list.csv").write_bytes(data)
+    (folder / "plan.toml").write_bytes(seeds.PLAN.replace(b'files = ["*/session.toml"]', b'table = "list.csv"'))
+    found = read_plan(folder / "plan.toml", "out/items")
+    assert all(item.name and "/" not in item.name for item in found.items), [item.name for item in found.items]
+    return found
+
+
+def _silently(do: Callable[[], object]) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):
+        do()
+
+
+def _validation(path: Path) -> object:
+    from wepose_pin.cli import _validation_tables
+    from wepose_pin.validation import read_document
+
+    found = read_document(path)
+    _silently(lambda: _validation_tables(found))
+    return found
+
+
+def _bench(path: Path) -> object:
+    from wepose_pin.bench import read_document, then_by_now
+
+    found = read_document(path)
+    return then_by_now(found, "speed", "amekf", "us", 2.0)
+
+
+validation = file("validation.json", _validation)
+bench = file("before.json", _bench)
+
+
+@functools.cache
+def _commands(made: Path) -> dict[str, Callable[..., None]]:
+    """The commands as `wepose rerun` sees them, of their own signatures; each takes a second file for what it made."""
+    from wepose_pin.cli import COMMANDS
+
+    def stub(name: str) -> Callable[..., None]:
+        def run(*first: Any, out: Any = None, **options: Any) -> None:
+            signature.bind(*first, out=out, **options)
+            if name not in RERUN:
+                raise AssertionError(f"a result's record had `wepose {name}` run")
+            shutil.copytree(made, out)
+
+        signature = inspect.signature(COMMANDS[name])
+        run.__signature__ = signature  # type: ignore[attr-defined]
+        return run
+
+    return {name: stub(name) for name in COMMANDS}
+
+
+def made_by(folder: Path, data: bytes) -> object:
+    """The input is what a result says made it; made again it is another."""
+    from wepose_pin.batch.rerun import rerun
+
+    result, made = folder / "result", folder / "made"
+    for place in (result, made):
+        if not place.is_dir():
+            place.mkdir()
+            (place / "pose.parquet").write_bytes(seeds.pose())
+    (folder / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
+    (result / "made_by.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
+    return rerun(result, _commands(made))
+
+
+def done(folder: Path, data: bytes) -> object:
+    """The input is what an item of a batch says made it; read as batch does before it makes it again."""
+    from wepose_pin.batch.items import _changed, _done, item_of
+    from wepose_pin.batch.rerun import _of_item
+
+    (folder / "item").mkdir(exist_ok=True)
+    (folder / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
+    (folder / "item" / "done.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
+    found = _done(str(folder / "item"))
+    item = item_of(_of_item(folder / "item"))
+    return None if found is None else _changed(item, "", found)
+
+
+# Recordings with a truth, for `wepose validate --data` ------------------------------------------------------------
+
+
+def _broad(path: Path) -> object:
+    from wepose_pin.readers.trials import read_broad
+
+    return read_broad(path)
+
+
+def _authors(path: Path) -> object:
+    from wepose_pin.readers.trials import read_authors_trial
+
+    return read_authors_trial(path)
+
+
+broad = file("trial.mat", _broad)
+authors = file("prova_HR.txt", _authors)
+
+
+def ring(folder: Path, data: bytes) -> object:
+    """One text for all three tables."""
+    from wepose_pin.readers.trials import read_ring
+
+    for name in ("omc", "imu_rigid", "imu_nonrigid"):
+        (folder / f"{name}.csv").write_bytes(data)
+    return read_ring(folder)
+
+
+def ur5(folder: Path, data: bytes) -> object:
+    from wepose_pin.readers.trials import read_ur5
+
+    for name in ("imu/a/radius_adx.csv", "encoder/a/radius.csv"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    return read_ur5(folder, "a", "radius")
+
+
+# A result, to what is made of it ------------------------------------------------------------------------------------
+
+
+def result(folder: Path, data: bytes) -> object:
+    """The input is a pose as CSV, in a result that is well otherwise: exported to all formats, compared, shown."""
+    import polars as pl
+
+    from wepose_pin.errors import WeposeError
+    from wepose_pin.evaluation import evaluate
+    from wepose_pin.pose import pose_from_table
+    from wepose_pin.readers.tables import read_table
+    from wepose_pin.viewer import pose_html
+    from wepose_pin.writers.export import export
+    from wepose_pin.writers.result import read_result
+
+    if not (folder / "subject.urdf").is_file():
+        (folder / "subject.urdf").write_bytes(seeds.shipped("urdf/upper_body.urdf")[0])
+    (folder / "summary.json").write_bytes(b"{}")
+    (folder / "pose.csv").write_bytes(data)
+    table = read_table(folder / "pose.csv")
+    with contextlib.suppress(pl.exceptions.PolarsError):  # of names that Parquet has not
+        table.write_parquet(folder / "pose.parquet")
+    pose, model, _ = read_result(folder)
+    pose_html(model, pose, title="a")
+    refused: WeposeError | None = None
+    truth = pose_from_table(pl.read_parquet(io.BytesIO(seeds.pose())), "truth")
+    for do in (lambda: evaluate(pose, truth), *(functools.partial(_exported, folder, name) for name in EXPORTS)):
+        try:
+            do()
+        except WeposeError as error:
+            refused = error
+    if refused is not None:
+        raise refused
+    return export
+
+
+EXPORTS = ("csv", "parquet", "mot", "sto", "trc", "bvh")
+
+
+def _exported(folder: Path, format: str) -> None:
+    from wepose_pin.writers.export import export
+
+    export(folder, folder / f"motion.{format}", format, force=True)
+    assert (folder / f"motion.{format}").stat().st_size

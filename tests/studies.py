@@ -1,0 +1,50 @@
+"""Three short sessions and a plan over them, for the tests of `wepose batch`."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from wepose_pin.batch import Item
+from wepose_pin.batch.plan import STEPS
+from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.writers import write_session
+
+QUICK = {"track": {**STEPS["track"], "view": False, "report": False}, "evaluate": {"interval": None}}
+PLAN = """
+[sessions]
+files = ["data/*/session.toml"]
+[steps.track]
+view = false
+report = false
+[steps.evaluate]
+"""
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three short sessions, one/ to three/."""
+    folder = tmp_path_factory.mktemp("recorded")
+    for seed, name in enumerate(("one", "two", "three"), 1):
+        made_up = simulate(simulated_person(seed).lengths, seed=seed, clasp_s=8.0, circles=0)
+        (folder / name).mkdir()
+        write_session(folder / name, made_up.recording(name), made_up.truth())
+    return folder
+
+
+@pytest.fixture
+def study(recorded: Path, tmp_path: Path) -> Path:
+    shutil.copytree(recorded, tmp_path / "data")
+    (tmp_path / "plan.toml").write_text(PLAN)
+    return tmp_path
+
+
+def item(study: Path, name: str = "one", **changes: Any) -> Item:
+    return Item(**{"name": name, "session": str(study / "data" / name), "steps": QUICK} | changes)
+
+
+def files(folder: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}

@@ -1,0 +1,715 @@
+"""A robot that follows a live pose: aims, limits of every command, and whatever may befall the poses."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from arms import person, write_arm
+from scipy.spatial.transform import Rotation
+from test_causal import first
+from test_retargeting import far_away
+
+from wepose_pin import cli
+from wepose_pin.errors import BadData, BadOption
+from wepose_pin.live.robot import LAST, RobotOut, TickReplay, Watched, command_json
+from wepose_pin.live.session import run_session
+from wepose_pin.live.state import LivePose, Stage, Status
+from wepose_pin.live.wearing import Wearing
+from wepose_pin.pose import Pose, point_covariance, spread
+from wepose_pin.readers import load_session
+from wepose_pin.retargeting import Robot, find_map, load, wish
+from wepose_pin.retargeting.limits import urdf_limits
+from wepose_pin.retargeting.stream import (
+    APPROACH_SPEED,
+    Command,
+    CommandStream,
+    Person,
+    Seen,
+    _Smoothed,
+)
+from wepose_pin.simulation import Simulation
+from wepose_pin.subject import LENGTHS, average_subject
+from wepose_pin.writers import write_session
+
+pytest.importorskip("daqp")
+ROOT = Path(__file__).resolve().parent.parent
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    return load(find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
+
+
+def stage_of(pose: Pose) -> Stage:
+    return Stage(tuple(pose.quat_WL), tuple(pose.points), 100.0)
+
+
+def live_poses(pose: Pose, std: float = 0.005) -> list[LivePose]:
+    """What the loop would show."""
+    quat = np.stack([pose.quat_WL[name] for name in pose.quat_WL], axis=1)
+    points = np.stack([pose.points[name] for name in pose.points], axis=1)
+    k = quat.shape[1]
+    return [
+        LivePose(float(t), quat[n], points[n], np.full(k, std), np.zeros(k, dtype=bool), 0.0)
+        for n, t in enumerate(pose.time)
+    ]
+
+
+class Driven:
+    """A stream under a clock of our own, and all that it said."""
+
+    def __init__(self, robot: Robot, stage: Stage, **options: Any) -> None:
+        self.robot, self.stream = robot, CommandStream(robot, rate_hz=1.0 / DT, **options)
+        self.person = Person(robot, stage.segments, stage.points)
+        self.commands: list[Command] = []
+        self.hand: list[np.ndarray] = []
+        self._came = 0.0
+
+    def run(self, poses: Sequence[LivePose | None], resume_at: int = -1) -> Driven:
+        """A command a tick; None: no pose came."""
+        for pose in poses:
+            if len(self.commands) == resume_at:
+                self.stream.resume()
+            now = len(self.commands) * DT
+            if pose is not None:
+                looked = self.person.look(pose.quat_WL, pose.points, pose.std, pose.lost)
+                self._came = now if self.stream.push(pose.time, looked) else self._came
+            self.commands.append(self.stream.step(now, now - self._came))
+            self.stream._stepper.look(self.commands[-1].u)
+            self.hand.append(self.stream._stepper.place(0)[0])
+        return self
+
+    def states(self, begin: float = 0.0, end: float = math.inf) -> list[str]:
+        """In order, repetitions left out."""
+        found = [c.state for c in self.commands if begin <= c.clock < end]
+        return [state for k, state in enumerate(found) if k == 0 or found[k - 1] != state]
+
+    def hand_speed(self, begin: float, end: float) -> float:
+        speed = np.linalg.norm(np.diff(self.hand, axis=0), axis=1) / DT
+        return float(speed[round(begin / DT) : round(end / DT)].max())
+
+    def messages(self) -> list[dict[str, Any]]:
+        return [json.loads(command_json(self.robot, command)) for command in self.commands]
+
+
+def keeps_its_limits(messages: Sequence[dict[str, Any]], robot: Robot) -> None:
+    """What was sent, by differences of its positions against the URDF's own text and the map's numbers."""
+    said = urdf_limits(robot.map.urdf)
+    joints = messages[0]["joints"]
+    q, v, a = (np.array([message[key] for message in messages]) for key in ("position", "velocity", "acceleration"))
+    clock = np.array([message["clock"] for message in messages])
+    assert np.isfinite(q).all()
+    assert np.array_equal(np.diff([message["n"] for message in messages]), np.ones(len(messages) - 1))
+    assert np.allclose(np.diff(clock), clock[1] - clock[0], atol=1e-9)
+    dt = clock[1] - clock[0]
+    low, high, fast = (
+        np.array([getattr(said[name], key) for name in joints]) for key in ("lower", "upper", "velocity")
+    )
+    hard = np.array([robot.map.acceleration[name] for name in joints])
+    assert (q >= low).all()
+    assert (q <= high).all()
+    mean = np.diff(q, axis=0) / dt
+    for speed in (v, mean):
+        assert (np.abs(speed) <= fast).all()
+    for change in (a, np.diff(mean, axis=0) / dt, np.diff(v, axis=0) / dt):
+        assert (np.abs(change) <= hard).all()
+    jerk = np.array([robot.map.jerk[name] for name in joints])
+    for change in (np.diff(a, axis=0) / dt, np.diff(mean, 2, axis=0) / dt**2):
+        assert (np.abs(change) <= jerk).all()
+    assert np.abs(mean - 0.5 * (v[1:] + v[:-1])).max() <= hard.max() * dt  # one motion
+
+
+def test_it_approaches_then_follows(arm: Robot) -> None:
+    pose = person(12.0)
+    found = Driven(arm, stage_of(pose)).run(live_poses(pose))
+    assert found.states() == ["approach", "follow"]
+    began = next(c.clock for c in found.commands if c.state == "follow")
+    assert 0.5 < began < 5.0
+    assert found.hand_speed(0.0, 1.0) < 1.2 * (APPROACH_SPEED + 0.1)
+    error = np.array([c.error[0] for c in found.commands if c.clock > began + 1.0])
+    assert np.median(error[:, 0]) < 0.003
+    assert error[:, 0].max() < 0.02
+    assert np.isfinite(error).all()
+    keeps_its_limits(found.messages(), arm)
+
+
+def test_the_aims_are_those_of_a_recording(arm: Robot) -> None:
+    """Of a person who stands both ways to a target, which share little, agree; of one who moves, but for the delay."""
+    still = person(3.0, swing=0.0)
+    target = wish(still, arm).arms[0]
+    found = Driven(arm, stage_of(still)).run(live_poses(still)[:5])
+    aim = found.stream._aim(0, 0.0, True)
+    assert np.allclose(aim.position, target.position[5], atol=1e-9)
+    assert np.allclose(aim.rotation, target.rotation[5], atol=1e-9)
+    assert np.allclose(aim.bend, target.bend[5], atol=1e-9)
+    pose = person(8.0)
+    target = wish(pose, arm).arms[0]
+    found = Driven(arm, stage_of(pose))
+    aims = np.array([(found.run([p]), found.stream._aim(0, 0.0, True).position)[1] for p in live_poses(pose)])
+    behind = [np.linalg.norm(aims[100 + d : 700 + d] - target.position[100:700], axis=1).mean() for d in range(12)]
+    assert abs(DT * int(np.argmin(behind)) - found.stream.delay_s) < DT
+    assert min(behind) < 0.003
+
+
+def test_the_low_pass_is_as_late_as_it_says_and_knows_the_rate() -> None:
+    omega, dt = 2.0 * np.pi * 6.0, 0.002
+    rate, turn = np.array([0.3, -0.2, 0.5]), np.array([0.4, 0.9, -0.7])
+
+    def seen(t: float) -> Seen:
+        return Seen(rate * t, -rate * t, Rotation.from_rotvec(turn * t).as_matrix(), 0.0, ())
+
+    smoothed = _Smoothed.at(seen(0.0))
+    for k in range(1, 1000):
+        smoothed.push(seen(k * dt), dt, omega)
+    t = 999 * dt
+    late = 2.0 / omega
+    assert np.allclose(smoothed.offset, rate * (t - late), atol=1e-9)
+    assert np.allclose(smoothed.bend, -rate * (t - late), atol=1e-9)
+    assert np.allclose(smoothed.R, seen(t - late).rotation, atol=1e-9)
+    for known, true in ((smoothed.offset_rate, rate), (smoothed.bend_rate, -rate), (smoothed.rate, turn)):
+        assert np.allclose(known, true, atol=1e-9)
+
+
+def test_the_hands_uncertainty_is_that_of_the_pose(arm: Robot) -> None:
+    """Where only the arm is uncertain, hand against root is hand against shoulder: `point_covariance` says the same."""
+    pose = person(0.5)
+    std = np.array([0.0, 0.02, 0.05])
+    cov = np.zeros((len(LENGTHS), len(LENGTHS)))
+    at = [LENGTHS.index(f"right_{name}") for name in ("upper_arm", "forearm", "hand")]
+    cov[np.ix_(at, at)] = average_subject().lengths_covariance()[np.ix_(at, at)]
+    segment_cov = {name: np.tile(s**2 * np.eye(3), (50, 1, 1)) for name, s in zip(pose.quat_WL, std, strict=True)}
+    true = spread(point_covariance(pose.points, pose.quat_WL, segment_cov, cov)["right_hand"])
+    seer = Person(arm, stage_of(pose).segments, stage_of(pose).points, cov)
+    for k, one in enumerate(live_poses(pose)):
+        seen = seer.look(one.quat_WL, one.points, std, one.lost)
+        assert seen is not None
+        assert math.isclose(seen[0].std, true[k], rel_tol=1e-9)
+
+
+def test_a_jump_of_a_metre_is_gone_after_slowly(arm: Robot) -> None:
+    pose = person(14.0)
+    points = dict(pose.points)
+    for name in ("right_elbow", "right_wrist", "right_hand"):
+        points[name] = points[name] + np.where(pose.time > 6.0, 1.0, 0.0)[:, None] * [0.0, 0.0, 1.0]
+    found = Driven(arm, stage_of(pose)).run(live_poses(replace(pose, points=points)))
+    assert found.states(5.0, 6.0) == ["follow"]
+    assert found.states(6.02, 6.5) == ["approach"]
+    assert "jumped" in found.commands[610].reason
+    assert found.hand_speed(6.5, 7.5) < 0.6  # what is left of the swing dies down before
+    assert found.states(12.0) == ["follow"]
+    keeps_its_limits(found.messages(), arm)
+
+
+def test_five_seconds_out_of_reach(arm: Robot) -> None:
+    pose = far_away(person(14.0, swing=0.0), (4.0, 9.0), 1.6)
+    stage = stage_of(pose)
+    found = Driven(arm, stage)
+    found.person = Person(arm, stage.segments, stage.points)
+    found.run(live_poses(pose))
+    reach = arm.arms[0].reach
+    far = np.linalg.norm(np.array(found.hand) - arm.arms[0].shoulder, axis=1)
+    assert 0.9 * reach < far[700:890].max() <= reach
+    assert found.hand_speed(7.5, 8.9) < 0.01  # still at the reach: it does not shake
+    assert max(np.abs(c.a).max() for c in found.commands[750:890]) < 0.6
+    assert found.commands[-1].error[0, 0] < 0.01
+    keeps_its_limits(found.messages(), arm)
+
+
+def test_a_pose_that_is_no_number_stops_the_robot(arm: Robot) -> None:
+    pose = person(9.0)
+    poses = live_poses(pose)
+    for k in range(500, 550):
+        poses[k] = poses[k]._replace(points=np.full_like(poses[k].points, np.nan))
+    poses[560] = poses[560]._replace(quat_WL=np.full_like(poses[560].quat_WL, np.nan))
+    poses[570] = poses[570]._replace(quat_WL=np.zeros_like(poses[570].quat_WL))
+    found = Driven(arm, stage_of(pose)).run(poses)
+    assert found.states(4.0) == ["follow", "hold", "approach", "follow"]
+    assert found.commands[515].reason == "no sound pose for 0.1 s"
+    keeps_its_limits(found.messages(), arm)
+
+
+def test_a_lost_sensor_slows_it_and_its_return_is_no_jump(arm: Robot) -> None:
+    """The forearm stays as it was for two seconds and is elsewhere when its sensor comes back."""
+    pose = person(14.0, swing=45.0)
+    poses = live_poses(pose)
+    row = list(pose.quat_WL).index("right_forearm")
+    names = list(pose.points)
+    elbow, wrist, hand = (names.index(f"right_{name}") for name in ("elbow", "wrist", "hand"))
+    for k in range(500, 700):
+        last, points, quat = poses[499], poses[k].points.copy(), poses[k].quat_WL.copy()
+        for at in (wrist, hand):
+            points[at] = points[elbow] + last.points[at] - last.points[elbow]
+        quat[row] = last.quat_WL[row]
+        poses[k] = poses[k]._replace(points=points, quat_WL=quat, lost=np.arange(3) == row)
+    found = Driven(arm, stage_of(pose)).run(poses)
+    usual = Driven(arm, stage_of(pose)).run(live_poses(pose))
+    assert found.states(4.9, 5.3) == ["follow", "slow"]
+    assert found.commands[550].reason == "no samples from right forearm"
+    assert usual.hand_speed(5.0, 7.0) > 0.8
+    assert found.hand_speed(5.5, 7.0) < 0.5
+    assert found.hand_speed(7.0, 7.5) < 0.8 * usual.hand_speed(7.0, 7.5)
+    assert found.states(11.0) == ["follow"]
+    keeps_its_limits(found.messages(), arm)
+
+
+def test_an_uncertain_hand_is_slow(arm: Robot) -> None:
+    pose = person(10.0, swing=45.0)
+    poses = live_poses(pose)
+    poses[500:800] = live_poses(pose, std=0.3)[500:800]
+    found = Driven(arm, stage_of(pose)).run(poses)
+    assert found.states(4.9, 7.9) == ["follow", "slow"]
+    assert re.fullmatch(r"the right hand is uncertain by \d{3} mm", found.commands[600].reason)
+    assert found.hand_speed(6.0, 8.0) < 1.3 * APPROACH_SPEED
+    assert found.states(9.5) == ["follow"]
+    keeps_its_limits(found.messages(), arm)
+
+
+def test_a_pause_of_half_a_second_holds_and_goes_on_by_itself(arm: Robot) -> None:
+    pose = person(9.0, swing=45.0)
+    poses: list[LivePose | None] = [*live_poses(pose)]
+    poses[500:550] = [None] * 50
+    found = Driven(arm, stage_of(pose)).run(poses)
+    assert found.states(4.9) == ["follow", "hold", "approach", "follow"]
+    first_hold = next(c.clock for c in found.commands if c.clock > 4.0 and c.state == "hold")
+    assert abs(first_hold - 5.1) < 0.015
+    moving = np.array([np.abs(c.v).max() for c in found.commands])
+    assert moving[505] > 0.2
+    assert moving[548] < 0.05
+    keeps_its_limits(found.messages(), arm)
+
+
+def test_a_pause_of_three_seconds_stops_it_until_somebody_says_so(arm: Robot) -> None:
+    pose = person(16.0, swing=45.0)
+    poses: list[LivePose | None] = [*live_poses(pose)]
+    poses[500:800] = [None] * 300
+    found = Driven(arm, stage_of(pose)).run(poses, resume_at=1100)
+    assert found.states(4.9) == ["follow", "hold", "stopped", "approach", "follow"]
+    halted = [c for c in found.commands if c.state == "stopped"]
+    assert 5.99 < halted[0].clock < 6.5
+    assert halted[-1].clock == pytest.approx(10.99)
+    for c in halted:
+        assert not c.v.any()
+        assert not c.a.any()
+        assert np.array_equal(c.u, halted[0].u)
+        assert c.reason == "no sound pose for 1 s"
+    keeps_its_limits(found.messages(), arm)
+    # Said while nothing comes it is not forgotten: the next pose goes on.
+    early = Driven(arm, stage_of(pose)).run(poses, resume_at=750)
+    assert early.states(7.4, 8.3) == ["stopped", "hold", "approach"]
+    keeps_its_limits(early.messages(), arm)
+
+
+def test_braking_from_any_moment_keeps_the_limits(arm: Robot) -> None:
+    """Held and let go again and again, at all phases of a fast motion."""
+    pose = person(20.0, swing=60.0)
+    poses: list[LivePose | None] = [*live_poses(pose)]
+    for begin in range(150, 1900, 61):
+        poses[begin : begin + 12 + begin % 37] = [None] * (12 + begin % 37)
+    found = Driven(arm, stage_of(pose)).run(poses[: len(pose.time)])
+    assert found.states().count("hold") > 20
+    keeps_its_limits(found.messages(), arm)
+
+
+def test_a_turned_base_is_the_same_motion(arm: Robot, tmp_path: Path) -> None:
+    turned = load(find_map(str(write_arm(tmp_path, turned=(0.4, -0.7, 2.0)))))
+    pose = person(6.0)
+    straight, other = (Driven(robot, stage_of(pose)).run(live_poses(pose)) for robot in (arm, turned))
+    u, w = (np.array([c.u for c in found.commands]) for found in (straight, other))
+    assert np.abs(u - w).max() < 1e-3
+    assert np.ptp(u, axis=0).max() > 0.5
+    assert other.states() == ["approach", "follow"]
+    keeps_its_limits(other.messages(), turned)
+
+
+def test_an_arm_without_sensors_is_refused(arm: Robot) -> None:
+    with pytest.raises(
+        BadData, match=r"no sensor on right_forearm, which its right arm follows; --arm names the other"
+    ):
+        Person(arm, ("torso", "right_upper_arm"), ("right_shoulder",))
+
+
+@pytest.mark.parametrize("options", [{"rate_hz": 5.0}, {"hold_after": 0.0}, {"hold_after": 1.0, "stop_after": 0.5}])
+def test_wrong_times(arm: Robot, options: dict[str, float]) -> None:
+    with pytest.raises(BadOption, match="--"):
+        CommandStream(arm, **options)
+
+
+# The output ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def robot_out() -> Iterator[Callable[..., RobotOut]]:
+    """Makes one, and ends its thread whatever becomes of the test."""
+    made: list[RobotOut] = []
+
+    def make(stream: CommandStream, to: str, **options: Any) -> RobotOut:
+        made.append(RobotOut(stream, to, **options))
+        return made[-1]
+
+    yield make
+    for out in made:
+        out.close()
+
+
+class Receiver(threading.Thread):
+    """Keeps all datagrams: what the system would is a second's."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.05)
+        self.port = str(self._socket.getsockname()[1])
+        self._lines: list[bytes] = []
+        self._over = False
+        self.start()
+
+    def run(self) -> None:
+        while not self._over:
+            with contextlib.suppress(TimeoutError):
+                self._lines.append(self._socket.recv(65535))
+        self._socket.close()
+
+    @property
+    def messages(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in list(self._lines)]
+
+    def until(self, happens: Callable[[dict[str, Any]], bool], timeout_s: float = 120.0) -> list[dict[str, Any]]:
+        """All that came, when the newest message is such a one."""
+        end = time.monotonic() + timeout_s
+        while not (self._lines and happens(json.loads(self._lines[-1]))):
+            assert time.monotonic() < end, self._lines[-1:]
+            time.sleep(0.005)
+        return self.messages
+
+    def close(self) -> None:
+        self._over = True
+        self.join(5.0)
+
+
+@pytest.fixture
+def receiver() -> Iterator[Receiver]:
+    listening = Receiver()
+    yield listening
+    listening.close()
+
+
+def ended(messages: list[dict[str, Any]]) -> bool:
+    """Whether the last of them tell that the robot stands."""
+    last = messages[-LAST:]
+    return all(m["state"] == "stopped" and not any(m["velocity"]) and not any(m["acceleration"]) for m in last)
+
+
+def play(out: RobotOut, poses: Sequence[LivePose], shift: float = 0.0) -> None:
+    """At their own pace."""
+    begin = time.monotonic() - poses[0].time
+    for pose in poses:
+        time.sleep(max(0.0, begin + pose.time - time.monotonic()))
+        out.show(pose._replace(time=pose.time + shift))
+
+
+def test_a_source_that_dies_stops_the_robot_by_the_wall_clock(robot_out, arm: Robot, receiver: Receiver) -> None:
+    pose = person(2.0, swing=45.0)
+    out = robot_out(CommandStream(arm), receiver.port)
+    out.open()
+    time.sleep(0.1)
+    out.start(stage_of(pose))
+    play(out, live_poses(pose)[:150], shift=1e4)
+    time.sleep(1.8)  # nobody calls it any more
+    messages = receiver.messages
+    assert messages[0]["state"] == "hold"
+    assert messages[0]["t"] is None
+    assert messages[0]["reason"] == "waiting for a pose"
+    assert messages[0]["position"] == pytest.approx(arm.rest.tolist())
+    last = messages[-1]
+    assert ended(messages)
+    assert last["t"] == pytest.approx(1e4 + pose.time[149])
+    states = [m["state"] for m in messages]
+    assert [s for k, s in enumerate(states) if k == 0 or states[k - 1] != s] == ["hold", "approach", "hold", "stopped"]
+    held = states.index("stopped") - max(k for k, s in enumerate(states) if s == "approach")
+    assert 60 < held < 130
+    out.close()
+    keeps_its_limits(receiver.messages, arm)
+
+
+def test_it_comes_evenly_though_poses_do_not(robot_out, arm: Robot, receiver: Receiver) -> None:
+    """Poses in bursts: commands at their rate, and no shaking."""
+    pose = person(5.0, swing=20.0)
+    poses = live_poses(pose)
+    out = robot_out(CommandStream(arm), receiver.port)
+    out.start(stage_of(pose))
+    begin, jitter = time.monotonic(), np.random.default_rng(0).uniform(0.0, 0.02, len(poses))
+    for one, late in zip(poses, np.maximum.accumulate(pose.time + jitter), strict=True):
+        time.sleep(max(0.0, begin + late - time.monotonic()))
+        out.show(one)
+    out.close()
+    messages = receiver.messages
+    keeps_its_limits(messages, arm)
+    follows = [m for m in messages if m["state"] == "follow"]
+    assert len(follows) > 100
+    assert np.median([m["arms"]["right"]["error_mm"] for m in follows]) < 10.0
+    assert ended(messages)
+
+
+def test_the_loop_never_waits_for_the_solver(robot_out, arm: Robot, receiver: Receiver, monkeypatch) -> None:
+    stream = CommandStream(arm)
+    quick = stream.step
+
+    def slow(now: float, age: float) -> Command:
+        time.sleep(0.035)
+        return quick(now, age)
+
+    monkeypatch.setattr(stream, "step", slow)
+    pose = person(1.0)
+    out = robot_out(stream, receiver.port)
+    out.start(stage_of(pose))
+    took = []
+    for one in live_poses(pose):
+        time.sleep(DT)
+        begin = time.perf_counter()
+        out.show(one)
+        took.append(time.perf_counter() - begin)
+    summary = out.summary()
+    out.close()
+    assert np.quantile(took, 0.9) < 0.005
+    assert summary.skipped > summary.commands  # two or three of four
+    assert len(receiver.messages) == out.summary().commands
+    keeps_its_limits(receiver.messages, arm)
+
+
+def test_an_error_of_the_thread_is_the_loops(robot_out, arm: Robot, receiver: Receiver, monkeypatch) -> None:
+    stream = CommandStream(arm)
+
+    def broken(_now: float, _age: float) -> Command:
+        raise ValueError("broken")
+
+    monkeypatch.setattr(stream, "step", broken)
+    pose = person(1.0)
+    out = robot_out(stream, receiver.port)
+    out.start(stage_of(pose))
+    time.sleep(0.1)
+    with pytest.raises(ValueError, match="broken"):
+        out.show(live_poses(pose)[0])
+    out.close()
+
+
+def test_nobody_receives(robot_out, arm: Robot) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        free = taken.getsockname()[1]
+    pose = person(1.0)
+    out = robot_out(CommandStream(arm), f"127.0.0.1:{free}")
+    out.start(stage_of(pose))
+    play(out, live_poses(pose)[:50])
+    out.close()
+    out.close()
+    summary = out.summary()
+    assert summary.commands > 50
+    assert summary.share["approach"] > 0.3
+
+
+def test_the_document_shows_a_message_and_the_example(arm: Robot) -> None:
+    text = (ROOT / "docs" / "live-robot.md").read_text(encoding="utf-8")
+    shown = re.search(r"```json\n(.*?)```", text, re.DOTALL)
+    assert shown is not None
+    real = Driven(arm, stage_of(person(0.5))).run(live_poses(person(0.5))[:3]).messages()[-1]
+    documented = json.loads(shown[1])
+    assert list(documented) == list(real)
+    assert list(documented["arms"]["right"]) == list(real["arms"]["right"])
+    assert documented["format"] == real["format"]
+    code = (ROOT / "examples" / "robot_receiver.py").read_text(encoding="utf-8").split('"""\n\n', 1)[1]
+    assert f"```python\n{code}```" in text
+
+
+def test_the_example_reads_it_and_notices_the_end(robot_out, arm: Robot) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        number = str(free.getsockname()[1])
+    script = (ROOT / "examples" / "robot_receiver.py").read_text(encoding="utf-8").replace("9002", number)
+    run = subprocess.Popen([sys.executable, "-W", "error", "-c", script], stdout=subprocess.PIPE, text=True)
+    assert run.stdout is not None
+    out = robot_out(CommandStream(arm), number)
+    out.open()
+    first_line = run.stdout.readline()
+    out.close()
+    said = [first_line, *run.communicate(timeout=30)[0].splitlines()]
+    assert run.returncode == 0
+    assert re.match(r"\d+ hold \[", first_line)
+    if len(said) > 2:  # on a machine that is too busy a tenth of a second may pass before
+        assert " stopped " in said[-2] or " hold " in said[-2]
+    assert said[-1] == "no command: the robot is to be stopped here"
+
+
+@pytest.mark.parametrize("to", ["", "here", "127.0.0.1:", "0", "70000", "no such host:9002"])
+def test_wrong_addresses(arm: Robot, to: str) -> None:
+    with pytest.raises(BadOption, match="--to"):
+        RobotOut(CommandStream(arm), to)
+
+
+def test_r_goes_on_and_the_person_is_told(robot_out, arm: Robot, receiver: Receiver) -> None:
+    class View:
+        def __init__(self) -> None:
+            self.keys: list[str] = []
+            self.message = ""
+
+        def status(self, status: Status) -> None:
+            self.message = status.message
+
+        def take_keys(self) -> list[str]:
+            return self.keys
+
+    pose = person(4.0)
+    poses = live_poses(pose)
+    out = robot_out(CommandStream(arm), receiver.port, speed=math.inf)
+    view = View()
+    watched = Watched(view, out)
+    out.start(stage_of(pose))
+    for one in [*poses[:50], poses[200]]:  # a second and a half of nothing, by the ticks' clock
+        out.show(one)
+    ready = Status("ready", "Tracking.", 1.0, 0.0, (), (0.0, 0.0), 0.0, {})
+    watched.status(ready)
+    assert view.message == "Tracking. arm: stopped (no sound pose for 1 s); r, in the start pose, goes on."
+    watched.status(ready._replace(state="hold"))
+    assert view.message == "Tracking."
+    assert watched.take_keys() == []
+    out.show(poses[201])
+    assert out.newest is not None
+    assert out.newest.state == "stopped"
+    view.keys = ["r"]
+    assert watched.take_keys() == ["r"]
+    out.show(poses[202])
+    assert out.newest.state == "approach"
+    out.close()
+    time.sleep(0.1)
+    assert ended(receiver.messages)
+    keeps_its_limits(receiver.messages, arm)
+
+
+def test_the_same_recording_gives_the_same_commands(
+    simulation: Simulation, arm: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A session as fast as it is read, and what it recorded: to the bit, without this machine's clock."""
+    sent: list[bytes] = []
+    monkeypatch.setattr("wepose_pin.live.robot._Wire.send", lambda _, data: sent.append(data))
+    recording = first(simulation.recording("bits"), 1500)
+
+    def commands(recording: Any, record: Path | None = None) -> list[bytes]:
+        sent.clear()
+        out = RobotOut(CommandStream(arm), speed=math.inf)
+        source = TickReplay(recording, math.inf)
+        run_session(source, Wearing.of(recording), method=METHOD, record=record, outputs=[out])
+        return list(sent)
+
+    once = commands(recording, tmp_path / "a.wepose")
+    assert len(once) > 500
+    assert commands(recording) == once
+    again = commands(load_session(tmp_path / "a.wepose"))
+    strip: Callable[[bytes], dict[str, Any]] = lambda line: json.loads(line) | {"t": None}  # noqa: E731
+    assert [strip(line) for line in again] == [strip(line) for line in once]
+    states = {json.loads(line)["state"] for line in once}
+    assert {"approach", "follow", "stopped"} <= states
+    keeps_its_limits([json.loads(line) for line in once], arm)
+
+
+# A filter whose covariance the loop does not ask for by the wall clock.
+METHOD = "ncf"
+
+
+# The command line ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def session(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("session")
+    write_session(folder, first(simulation.recording("robot"), 3000))
+    return folder
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_amid_a_motion_the_robot_stands(session: Path, tmp_path: Path, receiver: Receiver, number: int) -> None:
+    urdf = write_arm(tmp_path)
+    command = [sys.executable, "-m", "wepose_pin.cli", "live", "--source", f"replay:{session}", "--no-page"]
+    command += ["--speed", "2", "--robot", str(urdf), "--arm", "right", "--to", receiver.port]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    receiver.until(lambda m: m["state"] == "approach" and max(map(abs, m["velocity"])) > 0.2)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    messages = receiver.messages
+    assert process.returncode == 0, err
+    assert all("commands were skipped" in line for line in err.splitlines())  # on a busy machine
+    assert ended(messages)
+    assert messages[-1]["reason"] == "the session has ended"
+    assert "arm: " in out
+    keeps_its_limits(messages, load(find_map(str(urdf))))
+
+
+def test_wrong_robots_are_one_line_before_the_source_opens(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def opened(_: Any) -> None:
+        raise AssertionError("the source was opened")
+
+    monkeypatch.setattr("wepose_pin.live.sources.replay.ReplaySource.open", opened)
+    whole = write_arm(tmp_path)
+    alone, bare, torso = tmp_path / "alone", tmp_path / "bare", tmp_path / "torso"
+    for folder in (alone, bare, torso):
+        folder.mkdir()
+    write_arm(alone)
+    (alone / "arm.toml").rename(alone / "other.toml")
+    write_arm(bare, without="elbow.velocity")
+    only = first(load_session(session), 2000)
+    write_session(torso, replace(only, sensors={name: only.sensors[name] for name in ("torso", "left_upper_arm")}))
+    for arguments, said in (
+        (["--robot", "pandda"], "--robot pandda: not known; did you mean 'panda'?"),
+        (["--robot", str(tmp_path / "none.urdf")], "none.urdf: no such file"),
+        (["--robot", str(alone / "arm.urdf")], "no arm.toml beside it"),
+        (["--robot", str(bare / "arm.urdf")], "joint 'elbow' has no velocity limit"),
+        (["--robot", str(whole), "--arm", "left"], "--arm left: arm has no left arm"),
+        (["--robot", str(whole), "--to", "there"], "--to there: a port or HOST:PORT"),
+        (["--robot", str(whole), "--robot-hz", "5"], "--robot-hz 5: from 10 to 1000"),
+        (["--robot", str(whole), "--hold-after", "2"], "--hold-after 2, --stop-after 1: seconds, the second longer"),
+        (["--robot", "panda", "--map", str(alone / "other.toml")], "a map goes with a URDF"),
+        (["--robot", str(alone / "arm.urdf"), "--map", str(tmp_path / "no.toml")], "no.toml: no such file"),
+        (["--arm", "left"], "--arm left: goes with --robot, which is not given"),
+        (["--to", "9002"], "--to 9002: goes with --robot"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["live", "--source", f"replay:{session}", "--no-page", *arguments])
+        err = capsys.readouterr().err.strip()
+        assert stop.value.code == 2, said
+        assert said in err
+        assert len(err.splitlines()) == 1
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["live", "--source", f"replay:{torso}", "--no-page", "--robot", str(whole)])
+    assert stop.value.code == 2
+    assert "no sensor on right_upper_arm, right_forearm, which its right arm follows" in capsys.readouterr().err
+
+
+def test_a_map_may_lie_elsewhere(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    urdf = write_arm(tmp_path)
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "arm.toml").rename(tmp_path / "maps" / "mine.toml")
+    with pytest.raises(SystemExit) as stop:
+        cli.main(
+            ["live", "--source", f"replay:{session}", "--no-page", "--speed", "max"]
+            + ["--robot", str(urdf), "--map", str(tmp_path / "maps" / "mine.toml")]
+        )
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert re.search(r"mine: \d+ commands, .*% follow.*; each took \d+\.\d\d ms \(p50\)", out.replace("\n", " "))

@@ -1,0 +1,255 @@
+"""Long recordings: in pieces they give what they give as a whole, to the bit, in a memory that does not grow."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.bench.day import there_and_back
+from wepose_pin.calibration import calibrate_lengths
+from wepose_pin.cli import main
+from wepose_pin.errors import BadData, BadOption
+from wepose_pin.filters import METHODS, SensorRun, piece_multiple, run_filter
+from wepose_pin.model import load_model
+from wepose_pin.noise import noise_of
+from wepose_pin.pose import pose_table
+from wepose_pin.readers import load_session
+from wepose_pin.recording import Recording
+from wepose_pin.simulation import Person, Simulation, simulate
+from wepose_pin.subject import Subject
+from wepose_pin.tracking import TrackedPose, track, track_pieces
+from wepose_pin.tracking.tracked import Tally
+from wepose_pin.writers import write_session
+from wepose_pin.writers.result import write_subject
+
+RATE = 100.0
+
+
+@pytest.fixture(scope="module")
+def made(person: Person) -> Simulation:
+    """A minute: two stretches of joined hands, of which the session tells, and what lies between."""
+    return simulate(person.lengths, seed=8, clasp_s=30.0, circles=2)
+
+
+@pytest.fixture(scope="module")
+def subject(made: Simulation, person: Person) -> Subject:
+    """Calibrated, with hinges: headings are held together by them and by the hands."""
+    found = calibrate_lengths(made.recording(), gauge=person.taped, prior=person.average, gauge_std=person.taped_std)
+    assert set(found.subject.hinges) == {"left", "right"}
+    return found.subject
+
+
+@pytest.fixture
+def session(made: Simulation, tmp_path: Path) -> Path:
+    return written(tmp_path / "session", made.recording())
+
+
+def written(folder: Path, recording: Recording) -> Path:
+    folder.mkdir(parents=True)
+    write_session(folder, recording)
+    return folder
+
+
+def joined(pieces: list[TrackedPose]) -> pl.DataFrame:
+    return pl.concat([pose_table(piece, covariance=True) for piece in pieces])
+
+
+@pytest.mark.parametrize(("method", "seconds"), [("amekf", 7.31), ("amekf", 23.0), ("smekf", 5.0), ("ncf", 2.0)])
+def test_pieces_put_together_are_the_whole(session: Path, subject: Subject, method: str, seconds: float) -> None:
+    whole = track(load_session(session), subject, method=method)
+    pieces = list(track_pieces(session, subject, method=method, seconds=seconds))
+    assert len(pieces) > 2
+    assert joined(pieces).equals(pose_table(whole, covariance=True))
+    assert whole.reset is not None
+    assert pieces[-1].reset is not None
+    assert max(whole.reset.largest_deg.values()) > 0.01  # there was something to hold
+    tally = Tally()
+    for piece in pieces:
+        tally.add(piece)
+    assert tally.summary() == whole.summary()
+
+
+def test_of_a_csv_too_and_with_lost_samples(session: Path, subject: Subject, monkeypatch) -> None:
+    """Gaps over the edges of pieces, over a whole piece, and of rows: what is marked is marked in both."""
+    monkeypatch.setattr("wepose_pin.readers.tables.BLOCK_ROWS", 333)
+    table = pl.read_parquet(session / "recording.parquet")
+    time = table["time"].to_numpy()
+    lost = {"left_forearm": (14.0, 27.0), "torso": (19.5, 20.3), "right_forearm": (40.0, 40.03)}
+    for segment, (first, last) in lost.items():
+        gone = pl.Series((time >= first) & (time < last))
+        columns = [name for name in table.columns if name.startswith(segment)]
+        table = table.with_columns(pl.when(~gone).then(pl.col(columns)).name.keep())
+    table = table.filter(pl.Series((time < 31.0) | (time > 45.0)))
+    table.write_csv(session / "recording.csv")
+    text = (session / "session.toml").read_text().replace("recording.parquet", "recording.csv")
+    (session / "session.toml").write_text(text)
+    whole = track(load_session(session, gaps=True), subject)
+    pieces = list(track_pieces(session, subject, seconds=6.0, gaps=True))
+    ours, wanted = joined(pieces), pose_table(whole, covariance=True)
+    assert ours.equals(wanted)
+    assert wanted["left_forearm_gap"].sum() == pytest.approx(100 * (13.0 + 14.0), abs=3)
+    found, of_whole = (of["sensors"]["torso"] for of in (summary_of(pieces), whole.summary()))
+    assert (
+        (found["gaps"], found["gap_s"]) == (of_whole["gaps"], of_whole["gap_s"]) == (2, pytest.approx(14.8, abs=0.03))
+    )
+    with pytest.raises(BadData, match=r"--gaps"):
+        list(track_pieces(session, subject, seconds=6.0))
+
+
+def summary_of(pieces: list[TrackedPose]) -> dict:
+    tally = Tally()
+    for piece in pieces:
+        tally.add(piece)
+    return tally.summary()
+
+
+def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation, tmp_path: Path) -> None:
+    recording = made.recording()
+    again = there_and_back(recording, recording.span((0.5, 4.5)))
+    late = (float(again.time[-1]) - 4.5, float(again.time[-1]) - 1.0)
+    session = written(tmp_path / "late", replace(again, phases={"still": ((0.5, 4.5),), "start": (late,)}))
+    whole = track(load_session(session))
+    pieces = list(track_pieces(session, seconds=3.0))
+    assert pieces[0].time[-1] >= late[1] > pieces[0].time[-1] - 3.0
+    assert joined(pieces).equals(pose_table(whole, covariance=True))
+
+
+def test_a_body_whose_joints_are_too_few(made: Simulation, tmp_path: Path, data: Path) -> None:
+    """Its elbows are fitted from frame to frame: the next piece begins where the last one ended."""
+    from test_pose import gazebo
+
+    recording = made.recording()
+    first = {
+        name: replace(s, gyro_S=s.gyro_S[:1500], accel_S=s.accel_S[:1500]) for name, s in recording.sensors.items()
+    }  # type: ignore[index]
+    recording = replace(recording, time=recording.time[:1500], sensors=first, phases={"start": ((0.5, 4.5),)})
+    session, body = written(tmp_path / "short", recording), gazebo(data, 48)
+    whole = track(load_session(session), model=body)
+    pieces = list(track_pieces(session, model=body, seconds=4.0))
+    assert joined(pieces).equals(pose_table(whole, covariance=True))
+    missed = whole.summary()["not_followed_rms_deg"]
+    assert max(missed.values()) > 1.0
+    assert summary_of(pieces)["not_followed_rms_deg"] == missed
+
+
+# The smoother ---------------------------------------------------------------------------------------------------------
+
+
+def one_sensor(made: Simulation) -> tuple[np.ndarray, np.ndarray]:
+    sensor = made.recording().sensors["right_forearm"]
+    assert sensor.gyro_S is not None
+    assert sensor.accel_S is not None
+    return sensor.gyro_S, sensor.accel_S
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_filters_in_pieces(made: Simulation, method: str) -> None:
+    """The last two pieces of the smoother have seen all that lies behind them."""
+    gyro, accel = one_sensor(made)
+    noise = noise_of(gyro[50:450], accel[50:450], RATE)
+    whole = run_filter(gyro, accel, RATE, noise, method)
+    size = 40 * piece_multiple(method, RATE)
+    edges = [*range(0, len(gyro) - size, size), len(gyro)] if size > 40 else [0, 60, 1000, 1001, 3000, len(gyro)]
+    run, found = SensorRun(RATE, noise, method), []
+    for first, last in pairwise(edges):
+        if (of := run.push(gyro[first:last], accel[first:last])) is not None:
+            found.append(of)
+    if method == "smoother":
+        found.append(run.finish())
+    quat = np.concatenate([of.quat_WS for of in found])
+    same = slice(edges[-3], None) if method == "smoother" else slice(None)
+    np.testing.assert_array_equal(quat[same], whole.quat_WS[same])
+    np.testing.assert_array_equal(np.concatenate([of.gyro_bias for of in found])[same], whole.gyro_bias[same])
+    np.testing.assert_array_equal(np.concatenate([of.static for of in found]), whole.static)
+
+
+def test_the_smoother_looks_one_piece_ahead(session: Path) -> None:
+    """It is nearer to the smoother of the whole, the longer the pieces are; and nearer than the filter by itself."""
+    whole = track(load_session(session), method="smoother")
+
+    def off(table: Mapping[str, np.ndarray]) -> float:
+        angles = [
+            (Rotation.from_quat(table[name]) * Rotation.from_quat(quat).inv()).magnitude()
+            for name, quat in whole.quat_WL.items()
+        ]
+        return float(np.degrees(np.sqrt(np.mean(np.square(angles)))))
+
+    def in_pieces(seconds: float) -> dict[str, np.ndarray]:
+        pieces = list(track_pieces(session, method="smoother", seconds=seconds))
+        return {name: np.concatenate([piece.quat_WL[name] for piece in pieces]) for name in whole.quat_WL}
+
+    causal = off(track(load_session(session)).quat_WL)
+    assert off(in_pieces(1000.0)) == 0.0
+    assert off(in_pieces(30.0)) < off(in_pieces(5.0)) < causal
+
+
+# The command ----------------------------------------------------------------------------------------------------------
+
+
+def run(*words: object) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        main([str(word) for word in words])
+    return int(stopped.value.code or 0)
+
+
+@pytest.fixture
+def person_folder(subject: Subject, tmp_path: Path) -> Path:
+    folder = tmp_path / "person"
+    folder.mkdir()
+    write_subject(folder, subject, load_model().with_lengths(dict(subject.lengths)))
+    return folder
+
+
+def test_the_command_gives_the_same_folder(session: Path, person_folder: Path, tmp_path: Path, monkeypatch) -> None:
+    options = [session, "--subject", person_folder, "--covariance"]
+    assert run("track", *options, "-o", tmp_path / "whole", "--no-report") == 0
+    assert run("track", *options, "-o", tmp_path / "pieces", "--pieces", 10) == 0
+    monkeypatch.setattr("wepose_pin.tracking.LARGE", 1000)
+    assert run("track", *options, "-o", tmp_path / "large") == 0
+    whole = pl.read_parquet(tmp_path / "whole" / "pose.parquet")
+    summary = json.loads((tmp_path / "whole" / "summary.json").read_text())
+    for name in ("pieces", "large"):
+        assert sorted(p.name for p in (tmp_path / name).iterdir()) == sorted(
+            p.name for p in (tmp_path / "whole").iterdir()
+        )
+        assert pl.read_parquet(tmp_path / name / "pose.parquet").equals(whole)
+        ours = json.loads((tmp_path / name / "summary.json").read_text())
+        assert {k: v for k, v in ours.items() if k != "made_by"} == {k: v for k, v in summary.items() if k != "made_by"}
+
+
+def test_what_is_wrong_late_leaves_nothing(session: Path, tmp_path: Path, capsys) -> None:
+    table = pl.read_parquet(session / "recording.parquet")
+    wrong = table.with_columns(
+        pl.when(pl.col("time") > 50.0).then(1e5).otherwise(pl.col("torso_gyr_x")).alias("torso_gyr_x")
+    )
+    wrong.write_parquet(session / "recording.parquet")
+    assert run("track", session, "-o", tmp_path / "out", "--pieces", 5) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "sensors.torso.gyro" in line
+    assert not (tmp_path / "out").exists()
+    assert not list(tmp_path.glob(".out*"))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--causal"], "--causal is tracked as a whole"),
+        (["--torques"], "--torques is tracked as a whole"),
+        (["--pieces", "-1"], "at least 2 s"),
+        (["--pieces", "nan"], "at least 2 s"),
+    ],
+)
+def test_what_has_no_pieces(session: Path, tmp_path: Path, capsys, options: list[str], said: str) -> None:
+    assert run("track", session, "-o", tmp_path / "out", "--pieces", 5, *options) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(BadOption, match="at least 2 s"):
+        next(track_pieces(session, seconds=0.5))

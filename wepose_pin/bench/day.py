@@ -1,0 +1,169 @@
+"""What a recording of a day costs: `wepose track` in pieces, its memory, and whether it gives what the whole gives."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from scipy.spatial.transform import Rotation
+
+from ..calibration import calibrate_lengths
+from ..errors import NoSolution
+from ..recording import Recording, Sensor
+from ..simulation import simulate, simulated_person
+from ..tracking import AHEAD_S, PIECE_S
+from ..writers import write_session
+from ..writers.result import write_subject
+from . import Column, Table
+
+HOURS, FEW_HOURS = (1.0, 6.0, 24.0), (0.5, 1.0)
+SHORT_S = 120.0  # pieces of the smoother whose error is told too
+
+
+def day_sections(quick: bool) -> dict[str, Callable[[], Table]]:
+    """Name → a function that measures it."""
+    return {"a day": partial(_day, FEW_HOURS if quick else HOURS)}
+
+
+def _day(hours: tuple[float, ...]) -> Table:
+    """Recordings of so many hours; the first is tracked as a whole too."""
+    table = Table(
+        "Long recordings: five sensors at 100 Hz, wepose track",
+        (
+            Column("read", "read [MB]", 0),
+            Column("written", "written [MB]", 0),
+            Column("seconds", "time [s]", 0),
+            Column("faster", "times real time", 0),
+            Column("memory", "memory [MB]", 0),
+            Column("same", "same bits", 0),
+            Column("most", "off, most [deg]", 4),
+            Column("rms", "rms [deg]", 4),
+        ),
+    )
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for length in hours:
+            _write(folder / f"{length:g}", length)
+            begin = length == hours[0]
+            if begin:
+                table.rows[f"{length:g} h as a whole"] = _track(folder, length, "whole", pieces=0.0)
+            of = _track(folder, length, "pieces", pieces=PIECE_S)
+            if begin:
+                of["same"] = float(_pose(folder, "pieces").equals(_pose(folder, "whole")))
+            table.rows[f"{length:g} h in pieces of {PIECE_S:g} s"] = of
+            if begin:
+                whole = f"smoother, {length:g} h as a whole"
+                table.rows[whole] = _track(folder, length, "smooth", pieces=0.0, method="smoother")
+                for pieces in (SHORT_S, AHEAD_S):
+                    row = _track(folder, length, "pieces", pieces=pieces, method="smoother")
+                    row["most"], row["rms"] = _off(_pose(folder, "pieces"), _pose(folder, "smooth"))
+                    table.rows[f"smoother, {length:g} h in pieces of {pieces:g} s"] = row
+    table.notes.append("Same bits: 1 where every number of pose.parquet is that of the recording as a whole.")
+    table.notes.append(
+        "Off: segments of the smoother in pieces, which looks ahead by one of them, from those of the smoother as a "
+        "whole, about whose own errors docs/validation.md tells."
+    )
+    table.notes.append("Memory is that of the whole process, Python and all libraries in it, at its highest.")
+    return table
+
+
+def _write(folder: Path, hours: float) -> None:
+    """A person who stands, joins hands, draws circles and does it all backwards, again and again; calibrated."""
+    person = simulated_person(1)
+    made = simulate(person.lengths, seed=1)
+    recording = made.recording("day")
+    found = calibrate_lengths(recording, gauge=person.taped, prior=person.average, gauge_std=person.taped_std)
+    folder.mkdir()
+    write_session(folder, there_and_back(recording, recording.span(recording.phases["start"][0])))
+    piece = pl.read_parquet(folder / "recording.parquet").drop("time")
+    parts = folder / "parts"
+    parts.mkdir()
+    count, first = round(hours * 3600.0 * recording.rate_hz), 0
+    while first < count:
+        rows = piece.head(min(piece.height, count - first))
+        stamps = np.arange(first, first + rows.height) / recording.rate_hz
+        part = rows.with_columns(pl.Series("time", stamps)).select("time", *piece.columns)
+        part.write_parquet(parts / f"{first:012d}.parquet")
+        first += rows.height
+    pl.scan_parquet(sorted(parts.glob("*.parquet"))).sink_parquet(folder / "recording.parquet")
+    for path in parts.iterdir():
+        path.unlink()
+    from ..model import load_model
+
+    (folder / "subject").mkdir()
+    write_subject(folder / "subject", found.subject, load_model().with_lengths(dict(found.subject.lengths)))
+
+
+def there_and_back(recording: Recording, rest: slice) -> Recording:
+    """A recording and the same backwards: it ends as it began, and can be repeated.
+
+    Backwards a rate is negative and a specific force the same; a gyroscope's bias is no rate and stays.
+    """
+    sensors: dict[str, Sensor] = {}
+    for name, sensor in recording.sensors.items():
+        assert sensor.gyro_S is not None
+        assert sensor.accel_S is not None
+        bias = sensor.gyro_S[rest].mean(axis=0)
+        # The rate at a sample is that of the interval which ends there; backwards it is the one that begins there.
+        back = np.roll(2.0 * bias - sensor.gyro_S[::-1], 1, axis=0)
+        sensors[name] = replace(
+            sensor,
+            gyro_S=np.concatenate([sensor.gyro_S, back]),
+            accel_S=np.concatenate([sensor.accel_S, sensor.accel_S[::-1]]),
+        )
+    n = 2 * len(recording)
+    return replace(recording, time=np.arange(n) / recording.rate_hz, sensors=sensors)
+
+
+def _track(folder: Path, hours: float, out: str, *, pieces: float, method: str = "amekf") -> dict[str, float]:
+    """What it costs in a process of its own.
+
+    Raises
+    ------
+    NoSolution
+        It fails.
+    """
+    session = folder / f"{hours:g}"
+    words = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(folder / out), "--force"]
+    words += ["--subject", str(session / "subject"), "--method", method, "--pieces", f"{pieces:g}", "--no-report"]
+    begun = time.perf_counter()
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    assert process.stderr is not None
+    said = process.stderr.read()
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise NoSolution(f"wepose track of {hours:g} h ended with {process.returncode}: {said.decode().strip()[-300:]}")
+    seconds = time.perf_counter() - begun
+    return {
+        "read": (session / "recording.parquet").stat().st_size / 1e6,
+        "written": (folder / out / "pose.parquet").stat().st_size / 1e6,
+        "seconds": seconds,
+        "faster": 3600.0 * hours / seconds,
+        "memory": used.ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0) / 1e6,
+    }
+
+
+def _pose(folder: Path, out: str) -> pl.DataFrame:
+    return pl.read_parquet(folder / out / "pose.parquet")
+
+
+def _off(ours: pl.DataFrame, whole: pl.DataFrame) -> tuple[float, float]:
+    """Largest and rms angle [deg] between the segments of two poses."""
+    names = [name.removesuffix("_qw") for name in whole.columns if name.endswith("_qw")]
+    angles = []
+    for name in names:
+        columns = [f"{name}_q{c}" for c in "xyzw"]
+        a, b = (Rotation.from_quat(table.select(columns).to_numpy()) for table in (ours, whole))
+        angles.append(np.degrees((a.inv() * b).magnitude()))
+    found = np.concatenate(angles)
+    return float(found.max()), float(np.sqrt(np.mean(found**2)))
