@@ -1,4 +1,4 @@
-"""Three short sessions and a plan over them, for the tests of `wepose batch`."""
+"""Three short sessions and a plan over them, for the tests of `wepose batch`, which import the two fixtures."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ report = false
 """
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(name="recorded", scope="module")
+def three_sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three short sessions, one/ to three/."""
     folder = tmp_path_factory.mktemp("recorded")
     for seed, name in enumerate(("one", "two", "three"), 1):
@@ -35,8 +35,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def study(recorded: Path, tmp_path: Path) -> Path:
+@pytest.fixture(name="study")
+def sessions_and_plan(recorded: Path, tmp_path: Path) -> Path:
     shutil.copytree(recorded, tmp_path / "data")
     (tmp_path / "plan.toml").write_text(PLAN)
     return tmp_path

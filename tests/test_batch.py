@@ -11,7 +11,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from studies import PLAN, QUICK, files, item
+from studies import PLAN, QUICK, files, item, sessions_and_plan, three_sessions  # noqa: F401
 
 from wepose_pin.batch import Item, items, read_plan, run_study
 from wepose_pin.batch.compare import differences
@@ -21,8 +21,6 @@ from wepose_pin.batch.plan import STEPS
 from wepose_pin.batch.storage import DONE, new_folder, only_one
 from wepose_pin.batch.study import STUDY, _claim, table_of
 from wepose_pin.errors import BadData, ExistingOutput
-
-pytest_plugins = ["studies"]
 
 
 @pytest.fixture(autouse=True)

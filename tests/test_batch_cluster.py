@@ -19,7 +19,7 @@ import distributed
 import numpy as np
 import polars as pl
 import pytest
-from studies import PLAN, files, item
+from studies import PLAN, files, item, sessions_and_plan, three_sessions  # noqa: F401
 
 from wepose_pin.batch import cluster, run_study
 from wepose_pin.batch.apart import make_apart
@@ -29,7 +29,6 @@ from wepose_pin.batch.storage import DONE
 from wepose_pin.bench.study import _apart_from_us
 from wepose_pin.errors import BadData, BadOption, LostWorker
 
-pytest_plugins = ["studies"]
 WEPOSE = [sys.executable, "-m", "wepose_pin.cli"]
 APART = ("seconds", "memory_mb", "track_s", "evaluate_s")  # columns that are not the same twice
 
@@ -64,7 +63,7 @@ def test_a_study_on_this_machine(study: Path) -> None:
     shutil.rmtree(study / "out" / "items" / "subject-x")
     table = run_study(study / "plan.toml", str(study / "out"), workers=1).table
     assert table["status"].to_list() == ["failed"] * 5
-    assert "its subject 'x' could not be calibrated" in table["message"][2]
+    assert "its subject 'x' has no calibration, see item subject-x" in table["message"][2]
 
 
 def test_workers_listen_on_this_machine_only() -> None:

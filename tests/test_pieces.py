@@ -23,6 +23,8 @@ from wepose_pin.noise import noise_of
 from wepose_pin.pose import pose_table
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
+from wepose_pin.report import track_report
+from wepose_pin.report.thinned import Thinner, whole_of
 from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.subject import Subject
 from wepose_pin.tracking import TrackedPose, track, track_pieces
@@ -210,7 +212,7 @@ def person_folder(subject: Subject, tmp_path: Path) -> Path:
 
 def test_the_command_gives_the_same_folder(session: Path, person_folder: Path, tmp_path: Path, monkeypatch) -> None:
     options = [session, "--subject", person_folder, "--covariance"]
-    assert run("track", *options, "-o", tmp_path / "whole", "--no-report") == 0
+    assert run("track", *options, "-o", tmp_path / "whole") == 0
     assert run("track", *options, "-o", tmp_path / "pieces", "--pieces", 10) == 0
     monkeypatch.setattr("wepose_pin.tracking.LARGE", 1000)
     assert run("track", *options, "-o", tmp_path / "large") == 0
@@ -253,3 +255,33 @@ def test_what_has_no_pieces(session: Path, tmp_path: Path, capsys, options: list
     assert not (tmp_path / "out").exists()
     with pytest.raises(BadOption, match="at least 2 s"):
         next(track_pieces(session, seconds=0.5))
+
+
+def test_a_thinned_report_keeps_extremes(session: Path, subject: Subject, monkeypatch) -> None:
+    """What lasts, what is lost and what was largest are those of all samples, though one in eighteen is kept."""
+    monkeypatch.setattr("wepose_pin.report.thinned.MOST", 300)
+    pose = track(load_session(session), subject)
+    thinner = Thinner(len(pose.time))
+    for piece in track_pieces(session, subject, seconds=7.31):
+        thinner.add(piece)
+    assert pose.recording is not None
+    thin, whole = thinner.thinned(pose.recording.phases, pose.summary()["warnings"])
+    wanted = whole_of(pose)
+    assert whole.samples == len(pose.time) == 5698
+    assert len(thin.time) == 317
+    np.testing.assert_array_equal(thin.time, pose.time[::18])
+    assert whole.steps_ms == pytest.approx(wanted.steps_ms)
+    for name, signal in wanted.signals.items():
+        ours = whole.signals[name]
+        bins = [signal.rate[first : first + 18].max() for first in range(0, 5698, 18)]
+        np.testing.assert_allclose(ours.rate, bins, rtol=1e-12)
+        assert ours.peak_accel == signal.peak_accel
+        assert ours.rest is not None
+        assert signal.rest is not None
+        np.testing.assert_array_equal(ours.rest, [signal.rest[k : k + 18].all() for k in range(0, 5698, 18)])
+        np.testing.assert_array_equal(ours.bias, signal.bias)
+    for name, speed in wanted.peak_speed.items():
+        assert 0.8 * speed < whole.peak_speed[name] <= speed
+    page = track_report(thin, whole=whole)
+    assert "5698 samples at 100 Hz" in page
+    assert "of 317 samples, one in 18" in page

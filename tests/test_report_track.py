@@ -78,7 +78,7 @@ def looked_at(pose: TrackedPose) -> list[Concern]:
     signals = {name: signal_of(pose.recording, name, pose) for name in pose.recording.sensors}
     found = {side: elbow_of(pose, side, pose.subject) for side in ("left", "right")}
     elbows = {side: elbow for side, elbow in found.items() if elbow is not None}
-    return concerns(pose, signals, heading_budgets(pose), elbows)
+    return concerns(pose, signals, heading_budgets(pose), elbows, pose.summary()["warnings"])
 
 
 def said(pose: TrackedPose, words: str) -> Concern:

@@ -166,8 +166,8 @@ def track(
         limits: Let elbows and wrists of one or two axes pass the model's limits.
         torques: Write torques.parquet too, joint torques by the model's inertias and the smoothed motion: estimates.
         report: Leave out report.html (warnings and what to do, noise, drift, hands, joint angles).
-        pieces: Track in pieces of so many seconds, in the same memory however long the recording is, without
-            report.html (docs/long-recordings.md). Files of 500 MB and more always are; 0: not even those.
+        pieces: Track in pieces of so many seconds, in the same memory however long the recording is
+            (docs/long-recordings.md). Files of 500 MB and more always are; 0: not even those.
         force: Replace files of an earlier run.
     """
     given = dict(locals())
@@ -186,7 +186,7 @@ def track(
         what = "--causal" if causal else "--torques" if torques else f"{session}, a recording of wepose live,"
         raise BadOption(f"--pieces {pieces:g}: {what} is tracked as a whole; leave --pieces out")
     if pieces or (pieces is None and not causal and not torques and data_bytes(session) >= LARGE):
-        _track_pieces(session, out, subject, model, method or BEST, pieces, gaps, covariance, limits, given)
+        _track_pieces(session, out, subject, model, method or BEST, pieces, gaps, covariance, limits, report, given)
         return
     with whole_folder(out, force) as folder, _steps(4 if report else 3) as step:
         step("reading")
@@ -1062,6 +1062,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of ``wepose``; ends by `SystemExit`: 0, or 2 after one line on what was wrong."""
+    alone = argv is None
     if argv is None:
         argv = sys.argv[1:]
         # The last bits of BLAS depend on its number of threads, and `wepose rerun` looks at them. Before numpy loads.
@@ -1095,6 +1096,10 @@ def main(argv: list[str] | None = None) -> None:
             print(f"wepose: {where}: {error.strerror or error}; {_what_there_is()}", file=sys.stderr)
             sys.exit(2)
         raise
+    finally:
+        if alone:  # a signal while Python itself ends would take the exit code's place
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
     sys.exit(0)
 
 
@@ -1259,11 +1264,15 @@ def _track_pieces(
     gaps: bool,
     covariance: bool,
     limits: bool,
+    report: bool,
     given: Mapping[str, Any],
 ) -> None:
     """`track` in a memory that does not grow with the recording."""
     from .model import load_model
     from .readers.session import SessionReader
+    from .report import track_report
+    from .report.thinned import Thinner
+    from .report.track import MOST_FRAMES
     from .subject import load_subject
     from .tracking import track_pieces
     from .viewer import pose_html
@@ -1276,23 +1285,26 @@ def _track_pieces(
         who = load_subject(subject) if subject else None
         body = load_model(model) if model else None
         reader = SessionReader(session, gaps=gaps, in_memory=False)
-        writer = PieceWriter(folder, len(reader.time), covariance)
-        for piece in track_pieces(
-            reader, who, seconds=seconds, method=method, model=body, limits=limits, told=told
-        ):
+        writer, thinner = PieceWriter(folder, covariance), Thinner(len(reader.time))
+        for piece in track_pieces(reader, who, seconds=seconds, method=method, model=body, limits=limits, told=told):
             writer.add(piece)
+            thinner.add(piece)
         told("making the page", 1.0)
-        last = writer.tally.last
-        assert last is not None
-        assert last.model is not None
-        pose = writer.finish(reader.phases, made_by("track", given))
-        fps = min(30.0, (len(pose.time) - 1) / float(pose.time[-1] - pose.time[0]))
-        name = last.recording.name if last.recording else ""
-        page = pose_html(last.model, pose, phases=reader.phases, title=name, fps=fps)
+        writer.finish(reader.phases, made_by("track", given))
+        summary = writer.tally.summary()
+        pose, whole = thinner.thinned(reader.phases, summary["warnings"])
+        assert pose.model is not None
+        fps = min(30.0, MOST_FRAMES / max(float(pose.time[-1] - pose.time[0]), 1e-3))
+        page = pose_html(pose.model, pose, phases=reader.phases, title=summary["recording"], fps=fps)
         (folder / "view.html").write_text(page, encoding="utf-8")
-    _tracked_table(writer.tally.summary())
+        if report:
+            told("writing the report", 1.0)
+            (folder / "report.html").write_text(track_report(pose, view=page, whole=whole), encoding="utf-8")
+    _tracked_table(summary)
+    if report:
+        _say(f"Report to look at:  {out / 'report.html'}")
     _say(f"Motion to look at, {fps:.2g} pictures a second:  {out / 'view.html'}")
-    _say(f"Pose: {out / 'pose.parquet'}  ({len(last.quat_WL)} segments, {len(last.points)} points)")
+    _say(f"Pose: {out / 'pose.parquet'}  ({len(pose.quat_WL)} segments, {len(pose.points)} points)")
 
 
 def _track_chain(
@@ -1553,29 +1565,37 @@ def _driven_table(driven: Driven) -> None:
     )
     if driven.skipped:
         _warn([f"{driven.skipped} commands were skipped: the machine was too slow for them; --robot-hz asks for fewer"])
+    if driven.held:
+        _warn([f"in {driven.held} steps links were near each other and the joints' limits left no way apart"])
     if driven.dropped:
         _warn([f"{driven.dropped} commands were not taken by the network or by their receiver"])
 
 
 def _retarget_tables(found: dict[str, Any]) -> None:
-    """How well the hands follow, and what the trajectory keeps."""
-    rows = []
+    """How well the hands follow and why they do not, and what the trajectory keeps."""
+    rows, reasons = [], []
     for side, of in found["arms"].items():
-        inside, turn, swivel = of["hand_error_mm"], of["hand_error_deg"], of["swivel_error_deg"]
+        inside, turn, swivel, possible = (
+            of[key] for key in ("hand_error_mm", "hand_error_deg", "swivel_error_deg", "possible")
+        )
+        near = possible["hand_error_where_reachable_mm"]
         rows.append(
             (
                 side,
                 f"{of['scale']:.2f}",
-                *((f"{inside[key]:.1f}" for key in ("median", "p90")) if inside else ("", "")),
+                *((f"{error[key]:.1f}" if error else "") for error in (inside, near) for key in ("median", "p90")),
                 f"{turn['median']:.1f}",
                 f"{swivel['median']:.0f}" if swivel else "",
-                f"{100 * of['inside_reach_share']:.0f}",
+                f"{100 * possible['reachable_share']:.0f}",
             )
         )
-    header = ("arm", "scale", "hand [mm] median", "90 %", "turn [deg]", "elbow swivel [deg]", "inside the reach [%]")
+        reasons.append((side, *(f"{100 * share:.1f}" for share in of["causes"].values())))
+    header = ("arm", "scale", "hand [mm] median", "90 %", "where it can: median", "90 %", "turn [deg]",
+              "elbow swivel [deg]", "can reach [%]")  # fmt: skip
     _print_table(
         f"{found['robot']}: {found['duration_s']:.1f} s for {found['recorded_s']:.1f} s recorded", header, rows
     )
+    _print_table("Hand more than 20 mm off [% of the time], for", ("arm", *of["causes"]), reasons)
     margins, touched = found["limit_margins"], found["self_collision"]
     _say(
         f"Limits {'kept' if found['limits_kept'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "

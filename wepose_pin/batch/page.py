@@ -48,7 +48,7 @@ def study_page(plan: Plan, table: pl.DataFrame) -> str:
     columns = _figures(done)
     return as_html(
         [
-            Heading(f"Study {plan.name}", 1),
+            Heading(f"Study: {plan.name}", 1),
             _verdict(done.height, failed.height),
             Facts(_facts(plan, table, done)),
             *_failures(failed),
@@ -95,7 +95,7 @@ def _verdict(done: int, failed: int) -> Banner:
     if failed == 0:
         return Banner("pass", f"All {done} items are done.", [])
     kind = "poor" if done else "fail"
-    return Banner(kind, f"{done} of {done + failed} items are done; {failed} failed, see below.", [])
+    return Banner(kind, f"{done} of {done + failed} items are done; {failed} are not, see below.", [])
 
 
 def _facts(plan: Plan, table: pl.DataFrame, done: pl.DataFrame) -> list[tuple[str, str]]:
@@ -121,7 +121,7 @@ def _failures(failed: pl.DataFrame) -> list[Block]:
     causes = causes.sort("len", descending=True, maintain_order=True)
     listed = failed.head(MOST_ROWS).select("item", "error", "message").iter_rows()
     return [
-        Heading("Failures by cause"),
+        Heading("Not done, by cause"),
         Table(["cause", "items", "the first of them"], [[c, str(n), _cut(text)] for c, n, text in causes.iter_rows()]),
         Table(["item", "cause", "what was wrong"], [[item, cause, _cut(text)] for item, cause, text in listed]),
         *_more(failed.height),

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import BadOption
 from ..retargeting import Robot, find_map, load, read_map
-from ..retargeting.stream import Command, CommandStream, Person, needed
+from ..retargeting.stream import HOLD_AFTER_S, STOP_AFTER_S, Command, CommandStream, Person, needed
 from ..subject import average_subject
 from .loop import Latencies, Output
 from .out import LOOPBACK
@@ -275,7 +275,9 @@ def follower_of(
     map_file: Path | None = None,
     to: str | None = None,
     speed: float = 1.0,
-    **times: float,
+    rate_hz: float = 100.0,
+    hold_after: float = HOLD_AFTER_S,
+    stop_after: float = STOP_AFTER_S,
 ) -> tuple[RobotOut, Source]:
     """A robot by name or file that follows who wears the sensors, and the source as it needs it, not opened yet.
 
@@ -284,7 +286,7 @@ def follower_of(
     arms : sides; None: all that the robot has
     map_file : of a URDF in `robot` that has none beside it
     speed : of a replay; infinite: as fast as it is read
-    times : as `CommandStream`
+    rate_hz, hold_after, stop_after : as `CommandStream`
 
     Raises
     ------
@@ -299,7 +301,8 @@ def follower_of(
     if isinstance(source, ReplaySource) and math.isinf(speed):
         source = TickReplay(source.recording, speed)
     lengths_cov = (wearing.subject or average_subject()).lengths_covariance()
-    return RobotOut(CommandStream(loaded, **times), to or str(PORT), lengths_cov=lengths_cov, speed=speed), source
+    stream = CommandStream(loaded, rate_hz=rate_hz, hold_after=hold_after, stop_after=stop_after)
+    return RobotOut(stream, to or str(PORT), lengths_cov=lengths_cov, speed=speed), source
 
 
 def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:

@@ -51,6 +51,8 @@ class LiveRecording(NamedTuple):
 
 def is_live_log(path: Path) -> bool:
     """Whether the file is the recording of a live session."""
+    if not path.is_file():  # a pipe would hold us up
+        return False
     try:
         with path.open("rb") as file:
             return file.read(len(MAGIC)) == MAGIC

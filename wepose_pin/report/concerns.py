@@ -71,10 +71,10 @@ def concerns(
     signals: Mapping[str, Signal],
     budgets: Mapping[str, Budget],
     elbows: Mapping[str, Elbow],
+    warnings: list[str],
 ) -> list[Concern]:
-    """The grave ones first."""
+    """The grave ones first; `warnings` are those of the pose's summary."""
     assert pose.recording is not None
-    warnings = pose.summary()["warnings"]
     found = [
         *(_of_warning(text) for text in warnings),
         *_of_signals(pose, signals, "\n".join(warnings)),

@@ -11,11 +11,10 @@ from ..pose import deviation
 from ..recording import Recording, Sensor
 from ..tracking import TrackedPose
 from ..viewer import pose_html
-from .concerns import GRAVITY_OFF, concerns, hold
+from .concerns import GRAVITY_OFF, Concern, concerns, hold
 from .joints import joint_angle_section
 from .measures import (
     Budget,
-    Elbow,
     Hand,
     Signal,
     between,
@@ -23,9 +22,9 @@ from .measures import (
     hands_of,
     heading_budgets,
     longest,
-    signal_of,
     stated_mounts,
 )
+from .thinned import Whole, whole_of
 from .track_figures import (
     headings_picture,
     noise_picture,
@@ -40,7 +39,7 @@ MOST_FRAMES = 5000  # of the 3D view
 LARGEST_VIEW = 3_000_000  # of a view that comes ready, in characters
 
 
-def track_report(pose: TrackedPose, *, view: str | None = None) -> str:
+def track_report(pose: TrackedPose, *, view: str | None = None, whole: Whole | None = None) -> str:
     """``report.html``: one page that opens offline and prints; equal arguments give equal text.
 
     Its size does not grow with the recording's length.
@@ -49,21 +48,26 @@ def track_report(pose: TrackedPose, *, view: str | None = None) -> str:
     ----------
     pose : of `track`
     view : the page of `pose_html` where it is made already, to be shown here unless it is large; None: it is made here
+    whole : of a `pose` that `Thinner` thinned
     """
     recording = pose.recording
     assert recording is not None
-    signals = {name: signal_of(recording, name, pose) for name in recording.sensors}
+    whole = whole or whole_of(pose)
+    signals = whole.signals
     budgets = heading_budgets(pose)
     found = {side: elbow_of(pose, side, pose.subject) for side in ("left", "right")}
     elbows = {side: elbow for side, elbow in found.items() if elbow is not None}
-    hands = hands_of(pose, recording.rate_hz)
+    hands = {
+        name: hand._replace(peak_speed=whole.peak_speed[name])
+        for name, hand in hands_of(pose, recording.rate_hz).items()
+    }
     blocks: list[Block] = [
         Heading(f"Motion of {recording.name or 'a recording'}", 1),
-        _looked_at(pose, signals, budgets, elbows),
-        Bullets(_in_short(pose, signals, budgets)),
+        _looked_at(concerns(pose, signals, budgets, elbows, whole.warnings)),
+        Bullets(_in_short(pose, whole, budgets)),
         "± is one standard deviation throughout: two times out of three the truth lies within, 19 times out of 20 "
         "within twice as much.",
-        *_recorded(recording, signals),
+        *_recorded(recording, whole),
         *_noise(signals),
         *_drift(pose, budgets),
         *_hands(pose, hands),
@@ -71,16 +75,19 @@ def track_report(pose: TrackedPose, *, view: str | None = None) -> str:
         *_view(pose, view),
         *_run(pose),
     ]
+    if whole.samples > len(recording):
+        blocks.insert(
+            3,
+            f"Times, angles and places are shown of {len(recording)} samples, one in "
+            f"{whole.samples / len(recording):.0f}; extremes, rest and what was lost are of all.",
+        )
     return as_html(blocks, f"Motion of {recording.name}" if recording.name else "Motion")
 
 
 # The sections ---------------------------------------------------------------------------------------------------------
 
 
-def _looked_at(
-    pose: TrackedPose, signals: Mapping[str, Signal], budgets: Mapping[str, Budget], elbows: Mapping[str, Elbow]
-) -> Banner:
-    of = concerns(pose, signals, budgets, elbows)
+def _looked_at(of: list[Concern]) -> Banner:
     grave = sum(concern.grave for concern in of)
     lines = [concern.line() for concern in of]
     if not of:
@@ -92,12 +99,12 @@ def _looked_at(
     return Banner("poor", "**Look at this first,** before you use the figures below", lines)
 
 
-def _in_short(pose: TrackedPose, signals: Mapping[str, Signal], budgets: Mapping[str, Budget]) -> list[str]:
+def _in_short(pose: TrackedPose, whole: Whole, budgets: Mapping[str, Budget]) -> list[str]:
     recording = pose.recording
     assert recording is not None
     assert pose.subject is not None
     seconds = float(recording.time[-1] - recording.time[0])
-    said = [f"**{_duration(seconds)}** at {recording.rate_hz:g} Hz from {len(signals)} sensors."]
+    said = [f"**{_duration(seconds)}** at {whole.rate_hz:g} Hz from {len(whole.signals)} sensors."]
     pairs = between(budgets)
     if pairs:
         worst = max(pairs, key=lambda joint: float(pairs[joint].max()))
@@ -114,9 +121,9 @@ def _in_short(pose: TrackedPose, signals: Mapping[str, Signal], budgets: Mapping
     return said
 
 
-def _recorded(recording: Recording, signals: Mapping[str, Signal]) -> list[Block]:
+def _recorded(recording: Recording, whole: Whole) -> list[Block]:
     lines = []
-    for name, signal in signals.items():
+    for name, signal in whole.signals.items():
         peak = f"{signal.peak_accel:.0f} m/s²" if np.isfinite(signal.peak_accel) else ""
         lines.append(
             [
@@ -129,10 +136,9 @@ def _recorded(recording: Recording, signals: Mapping[str, Signal]) -> list[Block
                 f"{longest(~signal.rest, recording.rate_hz):.0f} s" if signal.rest is not None else "",
             ]
         )
-    steps = 1e3 * np.diff(recording.time)
-    low, high = f"{steps.min():.2f}", f"{steps.max():.2f}"
+    low, high = (f"{step:.2f}" for step in whole.steps_ms)
     text = (
-        f"{len(recording)} samples at {recording.rate_hz:g} Hz, {recording.time[0]:.2f} to {recording.time[-1]:.2f} s "
+        f"{whole.samples} samples at {whole.rate_hz:g} Hz, {recording.time[0]:.2f} to {recording.time[-1]:.2f} s "
         f"on the recording's clock, one every {low if low == high else f'{low} to {high}'} ms."
     )
     if recording.phases:
@@ -142,7 +148,7 @@ def _recorded(recording: Recording, signals: Mapping[str, Signal]) -> list[Block
         "Acceleration is what the sensor feels, gravity included. Cut off: an axis stood at the end of its range; a "
         "turn that is cut off is missing in the orientation. At rest the gyroscope's bias shows, and nothing drifts."
     )
-    picture = timeline_picture(recording.time, signals, recording.phases)
+    picture = timeline_picture(recording.time, whole.signals, recording.phases)
     return [Heading("What was recorded"), text, picture, Table(header, lines), after]
 
 

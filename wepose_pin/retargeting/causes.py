@@ -32,7 +32,7 @@ def causes(trajectory: Trajectory, arm: int) -> dict[str, float]:
     of, target, held = robot.arms[arm], trajectory.targets[arm], trajectory.held
     u = trajectory.u[:, of.joints]
     at_limit = (u - robot.lower[of.joints] < AT_LIMIT) | (robot.upper[of.joints] - u < AT_LIMIT)
-    bound, since = held.joints[:, of.joints], round(CATCHES_UP_S / float(trajectory.time[1]))
+    bound, since = held.joints[:, of.joints], round(0.5 * CATCHES_UP_S / float(trajectory.time[1]))
     because = np.stack(
         [
             target.lost,
@@ -74,10 +74,8 @@ def possible(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
                 continue
             for i, aim in enumerate(aims):
                 hand, turn, _ = stepper.place(i)
-                far, angle = (
-                    np.linalg.norm(hand - aim.position),
-                    Rotation.from_matrix(turn.T @ aim.rotation).magnitude(),
-                )
+                far = float(np.linalg.norm(hand - aim.position))
+                angle = Rotation.from_matrix(turn.T @ aim.rotation).magnitude()
                 cost = tasks.position * far**2 + tasks.orientation * angle**2
                 if cost < best[i]:
                     best[i], found[k, i] = cost, far

@@ -11,7 +11,6 @@ import pinocchio as pin
 import polars as pl
 from scipy.interpolate import CubicHermiteSpline
 
-from .collision import allowed_pairs
 from .limits import urdf_limits
 from .robot import Robot
 
@@ -68,20 +67,53 @@ class Touching(NamedTuple):
 
     samples: int
     first: str  # which shapes, and when; empty where nothing touches
+    pairs: int  # of shapes that were looked at
+    left_out: dict[str, list[str]]  # why → which pairs were not
 
 
 def touching(robot: Robot, time: np.ndarray, u: np.ndarray) -> Touching:
-    """Every sample against the robot's own shapes (meshes as they are, not hulls)."""
-    shapes = pin.GeometryModel(robot.shapes)
-    for i, j in allowed_pairs(robot):
-        shapes.addCollisionPair(pin.CollisionPair(i, j))
+    """Every sample against the robot's own shapes, meshes as they are and not hulls; by a rule of its own for pairs.
+
+    Left out are shapes of one part, or of parts with one joint between them; what the robot's SRDF excuses; and what
+    touches in the rest posture. The solver's rule, which looks at what can touch at all, has no part in it.
+    """
+    shapes, left_out = _pairs(robot)
     data, geometry = robot.model.createData(), shapes.createData()
     boxes = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(robot.model, shapes, geometry)
     hits = [k for k in range(len(u)) if pin.computeCollisions(robot.model, data, boxes, robot.q(u[k]), True)]
-    if not hits:
-        return Touching(0, "")
-    pin.computeCollisions(robot.model, data, shapes, geometry, robot.q(u[hits[0]]), True)
-    return Touching(len(hits), _which(shapes, geometry, float(time[hits[0]])))
+    first = ""
+    if hits:
+        pin.computeCollisions(robot.model, data, shapes, geometry, robot.q(u[hits[0]]), True)
+        first = _which(shapes, geometry, float(time[hits[0]]))
+    return Touching(len(hits), first, len(shapes.collisionPairs), left_out)
+
+
+def _pairs(robot: Robot) -> tuple[Any, dict[str, list[str]]]:
+    """The shapes with the pairs to look at, and those left out by their reason."""
+    shapes, parents = pin.GeometryModel(robot.shapes), robot.model.parents
+    shapes.addAllCollisionPairs()  # of different parts
+    left_out: dict[str, list[str]] = {"excused by the SRDF": [], "one joint between them": [], "touch at rest": []}
+
+    def there() -> list[tuple[int, int]]:
+        return [(pair.first, pair.second) for pair in shapes.collisionPairs]
+
+    def leave(reason: str, pairs: list[tuple[int, int]]) -> None:
+        for a, b in pairs:
+            left_out[reason].append(" - ".join(shapes.geometryObjects[i].name for i in (a, b)))
+            if shapes.existCollisionPair(pin.CollisionPair(a, b)):
+                shapes.removeCollisionPair(pin.CollisionPair(a, b))
+
+    if robot.map.srdf is not None:
+        before = there()
+        pin.removeCollisionPairs(robot.model, shapes, str(robot.map.srdf))
+        leave("excused by the SRDF", sorted(set(before) - set(there())))
+    on = [shape.parentJoint for shape in shapes.geometryObjects]
+    leave("one joint between them", [(a, b) for a, b in there() if on[a] == parents[on[b]] or on[b] == parents[on[a]]])
+    geometry = shapes.createData()
+    pin.computeCollisions(robot.model, robot.model.createData(), shapes, geometry, robot.q(robot.rest), False)
+    hit = [result.isCollision() for result in geometry.collisionResults]
+    leave("touch at rest", [pair for pair, touches in zip(there(), hit, strict=True) if touches])
+    return shapes, left_out
 
 
 def _which(shapes: Any, geometry: Any, time: float) -> str:

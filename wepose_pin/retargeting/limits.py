@@ -22,7 +22,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..errors import BadModel, MissingFile
-from ..so3 import inlined, kernel
+from ..so3 import compiled, inlined, kernel
 
 
 class JointLimit(NamedTuple):
@@ -179,19 +179,36 @@ def acceleration_bounds(u, v, a, lower, upper, v_most, a_most, j_most, dt, low, 
             low[j] = high[j] = 0.5 * (low[j] + high[j])
 
 
-def closing(
-    left: np.ndarray, v: np.ndarray, a: np.ndarray, brake: np.ndarray, jerk: np.ndarray, dt: float
-) -> np.ndarray:
-    """(m,) highest velocity [m/s] at which something may come nearer, to stop `left` [m] on: bound 3 of many at once.
+@compiled
+def opening_bounds(growth, distance, clearance, v, a, a_most, j_most, dt):  # type: ignore[no-untyped-def]
+    """(m,) the lowest growth [m/s] of distances half a step on, so that what comes nearer stops in time.
 
-    `v`, `a` are its velocity and acceleration now, `brake` and `jerk` what can be counted on; from the acceleration the
-    coming step takes off what it can.
+    Bound 3 for many things at once. Counted on is half of what all joints together could brake: the other half is
+    theirs for their own limits. From the acceleration at which two come nearer the coming step takes off what it can.
+
+    Parameters
+    ----------
+    growth : (m, n) of the distances with the joints [m/rad]
+    distance, clearance : (m,) [m]
+    v, a, a_most, j_most : (n,)
     """
-    pull = np.minimum(np.minimum(0.5 * jerk / brake, 0.3 / dt), SLOWEST_PULL)
-    bend = LAND_A * brake / pull**2
-    even = np.sqrt(2.0 * LAND_A * brake * np.maximum(left - 0.5 * bend, 0.0))
-    over = np.maximum(a - jerk * dt + np.minimum(pull * np.maximum(v, 0.0), LAND_A * brake), 0.0)
-    return np.where(left < bend, pull * left, even) - 0.5 * over**2 / (LAND_J * jerk)
+    bounds = np.empty(len(distance))
+    for k in range(len(distance)):
+        brake, jerk, nears, speeds, ahead = 1e-9, 1e-9, 0.0, 0.0, 0.0
+        for j in range(len(v)):
+            g = growth[k, j]
+            brake += 0.5 * abs(g) * a_most[j]
+            jerk += 0.5 * abs(g) * j_most[j]
+            nears -= g * (v[j] + 0.5 * dt * a[j])
+            speeds -= g * a[j]
+            ahead += g * (1.5 * v[j] + 0.5 * dt * a[j])
+        left = distance[k] - clearance[k] + dt * ahead
+        pull = min(0.5 * jerk / brake, 0.3 / dt, SLOWEST_PULL)
+        bend = LAND_A * brake / pull**2
+        slow = pull * left if left < bend else np.sqrt(2.0 * LAND_A * brake * (left - 0.5 * bend))
+        over = max(speeds - jerk * dt + min(pull * max(nears, 0.0), LAND_A * brake), 0.0)
+        bounds[k] = 0.5 * over**2 / (LAND_J * jerk) - slow
+    return bounds
 
 
 def usable(a_most: np.ndarray, v_most: np.ndarray, j_most: np.ndarray, span: np.ndarray, dt: float) -> np.ndarray:

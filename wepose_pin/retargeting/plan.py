@@ -177,7 +177,7 @@ class _Seen(NamedTuple):
 def _run(
     stepper: Stepper, motion: Wish, reference: np.ndarray | None, halts: int, progress: Callable[[float], None]
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], _Seen]:
-    """Positions, velocities, accelerations (n, joints) from rest on, and what was seen; the last `halts` samples halt."""
+    """u, v, a (n, joints) from rest on, and what was seen; it halts in the last `halts`."""
     robot, n, arms = stepper.robot, len(motion.time), len(stepper.robot.arms)
     u, v, a = (np.zeros((n, len(robot.names))) for _ in range(3))
     seen = _Seen(
@@ -198,12 +198,12 @@ def _run(
         seen.closest[k] = stepper.closest
         seen.held.joints[k], seen.held.shapes[k] = stepper.held
         for i in range(arms):
-            seen.hand[i][k], seen.turn[i][k], elbow = stepper.place(i)
-            offset = seen.hand[i][k] - robot.arms[i].shoulder
-            seen.bend[i][k] = bend_of(elbow - robot.arms[i].shoulder, offset)
+            seen.hand[i][k], seen.turn[i][k], seen.bend[i][k] = stepper.place(i)
         state = after
         if k % 64 == 0:
             progress(k / n)
+    for i, arm in enumerate(robot.arms):
+        seen.bend[i][:] = bend_of(seen.bend[i] - arm.shoulder, seen.hand[i] - arm.shoulder)
     return (u, v, a), seen
 
 

@@ -1,11 +1,11 @@
 """One step: where the hands are, where they are to be, the next joint velocities by one quadratic programme.
 
-The tasks are those of differential inverse kinematics (hand, elbow swivel, posture, damping), written for the velocity w
-of all joints half a step after the coming one, were the acceleration to stay what it is at the coming one's end:
-w = v + dt (½ a + a'). Over a step the jerk is even, and a' = (w - v) / dt - ½ a is the one such law that reaches a given
-velocity in two steps, without swinging about it. Every limit on a' is a simple bound (`limits.acceleration_bounds`). What
-is near in space adds a row each. The sums are those of Pink (a test holds them against it), whose limits on acceleration
-and position together leave its programme without a solution sooner or later.
+The tasks are those of differential inverse kinematics (hand, elbow swivel, posture, damping), written for the velocity
+w of all joints half a step after the coming one, were the acceleration to stay what it is at the coming one's end:
+w = v + dt (½ a + a'). Over a step the jerk is even, and a' = (w - v) / dt - ½ a is the one such law that reaches a
+given velocity in two steps, without swinging about it. Every limit on a' is a simple bound
+(`limits.acceleration_bounds`). What is near in space adds a row each. The sums are those of Pink (a test holds them
+against it), whose limits on acceleration and position together leave its programme without a solution sooner or later.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from ..errors import WeposeError
 from .collision import Shapes
-from .limits import acceleration_bounds, closing, usable
+from .limits import acceleration_bounds, opening_bounds, usable
 from .person import ArmTarget
 from .robot import Arm, Robot
 from .rows import add_arm
@@ -173,15 +173,9 @@ class Stepper:
         near = self.shapes.near(self.data)
         self.closest = float(near.distance.min()) if len(near.distance) else np.inf
         growth = near.growth if self._plain else near.growth @ self.robot.coupling
-        dt, (_, a_most, j_most) = self.dt, self._most
-        size = np.abs(growth)
-        # Half of what all joints together could do: the other half is theirs for their own limits.
-        brake, jerk = 0.5 * (size @ a_most) + 1e-9, 0.5 * (size @ j_most) + 1e-9
-        left = near.distance - near.clearance + dt * (growth @ (1.5 * state.v + 0.5 * dt * state.a))
-        nears = -growth @ (state.v + 0.5 * dt * state.a)
-        bound = closing(left, nears, -growth @ state.a, brake, jerk, dt)
-        self.counts.near += bool((left < 0.01).any())
-        return growth, -bound
+        _, a_most, j_most = self._most
+        self.counts.near += bool((near.distance - near.clearance < 0.01).any())
+        return growth, opening_bounds(growth, near.distance, near.clearance, state.v, state.a, a_most, j_most, self.dt)
 
     def _programme(
         self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray, low: np.ndarray, high: np.ndarray

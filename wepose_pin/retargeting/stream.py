@@ -108,12 +108,19 @@ def _settled(
 
 @dataclass
 class _Reference:
-    """Where one hand is asked to be: it goes from where the hand is to its aim, and then with it."""
+    """Where one hand is asked to be: it goes from where the hand is to its aim, and then with it.
+
+    It changes its velocity no faster than the robot's joints can: a robot that is asked for more shakes, and comes so
+    near to itself that its limits leave it no way out.
+    """
 
     position: np.ndarray
     R: np.ndarray
+    brisk: float  # [m/s²]
     speed: float = APPROACH_SPEED  # [m/s] allowed now
     found: bool = False
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    rate: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def step(self, aim: Aim, dt: float) -> Aim:
         """What the hand is to do in this step, on the way to `aim`."""
@@ -126,14 +133,21 @@ class _Reference:
             self.speed = float(np.clip(wanted, down * self.speed, up * self.speed))
         else:
             self.speed += GROWTH * dt * aim.weight
-        velocity = _no_faster(aim.velocity + CLOSING * away, self.speed)
-        rate = _no_faster(aim.rate + CLOSING * turned, TURN * self.speed)
-        middle, R_middle = self.position + 0.5 * dt * velocity, pin.exp3(0.5 * dt * rate) @ self.R
-        self.position, self.R = self.position + dt * velocity, pin.exp3(dt * rate) @ self.R
-        return Aim(middle, velocity, R_middle, rate, aim.bend, aim.weight)
+        self.velocity = _towards(self.velocity, aim.velocity, away, self.speed, self.brisk, dt)
+        self.rate = _towards(self.rate, aim.rate, turned, TURN * self.speed, TURN * self.brisk, dt)
+        middle, R_middle = self.position + 0.5 * dt * self.velocity, pin.exp3(0.5 * dt * self.rate) @ self.R
+        self.position, self.R = self.position + dt * self.velocity, pin.exp3(dt * self.rate) @ self.R
+        return Aim(middle, self.velocity, R_middle, self.rate, aim.bend, aim.weight)
 
 
-def _no_faster(v: np.ndarray, most: float) -> np.ndarray:
+def _towards(v: np.ndarray, aim: np.ndarray, away: np.ndarray, speed: float, brisk: float, dt: float) -> np.ndarray:
+    """The next velocity: the aim's, and what closes in on it as fast as half of `brisk` stops again."""
+    far = float(np.linalg.norm(away))
+    closing = min(CLOSING, np.sqrt(brisk / far)) if far > 0.0 else CLOSING
+    return v + _at_most(_at_most(aim + closing * away, speed) - v, brisk * dt)
+
+
+def _at_most(v: np.ndarray, most: float) -> np.ndarray:
     size = float(np.linalg.norm(v))
     return v if size <= most else v * (most / size)
 
@@ -350,8 +364,11 @@ class CommandStream:
         dt = self.dt
         if self._references is None:
             self._stepper.look(self.state.u)
-            places = [self._stepper.place(i) for i in range(len(self.robot.arms))]
-            self._references = [_Reference(hand, turn) for hand, turn, _ in places]
+            self._references = []
+            for i, arm in enumerate(self.robot.arms):
+                hand, turn, _ = self._stepper.place(i)
+                brisk = arm.reach * float(np.median(self.robot.a_most[arm.joints]))
+                self._references.append(_Reference(hand, turn, brisk))
             self._smoothed = self._smoothed or [_Smoothed.at(one) for one in self._seen]
         for i, seen in enumerate(self._seen):
             wanted = trust_in(seen)

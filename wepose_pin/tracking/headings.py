@@ -205,7 +205,7 @@ class HeadingHold:
 
     def _ask(self, piece: Recording, segments: Segments) -> None:
         """The filters' heading variances at the end of the start pose and in the middles of the knots."""
-        times = np.empty(0)
+        times: np.ndarray = np.empty(0)
         if self._first is not None:
             last = int(np.floor((piece.time[-1] - self._first) / KNOT_S - 0.5))
             times = self._first + KNOT_S * (np.arange(self._asked - 1, last + 1) + 0.5)

@@ -1,0 +1,268 @@
+"""What goes wrong around a command, not in its input: full disks, places that cannot be written, no files, kills.
+
+The outcome is a result that is whole, or exit code 2 (130 where a signal stopped it), one line and nothing left behind.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from test_bad_input import Files, good_table, refused
+
+from wepose_pin.cli import main
+from wepose_pin.errors import ExistingOutput
+from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.writers import whole_folder, write_session
+from wepose_pin.writers.folder import whole_file
+
+TRACKED = {"pose.parquet", "report.html", "subject.toml", "subject.urdf", "summary.json", "view.html"}
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A person with both arms, who can be calibrated in a second."""
+    folder = tmp_path_factory.mktemp("faults")
+    made = simulate(simulated_person(1).lengths, seed=1, clasp_s=5.0, circles=0)
+    write_session(folder, made.recording("made"), made.truth())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(session: Path) -> Path:
+    out = session / "result"
+    with pytest.raises(SystemExit) as stop:
+        main(["track", str(session), "--no-report", "-o", str(out)])
+    assert stop.value.code == 0
+    return out
+
+
+# A full disk -------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """No file of this process can grow beyond `size` bytes, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+FORMATS = ("csv", "parquet", "mot", "sto", "trc", "bvh", "urdf")
+FULL = [
+    *(("track SESSION --no-report -o OUT", size) for size in (0, 200_000)),
+    ("calibrate SESSION -o OUT", 20_000),
+    ("view RESULT --no-open -o OUT/a.html", 1000),
+    ("info SESSION/recording.parquet -o OUT/session.toml", 100),
+    *((f"export RESULT -o OUT/a.{format}", size) for format in FORMATS for size in (100, 4000)),
+]
+
+
+@pytest.mark.parametrize(("words", "size"), FULL)
+def test_a_full_disk(
+    words: str, size: int, session: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    if "OUT/" in words:
+        out.mkdir()
+    command = [
+        word.replace("SESSION", str(session)).replace("RESULT", str(result)).replace("OUT", str(out))
+        for word in words.split()
+    ]
+    capsys.readouterr()
+    with files_of_at_most(size), pytest.raises(SystemExit) as stop:
+        main(command)
+    said = capsys.readouterr()
+    assert stop.value.code == 2, said.err
+    assert said.err.count("\n") == 1
+    assert "too large" in said.err
+    assert [path.name for path in tmp_path.rglob("*")] == (["out"] if "OUT/" in words else [])
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_a_full_disk_is_told_with_the_name_of_the_output(number: int, tmp_path: Path) -> None:
+    """The system's error names no file, or the one that was copied from."""
+    for whole in (whole_file, whole_folder):
+        with pytest.raises(ExistingOutput) as told, whole(tmp_path / "out"):
+            raise OSError(number, os.strerror(number), "somewhere/else")
+        assert str(told.value) == f"{tmp_path / 'out'}: cannot be written: {os.strerror(number)}; nothing was written"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_export_that_has_no_room_for_its_record_is_none(result: Path, tmp_path: Path) -> None:
+    """The record of what made it stands beside the file: neither without the other."""
+    from wepose_pin.writers.export import export
+
+    with pytest.raises(ExistingOutput), files_of_at_most(40_000):
+        export(result, tmp_path / "a.urdf", made_by={"format": 1, "long": "x" * 50_000})
+    assert list(tmp_path.iterdir()) == []
+    export(result, tmp_path / "a.urdf", made_by={"format": 1})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.urdf", "a.urdf.made_by.json"]
+
+
+# Places that cannot be written -------------------------------------------------------------------------------------
+
+NOWHERE = [place for place in ("/proc/wepose", "/dev/null", "/dev/null/out") if Path("/proc/self").exists()]
+
+
+@pytest.mark.parametrize("place", NOWHERE)
+@pytest.mark.parametrize("command", ["track SESSION", "calibrate SESSION", "simulate"])
+def test_a_place_that_nobody_can_write_to(
+    command: str, place: str, session: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refused([*command.replace("SESSION", str(session)).split(), "-o", place], capsys)
+    assert f"{place}: " in line
+
+
+def test_no_home_and_no_cache(session: Path, tmp_path: Path) -> None:
+    """Nothing but the output is wanted: no folder of settings, no cache of fonts."""
+    nowhere = dict.fromkeys(("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR"), "/dev/null/nowhere")
+    command = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(tmp_path / "out")]
+    run = subprocess.run(command, env=os.environ | nowhere, cwd="/", capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == TRACKED
+    assert all(line.startswith("note: ") for line in run.stderr.splitlines()), run.stderr
+
+
+# What is no file ---------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def seconds_at_most(seconds: int) -> Iterator[None]:
+    def late(*_: object) -> None:
+        raise AssertionError("it waits for a pipe that nobody writes to")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+READS = [
+    *("track ODD.toml -o OUT", "track ODD.wepose -o OUT", "track SESSION --subject ODD.toml -o OUT"),
+    *("track SESSION --model ODD.urdf -o OUT", "track SESSION --model ODD.toml -o OUT", "evaluate ODD SESSION"),
+    *("calibrate SESSION --protocol ODD.toml -o OUT", "evaluate RESULT ODD.parquet", "evaluate RESULT ODD.csv"),
+    *("evaluate RESULT ODD.toml", "export ODD -o OUT.csv", "view ODD --no-open", "rerun ODD", "batch ODD.toml -o OUT"),
+    *("validate --from ODD.json", "bench --compare ODD.json", "live --no-page --source replay:ODD.toml"),
+    *("live --no-page --source udp:9 --session ODD.toml", "info ODD.csv", "info ODD.parquet", "info ODD.h5"),
+    *("info ODD.mat", "info ODD.mvnx", "info ODD.sto", "info ODD.toml", "info ODD"),
+]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "empty", "loop"])
+def test_what_is_no_file_is_refused_wherever_one_is_read(
+    kind: str, session: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make: dict[str, Callable[[Path], object]] = {
+        "pipe": os.mkfifo,
+        "folder": Path.mkdir,
+        "empty": Path.touch,
+        "loop": lambda path: path.symlink_to(path),
+    }
+    for words in READS:
+        odd = next(word for word in words.replace("replay:", "").split() if "ODD" in word)
+        path = tmp_path / odd.replace("ODD", "odd")
+        if not os.path.lexists(path):
+            make[kind](path)
+        there = sorted(tmp_path.iterdir())
+        names = {"ODD": tmp_path / "odd", "SESSION": session, "RESULT": result, "OUT": tmp_path / "out"}
+        command = words
+        for name, place in names.items():
+            command = command.replace(name, str(place))
+        with seconds_at_most(60):
+            refused(command.split(), capsys)
+        assert sorted(tmp_path.iterdir()) == there, words
+
+
+# Recordings of nothing ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2])
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_recording_of_hardly_a_sample(
+    rows: int, suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = Files(tmp_path, good_table().head(rows))
+    if suffix == ".parquet":
+        files.parquet()
+    line = refused(["track", str(files.write()), "-o", str(tmp_path / "out")], capsys)
+    assert f"arm{suffix}" in line or "session.toml" in line
+
+
+@pytest.mark.parametrize("rate", ["1e12", "1e-300", "1e308", "1" + "0" * 400, "nan", "-inf"])
+def test_a_rate_that_no_sensor_has(rate: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = Files(tmp_path, good_table())
+    files.say('time = "time"', f"rate_hz = {rate}")
+    line = refused(["track", str(files.write()), "-o", str(tmp_path / "out")], capsys)
+    assert "session.toml" in line
+
+
+# Paths -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["../outside/arm.csv", "ABSOLUTE", "link.csv"])
+def test_data_may_lie_where_the_lab_keeps_them(name: str, tmp_path: Path) -> None:
+    """docs/security.md says so, and why."""
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (tmp_path / "in").mkdir()
+    files = Files(tmp_path / "in", good_table())
+    good_table().write_csv(outside / "arm.csv")
+    (tmp_path / "in" / "link.csv").symlink_to(outside / "arm.csv")
+    files.say("arm.csv", str(outside / "arm.csv") if name == "ABSOLUTE" else name)
+    session = files.write()
+    (tmp_path / "in" / "arm.csv").unlink()
+    with pytest.raises(SystemExit) as stop:
+        main(["track", str(session), "--no-report", "-o", str(tmp_path / "out")])
+    assert stop.value.code == 0
+    assert (tmp_path / "out" / "pose.parquet").is_file()
+
+
+@pytest.mark.parametrize("name", ["a\\u0000b.csv", "x" * 5000 + ".csv", "/etc/passwd", "/proc/self/mem", "."])
+def test_names_of_data_that_are_none(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = Files(tmp_path, good_table())
+    files.say("arm.csv", name)
+    refused(["track", str(files.write()), "-o", str(tmp_path / "out")], capsys)
+
+
+# Kills -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_that_is_killed_at_any_moment_leaves_all_or_nothing(session: Path, tmp_path: Path) -> None:
+    """By hand with more moments: docs/security.md."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "--no-report", "-o", str(out)]
+    begun = time.monotonic()
+    subprocess.run(command, check=True, capture_output=True)
+    whole, took = {path.name for path in out.iterdir()}, time.monotonic() - begun
+    moments = random.Random(5)
+    for _ in range(3):
+        for path in out.iterdir() if out.exists() else ():
+            path.unlink()
+        if out.exists():
+            out.rmdir()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(moments.uniform(0.5, 1.0) * took)
+        process.kill()
+        process.wait()
+        assert not out.exists() or {path.name for path in out.iterdir()} == whole
+        assert all(path == out or path.name.startswith(".out.partial-") for path in tmp_path.iterdir())
+    if not out.exists():
+        subprocess.run(command, check=True, capture_output=True)
+    assert {path.name for path in out.iterdir()} == whole
