@@ -154,7 +154,7 @@ def test_an_item_that_is_too_much_for_a_worker_is_given_up_by_name(
 def test_an_item_in_a_process_of_its_own(study: Path) -> None:
     row = make_apart(item(study), str(study / "items"))
     assert (row["status"], (study / "items" / "one" / DONE).is_file()) == ("done", True)
-    assert make_apart(item(study, session="nobody"), str(study / "items"))["error"] == "MissingFile"
+    assert make_apart(item(study, "nobody"), str(study / "items"))["error"] == "MissingFile"
     with pytest.raises(BadData, match="another wepose-pin"):
         make_apart(item(study), str(study / "items"), same_code="0" * 64)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import struct
@@ -19,9 +20,20 @@ from scipy.io import loadmat, savemat
 from test_bad_input import Files, good_table, refused
 
 from wepose_pin.cli import main
-from wepose_pin.errors import BadData, BadModel, BadOption, BadSession, BadSubject, MissingFile, WeposeError, printable
+from wepose_pin.errors import (
+    BadData,
+    BadModel,
+    BadOption,
+    BadPlan,
+    BadSession,
+    BadSubject,
+    MissingFile,
+    WeposeError,
+    printable,
+)
 from wepose_pin.readers.arrays import ArrayFile
 from wepose_pin.readers.mat5 import read_mat5
+from wepose_pin.viewer import frame_indices
 from wepose_pin.writers import whole_folder
 from wepose_pin.writers.folder import written
 
@@ -318,6 +330,124 @@ def test_times_in_a_live_recording_that_would_make_years_of_ticks(tmp_path: Path
     assert "holds no as long recording" in told(
         "live_log", tmp_path, seeds.live_log().replace(times.tobytes(), wild.tobytes()), BadData
     )
+
+
+# Trials of others, results, tables ---------------------------------------------------------------------------------
+
+
+def test_a_trial_of_broad_on_which_scipy_died(tmp_path: Path) -> None:
+    """SciPy's reader ended the process with a segmentation fault on some of these: it is not asked any more."""
+    good = seeds.broad(False)
+    outcomes = set()
+    for at in range(128, len(good), 3):
+        data = bytearray(good)
+        data[at] ^= 0xFF
+        outcomes.add(try_one(BY_NAME["broad"], tmp_path, bytes(data)) is None)
+    assert outcomes == {True, False}
+
+
+@pytest.mark.parametrize("rate", [0.0, np.nan, np.inf, 1e12, -5.0])
+def test_a_trial_of_broad_without_a_rate(rate: float, tmp_path: Path) -> None:
+    content = {"imu_gyr": seeds.GYRO, "imu_acc": seeds.ACCEL, "opt_quat": seeds.QUAT, "movement": np.ones(seeds.N)}
+    savemat(tmp_path / "a.mat", {**content, "sampling_rate": rate})
+    assert "sampling_rate" in told("broad", tmp_path, (tmp_path / "a.mat").read_bytes(), BadData)
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "value", "says"),
+    [
+        ("time", 1, "-1e308", "time does not grow"),
+        ("time", 1, "nan", "time does not grow"),
+        ("time", 3, "1e300", "no pose has such a number"),
+        ("left_hand_x", 2, "1e308", "left_hand_x is 1e+308 in row 3"),
+        ("torso_std", 0, "-1e308", "torso_std is -1e+308 in row 1"),
+    ],
+)
+def test_a_pose_with_numbers_that_no_pose_has(column: str, row: int, value: str, says: str, tmp_path: Path) -> None:
+    """Pages, comparison and exports overflowed, each at another place."""
+    assert says in told("result", tmp_path, _pose_with(column, row, value), BadData)
+
+
+def _pose_with(column: str, row: int, value: str) -> bytes:
+    names, *rows = [line.split(",") for line in seeds.pose_csv().decode().splitlines()]
+    rows[row][names.index(column)] = value
+    return "\n".join(",".join(line) for line in [names, *rows]).encode()
+
+
+def test_a_pose_whose_time_leaps(tmp_path: Path) -> None:
+    """A page of 30 frames a second would have had 3e12 of them."""
+    try_one(BY_NAME["result"], tmp_path, _pose_with("time", 3, "1e11"))
+    assert len(frame_indices(np.array([0.0, 0.1, 1e11]), 30.0)) == 3
+    time = np.arange(0.0, 10.0, 0.01)
+    assert np.ptp(np.diff(time[frame_indices(time, 30.0)])) < 0.011
+
+
+def test_a_pose_that_states_no_uncertainty(tmp_path: Path) -> None:
+    """Deviations of zero: their covariance has no inverse."""
+    text = seeds.pose_csv().decode().replace("0.01", "0.0")
+    assert try_one(BY_NAME["result"], tmp_path, text.encode()) is None
+
+
+def test_a_pose_without_a_shoulder_is_no_bvh(tmp_path: Path) -> None:
+    text = seeds.pose_csv().decode().replace("right_shoulder_x", "x")
+    assert "no columns right_shoulder_x" in told("result", tmp_path, text.encode(), BadData)
+
+
+def test_an_empty_pose(tmp_path: Path) -> None:
+    text = seeds.pose_csv().splitlines(keepends=True)[0]
+    assert "no rows" in told("result", tmp_path, text, BadData)
+
+
+def test_an_axis_in_a_table_of_links_that_is_a_table(tmp_path: Path) -> None:
+    text = BY_NAME["table"].seeds()[0].replace(b'forward = "+x"\n[', b'forward = { link = "a" }\n[')
+    assert "forward = {'link': 'a'}" in told("table", tmp_path, text, BadModel)
+
+
+@pytest.mark.parametrize("name", ["body", "robot"])
+def test_a_urdf_in_an_encoding_that_nobody_knows(name: str, tmp_path: Path) -> None:
+    text = BY_NAME[name].seeds()[0]
+    text = b'<?xml version="1.0" encoding="utf-99"?>' + text[text.index(b"<robot") :]
+    assert "unknown encoding" in told(name, tmp_path, text, BadModel)
+
+
+@pytest.mark.parametrize("name", TOMLS)
+def test_a_byte_order_mark_and_dos_lines(name: str, tmp_path: Path) -> None:
+    """As editors on Windows write them."""
+    for seed in BY_NAME[name].seeds():
+        assert try_one(BY_NAME[name], tmp_path, b"\xef\xbb\xbf" + seed.replace(b"\n", b"\r\n")) is None
+
+
+def test_a_record_of_what_made_a_result_without_end(tmp_path: Path) -> None:
+    assert "damaged, no JSON" in told("made_by", tmp_path, b"[" * 100_000, BadData)
+
+
+@pytest.mark.xfail(strict=True, raises=AssertionError, reason="batch.rerun runs whatever command a record names")
+@pytest.mark.parametrize("command", ["batch", "live", "info"])
+def test_a_record_has_no_other_command_run_than_those_that_write_records(command: str, tmp_path: Path) -> None:
+    """`wepose batch` with a scheduler that a stranger's record names would unpickle what that sends."""
+    options = {
+        "batch": {"plan": "a.toml", "scheduler": "tcp://127.0.0.1:9", "workers": None},
+        "live": {"source": "udp:9", "record": "a.wepose"},
+        "info": {"file": "a.csv", "write": True},
+    }[command]
+    record = {"format": 1, "command": command, "options": options, "inputs": {}}
+    assert "cannot be made again" in told("made_by", tmp_path, json.dumps(record).encode(), BadData)
+
+
+@pytest.mark.xfail(strict=True, reason="batch.plan takes a name of dots for that of an item, whose folder is items/")
+@pytest.mark.parametrize("name", ["..", ".", "..."])
+def test_a_session_in_a_plan_whose_name_is_dots(name: str, tmp_path: Path) -> None:
+    text = seeds.PLAN_TABLE.replace(b"first", name.encode())
+    told("plan_table", tmp_path, text, BadPlan)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="retargeting reads XML by ElementTree, whose errors of encodings are of other kinds"
+)
+@pytest.mark.parametrize("name", ["retarget", "srdf"])
+def test_a_robot_in_an_encoding_that_nobody_knows(name: str, tmp_path: Path) -> None:
+    text = b'<?xml version="1.0" encoding="utf-99"?>' + BY_NAME[name].seeds()[0]
+    assert "unknown encoding" in told(name, tmp_path, text, BadModel)
 
 
 # Output ------------------------------------------------------------------------------------------------------------

@@ -22,9 +22,7 @@ def plan(folder: Path, data: bytes) -> object:
     from wepose_pin.batch.items import key_of
     from wepose_pin.batch.plan import read_plan
 
-    for name in ("one", "two"):
-        (folder / name).mkdir(exist_ok=True)
-        (folder / name / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
+    _beside_a_plan(folder)
     (folder / "list.csv").write_bytes(seeds.PLAN_TABLE)
     (folder / "plan.toml").write_bytes(data)
     found = read_plan(folder / "plan.toml", "out/items")
@@ -40,11 +38,21 @@ def plan_table(folder: Path, data: bytes) -> object:
     """The input is the table that a plan names."""
     from wepose_pin.batch.plan import read_plan
 
+    _beside_a_plan(folder)
     (folder / "list.csv").write_bytes(data)
     (folder / "plan.toml").write_bytes(seeds.PLAN.replace(b'files = ["*/session.toml"]', b'table = "list.csv"'))
     found = read_plan(folder / "plan.toml", "out/items")
     assert all(item.name and "/" not in item.name for item in found.items), [item.name for item in found.items]
     return found
+
+
+def _beside_a_plan(folder: Path) -> None:
+    for name in ("one", "two"):
+        (folder / name).mkdir(exist_ok=True)
+        (folder / name / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
+    (folder / "anna.toml").write_bytes(seeds.subject())
+    (folder / "arm.urdf").write_text(seeds.ARM, encoding="utf-8")
+    (folder / "arm.toml").write_bytes(seeds.ARM_MAP)
 
 
 def _silently(do: Callable[[], object]) -> None:

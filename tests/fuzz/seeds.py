@@ -269,9 +269,9 @@ method = "amekf"
 [steps.track]
 covariance = true
 [steps.retarget]
-robot = "panda"
+robot = "arm.urdf"
 rate_hz = 50.0
-arm = "left"
+arm = "right"
 [steps.export]
 formats = ["trc", "mot"]
 [steps.evaluate]

@@ -88,7 +88,7 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
             f"is long; cut the recording there"
         )
     if not lost.any():
-        return Clock(time, np.arange(len(time)), step)
+        return Clock(time, np.arange(len(time), dtype=np.int32 if len(time) < 2**31 else np.int64), step)
     counts = np.zeros(len(time), dtype=int)
     counts[wide] = lost.astype(int)
     row = np.repeat(np.arange(len(time)), counts + 1)

@@ -21,6 +21,8 @@ FORMATS = (".csv", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 # Lines of a CSV that are parsed at once where it is read in pieces.
 BLOCK_ROWS = 50_000
+# Rows of a Parquet file's column that are read at once.
+COLUMN_ROWS = 1_000_000
 # A packed file holds at most so many bytes of numbers, or this many times its own: sensors' noise packs to a tenth.
 MOST_BYTES, MOST_GROWTH = 1 << 28, 50
 # What a line without any value consists of.
@@ -135,8 +137,13 @@ def one_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.
         with _polars_errors(path):
             height = int(pl.scan_parquet(_source(path)).select(pl.len()).collect().item())
             _check_size(path, height, 1)
-            table = pl.scan_parquet(_source(path)).select(names).collect() if name is not None else None
-        return (columns(table, [name], file, place)[:, 0] if table is not None and name else np.empty(0)), height
+            if name is None:
+                return np.empty(0), height
+            values, lazy = np.empty(height), pl.scan_parquet(_source(path)).select(names)
+            for first in range(0, height, COLUMN_ROWS):  # what polars took to read stays with it
+                part = lazy.slice(first, COLUMN_ROWS).collect()
+                values[first : first + part.height] = columns(part, [name], file, place, first)[:, 0]
+        return values, height
     parts, height = [np.empty(0)], 0
     for block in _csv_blocks(path, _header(path)):
         if name is not None:

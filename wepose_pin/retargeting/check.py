@@ -74,7 +74,7 @@ class Touching(NamedTuple):
 def touching(robot: Robot, time: np.ndarray, u: np.ndarray) -> Touching:
     """Every sample against the robot's own shapes, meshes as they are and not hulls; by a rule of its own for pairs.
 
-    Left out are shapes of one part, or of parts with one joint between them; what the robot's SRDF excuses; and what
+    Left out are shapes of one part, or of parts that follow each other; what the robot's SRDF excuses; and what
     touches in the rest posture. The solver's rule, which looks at what can touch at all, has no part in it.
     """
     shapes, left_out = _pairs(robot)
@@ -92,7 +92,7 @@ def _pairs(robot: Robot) -> tuple[Any, dict[str, list[str]]]:
     """The shapes with the pairs to look at, and those left out by their reason."""
     shapes, parents = pin.GeometryModel(robot.shapes), robot.model.parents
     shapes.addAllCollisionPairs()  # of different parts
-    left_out: dict[str, list[str]] = {"excused by the SRDF": [], "one joint between them": [], "touch at rest": []}
+    left_out: dict[str, list[str]] = {"excused by the SRDF": [], "next to each other": [], "touch at rest": []}
 
     def there() -> list[tuple[int, int]]:
         return [(pair.first, pair.second) for pair in shapes.collisionPairs]
@@ -108,7 +108,12 @@ def _pairs(robot: Robot) -> tuple[Any, dict[str, list[str]]]:
         pin.removeCollisionPairs(robot.model, shapes, str(robot.map.srdf))
         leave("excused by the SRDF", sorted(set(before) - set(there())))
     on = [shape.parentJoint for shape in shapes.geometryObjects]
-    leave("one joint between them", [(a, b) for a, b in there() if on[a] == parents[on[b]] or on[b] == parents[on[a]]])
+    above = {}
+    for joint in on:
+        above[joint] = parents[joint]
+        while above[joint] > 0 and above[joint] not in on:  # a part without a shape
+            above[joint] = parents[above[joint]]
+    leave("next to each other", [(a, b) for a, b in there() if on[a] == above[on[b]] or on[b] == above[on[a]]])
     geometry = shapes.createData()
     pin.computeCollisions(robot.model, robot.model.createData(), shapes, geometry, robot.q(robot.rest), False)
     hit = [result.isCollision() for result in geometry.collisionResults]

@@ -16,6 +16,9 @@ from ..tracking.tracked import Tally
 from .result import write_about, write_table
 
 
+ROW_GROUP = 50_000  # rows that are put together at a time
+
+
 class PieceWriter:
     """`write_result`, a piece at a time: a part of ``pose.parquet`` each, made one table at the end.
 
@@ -61,7 +64,7 @@ def _put_together(parts: Path, path: Path) -> None:
         except UnicodeEncodeError:  # polars takes no such path
             write_table(path, lazy.collect())
         else:
-            lazy.sink_parquet(path)
+            lazy.sink_parquet(path, row_group_size=ROW_GROUP)
     except (pl.exceptions.PolarsError, OSError) as error:
         reason = str(error).splitlines()[0]
         raise ExistingOutput(f"{path.name}: cannot be written: {reason}; nothing was written") from error
