@@ -279,14 +279,17 @@ def test_a_study_on_s3(bucket: str, tmp_path: Path, recorded: Path) -> None:
 
 
 def test_a_study_on_s3_is_that_of_a_local_folder(bucket: str, study: Path) -> None:
-    (study / "there.toml").write_text(PLAN.replace("data/*", f"{bucket}/data/*"))
-    here = run_study(study / "plan.toml", str(study / "out"), workers=1).table
-    there = run_study(study / "there.toml", f"{bucket}/same", workers=1).table
-    differ = [name for name in here.columns if not here[name].equals(there[name])]
-    assert set(differ) <= {"session", "seconds", "memory_mb", "track_s", "evaluate_s"}
     import s3fs
 
-    s3fs.S3FileSystem().get("lab/same/items", str(study / "fetched"), recursive=True)
+    system = s3fs.S3FileSystem(use_listings_cache=False)
+    system.mkdir("other")
+    system.put(str(study / "data"), "other/data", recursive=True)
+    (study / "there.toml").write_text(PLAN.replace("data/*", f"{bucket.replace('lab', 'other')}/data/*"))
+    here = run_study(study / "plan.toml", str(study / "out"), workers=1).table
+    there = run_study(study / "there.toml", f"{bucket}/same", workers=1).table
+    differ = {name for name in here.columns if not here[name].equals(there[name])}
+    assert differ <= {"session", "seconds", "memory_mb", "track_s", "evaluate_s"}
+    system.get("lab/same/items", str(study / "fetched"), recursive=True)
     assert differences(study / "out" / "items", study / "fetched") == []
 
 

@@ -117,8 +117,24 @@ def test_items_keep_their_names_when_others_join(folder: Path) -> None:
         ('[sessions]\nfiles = "anna/*"\n[subjects.anna]\nfile = "a"\ncalibration = "b"\n[steps.track]', "not both"),
         ('[sessions]\nfiles = "anna/*"\n[subjects.a]\ngauge = { arm = 1 }\n[steps.track]', "gauge.arm is not a known"),
         (
-            '[sessions]\nfiles = "anna/*"\nsubject = "a"\n[subjects.a]\ncalibration = "x"\n[steps.track]',
+            '[sessions]\nfiles = "anna/*"\nsubject = "a"\n[subjects.a]\ncalibration = "ben/one"\n[steps.track]',
             "needs the step [steps.calibrate]",
+        ),
+        ('[sessions]\nfiles = "anna/*"\n[subjects.a]\nfile = "nobody"\n[steps.track]', "file = 'nobody': no such file"),
+        ('[sessions]\nfiles = "anna/*"\n[subjects]\na = 3\n[steps.track]', "subjects.a = 3 is not a table"),
+        ('[sessions]\nfiles = "anna/*"\n[subjects.a]\nstature = 170\n[steps.track]', "170 is not a body height"),
+        ('[sessions]\nfiles = "anna/*"\n[subjects.a]\ngauge = { handle = 0.4 }\n[steps.calibrate]', "gauge.handle"),
+        ('[sessions]\nfiles = "anna/*"\n[steps.calibrate]\nprotocol = "clsp"', "did you mean 'clasp'?"),
+        ('[sessions]\nfiles = "anna/*"\n[steps.track]\nmodel = "nobody.urdf"', "'nobody.urdf': no such file"),
+        ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "pandda"', "did you mean 'panda'?"),
+        ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "panda"\narm = "up"', "arm = 'up'"),
+        (
+            '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "panda"\nrate_hz = -3',
+            "rate_hz = -3 must be greater than 0",
+        ),
+        (
+            '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.export]\nformats = ["mot"]\nnames = "isp"',
+            "did you mean 'isb'?",
         ),
     ],
 )
@@ -130,12 +146,19 @@ def test_a_mistake_gets_one_line_that_names_it(folder: Path, text: str, said: st
     assert "\n" not in str(error.value)
 
 
+def test_the_distance_that_a_protocol_needs_may_be_taped(folder: Path) -> None:
+    subject = '[subjects.a]\ngauge = { handle = 0.42 }\n[steps.calibrate]\nprotocol = "handle"\n'
+    plan = planned(folder, f'[sessions]\nfiles = "ben/one"\nsubject = "a"\n{subject}')
+    assert plan.items[0].body.gauge == {"handle": 0.42}
+
+
 @pytest.mark.parametrize(
     ("table", "said"),
     [
         ("sesion\na", "no column 'session'; did you mean 'sesion'?"),
         ("session,age\na,3", "column 'age' is not known"),
         ("session,stature\na,178", "row 1: stature = '178' is not a length in metres"),
+        ("session,stature\na,0.5", "row 1: stature 0.5 is not a body height"),
         ("session,sex\na,x", "row 1: sex = 'x'"),
         ("session,name\na,x\nb,x", "row 1: name 'x' is there twice"),
         ("session\na\na", "is there twice"),

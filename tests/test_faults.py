@@ -210,7 +210,7 @@ def test_a_rate_that_no_sensor_has(rate: str, tmp_path: Path, capsys: pytest.Cap
     files = Files(tmp_path, good_table())
     files.say('time = "time"', f"rate_hz = {rate}")
     line = refused(["track", str(files.write()), "-o", str(tmp_path / "out")], capsys)
-    assert "session.toml" in line
+    assert "session.toml" in line or "1e+300" in line
 
 
 # Paths -------------------------------------------------------------------------------------------------------------
@@ -244,15 +244,16 @@ def test_names_of_data_that_are_none(name: str, tmp_path: Path, capsys: pytest.C
 # Kills -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("result")  # numba has compiled
 def test_a_run_that_is_killed_at_any_moment_leaves_all_or_nothing(session: Path, tmp_path: Path) -> None:
-    """By hand with more moments: docs/security.md."""
+    """Two moments of those in which it writes; twenty by hand: docs/security.md."""
     out = tmp_path / "out"
     command = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "--no-report", "-o", str(out)]
     begun = time.monotonic()
     subprocess.run(command, check=True, capture_output=True)
     whole, took = {path.name for path in out.iterdir()}, time.monotonic() - begun
     moments = random.Random(5)
-    for _ in range(3):
+    for _ in range(2):
         for path in out.iterdir() if out.exists() else ():
             path.unlink()
         if out.exists():

@@ -24,6 +24,7 @@ from fuzz.targets import NUMBERS, TARGETS, Target, try_one  # noqa: E402
 from hypothesis import HealthCheck, given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
+SLOW = {"live_loop": 8, "result": 12, "retarget": 8, "live_page": 20}  # examples of targets that take their time
 WORD = re.compile(rb'[\w.+-]+|"[^"]*"')
 
 
@@ -68,7 +69,7 @@ def spoiled(draw: st.DrawFn, target: Target) -> bytes:
 def test_what_is_spoiled_is_taken_or_refused_in_one_line(target: Target) -> None:
     outcomes = set()
 
-    @quick(60)
+    @quick(SLOW.get(target.name, 60))
     @given(data=spoiled(target))
     def tried(data: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder:

@@ -462,6 +462,8 @@ def test_it_comes_evenly_though_poses_do_not(robot_out, arm: Robot, receiver: Re
     messages = receiver.messages
     keeps_its_limits(messages, arm)
     follows = [m for m in messages if m["state"] == "follow"]
+    if out.summary().skipped > 5:
+        pytest.skip("the machine is too busy to keep time")
     assert len(follows) > 100
     assert np.median([m["arms"]["right"]["error_mm"] for m in follows]) < 10.0
     assert ended(messages)

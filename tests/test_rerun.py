@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import polars as pl
 import pytest
+from arms import write_arm
 
 from wepose_pin import __version__
 from wepose_pin.batch.compare import differences
@@ -95,6 +97,61 @@ def test_what_is_made_by_other_commands(session: Path, result: Path, tmp_path: P
     assert run("simulate", "--seed", 4, "--protocol", "poses", "--set", "palm_slip=0", "-o", tmp_path / "made") == 0
     assert read_made_by(tmp_path / "made")["options"]["seed"] == 4
     assert run("rerun", tmp_path / "made") == 0
+
+
+def test_what_another_version_has_made_is_made_again_and_said(result: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    summary = json.loads((result / "summary.json").read_text())
+    summary["made_by"] |= {"version": "0.0.9", "commit": "abc", "code": "0" * 64}
+    summary["made_by"]["packages"]["numpy"] = "1.0"
+    (result / "summary.json").write_text(json.dumps(summary))
+    capsys.readouterr()
+    assert run("rerun", result) == 0
+    said = capsys.readouterr()
+    assert "note: made by wepose-pin 0.0.9 (abc); this is " in said.err
+    assert "note: other versions now: numpy " in said.err
+    assert "the same, made again by wepose track" in said.out
+
+
+def test_retarget_again(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("daqp")
+    robot = tmp_path / "robot"
+    robot.mkdir()
+    write_arm(robot)
+    assert run("retarget", result, "--robot", robot / "arm.urdf", "--no-view", "-o", tmp_path / "moved") == 0
+    assert run("rerun", tmp_path / "moved") == 0
+    text = (robot / "arm.toml").read_text()
+    (robot / "arm.toml").write_text(text + "\n")
+    capsys.readouterr()
+    assert run("rerun", tmp_path / "moved") == 2
+    assert f"of its robot, {robot / 'arm.toml'} has changed" in capsys.readouterr().err
+    (robot / "arm.toml").write_text(text)
+    (result / "pose.parquet").unlink()
+    assert run("rerun", tmp_path / "moved") == 2
+    assert "of its result, pose.parquet is gone" in capsys.readouterr().err
+
+
+def test_a_whole_study_again(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(session, tmp_path / "other")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "session.toml").write_text("")
+    steps = "[steps.track]\nview = false\nreport = false\n"
+    (tmp_path / "plan.toml").write_text(f'[sessions]\nfiles = ["session", "other", "bad"]\n{steps}')
+    assert run("batch", tmp_path / "plan.toml", "--workers", 1, "-o", tmp_path / "study") == 3
+    capsys.readouterr()
+    assert run("rerun", tmp_path / "study") == 0
+    said = capsys.readouterr()
+    assert said.out == f"{tmp_path / 'study'}: the same, made again by wepose batch\n"
+    assert "1 items had failed" in said.err
+    pose = tmp_path / "study" / "items" / "other" / "track" / "pose.parquet"
+    pl.read_parquet(pose).head(3).write_parquet(pose)
+    (session / "recording.parquet").unlink()
+    assert run("rerun", tmp_path / "study") == 3
+    said = capsys.readouterr()
+    assert "other: track/pose.parquet: " in said.out
+    assert "session: cannot be made again: " in said.out
+    assert "recording.parquet is gone" in said.out
+    (tmp_path / "study" / "results.parquet").unlink()
+    assert run("rerun", tmp_path / "study") == 2
 
 
 def test_differences_are_named(result: Path, capsys: pytest.CaptureFixture[str]) -> None:

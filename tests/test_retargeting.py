@@ -29,6 +29,7 @@ from wepose_pin.retargeting import (
     write_episode,
     write_trajectory,
 )
+from wepose_pin.retargeting.causes import causes, possible
 from wepose_pin.retargeting.collision import Shapes
 from wepose_pin.retargeting.limits import acceleration_bounds, urdf_limits, usable
 from wepose_pin.retargeting.person import CLAMP_FROM, CLAMP_TO, drawn_in
@@ -165,9 +166,17 @@ def test_the_robot_follows_hand_turn_and_elbow(swung: Trajectory) -> None:
     assert found["inside_reach_share"] == 1.0
 
 
-def test_it_begins_at_rest_and_shows_the_recording_to_its_end(swung: Trajectory) -> None:
+def test_what_can_be_reached_is_reached(swung: Trajectory) -> None:
+    frames, reached = possible(swung)
+    assert len(frames) == len(reached) == 40
+    assert reached.max() < 5e-3
+    assert sum(causes(swung, 0).values()) == pytest.approx(np.mean(error(swung) > 0.02), abs=1e-3)
+
+
+def test_it_begins_and_ends_at_rest_and_shows_the_recording_to_its_end(swung: Trajectory) -> None:
     assert np.array_equal(swung.u[0], swung.robot.rest)
     assert not swung.v[0].any()
+    assert np.abs(swung.v[-1]).max() < 1e-12
     assert (np.diff(swung.recorded) >= -1e-12).all()
     assert swung.recorded[0] == swung.recorded[swung.approach - 1] == 0.0
     assert swung.recorded[-1] == pytest.approx(7.99, abs=0.02)
@@ -279,6 +288,8 @@ def test_five_seconds_out_of_reach(arm, swung: Trajectory) -> None:
     target = found.targets[0]
     outside = np.linalg.norm(target.position - target.wish, axis=1) > 1e-3
     assert outside[found.approach :].mean() > 0.3
+    why = causes(found, 0)
+    assert why["beyond the reach"] == pytest.approx(outside[found.approach :].mean(), abs=0.1)
     settled = (found.recorded > 5.5) & (found.recorded < 7.5)
     assert np.abs(found.v[settled]).max() < 0.02  # still at the reach: it does not shake
     assert np.abs(np.diff(found.a[settled], axis=0)).max() < 0.05 * 12.0
@@ -326,6 +337,9 @@ def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
         usual = ((swung.recorded > 3.1) & (swung.recorded < 4.1)).sum()
         assert during > 2 * usual
         assert np.quantile(error(found), 0.95) < 0.03
+    assert causes(gone, 0)["not measured"] == pytest.approx(
+        np.mean((error(gone) > 0.02) & gone.targets[0].lost[gone.approach :]), abs=1e-3
+    )
     assert summary(gone, checked(gone), touching(arm, gone.time, gone.u))[
         "arms"]["right"]["lost_share"] > 0.1  # fmt: skip
 
@@ -360,6 +374,11 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     is_sound(found)
     assert error(found)[-1] > 0.05  # it could not get there
     assert found.counts.near > 0
+    why = causes(found, 0)
+    assert why["own body"] > 0.2
+    assert why["own body"] > 0.9 * sum(why.values())
+    _, reached = possible(found)
+    assert reached[-1, 0] == pytest.approx(error(found)[-1], abs=0.02)  # nor could it with all the time there is
 
 
 def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
@@ -394,6 +413,12 @@ def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
         ("elbow = -1.2", "elbow = 1.2", "rest.elbow = 1.2 is outside its limits, -2.6 to -0.02"),
         ("elbow = -1.2", "elbo = -1.2", "rest.elbo: no joint that moves in arm.urdf; did you mean 'elbow'"),
         ("at = [0.0, 0.0, -0.1]", "at = [0.0, 0.0]", r"hand.at = \[0.0, 0.0\]; three numbers in metres"),
+        ("[limits.acceleration]", "limits.jerk.yaw = -5.0\n[limits.acceleration]", "limits.jerk: joint 'yaw' is -5"),
+        (
+            "[limits.acceleration]",
+            "[limits]\njerk = 'high'\n[limits.acceleration]",
+            "limits.jerk = 'high'; a number for",
+        ),
         ("yaw = 12.0", "yaw = -1.0", "limits.acceleration: joint 'yaw' is -1; no URDF holds it"),
         ("[rest]", "[rest", "not valid TOML"),
     ],
@@ -494,7 +519,7 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert "Limits kept" in text
     page = (tmp_path / "out" / "view.html").read_text()
     assert '"robot 0"' in page
-    assert '"right_robot_hand"' in page
+    assert '"right_robot"' in page
     code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
     assert (code, "--force replaces" in text) == (2, True)
 

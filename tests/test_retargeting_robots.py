@@ -6,47 +6,30 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from arms import person
 
 from wepose_pin.pose import Pose
-from wepose_pin.retargeting import ROBOTS, Trajectory, find_map, kept, load, retarget, table
+from wepose_pin.retargeting import ROBOTS, Trajectory, find_map, kept, load, retarget, table, touching, wish
 from wepose_pin.retargeting.maps import example_data
+from wepose_pin.retargeting.person import robot_reach
 
 pytest.importorskip("daqp")
 pytestmark = pytest.mark.skipif(example_data() is None, reason="example-robot-data is not installed")
 
 
-def touches(trajectory: Trajectory) -> list[int]:
-    """Samples in which shapes touch that do not at rest, by the robot's whole model and all its shapes.
-
-    Only links further apart than neighbours count; what the solver leaves out otherwise is not known here.
-    """
-    robot = trajectory.robot
-    shapes = pin.GeometryModel(robot.shapes)
-    shapes.addAllCollisionPairs()
-    if robot.map.srdf is not None:
-        pin.removeCollisionPairs(robot.model, shapes, str(robot.map.srdf))
-    data, geometry = robot.model.createData(), shapes.createData()
-    pin.computeCollisions(robot.model, data, shapes, geometry, robot.q(robot.rest), False)
-    for k in reversed(range(len(shapes.collisionPairs))):
-        pair = shapes.collisionPairs[k]
-        a, b = (shapes.geometryObjects[i].parentJoint for i in (pair.first, pair.second))
-        neighbours = robot.model.parents[a] == b or robot.model.parents[b] == a
-        if neighbours or geometry.collisionResults[k].isCollision():
-            shapes.removeCollisionPair(pin.CollisionPair(pair.first, pair.second))
-    geometry = shapes.createData()
-    boxes = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(robot.model, shapes, geometry)
-    return [
-        k
-        for k in range(len(trajectory.u))
-        if pin.computeCollisions(robot.model, data, boxes, robot.q(trajectory.u[k]), True)
-    ]
+def is_sound(found: Trajectory) -> None:
+    of = found.robot.map
+    held = kept(table(found), of.urdf, of.acceleration, of.jerk)
+    assert held.all, held
+    touched = touching(found.robot, found.time, found.u)
+    assert touched.samples == 0, touched.first
+    assert touched.pairs > 10
+    assert touched.left_out["touch at rest"] == []
 
 
-def both_arms(seconds: float) -> Pose:
-    right, left = person(seconds), person(seconds, side="left", swing=15.0)
+def both_arms(seconds: float, **angles: float) -> Pose:
+    right, left = person(seconds, **angles), person(seconds, side="left", **({"swing": 15.0} | angles))
     return replace(right, quat_WL=right.quat_WL | left.quat_WL, points=right.points | left.points)
 
 
@@ -54,12 +37,30 @@ def both_arms(seconds: float) -> Pose:
 def test_every_robot_follows_and_keeps_its_limits(name: str) -> None:
     robot = load(find_map(name))
     found = retarget(both_arms(4.0), robot)
-    held = kept(table(found), robot.map.urdf, robot.map.acceleration)
-    assert held.all, held
-    assert touches(found) == []
+    is_sound(found)
     for arm, target in zip(robot.arms, found.targets, strict=True):
         error = np.linalg.norm(found.hand[arm.side] - target.position, axis=1)[found.approach :]
         assert np.median(error) < 0.02, arm.side
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "baxter", "tiago_dual"])
+def test_no_jerk_where_the_reach_ends(name: str) -> None:
+    """Arms that stretch beyond the reach and come back: jerk about these moments against that of the rest."""
+    robot = load(find_map(name))
+    pose = both_arms(8.0, flexion=45.0, swing=40.0, abduction=40.0)
+    whole = max(arm.reach / robot_reach(robot, arm) for arm in robot.arms)
+    found = retarget(pose, robot, scale=whole * min(wish(pose, robot).scale.values()))
+    is_sound(found)
+    dt, settled = 0.01, found.approach + 100
+    for arm, target in zip(robot.arms, found.targets, strict=True):
+        outside = np.linalg.norm(target.position - target.wish, axis=1) > 1e-3
+        edges = settled + np.flatnonzero(np.diff(outside[settled:]))
+        assert len(edges) >= 4
+        near = np.abs(found.time[:, None] - found.time[edges]).min(axis=1) < 0.2
+        jerk = np.abs(np.diff(found.a, axis=0))[:, arm.joints] / dt / robot.j_most[arm.joints]
+        close, elsewhere = jerk[settled:][near[settled + 1 :]], jerk[settled:][~near[settled + 1 :]]
+        assert close.max() < 0.5
+        assert np.sqrt(np.mean(close**2)) < 1.5 * np.sqrt(np.mean(elsewhere**2))
 
 
 @pytest.fixture(scope="session")
@@ -82,7 +83,5 @@ def test_the_real_recording(tracked: Pose, name: str) -> None:
     )
     robot = load(find_map(name))
     found = retarget(pose, robot)
-    held = kept(table(found), robot.map.urdf, robot.map.acceleration)
-    assert held.all, held
-    assert touches(found) == []
+    is_sound(found)
     assert np.isfinite(found.u).all()

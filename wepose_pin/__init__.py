@@ -34,6 +34,7 @@ _WHERE = {
     "load_robot": "model.robot",
     "load_session": "readers",
     "load_subject": "subject",
+    "retarget": "retargeting",
     "simulate": "simulation",
     "track": "tracking",
     "track_chain": "tracking",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import logging
 import os
 import re
 import signal
@@ -1069,6 +1070,8 @@ def main(argv: list[str] | None = None) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         signal.signal(signal.SIGINT, _stop)
         signal.signal(signal.SIGTERM, _stop)
+        # It says in several lines that it cannot keep fonts and settings, and does without.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if argv in (["--version"], ["-V"]):
         from . import __version__
 
@@ -1132,7 +1135,7 @@ def _asked_to_stop() -> Iterator[Callable[[], bool]]:
     def is_asked() -> bool:
         nonlocal looks
         looks = True
-        return bool(asked)
+        return bool(asked or _stopped)  # a library may have swallowed what `_stop` raised
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -123,8 +123,8 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     shoulder_z = float(np.nanmedian([pose.points[f"{arm.side}_shoulder"][:, 2] for arm in robot.arms]))
     R_WB, p_WB = stands_at(robot, drawn, shoulder_z, FLOOR_Z)
     moved = robot_placements(trajectory, drawn, frames, R_WB, p_WB)
-    trails = {f"{arm.side}_hand": pose.points[f"{arm.side}_hand"][nearest] for arm in robot.arms}
-    trails |= {f"{arm.side}_robot_hand": trajectory.hand[arm.side][frames] @ R_WB.T + p_WB for arm in robot.arms}
+    trails = {arm.side: pose.points[f"{arm.side}_hand"][nearest] for arm in robot.arms}  # short: heads are beside them
+    trails |= {f"{arm.side}_robot": trajectory.hand[arm.side][frames] @ R_WB.T + p_WB for arm in robot.arms}
     return view_html(
         visuals,
         trajectory.time[frames],

@@ -65,7 +65,7 @@ def make_apart(item: Item, place: str, force: bool = False, same_code: str | Non
 
 def _watched(process: subprocess.Popen[bytes]) -> float | None:
     """Most memory [bytes] it was seen to have when it has ended; None where it was ended for having too much."""
-    import psutil
+    import psutil  # type: ignore[import-untyped]  # comes with Dask
 
     limit, most = _limit(), 0.0
     while process.poll() is None:

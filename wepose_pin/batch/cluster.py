@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
+import concurrent.futures
 import contextlib
 import logging
 import os
@@ -24,6 +24,7 @@ MOST = 500  # items a task
 AHEAD = 2  # tasks a worker: one runs, one waits
 DEATHS = 1  # of workers at one task, after which each of its items is made in a process of its own
 WAIT_S = 60.0  # without any worker, after which the run ends
+GONE = "the scheduler is gone; the same command goes on where it stopped"
 LOOK_S = 2.0  # between two looks at which workers there are
 # Workers share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
 _THREADED = "WEPOSE_THREADS NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
@@ -142,7 +143,7 @@ def made(
                 todo.extendleft(reversed(some[len(rows) :]))
                 yield rows
             elif future.status != "error":
-                raise LostWorker("the scheduler is gone; the same command goes on where it stopped")
+                raise LostWorker(GONE)
             elif not isinstance(error := future.exception(), KilledWorker):
                 raise error
             elif alone:
@@ -163,11 +164,14 @@ class _Workers:
         self._looked = self._there = 0.0
 
     def look(self) -> None:
-        """Raise LostWorker where there has been no worker for long."""
+        """Raise LostWorker where the scheduler is gone, or there has been no worker for long."""
         now = time.monotonic()
         if self._looked and now < self._looked + LOOK_S:
             return
-        found = sum(self.client.nthreads().values())
+        try:
+            found = sum(self.client.nthreads().values())
+        except OSError:
+            raise LostWorker(GONE) from None
         self._there = now if found or not self._looked else self._there
         self._looked, self.threads = now, max(1, found)
         if now > self._there + WAIT_S:
@@ -181,7 +185,9 @@ def _ended(running: dict[Any, list[Item]]) -> list[Any]:
     """Tasks that have ended; none after a while in which none has."""
     from distributed import wait
 
-    with contextlib.suppress(TimeoutError, asyncio.CancelledError):  # the latter where one of them is cancelled
+    with contextlib.suppress(
+        TimeoutError, concurrent.futures.CancelledError
+    ):  # the latter where one of them is cancelled
         wait(list(running), timeout=LOOK_S, return_when="FIRST_COMPLETED")
     return [future for future in running if future.status != "pending"]
 

@@ -14,7 +14,7 @@ from .storage import DONE
 
 # Pages are made from the tables beside them; blocks of provenance hold where inputs lie.
 _PAGES = (".html", ".png")
-_APART = ("made_by", "versions", "session")  # keys of records that say where and by what
+_APART = ("made_by", "versions", "session", "solve_ms")  # keys of records that say where, by what, and how fast
 _MOST = 5  # differences told of a file
 
 

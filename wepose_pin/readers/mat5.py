@@ -90,7 +90,8 @@ def _walk(at: str, data: memoryview, order: str, found: dict[str, np.ndarray], d
     """The arrays of a matrix that stands at the path `at`; `name` is that of a struct's field."""
     parts = _elements(data, order)
     flags, shape, own = (_numbers(next(parts, None), order) for _ in range(3))
-    if len(flags) < 1 or len(shape) < 2 or (shape < 0).any() or depth > DEEPEST:
+    whole = all(part.dtype.kind in "iu" for part in (flags, shape, own))
+    if not whole or len(flags) < 1 or len(shape) < 2 or (shape < 0).any() or depth > DEEPEST:
         raise ValueError("the head of an array is damaged")
     kind, size = int(flags[0]) & 0xFF, int(np.prod(shape, dtype=object))
     where = f"{at}/{name or own.astype('u1').tobytes().decode('utf-8', errors='replace')}"

@@ -27,6 +27,7 @@ ACCEL_UNITS = {"m/s^2": 1.0, "g": 9.80665}
 # How far a quaternion's norm may be off 1: decimals that were cut.
 NORM_OFF = 1e-2
 SI = {"gyro": 1.0, "accel": 1.0}
+_NO_ROW = 2**31 - 1
 _BEGINNING_S = 20.0  # [s] of a recording in which somebody stands still for a second
 
 
@@ -294,7 +295,7 @@ class SessionReader:
         for segment, (low, high) in windows.items():
             plan = self._plans[segment]
             there = plan.clock.row[low:high]
-            begin, end = int(there[there >= 0].min(initial=2**62)), int(there.max(initial=-1)) + 1
+            begin, end = int(there[there >= 0].min(initial=_NO_ROW)), int(there.max(initial=-1)) + 1
             so_far = rows.get(plan.table, slice(begin, end))
             rows[plan.table] = slice(min(begin, so_far.start), max(end, so_far.stop))
         tables = {which: self._tables[which][span] for which, span in rows.items()}

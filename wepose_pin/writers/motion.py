@@ -13,6 +13,8 @@ from ..pose import Pose, pose_of
 
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
+# Up to so many new samples for one, or up to a few, times are filled; 10 kHz of 100 Hz are a hundred for one.
+_MOST_NEW, _FEW = 200, 1_000_000
 # What moves a point: the segments on its way from the root.
 _WAY = {"shoulder": (), "elbow": ("upper_arm",), "wrist": ("upper_arm", "forearm")}
 
@@ -61,14 +63,21 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
     BadOption
         No rate that a recording has.
     BadData
-        An orientation is not known.
+        An orientation is not known; times leap so far that hardly a sample would be a measured one.
     """
     if not 1.0 <= rate_hz <= 10000.0:
         raise BadOption(f"--rate-hz {rate_hz:g}: between 1 and 10000 samples a second")
     whole(motion, "resampling")
     pose = motion.pose
     old = pose.time
-    time = old[0] + np.arange(int(np.floor((old[-1] - old[0]) * rate_hz + 1e-6)) + 1) / rate_hz
+    samples = int(np.floor((old[-1] - old[0]) * rate_hz + 1e-6)) + 1
+    if samples > max(_FEW, _MOST_NEW * len(old)):
+        leap = int(np.argmax(np.diff(old)))
+        raise BadData(
+            f"{motion.where}: time leaps from {old[leap]:g} to {old[leap + 1]:g} s in row {leap + 2} of pose.parquet; "
+            f"at {rate_hz:g} Hz that is {samples} samples of {len(old)}"
+        )
+    time = old[0] + np.arange(samples) / rate_hz
     time = np.minimum(time, old[-1])
     after = np.clip(np.searchsorted(old, time, side="left"), 1, len(old) - 1)
     share = (time - old[after - 1]) / (old[after] - old[after - 1])

@@ -15,7 +15,6 @@ from ..tracking import TrackedPose
 from ..tracking.tracked import Tally
 from .result import write_about, write_table
 
-
 ROW_GROUP = 50_000  # rows that are put together at a time
 
 

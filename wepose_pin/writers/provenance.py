@@ -109,7 +109,8 @@ def _as_input(name: str, value: Any) -> Path | None:
 def file_hashes(path: Path, truth: bool = False) -> dict[str, str]:
     """SHA-256 of all that an input consists of, by its name relative to the input's folder.
 
-    Of a session or a model's table the files that it names too; of a result what others are made from.
+    Of a session or a model's table the files that it names too; of a URDF the tables beside it that are read with it;
+    of a result what others are made from.
 
     Raises
     ------
@@ -126,7 +127,13 @@ def files_of(path: Path, truth: bool = False) -> list[Path]:
         path = path / "session.toml"
     if path.is_dir():
         return [path / name for name in _RESULT if (path / name).is_file()] or sorted(_all(path))
-    return [path, *(path.parent / name for name in named_in(path, truth))]
+    return [path, *(path.parent / name for name in named_in(path, truth)), *_beside(path)]
+
+
+def _beside(path: Path) -> list[Path]:
+    """What is read with a URDF because it lies there: the map of a robot, the table of a body."""
+    tables = (path.with_suffix(".toml"), path.with_name("model.toml")) if path.suffix == ".urdf" else ()
+    return [table for table in dict.fromkeys(tables) if table.is_file()]
 
 
 def named_in(path: Path, truth: bool = False) -> list[str]:
