@@ -445,7 +445,7 @@ def test_a_source_that_dies_stops_the_robot_by_the_wall_clock(robot_out, arm: Ro
     held = states.index("stopped") - max(k for k, s in enumerate(states) if s == "approach")
     assert 60 < held < 130
     out.close()
-    keeps_its_limits(receiver.messages, arm)
+    keeps_its_limits(receiver.until(lambda m: m["n"] + 1 == out.summary().commands, 5.0), arm)
 
 
 def test_it_comes_evenly_though_poses_do_not(robot_out, arm: Robot, receiver: Receiver) -> None:
@@ -459,10 +459,10 @@ def test_it_comes_evenly_though_poses_do_not(robot_out, arm: Robot, receiver: Re
         time.sleep(max(0.0, begin + late - time.monotonic()))
         out.show(one)
     out.close()
-    messages = receiver.messages
+    messages = receiver.until(lambda m: m["n"] + 1 == out.summary().commands, 5.0)
     keeps_its_limits(messages, arm)
     follows = [m for m in messages if m["state"] == "follow"]
-    if out.summary().skipped > 5:
+    if out.summary().skipped > 5 or any("no sound pose" in m["reason"] for m in messages):
         pytest.skip("the machine is too busy to keep time")
     assert len(follows) > 100
     assert np.median([m["arms"]["right"]["error_mm"] for m in follows]) < 10.0
@@ -489,6 +489,7 @@ def test_the_loop_never_waits_for_the_solver(robot_out, arm: Robot, receiver: Re
         took.append(time.perf_counter() - begin)
     summary = out.summary()
     out.close()
+    receiver.until(lambda m: m["n"] + 1 == out.summary().commands, 5.0)
     assert np.quantile(took, 0.9) < 0.005
     assert summary.skipped > summary.commands  # two or three of four
     assert len(receiver.messages) == out.summary().commands
@@ -629,8 +630,7 @@ def test_the_same_recording_gives_the_same_commands(
     keeps_its_limits([json.loads(line) for line in once], arm)
 
 
-# A filter whose covariance the loop does not ask for by the wall clock.
-METHOD = "ncf"
+METHOD = "amekf"
 
 
 # The command line ----------------------------------------------------------------------------------------------------

@@ -238,7 +238,9 @@ def test_the_programme_is_that_of_pink(arm) -> None:
     import pinocchio as pin
 
     free = replace(arm, shapes=pin.GeometryModel(), arms=(replace(arm.arms[0], elbow=-1),))
-    tasks = Tasks(smooth=0.0, straight=0.0, still=0.0, posture=1e-3, gain=10.0, posture_gain=10.0, brake=1e9)
+    tasks = Tasks(
+        smooth=0.0, straight=0.0, curved=0.0, still=0.0, posture=1e-3, gain=10.0, posture_gain=10.0, brake=1e9
+    )
     stepper = Stepper(free, Shapes(free), 0.01, tasks, loose=1e6)
     state = State(arm.rest + 0.1, np.zeros(7), np.zeros(7))
     stepper.look(state.u)
@@ -413,7 +415,7 @@ def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
         ("elbow = -1.2", "elbow = 1.2", "rest.elbow = 1.2 is outside its limits, -2.6 to -0.02"),
         ("elbow = -1.2", "elbo = -1.2", "rest.elbo: no joint that moves in arm.urdf; did you mean 'elbow'"),
         ("at = [0.0, 0.0, -0.1]", "at = [0.0, 0.0]", r"hand.at = \[0.0, 0.0\]; three numbers in metres"),
-        ("[limits.acceleration]", "limits.jerk.yaw = -5.0\n[limits.acceleration]", "limits.jerk: joint 'yaw' is -5"),
+        ("yaw = 12.0", "yaw = 12.0\n[limits.jerk]\nyaw = -5.0", "limits.jerk: joint 'yaw' is -5"),
         (
             "[limits.acceleration]",
             "[limits]\njerk = 'high'\n[limits.acceleration]",

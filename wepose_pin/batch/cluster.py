@@ -36,6 +36,8 @@ SETTINGS: dict[str, Any] = {
     # Nothing lies on workers that could be spilled, and one that has paused for want of memory would never go on: at
     # 95 % of its share of the machine's memory it is ended and replaced, and its items run again.
     **dict.fromkeys((f"distributed.worker.memory.{word}" for word in ("target", "spill", "pause")), False),
+    # A terminal's Ctrl-C is for us, who end them.
+    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
     "distributed.nanny.pre-spawn-environ": _ONE_THREAD | {"DASK_LOGGING__DISTRIBUTED": "critical"},
 }
 
@@ -75,6 +77,9 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
             )
             yield stack.enter_context(Client(cluster))
             return
+        logger = logging.getLogger("distributed")  # which says by tracebacks what we say by a line
+        stack.callback(logger.setLevel, logger.level)
+        logger.setLevel(logging.CRITICAL)
         try:
             client = stack.enter_context(Client(scheduler, timeout=10.0))
         except (OSError, ValueError, TypeError) as error:

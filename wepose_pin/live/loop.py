@@ -139,7 +139,7 @@ class LiveLoop:
         self._tracker: CausalTracker | None = None
         self._newest = dict.fromkeys(source.sensors, -np.inf)
         self._heading_set = 0.0
-        self._std = np.full(len(source.sensors), np.nan)
+        self._std, self._std_every = np.full(len(source.sensors), np.nan), 1
         self._latency = Latencies()
         self._latest: deque[float] = deque(maxlen=LATENCIES)  # [s] of the poses that were shown
         self._first_pose = self._last_pose = 0.0
@@ -213,6 +213,7 @@ class LiveLoop:
         # One wild clock must not put all others before the beginning.
         begin = self._begin if self._begin is not None else float(began[began < np.median(began) + JUMP_S].max())
         self._aligner = Aligner(self.source.sensors, rate, begin, self._wait)
+        self._std_every = max(1, round(STATUS_S * rate))
         self._guide = StartGuide(rate, len(self.source.sensors))
         if self.log is not None:
             self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self._wait)
@@ -234,6 +235,8 @@ class LiveLoop:
         tracker, quat_WL = self._tracker, None
         for n in range(at, len(ticks.time)):
             quat_WL = tracker.step(ticks.gyro_S[n], ticks.accel_S[n])
+            if (ticks.first + n) % self._std_every == 0:  # by ticks: a recording gives the same ones again
+                self._std = tracker.std()
             if self.log is not None:
                 self.log.pose(ticks.first + n, quat_WL)
         if quat_WL is None:
@@ -323,7 +326,6 @@ class LiveLoop:
         bias = np.zeros((len(sensors), 3)) if tracker is None else tracker.gyro_bias
         heading = np.full(len(sensors), np.nan)
         if tracker is not None:
-            self._std = tracker.std()
             heading = tracker.heading_std()
         latest = 1e3 * np.array(self._latest or [0.0])
         state, message, progress = self._state(lost)

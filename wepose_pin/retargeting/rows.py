@@ -9,6 +9,7 @@ from ..so3 import compiled, inlined
 # Where each number of the tasks stands in `numbers`.
 POSITION, ORIENTATION, SWIVEL, GAIN, BRAKE, STRAIGHT, DAMPING, CURVED = range(8)
 _NOTHING = 0.01  # [m] a bend below which an elbow has no direction
+_LEVER = 0.2  # [m] from a joint to the hand, about which its path bends
 _SURE = 0.05  # [m] a bend from which on it counts in full
 
 
@@ -53,7 +54,8 @@ def add_arm(H, f, J, above, p, elbow, shoulder, turn, position, velocity, rate, 
     # What the Jacobian's own change adds to the Hessian: where an arm is straight and its target farther, the only term
     # that keeps the elbow from swinging through (Levenberg; Sugihara 2011 weighs it by the error too).
     gap = np.sqrt(np.sum((position - p - ahead) ** 2))
-    bent = w_go * numbers[CURVED] * gap + w_spin * np.sqrt(np.sum((turn - ahead_turn) ** 2))
+    angle = np.sqrt(np.sum((turn - ahead_turn) ** 2))
+    bent = numbers[CURVED] * (w_go * _LEVER * gap + w_spin * angle)
     for j in joints:
         H[j, j] += bent
     gram = np.zeros((3, 3))

@@ -44,7 +44,7 @@ class Tasks:
     brake: float = 8.0  # [m/s², rad/s²]: an error is made good no faster than this stops it
     straight: float = 0.06  # [m] of the hand per rad/s: below it the arm counts as singular, and is damped
     damping: float = 0.05  # at most, where it is singular
-    curved: float = 0.2  # [m]: an error damps as much as the path of a hand bends, about a joint so far off
+    curved: float = 1.0  # how far an error damps the arm, as the path of its hand bends; 0: not at all
 
 
 class Aim(NamedTuple):
