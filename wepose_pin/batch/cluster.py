@@ -77,9 +77,10 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
             )
             yield stack.enter_context(Client(cluster))
             return
-        logger = logging.getLogger("distributed")  # which says by tracebacks what we say by a line
-        stack.callback(logger.setLevel, logger.level)
-        logger.setLevel(logging.CRITICAL)
+        for name in ("distributed", "distributed.client"):  # which say by tracebacks what we say by a line
+            logger = logging.getLogger(name)
+            stack.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL)
         try:
             client = stack.enter_context(Client(scheduler, timeout=10.0))
         except (OSError, ValueError, TypeError) as error:

@@ -370,6 +370,8 @@ def _tied(
     if not own:
         raise BadPlan(f"{entry.row}: nothing to do: its subject is calibrated elsewhere, and there is no step but that")
     name = _safe(entry.name) if entry.name else _name_of(entry.session, path)
+    if not name:
+        raise BadPlan(f"{entry.row}: name '{entry.name}' has no letter or digit; an item's folder has that name")
     return entry, Item(name, entry.session, own, entry.subject, file, entry.truth, body)
 
 

@@ -21,6 +21,8 @@ from .items import COMMAND, FAILED, item_of, make_into
 from .storage import DONE, fetch
 from .study import ITEMS, RESULTS, STUDY
 
+# What is run because a record says so: commands that make a result and talk to nobody. A record may be a stranger's.
+REMADE = ("track", "calibrate", "simulate", "retarget", "demo", "export")
 _PAGES = ("report", "view")  # options that make pages, which are not compared
 
 
@@ -72,7 +74,7 @@ def rerun(
             make_into(folder, item_of(block))
             part = result.relative_to(item)
             found = differences(result, folder / part)
-        elif command in commands:
+        elif command in REMADE and command in commands:
             _check(result, block, place)
             out = place / "made" / result.name
             out.parent.mkdir()
@@ -80,6 +82,8 @@ def rerun(
             try:
                 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
                     commands[command](*first, **options, out=out)
+            except (TypeError, AttributeError) as error:  # an option of another kind than the command writes
+                raise BadData(f"{result}: made_by is damaged: wepose {command} cannot take it: {error}") from None
             except SystemExit as stop:  # of a calibration that is poor: its files are written
                 if not out.exists():
                     raise BadData(f"{result}: wepose {command} ended with {stop.code} and wrote nothing") from None
@@ -118,7 +122,7 @@ def _done(study: Path) -> tuple[list[str], int]:
 def _of_item(folder: Path) -> dict[str, Any]:
     try:
         block = json.loads((folder / DONE).read_text(encoding="utf-8"))["made_by"]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise BadData(f"{folder / DONE}: is damaged: {error}") from None
     if not isinstance(block, dict) or not isinstance(block.get("inputs"), dict):
         raise BadData(f"{folder / DONE}: made_by is damaged: a table with inputs is needed")

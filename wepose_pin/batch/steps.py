@@ -150,7 +150,7 @@ class Work:
             tasks=replace(retargeting.Tasks(), **off),
             **{name: options[name] for name in ("rate_hz", "scale", "smoothing_hz", "strict")},
         )
-        held = retargeting.kept(retargeting.table(trajectory), model.map.urdf, model.map.acceleration)
+        held = retargeting.kept(retargeting.table(trajectory), model.map.urdf, model.map.acceleration, model.map.jerk)
         touched = retargeting.touching(model, trajectory.time, trajectory.u)
         retargeting.write_trajectory(folder, trajectory)
         found = as_json(retargeting.summary(trajectory, held, touched)) | {"made_by": dict(self.given.made_by)}

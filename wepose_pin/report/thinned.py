@@ -183,16 +183,21 @@ def _joined(poses: list[TrackedPose], phases: Mapping[str, Intervals]) -> Tracke
         all_of = [recording.sensors[name] for recording in recordings]
         sensors[name] = replace(
             sensor,
-            **{key: optional([getattr(s, key) for s in all_of]) for key in ("gyro_S", "accel_S", "quat_WS", "gap")},
+            gyro_S=optional([of.gyro_S for of in all_of]),
+            accel_S=optional([of.accel_S for of in all_of]),
+            quat_WS=optional([of.quat_WS for of in all_of]),
+            gap=optional([of.gap for of in all_of]),
         )
-    orientation = {
-        name: Orientation(
-            *(np.concatenate([getattr(s.orientation[name], key) for s in segments]) for key in _ORIENTED),
-            optional([s.orientation[name].attitude_cov for s in segments]),
-            of.noise,
+    orientation = {}
+    for name, last_of in segments[-1].orientation.items():
+        runs = [s.orientation[name] for s in segments]
+        orientation[name] = Orientation(
+            np.concatenate([of.quat_WS for of in runs]),
+            np.concatenate([of.gyro_bias for of in runs]),
+            np.concatenate([of.static for of in runs]),
+            optional([of.attitude_cov for of in runs]),
+            last_of.noise,
         )
-        for name, of in segments[-1].orientation.items()
-    }
     joined: Segments = replace(
         segments[-1],
         time=np.concatenate([s.time for s in segments]),
@@ -218,6 +223,3 @@ def _joined(poses: list[TrackedPose], phases: Mapping[str, Intervals]) -> Tracke
         recording=recording,
         segments=joined,
     )
-
-
-_ORIENTED = ("quat_WS", "gyro_bias", "static")

@@ -243,7 +243,7 @@ def _root_side(full: Any, joint: int) -> int:
 def _excused(srdf: Path) -> set[frozenset[str]]:
     try:
         root = ElementTree.parse(srdf).getroot()
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise BadModel(f"{srdf}: not valid XML: {error}") from error
     return {frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in root.iter("disable_collisions")}
 

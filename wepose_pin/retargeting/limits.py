@@ -49,7 +49,7 @@ def urdf_limits(path: Path) -> dict[str, JointLimit]:
         raise MissingFile(f"{path}: no such file")
     try:
         root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise BadModel(f"{path}: not valid XML: {error}") from error
     found = {}
     for joint in root.iter("joint"):

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
-from ..errors import BadModel, BadOption, one_of
+from ..errors import BadModel, BadOption, native_stderr_muted, one_of
 from .limits import JointLimit, urdf_limits
 from .maps import AXES, ArmMap, LinkPoint, RobotMap, example_data
 
@@ -102,7 +102,8 @@ def load(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
     chosen = {side: arm for side, arm in robot.arms.items() if sides is None or side in sides}
     said = urdf_limits(robot.urdf)
     try:
-        full = pin.buildModelFromUrdf(str(robot.urdf))
+        with native_stderr_muted():  # urdfdom says the same once more
+            full = pin.buildModelFromUrdf(str(robot.urdf))
     except Exception as error:  # what C++ throws
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadModel(f"{robot.urdf}: Pinocchio cannot build it: {reason}") from error

@@ -127,7 +127,9 @@ def files_of(path: Path, truth: bool = False) -> list[Path]:
         path = path / "session.toml"
     if path.is_dir():
         return [path / name for name in _RESULT if (path / name).is_file()] or sorted(_all(path))
-    return [path, *(path.parent / name for name in named_in(path, truth)), *_beside(path)]
+    # A map may name a URDF of example-robot-data, which lies elsewhere and has a version of its own.
+    named = [path.parent / name for name in named_in(path, truth)]
+    return [path, *(of for of in named if of.exists() or of.suffix != ".urdf"), *_beside(path)]
 
 
 def _beside(path: Path) -> list[Path]:
