@@ -168,7 +168,7 @@ def test_a_fuzzer_that_sees_coverage_finds_nothing(tmp_path: Path) -> None:
         str(run),
         "all",
         "--runs",
-        "1500",
+        "700",
         "--seed",
         "1",
         "--seconds",
