@@ -847,7 +847,7 @@ def bench(
         batch: Nothing but a study of 500 short sessions by wepose batch, on one worker, two, and two of which one is
             killed; --quick makes it twelve. Stopped, the same command goes on from there.
         sessions: Of --batch: so many.
-        day: Nothing but a recording of 24 hours, and shorter ones, tracked in pieces: time, memory, whether it gives what
+        day: Nothing but a recording of 24 hours, and shorter ones, in pieces: time, memory, whether it gives what
             the whole gives; --quick makes it one hour.
         data: Folder of real recordings (broad/, wepose_hr/) to measure accuracy on; WEPOSE_DATA names one too.
         save: Write the figures there, with versions, machine and date, as JSON.

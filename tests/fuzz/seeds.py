@@ -104,6 +104,27 @@ def parquet() -> bytes:
     return out.getvalue()
 
 
+def parquets() -> list[bytes]:
+    """Packed and not, in small pages and row groups, with empty cells, text and whole numbers."""
+    mixed = table().with_columns(
+        pl.when(pl.int_range(N) % 5 > 0).then(pl.col("gx")).alias("gx"),
+        pl.int_range(N).cast(pl.Int16).alias("count"),
+        (pl.int_range(N) % 3).cast(pl.String).alias("text"),
+        (pl.int_range(N) % 3 > 0).alias("flag"),
+    )
+    written = [parquet()]
+    for options in (
+        {"compression": "uncompressed", "data_page_size": 32, "row_group_size": 8},
+        {"compression": "uncompressed", "statistics": False},
+        {"compression": "snappy", "statistics": "full"},
+        {"compression": "gzip"},
+    ):
+        out = io.BytesIO()
+        mixed.write_parquet(out, **options)
+        written.append(out.getvalue())
+    return written
+
+
 def mat(compressed: bool) -> bytes:
     out = io.BytesIO()
     imu = {"torso": {"gyro": GYRO, "accel": ACCEL}}

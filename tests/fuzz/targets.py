@@ -76,6 +76,16 @@ def _pieces(path: Path) -> object:
     return list(iter_session(path.parent / "session.toml", 0.05))
 
 
+def _parquet(path: Path) -> object:
+    """Whole and in pieces."""
+    from wepose_pin.readers import iter_session, load_session
+
+    session = path.parent / "session.toml"
+    session.write_text(TABLE.replace("arm.csv", path.name), encoding="utf-8")
+    whole = load_session(session, gaps=True)
+    return whole, list(iter_session(session, 0.05))
+
+
 def _subject(path: Path) -> object:
     from wepose_pin.subject import load_subject, subject_toml
 
@@ -206,6 +216,11 @@ NUMBERS = (
     b"\xe2\x88\x921",
 )
 LINES = (*NUMBERS, b",", b";", b"\t", b"\n", b"\r\n", b'"', b"#", b"\0", b"\xff\xfe", b"\xef\xbb\xbf", b"\x1b[31m")
+# As Thrift writes 2³¹ − 1, −2³¹, 10¹⁷ and −2⁶³.
+VARINTS = (
+    b"PAR1", b"\xfe" + b"\xff" * 3 + b"\x0f", b"\xff" * 4 + b"\x0f", b"\x80\x80\xd0\xd8\x8b\xde\xa2\xe3\x02",
+    b"\xff" * 9 + b"\x01",
+)  # fmt: skip
 TOML = (
     *NUMBERS, b"[", b"]", b"[[", b"]]", b"{", b"}", b"= ", b"true", b"[]", b"{}", b'"', b"'", b'"""', b"\\u001b", b"\n",
     b"1979-05-27T07:32:00Z", b"[" * 2000, b"a." * 600, b'"' + b"\\n" + b'"', b"+x", b"\\u0000", b"../", b"/dev/zero",
@@ -250,10 +265,10 @@ TARGETS = (
     Target("pieces", lambda: [seeds.csv()], file("arm.csv", _pieces), LINES, "readers.tables"),
     Target(
         "parquet",
-        lambda: [seeds.parquet()],
-        _session("arm.parquet", TABLE.replace("csv", "parquet")),
-        (),
-        "readers.tables",
+        seeds.parquets,
+        file("arm.parquet", _parquet),
+        VARINTS,
+        "readers.parquet",
     ),
     Target(
         "mat",

@@ -16,6 +16,7 @@ import numpy as np
 import polars as pl
 
 from ..errors import BadData, MissingFile, UnknownColumn, native_stderr_muted, one_of
+from .parquet import Contents, contents
 
 FORMATS = (".csv", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
@@ -41,9 +42,8 @@ def read_table(path: Path) -> pl.DataFrame:
     """
     _must_be_table(path)
     if _is_parquet(path):
+        _parquet(path)
         with _polars_errors(path):
-            lazy = pl.scan_parquet(_source(path))
-            _check_size(path, int(lazy.select(pl.len()).collect().item()), len(lazy.collect_schema().names()))
             return pl.read_parquet(_source(path))
     table = _parsed(path, _header(path))
     return table.head(table.height - _empty_end(path)) if table.height else table
@@ -66,9 +66,13 @@ def columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str, fi
     return np.ascontiguousarray(pl.DataFrame(numbers).to_numpy().reshape(table.height, len(names)))
 
 
+def _no_column(name: str, names: list[str], file: str, place: str) -> UnknownColumn:
+    return UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(names, name)}")
+
+
 def _numbers(table: pl.DataFrame, name: str, file: str, place: str, first_row: int) -> pl.Series:
     if name not in table.columns:
-        raise UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(table.columns, name)}")
+        raise _no_column(name, table.columns, file, place)
     if f"{name}_duplicated_0" in table.columns:
         raise BadData(f"{file}: column '{name}' stands there more than once; each column needs a name of its own")
     series = table[name]
@@ -106,7 +110,7 @@ class Rows:
 
     def __post_init__(self) -> None:
         _must_be_table(self.path)
-        self.names = _parquet_names(self.path) if _is_parquet(self.path) else _header(self.path)
+        self.names = list(_parquet(self.path).sizes) if _is_parquet(self.path) else _header(self.path)
         self._from_the_top()
 
     def _from_the_top(self) -> None:
@@ -118,7 +122,7 @@ class Rows:
             return pl.DataFrame(schema=dict.fromkeys(self.names, pl.Float64))
         if _is_parquet(self.path):
             with _polars_errors(self.path):
-                return pl.scan_parquet(self.path).slice(rows.start, rows.stop - rows.start).collect()
+                return pl.scan_parquet(_source(self.path)).slice(rows.start, rows.stop - rows.start).collect()
         if rows.start < self._first:
             self._from_the_top()
         while self._first + self._held.height < rows.stop and (block := next(self._blocks, None)) is not None:
@@ -132,14 +136,13 @@ def one_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.
     """A column (n,) of a table that is not held as a whole, and the number of rows; without a name an empty array."""
     _must_be_table(path)
     if _is_parquet(path):
-        if name is not None and name in (names := _parquet_names(path)):
-            names = [name]
+        height, sizes = _parquet(path)
+        if name is None:
+            return np.empty(0), height
+        if name not in sizes:
+            raise _no_column(name, list(sizes), file, place)
         with _polars_errors(path):
-            height = int(pl.scan_parquet(_source(path)).select(pl.len()).collect().item())
-            _check_size(path, height, 1)
-            if name is None:
-                return np.empty(0), height
-            values, lazy = np.empty(height), pl.scan_parquet(_source(path)).select(names)
+            values, lazy = np.empty(height), pl.scan_parquet(_source(path)).select(name)
             for first in range(0, height, COLUMN_ROWS):  # what polars took to read stays with it
                 part = lazy.slice(first, COLUMN_ROWS).collect()
                 values[first : first + part.height] = columns(part, [name], file, place, first)[:, 0]
@@ -150,11 +153,6 @@ def one_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.
             parts.append(columns(block, [name], file, place, height)[:, 0])
         height += block.height
     return np.concatenate(parts), height
-
-
-def _parquet_names(path: Path) -> list[str]:
-    with _polars_errors(path):
-        return pl.scan_parquet(_source(path)).collect_schema().names()
 
 
 def _csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
@@ -201,9 +199,13 @@ def too_large(path: Path) -> str:
     return f"in a file of {path.stat().st_size} bytes: no recording packs so well; write it anew without compression"
 
 
-def _check_size(path: Path, rows: int, width: int) -> None:
-    if 8 * rows * width > most_bytes(path):
+def _parquet(path: Path) -> Contents:
+    """What a Parquet file holds, before polars sees it: on some that are damaged polars ends the whole process."""
+    found = contents(path)
+    if max(8 * found.rows, sum(found.sizes.values())) > most_bytes(path):
+        rows, width = found.rows, len(found.sizes)
         raise BadData(f"{path}: says that it holds {rows} rows of {width} columns, {too_large(path)}")
+    return found
 
 
 def _must_be_table(path: Path) -> None:
