@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from ..readers.tables import read_table
 from .storage import DONE
 
 # Pages are made from the tables beside them; blocks of provenance hold where inputs lie.
@@ -47,7 +48,7 @@ def _differ(before: Path, after: Path, name: str) -> list[str]:
     if before.read_bytes() == after.read_bytes():
         return []
     if before.suffix == ".parquet":
-        return _tables(pl.read_parquet(before), pl.read_parquet(after), name)
+        return _tables(read_table(before), read_table(after), name)
     if before.suffix == ".json":
         found = list(_values(_record(before), _record(after), ""))
         return _few([f"{name}: {line}" for line in found], name)

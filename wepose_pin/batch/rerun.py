@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import polars as pl
 
 from ..errors import BadData, MissingFile, WeposeError
+from ..readers.tables import read_table
 from ..writers.provenance import code, file_hash, machine, read_made_by
 from ..writers.result import versions
 from .compare import differences
@@ -112,8 +113,8 @@ def _study(result: Path, commands: Mapping[str, Callable[..., None]], step: Call
 def _done(study: Path) -> tuple[list[str], int]:
     """Names of a study's items that are there, and how many are not."""
     try:
-        table = pl.read_parquet(study / RESULTS, columns=["item", "status"])
-    except (OSError, pl.exceptions.PolarsError):
+        table = read_table(study / RESULTS).select("item", "status")
+    except (WeposeError, pl.exceptions.PolarsError):
         raise MissingFile(f"{study}: no {RESULTS} in it to go by; wepose batch goes on where it was stopped") from None
     names = table.filter(pl.col("status") != FAILED)["item"].to_list()
     return names, table.height - len(names)
