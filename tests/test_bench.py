@@ -161,3 +161,9 @@ def test_real_recordings_when_at_hand(data: Path) -> None:
     table = bench.sections(TINY, data)["recordings"]()
     assert "1 of BROAD and the authors' trial" in table.title
     assert 0.5 < table.rows["smekf"]["total_rmse"] < 10.0
+
+
+def test_a_figure_that_there_is_none_of_is_left_out_of_the_file() -> None:
+    table = bench.Table("of", (bench.Column("a", "a"), bench.Column("b", "b")), {"row": {"a": 1.5, "b": float("nan")}})
+    text = json.dumps(bench.document({"of": table}, False, {}), allow_nan=False)
+    assert json.loads(text)["sections"]["of"]["rows"] == {"row": {"a": 1.5}}

@@ -613,8 +613,13 @@ def document(tables: dict[str, Table], quick: bool, versions: dict[str, str]) ->
         "machine": {"processor": _processor(), "system": platform.platform(), "processors": os.cpu_count()},
         "versions": versions | found,
         "quick": quick,
-        "sections": {name: asdict(table) for name, table in tables.items()},
+        "sections": {name: asdict(table) | {"rows": _known(table)} for name, table in tables.items()},
     }
+
+
+def _known(table: Table) -> dict[str, dict[str, float]]:
+    """The rows without figures that there are none of."""
+    return {name: {key: value for key, value in row.items() if value == value} for name, row in table.rows.items()}
 
 
 def _processor() -> str:
@@ -656,6 +661,5 @@ def _noted(table: Table) -> Table:
     """The table without the ratios that there are none of, and a word on why."""
     if not have("vqf"):
         table.notes.append(NO_PEERS)
-    for name, row in table.rows.items():
-        table.rows[name] = {key: value for key, value in row.items() if value == value}
+    table.rows = _known(table)
     return table
