@@ -173,7 +173,7 @@ def test_a_run_that_was_killed_goes_on_where_it_stopped(study: Path) -> None:
     command += ["--workers", "1"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     until = time.monotonic() + 120.0
-    while not list((study / "out" / "items").glob(f"*/{DONE}")) and time.monotonic() < until:
+    while not list((study / "out" / "items").glob(f"[!.]*/{DONE}")) and time.monotonic() < until:
         time.sleep(0.01)
     process.kill()
     process.wait()
@@ -245,7 +245,7 @@ def test_stopped_by_ctrl_c_it_ends_at_once_and_goes_on_later(study: Path) -> Non
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
     until = time.monotonic() + 120.0
-    while not list((study / "out" / "items").glob(f"*/{DONE}")) and time.monotonic() < until:
+    while not list((study / "out" / "items").glob(f"[!.]*/{DONE}")) and time.monotonic() < until:
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=30.0)
