@@ -69,7 +69,7 @@ def signal_of(recording: Recording, name: str, pose: TrackedPose) -> Signal:
         _rms(of.noise.gyro_cov),
         of.noise.gravity * _rms(of.noise.accel_cov),
         of.noise.gravity,
-        (of.noise.gyro_bias, of.gyro_bias[-1]),
+        (of.noise.gyro_bias, of.gyro_bias[-1].copy()),  # a view would keep the whole run
     )
 
 
