@@ -19,7 +19,7 @@ from . import so3
 from .errors import BadPhase, BadSession, WeposeError
 from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
-from .filters.smekf import ACCEL_BIAS_STD
+from .filters.start import ACCEL_BIAS_STD
 from .noise import noise_of, quietest
 from .recording import SEGMENTS, Recording
 from .static import StaticTest
@@ -123,10 +123,14 @@ class SensorFilters:
             assert sensor.accel_S is not None
             at_rest = first.span(self.still)
             try:
-                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz)
+                worn = self.still == self.start
+                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
             except WeposeError as error:
                 raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
-            self._runs[segment] = SensorRun(first.rate_hz, noise, method, static_test=static_test, measured_start=True)
+            start = first.span(self.start)
+            self._runs[segment] = SensorRun(
+                first.rate_hz, noise, method, static_test=static_test, measured_start=True, start=start
+            )
         self.ahead = method in OFFLINE and bool(self._runs)
 
     def push(self, piece: Recording) -> tuple[Recording, dict[str, Orientation]] | None:
