@@ -241,12 +241,15 @@ class SensorRun:
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
         live = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
-        after = Orientation(run.quat_WS, run.gyro_bias, static, run.attitude_cov, self._noise, *live)
         before, self._before = self._before, None
-        if before is None:
-            return after
-        joined = (None if a is None else np.concatenate([a, b]) for a, b in zip(before[:4], after[:4], strict=True))
-        return Orientation(*joined, *after[4:])  # type: ignore[arg-type]
+        if before is not None:
+            run = FilterRun(
+                np.concatenate([before.quat_WS, run.quat_WS]),
+                np.concatenate([before.gyro_bias, run.gyro_bias]),
+                None if run.attitude_cov is None else np.concatenate([before.attitude_cov, run.attitude_cov]),
+            )
+            static = np.concatenate([before.static, static])
+        return Orientation(run.quat_WS, run.gyro_bias, static, run.attitude_cov, self._noise, *live)
 
 
 def run_filter(
