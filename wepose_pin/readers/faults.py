@@ -33,7 +33,7 @@ MOVES = 2.0  # [m/s²] by which accel changes on an axis only where the sensor m
 TURNS_BACK, TURNS_BACK_HZ = 0.3, 15.0
 ROUNDING = 1e-9  # steps below this share of the largest value are rounding, not noise
 NOISY_S = 1.5  # [s] of noise that show a sensor to be noisy
-COARSE = 0.01  # share of runs of equal samples that are longer than twice the usual, from which the digits are coarse
+COARSE = 1e-4  # share of runs of equal samples that are longer than twice the usual, from which the digits are coarse
 
 SAME_RANGE = 0.1  # share by which the ranges of a sensor's axes may differ: each has its own scale
 COPIED = 0.5  # share of a sensor's rows, those that repeat aside, that another has as well only if it is a copy
@@ -118,11 +118,13 @@ class SensorScan:
         self.last, self._before = float(time[-1]), block[-1].copy()
         if len(block) < 2:
             return
-        equal = block[1:, 1:] == block[:-1, 1:]
+        equal = np.stack([axis[1:] == axis[:-1] for axis in block[:, 1:].T])
         for name, axes in _SIGNALS.items():
-            self._gather(name, block, equal[:, axes].all(axis=1), first_row)
-        self._noise(block[np.concatenate([[True], ~equal.all(axis=1)])])
-        self._cut_off(block[:, 1:])
+            self._gather(name, block, np.logical_and.reduce(equal[axes]), first_row)
+        changing = block[np.concatenate([[True], ~np.logical_and.reduce(equal)])]
+        if self._noisy_s < NOISY_S:
+            self._noise(changing)
+        self._cut_off(changing[:, 1:])
 
     def _gather(self, name: str, block: np.ndarray, same: np.ndarray, first_row: bool) -> None:
         spans = np.array(runs(same), dtype=np.int64).reshape(-1, 2)
@@ -151,7 +153,8 @@ class SensorScan:
             self._long[name].append(run)
 
     def _noise(self, distinct: np.ndarray) -> None:
-        """Count the seconds in which the signal turns back as noise does; in fast motion that drowns."""
+        """Count the seconds in which the signal turns back as noise does on all axes: at rest, where it does not drown.
+        """
         if len(distinct) < 2 * FROZEN_SAMPLES:
             return
         usual = max(float(np.median(np.diff(distinct[:, 0]))), 1e-9)
@@ -161,7 +164,8 @@ class SensorScan:
         count = (len(steps) - 1) // size
         turns = (steps[1:] * steps[:-1] < 0.0)[: count * size].reshape(count, size, 6).mean(axis=1)
         varies = (steps[1:] != 0.0)[: count * size].reshape(count, size, 6).any(axis=1)
-        share = turns.sum(axis=1) / np.maximum(varies.sum(axis=1), 1)
+        share = np.where(varies, turns, np.inf).min(axis=1)  # of all axes: in motion some go on
+        share[~varies.any(axis=1)] = 0.0
         self._noisy_s += float(np.count_nonzero(share > min(TURNS_BACK, TURNS_BACK_HZ * usual))) * size * usual
 
     def _cut_off(self, values: np.ndarray) -> None:
@@ -196,7 +200,7 @@ class SensorScan:
         short = self._lengths.copy()
         usual = int(np.searchsorted(np.cumsum(short), 0.5 * short.sum()))
         longer = int(short[2 * usual + 1 :].sum()) - long_
-        return longer <= COARSE * short.sum()
+        return longer <= 2 * long_ + COARSE * short.sum()
 
     def constant(self, name: str) -> bool:
         """Whether the signal has one value in all rows."""
