@@ -126,7 +126,14 @@ class SensorFilters:
                 noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz)
             except WeposeError as error:
                 raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
-            self._runs[segment] = SensorRun(first.rate_hz, noise, method, static_test=static_test, measured_start=True)
+            self._runs[segment] = SensorRun(
+                first.rate_hz,
+                noise,
+                method,
+                static_test=static_test,
+                measured_start=True,
+                gyro_range=sensor.gyro_range,
+            )
         self.ahead = method in OFFLINE and bool(self._runs)
 
     def push(self, piece: Recording) -> tuple[Recording, dict[str, Orientation]] | None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,6 +150,15 @@ def estimate_orientation(
     )
 
 
+def with_range(method: str, params: Any, gyro_range: float) -> Any:
+    """The filter's parameters with the range [rad/s] at which gyro is cut off, for those filters that know of one."""
+    kinds: dict[str, type] = {"amekf": AmekfParams, "smoother": AmekfParams, "smekf": SmekfParams}
+    if method not in kinds:
+        return params
+    params = params or kinds[method]()
+    return replace(params, gyro_range=min(gyro_range, params.gyro_range))
+
+
 def piece_multiple(method: str, rate_hz: float) -> int:
     """How many samples the pieces of a recording are a multiple of, the last one excepted."""
     return max(1, round(AmekfParams().block_s * rate_hz)) if method in OFFLINE else 1
@@ -174,8 +184,10 @@ class SensorRun:
         params: Any = None,
         static_test: StaticTest | None = None,
         measured_start: bool = False,
+        gyro_range: float = np.inf,
     ) -> None:
         self.test = static_test or StaticTest()
+        self._gyro_range = gyro_range
         self._noise, self._rate_hz, self._method, self._params = noise, rate_hz, method, params
         self._measured_start = measured_start
         self._detector = StaticDetector(noise, rate_hz, self.test)
@@ -207,6 +219,8 @@ class SensorRun:
         quat_start, params = so3.tilt(first_accel), self._params
         if self._measured_start and params is None and self._method == "smekf":
             params = starting_params(self._noise, quat_start, still_start=bool(static[window - 1 : window].any()))
+        if np.isfinite(self._gyro_range):
+            params = with_range(self._method, params, self._gyro_range)
         self._filter = METHODS[self._method](self._noise, self._rate_hz, quat_start, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:

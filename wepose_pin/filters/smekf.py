@@ -39,6 +39,7 @@ class SmekfParams:
     attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
     bias_cov0: float | np.ndarray = 1e-3  # [rad²/s²], a number or (3, 3)
     bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the still phase's first differences
+    gyro_range: float = np.inf  # [rad/s]; a sample at it is cut off: turned by it, but what is beyond went unseen
 
 
 def starting_params(noise: SensorNoise, quat_WS: np.ndarray, still_start: bool) -> SmekfParams:
@@ -108,7 +109,9 @@ class Smekf:
         self.noise = noise
         self.rate_hz = rate_hz
         step = self.params.bias_step_cov
-        self.model = _model(noise, 1.0 / rate_hz, noise.bias_step_cov if step is None else _matrix(step))
+        self.model = _model(
+            noise, 1.0 / rate_hz, noise.bias_step_cov if step is None else _matrix(step), self.params.gyro_range
+        )
         row = np.zeros(STATE_SIZE)
         row[QUAT:BIAS], row[BIAS:P_AA] = quat_WS, noise.gyro_bias
         row[P_AA:P_AB] = _matrix(self.params.attitude_cov0)[_UPPER]
@@ -143,23 +146,26 @@ def _matrix(cov: float | np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _model(noise: SensorNoise, dt: float, bias_step_cov: np.ndarray) -> np.ndarray:
-    """(27,): δt, 1/g, δt² Σ_ω, δt² Σ_b, Σ_ω, Σ_g as upper triangles, what is left of a held rate after a sample."""
+def _model(noise: SensorNoise, dt: float, bias_step_cov: np.ndarray, gyro_range: float) -> np.ndarray:
+    """(28,): δt, 1/g, δt² Σ_ω, δt² Σ_b, Σ_ω, Σ_g as upper triangles, what is left of a held rate after a sample, range.
+    """
     covs = dt * dt * noise.gyro_cov, dt * dt * bias_step_cov, noise.gyro_cov, noise.accel_cov
-    return np.concatenate([[dt, 1.0 / noise.gravity], *(cov[_UPPER] for cov in covs), [np.exp(-dt / HOLD_S)]])
+    return np.concatenate([[dt, 1.0 / noise.gravity], *(cov[_UPPER] for cov in covs), [np.exp(-dt / HOLD_S), gyro_range]])
 
 
 @inlined
 def step(x, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
-    """One sample of one sensor: `x` (32,) its state, `model` (27,), gyro [rad/s], accel [m/s²]."""
+    """One sample of one sensor: `x` (32,) its state, `model` (28,), gyro [rad/s], accel [m/s²]."""
     dt = model[0]
     seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE  # false for NaN
     unseen_cov = 0.0
     if seen:
         wx, wy, wz = gx - x[4], gy - x[5], gz - x[6]
-        x[31] = 0.0
     else:
         wx, wy, wz = model[26] * x[28], model[26] * x[29], model[26] * x[30]
+    if seen and max(abs(gx), abs(gy), abs(gz)) < model[27]:
+        x[31] = 0.0
+    else:
         before, after = x[31], x[31] + dt
         std_before = min(np.pi, UNSEEN_RATE_STD * before * before / (before + HOLD_S))
         std_after = min(np.pi, UNSEEN_RATE_STD * after * after / (after + HOLD_S))
