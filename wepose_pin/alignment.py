@@ -21,7 +21,7 @@ from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
 from .filters.smekf import ACCEL_BIAS_STD
 from .noise import noise_of, quietest
-from .recording import SEGMENTS, Recording
+from .recording import SEGMENTS, Recording, format_time
 from .static import StaticTest
 from .subject import Subject
 
@@ -44,6 +44,10 @@ MOVED_MOUNT = 3.5
 # below 3 deg/s and 3 deg; at the limits the mean pose is no longer the pose that was meant.
 MOVES_DEG_S, MOVES_DEG = 20.0, 15.0
 SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
+
+
+# Samples of a phase at rest, and the share of them that each sensor must have measured.
+FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,7 @@ class SensorFilters:
                 continue
             assert sensor.gyro_S is not None
             assert sensor.accel_S is not None
-            at_rest = first.span(self.still)
+            at_rest = first.measured(segment, self.still)
             try:
                 noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz)
             except WeposeError as error:
@@ -185,7 +189,7 @@ def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTes
 def filtered_piece(filters: SensorFilters, piece: Recording, orientation: Mapping[str, Orientation]) -> Filtered:
     """A piece that `filters` gave, if the start pose is in it."""
     R_VS = _in_sensor_worlds(piece, orientation)
-    at_start = {segment: R[piece.span(filters.start)].mean() for segment, R in R_VS.items()}
+    at_start = {segment: R[piece.measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
     return Filtered(R_VS, at_start, dict(orientation), filters.start, filters.still, filters.warnings)
 
 
@@ -405,12 +409,19 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
     if len(still) > 1:
         notes.append(f"phases.still holds several intervals; the first, {still[0][0]:g} to {still[0][1]:g} s, is used")
     for name, interval in (("start", start), *(("still", span) for span in still[:1])):
+        place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
-        if samples < 10:
+        if samples < FEWEST_AT_START:
             raise BadPhase(
-                f"{recording.where()}: phases.{name}: [{interval[0]:g}, {interval[1]:g}] holds {samples} samples; it "
-                f"needs at least 10, better two seconds"
+                f"{place} holds {samples} samples; it needs at least {FEWEST_AT_START}, better two seconds"
             )
+        for segment in recording.sensors:
+            measured = len(recording.measured(segment, interval))
+            if measured < max(FEWEST_AT_START, LEAST_SHARE_AT_START * samples):
+                raise BadPhase(
+                    f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: nothing "
+                    f"there says how it sits; name seconds in which it measures, or take [sensors.{segment}] out"
+                )
     return start, still[0] if still else start, notes
 
 
@@ -419,13 +430,13 @@ def _motion(recording: Recording, segment: str, interval: tuple[float, float], p
 
     The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
     """
-    sensor, span = recording.sensors[segment], recording.span(interval)
+    sensor, measured = recording.sensors[segment], recording.measured(segment, interval)
     if sensor.quat_WS is not None:
-        R = Rotation.from_quat(sensor.quat_WS[span])
+        R = Rotation.from_quat(sensor.quat_WS[measured])
         rate = (R[:-1].inv() * R[1:]).as_rotvec() * recording.rate_hz
     else:
         assert sensor.gyro_S is not None
-        rate = sensor.gyro_S[span]
+        rate = sensor.gyro_S[measured]
         R = Rotation.from_quat(so3.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
     turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))

@@ -95,7 +95,13 @@ def _floored(cov: np.ndarray, std: float) -> np.ndarray:
 
 
 def quietest(recording: Recording) -> tuple[float, float]:
-    """Interval [s] of `QUIET_S` within the first `BEGINNING_S` in which all sensors together move least."""
+    """Interval [s] of `QUIET_S` within the first `BEGINNING_S` in which all sensors measure and together move least.
+
+    Raises
+    ------
+    BadPhase
+        In each of them a sensor was lost.
+    """
     time, rate_hz = recording.time, recording.rate_hz
     n = int(np.searchsorted(time, time[0] + BEGINNING_S, side="right"))
     window = min(max(round(QUIET_S * rate_hz), 10), n)
@@ -112,5 +118,14 @@ def quietest(recording: Recording) -> tuple[float, float]:
             signal = 2.0 * rate_hz * np.concatenate([np.zeros((1, 4)), quat[1:] - flips * quat[:-1]])
         windows = np.lib.stride_tricks.sliding_window_view(signal, window, axis=0)[::stride]
         motion += windows.var(axis=-1).sum(axis=-1)
+        if sensor.gap is not None:  # what was bridged is quieter than any person
+            motion[np.lib.stride_tricks.sliding_window_view(sensor.gap[:n], window)[::stride].any(axis=-1)] = np.inf
+    if not np.isfinite(motion).any():
+        lost = [name for name, sensor in recording.sensors.items() if sensor.gap is not None and sensor.gap[:n].any()]
+        raise BadPhase(
+            f"{recording.where()}: no {QUIET_S:g} s in the first {BEGINNING_S:g} s in which all sensors measure: "
+            f"{', '.join(f'sensors.{name}' for name in lost)} are lost there; take them out, or name the start pose, "
+            f"[phases] start = [[from, to]]"
+        )
     first = int(np.argmin(motion)) * stride
     return float(time[first]), float(time[first + window - 1])

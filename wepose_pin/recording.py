@@ -128,6 +128,12 @@ class Recording:
         first, last = np.searchsorted(self.time, [interval[0] - 1e-9, interval[1] + 1e-9])
         return slice(int(first), int(last))
 
+    def measured(self, segment: str, interval: tuple[float, float]) -> np.ndarray:
+        """Samples (k,) within the interval [s] that the sensor measured: what lies in its gaps was bridged."""
+        span, gap = self.span(interval), self.sensors[segment].gap
+        samples = np.arange(len(self))[span]
+        return samples if gap is None else samples[~gap[span]]
+
     def phase(self, name: str) -> Intervals:
         """Intervals of a phase that must be there.
 
