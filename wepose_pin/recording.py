@@ -34,6 +34,11 @@ AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) f
 Intervals = tuple[tuple[float, float], ...]
 
 
+def format_time(time: float) -> str:
+    """A time [s] as it stands in the file, to the millisecond: on a clock that counts from 1970 as well."""
+    return f"{time:.3f}".rstrip("0").rstrip(".")
+
+
 def mount_from_axes(up: str, forward: str) -> np.ndarray:
     """`quat_LS` (4,) xyzw of the sensor axes that point up and forward in the start pose, as in ``"+x", "-z"``.
 
@@ -60,7 +65,9 @@ class Sensor:
     accel_S : (n, 3) [m/s²], specific force, +g up at rest; None for ready orientations
     quat_WS : (n, 4) xyzw, sensor to a world of its own whose z points up; None for raw sensors
     stated_quat_LS : (4,) xyzw, the mount as the session states it, sensor to segment; None where it says nothing
-    gap : (n,) bool, true where samples were lost for longer than is bridged in silence; None where that is not allowed
+    gap : (n,) bool, true where samples were lost for longer than is bridged in silence, or the sensor was frozen; None
+        where neither can be
+    gyro_range : [rad/s] from which on an axis of gyro is cut off; infinite where that is not known
     aligned : `quat_WS` is the segment's own orientation, in a world that is common to all that are aligned: only where
         that world's x points is taken from the start pose
     """
@@ -71,6 +78,7 @@ class Sensor:
     stated_quat_LS: np.ndarray | None = None
     gap: np.ndarray | None = None
     aligned: bool = False
+    gyro_range: float = np.inf
 
     @property
     def ready(self) -> bool:
@@ -119,6 +127,12 @@ class Recording:
         """Samples within the interval [s], both ends included."""
         first, last = np.searchsorted(self.time, [interval[0] - 1e-9, interval[1] + 1e-9])
         return slice(int(first), int(last))
+
+    def measured(self, segment: str, interval: tuple[float, float]) -> np.ndarray:
+        """Samples (k,) within the interval [s] that the sensor measured: what lies in its gaps was bridged."""
+        span, gap = self.span(interval), self.sensors[segment].gap
+        samples = np.arange(len(self))[span]
+        return samples if gap is None else samples[~gap[span]]
 
     def phase(self, name: str) -> Intervals:
         """Intervals of a phase that must be there.

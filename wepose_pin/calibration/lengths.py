@@ -262,15 +262,19 @@ def _looks(
     """The looks of all conditions, and their samples (n,)."""
     stride = max(1, round(recording.rate_hz / rate_hz))
     samples = []
+    gaps = {name: of.gap for name, of in recording.sensors.items() if of.gap is not None}
     for condition in protocol.conditions:
         spans = [recording.span(interval) for interval in recording.phase(condition.phase)]
         # Each look once, however the intervals overlap.
-        samples.append(np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride])
+        phase = np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride]
+        lost = [name for name, gap in gaps.items() if gap[phase].any()]
+        samples.append(phase[~np.any([gaps[name][phase] for name in lost], axis=0)] if lost else phase)
         if len(samples[-1]) < LEAST_LOOKS * rate_hz / LOOK_RATE_HZ:
             raise BadPhase(
                 f"{recording.where()}: phases.{condition.phase} holds {len(samples[-1])} looks at {LOOK_RATE_HZ:g} a "
                 f"second; at least {LEAST_LOOKS} are needed"
                 + (", better a minute" if isinstance(condition, Closure) else ", better five seconds")
+                + (f"; in the others {', '.join(f'sensors.{name}' for name in lost)} is lost" if lost else "")
             )
     at = np.concatenate(samples)
     seen = {carrier(segment, found.R_VS) for segment in protocol.segments}

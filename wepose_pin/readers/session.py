@@ -11,10 +11,21 @@ import numpy as np
 import polars as pl
 
 from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, one_of, printable
-from ..recording import CONFIGURATION, SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases
+from ..recording import (
+    CONFIGURATION,
+    SEGMENTS,
+    START_POSES,
+    Intervals,
+    Recording,
+    Sensor,
+    check,
+    check_phases,
+    format_time,
+)
 from .arrays import ArrayFile, is_array_file
 from .clocks import BRIDGED, LONG, Clock, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time, runs
 from .device import HUGE, Device
+from .faults import Scan
 from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
 from .plausibility import sensor_notes
@@ -28,6 +39,7 @@ ACCEL_UNITS = {"m/s^2": 1.0, "g": 9.80665}
 NORM_OFF = 1e-2
 SI = {"gyro": 1.0, "accel": 1.0}
 _NO_ROW = 2**31 - 1
+_SCAN_ROWS = 1 << 16  # that are looked at together for faults
 _BEGINNING_S = 20.0  # [s] of a recording in which somebody stands still for a second
 
 
@@ -175,6 +187,20 @@ class SessionReader:
         check_phases(str(self.path), self.time, self._head.phases)
         self.phases, self.start_pose, self.strapping = self._head.phases, start_pose, self._head.strapping
         self.any_aligned = any(plan.aligned for plan in self._plans.values())
+        self._refuse_shared_columns()
+        self._scanned: Scan | None = None
+
+    def _refuse_shared_columns(self) -> None:
+        """Two sensors that are read from the same columns are one."""
+        owner: dict[tuple[Path, str], str] = {}
+        for segment, plan in self._plans.items():
+            for signal, name in ((signal, name) for signal, names in plan.signals.items() for name in names):
+                other = owner.setdefault((plan.path, name), segment)
+                if other != segment:
+                    raise BadSession(
+                        f"{self.path}: {plan.place}.{signal} names column '{name}' of {plan.path.name}, which is that "
+                        f"of sensors.{other}; each sensor has columns of its own"
+                    )
 
     def _file(self, keys: Keys, data: Keys) -> Path:
         file = (keys if "file" in keys else data).text("file", None)
@@ -287,8 +313,39 @@ class SessionReader:
             wanted[time] = own.at("time")
         return file.table(wanted), named
 
+    def _scan(self) -> Scan:
+        """What all rows say of the sensors, in a pass over them; once.
+
+        Raises
+        ------
+        BadData
+            As `Scan.finish`, and where values are no numbers.
+        """
+        if self._scanned is not None:
+            return self._scanned
+        clocks = {id(plan.clock): plan.clock for plan in self._plans.values()}
+        times = {key: clock.time[clock.row >= 0] for key, clock in clocks.items()}
+        scan = Scan()
+        for first in range(0, max(map(len, times.values())), _SCAN_ROWS):
+            rows = slice(first, first + _SCAN_ROWS)
+            tables = {plan.table: self._tables[plan.table][rows] for plan in self._plans.values()}
+            blocks = {}
+            for segment, plan in self._plans.items():
+                values = []
+                for name, names in plan.signals.items():
+                    read = columns(
+                        tables[plan.table], names, str(plan.path), f"{self.path}: {plan.place}.{name}", first
+                    )
+                    values.append(read * plan.units.get(name, 1.0))
+                blocks[segment] = times[id(plan.clock)][rows], np.column_stack(values)
+            scan.push(blocks)
+        scan.finish(str(self.path), next(iter(self.phases.get("start", ())), None))
+        self._scanned = scan
+        return scan
+
     def recording(self, first: int, last: int) -> Recording:
         """The recording from sample `first` of the common time to before `last`, checked."""
+        scan = self._scan()
         time = self.time[first:last]
         windows = {segment: self._window(plan, first, last) for segment, plan in self._plans.items()}
         rows: dict[str, slice] = {}
@@ -323,7 +380,7 @@ class SessionReader:
             rate_hz=self.rate_hz,
             sensors=sensors,
             phases=self._head.phases if whole else _within(self._head.phases, time),
-            notes=(*self._notes, *gap_notes),
+            notes=(*self._notes, *scan.notes(), *gap_notes),
         )
         check(recording)
         begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
@@ -346,6 +403,11 @@ class SessionReader:
             name: self._signal(plan, name, clock, table, first_row) for name in plan.signals
         }  # (values, good) each
         marks = {}
+        segment = plan.place.removeprefix("sensors.")
+        faults = self._scan().faults.get(segment, [])
+        frozen = np.zeros(len(clock.time), dtype=bool)
+        for fault in faults:
+            frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
         for name, (_, good) in found.items():
             place = f"{plan.path}: {plan.place}.{name}"
             lost_a_while = self.gaps and len(clock.time) < len(plan.clock.time) and name != "orientation"
@@ -359,14 +421,17 @@ class SessionReader:
                     f"{place}: {last - first} samples without numbers, {(last - first) * clock.step:.3f} s from "
                     f"{clock.time[first]:.3f} s; {_too_long(clock)}"
                 )
+            if frozen.any():
+                marks[name] = lost_samples(clock, good & ~frozen)
         every = np.max(list(marks.values()), axis=0)
-        gap = every == LONG if self.gaps else None
+        gap = every == LONG if self.gaps or faults else None
         if "orientation" in found:
             quat = bridge_quat(found["orientation"][0], marks["orientation"], clock)
             return Sensor(quat_WS=quat, stated_quat_LS=plan.mount, gap=gap, aligned=plan.aligned), every
         gyro_S = bridge(found["gyro"][0], marks["gyro"], clock, rate=True)
         accel_S = bridge(found["accel"][0], marks["accel"], clock)
-        return Sensor(gyro_S=gyro_S, accel_S=accel_S, stated_quat_LS=plan.mount, gap=gap), every
+        gyro_range = self._scan().sensors[segment].gyro_range
+        return Sensor(gyro_S=gyro_S, accel_S=accel_S, stated_quat_LS=plan.mount, gap=gap, gyro_range=gyro_range), every
 
     def _signal(
         self, plan: _Plan, name: str, clock: Clock, table: pl.DataFrame, first_row: int
