@@ -495,8 +495,7 @@ def test_columns_by_their_names() -> None:
     assert list(found.sensors) == ["torso"]
     assert found.sensors["torso"]["accel"] == ["chest_acc_x", "chest_acc_y", "chest_acc_z"]
     found = guess_columns(["t", "gx", "gy", "gz", "ax", "ay", "az"])
-    assert found.sensors == {"torso": {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
-    assert not found.sure
+    assert found.sensors == {"?": {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
     found = guess_columns(["head_q0", "head_q1", "head_q2", "head_q3"])
     assert found.sensors == {"head": {"orientation": ["head_q1", "head_q2", "head_q3", "head_q0"]}}
     assert guess_columns(["a", "b", "velocity_x"]).sensors == {}

@@ -1,6 +1,6 @@
 """APDM (Opal) CSV, as Motion Studio and Mobility Lab export it: all sensors of a recording in one file.
 
-``Format=7``: three lines of names. The first has each sensor's number and what it was called, the second what is measured
+``Format=7``: three lines of names. The first has each sensor's number and name, the second what is measured
 (Accelerometer [m/s²], Gyroscope [rad/s], Magnetometer, Barometer, Orientation), the third the axes; Time is in µs since
 1970. Before that: ``Test Name:``, ``Sample Rate:``, then ``<sensor>/Acceleration/X`` and so on, and a line of units.
 Orientations are quaternions (scalar first) of the sensor to a world with z up.
@@ -72,7 +72,9 @@ def read_apdm(path: Path, use: str | None = None, rate_hz: float | None = None) 
     kind = next((kind for kind in kinds if signals[kind]), None)
     if kind is None:
         instead = "; leave out data.use" if use else ""
-        raise BadData(f"{path}: no sensor in it has {' or '.join(' and '.join(wanted[kind]) for kind in kinds)}{instead}")
+        raise BadData(
+            f"{path}: no sensor in it has {' or '.join(' and '.join(wanted[kind]) for kind in kinds)}{instead}"
+        )
     values = {}
     for label, its in signals[kind].items():
         values[label] = {
@@ -103,7 +105,7 @@ def _places_of_format_7(rows: Sequence[Sequence[str]]) -> tuple[dict[str, dict[s
 def _places_by_name(
     path: Path, rows: Sequence[Sequence[str]]
 ) -> tuple[dict[str, dict[str, list[int]]], dict[str, float]]:
-    """Sensor → signal → its columns, from names as ``Lumbar/Acceleration/X``; and signal → SI, from the line of units."""
+    """Sensor → signal → its columns, from names as ``Lumbar/Acceleration/X``; and its factor to SI, by units."""
     at: dict[str, dict[str, dict[str, int]]] = {}
     scale = {}
     for k, name in enumerate(rows[2]):
@@ -120,7 +122,9 @@ def _places_by_name(
             scale[signal] = UNITS[signal][unit]
     return {
         label: {
-            signal: [axes[axis] for axis in AXES[signal]] for signal, axes in its.items() if set(AXES[signal]) <= set(axes)
+            signal: [axes[axis] for axis in AXES[signal]]
+            for signal, axes in its.items()
+            if set(AXES[signal]) <= set(axes)
         }
         for label, its in at.items()
     }, scale

@@ -167,7 +167,9 @@ def read_text(path: Path, first: str, what: str) -> Text:
     return Text(path, about, parsed_rows(path, body, wanted, separator, head + 1, what))
 
 
-def parsed_rows(path: Path, body: bytes, wanted: Sequence[str], separator: str, names_line: int, what: str) -> pl.DataFrame:
+def parsed_rows(
+    path: Path, body: bytes, wanted: Sequence[str], separator: str, names_line: int, what: str
+) -> pl.DataFrame:
     """The rows after the line of names, number `names_line` of the file: all cells text, null where there is no value.
 
     Raises

@@ -88,7 +88,7 @@ def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
     rate = rate_hz or (float(number[0]) if number else 0.0)
     if rate <= 0.0:
         raise BadData(
-            f"{text.path}: no SampleTimeFine and no OutputRate to tell the time by; state the output rate as rate_hz in "
-            f"[data], or export one of the two"
+            f"{text.path}: no SampleTimeFine and no OutputRate to tell the time by; state the output rate as rate_hz "
+            f"in [data], or export one of the two"
         )
     return counted_time(text.numbers(["PacketCounter"])[:, 0], rate, WRAPS)[0], None

@@ -131,7 +131,8 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     log = read_live_log(path)
     values = {}
     for label, sensor in log.recording.sensors.items():
-        assert sensor.gyro_S is not None and sensor.accel_S is not None
+        assert sensor.gyro_S is not None
+        assert sensor.accel_S is not None
         lost = np.zeros((len(log.recording), 1), dtype=bool) if sensor.gap is None else sensor.gap[:, None]
         values[label] = {
             "gyro": np.where(lost, np.nan, sensor.gyro_S),

@@ -36,7 +36,11 @@ SEGMENT_OF = {
 _QUARTER = {"left": 0.5 * np.pi, "right": -0.5 * np.pi}
 WIDTH = {"orientation": 4, "position": 3, "sensorAngularVelocity": 3, "sensorAcceleration": 3}
 # An arm's segment and the one that begins at its other end.
-ARM = {f"{side}{part}": f"{side}{end}" for side in ("Left", "Right") for part, end in (("UpperArm", "ForeArm"), ("ForeArm", "Hand"))}
+ARM = {
+    f"{side}{part}": f"{side}{end}"
+    for side in ("Left", "Right")
+    for part, end in (("UpperArm", "ForeArm"), ("ForeArm", "Hand"))
+}
 # MVN draws its joints on the axis, to 0.03 deg: what is off by more than this is of another convention.
 ALONG_DEG = 5.0
 
@@ -79,7 +83,9 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         quat = frames.values["orientation"]
         pose = _reference_pose(path, frames)
         if pose is None:
-            notes = (f"{path.name}: no positions of the arms' segments: their frames are taken for those of the T-pose",)
+            notes = (
+                f"{path.name}: no positions of the arms' segments: their frames are taken for those of the T-pose",
+            )
         values = {
             label: {"orientation": _segment_quat(label, quat[:, k], pose or "T")}
             for k, label in enumerate(frames.segments)
@@ -126,12 +132,14 @@ def _reference_pose(path: Path, frames: Frames) -> str | None:
         poses[label] = min(off, key=lambda pose: off[pose])
         if off[poses[label]] > ALONG_DEG:
             raise BadData(
-                f"{path}: {label} lies {off['T']:.0f} deg off y of its frame (as in MVN's T-pose) and {off['N']:.0f} deg "
-                f"off -z (N-pose), by its <position> and {end}'s; its orientations are of neither and are not read"
+                f"{path}: by its <position> and {end}'s, {label} lies {off['T']:.0f} deg off y of its frame (as in MVN's "
+                f"T-pose) and {off['N']:.0f} deg off -z (N-pose); its orientations are of neither and are not read"
             )
     if len(set(poses.values())) > 1:
         told = ", ".join(f"{label} {pose}-pose" for label, pose in poses.items())
-        raise BadData(f"{path}: the arms' frames are the world's in two poses: {told}; export it again, with one of them")
+        raise BadData(
+            f"{path}: the arms' frames are the world's in two poses: {told}; export it again, with one of them"
+        )
     return next(iter(poses.values()), None)
 
 

@@ -13,7 +13,19 @@ import polars as pl
 from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, one_of, printable
 from ..recording import CONFIGURATION, SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases
 from .arrays import ArrayFile, is_array_file
-from .clocks import BRIDGED, LONG, TIME_UNITS, Clock, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time, runs
+from .clocks import (
+    BRIDGED,
+    LONG,
+    TIME_UNITS,
+    Clock,
+    bridge,
+    bridge_quat,
+    clock_of,
+    common_time,
+    lost_samples,
+    on_time,
+    runs,
+)
 from .device import HUGE, Device
 from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
@@ -155,10 +167,11 @@ class SessionReader:
         )
         stated = {segment: sensor_stated(sensors.table(segment)) for segment in sensors.values}
         self._units: Mapping[str, float] = SI
-        if any("gyro" in (said.signals or ()) for said in stated.values()):
+        if any(said.signals is not None for said in stated.values()):
+            raw = any("gyro" in (said.signals or ()) for said in stated.values())
             self._units = {
-                "gyro": GYRO_UNITS[data.choice("gyro_unit", GYRO_UNITS)],
-                "accel": ACCEL_UNITS[data.choice("accel_unit", ACCEL_UNITS)],
+                signal: known[data.choice(key, known)] if raw or key in data else 1.0
+                for signal, key, known in (("gyro", "gyro_unit", GYRO_UNITS), ("accel", "accel_unit", ACCEL_UNITS))
             }
             self._used |= {"gyro_unit", "accel_unit"}
         self._tables: dict[str, pl.DataFrame | Rows] = {}
@@ -437,8 +450,8 @@ def _useless(key: str) -> str:
     return {
         "file": "every sensor names a file of its own",
         "rate_hz": "every sensor has a time of its own",
-        "gyro_unit": "no sensor here has gyro in columns whose unit must be stated",
-        "accel_unit": "no sensor here has accel in columns whose unit must be stated",
+        "gyro_unit": "the format of every sensor here knows its units",
+        "accel_unit": "the format of every sensor here knows its units",
         "format": "no sensor here is read by it: they state columns, or a format of their own",
         "use": "no sensor here is of a format that holds both; state the columns that are wanted",
     }[key]

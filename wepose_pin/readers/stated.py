@@ -39,7 +39,9 @@ def sensor_stated(keys: Keys) -> Stated:
         return Stated(None, mount, aligned)
     for key in ("label", "format"):
         if key in keys:
-            raise BadSession(f"{keys.at(key)} stands beside {named[0]}; a known format has a {key}, a table has columns")
+            raise BadSession(
+                f"{keys.at(key)} stands beside {named[0]}; a known format has a {key}, a table has columns"
+            )
     if "orientation" not in keys:
         return Stated({"gyro": _names(keys, "gyro"), "accel": _names(keys, "accel")}, mount, aligned)
     if "gyro" in keys or "accel" in keys:
