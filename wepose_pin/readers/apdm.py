@@ -94,7 +94,7 @@ def _places_of_format_7(rows: Sequence[Sequence[str]]) -> tuple[dict[str, dict[s
     who, kinds, _ = ([*row, *[""] * (len(rows[1]) - len(row))] for row in rows[:3])
     begins = [k for k, kind in enumerate(kinds) if kind == "Accelerometer"]
     places: dict[str, dict[str, list[int]]] = {}
-    for first, last in zip(begins, [*begins[1:], len(kinds)], strict=True):
+    for first, last in zip(begins, [*begins, len(kinds)][1:], strict=True):
         number, *title = [cell for cell in who[first:last] if cell] or [f"sensor {len(places) + 1}"]
         label = title[0] if title and title[0] not in places else f"{title[0]} {number}" if title else number
         its = {KINDS[kinds[k]]: k for k in range(first, last) if kinds[k] in KINDS}

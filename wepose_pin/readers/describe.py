@@ -283,6 +283,7 @@ def _of_live(path: Path) -> tuple[list[str], list[str]]:
         f"of {header['name']}, live by {header['method']}: {len(log.quat_WL)} poses were shown",
         f"subject: {parsed_toml(subject).get('name') or 'without a name'}" if subject else "no subject",
         f"mounts: {mounts}" if mounts else "no mounts",
+        f"start pose held [s]: {first:.2f} to {last:.2f}",
     ]
     if recording.resets:
         times = ", ".join(f"{recording.time[tick]:.1f}" for tick in recording.resets)
@@ -290,7 +291,8 @@ def _of_live(path: Path) -> tuple[list[str], list[str]]:
     if log.broken_off:
         facts.append("note: its last block is not whole; the session was killed, and it is read up to there")
     facts.append(f"track it as it was: wepose track {path} -o result; to add phases, for wepose calibrate: --write")
-    return facts, [f"start = [[{first:.2f}, {last:.2f}]]   # as it was held live"]
+    first, last = np.ceil(1e3 * first) / 1e3, np.floor(1e3 * last) / 1e3
+    return facts, [f"start = [[{first:.3f}, {last:.3f}]]   # as it was held live"]
 
 
 def _siblings(path: Path, format: str) -> list[Path]:

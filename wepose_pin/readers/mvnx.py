@@ -132,7 +132,7 @@ def _reference_pose(path: Path, frames: Frames) -> str | None:
         poses[label] = min(off, key=lambda pose: off[pose])
         if off[poses[label]] > ALONG_DEG:
             raise BadData(
-                f"{path}: by its <position> and {end}'s, {label} lies {off['T']:.0f} deg off y of its frame (as in MVN's "
+                f"{path}: by its <position> and {end}'s, {label} lies {off['T']:.0f} deg off y of its frame (as in the "
                 f"T-pose) and {off['N']:.0f} deg off -z (N-pose); its orientations are of neither and are not read"
             )
     if len(set(poses.values())) > 1:
