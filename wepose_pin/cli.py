@@ -521,6 +521,7 @@ def live(
     stream = open_source(source, sensors=named or None, speed=speed)
     wearing = stated or wearing_of(stream, subject, None)
     body = wearer_model(wearing.subject, load_model(model) if model else None)
+    _warn(body.warnings)
     outputs: list[Output] = []
     follower: RobotOut | None = None
     try:
