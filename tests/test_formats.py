@@ -221,6 +221,20 @@ def test_times_in_the_unit_that_is_stated(unit: str, a_second: float, where: str
         load(tmp_path, text.replace(f"'{unit}'", "'min'"))
 
 
+def test_where_data_names_no_file_its_clock_is_that_of_all(tmp_path: Path) -> None:
+    frame = pl.DataFrame(np.column_stack([1e3 * TIME, GYRO, ACCEL]), schema=["t", *"abcdef"])
+    frame.write_csv(tmp_path / "a.csv")
+    values = "gyro = ['a', 'b', 'c']\naccel = ['d', 'e', 'f']\n"
+    sensors = "".join(f"[sensors.{name}]\nfile = 'a.csv'\n{values}" for name in ("torso", "left_forearm"))
+    units = "[data]\ngyro_unit = 'rad/s'\naccel_unit = 'm/s^2'\n"
+    check_raw(load(tmp_path, f"{units}time = 't'\ntime_unit = 'ms'\n{sensors}"), "left_forearm")
+    check_raw(load(tmp_path, f"{units}rate_hz = 100\n{sensors}"), "left_forearm")
+    with pytest.raises(BadSession, match=r"sensors\.torso\.time or rate_hz is needed"):  # never half of a clock
+        load(tmp_path, f"{units}time = 't'\n[sensors.torso]\nfile = 'a.csv'\ntime_unit = 'ms'\n{values}")
+    with pytest.raises(BadSession, match=r"data\.time_unit: .*; leave it out"):
+        load(tmp_path, f"{units}rate_hz = 100\ntime_unit = 'ms'\n{sensors}")
+
+
 # APDM --------------------------------------------------------------------------------------------------------------
 
 

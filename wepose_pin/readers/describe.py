@@ -240,8 +240,8 @@ def _of_devices(
     )
     if format == "wepose_live":
         notes, phases = _of_live(path)
-        tables = {str(segment): [] for segment in device.labels.values()}
-        return title, notes, [f"file = {_relative(path, folder)}", *phases], tables, {}
+        worn = {str(segment): list[str]() for segment in device.labels.values()}
+        return title, notes, [f"file = {_relative(path, folder)}", *phases], worn, {}
     if len(device.labels) > 1 or format in ("mvnx", "opensim", "apdm"):
         tables: dict[str, list[str]] = {}
         for label, segment in device.labels.items():
@@ -343,7 +343,8 @@ def _of_columns(
                 f'{CHECK}x, y, z, w? if w comes first: ["{path_}[1]", "{path_}[2]", "{path_}[3]", "{path_}[0]"]'
             )
         tables[segment] = lines
-    unknown = [name.removeprefix("?") for name in tables if name.startswith("?")]
+    columns_of = {name: next(iter(signals.values()))[0] for name, signals in guess.sensors.items()}
+    unknown = [name.removeprefix("?") or f"{columns_of[name]}, …" for name in tables if name.startswith("?")]
     if unknown:
         note = [*note, f"which segment is not said by the names of: {', '.join(unknown)}"]
     return title, note, head, tables, {}
@@ -355,7 +356,10 @@ def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str]
     if name is None:
         return [f"rate_hz = 100.0{CHECK}no column looks like time"], ["no column looks like time: state the rate"]
     table = arrays.table({name: str(path)}) if arrays else read_table(path)
-    time = columns(table, [name], str(path), "time")[:, 0]
+    try:
+        time = columns(table, [name], str(path), "time")[:, 0]
+    except BadData as error:  # dates, say
+        return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {error}"]
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     said = guess.time_unit

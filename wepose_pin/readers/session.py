@@ -212,7 +212,7 @@ class SessionReader:
         format = own.choice("format", FORMATS) if "format" in own else format_of(path) if path.exists() else None
         self._used |= {"format", "use"} if own is data else {"use"}
         if format is None:
-            if not path.exists() and path.suffix.lower() in (".mvnx", ".sto", ".txt", ""):
+            if not path.exists():
                 raise MissingFile(f"{path}: no such file or folder")
             keys.names("gyro", 3)  # a table of which the session must say what it holds
         else:
@@ -250,8 +250,9 @@ class SessionReader:
     def _plan(self, keys: Keys, data: Keys, stated: Stated) -> _Plan:
         path, segment = self._file(keys, data), keys.place.removeprefix("sensors.")[:-1]
         device = self.devices.get(path) if stated.signals is None else None
-        # A file of its own has a clock of its own.
-        own = keys if any(key in keys for key in ("file", "time", "rate_hz")) else data
+        # A file of its own has a clock of its own beside that of [data], or where [data] names no file that of all.
+        clock = any(key in keys for key in ("time", "time_unit", "rate_hz"))
+        own = keys if clock or ("file" in keys and "file" in data) else data
         name, rate_hz = own.text("time", None), own.number("rate_hz", None, positive=True)
         unit = TIME_UNITS[own.choice("time_unit", TIME_UNITS, "s")]
         if device is not None:
@@ -259,7 +260,7 @@ class SessionReader:
         else:
             if own is data:
                 self._used |= {"time", "rate_hz"} | ({"time_unit"} if name is not None else set())
-            elif "time_unit" in keys and name is None:
+            elif "time_unit" in keys and rate_hz is not None:
                 raise BadSession(f"{keys.at('time_unit')}: {_useless('time_unit')}; leave it out")
         if (name is None) == (rate_hz is None):
             found = "neither" if name is None else "both"
