@@ -251,8 +251,8 @@ class SessionReader:
         path, segment = self._file(keys, data), keys.place.removeprefix("sensors.")[:-1]
         device = self.devices.get(path) if stated.signals is None else None
         # A file of its own has a clock of its own beside that of [data], or where [data] names no file that of all.
-        clock = any(key in keys for key in ("time", "time_unit", "rate_hz"))
-        own = keys if clock or ("file" in keys and "file" in data) else data
+        states = any(key in keys for key in ("time", "time_unit", "rate_hz"))
+        own = keys if states or ("file" in keys and "file" in data) else data
         name, rate_hz = own.text("time", None), own.number("rate_hz", None, positive=True)
         unit = TIME_UNITS[own.choice("time_unit", TIME_UNITS, "s")]
         if device is not None:
