@@ -521,6 +521,7 @@ def live(
     stream = open_source(source, sensors=named or None, speed=speed)
     wearing = stated or wearing_of(stream, subject, None)
     body = wearer_model(wearing.subject, load_model(model) if model else None)
+    _warn(body.warnings)
     outputs: list[Output] = []
     follower: RobotOut | None = None
     try:
@@ -921,8 +922,9 @@ def info(
 ) -> None:
     """What a file is: its sensors, rates and gaps, and a session file that is ready for it.
 
-    Knows Xsens MVNX, MT Manager's text, Movella DOT, x-IMU3, OpenSim .sto of orientations, CSV, Parquet, HDF5, MATLAB
-    (docs/formats/), and sessions, subjects and results. What is marked CHECK in the session is guessed.
+    Knows Xsens MVNX, MT Manager's text, Movella DOT, x-IMU3, APDM, OpenSim .sto of orientations, CSV, Parquet, HDF5,
+    MATLAB (docs/formats/), recordings of wepose live, and sessions, subjects and results. What is marked CHECK in the
+    session is guessed.
 
     Example: wepose info trial.mvnx --write
 
@@ -963,7 +965,7 @@ def info(
         partial.replace(target)
     finally:
         partial.unlink(missing_ok=True)
-    _say(f"Session: {target}  (check the lines marked CHECK, then: wepose track {target} -o result)")
+    _say(f"Session: {target}  (check the lines marked CHECK, then: {found.then.replace('SESSION', str(target))})")
 
 
 def batch(

@@ -10,7 +10,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Iterable, Iterator
-from difflib import get_close_matches
+from difflib import SequenceMatcher, get_close_matches
 
 LONGEST = 2000  # letters of an error's text
 _END = 500  # of these, what is kept of the end, where it says what would be right
@@ -113,8 +113,14 @@ def native_stderr_muted() -> Iterator[None]:
 
 
 def one_of(names: Iterable[str], found: str | None = None, most: int = 12) -> str:
-    """The choices for an error's end: ``a, b, c`` with the closest to `found` named first."""
+    """The choices for an error's end: ``a, b, c`` with the closest to `found` named first.
+
+    Of more than `most` those are listed that are nearest to `found`, the nearest first.
+    """
     choices = list(names)
-    listed = ", ".join(choices[:most]) + (", …" if len(choices) > most else "")
+    nearest = choices
+    if found and len(choices) > most:
+        nearest = sorted(choices, key=lambda name: -SequenceMatcher(None, found.lower(), name.lower()).ratio())
+    listed = ", ".join(nearest[:most]) + (f", … ({len(choices)} in all)" if len(choices) > most else "")
     close = get_close_matches(found, choices, n=1) if found else []
     return f"did you mean '{close[0]}'? there is: {listed}" if close else f"there is: {listed or 'none'}"

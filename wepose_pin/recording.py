@@ -143,6 +143,12 @@ class Recording:
             The recording has no such phase.
         """
         intervals = self.phases.get(name, ())
+        if not intervals and self.source is not None and self.source.suffix == ".wepose":
+            raise BadPhase(
+                f"{self.where()}: phases.{name} is needed here, and a live recording has phases.start alone; `wepose "
+                f"info {self.source.name} --write` writes a session that names it: add {name} = [[from, to]] to its "
+                f"[phases]"
+            )
         if not intervals:
             raise BadPhase(
                 f"{self.where()}: phases.{name} is needed here and missing; add [phases] {name} = "
