@@ -52,10 +52,11 @@ def joint_angle_section(pose: TrackedPose) -> list[Block]:
     for joint, found in summary(angles).items():
         stds = angles[joint].std
         for k, name in enumerate(angles[joint].names):
-            usual = f"± {np.degrees(np.nanmedian(stds[:, k])):.1f}°" if stds is not None else "not known"
+            known = stds[np.isfinite(stds[:, k]), k] if stds is not None else np.empty(0)
+            usual = f"± {np.degrees(np.median(known)):.1f}°" if len(known) else "not known"
             ends = [f"{whole(np.degrees(value))}°" for value in (found.lowest[k], found.highest[k], found.range[k])]
             if not np.isfinite(found.range[k]):
-                ends = ["", "", ""]
+                ends = ["", "", ""]  # every sample is in a gap or near the lock, as of an arm that hangs
             elif found.range[k] >= FULL_TURN and found.near_lock:
                 ends = ["", "", "all round"]
             lines.append(
