@@ -78,6 +78,12 @@ def largest(values: np.ndarray) -> float:
     return float(np.max(values, initial=-np.inf, where=np.isfinite(values))) if np.isfinite(values).any() else np.nan
 
 
+def usual(values: np.ndarray) -> float:
+    """The median of the finite values; NaN where there is none."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
 def from_start(pose: TrackedPose) -> np.ndarray:
     """(n,) bool, the samples from the start pose on: only of these the stated uncertainties are summed up."""
     assert pose.segments is not None

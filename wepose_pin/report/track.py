@@ -25,6 +25,7 @@ from .measures import (
     largest,
     longest,
     stated_mounts,
+    usual,
 )
 from .thinned import Whole, whole_of
 from .track_figures import (
@@ -123,8 +124,8 @@ def _in_short(pose: TrackedPose, whole: Whole, budgets: Mapping[str, Budget]) ->
     stds = {name: spread(cov[since]) for name, cov in pose.point_cov.items()}
     seen = [name for name in ("left_hand", "right_hand") if name in stds]
     if seen:
-        usual = listed([f"{plain(name)} ± {1e3 * np.nanmedian(stds[name]):.0f} mm" for name in seen])
-        said.append(f"Positions, each axis, counted from between the hips, half of the time better than: {usual}.")
+        half = listed([f"{plain(name)} ± {1e3 * usual(stds[name]):.0f} mm" for name in seen])
+        said.append(f"Positions, each axis, counted from between the hips, half of the time better than: {half}.")
     said.append(f"Lengths: {plain(pose.subject.note or pose.subject.name)}.")
     return said
 
@@ -225,7 +226,7 @@ def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> list[Block]:
         for name, budget in budgets.items()
     ]
     pairs = [
-        [joint, degrees(float(np.degrees(np.nanmedian(std)))), degrees(float(np.degrees(largest(std))))]
+        [joint, degrees(float(np.degrees(usual(std)))), degrees(float(np.degrees(largest(std))))]
         for joint, std in ((joint, std[since]) for joint, std in between(budgets).items())
     ]
     picture = headings_picture(
@@ -276,15 +277,15 @@ def _hands(pose: TrackedPose, hands: Mapping[str, Hand]) -> list[Block]:
     lines = []
     for name, hand in hands.items():
         low, high = np.nanpercentile(100 * hand.reach, [1.0, 99.0], axis=0)
-        usual, most = ("not known", "not known")
+        half, most = ("not known", "not known")
         if hand.std is not None:
-            usual, most = (f"± {whole(1e3 * of(hand.std[since]))} mm" for of in (np.nanmedian, largest))
+            half, most = (f"± {whole(1e3 * of(hand.std[since]))} mm" for of in (usual, largest))
         lines.append(
             [
                 plain(name),
                 *(f"{whole(a)} to {whole(b)}" for a, b in zip(low, high, strict=True)),
                 f"{hand.peak_speed:.1f} m/s",
-                usual,
+                half,
                 most,
             ]
         )
