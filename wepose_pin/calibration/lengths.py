@@ -34,6 +34,7 @@ from ..errors import BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST
 from ..recording import Recording
 from ..subject import LENGTHS, Drift, Hinge, StartTilt, Subject, average_subject
+from .alternatives import Alternative, alternatives, on_others, spread_over
 from .anatomy import (
     BETTER,
     Arms,
@@ -48,7 +49,7 @@ from .anatomy import (
 )
 from .chain import CHAIN, SIDES
 from .joints import coupled, couplings
-from .known import known_before, known_lengths
+from .known import known_before, known_lengths, stated_headings
 from .problem import HINGE_STD, K, Layout, Looks, carrier, placed, residuals
 from .protocols import Closure, Protocol, load_protocol
 from .remarks import on_headings, on_lengths, on_looks
@@ -299,8 +300,9 @@ def _solve(
     looks, at = _looks(recording, found, protocol, QUICK_RATE_HZ if quick else LOOK_RATE_HZ)
     layout = looks.layout
     center, known = known_before(recording, found, looks, prior, gauge, gauge_std)
-    information = known
+    uncoupled, information = center, known
     start, touching = center, np.ones(len(at))
+    others: list[Alternative] = []
     if not quick:
         start, touching = touching_start(
             looks, lambda some: known_before(recording, found, some, prior, gauge, gauge_std)[0]
@@ -310,6 +312,16 @@ def _solve(
         center, information = coupled(center, known, layout, told, start)
 
     fit, weights, weight, independent = weighed(looks, center, information, start, touching, quick)
+    if not quick:
+        headings = stated_headings(recording, found, layout, prior)
+        free = layout.heading.start + np.flatnonzero([name not in headings for name in layout.sensors])
+
+        def known_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            begun = uncoupled.copy()
+            begun[free] = x[free]
+            return coupled(begun, known, layout, told, x)
+
+        others = alternatives(looks, known_at, fit, weights, independent, headings)
     lengths = fit.x[:K]
     if not quick and np.min(lengths) < 0.01:
         raise NoSolution(
@@ -320,7 +332,7 @@ def _solve(
     covariance = np.linalg.inv(fit.information)
     if not quick:
         learned = learned_of(fit, looks.layout, weights, covariance)
-        covariance = covariance_of(looks, fit, information, weights, weight)
+        covariance = spread_over(covariance_of(looks, fit, information, weights, weight), others, layout)
     order, joint = handed_on(layout, covariance)
     mounts = {name: _mount(found, fit.x, layout, name).as_quat() for name in layout.sensors}
     # Of sensors that are not in the chain the start pose has measured what it can.
@@ -340,9 +352,10 @@ def _solve(
     measured = {name: (value, gauge_std) for name, value in gauge.items()}
     measured |= {c.gauge: (c.metres, c.metres_std) for c in protocol.closures if c.gauge and c.gauge not in gauge}
     tapes = taped(fit, layout, measured)
-    free = None if scaling else scale_std
-    warnings = on_lengths(protocol, lengths, covariance[:K, :K], without_data, prior, free, tapes)
+    loose = None if scaling else scale_std
+    warnings = on_lengths(protocol, lengths, covariance[:K, :K], without_data, prior, loose, tapes)
     warnings += on_headings(protocol, layout, covariance, gauge)
+    warnings += on_others(others, layout)
     seen = {side: SIDES.index(side) for side in (layout.arms if looks.closed.any() else ())}
     axes = {side: np.array([x, 1.0, z]) for side, (x, z) in zip(SIDES, fit.x[layout.hinge].reshape(2, 2), strict=True)}
     hinge = {side: axes[side] / np.linalg.norm(axes[side]) for side in seen}
