@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .arguments import NonNegative, Positive
 from .errors import BadData
 from .noise import SensorNoise
 from .so3 import inlined, kernel
@@ -25,11 +26,11 @@ class StaticTest:
     The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite.
     """
 
-    window_s: float = 0.5  # [s] W
-    alpha: float = 2.0  # (1) gyro covariance against the still one
-    beta: float = 2.0  # (2) accel/g covariance against the still one
-    gamma1: float = 0.01  # (3) |mean ‖accel/g‖ − 1| at most
-    gamma2: float = 0.01  # (4) variance of ‖accel/g‖ at most
+    window_s: Positive = 0.5  # [s] W
+    alpha: NonNegative = 2.0  # (1) gyro covariance against the still one
+    beta: NonNegative = 2.0  # (2) accel/g covariance against the still one
+    gamma1: NonNegative = 0.01  # (3) |mean ‖accel/g‖ − 1| at most
+    gamma2: NonNegative = 0.01  # (4) variance of ‖accel/g‖ at most
 
     def samples(self, rate_hz: float) -> int:
         """N, the window in samples (at least 4: a covariance of three axes needs them)."""

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import so3
+from ..arguments import Positive, check_arguments
 from ..errors import BadData, BadOption, BadPhase, one_of
 from ..noise import SensorNoise, noise_of
 from ..static import StaticDetector, StaticTest
@@ -89,7 +90,7 @@ def check_method(method: str) -> str:
 def estimate_orientation(
     gyro_S: np.ndarray,
     accel_S: np.ndarray,
-    rate_hz: float,
+    rate_hz: Positive,
     *,
     method: str = BEST,
     still: tuple[float, float] | None,
@@ -116,7 +117,9 @@ def estimate_orientation(
     BadOption, BadData, BadPhase
         An unknown method; arrays that do not fit each other; a still phase outside the data.
     """
+    check_arguments(estimate_orientation, locals())
     check_method(method)
+    check_arguments(METHODS[method], {"params": params})
     try:
         gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
     except (TypeError, ValueError) as error:

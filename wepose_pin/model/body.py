@@ -10,6 +10,7 @@ from xml.parsers import expat
 
 import pinocchio as pin
 
+from ..arguments import check_arguments
 from ..assets import asset
 from ..errors import BadModel, MissingFile, one_of
 from . import lengths as _lengths
@@ -110,6 +111,7 @@ def load_model(
     MissingFile, BadModel
         Not there; not a URDF; no tree with one root; a table that names what is not there; no links for the segments.
     """
+    check_arguments(load_model, locals())
     path = Path(path) if path is not None else asset("urdf", DEFAULT_URDF)
     table: LinkTable | None = None
     if path.suffix.lower() == ".toml":

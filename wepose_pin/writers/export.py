@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..arguments import Positive, check_arguments
 from ..errors import BadData, BadOption, MissingFile, one_of
 from .bvh import write_bvh
 from .c3d import write_c3d
@@ -44,12 +45,12 @@ class Exported(NamedTuple):
 
 
 def export(
-    result: Path,
-    file: Path,
+    result: str | Path,
+    file: str | Path,
     format: str | None = None,
     *,
     names: str | None = None,
-    rate_hz: float | None = None,
+    rate_hz: Positive | None = None,
     force: bool = False,
     made_by: Mapping[str, Any] | None = None,
 ) -> Exported:
@@ -71,6 +72,8 @@ def export(
     ExistingOutput
         The file is there and `force` is not given, or it cannot be written.
     """
+    check_arguments(export, locals())
+    result, file = Path(result), Path(file)
     format = _format(file, format)
     if names is not None and format != "mot":
         raise BadOption(f"--names {names}: only a .mot has names to choose, and the format is {format}")
