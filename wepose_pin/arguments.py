@@ -53,10 +53,14 @@ def check_arguments(function: Any, arguments: Mapping[str, Any]) -> None:
     WeposeError
         What the `check` of an argument that has one raises.
     """
-    made_by = function.__init__ if isinstance(function, type) else function
+    made_by = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
     for name, hint in _hints(made_by).items():
-        if name in arguments:
-            check_value(name, arguments[name], hint)
+        if name not in arguments:
+            continue
+        value = arguments[name]
+        nan = isinstance(value, float) and math.isnan(value)
+        if not (nan and float in _options(hint)):  # which the function's own range refuses
+            check_value(name, value, hint)
 
 
 def check_fields(value: Any, place: str, kind: type | None = None) -> None:
@@ -131,11 +135,17 @@ def check_covariance(place: str, matrices: np.ndarray) -> None:
         raise BadData(f"{place} is not symmetric and positive semidefinite")
 
 
-def check_names(place: str, names: Collection[str], known: Collection[str]) -> None:
-    """Each name is one of those that are known."""
+def check_names(place: str, names: Collection[str], known: Collection[str], otherwise: str = "") -> None:
+    """Each name is one of those that are known; `otherwise` says what else it may need.
+
+    Raises
+    ------
+    BadOption
+        One is not.
+    """
     for name in names:
         if name not in known:
-            raise BadData(f"{place}: '{name}' is not known; {one_of(known, name)}")
+            raise BadOption(f"{place}: '{name}' is not known; {one_of(known, name)}{otherwise}")
 
 
 @cache

@@ -167,7 +167,8 @@ def check(recording: Recording) -> Recording:
         if getattr(recording, name) not in choices:
             raise BadOption(f"{where}: {name} = '{getattr(recording, name)}' is not known; {one_of(choices)}")
     if recording.start_pose != CONFIGURATION:  # else they are links
-        check_names(f"{where}: sensors", recording.sensors, SEGMENTS)
+        links = f'; a chain\'s links need start_pose = "{CONFIGURATION}"'
+        check_names(f"{where}: sensors", recording.sensors, SEGMENTS, links)
     if not recording.sensors:
         raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}")
     if len(time) < 2:

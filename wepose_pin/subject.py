@@ -13,7 +13,6 @@ import numpy as np
 
 from .arguments import (
     NonNegative,
-    Positive,
     check_arguments,
     check_array,
     check_covariance,
@@ -122,7 +121,7 @@ class Subject:
                 check_finite(f"{where}{name}", values)
                 if shape != (2,):
                     check_unit(f"{where}{name}", values, 1e-3)
-        except BadData as error:
+        except (BadData, BadOption) as error:
             raise BadSubject(str(error)) from None
         return self
 
@@ -178,16 +177,16 @@ def check_lengths(place: str, lengths: Mapping[str, float], names: Collection[st
 
     Raises
     ------
-    BadData
+    BadOption
         One has, or is, not.
     """
     check_names(place, lengths, names)
     for name, value in lengths.items():
         if not 0.0 < value < LONGEST:
-            raise BadData(f"{place}.{name} = {value:g}: a length in metres is needed, above 0 and below {LONGEST:g}")
+            raise BadOption(f"{place}.{name} = {value:g}: a length in metres is needed, above 0 and below {LONGEST:g}")
 
 
-def average_subject(stature: Positive | None = None, sex: str | None = None) -> Subject:
+def average_subject(stature: float | None = None, sex: str | None = None) -> Subject:
     """The anthropometric prior: mean lengths and their covariance over people.
 
     Lengths share the stature's spread where it is not given, left and right share the person's shape; numbers and

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import so3
-from ..arguments import Positive, check_arguments
+from ..arguments import check_arguments
 from ..errors import BadData, BadOption, BadPhase, one_of
 from ..noise import SensorNoise, noise_of
 from ..static import StaticDetector, StaticTest
@@ -90,7 +90,7 @@ def check_method(method: str) -> str:
 def estimate_orientation(
     gyro_S: np.ndarray,
     accel_S: np.ndarray,
-    rate_hz: Positive,
+    rate_hz: float,
     *,
     method: str = BEST,
     still: tuple[float, float] | None,

@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..arguments import NonNegative, Positive, check_arguments
+from ..arguments import check_arguments
 from ..errors import BadOption, NoSolution
 from ..pose import Pose
 from .collision import Shapes
@@ -96,10 +96,10 @@ def retarget(
     pose: Pose,
     robot: Robot | str | Path,
     *,
-    rate_hz: Positive = RATE_HZ,
+    rate_hz: float = RATE_HZ,
     tasks: Tasks | None = None,
-    scale: Positive | None = None,
-    smoothing_hz: NonNegative = SMOOTHING_HZ,
+    scale: float | None = None,
+    smoothing_hz: float = SMOOTHING_HZ,
     strict: bool = False,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> Trajectory:

@@ -211,7 +211,7 @@ def simulate(
 
     Raises
     ------
-    BadOption, BadData
+    BadOption
         A length is missing or not positive, the arms cannot do the motion, or a parameter is out of range.
     """
     check_arguments(simulate, locals())
