@@ -11,6 +11,7 @@ import os
 import threading
 from collections.abc import Iterable, Iterator
 from difflib import SequenceMatcher, get_close_matches
+from typing import Any
 
 LONGEST = 2000  # letters of an error's text
 _END = 500  # of these, what is kept of the end, where it says what would be right
@@ -56,8 +57,8 @@ class BadModel(WeposeError):
     """A URDF that cannot be read, or that is not the body this work needs."""
 
 
-class BadOption(WeposeError):
-    """An option's value is outside what it may be."""
+class BadOption(WeposeError, ValueError):
+    """An option or argument is not of the kind that is needed, or outside what it may be."""
 
 
 class BadSource(WeposeError):
@@ -70,6 +71,23 @@ class BadPlan(WeposeError):
 
 class LostWorker(WeposeError):
     """Workers died at an item, again and again: too little memory, say."""
+
+
+class CalibrationFailed(WeposeError):
+    """A calibration whose verdict is "fail": what it found must not be used unread.
+
+    Parameters
+    ----------
+    calibration, verdict : what was found, and what is wrong with it
+    """
+
+    def __init__(self, text: str, calibration: Any = None, verdict: Any = None) -> None:
+        super().__init__(text)
+        self.calibration, self.verdict = calibration, verdict
+
+
+class WeposeWarning(UserWarning):
+    """A result that can be used, but is worth less than it should be: what is wrong with it, and what to do."""
 
 
 class NoSolution(WeposeError):

@@ -24,14 +24,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import Filtered, filtered, heading_to, nominal_mount
+from ..arguments import Positive, check_arguments
 from ..errors import BadOption, BadPhase, BadSession, NoSolution, one_of
-from ..filters import BEST
+from ..filters import BEST, check_method
 from ..recording import Recording
 from ..subject import LENGTHS, Drift, Hinge, StartTilt, Subject, average_subject
 from .alternatives import Alternative, alternatives, on_others, spread_over
@@ -132,13 +132,6 @@ class Calibration:
         return arms(quat_WL, self.subject.lengths, float(gap))
 
 
-def calibrate(
-    recording: Recording, *, gauge: Mapping[str, float] | None = None, prior: Subject | None = None, **options: Any
-) -> Subject:
-    """The subject of a hands-together recording; options, and what else was found: see `calibrate_lengths`."""
-    return calibrate_lengths(recording, gauge=gauge, prior=prior, **options).subject
-
-
 def calibrate_lengths(
     recording: Recording,
     *,
@@ -146,7 +139,7 @@ def calibrate_lengths(
     prior: Subject | None = None,
     protocol: str | Protocol = "clasp",
     method: str = BEST,
-    gauge_std: float = GAUGE_STD,
+    gauge_std: Positive = GAUGE_STD,
 ) -> Calibration:
     """Link lengths with their covariance, and what was found beside them.
 
@@ -165,6 +158,8 @@ def calibrate_lengths(
     BadSession, BadPhase
         A sensor that the protocol needs is missing; there is no such phase.
     """
+    check_arguments(calibrate_lengths, locals())
+    check_method(method)
     if not isinstance(protocol, Protocol):
         protocol = load_protocol(protocol)
     gauge = dict(gauge or {})
@@ -173,8 +168,6 @@ def calibrate_lengths(
             raise BadOption(f"gauge {name}: not a length; {one_of((*LENGTHS, *protocol.gauges), name)}")
         if not 0.02 < value < 1.0:
             raise BadOption(f"gauge {name}={value:g}: a length in metres is needed, between 0.02 and 1.0")
-    if not gauge_std > 0.0:
-        raise BadOption(f"gauge_std={gauge_std:g}: a standard deviation in metres is needed, above 0")
     if len(set(gauge) & set(protocol.chain)) < protocol.taped:
         raise BadOption(
             f"protocol '{protocol.name}' needs {protocol.taped} taped length of its chain, as in --gauge "

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import so3
+from ..arguments import check_arguments
 from ..errors import BadData, BadOption, BadPhase, one_of
 from ..noise import SensorNoise, noise_of
 from ..static import StaticDetector, StaticTest
@@ -120,7 +121,9 @@ def estimate_orientation(
     BadOption, BadData, BadPhase
         An unknown method; arrays that do not fit each other; a still phase outside the data.
     """
+    check_arguments(estimate_orientation, locals())
     check_method(method)
+    check_arguments(METHODS[method], {"params": params})
     try:
         gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
     except (TypeError, ValueError) as error:

@@ -10,6 +10,7 @@ from xml.parsers import expat
 
 import pinocchio as pin
 
+from ..arguments import check_arguments
 from ..assets import asset
 from ..errors import BadModel, MissingFile, one_of
 from ..subject import average_subject
@@ -151,6 +152,7 @@ def load_model(
         Not there; not a URDF; no tree with one root; a table that names what is not there; no links for the segments;
         an arm without a joint that could move it.
     """
+    check_arguments(load_model, locals())
     path = Path(path) if path is not None else asset("urdf", DEFAULT_URDF)
     table: LinkTable | None = None
     if path.suffix.lower() == ".toml":

@@ -20,7 +20,6 @@ from ..recording import (
     Sensor,
     check,
     check_phases,
-    format_time,
 )
 from .arrays import ArrayFile, is_array_file
 from .clocks import (
