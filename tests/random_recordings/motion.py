@@ -1,0 +1,124 @@
+"""A person's motion as a function of time: activities one after another, joined smoothly, with sway and breath."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .activities import DEG, Activity
+from .curves import Curve, rise, wander
+from .people import SIDES, Person, joint_points, segment_origins
+
+STEP_S = 1e-3  # of the differences that give accelerations: truncation below 1e-3 m/s² at 2 Hz
+GRAVITY = 9.80665  # [m/s²]
+
+ANGLES = [f"{part}_{name}" for part in ("torso", "pelvis", "head") for name in ("yaw", "pitch", "roll")]
+ANGLES += [f"{side}_{name}" for side in SIDES for name in ("flex", "abd", "rot", "elbow", "pron", "wrist")]
+
+
+@dataclass
+class Motion:
+    """Activities with the times at which each begins, and the sway that lies over all.
+
+    `begins` [s] has one entry an activity, the first of them is not looked at: it lasted since ever. `joins` [s] is how
+    long the change to each takes. `stance` are angles by which this person's upright stance is off.
+    """
+
+    person: Person
+    activities: Sequence[Activity]
+    begins: Sequence[float]
+    joins: Sequence[float]
+    sway: dict[str, Curve]
+    stance: dict[str, float]
+    bending: frozenset[str] = frozenset()  # sides whose wrist bends; else the hand is in line with the forearm
+
+    def angles(self, t: np.ndarray) -> dict[str, np.ndarray]:
+        """All angles [rad] and root_x, _y, _z [m], each (n,)."""
+        weights = self._weights(t)
+        found = {name: np.zeros(len(t)) for name in [*ANGLES, "root_x", "root_y", "root_z"]}
+        calm, free = np.zeros(len(t)), np.ones(len(t))
+        heading = np.zeros(len(t))
+        for activity, weight in zip(self.activities, weights, strict=True):
+            on = np.flatnonzero(weight)
+            calm += weight * activity.calm
+            free -= weight * activity.exact
+            if activity.turn is not None:
+                heading += activity.turn(t)
+            if not len(on):
+                continue
+            for name, curve in activity.angles.items():
+                found[name][on] += weight[on] * curve(t[on])
+        for name, curve in self.sway.items():
+            found[name] += calm * curve(t) * (free if name.startswith(SIDES) else 1.0)
+        for name, value in self.stance.items():
+            found[name] += value * (free if name.startswith(SIDES) else 1.0)
+        found["torso_yaw"] += heading
+        found["pelvis_yaw"] += heading
+        return found
+
+    def _weights(self, t: np.ndarray) -> list[np.ndarray]:
+        up = [np.ones(len(t))]
+        up += [rise((t - begin) / join) for begin, join in zip(self.begins[1:], self.joins[1:], strict=True)]
+        return [a - b for a, b in zip(up, [*up[1:], np.zeros(len(t))], strict=True)]
+
+    def orientations(self, t: np.ndarray) -> dict[str, Rotation]:
+        """Segment → n rotations to the world."""
+        return self._orientations(self.angles(t))
+
+    def _orientations(self, a: dict[str, np.ndarray]) -> dict[str, Rotation]:
+        def turned(order: str, *angles: np.ndarray) -> Rotation:
+            return Rotation.from_euler(order, np.column_stack(angles))
+
+        R = {part: turned("ZYX", *(a[f"{part}_{name}"] for name in ("yaw", "pitch", "roll"))) for part in
+             ("torso", "pelvis")}
+        R["head"] = R["torso"] * turned("ZYX", a["head_yaw"], a["head_pitch"], a["head_roll"])
+        for side, out in zip(SIDES, (1.0, -1.0), strict=True):
+            upper = R["torso"] * turned("YXZ", -a[f"{side}_flex"], out * a[f"{side}_abd"], -out * a[f"{side}_rot"])
+            lower = upper * turned("YZ", -a[f"{side}_elbow"], -out * a[f"{side}_pron"])
+            R[f"{side}_upper_arm"], R[f"{side}_forearm"] = upper, lower
+            R[f"{side}_hand"] = lower * turned("Y", -a[f"{side}_wrist"] * (side in self.bending))
+        return R
+
+    def points(self, t: np.ndarray) -> dict[str, np.ndarray]:
+        """Joint centres and palms (n, 3) [m] from the root."""
+        return joint_points(self.person.lengths, self.orientations(t))
+
+    def at_sensors(
+        self, t: np.ndarray, places: dict[str, np.ndarray]
+    ) -> tuple[dict[str, Rotation], dict[str, np.ndarray]]:
+        """Orientations of segments, and specific force (n, 3) [m/s²] in the world where their sensors are."""
+        positions, R = [], {}
+        for shift in (-STEP_S, STEP_S, 0.0):
+            a = self.angles(t + shift)
+            R = self._orientations(a)
+            origins = segment_origins(self.person.lengths, R)
+            root = np.column_stack([a["root_x"], a["root_y"], a["root_z"]])
+            positions.append({s: root + origins[s] + R[s].apply(place) for s, place in places.items()})
+        before, after, now = positions
+        force = {
+            s: (before[s] - 2.0 * now[s] + after[s]) / STEP_S**2 + np.array([0.0, 0.0, GRAVITY]) for s in places
+        }
+        return {s: R[s] for s in places}, force
+
+
+def draw_sway(rng: np.random.Generator) -> tuple[dict[str, Curve], float]:
+    """Sway of someone who stands, and its size: root mean square rate [rad/s] of the trunk; and breath."""
+    size = rng.uniform(0.2, 0.6) * DEG
+    sway = {name: wander(rng, size) for name in ("torso_yaw", "torso_pitch", "torso_roll")}
+    sway |= {f"pelvis_{name}": wander(rng, 0.5 * size) for name in ("yaw", "pitch", "roll")}
+    sway |= {f"head_{name}": wander(rng, size) for name in ("yaw", "pitch")}
+    for side in SIDES:
+        sway |= {f"{side}_{name}": wander(rng, 0.6 * size) for name in ("flex", "abd", "rot", "elbow", "pron")}
+    sway["torso_pitch"].waves.append((0.25 * DEG, float(rng.uniform(0.2, 0.3)), float(rng.uniform(0, 6.28))))
+    return sway, size
+
+
+def draw_stance(rng: np.random.Generator) -> dict[str, float]:
+    """How this person's upright stance is off the ideal: a degree or two at each joint [rad]."""
+    parts = [name for name in ANGLES if not name.endswith(("elbow", "pelvis_yaw", "torso_yaw", "wrist"))]
+    return {name: float(rng.normal(0.0, 1.0 if name.startswith(("torso", "pelvis")) else 1.5)) * DEG for name in parts}
+
+
