@@ -193,11 +193,9 @@ def clasp(rng: np.random.Generator, person: Person, begin: float, end: float, sp
         for side, sign in zip(SIDES, (1.0, -1.0))
     }
     least = min(sum(lengths) for lengths in arm.values())
-    size = span * least * np.array([0.22, 0.4, 0.4])
-    path = [
-        Curve(0.0, [wave(rng, float(s) / 2.0, rng.uniform(0.06, 0.35)) for _ in range(2)]) for s in size
-    ]
-    middle = np.array([0.6 * least, 0.0, person.lengths["trunk"] - 0.25 * least])
+    size = span * least * np.array([0.2, 0.6, 1.1])
+    path = [Curve(0.0, [wave(rng, float(s) / 3.0, rng.uniform(0.1, 0.5)) for _ in range(3)]) for s in size]
+    middle = np.array([0.6 * least, 0.0, person.lengths["trunk"] - 0.1 * least])
     swivel = {side: Curve(rng.uniform(15, 45) * DEG, [wave(rng, 12 * span * DEG, rng.uniform(0.05, 0.3))]) for side in SIDES}
     pron = {
         side: Curve(rng.uniform(20, 50) * DEG, [wave(rng, 20 * span * DEG, rng.uniform(0.05, 0.3))]) for side in SIDES
@@ -222,7 +220,10 @@ def clasp(rng: np.random.Generator, person: Person, begin: float, end: float, sp
     for side in SIDES:
         angles |= {f"{side}_{name}": angle(side, name) for name in ("flex", "abd", "rot", "elbow")}
         angles[f"{side}_pron"] = pron[side]
-    return Activity("joins the hands", angles, exact=True)
+    for name, degrees in (("yaw", 20.0), ("pitch", 12.0), ("roll", 8.0)):
+        angles[f"torso_{name}"] = Curve(0.0, [wave(rng, span * degrees * DEG, rng.uniform(0.08, 0.25))])
+    detail = "" if span > 0.5 else "hardly moving them"
+    return Activity("joins the hands", angles, exact=True, detail=detail)
 
 
 def _palm(person: Person, side: str) -> float:

@@ -93,6 +93,10 @@ class Case:
     def stream(self, name: str) -> np.random.Generator:
         return stream(self.seed, name)
 
+    def noise(self, sensor: str) -> np.random.Generator:
+        """Random numbers of one sensor's errors, the same each time."""
+        return stream(self.seed, f"noise-{sensor}")
+
 
 def stream(seed: int, name: str) -> np.random.Generator:
     """Random numbers of one room of a seed."""
@@ -180,8 +184,9 @@ def _timeline(
         join = rng.uniform(0.9, 2.0)
         left = total - t - join
         if not clasped:
-            lasts = min(rng.uniform(25.0, 60.0), max(left, 8.0))
-            activity = clasp(rng, person, t, t + join + lasts)
+            lasts = min(rng.uniform(30.0, 65.0), max(left, 20.0))
+            moved = float(rng.choice([1.0, 0.2], p=[0.88, 0.12]))
+            activity = clasp(rng, person, t, t + join + lasts, moved)
             spans["clasp"] = (t + join + 0.1, t + join + lasts - 0.1)
             clasped = True
         elif left < 3.0:
@@ -344,6 +349,7 @@ def _swapped(case: Case, rng: np.random.Generator) -> None:
 def _orientations(case: Case, rng: np.random.Generator) -> None:
     if any(sensor.axes is None for sensor in case.worn.values()):
         return
+    case.options.discard("causal")  # where no filter runs, none runs causally
     for name, sensor in case.worn.items():
         if rng.random() < 0.5 or name == next(iter(case.worn)):
             sensor.orientation = float(rng.uniform(0.0, 1.0) * DEG)

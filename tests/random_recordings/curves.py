@@ -53,7 +53,7 @@ class Turn:
         return self.rate * (up - down)
 
 
-def wander(rng: np.random.Generator, rate_rms: float, slow: float = 0.05, fast: float = 0.5, count: int = 5) -> Curve:
+def wander(rng: np.random.Generator, rate_rms: float, slow: float = 0.08, fast: float = 0.5, count: int = 5) -> Curve:
     """A slow irregular wave whose derivative has this root mean square, of frequencies [Hz] between the two."""
     frequencies = np.exp(rng.uniform(np.log(slow), np.log(fast), count))
     share = rng.dirichlet(np.ones(count))

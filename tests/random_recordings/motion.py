@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from .activities import DEG, Activity
 from .curves import Curve, rise, wander
 from .people import SIDES, Person, joint_points, segment_origins
+from .quaternions import rotation, times, turned
 
 STEP_S = 1e-3  # of the differences that give accelerations: truncation below 1e-3 m/s² at 2 Hz
 GRAVITY = 9.80665  # [m/s²]
@@ -69,18 +70,19 @@ class Motion:
         return self._orientations(self.angles(t))
 
     def _orientations(self, a: dict[str, np.ndarray]) -> dict[str, Rotation]:
-        def turned(order: str, *angles: np.ndarray) -> Rotation:
-            return Rotation.from_euler(order, np.column_stack(angles))
-
-        R = {part: turned("ZYX", *(a[f"{part}_{name}"] for name in ("yaw", "pitch", "roll"))) for part in
-             ("torso", "pelvis")}
-        R["head"] = R["torso"] * turned("ZYX", a["head_yaw"], a["head_pitch"], a["head_roll"])
+        q = {
+            part: turned("ZYX", *(a[f"{part}_{name}"] for name in ("yaw", "pitch", "roll")))
+            for part in ("torso", "pelvis", "head")
+        }
+        q["head"] = times(q["torso"], q["head"])
         for side, out in zip(SIDES, (1.0, -1.0), strict=True):
-            upper = R["torso"] * turned("YXZ", -a[f"{side}_flex"], out * a[f"{side}_abd"], -out * a[f"{side}_rot"])
-            lower = upper * turned("YZ", -a[f"{side}_elbow"], -out * a[f"{side}_pron"])
-            R[f"{side}_upper_arm"], R[f"{side}_forearm"] = upper, lower
-            R[f"{side}_hand"] = lower * turned("Y", -a[f"{side}_wrist"] * (side in self.bending))
-        return R
+            arm = turned("YXZ", -a[f"{side}_flex"], out * a[f"{side}_abd"], -out * a[f"{side}_rot"])
+            q[f"{side}_upper_arm"] = times(q["torso"], arm)
+            lower = turned("YZ", -a[f"{side}_elbow"], -out * a[f"{side}_pron"])
+            q[f"{side}_forearm"] = times(q[f"{side}_upper_arm"], lower)
+            wrist = turned("Y", -a[f"{side}_wrist"] * (side in self.bending))
+            q[f"{side}_hand"] = times(q[f"{side}_forearm"], wrist)
+        return {name: rotation(value) for name, value in q.items()}
 
     def points(self, t: np.ndarray) -> dict[str, np.ndarray]:
         """Joint centres and palms (n, 3) [m] from the root."""

@@ -132,7 +132,7 @@ def _rigid(result: Result) -> dict[tuple[str, str], float]:
 
 
 def of_errors(
-    result: Result, case: Case, recorded: Recorded, stated: bool, method: str, shown: str
+    result: Result, case: Case, recorded: Recorded, stated: bool, shown: str
 ) -> tuple[Accuracy, Truth]:
     """Errors within six stated deviations, or a warning that names the cause."""
     truth = truth_at(case, result.time, recorded.origin, result.start, stated)
@@ -141,7 +141,10 @@ def of_errors(
     for name, quat in result.quat.items():
         error = (truth.R_WL[name].inv() * Rotation.from_quat(quat)).magnitude()
         over = np.maximum(error - truth.turned[name] - FLOOR_RAD, 0.0)
-        z = _z(over, result.quat_std.get(name), case, name, method, truth.R_WL[name], quat)
+        fused = case.worn[name].orientation
+        if result.quat_std.get(name) is None and fused is not None and not stated:
+            continue  # a calibrated mount's own error, of which the result says nothing
+        z = _z(over, result.quat_std.get(name), fused, truth.R_WL[name], quat)
         k = int(np.argmax(z))
         std = result.quat_std.get(name)
         stated_ = f" at ± {np.degrees(std[k]):.2f}" if std is not None else ""
@@ -166,14 +169,12 @@ def of_errors(
     return found, truth
 
 
-def _z(
-    over: np.ndarray, std: np.ndarray | None, case: Case, name: str, method: str, R: Rotation, quat: np.ndarray
-) -> np.ndarray:
+def _z(over: np.ndarray, std: np.ndarray | None, fused: float | None, R: Rotation, quat: np.ndarray) -> np.ndarray:
     """Error over what is stated, or over what may be expected where nothing is."""
     if std is not None:
         return over / (ALL_AXES * np.maximum(std, 1e-9))
-    if case.worn[name].orientation is not None:
-        return MOST_Z * over / (FUSED_RAD + case.worn[name].orientation)
+    if fused is not None:
+        return MOST_Z * over / (FUSED_RAD + fused)
     up = R.apply([0.0, 0.0, 1.0], inverse=True)
     seen = Rotation.from_quat(quat).apply([0.0, 0.0, 1.0], inverse=True)
     tilt = np.degrees(np.arccos(np.clip(np.sum(up * seen, axis=1), -1.0, 1.0)))

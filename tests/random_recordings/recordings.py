@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from .cases import Case
 from .people import joint_points
-from .sensors import Signals, axes_rotation, measure, peak_share
+from .sensors import Signals, Worn, axes_rotation, measure, peak_share
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 
@@ -68,12 +68,8 @@ def record(case: Case, variant: Variant | None = None) -> Recorded:
         t = begin + ahead + np.arange(n) / own_rate
         if clock.stamps == "uneven":
             t = t + 0.3 / own_rate * rng.uniform(-1.0, 1.0, n)
-        signals = {}
-        for name in group:
-            # A stream a sensor: the noise of one does not depend on which others are worn.
-            noise = case.stream(f"noise-{name}")
-            worn = {name: case.worn[name]}
-            signals |= _halved(case, worn, t, noise, v) if v.half > 1 else measure(case.motion, worn, t, noise)
+        worn = {name: case.worn[name] for name in group}
+        signals = _averaged(case, worn, t, v.half) if v.half > 1 else measure(case.motion, worn, t, case.noise)
         shares |= {name: peak_share(signals[name], case.worn[name].errors) for name in group}
         for begin_gap, lasts, segment in clock.lost:
             away = (t >= begin_gap) & (t < begin_gap + lasts)
@@ -97,8 +93,6 @@ def record(case: Case, variant: Variant | None = None) -> Recorded:
         axes[name] = sensor.axes
     shift = origin if clock.stamps != "none" else -begin
     made = Recorded(tables, axes, _moved(case.start, shift), _moved(case.clasp, shift), shift, shares)
-    for of, its in case.shared_columns.items():
-        made.tables[0].signals = dict(made.tables[0].signals)
     if case.shared_columns:
         whole = {name: table.signals[name] for table in made.tables for name in table.signals}
         for table in made.tables:
@@ -130,19 +124,22 @@ def _stamp_errors(kind: str, t: np.ndarray, rate_hz: float, rng: np.random.Gener
     return np.zeros(len(t))
 
 
-def _halved(case: Case, worn: dict, t: np.ndarray, rng: np.random.Generator, v: Variant) -> dict[str, Signals]:
-    """Samples whose noise is that of `v.half` times the rate, averaged: what a finer recording would give, thinned."""
-    fine = np.linspace(t[0] - (t[1] - t[0]) * (1.0 - 1.0 / v.half), t[-1], v.half * len(t))
-    quiet = {name: replace(s, errors=replace(s.errors, gyro_noise=0.0, accel_noise=0.0, gyro_walk=0.0, bits=40)) for name, s in worn.items()}
-    clean = measure(case.motion, quiet, fine, np.random.default_rng(0))
-    full = measure(case.motion, {n: replace(s, errors=replace(s.errors, bits=40)) for n, s in worn.items()}, fine, rng)
-    coarse = measure(case.motion, quiet, t, np.random.default_rng(0))
+def _averaged(case: Case, worn: dict[str, Worn], t: np.ndarray, times: int) -> dict[str, Signals]:
+    """Samples whose noise is that of so many times the rate, averaged: what a finer recording would give, thinned."""
+    step = (t[1] - t[0]) / times
+    fine = t[0] - (t[1] - t[0]) + step * np.arange(1, times * len(t) + 1)
+    errors = {name: replace(s, errors=replace(s.errors, bits=40)) for name, s in worn.items()}
+    quiet = {
+        name: replace(s, errors=replace(s.errors, gyro_noise=0.0, accel_noise=0.0, gyro_walk=0.0))
+        for name, s in errors.items()
+    }
+    noisy, clean = (measure(case.motion, of, fine, case.noise) for of in (errors, quiet))
+    coarse = measure(case.motion, quiet, t, case.noise)
     for name, signals in coarse.items():
-        if signals.quat is not None:
-            continue
-        for of in ("gyro", "accel"):
-            noise = (getattr(full[name], of) - getattr(clean[name], of)).reshape(len(t), v.half, 3).mean(axis=1)
-            setattr(signals, of, getattr(signals, of) + noise)
+        if signals.quat is None:
+            for of in ("gyro", "accel"):
+                noise = (getattr(noisy[name], of) - getattr(clean[name], of)).reshape(len(t), times, 3).mean(axis=1)
+                setattr(signals, of, getattr(signals, of) + noise)
     return coarse
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -83,14 +83,19 @@ def axes_rotation(up: str, forward: str) -> Rotation:
     return Rotation.from_matrix(np.array([x, np.cross(z, x), z]))
 
 
-def measure(motion: Motion, worn: Mapping[str, Worn], t: np.ndarray, rng: np.random.Generator) -> dict[str, Signals]:
-    """What sensors give that sample at the times `t` (n,) [s]; a stretch before each is seen too."""
+def measure(
+    motion: Motion, worn: Mapping[str, Worn], t: np.ndarray, chance: Callable[[str], np.random.Generator]
+) -> dict[str, Signals]:
+    """What sensors give that sample at the times `t` (n,) [s]; a stretch before each is seen too.
+
+    `chance` gives each sensor random numbers of its own, that do not depend on which others are worn.
+    """
     before = np.concatenate([[2.0 * t[0] - t[1]], t])
     R, force = motion.at_sensors(before, {name: sensor.place for name, sensor in worn.items()})
     dt = np.diff(before)
     found = {}
     for name, sensor in worn.items():
-        R_WS = R[name] * sensor.mount
+        rng, R_WS = chance(name), R[name] * sensor.mount
         if sensor.orientation is not None:
             found[name] = Signals(quat=_fused(R_WS[1:], sensor.orientation, t, rng))
             continue

@@ -118,7 +118,7 @@ class Trial:
         if self.subject_failed or "swapped" in case.suspects.values():
             return
         stated = self.subject is None
-        accuracy, truth = of_errors(self.result, case, self.recorded, stated, case.method, shown)
+        accuracy, truth = of_errors(self.result, case, self.recorded, stated, shown)
         self.report.failures += accuracy.failures
         self.report.accuracy = _rounded(accuracy) | {"method": case.method}
         worn = {name: R.as_quat() for name, R in truth.R_WL.items() if name in case.worn}
