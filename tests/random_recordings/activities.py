@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .curves import Curve, Function, Turn, wander, wave
+from .curves import Curve, Function, Steady, wave
 from .people import SIDES, Person
 
 DEG = np.pi / 180.0
@@ -20,14 +20,14 @@ DEG = np.pi / 180.0
 
 @dataclass
 class Activity:
-    """Angles by name while it lasts; `turn` adds to the heading for good; `calm` is the share of usual sway left.
+    """Angles by name while it lasts; `for_good` adds to heading or root_x from then on; `calm`: the usual sway's share.
 
     `exact`: the arms are where `angles` say, without sway or the stance's own angles.
     """
 
     name: str
     angles: dict[str, Function] = field(default_factory=dict)
-    turn: Turn | None = None
+    for_good: dict[str, Function] = field(default_factory=dict)
     calm: float = 1.0
     detail: str = ""
     exact: bool = False
@@ -111,7 +111,6 @@ def swing(rng: np.random.Generator, person: Person, begin: float, end: float) ->
 def walk(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
     step, phase = rng.uniform(1.6, 2.1), rng.uniform(0, 2 * np.pi)
     angles: dict[str, Function] = {
-        "root_x": Curve(0.0, [], [(begin, end - begin, 1.2 * (end - begin) * rng.uniform(0.5, 0.8))]),
         "root_z": Curve(0.0, [(0.02, step, 2 * phase)]),
         "torso_yaw": Curve(0.0, [(4 * DEG, step / 2, phase)]),
         "pelvis_yaw": Curve(0.0, [(-5 * DEG, step / 2, phase)]),
@@ -120,7 +119,8 @@ def walk(rng: np.random.Generator, person: Person, begin: float, end: float) -> 
     for side, sign in zip(SIDES, (1.0, -1.0)):
         angles[f"{side}_flex"] = Curve(5 * DEG, [(sign * rng.uniform(12, 25) * DEG, step / 2, phase)])
         angles[f"{side}_elbow"] = Curve(20 * DEG, [(sign * 8 * DEG, step / 2, phase)])
-    return Activity("walks", angles)
+    way = {"root_x": Steady(begin, end, 1.0, rng.uniform(0.6, 1.4))}
+    return Activity("walks", angles, way)
 
 
 def drum(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
@@ -180,9 +180,10 @@ def turn_on_spot(rng: np.random.Generator, person: Person, begin: float, end: fl
     on_chair = rng.random() < 0.6
     activity = (sit if on_chair else stand)(rng, person, begin, end)
     rate = float(np.exp(rng.uniform(np.log(2.0), np.log(180.0 if on_chair else 60.0))) * rng.choice([-1, 1]))
-    turn = Turn(begin + 0.5, end - 0.5, min(rng.uniform(0.3, 1.5), (end - begin - 1.0) / 3.0), rate * DEG)
+    turn = Steady(begin + 0.5, end - 0.5, min(rng.uniform(0.3, 1.5), (end - begin - 1.0) / 3.0), rate * DEG)
     where = "on an office chair" if on_chair else "on foot"
-    return Activity("turns on the spot", activity.angles, turn, rng.uniform(0.1, 0.5), f"{where}, {rate:.1f} deg/s")
+    about = f"{where}, {rate:.1f} deg/s"
+    return Activity("turns on the spot", activity.angles, {"heading": turn}, rng.uniform(0.1, 0.5), about)
 
 
 def clasp(rng: np.random.Generator, person: Person, begin: float, end: float, span: float = 1.0) -> Activity:

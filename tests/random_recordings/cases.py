@@ -103,14 +103,18 @@ def stream(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
-def draw_case(seed: int) -> Case:
-    """The case of a seed: always the same."""
+def draw_case(seed: int, seconds: float | None = None) -> Case:
+    """The case of a seed: always the same. With `seconds`, one as long as that, at 25 to 100 Hz, wholly ordinary."""
     person = draw_person(stream(seed, "person"))
     clock = _clock(stream(seed, "clock"))
     rng = stream(seed, "motion")
-    calibrates = rng.random() < 0.35
+    calibrates = rng.random() < 0.35 and seconds is None
+    if seconds is not None:
+        clock = Clock(float(rng.choice([25.0, 50.0, 100.0])), "even", clock.origin)
     sensors = _segments(stream(seed, "segments"), calibrates)
-    activities, begins, joins, spans, duration, in_motion = _timeline(rng, person, clock.rate_hz, calibrates)
+    activities, begins, joins, spans, duration, in_motion = _timeline(
+        rng, person, clock.rate_hz, calibrates, seconds
+    )
     sway, size = draw_sway(stream(seed, "sway"))
     bending = frozenset(side for side in SIDES if f"{side}_hand" in sensors)
     motion = Motion(person, activities, begins, joins, sway, draw_stance(stream(seed, "stance")), bending)
@@ -128,7 +132,8 @@ def draw_case(seed: int) -> Case:
         f"start pose stated {spans['start'][0]:.2f} to {spans['start'][1]:.2f} s",
     ]
     _commands(case, stream(seed, "commands"))
-    _oddities(case, stream(seed, "oddities"))
+    if seconds is None:
+        _oddities(case, stream(seed, "oddities"))
     case.about.append(f"by {case.method} {' '.join(sorted(case.options))}, then {', '.join(case.steps)}")
     return case
 
@@ -159,11 +164,12 @@ def _segments(rng: np.random.Generator, calibrates: bool) -> tuple[str, ...]:
 
 
 def _timeline(
-    rng: np.random.Generator, person: Person, rate_hz: float, calibrates: bool
+    rng: np.random.Generator, person: Person, rate_hz: float, calibrates: bool, seconds: float | None
 ) -> tuple[list[Activity], list[float], list[float], dict[str, tuple[float, float]], float, bool]:
     """Activities with begins and joins [s], the spans of the phases, the duration, whether it begins in motion."""
     most = MOST_SAMPLES / rate_hz
     total = min(most, float(np.exp(rng.uniform(np.log(25.0), np.log(150.0)))))
+    total = total if seconds is None else seconds
     held = float(np.exp(rng.uniform(np.log(0.6), np.log(10.0))))
     held = min(held, 0.4 * total)
     in_motion = bool(rng.random() < 0.25) and total > 20.0

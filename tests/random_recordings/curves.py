@@ -40,8 +40,8 @@ class Curve:
 
 
 @dataclass
-class Turn:
-    """An angle that grows at `rate` [rad/s] from `begin` to `end` [s], the rate rising and falling within `ramp` [s]."""
+class Steady:
+    """What grows at `rate` [1/s] from `begin` to `end` [s], the rate rising and falling within `ramp` [s]."""
 
     begin: float
     end: float

@@ -38,32 +38,35 @@ class Motion:
 
     def angles(self, t: np.ndarray) -> dict[str, np.ndarray]:
         """All angles [rad] and root_x, _y, _z [m], each (n,)."""
-        weights = self._weights(t)
-        found = {name: np.zeros(len(t)) for name in [*ANGLES, "root_x", "root_y", "root_z"]}
+        found = {name: np.zeros(len(t)) for name in [*ANGLES, "heading", "root_x", "root_y", "root_z"]}
         calm, free = np.zeros(len(t)), np.ones(len(t))
-        heading = np.zeros(len(t))
-        for activity, weight in zip(self.activities, weights, strict=True):
+        for k, activity in enumerate(self.activities):
+            if k == 0 or self.begins[k] < t.max():
+                for name, lasting in activity.for_good.items():
+                    found[name] += lasting(t)
+            weight = self._begun(k, t) - self._begun(k + 1, t)
             on = np.flatnonzero(weight)
-            calm += weight * activity.calm
-            free -= weight * activity.exact
-            if activity.turn is not None:
-                heading += activity.turn(t)
             if not len(on):
                 continue
+            calm += weight * activity.calm
+            free -= weight * activity.exact
             for name, curve in activity.angles.items():
                 found[name][on] += weight[on] * curve(t[on])
         for name, curve in self.sway.items():
             found[name] += calm * curve(t) * (free if name.startswith(SIDES) else 1.0)
         for name, value in self.stance.items():
             found[name] += value * (free if name.startswith(SIDES) else 1.0)
-        found["torso_yaw"] += heading
-        found["pelvis_yaw"] += heading
+        found["torso_yaw"] += found["heading"]
+        found["pelvis_yaw"] += found["heading"]
         return found
 
-    def _weights(self, t: np.ndarray) -> list[np.ndarray]:
-        up = [np.ones(len(t))]
-        up += [rise((t - begin) / join) for begin, join in zip(self.begins[1:], self.joins[1:], strict=True)]
-        return [a - b for a, b in zip(up, [*up[1:], np.zeros(len(t))], strict=True)]
+    def _begun(self, k: int, t: np.ndarray) -> np.ndarray:
+        """How far the change to the k-th activity has come (n,), 0 to 1."""
+        if k == len(self.activities) or (k > 0 and self.begins[k] > t.max()):
+            return np.zeros(len(t))
+        if k == 0 or self.begins[k] + self.joins[k] < t.min():
+            return np.ones(len(t))
+        return rise((t - self.begins[k]) / self.joins[k])
 
     def orientations(self, t: np.ndarray) -> dict[str, Rotation]:
         """Segment → n rotations to the world."""
@@ -87,6 +90,10 @@ class Motion:
     def points(self, t: np.ndarray) -> dict[str, np.ndarray]:
         """Joint centres and palms (n, 3) [m] from the root."""
         return joint_points(self.person.lengths, self.orientations(t))
+
+    def origins(self, t: np.ndarray) -> dict[str, np.ndarray]:
+        """Where each segment's frame sits (n, 3) [m], from the root."""
+        return segment_origins(self.person.lengths, self.orientations(t))
 
     def at_sensors(
         self, t: np.ndarray, places: dict[str, np.ndarray]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from .motion import GRAVITY, Motion
 
 DEG = np.pi / 180.0
-FAULTS = ("dead", "stuck", "frozen", "lost")
+BLOCK = 1 << 13  # samples
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def measure(
     `chance` gives each sensor random numbers of its own, that do not depend on which others are worn.
     """
     before = np.concatenate([[2.0 * t[0] - t[1]], t])
-    R, force = motion.at_sensors(before, {name: sensor.place for name, sensor in worn.items()})
+    R, force = _in_blocks(motion, before, {name: sensor.place for name, sensor in worn.items()})
     dt = np.diff(before)
     found = {}
     for name, sensor in worn.items():
@@ -104,6 +104,17 @@ def measure(
         signals = with_errors(rate, accel, dt, sensor.errors, rng)
         found[name] = with_fault(signals, sensor, t)
     return found
+
+
+def _in_blocks(
+    motion: Motion, t: np.ndarray, places: dict[str, np.ndarray]
+) -> tuple[dict[str, Rotation], dict[str, np.ndarray]]:
+    """As `Motion.at_sensors`, some minutes at once: of a long recording each sees only the activities of its time."""
+    parts = [motion.at_sensors(t[first : first + BLOCK], places) for first in range(0, len(t), BLOCK)]
+    return (
+        {name: Rotation.concatenate([R[name] for R, _ in parts]) for name in places},
+        {name: np.concatenate([force[name] for _, force in parts]) for name in places},
+    )
 
 
 def _fused(R_WS: Rotation, size: float, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
