@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_recordings.activities import ACTIVITIES, clasp, stand
+from random_recordings.activities import ACTIVITIES, Scene, clasp, stand
 from random_recordings.cases import draw_case
 from random_recordings.motion import Motion, draw_stance, draw_sway
 from random_recordings.people import CORE, draw_person
@@ -46,8 +46,12 @@ def test_the_force_belongs_to_the_motion(name: str) -> None:
     rng = np.random.default_rng(7)
     person = draw_person(rng)
     motion = Motion(
-        person, [stand(rng, person, 0.0, 2.0), ACTIVITIES[name][0](rng, person, 2.0, 12.0)], [0.0, 2.0], [1.0, 2.0],
-        draw_sway(rng)[0], draw_stance(rng),
+        person,
+        [stand(Scene(rng, person, 0.0, 2.0)), ACTIVITIES[name][0](Scene(rng, person, 2.0, 12.0))],
+        [0.0, 2.0],
+        [1.0, 2.0],
+        draw_sway(rng)[0],
+        draw_stance(rng),
     )
     t = np.arange(1.0, 8.0, 1e-3)
     place = {segment: np.array([0.02, 0.01, -0.1]) for segment in CORE}
@@ -65,7 +69,7 @@ def test_joined_palms_are_one_place() -> None:
     rng = np.random.default_rng(3)
     for _ in range(5):
         person = draw_person(rng)
-        activities = [stand(rng, person, 0.0, 2.0), clasp(rng, person, 2.0, 40.0)]
+        activities = [stand(Scene(rng, person, 0.0, 2.0)), clasp(Scene(rng, person, 2.0, 40.0))]
         motion = Motion(person, activities, [0.0, 2.0], [1.0, 1.5], draw_sway(rng)[0], draw_stance(rng))
         points = motion.points(np.linspace(4.0, 39.0, 500))
         np.testing.assert_allclose(points["left_palm"], points["right_palm"], atol=1e-9)

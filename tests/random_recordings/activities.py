@@ -26,17 +26,27 @@ class Activity:
     """
 
     name: str
-    angles: dict[str, Function] = field(default_factory=dict)
-    for_good: dict[str, Function] = field(default_factory=dict)
+    angles: Mapping[str, Function] = field(default_factory=dict)
+    for_good: Mapping[str, Function] = field(default_factory=dict)
     calm: float = 1.0
     detail: str = ""
     exact: bool = False
 
 
-Draw = Callable[[np.random.Generator, Person, float, float], Activity]
+@dataclass(frozen=True)
+class Scene:
+    """Chance, the person, and from when to when [s] an activity lasts."""
+
+    rng: np.random.Generator
+    person: Person
+    begin: float
+    end: float
 
 
-def _arms(rng: np.random.Generator, **mean_deg: tuple[float, float]) -> dict[str, Function]:
+Draw = Callable[[Scene], Activity]
+
+
+def _arms(rng: np.random.Generator, **mean_deg: tuple[float, float]) -> dict[str, Curve]:
     """Both arms alike but for a few degrees."""
     return {
         f"{side}_{name}": Curve(rng.uniform(low, high) * DEG)
@@ -45,163 +55,176 @@ def _arms(rng: np.random.Generator, **mean_deg: tuple[float, float]) -> dict[str
     }
 
 
-def stand(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    return Activity("stands", {f"{side}_elbow": Curve(abs(rng.normal(0.0, 2.0)) * DEG) for side in SIDES})
+def stand(scene: Scene) -> Activity:
+    return Activity("stands", {f"{side}_elbow": Curve(abs(scene.rng.normal(0.0, 2.0)) * DEG) for side in SIDES})
 
 
-def sit(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    angles = _arms(rng, flex=(15, 40), abd=(5, 20), elbow=(50, 90), pron=(0, 50))
-    angles |= {"root_z": Curve(-0.25 * person.stature), "torso_pitch": Curve(rng.uniform(-5, 15) * DEG)}
-    return Activity("sits", angles, calm=0.6)
+def _seated(scene: Scene) -> dict[str, Curve]:
+    angles = _arms(scene.rng, flex=(15, 40), abd=(5, 20), elbow=(50, 90), pron=(0, 50))
+    angles |= {"root_z": Curve(-0.25 * scene.person.stature), "torso_pitch": Curve(scene.rng.uniform(-5, 15) * DEG)}
+    return angles
 
 
-def lie(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    on = str(rng.choice(["back", "right side"]))
+def sit(scene: Scene) -> Activity:
+    return Activity("sits", _seated(scene), calm=0.6)
+
+
+def lie(scene: Scene) -> Activity:
+    on = str(scene.rng.choice(["back", "right side"]))
     pitch, roll = (-90.0, 0.0) if on == "back" else (0.0, 90.0)
-    angles = _arms(rng, flex=(0, 30), abd=(5, 30), elbow=(5, 60))
+    angles = _arms(scene.rng, flex=(0, 30), abd=(5, 30), elbow=(5, 60))
     for part in ("torso", "pelvis"):
-        angles |= {f"{part}_pitch": Curve((pitch + rng.normal(0, 3)) * DEG), f"{part}_roll": Curve(roll * DEG)}
-    angles["root_z"] = Curve(-0.5 * person.stature)
+        angles |= {f"{part}_pitch": Curve((pitch + scene.rng.normal(0, 3)) * DEG), f"{part}_roll": Curve(roll * DEG)}
+    angles["root_z"] = Curve(-0.5 * scene.person.stature)
     return Activity("lies", angles, calm=0.15, detail=f"on the {on}")
 
 
-def sleep(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    activity = lie(rng, person, begin, end)
+def sleep(scene: Scene) -> Activity:
+    activity = lie(scene)
     return Activity("sleeps", activity.angles, calm=0.02, detail=activity.detail)
 
 
-def type_(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    angles = sit(rng, person, begin, end).angles | _arms(rng, elbow=(80, 100), pron=(50, 75))
+def type_(scene: Scene) -> Activity:
+    angles = _seated(scene) | _arms(scene.rng, elbow=(80, 100), pron=(50, 75))
     for side in SIDES:
         pron, flex = angles[f"{side}_pron"], angles[f"{side}_flex"]
-        assert isinstance(pron, Curve) and isinstance(flex, Curve)
-        pron.waves += [wave(rng, rng.uniform(0.5, 2.0) * DEG, rng.uniform(2.0, 6.0)) for _ in range(2)]
-        flex.waves += [wave(rng, rng.uniform(0.1, 0.5) * DEG, rng.uniform(0.3, 2.0)) for _ in range(2)]
+        pron.waves += [
+            wave(scene.rng, scene.rng.uniform(0.5, 2.0) * DEG, scene.rng.uniform(2.0, 6.0)) for _ in range(2)
+        ]
+        flex.waves += [
+            wave(scene.rng, scene.rng.uniform(0.1, 0.5) * DEG, scene.rng.uniform(0.3, 2.0)) for _ in range(2)
+        ]
     return Activity("types", angles, calm=0.5)
 
 
-def read(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    angles = sit(rng, person, begin, end).angles | _arms(rng, flex=(30, 50), elbow=(80, 110), rot=(10, 30))
-    angles["head_pitch"] = Curve(rng.uniform(15, 35) * DEG, [wave(rng, 2 * DEG, 0.2)])
+def read(scene: Scene) -> Activity:
+    angles = _seated(scene) | _arms(scene.rng, flex=(30, 50), elbow=(80, 110), rot=(10, 30))
+    angles["head_pitch"] = Curve(scene.rng.uniform(15, 35) * DEG, [wave(scene.rng, 2 * DEG, 0.2)])
     return Activity("reads", angles, calm=0.4)
 
 
-def overhead(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    angles = _arms(rng, flex=(150, 172), elbow=(5, 40), rot=(-20, 20))
+def overhead(scene: Scene) -> Activity:
+    angles = _arms(scene.rng, flex=(150, 172), elbow=(5, 40), rot=(-20, 20))
     for side in SIDES:
         curve = angles[f"{side}_flex"]
-        assert isinstance(curve, Curve)
-        curve.waves += [wave(rng, rng.uniform(1, 6) * DEG, rng.uniform(0.1, 0.8))]
+        curve.waves += [wave(scene.rng, scene.rng.uniform(1, 6) * DEG, scene.rng.uniform(0.1, 0.8))]
     return Activity("arms overhead", angles)
 
 
-def swing(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    frequency, amplitude = rng.uniform(1.2, 1.6), rng.uniform(55, 85)
-    phase = rng.uniform(0, 2 * np.pi)
-    both = rng.random() < 0.5
+def swing(scene: Scene) -> Activity:
+    frequency, amplitude = scene.rng.uniform(1.2, 1.6), scene.rng.uniform(55, 85)
+    phase = scene.rng.uniform(0, 2 * np.pi)
+    both = scene.rng.random() < 0.5
     angles: dict[str, Function] = {}
     for side in SIDES:
         opposite = 0.0 if both or side == "left" else np.pi
         angles[f"{side}_flex"] = Curve(20 * DEG, [(amplitude * DEG, frequency, phase + opposite)])
-        angles[f"{side}_elbow"] = Curve(rng.uniform(5, 25) * DEG)
+        angles[f"{side}_elbow"] = Curve(scene.rng.uniform(5, 25) * DEG)
     peak = amplitude * 2 * np.pi * frequency
     return Activity("swings the arms", angles, detail=f"{frequency:.1f} Hz, {peak:.0f} deg/s")
 
 
-def walk(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    step, phase = rng.uniform(1.6, 2.1), rng.uniform(0, 2 * np.pi)
+def walk(scene: Scene) -> Activity:
+    step, phase = scene.rng.uniform(1.6, 2.1), scene.rng.uniform(0, 2 * np.pi)
     angles: dict[str, Function] = {
         "root_z": Curve(0.0, [(0.02, step, 2 * phase)]),
         "torso_yaw": Curve(0.0, [(4 * DEG, step / 2, phase)]),
         "pelvis_yaw": Curve(0.0, [(-5 * DEG, step / 2, phase)]),
         "torso_pitch": Curve(3 * DEG, [(1.0 * DEG, step, phase)]),
     }
-    for side, sign in zip(SIDES, (1.0, -1.0)):
-        angles[f"{side}_flex"] = Curve(5 * DEG, [(sign * rng.uniform(12, 25) * DEG, step / 2, phase)])
+    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+        angles[f"{side}_flex"] = Curve(5 * DEG, [(sign * scene.rng.uniform(12, 25) * DEG, step / 2, phase)])
         angles[f"{side}_elbow"] = Curve(20 * DEG, [(sign * 8 * DEG, step / 2, phase)])
-    way = {"root_x": Steady(begin, end, 1.0, rng.uniform(0.6, 1.4))}
+    way = {"root_x": Steady(scene.begin, scene.end, 1.0, scene.rng.uniform(0.6, 1.4))}
     return Activity("walks", angles, way)
 
 
-def drum(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    angles = _arms(rng, flex=(15, 30), abd=(5, 20), elbow=(75, 95), pron=(40, 70))
+def drum(scene: Scene) -> Activity:
+    angles = _arms(scene.rng, flex=(15, 30), abd=(5, 20), elbow=(75, 95), pron=(40, 70))
     for side in SIDES:
         curve = angles[f"{side}_elbow"]
-        assert isinstance(curve, Curve)
-        curve.waves += [wave(rng, rng.uniform(8, 20) * DEG, rng.uniform(2.5, 4.5))]
+        curve.waves += [wave(scene.rng, scene.rng.uniform(8, 20) * DEG, scene.rng.uniform(2.5, 4.5))]
     return Activity("drums", angles)
 
 
-def throw(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    side = str(rng.choice(SIDES))
+def throw(scene: Scene) -> Activity:
+    side = str(scene.rng.choice(SIDES))
     flex, elbow, yaw = Curve(-20 * DEG), Curve(90 * DEG), Curve(0.0)
-    t, fastest = begin + 1.0, 1.0
-    while t < end - 2.5:
-        duration = rng.uniform(0.25, 0.5)
+    t, fastest = scene.begin + 1.0, 1.0
+    while t < scene.end - 2.5:
+        duration = scene.rng.uniform(0.25, 0.5)
         fastest = min(fastest, duration)
-        for curve, size in ((flex, rng.uniform(110, 150)), (elbow, -rng.uniform(50, 80)), (yaw, rng.uniform(10, 30))):
+        for curve, size in (
+            (flex, scene.rng.uniform(110, 150)),
+            (elbow, -scene.rng.uniform(50, 80)),
+            (yaw, scene.rng.uniform(10, 30)),
+        ):
             curve.moves += [(t, duration, size * DEG), (t + duration + 0.2, 1.2, -size * DEG)]
-        t += duration + rng.uniform(1.5, 4.0)
+        t += duration + scene.rng.uniform(1.5, 4.0)
     angles: dict[str, Function] = {f"{side}_flex": flex, f"{side}_elbow": elbow, "torso_yaw": yaw}
     return Activity("throws", angles, detail=f"{side} arm, within {fastest:.2f} s")
 
 
-def reach(rng: np.random.Generator, person: Person, begin: float, end: float, hanging: str = "") -> Activity:
+def reach(scene: Scene, hanging: str = "") -> Activity:
     """Moves from place to place, with or without pauses."""
     limits = {"flex": (-20, 130), "abd": (0, 60), "rot": (-30, 40), "elbow": (5, 120), "pron": (-30, 60)}
     limits |= {"wrist": (-20, 30)}
-    pause = rng.choice([0.1, 1.0, 5.0])
+    pause = scene.rng.choice([0.1, 1.0, 5.0])
     names = [(side, name, of) for side in SIDES if side != hanging for name, of in limits.items()]
-    curves = {f"{side}_{name}": Curve(rng.uniform(*of) * DEG * 0.3) for side, name, of in names}
+    curves = {f"{side}_{name}": Curve(scene.rng.uniform(*of) * DEG * 0.3) for side, name, of in names}
     trunk = {"torso_yaw": (-30, 30), "torso_pitch": (-5, 25), "torso_roll": (-10, 10), "head_yaw": (-50, 50)}
     curves |= {name: Curve(0.0) for name in trunk}
     at = {name: curve.constant for name, curve in curves.items()}
     spans = {f"{side}_{name}": of for side, name, of in names} | trunk
-    t = begin
-    while t < end:
-        duration = rng.uniform(0.5, 1.8)
+    t = scene.begin
+    while t < scene.end:
+        duration = scene.rng.uniform(0.5, 1.8)
         for name, (low, high) in spans.items():
-            if rng.random() < (0.6 if "_" in name and name.split("_")[0] in SIDES else 0.25):
-                target = rng.uniform(low, high) * DEG
+            if scene.rng.random() < (0.6 if "_" in name and name.split("_")[0] in SIDES else 0.25):
+                target = scene.rng.uniform(low, high) * DEG
                 curves[name].moves.append((t, duration, target - at[name]))
                 at[name] = target
-        t += duration + rng.exponential(pause)
+        t += duration + scene.rng.exponential(pause)
     return Activity("reaches about", dict(curves))
 
 
-def one_arm_hangs(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
-    side = str(rng.choice(SIDES))
-    activity = reach(rng, person, begin, end, hanging=side)
+def one_arm_hangs(scene: Scene) -> Activity:
+    side = str(scene.rng.choice(SIDES))
+    activity = reach(scene, hanging=side)
     return Activity("works with one arm", activity.angles, detail=f"the {side} one hangs")
 
 
-def turn_on_spot(rng: np.random.Generator, person: Person, begin: float, end: float) -> Activity:
+def turn_on_spot(scene: Scene) -> Activity:
     """An office chair, or slowly on foot: a steady rate about the vertical, either way."""
+    rng, lasts = scene.rng, scene.end - scene.begin
     on_chair = rng.random() < 0.6
-    activity = (sit if on_chair else stand)(rng, person, begin, end)
+    activity = (sit if on_chair else stand)(scene)
     rate = float(np.exp(rng.uniform(np.log(2.0), np.log(180.0 if on_chair else 60.0))) * rng.choice([-1, 1]))
-    turn = Steady(begin + 0.5, end - 0.5, min(rng.uniform(0.3, 1.5), (end - begin - 1.0) / 3.0), rate * DEG)
+    turn = Steady(scene.begin + 0.5, scene.end - 0.5, min(rng.uniform(0.3, 1.5), (lasts - 1.0) / 3.0), rate * DEG)
     where = "on an office chair" if on_chair else "on foot"
     about = f"{where}, {rate:.1f} deg/s"
     return Activity("turns on the spot", activity.angles, {"heading": turn}, rng.uniform(0.1, 0.5), about)
 
 
-def clasp(rng: np.random.Generator, person: Person, begin: float, end: float, span: float = 1.0) -> Activity:
+def clasp(scene: Scene, span: float = 1.0) -> Activity:
     """Palms together, moved freely in front of the body: elbows follow by inverse kinematics."""
+    rng, person = scene.rng, scene.person
     arm = {side: [person.lengths[f"{side}_upper_arm"], _palm(person, side)] for side in SIDES}
     shoulder = {
         side: np.array([0.0, sign * person.lengths["shoulder_width"] / 2.0, person.lengths["trunk"]])
-        for side, sign in zip(SIDES, (1.0, -1.0))
+        for side, sign in zip(SIDES, (1.0, -1.0), strict=True)
     }
     least = min(sum(lengths) for lengths in arm.values())
     size = span * least * np.array([0.2, 0.6, 1.1])
     path = [Curve(0.0, [wave(rng, float(s) / 3.0, rng.uniform(0.1, 0.5)) for _ in range(3)]) for s in size]
     middle = np.array([0.6 * least, 0.0, person.lengths["trunk"] - 0.1 * least])
-    swivel = {side: Curve(rng.uniform(15, 45) * DEG, [wave(rng, 12 * span * DEG, rng.uniform(0.05, 0.3))]) for side in SIDES}
+    swivel = {
+        side: Curve(rng.uniform(15, 45) * DEG, [wave(rng, 12 * span * DEG, rng.uniform(0.05, 0.3))]) for side in SIDES
+    }
     pron = {
         side: Curve(rng.uniform(20, 50) * DEG, [wave(rng, 20 * span * DEG, rng.uniform(0.05, 0.3))]) for side in SIDES
     }
-    times = np.linspace(begin, end, 400)
+    times = np.linspace(scene.begin, scene.end, 400)
     offsets = np.column_stack([curve(times) for curve in path])
     scale = 1.0
     for _ in range(40):
@@ -232,7 +255,7 @@ def _palm(person: Person, side: str) -> float:
 
 
 def arm_angles(side: str, palm: np.ndarray, upper: float, lower: float, swivel: np.ndarray) -> Mapping[str, np.ndarray]:
-    """Angles of a two-link arm whose palm is at `palm` (n, 3) [m] from the shoulder; the elbow hangs, `swivel` lifts it."""
+    """Angles of a two-link arm whose palm is `palm` (n, 3) [m] from the shoulder; `swivel` lifts the elbow."""
     outward = 1.0 if side == "left" else -1.0
     reach_ = np.linalg.norm(palm, axis=1)
     along = palm / reach_[:, None]

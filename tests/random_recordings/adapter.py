@@ -34,11 +34,11 @@ NO_COVARIANCE = ("ncf", "gdc")  # methods that state no uncertainty
 EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet", "out.urdf")
 HAND_POINTS = {"left_palm": "left_hand", "right_palm": "right_hand"}  # our point → the project's
 
-# Words of a warning that says why a segment is not to be believed, by cause. A warning counts where it names the segment
-# too, or, of GENERAL ones, none.
+# Words of a warning that says why a segment is not to be believed, by cause; it counts where it names the segment too.
+# One of GENERAL need not.
 CAUSES = {
     "range": r"cut off|saturat|range",
-    "fault": r"does not measure|stands? still|stuck|frozen|froze|constant|the same value|never changes|not change|dead|zero|lost|gap",
+    "fault": r"does not measure|stands? still|stuck|fro[zs]en?|constant|same value|not change|dead|zero|lost|gap",
     "identical": r"same (?:values|columns|samples|data|signal)|identical|equal to|copy|one sensor|two sensors",
     "swapped": r"swap|exchanged|other'?s? name|each other|under",
     "mount": r"off what gravity|mount|strapp",
@@ -129,10 +129,14 @@ def _write_table(path: Path, table: Table, layout: Layout, unit: str) -> None:
     if table.stamps is not None:
         columns["time"] = table.stamps * {"s": 1.0, "ms": 1e3, "us": 1e6}[unit]
     for segment, s in table.signals.items():
-        parts = {"orientation": s.quat} if s.quat is not None else {
-            "gyro": s.gyro / DEG if layout.gyro_in_deg else s.gyro,
-            "accel": s.accel / GRAVITY if layout.accel_in_g else s.accel,
-        }
+        parts = (
+            {"orientation": s.quat}
+            if s.quat is not None
+            else {
+                "gyro": s.gyro / DEG if layout.gyro_in_deg else s.gyro,
+                "accel": s.accel / GRAVITY if layout.accel_in_g else s.accel,
+            }
+        )
         for kind, values in parts.items():
             assert values is not None
             columns |= dict(zip(_columns(segment, kind), values.T, strict=True))
@@ -161,7 +165,12 @@ def calibrate(session: Path, out: Path, case: Case) -> list[str]:
 
 
 def track(
-    session: Path, out: Path, method: str, options: Iterable[str], subject: Path | None = None, chunk: float | None = None
+    session: Path,
+    out: Path,
+    method: str,
+    options: Iterable[str],
+    subject: Path | None = None,
+    chunk: float | None = None,
 ) -> list[str]:
     options = set(options)
     argv = ["track", str(session), "-o", str(out), *_gaps(options)]
@@ -230,7 +239,9 @@ def run(argv: list[str], as_process: bool = False) -> Outcome:
     """Run a command: in this process, or in one of its own as a user does."""
     begin = time.perf_counter()
     if as_process:
-        done = subprocess.run([sys.executable, "-m", "wepose_pin.cli", *argv], capture_output=True, text=True, errors="replace")
+        done = subprocess.run(
+            [sys.executable, "-m", "wepose_pin.cli", *argv], capture_output=True, text=True, errors="replace"
+        )
         failed = done.stderr if "Traceback (most recent call last)" in done.stderr else ""
         return Outcome(argv, done.returncode, done.stdout, done.stderr, time.perf_counter() - begin, failed)
     from wepose_pin.cli import main
@@ -299,7 +310,9 @@ def table_bytes(folder: Path) -> pl.DataFrame:
     return pl.read_parquet(folder / "pose.parquet")
 
 
-def write_truth(path: Path, stamps: np.ndarray, quat: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]) -> None:
+def write_truth(
+    path: Path, stamps: np.ndarray, quat: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]
+) -> None:
     """A reference table for `evaluate`."""
     columns = {"time": stamps}
     for name, values in quat.items():
@@ -313,7 +326,7 @@ def write_truth(path: Path, stamps: np.ndarray, quat: Mapping[str, np.ndarray], 
 
 
 def names_cause(texts: Iterable[str], segments: Iterable[str]) -> str:
-    """The first warning that says why these segments may be wrong: it names one of them and a cause, or a general one."""
+    """The first warning that says why these segments may be wrong: it names one and a cause, or a general one."""
     segments = list(segments)
     for text in texts:
         if re.search(NOT_A_CAUSE, text):
@@ -340,7 +353,8 @@ def is_one_line(outcome: Outcome) -> bool:
 def names_something(outcome: Outcome, case: Case) -> bool:
     """Whether a refusal names what it refuses: a file, key, column, sensor, option or a time."""
     text = refusal(outcome)
-    return any(segment in text for segment in case.worn) or bool(re.search(r"\.(toml|csv|parquet)|--\w|phases\.|\d+\.?\d* s\b", text))
+    named = re.search(r"\.(toml|csv|parquet)|--\w|phases\.|\d+\.?\d* s\b", text)
+    return named is not None or any(segment in text for segment in case.worn)
 
 
 def left_behind(out: Path) -> list[str]:

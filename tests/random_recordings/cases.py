@@ -11,16 +11,27 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .activities import ACTIVITIES, Activity, clasp, reach, stand, swing, walk
+from .activities import ACTIVITIES, Activity, Scene, clasp, reach, stand, swing, walk
 from .motion import Motion, draw_stance, draw_sway
+from .oddities import draw_oddities
 from .people import CORE, SIDES, Person, draw_person, sensor_place
-from .sensors import Errors, Worn, axes_rotation, draw_errors
+from .sensors import DEG, Worn, axes_rotation, draw_errors
 
-DEG = np.pi / 180.0
 METHODS = {"amekf": 0.4, "smoother": 0.15, "smekf": 0.2, "ncf": 0.12, "gdc": 0.13}
-RATES = {25.0: 1, 50.0: 2, 60.0: 2, 100.0: 6, 120.0: 1, 148.0: 1, 200.0: 2, 240.0: 0.7, 400.0: 0.7, 1000.0: 0.7, 2000.0: 0.4}
+RATES = {
+    25.0: 1,
+    50.0: 2,
+    60.0: 2,
+    100.0: 6,
+    120.0: 1,
+    148.0: 1,
+    200.0: 2,
+    240.0: 0.7,
+    400.0: 0.7,
+    1000.0: 0.7,
+    2000.0: 0.4,
+}
 MOST_SAMPLES = 24_000  # of a recording
-LONG_GAP_S = 0.05  # what is longer is said to need a consent
 
 
 @dataclass
@@ -112,28 +123,43 @@ def draw_case(seed: int, seconds: float | None = None) -> Case:
     if seconds is not None:
         clock = Clock(float(rng.choice([25.0, 50.0, 100.0])), "even", clock.origin)
     sensors = _segments(stream(seed, "segments"), calibrates)
-    activities, begins, joins, spans, duration, in_motion = _timeline(
-        rng, person, clock.rate_hz, calibrates, seconds
-    )
+    activities, begins, joins, spans, duration, in_motion = _timeline(rng, person, clock.rate_hz, calibrates, seconds)
     sway, size = draw_sway(stream(seed, "sway"))
     bending = frozenset(side for side in SIDES if f"{side}_hand" in sensors)
     motion = Motion(person, activities, begins, joins, sway, draw_stance(stream(seed, "stance")), bending)
     worn, mounts = _worn(stream(seed, "sensors"), sensors, person, calibrates)
     case = Case(
-        seed, person, motion, worn, clock, _layout(stream(seed, "files")), duration, spans["start"], spans["start"],
-        spans.get("clasp"), in_motion, "amekf", set(), [], {},
+        seed,
+        person,
+        motion,
+        worn,
+        clock,
+        _layout(stream(seed, "files")),
+        duration,
+        spans["start"],
+        spans["start"],
+        spans.get("clasp"),
+        in_motion,
+        "amekf",
+        set(),
+        [],
+        {},
     )
     case.about += [
         f"{person.sex}, {person.stature:.2f} m, sways {size / DEG:.1f} deg/s",
         f"{len(worn)} sensors ({mounts}): {', '.join(worn)}",
         f"{duration:.0f} s at {clock.rate_hz:g} Hz, clock {clock.stamps}"
-        + (f" from {clock.origin:g} s" if clock.origin else "") + (", one file a sensor" if clock.separate else ""),
-        "then ".join(f"{a.name}{f' ({a.detail})' if a.detail else ''} from {b:.1f} s " for a, b in zip(activities, begins)),
+        + (f" from {clock.origin:g} s" if clock.origin else "")
+        + (", one file a sensor" if clock.separate else ""),
+        "then ".join(
+            f"{a.name}{f' ({a.detail})' if a.detail else ''} from {b:.1f} s "
+            for a, b in zip(activities, begins, strict=True)
+        ),
         f"start pose stated {spans['start'][0]:.2f} to {spans['start'][1]:.2f} s",
     ]
     _commands(case, stream(seed, "commands"))
     if seconds is None:
-        _oddities(case, stream(seed, "oddities"))
+        draw_oddities(case, stream(seed, "oddities"))
     case.about.append(f"by {case.method} {' '.join(sorted(case.options))}, then {', '.join(case.steps)}")
     return case
 
@@ -143,7 +169,9 @@ def _clock(rng: np.random.Generator) -> Clock:
     clock = Clock(float(rng.choice(rates, p=weights / weights.sum())))
     clock.stamps = str(rng.choice(["even", "none", "jitter", "uneven", "packets"], p=[0.66, 0.1, 0.12, 0.06, 0.06]))
     if clock.stamps != "none":
-        clock.origin = float(rng.choice([0.0, rng.uniform(1.0, 5000.0), 1.7e9 + rng.uniform(0, 1e6)], p=[0.65, 0.15, 0.2]))
+        clock.origin = float(
+            rng.choice([0.0, rng.uniform(1.0, 5000.0), 1.7e9 + rng.uniform(0, 1e6)], p=[0.65, 0.15, 0.2])
+        )
     clock.separate = clock.stamps == "even" and clock.rate_hz <= 400 and rng.random() < 0.12
     return clock
 
@@ -168,16 +196,16 @@ def _timeline(
 ) -> tuple[list[Activity], list[float], list[float], dict[str, tuple[float, float]], float, bool]:
     """Activities with begins and joins [s], the spans of the phases, the duration, whether it begins in motion."""
     most = MOST_SAMPLES / rate_hz
-    total = min(most, float(np.exp(rng.uniform(np.log(25.0), np.log(150.0)))))
+    total = min(most, float(np.exp(rng.uniform(np.log(20.0), np.log(120.0)))))
     total = total if seconds is None else seconds
     held = float(np.exp(rng.uniform(np.log(0.6), np.log(10.0))))
     held = min(held, 0.4 * total)
     in_motion = bool(rng.random() < 0.25) and total > 20.0
     t = rng.uniform(3.0, 8.0) if in_motion else 0.0
-    activities, begins, joins = [stand(rng, person, 0.0, t)], [0.0], [1.0]
+    activities, begins, joins = [stand(Scene(rng, person, 0.0, t))], [0.0], [1.0]
     if in_motion:
         before = [reach, walk, swing][rng.integers(3)]
-        activities = [before(rng, person, 0.0, t), activities[0]]
+        activities = [before(Scene(rng, person, 0.0, t)), activities[0]]
         begins, joins = [0.0, t], [1.0, rng.uniform(0.8, 1.5)]
         t += joins[-1] + 0.3
     first = t + rng.uniform(0.0, 1.5)
@@ -192,7 +220,7 @@ def _timeline(
         if not clasped:
             lasts = min(rng.uniform(30.0, 65.0), max(left, 20.0))
             moved = float(rng.choice([1.0, 0.2], p=[0.88, 0.12]))
-            activity = clasp(rng, person, t, t + join + lasts, moved)
+            activity = clasp(Scene(rng, person, t, t + join + lasts), moved)
             spans["clasp"] = (t + join + 0.1, t + join + lasts - 0.1)
             clasped = True
         elif left < 3.0:
@@ -200,7 +228,7 @@ def _timeline(
         else:
             draw, _, least, longest = ACTIVITIES[str(rng.choice(names, p=weights / weights.sum()))]
             lasts = min(rng.uniform(least, longest), max(left, 3.0))
-            activity = draw(rng, person, t + join, t + join + lasts)
+            activity = draw(Scene(rng, person, t + join, t + join + lasts))
         if activity.name in ("lies", "sleeps") or activities[-1].name in ("lies", "sleeps"):
             join = max(join, rng.uniform(1.8, 3.0))
         activities.append(activity)
@@ -231,7 +259,10 @@ def _worn(
 
 def _layout(rng: np.random.Generator) -> Layout:
     return Layout(
-        str(rng.choice([".csv", ".parquet"])), bool(rng.random() < 0.5), bool(rng.random() < 0.4), int(rng.choice([7, 9, 15]))
+        str(rng.choice([".csv", ".parquet"])),
+        bool(rng.random() < 0.5),
+        bool(rng.random() < 0.4),
+        int(rng.choice([7, 9, 15])),
     )
 
 
@@ -244,8 +275,14 @@ def _commands(case: Case, rng: np.random.Generator) -> None:
     steps = ["calibrate"] if case.clasp else []
     steps.append("track")
     for step, share in (
-        ("evaluate", 0.3), ("view", 0.15), ("export", 0.5), ("info", 0.15), ("reproduce", 0.15), ("again", 0.1),
-        ("chunks", 0.3), ("retarget", 0.03),
+        ("evaluate", 0.3),
+        ("view", 0.15),
+        ("export", 0.5),
+        ("info", 0.15),
+        ("reproduce", 0.15),
+        ("again", 0.1),
+        ("chunks", 0.3),
+        ("retarget", 0.03),
     ):
         if rng.random() < share and not (step == "chunks" and ("causal" in case.options or case.method == "smoother")):
             steps.append(step)
@@ -255,122 +292,3 @@ def _commands(case: Case, rng: np.random.Generator) -> None:
             case.taped["shoulder_width"] = round(case.person.lengths["shoulder_width"] + rng.normal(0.0, 0.004), 3)
         if rng.random() < 0.5:
             case.taped["stature"] = round(case.person.stature + rng.normal(0.0, 0.01), 2)
-
-
-def _oddities(case: Case, rng: np.random.Generator) -> None:
-    """What is out of the ordinary: in three cases of ten, and then one thing, now and then two."""
-    draws = {
-        "guessed": _guessed, "gap": _gap, "saturated": _saturated, "fault": _fault, "identical": _identical,
-        "swapped": _swapped, "orientations": _orientations, "twice": _twice, "milliseconds": _milliseconds,
-    }
-    shares = np.array([4.0, 3.0, 3.0, 4.0, 1.0, 1.0, 3.0, 0.7, 0.5])
-    if rng.random() > 0.35:
-        unknown = [s for s, w in case.worn.items() if w.axes is None and w.orientation is None]
-        if unknown and not case.clasp:
-            case.refusal = "must: no mount is known"
-        return
-    chosen = rng.choice(list(draws), size=1 if rng.random() < 0.85 else 2, replace=False, p=shares / shares.sum())
-    for name in sorted(chosen):
-        draws[str(name)](case, rng)
-    unknown = [s for s, w in case.worn.items() if w.axes is None]
-    if unknown and not case.clasp:
-        case.refusal = "must: no mount is known"
-
-
-def _guessed(case: Case, rng: np.random.Generator) -> None:
-    if case.clasp:
-        return  # a calibration needs its phases
-    case.start = None
-    case.about.append("no phases are stated")
-    calm = not case.begins_in_motion and case.stood[1] - case.stood[0] >= 2.5
-    if not calm:
-        case.refusal = case.refusal or "may: the start pose can only be guessed"
-
-
-def _gap(case: Case, rng: np.random.Generator) -> None:
-    whole = rng.random() < 0.5
-    segment = "" if whole and not case.clock.separate else str(rng.choice(list(case.worn)))
-    long = rng.random() < 0.7
-    step = 1.0 / case.clock.rate_hz
-    lasts = rng.uniform(0.1, 4.0) if long else rng.uniform(1.0, max(1.01, 0.045 / step)) * step
-    at = rng.uniform(1.0, case.duration - lasts - 1.0) if rng.random() < 0.3 else rng.uniform(
-        case.stood[1] + 0.5, max(case.stood[1] + 0.6, case.duration - lasts - 0.5)
-    )
-    if case.clock.stamps == "none" and not segment:
-        segment = next(iter(case.worn))
-    case.clock.lost.append((float(at), float(lasts), segment))
-    case.about.append(f"{segment or 'everything'} is lost for {lasts:.2f} s at {at:.1f} s")
-    if lasts > LONG_GAP_S - step:
-        if rng.random() < 0.85:
-            case.options.add("gaps")
-            if at < case.stood[1] and at + lasts > case.stood[0]:
-                case.refusal = case.refusal or "may: samples are lost in the start pose"
-        else:
-            case.refusal = "must: samples are lost" if lasts > LONG_GAP_S + 3.0 * step else "may: samples are lost"
-
-
-def _saturated(case: Case, rng: np.random.Generator) -> None:
-    gyro, accel = rng.choice([125.0, 250.0, 500.0]) * DEG, rng.choice([2.0, 4.0, 16.0]) * 9.80665
-    for name, sensor in case.worn.items():
-        e = sensor.errors
-        sensor.errors = Errors(**{**e.__dict__, "gyro_range": gyro, "accel_range": accel})
-        case.suspects.setdefault(name, "range")
-    case.about.append(f"ranges are {gyro / DEG:.0f} deg/s and {accel / 9.80665:.0f} g")
-
-
-def _fault(case: Case, rng: np.random.Generator) -> None:
-    name = str(rng.choice(list(case.worn)))
-    sensor = case.worn[name]
-    sensor.fault = str(rng.choice(["dead", "stuck", "frozen", "lost"], p=[0.3, 0.2, 0.35, 0.15]))
-    sensor.fault_of = str(rng.choice(["gyro", "accel", "both"], p=[0.6, 0.1, 0.3]))
-    sensor.fault_at = float(rng.uniform(case.stood[1] + 2.0, max(case.stood[1] + 2.1, 0.8 * case.duration)))
-    case.suspects[name] = "fault"
-    when = f" from {sensor.fault_at:.1f} s" if sensor.fault in ("frozen", "lost") else ""
-    case.about.append(f"{sensor.fault_of} of {name} is {sensor.fault}{when}")
-    case.refusal = case.refusal or f"may: {name} is broken"
-
-
-def _identical(case: Case, rng: np.random.Generator) -> None:
-    if len(case.worn) < 2 or case.clock.separate:
-        return
-    one, other = (str(v) for v in rng.choice(list(case.worn), size=2, replace=False))
-    case.shared_columns[one] = other
-    case.suspects |= {one: "identical", other: "identical"}
-    case.about.append(f"{one} and {other} have the same columns")
-    case.refusal = case.refusal or f"may: {one} and {other} are one sensor"
-
-
-def _swapped(case: Case, rng: np.random.Generator) -> None:
-    if case.clasp is None:
-        return  # nothing in a recording without a closed chain tells of it
-    one, other = [("left_forearm", "right_forearm"), ("left_upper_arm", "left_forearm"), ("left_upper_arm", "right_upper_arm")][
-        rng.integers(3)
-    ]
-    case.shared_columns |= {one: other, other: one}
-    case.suspects |= {name: "swapped" for name in case.worn}
-    case.about.append(f"{one} and {other} are swapped")
-    case.refusal = case.refusal or f"may: {one} and {other} are swapped"
-
-
-def _orientations(case: Case, rng: np.random.Generator) -> None:
-    if any(sensor.axes is None for sensor in case.worn.values()):
-        return
-    case.options.discard("causal")  # where no filter runs, none runs causally
-    for name, sensor in case.worn.items():
-        if rng.random() < 0.5 or name == next(iter(case.worn)):
-            sensor.orientation = float(rng.uniform(0.0, 1.0) * DEG)
-    case.about.append("orientations from " + ", ".join(n for n, s in case.worn.items() if s.orientation is not None))
-
-
-def _twice(case: Case, rng: np.random.Generator) -> None:
-    if case.clock.stamps != "none":
-        case.clock.twice = int(rng.integers(1, 6))
-        case.about.append(f"{case.clock.twice} rows are written twice")
-        case.refusal = case.refusal or "may: rows are written twice"
-
-
-def _milliseconds(case: Case, rng: np.random.Generator) -> None:
-    if case.clock.stamps != "none":
-        case.clock.unit = str(rng.choice(["ms", "us"]))
-        case.about.append(f"time is in {case.clock.unit}")
-        case.refusal = "must: time is not in seconds"

@@ -58,7 +58,13 @@ def wander(rng: np.random.Generator, rate_rms: float, slow: float = 0.08, fast: 
     frequencies = np.exp(rng.uniform(np.log(slow), np.log(fast), count))
     share = rng.dirichlet(np.ones(count))
     amplitudes = rate_rms * np.sqrt(2.0 * share) / (2.0 * np.pi * frequencies)
-    return Curve(0.0, [(float(a), float(f), float(rng.uniform(0.0, 2.0 * np.pi))) for a, f in zip(amplitudes, frequencies)])
+    return Curve(
+        0.0,
+        [
+            (float(a), float(f), float(rng.uniform(0.0, 2.0 * np.pi)))
+            for a, f in zip(amplitudes, frequencies, strict=True)
+        ],
+    )
 
 
 def wave(rng: np.random.Generator, amplitude: float, frequency: float) -> tuple[float, float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ class Invariance:
     """`variant` against `base`, and what may differ [deg]; None: by what is stated."""
 
     variant: Variant
-    base: Variant = Variant()
+    base: Variant = field(default_factory=Variant)
     most_deg: float | None = ROUNDING_DEG
 
 
@@ -125,7 +125,10 @@ def _deviation(
         found.z = max(found.z, z)
         most = of.most_deg if of.most_deg is not None else UNSTATED_DEG if std is None else None
         if (most is not None and degrees > most) or z > MOST_Z:
-            over = over or f"{segment} is {degrees:.3g} deg off at {one.time[rows][k] - at:.1f} s, z = {z:.1f}, {case.method}"
+            over = (
+                over
+                or f"{segment} is {degrees:.3g} deg off at {one.time[rows][k] - at:.1f} s, z = {z:.1f}, {case.method}"
+            )
     return found, over
 
 

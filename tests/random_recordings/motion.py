@@ -107,9 +107,7 @@ class Motion:
             root = np.column_stack([a["root_x"], a["root_y"], a["root_z"]])
             positions.append({s: root + origins[s] + R[s].apply(place) for s, place in places.items()})
         before, after, now = positions
-        force = {
-            s: (before[s] - 2.0 * now[s] + after[s]) / STEP_S**2 + np.array([0.0, 0.0, GRAVITY]) for s in places
-        }
+        force = {s: (before[s] - 2.0 * now[s] + after[s]) / STEP_S**2 + np.array([0.0, 0.0, GRAVITY]) for s in places}
         return {s: R[s] for s in places}, force
 
 
@@ -129,5 +127,3 @@ def draw_stance(rng: np.random.Generator) -> dict[str, float]:
     """How this person's upright stance is off the ideal: a degree or two at each joint [rad]."""
     parts = [name for name in ANGLES if not name.endswith(("elbow", "pelvis_yaw", "torso_yaw", "wrist"))]
     return {name: float(rng.normal(0.0, 1.0 if name.startswith(("torso", "pelvis")) else 1.5)) * DEG for name in parts}
-
-

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import polars as pl
 from scipy.spatial.transform import Rotation
 
 from . import adapter
@@ -131,9 +132,7 @@ def _rigid(result: Result) -> dict[tuple[str, str], float]:
     return pairs
 
 
-def of_errors(
-    result: Result, case: Case, recorded: Recorded, stated: bool, shown: str
-) -> tuple[Accuracy, Truth]:
+def of_errors(result: Result, case: Case, recorded: Recorded, stated: bool, shown: str) -> tuple[Accuracy, Truth]:
     """Errors within six stated deviations, or a warning that names the cause."""
     truth = truth_at(case, result.time, recorded.origin, result.start, stated)
     found = Accuracy()
@@ -190,15 +189,16 @@ def _behind(name: str, case: Case) -> list[str]:
     return chain[: 1 + ("shoulder", "elbow", "wrist", "palm").index(part)]
 
 
-def of_same_table(one: object, other: object, oracle: str, shown: str) -> list[Failure]:
+def of_same_table(one: pl.DataFrame, other: pl.DataFrame, oracle: str, shown: str) -> list[Failure]:
     """The same columns with the same bits."""
-    import polars as pl
-
-    assert isinstance(one, pl.DataFrame) and isinstance(other, pl.DataFrame)
     if one.equals(other):
         return []
     if one.columns != other.columns or one.height != other.height:
-        return [Failure(oracle, shown, f"{one.shape} and {other.shape}, columns {set(one.columns) ^ set(other.columns)}")]
+        return [
+            Failure(oracle, shown, f"{one.shape} and {other.shape}, columns {set(one.columns) ^ set(other.columns)}")
+        ]
     differ = [name for name in one.columns if not one[name].equals(other[name])]
-    size = max(float(np.nanmax(np.abs(one[n].to_numpy().astype(float) - other[n].to_numpy().astype(float)))) for n in differ)
+    size = max(
+        float(np.nanmax(np.abs(one[n].to_numpy().astype(float) - other[n].to_numpy().astype(float)))) for n in differ
+    )
     return [Failure(oracle, shown, f"{len(differ)} columns differ by up to {size:.3g}: {', '.join(differ[:4])}")]

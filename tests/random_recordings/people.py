@@ -1,7 +1,7 @@
 """People of all sizes, and where the joints of their bodies are.
 
 Nothing here knows the project: own names, own geometry. Frames: world z up; every segment's frame equals the world's
-while the person stands upright, arms hanging, and faces x (left is y). Metres, radians, rotations take segment to world.
+while the person stands upright, arms hanging, facing x (left is y). Metres, radians; rotations take segment to world.
 """
 
 from __future__ import annotations

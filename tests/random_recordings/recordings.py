@@ -63,7 +63,9 @@ def record(case: Case, variant: Variant | None = None) -> Recorded:
     groups = [[name] for name in case.worn] if clock.separate else [list(case.worn)]
     tables, axes, shares = [], {}, {}
     for group in groups:
-        ahead, own_rate = (rng.uniform(-0.3, 0.0), rate * (1.0 + rng.choice([0.0, 2e-3]))) if clock.separate else (0.0, rate)
+        ahead, own_rate = (
+            (rng.uniform(-0.3, 0.0), rate * (1.0 + rng.choice([0.0, 2e-3]))) if clock.separate else (0.0, rate)
+        )
         n = int((case.duration - begin - ahead) * own_rate)
         t = begin + ahead + np.arange(n) / own_rate
         if clock.stamps == "uneven":
@@ -110,8 +112,11 @@ def _moved(span: tuple[float, float] | None, by: float) -> tuple[float, float] |
 
 def _rows(signals: Signals, rows: np.ndarray) -> Signals:
     quat = None if signals.quat is None else signals.quat[rows]
-    return Signals(signals.gyro[rows] if len(signals.gyro) else signals.gyro,
-                   signals.accel[rows] if len(signals.accel) else signals.accel, quat)
+    return Signals(
+        signals.gyro[rows] if len(signals.gyro) else signals.gyro,
+        signals.accel[rows] if len(signals.accel) else signals.accel,
+        quat,
+    )
 
 
 def _stamp_errors(kind: str, t: np.ndarray, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
@@ -146,11 +151,15 @@ def _averaged(case: Case, worn: dict[str, Worn], t: np.ndarray, times: int) -> d
 def _turn_axes(made: Recorded, rng: np.random.Generator) -> None:
     """Each sensor's axes exchanged: x of one becomes −y of the other, say. Signals and stated mounts alike."""
     names = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) for k, axis in enumerate("xyz")}
-    cube = [r for r in Rotation.create_group("O")]
+    cube = list(Rotation.create_group("O"))
     for table in made.tables:
         for name, signals in table.signals.items():
             A = np.round(cube[rng.integers(1, len(cube))].as_matrix())
-            quat = None if signals.quat is None else (Rotation.from_quat(signals.quat) * Rotation.from_matrix(A).inv()).as_quat()
+            quat = (
+                None
+                if signals.quat is None
+                else (Rotation.from_quat(signals.quat) * Rotation.from_matrix(A).inv()).as_quat()
+            )
             table.signals[name] = Signals(signals.gyro @ A.T, signals.accel @ A.T, quat)
             axes = made.axes[name]
             if axes is not None:
@@ -160,6 +169,7 @@ def _turn_axes(made: Recorded, rng: np.random.Generator) -> None:
 
 def _mirror(made: Recorded) -> None:
     """Left becomes right; sensors are mirrored along their own y, so that they stay right-handed."""
+
     def flipped(axis: str) -> str:
         return axis if axis[1] != "y" else {"+": "-", "-": "+"}[axis[0]] + "y"
 
@@ -171,7 +181,8 @@ def _mirror(made: Recorded) -> None:
             mirrored[other_side(name)] = Signals(-s.gyro @ MIRROR, s.accel @ MIRROR, quat)
         table.signals = mirrored
     made.axes = {
-        other_side(name): None if axes is None else (flipped(axes[0]), flipped(axes[1])) for name, axes in made.axes.items()
+        other_side(name): None if axes is None else (flipped(axes[0]), flipped(axes[1]))
+        for name, axes in made.axes.items()
     }
 
 
@@ -200,8 +211,8 @@ def truth_at(case: Case, stamps: np.ndarray, origin: float, start: tuple[float, 
     """The motion at a file's times (n,) [s].
 
     With `stated` mounts the project says: as a segment is in the start pose on the mean, so is the N-pose, and a stated
-    mount counts as exact. Truth is then a segment's motion since that mean, in a world that is off by what the heading of
-    the stated mount is off. Else, with calibrated mounts, truth is anatomy, and the trunk faces x in the start pose.
+    mount is exact. Truth is then a segment's motion since that mean, in a world that is off by what the heading of the
+    stated mount is off. Else, with calibrated mounts, truth is anatomy, and the trunk faces x in the start pose.
     """
     t = stamps - origin
     late = case.clock.late
@@ -209,14 +220,15 @@ def truth_at(case: Case, stamps: np.ndarray, origin: float, start: tuple[float, 
     at_start = {name: R.mean() for name, R in case.motion.orientations(held).items()}
     R_WL = {name: _aligned(case, name, R, at_start, stated) for name, R in case.motion.orientations(t).items()}
     points = joint_points(case.person.lengths, _worn_only(case, R_WL))
-    near = {name: _aligned(case, name, R, at_start, stated) for name, R in case.motion.orientations(t - max(late, 1e-6)).items()}
-    near_points = joint_points(case.person.lengths, _worn_only(case, near))
-    none = late == 0.0
-    return Truth(
-        R_WL, points,
-        {name: (R.inv() * near[name]).magnitude() * (0.0 if none else 1.0) for name, R in R_WL.items()},
-        {name: np.linalg.norm(p - near_points[name], axis=1) * (0.0 if none else 1.0) for name, p in points.items()},
-    )
+    turned = {name: np.zeros(len(t)) for name in R_WL}
+    moved = {name: np.zeros(len(t)) for name in points}
+    if late > 0.0:
+        before = case.motion.orientations(t - late)
+        near = {name: _aligned(case, name, R, at_start, stated) for name, R in before.items()}
+        turned = {name: (R.inv() * near[name]).magnitude() for name, R in R_WL.items()}
+        near_points = joint_points(case.person.lengths, _worn_only(case, near))
+        moved = {name: np.linalg.norm(p - near_points[name], axis=1) for name, p in points.items()}
+    return Truth(R_WL, points, turned, moved)
 
 
 def _worn_only(case: Case, R_WL: dict[str, Rotation]) -> dict[str, Rotation]:

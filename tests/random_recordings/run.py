@@ -1,7 +1,7 @@
 """Try seeds: ``python tests/random_recordings/run.py --seeds 0:3000 --jobs 2 -o DIR``.
 
 One line of JSON a seed is added to DIR/seeds.jsonl; what is there already is not tried again. At the end, and with
-``--report`` at once, a summary: commands by exit code, each failing seed, the table of invariances, the largest error over
+``--report`` at once, a summary: commands by exit code, failing seeds, the table of invariances, the largest error over
 what is stated. ``--seed 17 --keep DIR`` writes one case's files there and says what it holds.
 """
 
@@ -32,8 +32,16 @@ def try_one(task: tuple[int, bool]) -> dict[str, Any]:
         return try_seed(seed, as_process=as_process).as_json()
     except Exception:
         failure = {"oracle": "the harness itself", "command": "", "message": traceback.format_exc()[-1500:]}
-        return {"seed": seed, "about": "", "failures": [failure], "commands": [], "accuracy": {}, "deviation": {},
-                "recorded_s": 0.0, "seconds": 0.0}
+        return {
+            "seed": seed,
+            "about": "",
+            "failures": [failure],
+            "commands": [],
+            "accuracy": {},
+            "deviation": {},
+            "recorded_s": 0.0,
+            "seconds": 0.0,
+        }
 
 
 def run_seeds(seeds: list[int], out: Path, jobs: int, as_process: bool) -> None:
@@ -70,7 +78,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="one seed, whose failures are shown")
     parser.add_argument("--keep", type=Path, help="of --seed: write its files there")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--as-process", action="store_true", help="every command in a process of its own, as a user does")
+    parser.add_argument(
+        "--as-process", action="store_true", help="every command in a process of its own, as a user does"
+    )
     parser.add_argument("--report", action="store_true", help="only say what DIR holds")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / ".random_recordings")
     options = parser.parse_args()

@@ -32,6 +32,7 @@ class Errors:
 
 def draw_errors(rng: np.random.Generator) -> Errors:
     """Between a good and a cheap MEMS device: densities of BMI088, ICM-20948, MTi-3; bias after a usual calibration."""
+
     def direction() -> np.ndarray:
         v = rng.standard_normal(3)
         return v / np.linalg.norm(v)
@@ -135,9 +136,7 @@ def with_errors(
     gyro = gyro + errors.gyro_noise * per_sample * rng.standard_normal((n, 3))
     force = accel * (1.0 + errors.accel_scale) + errors.accel_bias
     force = force + errors.accel_noise * per_sample * rng.standard_normal((n, 3))
-    return Signals(
-        _digital(gyro, errors.gyro_range, errors.bits), _digital(force, errors.accel_range, errors.bits)
-    )
+    return Signals(_digital(gyro, errors.gyro_range, errors.bits), _digital(force, errors.accel_range, errors.bits))
 
 
 def _digital(values: np.ndarray, limit: float, bits: int) -> np.ndarray:

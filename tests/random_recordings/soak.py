@@ -1,8 +1,8 @@
 """Hours of recorded time through `batch`: ``python tests/random_recordings/soak.py --hours 24 --workers 2 -o soak``.
 
 Long recordings of ordinary activities are made, then tracked by one run of `batch`; every two seconds the memory of the
-process tree (resident, each worker's and the sum) and its open files are read from /proc. At the end it says whether they
-are flat: the highest sum of the last third against that of the middle one, the first being the start.
+process tree (resident, each worker's and the sum) and its open files are read from /proc. At the end it says whether
+they are flat: the highest sum of the last third against that of the middle one, the first being the start.
 """
 
 from __future__ import annotations
@@ -75,7 +75,9 @@ def soak(out: Path, workers: int, pages: bool) -> tuple[int, list[dict[str, floa
     begin = time.monotonic()
     with (out / "batch.log").open("w") as log:
         process = subprocess.Popen(
-            adapter.batch_process(plan, out / "study", workers), stdout=log, stderr=subprocess.STDOUT,
+            adapter.batch_process(plan, out / "study", workers),
+            stdout=log,
+            stderr=subprocess.STDOUT,
             env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
         )
         series = []
@@ -92,10 +94,16 @@ def verdict(series: list[dict[str, float]]) -> list[str]:
         return ["too short to say"]
     middle, last = series[third : 2 * third], series[2 * third :]
     lines = []
-    for key, name, most in (("memory_mb", "memory [MB]", None), ("largest_mb", "largest process [MB]", None), ("files", "open files", FILES_GROWTH)):
+    for key, name, most in (
+        ("memory_mb", "memory [MB]", None),
+        ("largest_mb", "largest process [MB]", None),
+        ("files", "open files", FILES_GROWTH),
+    ):
         before, after = (max(row[key] for row in rows) for rows in (middle, last))
         grown = after > before * (1.0 + MEMORY_GROWTH) if most is None else after > before + most
-        lines.append(f"{name}: {before:.0f} in the middle third, {after:.0f} in the last: {'GROWS' if grown else 'flat'}")
+        lines.append(
+            f"{name}: {before:.0f} in the middle third, {after:.0f} in the last: {'GROWS' if grown else 'flat'}"
+        )
     return lines
 
 
@@ -116,7 +124,10 @@ def main() -> int:
     made = time.monotonic() - begin
     code, series = soak(options.out, options.workers, options.pages)
     (options.out / "series.json").write_text(json.dumps(series) + "\n")
-    lines = [f"{recorded / 3600.0:.1f} h of recorded time, made in {made:.0f} s", f"batch: exit code {code} after {series[-1]['seconds']:.0f} s"]
+    lines = [
+        f"{recorded / 3600.0:.1f} h of recorded time, made in {made:.0f} s",
+        f"batch: exit code {code} after {series[-1]['seconds']:.0f} s",
+    ]
     lines += verdict(series)
     (options.out / "soak.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))

@@ -11,13 +11,16 @@ def summary_text(reports: list[dict[str, Any]]) -> str:
     hours = sum(report["recorded_s"] for report in reports) / 3600.0
     commands = Counter((command, code) for report in reports for command, code in report["commands"])
     lines = [
-        "# Random recordings", "",
+        "# Random recordings",
+        "",
         f"{len(reports)} seeds, {hours:.1f} h of recorded time, {sum(commands.values())} commands, "
-        f"{sum(bool(report['failures']) for report in reports)} seeds with failures", "",
+        f"{sum(bool(report['failures']) for report in reports)} seeds with failures",
+        "",
     ]
     codes = sorted({code for _, code in commands})
     rows = [
-        [name, *(str(commands.get((name, code), "")) for code in codes)] for name in sorted({name for name, _ in commands})
+        [name, *(str(commands.get((name, code), "")) for code in codes)]
+        for name in sorted({name for name, _ in commands})
     ]
     lines += ["## Commands by exit code", "", *_table(["command", *map(str, codes)], rows)]
     lines += ["## Equal physics: largest deviation [deg]", "", *_invariances(reports)]
@@ -29,7 +32,10 @@ def summary_text(reports: list[dict[str, Any]]) -> str:
     lines += ["## Failures", ""]
     for oracle, found in sorted(by_oracle.items(), key=lambda item: -len(item[1])):
         lines += [f"### {oracle}: {len(found)}", ""]
-        lines += [f"- seed {seed}: {' '.join(failure['message'].split())[:400]}" for seed, failure in sorted(found, key=lambda f: f[0])]
+        lines += [
+            f"- seed {seed}: {' '.join(failure['message'].split())[:400]}"
+            for seed, failure in sorted(found, key=lambda f: f[0])
+        ]
         lines.append("")
     return "\n".join(lines) + "\n"
 

@@ -90,7 +90,9 @@ class Trial:
     def calibrate(self) -> None:
         out, case = self.folder / "subject", self.case
         swapped = "swapped" in case.suspects.values()
-        outcome = self.command(adapter.calibrate(self.session, out, case), out, "" if case.refusal.startswith("must: no mount") else None)
+        outcome = self.command(
+            adapter.calibrate(self.session, out, case), out, "" if case.refusal.startswith("must: no mount") else None
+        )
         if outcome.code == 2 or outcome.traceback:
             return
         if swapped and outcome.code == 0:
@@ -135,7 +137,10 @@ class Trial:
         rng = self.case.stream("export")
         for name in rng.choice(adapter.EXPORTS, size=2, replace=False):
             points = bool(self.result and self.result.points)
-            self.command(adapter.export(self.result_folder, self.folder / str(name)), acceptance="" if points else "may: no points")
+            self.command(
+                adapter.export(self.result_folder, self.folder / str(name)),
+                acceptance="" if points else "may: no points",
+            )
 
     def info(self) -> None:
         self.command(adapter.info(self.session), acceptance="may: a damaged recording" if self.case.refusal else "")
