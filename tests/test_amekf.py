@@ -181,6 +181,7 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     variance = float(np.trace(of.noise.gyro_cov)) / 3.0
     q = np.zeros(STATES)
     q[:3] = variance * T / RATE
+    q[2] += still * params.rest_turn_noise**2 * T
     q[V : V + 2] = float(np.trace(of.noise.accel_cov)) / 3.0 * of.noise.gravity**2 * T / RATE
     q[B : B + 3], q[M : M + 9] = params.gyro_bias_walk**2 * T, params.gyro_matrix_walk**2 * T
     q[F : F + 3], q[D:] = params.accel_bias_walk**2 * T, params.motion_bias_walk**2 * T

@@ -9,18 +9,19 @@ calibrated mount's covariance says is weighed against the few degrees by which t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from . import so3
 from .errors import BadPhase, BadSession, WeposeError
 from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
-from .filters.smekf import ACCEL_BIAS_STD
-from .noise import noise_of, quietest
+from .filters.start import ACCEL_BIAS_STD
+from .noise import SensorNoise, noise_of, quietest
 from .recording import SEGMENTS, Recording
 from .static import StaticTest
 from .subject import Subject
@@ -44,6 +45,10 @@ MOVED_MOUNT = 3.5
 # below 3 deg/s and 3 deg; at the limits the mean pose is no longer the pose that was meant.
 MOVES_DEG_S, MOVES_DEG = 20.0, 15.0
 SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
+# Sensors that all turn about the vertical at the same rate are on a person who turns: rates [rad/s] above the first, by
+# chance once in a thousand times. Of one or two sensors, a rate above what data sheets give for a bias.
+COMMON_RATE, COMMON_RATE_CHANCE = float(np.deg2rad(0.5)), 1e-3
+LARGEST_BIAS = float(np.deg2rad(5.0))
 
 
 @dataclass(frozen=True)
@@ -112,6 +117,7 @@ class SensorFilters:
         self._first = True
         self._held: Recording | None = None  # the piece that the smoother has not given yet
         self._runs: dict[str, SensorRun] = {}
+        noises: dict[str, SensorNoise] = {}
         for segment, sensor in first.sensors.items():
             if not sensor.aligned:
                 self.warnings += _motion(first, segment, self.start, "start")
@@ -123,10 +129,17 @@ class SensorFilters:
             assert sensor.accel_S is not None
             at_rest = first.span(self.still)
             try:
-                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz)
+                worn = self.still == self.start
+                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
             except WeposeError as error:
                 raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
-            self._runs[segment] = SensorRun(first.rate_hz, noise, method, static_test=static_test, measured_start=True)
+            noises[segment] = noise
+        self.warnings += _common_rotation(first, noises, self.still)
+        for segment, noise in noises.items():
+            start = first.span(self.start)
+            self._runs[segment] = SensorRun(
+                first.rate_hz, noise, method, static_test=static_test, measured_start=True, start=start
+            )
         self.ahead = method in OFFLINE and bool(self._runs)
 
     def push(self, piece: Recording) -> tuple[Recording, dict[str, Orientation]] | None:
@@ -405,6 +418,39 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
                 f"needs at least 10, better two seconds"
             )
     return start, still[0] if still else start, notes
+
+
+def _common_rotation(recording: Recording, noises: dict[str, SensorNoise], interval: tuple[float, float]) -> list[str]:
+    """A warning if the person turns in a phase, whose mean rate is the gyroscopes' bias then; an error if by much.
+
+    The biases of several sensors about the vertical are as different as sensors are; the same rate in all is the
+    person's (one-sample t-test). What it may be stays in the biases' covariance, in place.
+    """
+    span = recording.span(interval)
+    up_S = {segment: recording.sensors[segment].accel_S[span].mean(axis=0) for segment in noises}  # type: ignore[index]
+    up_S = {segment: up / np.linalg.norm(up) for segment, up in up_S.items()}
+    rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
+    if len(rates) == 0:
+        return []
+    mean = float(rates.mean())
+    if len(rates) >= 3:
+        spread = max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
+        turns = abs(mean) > COMMON_RATE and 2.0 * stats.t.sf(abs(mean) / spread, len(rates) - 1) < COMMON_RATE_CHANCE
+    else:
+        turns = abs(mean) > LARGEST_BIAS
+    if not turns:
+        return []
+    turn_deg = abs(np.degrees(mean)) * (interval[1] - interval[0])
+    found = f"all sensors turn about the vertical at {np.degrees(mean):.1f} deg/s, by {turn_deg:.0f} deg in all"
+    if turn_deg > MOVES_DEG:
+        raise BadPhase(
+            f"{recording.where()}: phases.start ({interval[0]:g} to {interval[1]:g} s): {found}, where gyroscopes have "
+            f"biases of their own: name seconds in which the person does not turn"
+        )
+    for segment, noise in noises.items():
+        up = up_S[segment]
+        noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + mean**2 * np.outer(up, up))
+    return [f"{found}: the biases of the gyroscopes, and so all headings, are uncertain by as much"]
 
 
 def _motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[str]:

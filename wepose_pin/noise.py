@@ -18,6 +18,14 @@ BIAS_FLOOR = 1e-6  # [rad/s] of the bias itself, that is 0.2 deg/h
 # Blocks for the covariance of the mean: long against the sensor's noise, short against a person's sway.
 BLOCK_S = 0.5
 
+# A person who stands sways at 0.3 to 0.5 deg/s (rms) below 0.5 Hz and tilts by 0.2 to 0.4 deg; a hanging arm and a
+# breathing chest turn faster. What a sensor's mean rate over T seconds is off by is that rate, and at most what such a
+# tilt allows: √2 σ/(ω T).
+SWAY_RATE_STD = float(np.deg2rad(0.7))  # [rad/s] of a worn sensor
+SWAY_RATE = 2.0 * np.pi * 0.25  # [rad/s] ω
+PRIOR_BLOCKS = 4.0
+LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks, beyond white noise: less is no person
+
 # Without stated phases: the quietest stretch of this length within the beginning is taken.
 QUIET_S = 2.0
 BEGINNING_S = 20.0
@@ -47,8 +55,11 @@ class SensorNoise:
     gyro_half_second_cov: np.ndarray | None = None
 
 
-def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> SensorNoise:
+def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool = False) -> SensorNoise:
     """Noise and bias from samples at rest: `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²].
+
+    `worn`: a person wears the sensor and sways, which a phase of a second or two does not show: the bias is then as
+    uncertain as sway makes it.
 
     Raises
     ------
@@ -62,15 +73,35 @@ def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> SensorN
         raise BadPhase(
             "the still phase holds no gravity: accel is zero; the filter needs specific force, +g up at rest"
         )
+    half_second_cov, bias_cov = _cov_of_half_seconds(gyro_S, rate_hz), _cov_of_mean(gyro_S, rate_hz)
+    if worn:
+        half_second_cov = _sway_cov(gyro_S, rate_hz, half_second_cov)
+        allowed = min(1.0, 2.0 / (SWAY_RATE * len(gyro_S) / rate_hz) ** 2)
+        bias_cov = bias_cov + float(np.trace(half_second_cov)) / 3.0 * allowed * np.eye(3)
     return SensorNoise(
         gyro_bias=gyro_S.mean(axis=0),
-        gyro_bias_cov=_cov_of_mean(gyro_S, rate_hz),
+        gyro_bias_cov=bias_cov,
         gyro_cov=_floored(np.cov(gyro_S.T), GYRO_FLOOR),
         accel_cov=_floored(np.cov(accel_S.T / gravity), ACCEL_FLOOR),
         bias_step_cov=_floored(np.cov(np.diff(gyro_S, axis=0).T), GYRO_FLOOR),
         gravity=gravity,
-        gyro_half_second_cov=_cov_of_half_seconds(gyro_S, rate_hz),
+        gyro_half_second_cov=half_second_cov,
     )
+
+
+def _sway_cov(gyro_S: np.ndarray, rate_hz: float, measured: np.ndarray | None) -> np.ndarray:
+    """Covariance (3, 3) [rad²/s²] of a worn sensor's half-second means by sway: as `measured`, with `SWAY_RATE_STD`
+    counted as `PRIOR_BLOCKS` more of them, or as none where even shorter means vary by no more than white noise."""
+    half_second = max(1, round(BLOCK_S * rate_hz))
+    size = max(1, min(half_second, len(gyro_S) // 4))
+    blocks = len(gyro_S) // size
+    means = gyro_S[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
+    white = float(np.diff(gyro_S, axis=0).var(axis=0).mean()) / 2.0 / size
+    excess = float(means.var(axis=0, ddof=1).mean()) - white
+    prior = PRIOR_BLOCKS * min(1.0, max(0.0, excess) / LEAST_SWAY_STD**2)
+    degrees = 0 if measured is None else len(gyro_S) // half_second - 1
+    total = prior * SWAY_RATE_STD**2 * np.eye(3) + (0.0 if measured is None else degrees * measured)
+    return total / max(1.0, prior + degrees)
 
 
 def _cov_of_mean(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray:

@@ -1,4 +1,10 @@
-"""The static-phase detector: when a sensor counts as lying still (Lisini Baldi 2019, conditions (1) to (4))."""
+"""The static-phase detector: when a sensor counts as lying still.
+
+Conditions (1) to (4) of Lisini Baldi 2019 bound how much gyro and accel vary, and a steady rotation about the vertical
+varies nothing: an office chair passes them, and a filter that reads the gyroscope's bias at rest takes the chair's
+rate for it. Condition (5), ours, holds the mean rate about the vertical against the bias that is known: from the start
+phase, then from each rest that was accepted. About horizontal axes gravity would turn away, which (2) sees.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .errors import BadData
-from .noise import SensorNoise
+from .errors import BadData, BadOption
+from .noise import BLOCK_S, SensorNoise
 from .so3 import inlined, kernel
 
 # A sample is gyro (3), accel/g (3) and the norm of accel/g. The sums are of its differences from an anchor: those
@@ -16,13 +22,19 @@ from .so3 import inlined, kernel
 _SIGNALS = 7
 _SUMS = 20
 _UPPER = np.triu_indices(3)
+# Limits of (5), behind those of (1) to (4): rate_stds², variance of a window's mean, of the average's, bias_spread²
+# [rad²/s²], by how much the known bias' variance grows and the average fades in a sample, a sample's share of a window.
+_STDS2, _WINDOW_VAR, _AVERAGE_VAR, _SPREAD_VAR, _WALK_VAR, _FADE, _SHARE, _LIMITS = 15, 16, 17, 18, 19, 20, 21, 22
 
 
 @dataclass(frozen=True)
 class StaticTest:
-    """When a sensor counts as still; the defaults are the paper's; it leaves the window open.
+    """When a sensor counts as still; the defaults of (1) to (4) are the paper's, which leaves the window open.
 
-    The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite.
+    The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite. Condition (5) is ours, and
+    ``rate_stds=inf`` leaves the paper's test alone. It holds for the window and for an average over `averaging_s`, in
+    which sway cancels; the standard deviation is that of the known bias, which grows by `bias_walk`, of the mean's
+    noise and sway as measured in the start phase, and of `bias_spread`.
     """
 
     window_s: float = 0.5  # [s] W
@@ -30,6 +42,18 @@ class StaticTest:
     beta: float = 2.0  # (2) accel/g covariance against the still one
     gamma1: float = 0.01  # (3) |mean ‖accel/g‖ − 1| at most
     gamma2: float = 0.01  # (4) variance of ‖accel/g‖ at most
+    rate_stds: float = 3.0  # (5) standard deviations by which the rate about the vertical may be off the known bias
+    averaging_s: float = 4.0  # [s] of (5)'s average, about two periods of a standing person's sway
+    # [rad/s] by which the bias depends on how the sensor lies; 0.01 deg/s, twice what BROAD's sensors show at rest
+    bias_spread: float = float(np.deg2rad(0.01))
+    # [rad/s/√s] by which it drifts: a strapped sensor warms by 5 to 10 K in a quarter of an hour, at 0.02 deg/s a
+    # kelvin that is 0.2 deg/s, here three standard deviations
+    bias_walk: float = float(np.deg2rad(0.002))
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value >= 0.0 or (value == 0.0 and name in ("window_s", "averaging_s")):
+                raise BadOption(f"{name} = {value}: a number from 0 on is needed, seconds above 0")
 
     def samples(self, rate_hz: float) -> int:
         """N, the window in samples (at least 4: a covariance of three axes needs them)."""
@@ -44,7 +68,10 @@ class StaticState(NamedTuple):
     head: np.ndarray  # (k, 20) sums of the current block so far
     anchor: np.ndarray  # (k, 7) what the differences are taken from: the last sample of the block before
     counts: np.ndarray  # (k, 2) samples in the current block; whether there is a block before it
-    limits: np.ndarray  # (k, 15) right-hand sides of (1), (2) times N − 1, of (3), of (4) times N − 1; 1/gravity
+    limits: (
+        np.ndarray
+    )  # (k, 22) right-hand sides of (1), (2) times N − 1, of (3), of (4) times N − 1; 1/gravity; of (5)
+    bias: np.ndarray  # (k, 5) (5): the known bias [rad/s], its variance [rad²/s²], the average rate off it [rad/s]
 
 
 class StaticDetector:
@@ -58,6 +85,7 @@ class StaticDetector:
     those of the rest of the block before, which are made backwards once a block. Nothing is ever subtracted from a sum,
     and the differences summed are from a sample within the window, so that (mean − anchor)² is at most N − 1 variances
     of the window itself: a window at rest is as precise after 1e8 samples of any motion as in the first second.
+    Condition (5) alone remembers more, the known bias.
     """
 
     def __init__(self, noise: SensorNoise, rate_hz: float, test: StaticTest | None = None) -> None:
@@ -85,11 +113,20 @@ class StaticDetector:
 def static_state(noises: list[SensorNoise], rate_hz: float, test: StaticTest) -> StaticState:
     """The state of k detectors before their first sample, for `static_step`."""
     k, n = len(noises), test.samples(rate_hz)
-    limits = np.empty((k, 15))
-    for row, noise in zip(limits, noises, strict=True):
+    dt, window_s = 1.0 / rate_hz, n / rate_hz
+    limits, bias = np.empty((k, _LIMITS)), np.zeros((k, 5))
+    for row, known, noise in zip(limits, bias, noises, strict=True):
         row[:6] = (n - 1) * test.alpha * noise.gyro_cov[_UPPER]
         row[6:12] = (n - 1) * test.beta * noise.accel_cov[_UPPER]
-        row[12:] = test.gamma1, (n - 1) * test.gamma2, 1.0 / noise.gravity
+        row[12:15] = test.gamma1, (n - 1) * test.gamma2, 1.0 / noise.gravity
+        white, sway = np.trace(noise.gyro_cov) / 3.0 / n, 0.0
+        if noise.gyro_half_second_cov is not None:
+            sway = np.trace(noise.gyro_half_second_cov) / 3.0 * BLOCK_S / window_s
+        row[_STDS2], row[_WINDOW_VAR] = test.rate_stds**2, max(white, sway)
+        row[_AVERAGE_VAR] = row[_WINDOW_VAR] * window_s / (2.0 * test.averaging_s)
+        row[_SPREAD_VAR], row[_WALK_VAR] = test.bias_spread**2, test.bias_walk**2 * dt
+        row[_FADE], row[_SHARE] = min(1.0, dt / test.averaging_s), 1.0 / n
+        known[:3], known[3] = noise.gyro_bias, np.trace(noise.gyro_bias_cov) / 3.0
     return StaticState(
         block=np.zeros((k, n, _SIGNALS)),
         tail=np.zeros((k, n, _SUMS)),
@@ -97,6 +134,7 @@ def static_state(noises: list[SensorNoise], rate_hz: float, test: StaticTest) ->
         anchor=np.zeros((k, _SIGNALS)),
         counts=np.zeros((k, 2), dtype=np.int64),
         limits=limits,
+        bias=bias,
     )
 
 
@@ -194,7 +232,34 @@ def _within(head, tail, row, limits, first, at, share):  # type: ignore[no-untyp
 
 
 @inlined
-def static_step(block, tail, head, anchor, counts, limits, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+def _bias_agrees(bias, limits, static, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+    """Condition (5) for a window that passes (1) to (4), of its mean rate g and mean specific force a; learns the bias.
+
+    `static`: whether the window passes them; where it does not the average fades and the known bias ages.
+    """
+    bias[3] += limits[_WALK_VAR]
+    if not static:
+        bias[4] -= limits[_FADE] * bias[4]
+        return False
+    gx, gy, gz = gx - bias[0], gy - bias[1], gz - bias[2]
+    off = (gx * ax + gy * ay + gz * az) / np.sqrt(ax * ax + ay * ay + az * az)
+    known = bias[3] + limits[_SPREAD_VAR]
+    bound = np.sqrt(limits[_STDS2] * (known + limits[_WINDOW_VAR]))
+    # What enters the average is bounded, so that it is soon forgotten when a fast rotation ends.
+    bias[4] += limits[_FADE] * (min(max(off, -bound), bound) - bias[4])
+    if abs(off) > bound or bias[4] * bias[4] > limits[_STDS2] * (known + limits[_AVERAGE_VAR]):
+        return False
+    # A window's mean measures the bias; its samples share that, since windows overlap.
+    gain = bias[3] / (bias[3] + limits[_WINDOW_VAR] / limits[_SHARE]) if bias[3] > 0.0 else 0.0
+    bias[0] += gain * gx
+    bias[1] += gain * gy
+    bias[2] += gain * gz
+    bias[3] -= gain * bias[3]
+    return True
+
+
+@inlined
+def static_step(block, tail, head, anchor, counts, limits, bias, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
     """One sample of one sensor, rows of a `StaticState`: is the window that it ends static?"""
     n = len(block)
     at = counts[0]
@@ -208,6 +273,7 @@ def static_step(block, tail, head, anchor, counts, limits, gx, gy, gz, ax, ay, a
         counts[0] = row
         _add(head, block, at, anchor)
         if counts[1] == 0:
+            bias[3] += limits[_WALK_VAR]
             return False
     else:  # the block is full and is the window: sum it up backwards, begin the next
         if (gx + gy + gz + norm) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
@@ -220,17 +286,29 @@ def static_step(block, tail, head, anchor, counts, limits, gx, gy, gz, ax, ay, a
         counts[1] = 1
         row = 0
     norm, share = head[6] + tail[row, 6], 1.0 / n
-    return (
+    static = (
         abs(anchor[6] + norm * share - 1.0) <= limits[12]  # (3)
         and head[19] + tail[row, 19] - norm * norm * share <= limits[13]  # (4)
         and _within(head, tail, row, limits, 0, 7, share)  # (1)
         and _within(head, tail, row, limits, 3, 13, share)  # (2)
     )
+    return _bias_agrees(
+        bias,
+        limits,
+        static,
+        anchor[0] + (head[0] + tail[row, 0]) * share,
+        anchor[1] + (head[1] + tail[row, 1]) * share,
+        anchor[2] + (head[2] + tail[row, 2]) * share,
+        anchor[3] + (head[3] + tail[row, 3]) * share,
+        anchor[4] + (head[4] + tail[row, 4]) * share,
+        anchor[5] + (head[5] + tail[row, 5]) * share,
+    )
 
 
 @kernel
-def _run(block, tail, head, anchor, counts, limits, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+def _run(block, tail, head, anchor, counts, limits, bias, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
     block, tail, head, anchor, counts, limits = block[0], tail[0], head[0], anchor[0], counts[0], limits[0]
+    bias = bias[0]
     for k in range(len(gyro_S)):
         static[k] = static_step(
             block,
@@ -239,6 +317,7 @@ def _run(block, tail, head, anchor, counts, limits, gyro_S, accel_S, static):  #
             anchor,
             counts,
             limits,
+            bias,
             gyro_S[k, 0],
             gyro_S[k, 1],
             gyro_S[k, 2],

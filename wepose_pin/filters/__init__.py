@@ -6,9 +6,11 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..errors import BadData, BadOption, BadPhase, one_of
@@ -20,6 +22,7 @@ from .gdc import Gdc, GdcParams
 from .ncf import Ncf, NcfParams
 from .smekf import Smekf, SmekfParams, starting_params
 from .smoother import Smoother
+from .start import MOVING_TILT_STD, StartTilt, start_tilt
 
 __all__ = [
     "BEST",
@@ -62,7 +65,7 @@ TYPICAL = SensorNoise(
 
 
 class Orientation(NamedTuple):
-    """Orientation of one sensor over time, in a world of its own: z up, zero heading at the start."""
+    """Orientation of one sensor over time, in a world of its own: z up, zero heading where the start phase begins."""
 
     quat_WS: np.ndarray  # (n, 4) xyzw
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
@@ -109,7 +112,8 @@ def estimate_orientation(
     params : the filter's own frozen parameters; None for its defaults
     static_test : when the sensor counts as still; None for the paper's values
 
-    The start has zero heading and the tilt of the accelerometer, averaged over the first window of `static_test`.
+    The still phase begins with zero heading and the tilt of the accelerometer, averaged over it (without one: over the
+    first window of `static_test`); the filter goes forward and backward from there.
 
     Raises
     ------
@@ -146,6 +150,7 @@ def estimate_orientation(
         method,
         params,
         static_test,
+        start=slice(first, last),
     )
 
 
@@ -155,15 +160,17 @@ def piece_multiple(method: str, rate_hz: float) -> int:
 
 
 class SensorRun:
-    """`run_filter` of a recording that comes in pieces; all that it gives, put together, is that of the whole.
+    """`run_filter` of a recording that comes in chunks; all that it gives, put together, is that of the whole.
 
-    The smoother alone looks ahead, by one piece: `push` gives the piece before, and what lies further ahead does not
-    count. Its pieces are multiples of `piece_multiple`. Parameters as `run_filter`.
+    The filter starts with the tilt of the start phase and goes forward from its first sample; what lies before is
+    filtered backward from there, so that a recording may begin in motion. The smoother alone looks ahead, by one chunk:
+    `push` gives the chunk before, and what lies further ahead does not count. Its chunks are multiples of
+    `piece_multiple`. Parameters as `run_filter`; the start phase is in the first chunk.
 
     Raises
     ------
     BadData
-        The first piece has no gravity in its first window, in which the filter starts.
+        The start phase has no gravity in it.
     """
 
     def __init__(
@@ -174,43 +181,74 @@ class SensorRun:
         params: Any = None,
         static_test: StaticTest | None = None,
         measured_start: bool = False,
+        start: slice | None = None,
     ) -> None:
         self.test = static_test or StaticTest()
         self._noise, self._rate_hz, self._method, self._params = noise, rate_hz, method, params
-        self._measured_start = measured_start
+        self._measured_start, self._start = measured_start, start
         self._detector = StaticDetector(noise, rate_hz, self.test)
         self._filter: Any = None
-        self._held: np.ndarray | None = None  # `static` of the smoother's piece
+        self._before: Orientation | None = None  # what lies before the start phase, until it is given
+        self._static: np.ndarray | None = None  # of the smoother's chunk
 
     def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation | None:
-        """Take a piece (n, 3) [rad/s], (n, 3) [m/s²]; gives it filtered, or the one before it smoothed."""
-        static = self._detector.run(gyro_S, accel_S)
+        """Take a chunk (n, 3) [rad/s], (n, 3) [m/s²]; gives it filtered, or the one before it smoothed."""
         if self._filter is None:
-            self._begin(accel_S, static)
+            first = self._begin(gyro_S, accel_S)
+            gyro_S, accel_S = gyro_S[first:], accel_S[first:]
+        static = self._detector.run(gyro_S, accel_S)
         if self._method in OFFLINE:
-            done, self._held, before = self._filter.push(gyro_S, accel_S, static), static, self._held
+            done, self._static, before = self._filter.push(gyro_S, accel_S, static), static, self._static
             return None if done is None or before is None else self._orientation(done, before)
         return self._orientation(self._filter.run(gyro_S, accel_S, static), static)
 
     def finish(self) -> Orientation:
-        """The smoother's last piece."""
-        assert self._held is not None
-        return self._orientation(self._filter.finish(), self._held)
+        """The smoother's last chunk."""
+        assert self._static is not None
+        return self._orientation(self._filter.finish(), self._static)
 
-    def _begin(self, accel_S: np.ndarray, static: np.ndarray) -> None:
-        window = self.test.samples(self._rate_hz)
-        first_accel = accel_S[:window].mean(axis=0)
-        if not np.linalg.norm(first_accel) > 0.0:
-            raise BadData(
-                f"accel is zero in the first {self.test.window_s:g} s; the filter starts from the direction of gravity"
-            )
-        quat_start, params = so3.tilt(first_accel), self._params
-        if self._measured_start and params is None and self._method == "smekf":
-            params = starting_params(self._noise, quat_start, still_start=bool(static[window - 1 : window].any()))
-        self._filter = METHODS[self._method](self._noise, self._rate_hz, quat_start, params)
+    def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> int:
+        """Make the filter, and filter what lies before its first sample; gives that sample's index."""
+        multiple = piece_multiple(self._method, self._rate_hz)
+        phase = self._start or slice(0, self.test.samples(self._rate_hz))
+        first = phase.start // multiple * multiple
+        samples = slice(first, phase.stop)
+        start = start_tilt(gyro_S[samples], accel_S[samples], self._noise, self._rate_hz)
+        if self._start is None:  # nobody says that it rests there
+            static = StaticDetector(self._noise, self._rate_hz, self.test).run(gyro_S[samples], accel_S[samples])
+            if not static[-1]:
+                start = start._replace(tilt_std=MOVING_TILT_STD)
+        self._filter = self._made(self._noise, start)
+        if first > 0:
+            turn = so3.exp(np.nan_to_num(gyro_S[first] - self._noise.gyro_bias) / self._rate_hz)
+            quat_WS = (Rotation.from_quat(start.quat_WS) * Rotation.from_quat(turn)).as_quat()
+            # Backward in time rates change their sign, the bias' too; specific forces do not.
+            noise = replace(self._noise, gyro_bias=-self._noise.gyro_bias)
+            gyro, accel = -gyro_S[first:0:-1], accel_S[first - 1 :: -1]
+            static = StaticDetector(noise, self._rate_hz, self.test).run(gyro, accel)
+            run = self._made(noise, start._replace(quat_WS=quat_WS)).run(gyro, accel, static)
+            cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
+            self._before = Orientation(run.quat_WS[::-1], -run.gyro_bias[::-1], static[::-1], cov, self._noise)
+        return first
+
+    def _made(self, noise: SensorNoise, start: StartTilt) -> Any:
+        params = self._params
+        if params is None and self._method in ("amekf", "smoother") and self._start is not None:
+            params = AmekfParams(tilt_std=start.tilt_std)
+        if params is None and self._method == "smekf" and self._measured_start:
+            params = starting_params(noise, self._rate_hz, start.quat_WS, start.tilt_std)
+        return METHODS[self._method](noise, self._rate_hz, start.quat_WS, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
         live = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
+        before, self._before = self._before, None
+        if before is not None:
+            run = FilterRun(
+                np.concatenate([before.quat_WS, run.quat_WS]),
+                np.concatenate([before.gyro_bias, run.gyro_bias]),
+                None if run.attitude_cov is None else np.concatenate([before.attitude_cov, run.attitude_cov]),
+            )
+            static = np.concatenate([before.static, static])
         return Orientation(run.quat_WS, run.gyro_bias, static, run.attitude_cov, self._noise, *live)
 
 
@@ -223,10 +261,12 @@ def run_filter(
     params: Any = None,
     static_test: StaticTest | None = None,
     measured_start: bool = False,
+    start: slice | None = None,
 ) -> Orientation:
     """`estimate_orientation` once the noise is known and the arrays are checked.
 
     `measured_start`: without `params`, smekf takes P₀ from `noise` in place of the paper's (`smekf.starting_params`).
+    `start`: samples of the start phase; None: the first window of `static_test`, at rest or not.
     """
-    run = SensorRun(rate_hz, noise, method, params, static_test, measured_start)
+    run = SensorRun(rate_hz, noise, method, params, static_test, measured_start, start)
     return run.push(gyro_S, accel_S) or run.finish()

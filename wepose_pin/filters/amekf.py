@@ -29,7 +29,7 @@ from ..errors import BadOption
 from ..noise import BLOCK_S, SensorNoise
 from ..so3 import inlined, kernel
 from ..static import static_step
-from .base import HIGHEST_ACCEL, HIGHEST_RATE, FilterRun, OneSample, samples
+from .base import HIGHEST_ACCEL, HIGHEST_RATE, REST_TURN_NOISE, FilterRun, OneSample, samples
 
 # Error states
 _V, _P, _B, _M, _F, _D = 3, 5, 7, 10, 19, 22  # velocity, position, bias, matrix, accel (force) bias, bias in motion
@@ -45,7 +45,7 @@ _LOST = 4.0  # [rad] of unknown turn are as good as any more
 # Parameters in the order in which the compiled steps take them
 _PARAMETERS = (
     "gravity gyro_noise accel_noise speed position zero_speed rate_noise force_noise bias_walk matrix_walk "
-    "accel_bias_walk motion_bias_walk rest_bias lost_rate lost_force gyro_limit accel_limit knock"
+    "accel_bias_walk motion_bias_walk rest_bias lost_rate lost_force gyro_limit accel_limit knock rest_turn"
 ).split()
 
 # A tape row, for the smoother: transition sums (45), the block's length [s], variance of the turn lost in it, number of
@@ -82,6 +82,7 @@ class AmekfParams:
     gyro_matrix_walk: float = 1e-6  # [1/√s]
     gyro_bias_walk: float = 5e-6  # [rad/s/√s], 10 deg/h in 100 s
     rest_bias_std: float = 1e-4  # [rad/s] by which the mean of gyro over a static block is not the bias, sway aside
+    rest_turn_noise: float = REST_TURN_NOISE  # [rad/√s]
     motion_bias_std: float = 1.7e-4  # [rad/s], 0.01 deg/s, bias in motion less that at rest
     motion_bias_walk: float = 5e-5  # [rad/s/√s]
     accel_bias_std: float = 0.03  # [m/s²], 3 mg
@@ -164,6 +165,8 @@ class Amekf:
             "gyro_limit": p.gyro_range,
             "accel_limit": p.accel_range,
             "knock": p.knock,
+            # Who sways may turn slowly as well: half of what the sway's rate adds up to.
+            "rest_turn": p.rest_turn_noise**2 + (0.0 if slow is None else float(np.trace(slow)) / 6.0 * BLOCK_S),
         }
         accel = np.linalg.inv(np.eye(3) + p.accel_matrix)  # measured to true
         self.model = np.concatenate(
@@ -267,7 +270,7 @@ def _close(state, quat, x, P, sums, dt, numbers, tape, row):  # type: ignore[no-
     rows, columns = state[at : at + 175].reshape((7, STATES)), state[at + 175 : at + 350].reshape((STATES, 7))
     corner = state[at + 350 : at + 399].reshape((7, 7))
     d, scaled = state[at + 399 : at + 424], state[at + 424 : at + 449]
-    count = numbers[28]
+    count = numbers[29]
     gravity, gyro_noise, accel_noise = numbers[0], numbers[1], numbers[2]
     speed, position, zero_speed = numbers[3], numbers[4], numbers[5]
     rate_noise, force_noise, bias_walk, matrix_walk = numbers[6], numbers[7], numbers[8], numbers[9]
@@ -309,6 +312,8 @@ def _close(state, quat, x, P, sums, dt, numbers, tape, row):  # type: ignore[no-
         P[_V + i, _V + i] += pushed
 
     still = sums[_STATIC] == count
+    if still:
+        P[2, 2] += numbers[18] * length
     for j in range(STATES):
         d[j] = 0.0
     n = MEASUREMENTS if still else 4
@@ -398,11 +403,11 @@ def matrix_of(quat, R):  # type: ignore[no-untyped-def]
 
 @inlined
 def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: ignore[no-untyped-def]
-    """One sample of one sensor: `state` (1180,), `model` (29,), gyro [rad/s], accel [m/s²]; whether a block ended."""
+    """One sample of one sensor: `state` (1180,), `model` (30,), gyro [rad/s], accel [m/s²]; whether a block ended."""
     quat, x, sums, kept, R = state[:4], state[_X:_COV], state[_SUM:_KEEP], state[_KEEP:_COUNT], state[_ROOM : _ROOM + 9]
     P = state[_COV:_SUM].reshape((STATES, STATES))
     gravity, lost_rate, gyro_limit, accel_limit, knock = model[0], model[13], model[15], model[16], model[17]
-    dt = model[27]
+    dt = model[28]
     moving = 0.0 if static else 1.0
     bx, by, bz = x[_B] + moving * x[_D], x[_B + 1] + moving * x[_D + 1], x[_B + 2] + moving * x[_D + 2]
     if gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE:  # false for NaN
@@ -451,9 +456,9 @@ def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: igno
         if max(abs(ax), abs(ay), abs(az)) >= accel_limit:
             sums[_LOST_FORCE] += dt
         ax, ay, az = ax - x[_F], ay - x[_F + 1], az - x[_F + 2]
-        fx = model[18] * ax + model[19] * ay + model[20] * az
-        fy = model[21] * ax + model[22] * ay + model[23] * az
-        fz = model[24] * ax + model[25] * ay + model[26] * az
+        fx = model[19] * ax + model[20] * ay + model[21] * az
+        fy = model[22] * ax + model[23] * ay + model[24] * az
+        fz = model[25] * ax + model[26] * ay + model[27] * az
         ax = R[0] * fx + R[1] * fy + R[2] * fz
         ay = R[3] * fx + R[4] * fy + R[5] * fz
         az = R[6] * fx + R[7] * fy + R[8] * fz - gravity
@@ -469,7 +474,7 @@ def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: igno
     x[_V + 1] += dt * ay
 
     state[_COUNT] += 1.0
-    full = state[_COUNT] == model[28]
+    full = state[_COUNT] == model[29]
     if full:
         _close(state, quat, x, P, sums, dt, model, tape, row)
         state[_COUNT] = 0.0
@@ -496,12 +501,14 @@ def _run(state, model, gyro_S, accel_S, static, tape, out_quat, out_bias, out_co
 
 @kernel
 def _live(  # type: ignore[no-untyped-def]
-    rows, models, block, tail, head, anchor, counts, limits, gyro_S, accel_S, static
+    rows, models, block, tail, head, anchor, counts, limits, bias, gyro_S, accel_S, static
 ):
     """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `bank.LiveBank` has them."""
     for i in range(len(rows)):
         gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]
         ax, ay, az = accel_S[i, 0], accel_S[i, 1], accel_S[i, 2]
-        still = static_step(block[i], tail[i], head[i], anchor[i], counts[i], limits[i], gx, gy, gz, ax, ay, az)
+        still = static_step(
+            block[i], tail[i], head[i], anchor[i], counts[i], limits[i], bias[i], gx, gy, gz, ax, ay, az
+        )
         static[i] = still
         step(rows[i], models[i], gx, gy, gz, ax, ay, az, still, models[:0], 0)  # no tape

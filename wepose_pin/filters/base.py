@@ -18,6 +18,9 @@ T = TypeVar("T")
 HIGHEST_RATE = 1e3  # [rad/s]
 HIGHEST_ACCEL = 1e4  # [m/s²]
 
+# [rad/√s] by which a sensor that counts as static may turn about the vertical unseen: 0.01 deg/s for 10 s at a time
+REST_TURN_NOISE = 8e-4
+
 
 class FilterRun(NamedTuple):
     """What a run gives, one row a sample."""

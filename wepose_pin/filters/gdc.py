@@ -1,7 +1,8 @@
 """GDC: gradient-descent filter without magnetometer (Madgwick, Harrison, Vaidyanathan 2011, ICORR).
 
 Their equations (25), (26), (32) to (34): q̇ = ½ q ⊗ (gyro − b) − β ∇f/‖∇f‖ with f = R_WSᵀ e_z − a. The bias is the
-still phase's and stays; their bias step needs a magnetometer.
+still phase's and stays; their bias step needs a magnetometer. Of ∇f only the part across q is taken: the part along q
+turns nothing, and in their f, which counts on ‖q‖ = 1, its size depends on how the sensor's axes lie.
 """
 
 from __future__ import annotations
@@ -78,6 +79,8 @@ def _step(quat, wx, wy, wz, ax, ay, az, dt, gain):  # type: ignore[no-untyped-de
         gx = 2.0 * z * f1 + 2.0 * w * f2 - 4.0 * x * f3
         gy = -2.0 * w * f1 + 2.0 * z * f2 - 4.0 * y * f3
         gz = 2.0 * x * f1 + 2.0 * y * f2
+        along = gw * w + gx * x + gy * y + gz * z
+        gw, gx, gy, gz = gw - along * w, gx - along * x, gy - along * y, gz - along * z
         steep = np.sqrt(gw * gw + gx * gx + gy * gy + gz * gz)
         if steep > 0.0:
             dx -= gain * gx / steep

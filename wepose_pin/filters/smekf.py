@@ -1,4 +1,9 @@
-"""sMEKF: the multiplicative Kalman filter that corrects only at rest (Lisini Baldi 2019, Algorithm 1), nothing added.
+"""sMEKF: the multiplicative Kalman filter that corrects only at rest (Lisini Baldi 2019, Algorithm 1).
+
+One thing differs from the paper, which works to first order: its transition Φ = I − [ω δt]× lets the covariance grow by
+√(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz to 10⁶ deg in 20 s, and leaves it as it is where a correction turns
+the attitude, so that rests seem to measure the heading. Here Φ = exp(−[ω δt]×), and the covariance turns with the
+correction; `SmekfParams.first_order` is the paper's.
 
 The state is x = [a; b]: the attitude error a [rad] on the right of `quat_WS`, in the sensor frame, and the gyroscope
 bias b [rad/s]. Measurement model: gyro = ω + b + w_ω, accel/g = R_WSᵀ e_z + w_g. At rest ω = 0, so gyro measures b.
@@ -12,13 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import BadOption
-from ..noise import SensorNoise
+from ..noise import BLOCK_S, SensorNoise
 from ..so3 import inlined, kernel, rotate_by_vector, up_in_sensor
 from ..static import static_step
-from .base import HIGHEST_ACCEL, HIGHEST_RATE, FilterRun, OneSample, samples
+from .base import HIGHEST_ACCEL, HIGHEST_RATE, REST_TURN_NOISE, FilterRun, OneSample, samples
 
-ACCEL_BIAS_STD = 0.003  # [rad] tilt error that a calibrated MEMS accelerometer's bias makes (3 mg: our assumption)
-MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
 HEADING_FLOOR = 1e-5  # [rad] keeps P₀ positive definite about the vertical
 
 
@@ -26,36 +29,47 @@ HEADING_FLOOR = 1e-5  # [rad] keeps P₀ positive definite about the vertical
 class SmekfParams:
     """P₀ and Σ_b; the defaults are those of the authors' published software.
 
-    Their P₀ gives the heading, which nothing measures, a standard deviation of 1.8 deg. With the first-order F of the
-    algorithm this leaks into the tilt over a minute of motion at 100 Hz and comes back as jumps of the heading by
-    degrees at the next rest; `starting_params` says what a still start is really worth. Their Σ_b is some 2 Σ_ω, orders
-    above the drift of a real bias, so every rest forgets the ones before and the covariance is too large.
+    Their P₀ gives the heading, which nothing measures, a standard deviation of 1.8 deg. `starting_params` says what a
+    still start is really worth. Their Σ_b is some 2 Σ_ω, orders above the drift of a real bias, so every rest forgets
+    the ones before and the covariance is too large.
 
     By how much, over two minutes of simulated motion with rests (`tests/test_filters.py` measures it; a NEES of 3 is
-    right, below is a covariance too large): NEES 1.9 and 0.57 deg of heading (rms) with the paper's P₀ and Σ_b, 1.1 and
-    0.10 deg with a measured P₀, 2.2 and 0.08 deg with a measured P₀ and the Σ_b of a bias that drifts by 10 deg/h.
+    right, below is a covariance too large): NEES 1.9 and 0.57 deg of heading (rms) with the paper's P₀, Σ_b and first
+    order, 1.3 and 0.10 deg exact and with a measured P₀, 2.3 and 0.08 deg with the Σ_b of a bias that drifts by
+    10 deg/h as well.
     """
 
     attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
     bias_cov0: float | np.ndarray = 1e-3  # [rad²/s²], a number or (3, 3)
     bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the still phase's first differences
+    rest_gyro_cov: np.ndarray | None = None  # (3, 3) [rad²/s²] by which gyro at rest is not the bias; None: Σ_ω
+    rest_turn_noise: float = (
+        0.0  # [rad/√s] by which a sensor at rest may turn about the vertical unseen; the paper: none
+    )
+    first_order: bool = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
 
 
-def starting_params(noise: SensorNoise, quat_WS: np.ndarray, still_start: bool) -> SmekfParams:
-    """P₀ from what the still phase says: the tilt as good as the accelerometer, the heading exact by definition.
+def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, tilt_std: float) -> SmekfParams:
+    """P₀ from what the start phase says: the tilt as good as it is known, the heading exact by definition.
+
+    A person's sway goes on from sample to sample, where Σ_ω is taken for white: what gyro measures of the bias at rest
+    counts as much as the sway's means over half seconds allow.
 
     Parameters
     ----------
     quat_WS : (4,) xyzw, the orientation the filter starts from
-    still_start : the recording begins at rest; if not, the first tilt may be off by tens of degrees
+    tilt_std : [rad] one standard deviation of its roll and pitch
     """
     up_S = np.array(up_in_sensor(quat_WS))
-    tilt_std = ACCEL_BIAS_STD if still_start else MOVING_TILT_STD
-    across = np.cross(np.eye(3), up_S)  # [up]×, up to the sign: an error of the measured vertical is one of the tilt
-    measured = tilt_std**2 * np.eye(3) + noise.accel_cov * bool(still_start)
+    across = np.eye(3) - np.outer(up_S, up_S)
+    rest, slow = noise.gyro_cov, noise.gyro_half_second_cov
+    if slow is not None:
+        rest = max(rest, BLOCK_S * rate_hz * slow, key=np.trace)
     return SmekfParams(
-        attitude_cov0=across.T @ measured @ across + HEADING_FLOOR**2 * np.eye(3),
+        attitude_cov0=tilt_std**2 * across + HEADING_FLOOR**2 * np.eye(3),
         bias_cov0=noise.gyro_bias_cov,
+        rest_gyro_cov=rest,
+        rest_turn_noise=REST_TURN_NOISE,
     )
 
 
@@ -107,8 +121,7 @@ class Smekf:
         self.params = params or SmekfParams()
         self.noise = noise
         self.rate_hz = rate_hz
-        step = self.params.bias_step_cov
-        self.model = _model(noise, 1.0 / rate_hz, noise.bias_step_cov if step is None else _matrix(step))
+        self.model = _model(noise, 1.0 / rate_hz, self.params)
         row = np.zeros(STATE_SIZE)
         row[QUAT:BIAS], row[BIAS:P_AA] = quat_WS, noise.gyro_bias
         row[P_AA:P_AB] = _matrix(self.params.attitude_cov0)[_UPPER]
@@ -143,15 +156,20 @@ def _matrix(cov: float | np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _model(noise: SensorNoise, dt: float, bias_step_cov: np.ndarray) -> np.ndarray:
-    """(27,): δt, 1/g, δt² Σ_ω, δt² Σ_b, Σ_ω, Σ_g as upper triangles, what is left of a held rate after a sample."""
-    covs = dt * dt * noise.gyro_cov, dt * dt * bias_step_cov, noise.gyro_cov, noise.accel_cov
-    return np.concatenate([[dt, 1.0 / noise.gravity], *(cov[_UPPER] for cov in covs), [np.exp(-dt / HOLD_S)]])
+def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
+    """(29,): δt, 1/g, δt² Σ_ω, δt² Σ_b, gyro's at rest, Σ_g as upper triangles, what is left of a held rate after a
+    sample, whether the transition is of first order, variance of an unseen turn in a sample at rest."""
+    step, rest = params.bias_step_cov, params.rest_gyro_cov
+    bias_step_cov = noise.bias_step_cov if step is None else _matrix(step)
+    rest_gyro_cov = noise.gyro_cov if rest is None else _matrix(rest)
+    covs = dt * dt * noise.gyro_cov, dt * dt * bias_step_cov, rest_gyro_cov, noise.accel_cov
+    ends = [np.exp(-dt / HOLD_S), float(params.first_order), params.rest_turn_noise**2 * dt]
+    return np.concatenate([[dt, 1.0 / noise.gravity], *(cov[_UPPER] for cov in covs), ends])
 
 
 @inlined
 def step(x, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
-    """One sample of one sensor: `x` (32,) its state, `model` (27,), gyro [rad/s], accel [m/s²]."""
+    """One sample of one sensor: `x` (32,) its state, `model` (29,), gyro [rad/s], accel [m/s²]."""
     dt = model[0]
     seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE  # false for NaN
     unseen_cov = 0.0
@@ -172,37 +190,97 @@ def step(x, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-d
 
 
 @inlined
-def predict(x, model, wx, wy, wz, unseen_cov):  # type: ignore[no-untyped-def]
-    """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w), P ← F P Fᵀ + G Q Gᵀ, block by block.
+def transition_series(t):  # type: ignore[no-untyped-def]
+    """cos θ, sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ of θ² = `t`; below 0.02 by series, to the last bit or two."""
+    if t < 0.02:
+        s = 1.0 - t / 6.0 * (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0)))
+        c = 0.5 * (1.0 - t / 12.0 * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0))))
+        d = (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0 * (1.0 - t / 110.0)))) / 6.0
+        return 1.0 - t * c, s, c, d
+    angle = np.sqrt(t)
+    cosine, s = np.cos(angle), np.sin(angle) / angle
+    return cosine, s, (1.0 - cosine) / t, (1.0 - s) / t
 
-    F = [[A, −δt I], [0, I]] with A = I − [w]×, and G Q Gᵀ = δt² diag(Σ_ω, Σ_b). `unseen_cov` [rad²] is added on top.
+
+@inlined
+def predict(x, model, wx, wy, wz, unseen_cov):  # type: ignore[no-untyped-def]
+    """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w), P ← F P Fᵀ + G Q Gᵀ.
+
+    G Q Gᵀ = δt² diag(Σ_ω, Σ_b). `unseen_cov` [rad²] is added on top.
     """
     rotate_by_vector(x, wx, wy, wz)
-    dt = model[0]
+    carry(x, wx, wy, wz, model[0], model[27] != 0.0)
+    x[7] += model[2] + unseen_cov
+    x[8] += model[3]
+    x[9] += model[4]
+    x[10] += model[5] + unseen_cov
+    x[11] += model[6]
+    x[12] += model[7] + unseen_cov
+    x[22] += model[8]
+    x[23] += model[9]
+    x[24] += model[10]
+    x[25] += model[11]
+    x[26] += model[12]
+    x[27] += model[13]
+
+
+@inlined
+def carry(x, wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
+    """P ← F P Fᵀ over the turn w [rad] in δt [s], block by block.
+
+    F = [[A, B], [0, I]] with A = exp(−[w]×) and B = −δt ∫₀¹ exp(−[w]× u) du; to first order, as the paper writes it,
+    A = I − [w]× and B = −δt I.
+    """
+    cosine, s, c, d = 1.0, 1.0, 0.0, 0.0
+    e = 1.0  # B's share of I, s where A's is cos θ
+    if not first_order:
+        cosine, s, c, d = transition_series(wx * wx + wy * wy + wz * wz)
+        e = s
+    # A = cos θ I − s [w]× + c w wᵀ
+    xy, xz, yz = c * wx * wy, c * wx * wz, c * wy * wz
+    ux, uy, uz = s * wx, s * wy, s * wz
+    A00, A01, A02 = cosine + c * wx * wx, xy + uz, xz - uy
+    A10, A11, A12 = xy - uz, cosine + c * wy * wy, yz + ux
+    A20, A21, A22 = xz + uy, yz - ux, cosine + c * wz * wz
+    # B = −δt (s I − c [w]× + d w wᵀ)
+    d, ux, uy, uz = -dt * d, -dt * c * wx, -dt * c * wy, -dt * c * wz
+    xy, xz, yz = d * wx * wy, d * wx * wz, d * wy * wz
+    B00, B01, B02 = d * wx * wx - dt * e, xy + uz, xz - uy
+    B10, B11, B12 = xy - uz, d * wy * wy - dt * e, yz + ux
+    B20, B21, B22 = xz + uy, yz - ux, d * wz * wz - dt * e
     axx, axy, axz, ayy, ayz, azz = x[7], x[8], x[9], x[10], x[11], x[12]
     bxx, bxy, bxz, byx, byy, byz, bzx, bzy, bzz = x[13], x[14], x[15], x[16], x[17], x[18], x[19], x[20], x[21]
     cxx, cxy, cxz, cyy, cyz, czz = x[22], x[23], x[24], x[25], x[26], x[27]
-    # A P_ab
-    mxx, mxy, mxz = bxx + wz * byx - wy * bzx, bxy + wz * byy - wy * bzy, bxz + wz * byz - wy * bzz
-    myx, myy, myz = byx - wz * bxx + wx * bzx, byy - wz * bxy + wx * bzy, byz - wz * bxz + wx * bzz
-    mzx, mzy, mzz = bzx + wy * bxx - wx * byx, bzy + wy * bxy - wx * byy, bzz + wy * bxz - wx * byz
-    # A P_aa
-    nxx, nxy, nxz = axx + wz * axy - wy * axz, axy + wz * ayy - wy * ayz, axz + wz * ayz - wy * azz
-    nyx, nyy, nyz = axy - wz * axx + wx * axz, ayy - wz * axy + wx * ayz, ayz - wz * axz + wx * azz
-    nzx, nzy, nzz = axz + wy * axx - wx * axy, ayz + wy * axy - wx * ayy, azz + wy * axz - wx * ayz
-    # A P_aa Aᵀ − δt (A P_ab + its transpose) + δt² (P_bb + Σ_ω)
-    x[7] = (nxx + wz * nxy - wy * nxz) - dt * (mxx + mxx) + (dt * dt * cxx + model[2]) + unseen_cov
-    x[8] = (nxy - wz * nxx + wx * nxz) - dt * (mxy + myx) + (dt * dt * cxy + model[3])
-    x[9] = (nxz + wy * nxx - wx * nxy) - dt * (mxz + mzx) + (dt * dt * cxz + model[4])
-    x[10] = (nyy - wz * nyx + wx * nyz) - dt * (myy + myy) + (dt * dt * cyy + model[5]) + unseen_cov
-    x[11] = (nyz + wy * nyx - wx * nyy) - dt * (myz + mzy) + (dt * dt * cyz + model[6])
-    x[12] = (nzz + wy * nzx - wx * nzy) - dt * (mzz + mzz) + (dt * dt * czz + model[7]) + unseen_cov
-    # A P_ab − δt P_bb
-    x[13], x[14], x[15] = mxx - dt * cxx, mxy - dt * cxy, mxz - dt * cxz
-    x[16], x[17], x[18] = myx - dt * cxy, myy - dt * cyy, myz - dt * cyz
-    x[19], x[20], x[21] = mzx - dt * cxz, mzy - dt * cyz, mzz - dt * czz
-    x[22], x[23], x[24] = cxx + model[8], cxy + model[9], cxz + model[10]
-    x[25], x[26], x[27] = cyy + model[11], cyz + model[12], czz + model[13]
+    # M = A P_ab + B P_bb, the new P_ab
+    M00 = A00 * bxx + A01 * byx + A02 * bzx + B00 * cxx + B01 * cxy + B02 * cxz
+    M01 = A00 * bxy + A01 * byy + A02 * bzy + B00 * cxy + B01 * cyy + B02 * cyz
+    M02 = A00 * bxz + A01 * byz + A02 * bzz + B00 * cxz + B01 * cyz + B02 * czz
+    M10 = A10 * bxx + A11 * byx + A12 * bzx + B10 * cxx + B11 * cxy + B12 * cxz
+    M11 = A10 * bxy + A11 * byy + A12 * bzy + B10 * cxy + B11 * cyy + B12 * cyz
+    M12 = A10 * bxz + A11 * byz + A12 * bzz + B10 * cxz + B11 * cyz + B12 * czz
+    M20 = A20 * bxx + A21 * byx + A22 * bzx + B20 * cxx + B21 * cxy + B22 * cxz
+    M21 = A20 * bxy + A21 * byy + A22 * bzy + B20 * cxy + B21 * cyy + B22 * cyz
+    M22 = A20 * bxz + A21 * byz + A22 * bzz + B20 * cxz + B21 * cyz + B22 * czz
+    # N = A P_aa + B P_ba
+    N00 = A00 * axx + A01 * axy + A02 * axz + B00 * bxx + B01 * bxy + B02 * bxz
+    N01 = A00 * axy + A01 * ayy + A02 * ayz + B00 * byx + B01 * byy + B02 * byz
+    N02 = A00 * axz + A01 * ayz + A02 * azz + B00 * bzx + B01 * bzy + B02 * bzz
+    N10 = A10 * axx + A11 * axy + A12 * axz + B10 * bxx + B11 * bxy + B12 * bxz
+    N11 = A10 * axy + A11 * ayy + A12 * ayz + B10 * byx + B11 * byy + B12 * byz
+    N12 = A10 * axz + A11 * ayz + A12 * azz + B10 * bzx + B11 * bzy + B12 * bzz
+    N20 = A20 * axx + A21 * axy + A22 * axz + B20 * bxx + B21 * bxy + B22 * bxz
+    N21 = A20 * axy + A21 * ayy + A22 * ayz + B20 * byx + B21 * byy + B22 * byz
+    N22 = A20 * axz + A21 * ayz + A22 * azz + B20 * bzx + B21 * bzy + B22 * bzz
+    # N Aᵀ + M Bᵀ, the new P_aa
+    x[7] = N00 * A00 + N01 * A01 + N02 * A02 + M00 * B00 + M01 * B01 + M02 * B02
+    x[8] = N00 * A10 + N01 * A11 + N02 * A12 + M00 * B10 + M01 * B11 + M02 * B12
+    x[9] = N00 * A20 + N01 * A21 + N02 * A22 + M00 * B20 + M01 * B21 + M02 * B22
+    x[10] = N10 * A10 + N11 * A11 + N12 * A12 + M10 * B10 + M11 * B11 + M12 * B12
+    x[11] = N10 * A20 + N11 * A21 + N12 * A22 + M10 * B20 + M11 * B21 + M12 * B22
+    x[12] = N20 * A20 + N21 * A21 + N22 * A22 + M20 * B20 + M21 * B21 + M22 * B22
+    x[13], x[14], x[15] = M00, M01, M02
+    x[16], x[17], x[18] = M10, M11, M12
+    x[19], x[20], x[21] = M20, M21, M22
 
 
 @inlined
@@ -262,9 +340,20 @@ def correct(x, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
     )
     e = fuse(x, row0, row1, row2, S, innovation)
     rotate_by_vector(x, d[0] + e[0], d[1] + e[1], d[2] + e[2])
+    if model[27] == 0.0:
+        # The vertical, which accel does not measure about, turns in S with the correction, and P with it: left as it
+        # was, P would lie askew and the next sample would take its long axis for one that accel measures.
+        carry(x, d[0] + e[0], d[1] + e[1], d[2] + e[2], 0.0, False)
     x[4] += d[3] + e[3]
     x[5] += d[4] + e[4]
     x[6] += d[5] + e[5]
+    tx, ty, tz = model[28] * ux, model[28] * uy, model[28] * uz
+    x[7] += tx * ux
+    x[8] += tx * uy
+    x[9] += tx * uz
+    x[10] += ty * uy
+    x[11] += ty * uz
+    x[12] += tz * uz
 
 
 @inlined
@@ -343,12 +432,14 @@ def _run(x, model, gyro_S, accel_S, static, out_quat, out_bias, out_cov):  # typ
 
 @kernel
 def _live(  # type: ignore[no-untyped-def]
-    rows, models, block, tail, head, anchor, counts, limits, gyro_S, accel_S, static
+    rows, models, block, tail, head, anchor, counts, limits, bias, gyro_S, accel_S, static
 ):
     """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `bank.LiveBank` has them."""
     for i in range(len(rows)):
         gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]
         ax, ay, az = accel_S[i, 0], accel_S[i, 1], accel_S[i, 2]
-        still = static_step(block[i], tail[i], head[i], anchor[i], counts[i], limits[i], gx, gy, gz, ax, ay, az)
+        still = static_step(
+            block[i], tail[i], head[i], anchor[i], counts[i], limits[i], bias[i], gx, gy, gz, ax, ay, az
+        )
         static[i] = still
         step(rows[i], models[i], gx, gy, gz, ax, ay, az, still)

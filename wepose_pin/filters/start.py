@@ -1,0 +1,55 @@
+"""Where a filter starts: the tilt of the start phase, forward from its first sample and backward before it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .. import so3
+from ..errors import BadData
+from ..noise import BLOCK_S, SensorNoise
+
+ACCEL_BIAS_STD = 0.003  # [rad] tilt error that a calibrated MEMS accelerometer's bias makes (3 mg: our assumption)
+MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
+
+
+class StartTilt(NamedTuple):
+    """Orientation of a sensor before the first sample of its start phase."""
+
+    quat_WS: np.ndarray  # (4,) xyzw, zero heading
+    tilt_std: float  # [rad] one standard deviation of roll and of pitch
+
+
+def start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise, rate_hz: float) -> StartTilt:
+    """Tilt before the first of some samples at rest, from their mean specific force.
+
+    The gyroscope turns each sample's force into the sensor frame of the first, so that sway does not blur the mean.
+    Samples that are no numbers are left out.
+
+    Parameters
+    ----------
+    gyro_S, accel_S : (n, 3) [rad/s], (n, 3) [m/s²]
+
+    Raises
+    ------
+    BadData
+        No gravity in them.
+    """
+    rate = np.where(np.isfinite(gyro_S), gyro_S - noise.gyro_bias, 0.0)
+    force = Rotation.from_quat(so3.integrate(rate / rate_hz)[1:]).apply(np.nan_to_num(accel_S))
+    force = force[np.isfinite(accel_S).all(axis=1)]
+    mean = force.mean(axis=0) if len(force) else np.zeros(3)
+    norm = float(np.linalg.norm(mean))
+    if not norm > 0.0:
+        raise BadData("accel is zero in the start phase; the filter starts from the direction of gravity")
+    across = force - (force @ mean)[:, None] * mean / norm**2
+    size = max(1, round(BLOCK_S * rate_hz))
+    blocks = len(across) // size
+    if blocks >= 4:
+        means = across[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
+        variance = float(means.var(axis=0, ddof=1).sum()) / 2.0 / blocks
+    else:  # too short to see how sway averages out: as if it did not
+        variance = float(across.var(axis=0).sum()) / 2.0
+    return StartTilt(so3.tilt(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm)))
