@@ -1,0 +1,363 @@
+"""The one file that knows the project: its commands, options, exit codes, files, columns, keys and words.
+
+Where a name of the project changes, it changes here and nowhere else in this folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import subprocess
+import sys
+import time
+import traceback
+import warnings as python_warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from .cases import Case, Layout
+from .recordings import Recorded, Table
+from .sensors import DEG, GRAVITY
+
+# Exit codes that a command may end with.
+CODES = {"calibrate": {0, 2, 3, 4}, "batch": {0, 2, 3}, "reproduce": {0, 2, 3}}
+USUAL_CODES = {0, 2}
+ACCEPTED = {"calibrate": {0, 3, 4}}
+COMMANDS = {"reproduce": "rerun"}  # ours → the project's, where they differ
+NO_COVARIANCE = ("ncf", "gdc")  # methods that state no uncertainty
+EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet", "out.urdf")
+HAND_POINTS = {"left_palm": "left_hand", "right_palm": "right_hand"}  # our point → the project's
+
+# Words of a warning that says why a segment is not to be believed, by cause; it counts where it names the segment too.
+# One of GENERAL need not.
+CAUSES = {
+    "range": r"cut off|saturat|range",
+    "fault": r"does not measure|stands? still|stuck|fro[zs]en?|constant|same value|not change|dead|zero|lost|gap",
+    "identical": r"same (?:values|columns|samples|data|signal)|identical|equal to|copy|one sensor|two sensors",
+    "swapped": r"swap|exchanged|other'?s? name|each other|under",
+    "mount": r"off what gravity|mount|strapp",
+    "start": r"start",
+    "gravity": r"gravity|scale",
+    "moves": r"turns|moves|sway|swing",
+    "gap": r"gap|lost|bridged",
+    "heading": r"heading",
+    "rate": r"bias|drift|rotation",
+}
+GENERAL = {"start": r"guess|quietest|no phases\.start"}
+NOT_A_CAUSE = r"no sensor on|not known and not written|short gaps? bridged|no gauge|resampled"
+
+
+@dataclass
+class Outcome:
+    """How a command ended. `traceback`: the error that left it, which it never may."""
+
+    argv: list[str]
+    code: int
+    out: str
+    err: str
+    seconds: float
+    traceback: str = ""
+
+
+@dataclass
+class Result:
+    """What `track` wrote: rotations as xyzw, standard deviations of one axis."""
+
+    time: np.ndarray
+    quat: dict[str, np.ndarray]
+    quat_std: dict[str, np.ndarray]
+    points: dict[str, np.ndarray]
+    points_std: dict[str, np.ndarray]
+    gap: dict[str, np.ndarray]
+    table: pl.DataFrame
+    lengths: dict[str, float]
+    start: tuple[float, float]
+    warnings: list[str]
+    guessed: bool = False
+    notes: list[str] = field(default_factory=list)
+
+
+# Session -----------------------------------------------------------------------------------------------------------
+
+
+def write_session(folder: Path, recorded: Recorded, layout: Layout, unit: str = "s", start_said: bool = True) -> Path:
+    """The recording as a user has it: tables and the session file that names them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ['name = "random"', 'start_pose = "n_pose"', "[data]"]
+    several = len(recorded.tables) > 1
+    if not several:
+        lines += [f'file = "recording{layout.suffix}"', _clock_line(recorded.tables[0])]
+    lines += [f'gyro_unit = "{"deg/s" if layout.gyro_in_deg else "rad/s"}"']
+    lines += [f'accel_unit = "{"g" if layout.accel_in_g else "m/s^2"}"', "[phases]"]
+    for name, span in (("start", recorded.start if start_said else None), ("clasp", recorded.clasp)):
+        if span is not None:
+            lines.append(f"{name} = [[{span[0]:.6f}, {span[1]:.6f}]]")
+    for k, table in enumerate(recorded.tables):
+        file = f"sensor_{k}{layout.suffix}" if several else f"recording{layout.suffix}"
+        _write_table(folder / file, table, layout, unit)
+        for segment, signals in table.signals.items():
+            lines.append(f"[sensors.{segment}]")
+            if several:
+                lines += [f'file = "{file}"', _clock_line(table), f"offset_s = {table.offset!r}"]
+            kinds = ("gyro", "accel") if signals.quat is None else ("orientation",)
+            lines += [f"{kind} = {json.dumps(_columns(segment, kind))}" for kind in kinds]
+            axes = recorded.axes[segment]
+            if axes is not None:
+                lines.append(f'mount = {{ up = "{axes[0]}", forward = "{axes[1]}" }}')
+    session = folder / "session.toml"
+    session.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return session
+
+
+def _clock_line(table: Table) -> str:
+    return f"rate_hz = {table.rate_hz!r}" if table.stamps is None else 'time = "time"'
+
+
+def _columns(segment: str, kind: str) -> list[str]:
+    short = {"gyro": "gyr", "accel": "acc", "orientation": "q"}[kind]
+    return [f"{segment}_{short}_{axis}" for axis in ("xyzw" if kind == "orientation" else "xyz")]
+
+
+def _write_table(path: Path, table: Table, layout: Layout, unit: str) -> None:
+    columns: dict[str, np.ndarray] = {}
+    if table.stamps is not None:
+        columns["time"] = table.stamps * {"s": 1.0, "ms": 1e3, "us": 1e6}[unit]
+    for segment, s in table.signals.items():
+        parts = (
+            {"orientation": s.quat}
+            if s.quat is not None
+            else {
+                "gyro": s.gyro / DEG if layout.gyro_in_deg else s.gyro,
+                "accel": s.accel / GRAVITY if layout.accel_in_g else s.accel,
+            }
+        )
+        for kind, values in parts.items():
+            assert values is not None
+            columns |= dict(zip(_columns(segment, kind), values.T, strict=True))
+    if path.suffix == ".parquet":
+        pl.DataFrame(columns).write_parquet(path)
+        return
+    shown = pl.DataFrame({n: v if n == "time" else rounded(v, layout.digits) for n, v in columns.items()})
+    shown.with_columns(pl.all().fill_nan(None)).write_csv(path)
+
+
+def rounded(values: np.ndarray, digits: int) -> np.ndarray:
+    """To so many significant digits of the largest value."""
+    size = np.nanmax(np.abs(values), initial=1e-12)
+    return np.round(values, max(0, digits - 1 - int(np.floor(np.log10(size)))))
+
+
+# Commands ----------------------------------------------------------------------------------------------------------
+
+
+def calibrate(session: Path, out: Path, case: Case) -> list[str]:
+    taped = [part for name, value in case.taped.items() if name != "stature" for part in ("--gauge", f"{name}={value}")]
+    if "stature" in case.taped:
+        taped += ["--stature", str(case.taped["stature"]), "--sex", case.person.sex]
+    method = [] if case.method == "amekf" else ["--method", case.method]
+    return ["calibrate", str(session), "-o", str(out), *taped, *method, *_gaps(case.options)]
+
+
+def track(
+    session: Path,
+    out: Path,
+    method: str,
+    options: Iterable[str],
+    subject: Path | None = None,
+    chunk: float | None = None,
+) -> list[str]:
+    options = set(options)
+    argv = ["track", str(session), "-o", str(out), *_gaps(options)]
+    argv += [] if method == "amekf" else ["--method", method]
+    argv += [f"--{name}" for name in ("covariance", "causal") if name in options]
+    argv += [] if "report" in options else ["--no-report"]
+    argv += ["--subject", str(subject)] if subject else []
+    return argv + (["--pieces", f"{chunk:g}"] if chunk else [])
+
+
+def _gaps(options: Iterable[str]) -> list[str]:
+    return ["--gaps"] if "gaps" in options else []
+
+
+def evaluate(result: Path, truth: Path) -> list[str]:
+    return ["evaluate", str(result), str(truth)]
+
+
+def view(result: Path, out: Path) -> list[str]:
+    return ["view", str(result), "-o", str(out), "--no-open"]
+
+
+def export(result: Path, out: Path) -> list[str]:
+    return ["export", str(result), "-o", str(out)]
+
+
+def info(file: Path) -> list[str]:
+    return ["info", str(file)]
+
+
+def reproduce(result: Path) -> list[str]:
+    return ["rerun", str(result)]
+
+
+def retarget(result: Path, out: Path) -> list[str]:
+    return ["retarget", str(result), "--robot", "panda", "-o", str(out)]
+
+
+def batch(plan: Path, out: Path, workers: int) -> list[str]:
+    return ["batch", str(plan), "-o", str(out), "--workers", str(workers)]
+
+
+def write_plan(file: Path, sessions: str, method: str, pages: bool) -> None:
+    """A plan of `batch`: all sessions of a pattern are tracked and exported."""
+    shown = "true" if pages else "false"
+    lines = ['name = "soak"', "[sessions]", f'files = ["{sessions}"]', "[steps.track]", f'method = "{method}"']
+    lines += [f"view = {shown}", f"report = {shown}", "[steps.export]", 'formats = ["trc"]']
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def batch_process(plan: Path, out: Path, workers: int) -> list[str]:
+    """The command line of a process of its own."""
+    return [sys.executable, "-m", "wepose_pin.cli", *batch(plan, out, workers)]
+
+
+def codes(command: str) -> set[int]:
+    """Exit codes that the documents promise."""
+    return CODES.get(command, USUAL_CODES)
+
+
+def accepted(command: str, code: int) -> bool:
+    return code in ACCEPTED.get(command, {0})
+
+
+def run(argv: list[str], as_process: bool = False) -> Outcome:
+    """Run a command: in this process, or in one of its own as a user does."""
+    begin = time.perf_counter()
+    if as_process:
+        done = subprocess.run(
+            [sys.executable, "-m", "wepose_pin.cli", *argv], capture_output=True, text=True, errors="replace"
+        )
+        failed = done.stderr if "Traceback (most recent call last)" in done.stderr else ""
+        return Outcome(argv, done.returncode, done.stdout, done.stderr, time.perf_counter() - begin, failed)
+    from wepose_pin.cli import main
+
+    out, err, code, failed = io.StringIO(), io.StringIO(), 0, ""
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), python_warnings.catch_warnings():
+        python_warnings.simplefilter("error")  # a library's complaint would stand in the user's terminal
+        python_warnings.filterwarnings("ignore", category=DeprecationWarning)
+        python_warnings.filterwarnings("ignore", category=ResourceWarning)
+        try:
+            main(list(argv))
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            code, failed = 1, traceback.format_exc()
+    return Outcome(argv, code, out.getvalue(), err.getvalue(), time.perf_counter() - begin, failed)
+
+
+# Results -----------------------------------------------------------------------------------------------------------
+
+
+def read_result(folder: Path) -> Result:
+    """What `track` wrote."""
+    table = pl.read_parquet(folder / "pose.parquet")
+    values = {name: table[name].to_numpy() for name in table.columns}
+    segments = [name[:-3] for name in values if name.endswith("_qx")]
+    ours = {of: name for name, of in HAND_POINTS.items()}
+    points = {ours.get(name[:-2], name[:-2]): name[:-2] for name in values if name.endswith("_x")}
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    subject = (folder / "subject.toml").read_text(encoding="utf-8")
+    lengths = dict(re.findall(r"^(\w+) = ([-0-9.e]+)", subject.split("[lengths]")[1].split("\n[")[0], re.MULTILINE))
+    texts = warnings_of(summary)
+    std = {name: values.get(f"{name}_q_std", values.get(f"{name}_std")) for name in segments}
+    return Result(
+        time=values["time"],
+        quat={name: np.column_stack([values[f"{name}_q{c}"] for c in "xyzw"]) for name in segments},
+        quat_std={name: v for name, v in std.items() if v is not None},
+        points={name: np.column_stack([values[f"{of}_{c}"] for c in "xyz"]) for name, of in points.items()},
+        points_std={name: values[f"{of}_std"] for name, of in points.items() if f"{of}_std" in values},
+        gap={name[:-4]: values[name] for name in values if name.endswith("_gap")},
+        table=table,
+        lengths={name: float(value) for name, value in lengths.items()},
+        start=_first_span(summary["phases"]["start"]),
+        warnings=texts,
+        guessed=any(re.search(GENERAL["start"], text) for text in texts),
+    )
+
+
+def warnings_of(summary: Mapping[str, object]) -> list[str]:
+    """The texts of all that a summary warns of."""
+    texts = list(summary.get("warnings") or ())  # type: ignore[call-overload]
+    for item in summary.get("diagnostics") or ():  # type: ignore[attr-defined]
+        texts.append(" ".join(str(item.get(key, "")) for key in ("place", "code", "text")))
+    return [str(text) for text in texts]
+
+
+def _first_span(value: list) -> tuple[float, float]:
+    first = value[0] if isinstance(value[0], list) else value
+    return float(first[0]), float(first[1])
+
+
+def table_bytes(folder: Path) -> pl.DataFrame:
+    """All numbers of a result, for comparison to the bit."""
+    return pl.read_parquet(folder / "pose.parquet")
+
+
+def write_truth(
+    path: Path, stamps: np.ndarray, quat: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]
+) -> None:
+    """A reference table for `evaluate`."""
+    columns = {"time": stamps}
+    for name, values in quat.items():
+        columns |= {f"{name}_q{c}": values[:, k] for k, c in enumerate("xyzw")}
+    for name, values in points.items():
+        columns |= {f"{HAND_POINTS.get(name, name)}_{c}": values[:, k] for k, c in enumerate("xyz")}
+    pl.DataFrame(columns).write_parquet(path)
+
+
+# Words -------------------------------------------------------------------------------------------------------------
+
+
+def names_cause(texts: Iterable[str], segments: Iterable[str]) -> str:
+    """The first warning that says why these segments may be wrong: it names one and a cause, or a general one."""
+    segments = list(segments)
+    for text in texts:
+        if re.search(NOT_A_CAUSE, text):
+            continue
+        named = any(re.search(rf"\b{segment}\b", text.replace("sensors.", "")) for segment in segments)
+        if named and any(re.search(pattern, text) for pattern in CAUSES.values()):
+            return text
+        if any(re.search(pattern, text) for pattern in GENERAL.values()):
+            return text
+    return ""
+
+
+def refusal(outcome: Outcome) -> str:
+    """The one line by which a command refuses."""
+    return outcome.err.strip().removeprefix("wepose: ")
+
+
+def is_one_line(outcome: Outcome) -> bool:
+    """Whether a refusal is one line that begins with the program's name."""
+    lines = [line for line in outcome.err.splitlines() if line.strip()]
+    return len(lines) == 1 and lines[0].startswith("wepose: ")
+
+
+def names_something(outcome: Outcome, case: Case) -> bool:
+    """Whether a refusal names what it refuses: a file, key, column, sensor, option or a time."""
+    text = refusal(outcome)
+    named = re.search(r"\.(toml|csv|parquet)|--\w|phases\.|\d+\.?\d* s\b", text)
+    return named is not None or any(segment in text for segment in case.worn)
+
+
+def left_behind(out: Path) -> list[str]:
+    """What a command that refused has left where its output would stand."""
+    beside = [path.name for path in out.parent.glob(f".{out.name}*")]
+    return [str(out)] * out.exists() + beside

@@ -1,0 +1,141 @@
+"""Equal physics gives equal results: the same recording written or sampled otherwise, tracked, and compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from . import adapter
+from .adapter import Result
+from .cases import Case
+from .oracles import ALL_AXES, FLOOR_RAD, Failure
+from .recordings import Variant, other_side, record
+
+# Bounds [deg]. The first four change nothing but rounding, in the sixteenth digit (in the tenth for times of 1.7e9 s);
+# what decides by a threshold may then decide otherwise for one sample, and a sample's noise moves a filter by less than
+# a hundredth of a degree.
+ROUNDING_DEG = 0.01
+# The others give a filter more, or other samples of the same noise: two estimates of one thing, each within its ±, of
+# which this many together are allowed; where nothing is stated, so many degrees.
+MOST_Z, UNSTATED_DEG = 4.0, 5.0
+
+
+@dataclass(frozen=True)
+class Invariance:
+    """`variant` against `base`, and what may differ [deg]; None: by what is stated."""
+
+    variant: Variant
+    base: Variant = field(default_factory=Variant)
+    most_deg: float | None = ROUNDING_DEG
+
+
+INVARIANCES: Mapping[str, Invariance] = {
+    "sensor axes rotated": Invariance(Variant(axes=True)),
+    "units changed": Invariance(Variant(other_units=True)),
+    "mirrored": Invariance(Variant(mirrored=True)),
+    "time shifted by 1.7e9 s": Invariance(Variant(shift=1.7e9)),
+    "stillness before": Invariance(Variant(stillness=6.0), most_deg=None),
+    "rate doubled": Invariance(Variant(finer=2), Variant(half=2), most_deg=None),
+}
+
+
+@dataclass
+class Deviation:
+    """The largest difference [deg] of an invariance, and over what is stated."""
+
+    invariance: str
+    method: str
+    degrees: float
+    z: float
+    of: str
+
+
+def choose(case: Case) -> str:
+    """The invariance that is tried on this case, or "" for none."""
+    rng = case.stream("invariance")
+    if rng.random() > 0.4 or case.refusal or case.suspects or any(s.axes is None for s in case.worn.values()):
+        return ""
+    clock = case.clock
+    fits = ["sensor axes rotated", "units changed", "mirrored"]
+    if clock.stamps != "none" and not clock.origin > 1e9 and not clock.separate:
+        fits.append("time shifted by 1.7e9 s")
+    plain = not clock.lost and not clock.separate and not clock.twice and clock.stamps in ("even", "none")
+    if plain and not case.begins_in_motion and case.start is not None and "causal" not in case.options:
+        fits.append("stillness before")
+    if plain and clock.rate_hz <= 240 and "causal" not in case.options:
+        fits.append("rate doubled")
+    return str(rng.choice(fits))
+
+
+def compare(case: Case, name: str, folder: Path, as_process: bool) -> tuple[Deviation | None, list[Failure], list]:
+    """Track both and compare; what was found, failures, and how the commands ended."""
+    of = INVARIANCES[name]
+    results, outcomes = [], []
+    for which, variant in (("base", of.base), ("variant", of.variant)):
+        recorded = record(case, variant)
+        layout = case.layout
+        if variant.other_units:
+            layout = type(layout)(layout.suffix, not layout.gyro_in_deg, not layout.accel_in_g, 15)
+        # All digits: what is written shorter is another recording.
+        layout = type(layout)(layout.suffix, layout.gyro_in_deg, layout.accel_in_g, 15)
+        session = adapter.write_session(folder / which, recorded, layout)
+        options = case.options - {"report"}
+        outcome = adapter.run(adapter.track(session, folder / f"{which}-result", case.method, options), as_process)
+        outcomes.append(outcome)
+        if outcome.code:
+            message = f"{which} of '{name}': exit {outcome.code}: {adapter.refusal(outcome)[-300:]}"
+            return None, [Failure("equal physics is accepted alike", " ".join(outcome.argv), message)], outcomes
+        results.append((adapter.read_result(folder / f"{which}-result"), recorded.origin))
+    (base, at), (other, other_at) = results
+    deviation, over = _deviation(case, name, (base, at), (other, other_at), of)
+    if over:
+        shown = " ".join(outcomes[-1].argv)
+        return deviation, [Failure(f"equal physics: {name}", shown, over)], outcomes
+    return deviation, [], outcomes
+
+
+def _deviation(
+    case: Case, name: str, base: tuple[Result, float], other: tuple[Result, float], of: Invariance
+) -> tuple[Deviation, str]:
+    (one, at), (two, two_at) = base, other
+    mirrored = of.variant.mirrored
+    found = Deviation(name, case.method, 0.0, 0.0, "")
+    over = ""
+    rows, rows_two = _common(one.time - at, two.time - two_at)
+    if not len(rows):
+        return found, "no common times"
+    for segment, quat in one.quat.items():
+        quat_two = two.quat[other_side(segment) if mirrored else segment][rows_two]
+        if mirrored:
+            quat_two = quat_two * [-1.0, 1.0, -1.0, 1.0]
+        angle = (Rotation.from_quat(quat[rows]).inv() * Rotation.from_quat(quat_two)).magnitude()
+        std = one.quat_std.get(segment)
+        k = int(np.argmax(angle))
+        degrees, z = float(np.degrees(angle[k])), 0.0
+        if std is not None and of.most_deg is None:
+            second = two.quat_std[segment][rows_two]
+            ratio = np.maximum(angle - FLOOR_RAD, 0.0) / (ALL_AXES * np.maximum(std[rows] + second, 1e-9))
+            z = float(ratio.max())
+        if degrees > found.degrees:
+            found.degrees, found.of = degrees, segment
+        found.z = max(found.z, z)
+        most = of.most_deg if of.most_deg is not None else UNSTATED_DEG if std is None else None
+        if (most is not None and degrees > most) or z > MOST_Z:
+            over = (
+                over
+                or f"{segment} is {degrees:.3g} deg off at {one.time[rows][k] - at:.1f} s, z = {z:.1f}, {case.method}"
+            )
+    return found, over
+
+
+def _common(one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the two time bases that are the same time, to a tenth of a step."""
+    step = float(np.median(np.diff(one)))
+    near = np.clip(np.searchsorted(two, one), 1, len(two) - 1)
+    near = np.where(np.abs(two[near - 1] - one) < np.abs(two[near] - one), near - 1, near)
+    same = np.abs(two[near] - one) < 0.1 * step
+    return np.flatnonzero(same), near[same]

@@ -1,0 +1,138 @@
+"""Hours of recorded time through `batch`: ``python tests/random_recordings/soak.py --hours 24 --workers 2 -o soak``.
+
+Long recordings of ordinary activities are made, then tracked by one run of `batch`; every two seconds the memory of the
+process tree (resident, each worker's and the sum) and its open files are read from /proc. At the end it says whether
+they are flat: the highest sum of the last third against that of the middle one, the first being the start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "tests")) if path not in sys.path]
+
+EVERY_S = 2.0
+# What memory and files may grow by from the middle third to the last, and be called flat: recordings differ in rate.
+MEMORY_GROWTH, FILES_GROWTH = 0.10, 5
+PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+def make_session(task: tuple[int, float, Path]) -> float:
+    """Write one long recording; its duration [s]."""
+    from random_recordings import adapter
+    from random_recordings.cases import draw_case
+    from random_recordings.recordings import record
+
+    seed, seconds, folder = task
+    case = draw_case(seed, seconds)
+    case.layout.suffix = ".parquet"
+    for name in case.worn:  # nothing is calibrated here
+        if case.worn[name].axes is None:
+            return 0.0
+    adapter.write_session(folder / f"recording-{seed:04d}", record(case), case.layout)
+    return case.duration
+
+
+def tree(pid: int) -> list[int]:
+    """The process and all that it started, of those that are there."""
+    found, at = [pid], 0
+    while at < len(found):
+        for task in Path(f"/proc/{found[at]}/task").glob("*"):
+            try:
+                found += [int(child) for child in (task / "children").read_text().split()]
+            except OSError:
+                continue
+        at += 1
+    return found
+
+
+def measured(pid: int) -> dict[str, float]:
+    """Processes, resident memory [MB] of all and of the largest, open files."""
+    sizes, files = [], 0
+    for process in tree(pid):
+        try:
+            sizes.append(int(Path(f"/proc/{process}/statm").read_text().split()[1]) * PAGE / 1e6)
+            files += len(os.listdir(f"/proc/{process}/fd"))
+        except OSError:
+            continue
+    return {"processes": len(sizes), "memory_mb": sum(sizes), "largest_mb": max(sizes, default=0.0), "files": files}
+
+
+def soak(out: Path, workers: int, pages: bool) -> tuple[int, list[dict[str, float]]]:
+    """Run the batch and watch it."""
+    from random_recordings import adapter
+
+    plan = out / "plan.toml"
+    adapter.write_plan(plan, "recording-*/session.toml", "amekf", pages)
+    begin = time.monotonic()
+    with (out / "batch.log").open("w") as log:
+        process = subprocess.Popen(
+            adapter.batch_process(plan, out / "study", workers),
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+        )
+        series = []
+        while process.poll() is None:
+            series.append({"seconds": round(time.monotonic() - begin, 1)} | measured(process.pid))
+            time.sleep(EVERY_S)
+    return process.returncode, series
+
+
+def verdict(series: list[dict[str, float]]) -> list[str]:
+    """Whether memory and files are flat, in lines."""
+    third = len(series) // 3
+    if not third:
+        return ["too short to say"]
+    middle, last = series[third : 2 * third], series[2 * third :]
+    lines = []
+    for key, name, most in (
+        ("memory_mb", "memory [MB]", None),
+        ("largest_mb", "largest process [MB]", None),
+        ("files", "open files", FILES_GROWTH),
+    ):
+        before, after = (max(row[key] for row in rows) for rows in (middle, last))
+        grown = after > before * (1.0 + MEMORY_GROWTH) if most is None else after > before + most
+        lines.append(
+            f"{name}: {before:.0f} in the middle third, {after:.0f} in the last: {'GROWS' if grown else 'flat'}"
+        )
+    return lines
+
+
+def main() -> int:
+    """Make recordings, run them, say what came of it; exit code 1 where something grows or an item failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hours", type=float, default=24.0, help="of recorded time")
+    parser.add_argument("--each", type=float, default=0.5, help="hours a recording")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--pages", action="store_true", help="with view.html and report.html of each")
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    begin = time.monotonic()
+    tasks = [(seed, 3600.0 * options.each, options.out) for seed in range(round(options.hours / options.each))]
+    with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
+        recorded = sum(pool.imap_unordered(make_session, tasks))
+    made = time.monotonic() - begin
+    code, series = soak(options.out, options.workers, options.pages)
+    (options.out / "series.json").write_text(json.dumps(series) + "\n")
+    lines = [
+        f"{recorded / 3600.0:.1f} h of recorded time, made in {made:.0f} s",
+        f"batch: exit code {code} after {series[-1]['seconds']:.0f} s",
+    ]
+    lines += verdict(series)
+    (options.out / "soak.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
+    return 1 if code or any("GROWS" in line for line in lines) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
