@@ -107,7 +107,7 @@ def _places_by_name(
 ) -> tuple[dict[str, dict[str, list[int]]], dict[str, float]]:
     """Sensor → signal → its columns, from names as ``Lumbar/Acceleration/X``; and its factor to SI, by units."""
     at: dict[str, dict[str, dict[str, int]]] = {}
-    scale = {}
+    scale: dict[str, float] = {}
     for k, name in enumerate(rows[2]):
         label, _, rest = name.partition("/")
         kind, _, axis = rest.partition("/")
