@@ -85,6 +85,21 @@ def test_files_of_one_recording_make_one_session(capsys: pytest.CaptureFixture[s
     assert recording.time[0] == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_rate_is_proposed_for_files_without_one_alone(
+    stated: bool, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    mt_manager(tmp_path / "chest.txt", preamble="// MT Manager version: 2022.2.0\n")
+    beside = "// Update Rate: 50.0Hz\n" if stated else "// MT Manager version: 2022.2.0\n"
+    mt_manager(tmp_path / "left_wrist.txt", preamble=beside)
+    text = info(capsys, tmp_path / "chest.txt", "--write")
+    recording = wp.load_session(tmp_path)
+    session = (tmp_path / "session.toml").read_text(encoding="utf-8")
+    assert session.count("rate_hz = 100.0   # CHECK: the file does not say its rate") == 1
+    assert ("rate_hz" in session.partition("[sensors.")[0]) is not stated
+    assert recording.rate_hz == pytest.approx(50.0 if stated else 100.0, rel=0.01), text
+
+
 @pytest.mark.parametrize(
     ("make", "name"),
     [

@@ -107,7 +107,7 @@ def _places_by_name(
 ) -> tuple[dict[str, dict[str, list[int]]], dict[str, float]]:
     """Sensor → signal → its columns, from names as ``Lumbar/Acceleration/X``; and its factor to SI, by units."""
     at: dict[str, dict[str, dict[str, int]]] = {}
-    scale = {}
+    scale: dict[str, float] = {}
     for k, name in enumerate(rows[2]):
         label, _, rest = name.partition("/")
         kind, _, axis = rest.partition("/")
@@ -119,7 +119,10 @@ def _places_by_name(
             unit = rows[3][k] if k < len(rows[3]) else ""
             if unit not in UNITS[signal]:
                 raise BadData(f"{path}: '{name}' is in '{unit}'; {one_of(UNITS[signal], unit)}")
-            scale[signal] = UNITS[signal][unit]
+            if scale.setdefault(signal, UNITS[signal][unit]) != UNITS[signal][unit]:
+                raise BadData(
+                    f"{path}: '{name}' is in '{unit}', other columns of {signal} are not; export them in one unit"
+                )
     return {
         label: {
             signal: [axes[axis] for axis in AXES[signal]]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -228,13 +229,7 @@ def _of_devices(
     path: Path, folder: Path, format: str
 ) -> tuple[str, list[str], list[str], dict[str, list[str]], dict[str, str]]:
     """What a known format's file holds; with those beside it where the device wrote one a sensor."""
-    rate: list[str] = []
-    try:
-        device = read_device(path, format)
-    except BadData as error:
-        if "rate_hz" not in str(error):
-            raise
-        device, rate = read_device(path, format, None, 100.0), [f"rate_hz = 100.0{CHECK}the file does not say its rate"]
+    device, rate = _read(path, format)
     title = (
         f"{TITLES[format]}, {'gyroscope and accelerometer' if device.kind == 'raw' else 'orientations, no raw data'}"
     )
@@ -252,14 +247,22 @@ def _of_devices(
         notes = [f"segments of these are not known by their names: {', '.join(unknown)}"] if unknown else []
         return title, notes, [f"file = {_relative(path, folder)}", *rate], tables, labels
     tables, labels, notes = {}, {}, []
+    rates: list[list[str]] = []
     for file in _siblings(path, format):
-        its = device if file == path else _try(file, format, notes, 100.0 if rate else None)
-        if its is None:
+        try:
+            its, its_rate = (device, rate) if file == path else _read(file, format)
+        except WeposeError as error:
+            notes.append(f"left out: {error}")
             continue
         (label, segment), *_ = its.labels.items()
         where = segment if segment and segment not in tables else f"?{file.name}"
-        tables[where] = [f"file = {_relative(file, folder)}"]
+        tables[where] = [f"file = {_relative(file, folder)}", *its_rate]
         labels[where] = label
+        rates.append(its_rate)
+    if all(rates):  # one line says it for all
+        tables = {where: lines[:1] for where, lines in tables.items()}
+    else:
+        rate = []
     unknown = [name.removeprefix("?") for name in tables if name.startswith("?")]
     if unknown:
         notes.append(f"which segment is not said by the names of: {', '.join(unknown)}")
@@ -275,13 +278,16 @@ def _of_live(path: Path) -> tuple[list[str], list[str]]:
     subject = header["subject"]
     first, last = recording.phases["start"][0]
     names = {who: "stated" for who, sensor in recording.sensors.items() if sensor.stated_quat_LS is not None}
+    about: dict[str, Any] = {}
     if subject:
-        calibrated = parsed_toml(subject).get("mounts", {})
+        with contextlib.suppress(ValueError):  # of a file that somebody else wrote
+            about = parsed_toml(subject)
+        calibrated = _texts(about.get("mounts"))
         names |= {who: "calibrated" for who in recording.sensors if who in calibrated}
     mounts = ", ".join(f"{who} {how}" for who, how in names.items())
     facts = [
         f"of {header['name']}, live by {header['method']}: {len(log.quat_WL)} poses were shown",
-        f"subject: {parsed_toml(subject).get('name') or 'without a name'}" if subject else "no subject",
+        f"subject: {about.get('name') or 'without a name'}" if subject else "no subject",
         f"mounts: {mounts}" if mounts else "no mounts",
         f"start pose held [s]: {first:.2f} to {last:.2f}",
     ]
@@ -307,12 +313,14 @@ def _siblings(path: Path, format: str) -> list[Path]:
     return found[:MOST_SIBLINGS] if path in found[:MOST_SIBLINGS] else [path]
 
 
-def _try(file: Path, format: str, notes: list[str], rate_hz: float | None) -> Device | None:
+def _read(path: Path, format: str) -> tuple[Device, list[str]]:
+    """The device's file, and the line that states a rate for it to be read, where it has none."""
     try:
-        return read_device(file, format, None, rate_hz)
-    except WeposeError as error:
-        notes.append(f"left out: {error}")
-        return None
+        return read_device(path, format), []
+    except BadData as error:
+        if "as rate_hz in" not in str(error):
+            raise
+        return read_device(path, format, None, 100.0), [f"rate_hz = 100.0{CHECK}the file does not say its rate"]
 
 
 def _of_columns(
