@@ -454,8 +454,8 @@ def _common_rotation(recording: Recording, noises: dict[str, SensorNoise], inter
     found = f"all sensors turn about the vertical at {np.degrees(mean):.1f} deg/s, by {turn_deg:.0f} deg in all"
     if turn_deg > MOVES_DEG:
         raise BadPhase(
-            f"{recording.where()}: phases.start ({format_time(interval[0])} to {format_time(interval[1])} s): {found}, where gyroscopes have "
-            f"biases of their own: name seconds in which the person does not turn"
+            f"{recording.where()}: phases.start ({format_time(interval[0])} to {format_time(interval[1])} s): {found}, "
+            f"where gyroscopes have biases of their own: name seconds in which the person does not turn"
         )
     for segment, noise in noises.items():
         up = up_S[segment]
