@@ -384,7 +384,18 @@ def covariance_of(
         tilt = known[:2]
         left = known - tilt.T @ np.linalg.solve(tilt[:, :2] + START_POSE_STD**2 * np.eye(2), tilt)
         cov_W += lever @ left @ lever.swapaxes(1, 2)
+        cov_W[:, 2, 2] += start_heading_var(recording, segment, subject)
     return cov_W
+
+
+def start_heading_var(recording: Recording, segment: str, subject: Subject | None) -> float:
+    """Variance [rad²] of the heading that a segment's start pose gives its sensor's world: nobody stands exactly so.
+
+    The torso's is zero: it says where x points. Nor does it count where the mount is stated, since what a person means
+    by it is the start pose.
+    """
+    calibrated = mount_covariance(recording, segment, subject) is not None
+    return START_POSE_STD**2 if calibrated and segment != "torso" else 0.0
 
 
 def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
