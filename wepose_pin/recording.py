@@ -39,6 +39,11 @@ def format_time(time: float) -> str:
     return f"{time:.3f}".rstrip("0").rstrip(".")
 
 
+def span_text(interval: tuple[float, float]) -> str:
+    """From when to when [s], in words."""
+    return f"{format_time(interval[0])} to {format_time(interval[1])} s"
+
+
 def mount_from_axes(up: str, forward: str) -> np.ndarray:
     """`quat_LS` (4,) xyzw of the sensor axes that point up and forward in the start pose, as in ``"+x", "-z"``.
 
@@ -203,7 +208,7 @@ def check_time(where: str, time: np.ndarray) -> None:
         k = int(back[0])
         how = "stands still" if time[k + 1] == time[k] else "goes back"
         raise BadData(
-            f"{where}: time {how} in row {k + 2}: {time[k + 1]:.6g} s after {time[k]:.6g} s; it must grow in every row"
+            f"{where}: time {how} in row {k + 2}: {format_time(time[k + 1])} s after {format_time(time[k])} s; it must grow in every row"
         )
 
 
@@ -211,7 +216,7 @@ def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tup
     """Every interval [s] has a length and lies in the recording."""
     for name, intervals in phases.items():
         for first, last in intervals:
-            place = f"{where}: phases.{name}: [{first:g}, {last:g}]"
+            place = f"{where}: phases.{name}: [{format_time(first)}, {format_time(last)}]"
             if not first < last:
                 raise BadPhase(f"{place} is empty; the first number is the earlier one, in seconds")
             if first < time[0] - 1e-6 or last > time[-1] + 1e-6:
