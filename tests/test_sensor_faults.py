@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,7 +80,9 @@ def test_a_sensor_that_never_measures_is_refused_by_name(
         next(iter_session(path, 5.0))
 
 
-@pytest.mark.parametrize(("signals", "since"), [("gyro accel", 9.0), ("gyro accel", 16.3), ("gyro", 9.0), ("accel", 9.0)])
+@pytest.mark.parametrize(
+    ("signals", "since"), [("gyro accel", 9.0), ("gyro accel", 16.3), ("gyro", 9.0), ("accel", 9.0)]
+)
 def test_a_sensor_that_freezes_is_lost_from_there(signals: str, since: float, made: Simulation, tmp_path: Path) -> None:
     whole = made.recording("frozen")
     path = written(tmp_path / "in", stopped(whole, signals, since))
@@ -252,7 +253,8 @@ def test_arms_that_swing_fast_are_measured_in_the_unit_that_is_stated(hertz: flo
 @pytest.mark.parametrize("packet", [2, 4, 10])
 def test_time_stamps_of_packets_are_spread_over_their_samples(packet: int, within: float) -> None:
     true = 1.7e9 + np.arange(2000) / RATE
-    stamps = true[packet - 1 :: packet].repeat(packet) + np.tile(np.arange(packet) - packet + 1, 2000 // packet) * within
+    stamps = true[packet - 1 :: packet].repeat(packet)
+    stamps += np.tile(np.arange(packet) - packet + 1, 2000 // packet) * within
     clock = clock_of(stamps, "x")
     assert clock.packet == packet
     np.testing.assert_allclose(clock.time, true, atol=1e-4 + 0.02 * within)
@@ -262,7 +264,7 @@ def test_time_stamps_of_packets_are_spread_over_their_samples(packet: int, withi
     assert np.count_nonzero(clock.row < 0) == packet
 
 
-def test_a_measured_orientation_that_is_lost_for_long_is_the_same_in_chunks(made: Simulation, tmp_path: Path) -> None:
+def test_a_measured_orientation_that_is_lost_for_long_is_the_same_in_chunks(tmp_path: Path) -> None:
     time = np.arange(3000) / RATE
     quat = Rotation.from_rotvec(np.clip(time - 5.0, 0.0, 1e9)[:, None] * [0.01, 0.02, 0.03]).as_quat()
     for first, last in ((8.0, 15.2), (12.0, 31.0), (-1.0, 12.0)):
@@ -278,7 +280,9 @@ def test_a_measured_orientation_that_is_lost_for_long_is_the_same_in_chunks(made
             np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in pieces]), getattr(whole, name))
 
 
-def test_a_start_pose_that_was_guessed_says_so(made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_start_pose_that_was_guessed_says_so(
+    made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = written(tmp_path / "in", made.recording("guessed"))
     text = (path / "session.toml").read_text()
     mount, phases = text.index("mount = {"), text.index("[phases]")

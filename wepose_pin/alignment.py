@@ -264,7 +264,8 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
         A mount that gravity contradicts.
     """
     start, warnings = found.start, list(found.warnings)
-    guessed = "" if recording.phases.get("start") else ", which was only guessed: [phases] start = [[from, to]] is missing"
+    named = bool(recording.phases.get("start"))
+    guessed = "" if named else ", which was only guessed: [phases] start = [[from, to]] is missing"
     mount, turn, heading = {}, {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
@@ -296,7 +297,9 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
                 f"({span_text(start)}){guessed}; {do}"
             )
         if off > STATED_WARNING_DEG:
-            warnings.append(f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose{guessed}")
+            warnings.append(
+                f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose{guessed}"
+            )
         known = mount_covariance(recording, segment, subject)
         if known is not None:
             # The tilt's misfit is the pose's error and the mount's together; each takes its share. Of the heading,
@@ -407,9 +410,7 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
         )
     else:
         start = quietest(recording)
-        notes.append(
-            f"no phases.start: the quietest window, {span_text(start)}, is taken for the start pose"
-        )
+        notes.append(f"no phases.start: the quietest window, {span_text(start)}, is taken for the start pose")
     still = recording.phases.get("still", ())
     if len(still) > 1:
         notes.append(f"phases.still holds several intervals; the first, {span_text(still[0])}, is used")
@@ -417,9 +418,7 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
         place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
         if samples < FEWEST_AT_START:
-            raise BadPhase(
-                f"{place} holds {samples} samples; it needs at least {FEWEST_AT_START}, better two seconds"
-            )
+            raise BadPhase(f"{place} holds {samples} samples; it needs at least {FEWEST_AT_START}, better two seconds")
         for segment in recording.sensors:
             measured = len(recording.measured(segment, interval))
             if measured < max(FEWEST_AT_START, LEAST_SHARE_AT_START * samples):
@@ -447,9 +446,7 @@ def _motion(recording: Recording, segment: str, interval: tuple[float, float], p
     turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
     guessed = phase not in recording.phases or not recording.phases[phase]
     place = "the quietest window, taken for the start pose" if guessed else f"phases.{phase}"
-    found = (
-        f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} ({span_text(interval)})"
-    )
+    found = f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} ({span_text(interval)})"
     if rms > MOVES_DEG_S or turn > MOVES_DEG:
         raise BadPhase(
             f"{recording.where()}: {found}; name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "

@@ -34,12 +34,12 @@ AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) f
 Intervals = tuple[tuple[float, float], ...]
 
 
-def format_time(time: float) -> str:
+def format_time(time: float, decimals: int = 3) -> str:
     """A time [s] as it stands in the file, to the millisecond: on a clock that counts from 1970 as well."""
-    return f"{time:.3f}".rstrip("0").rstrip(".")
+    return f"{time:.{decimals}f}".rstrip("0").rstrip(".")
 
 
-def span_text(interval: tuple[float, float]) -> str:
+def span_text(interval: Sequence[float] | np.ndarray) -> str:
     """From when to when [s], in words."""
     return f"{format_time(interval[0])} to {format_time(interval[1])} s"
 
@@ -208,7 +208,8 @@ def check_time(where: str, time: np.ndarray) -> None:
         k = int(back[0])
         how = "stands still" if time[k + 1] == time[k] else "goes back"
         raise BadData(
-            f"{where}: time {how} in row {k + 2}: {format_time(time[k + 1])} s after {format_time(time[k])} s; it must grow in every row"
+            f"{where}: time {how} in row {k + 2}: {format_time(time[k + 1], 6)} s after {format_time(time[k], 6)} s; "
+            f"it must grow in every row"
         )
 
 

@@ -147,10 +147,10 @@ def _matrix(cov: float | np.ndarray) -> np.ndarray:
 
 
 def _model(noise: SensorNoise, dt: float, bias_step_cov: np.ndarray, gyro_range: float) -> np.ndarray:
-    """(28,): δt, 1/g, δt² Σ_ω, δt² Σ_b, Σ_ω, Σ_g as upper triangles, what is left of a held rate after a sample, range.
-    """
+    """(28,): δt, 1/g, δt² Σ_ω, δt² Σ_b, Σ_ω, Σ_g as upper triangles, what is left of a held rate after one, range."""
+    left = [np.exp(-dt / HOLD_S)]
     covs = dt * dt * noise.gyro_cov, dt * dt * bias_step_cov, noise.gyro_cov, noise.accel_cov
-    return np.concatenate([[dt, 1.0 / noise.gravity], *(cov[_UPPER] for cov in covs), [np.exp(-dt / HOLD_S), gyro_range]])
+    return np.concatenate([[dt, 1.0 / noise.gravity], *(cov[_UPPER] for cov in covs), left, [gyro_range]])
 
 
 @inlined

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from .. import so3
 from ..errors import BadData
-from ..recording import Sensor, check_time, format_time
+from ..recording import Sensor, check_time, span_text
 
 LONGEST_GAP_S = 0.05
 # A step this far from the usual one (as a share of it) is uneven, or a lost row; clocks of devices jitter less.
@@ -89,7 +89,7 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
     if lost.sum() > 10 * len(time) + 1000:
         k = int(wide[np.argmax(time[wide + 1] - time[wide])])
         raise BadData(
-            f"{place}: time jumps from {format_time(time[k])} to {format_time(time[k + 1])} s in row {k + 2}, by more than the recording "
+            f"{place}: time jumps from {span_text(time[k : k + 2])} in row {k + 2}, by more than the recording "
             f"is long; cut the recording there"
         )
     if not lost.any():
@@ -156,7 +156,7 @@ def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tu
     end = min(float(clock.time[-1]) for clock in clocks.values())
     usual = max(float(clock.time[-1] - clock.time[0]) / (len(clock.time) - 1) for clock in clocks.values())
     if end - begin < 2.0 * usual:
-        spans = ", ".join(f"{name} {format_time(c.time[0])} to {format_time(c.time[-1])} s" for name, c in clocks.items())
+        spans = ", ".join(f"{name} {span_text(c.time[[0, -1]])}" for name, c in clocks.items())
         raise BadData(
             f"{where}: the sensors' clocks do not overlap ({spans}); check each sensor's time and offset_s, in seconds"
         )

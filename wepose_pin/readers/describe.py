@@ -356,7 +356,7 @@ def _facts(recording: Recording) -> tuple[str, ...]:
     listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in still[:8]) + (" …" if len(still) > 8 else "")
     facts.append(f"all sensors at rest [s]: {listed}" if still else "never are all sensors at rest for a second")
     for name, spans in recording.phases.items():
-        facts.append(f"phase {name} [s]: " + (", ".join(span_text(span).removesuffix(" s") for span in spans) or "none"))
+        facts.append(f"phase {name}: " + (", ".join(map(span_text, spans)) or "none"))
     facts += [f"note: {note}" for note in recording.notes]
     return tuple(facts)
 

@@ -29,7 +29,7 @@ STUCK_S = 1.0  # of one of them alone
 # While accel stays the same: how fast gyro tips it [rad/s], beyond any bias, and by how much in all [rad], one alone.
 TIPS, TIPPED = 0.2, 1.0
 MOVES = 2.0  # [m/s²] by which accel changes on an axis only where the sensor moves
-# A series of noise turns back at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
+# Noise turns back at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
 TURNS_BACK, TURNS_BACK_HZ = 0.3, 15.0
 ROUNDING = 1e-9  # steps below this share of the largest value are rounding, not noise
 NOISY_S = 1.5  # [s] of noise that show a sensor to be noisy
@@ -154,8 +154,7 @@ class SensorScan:
             self._long[name].append(run)
 
     def _noise(self, distinct: np.ndarray) -> None:
-        """Count the seconds in which the signal turns back as noise does on all axes: at rest, where it does not drown.
-        """
+        """Count the seconds in which all axes turn back as noise does: at rest, where it does not drown."""
         if len(distinct) < 2 * FROZEN_SAMPLES:
             return
         usual = max(float(np.median(np.diff(distinct[:, 0]))), 1e-9)
@@ -322,9 +321,7 @@ class Scan:
         for name, faults in self.faults.items():
             seconds = sum(fault.last - max(fault.first, self.sensors[name].first) for fault in faults)
             more = f", and {len(faults) - 1} times more" if len(faults) > 1 else ""
-            notes.append(
-                f"sensors.{name}: {faults[0].described(faults[0].first)}{more}: {seconds:.3g} s count as lost"
-            )
+            notes.append(f"sensors.{name}: {faults[0].described(faults[0].first)}{more}: {seconds:.3g} s count as lost")
         notes += [
             f"sensors.{name}: the orientation is the same in all {scan.rows} rows: is the sensor dead?"
             for name, scan in self.orientations.items()

@@ -105,7 +105,7 @@ def _accel_unit(norm: float) -> str:
 
 
 def _quiet_second(recording: Recording, sensor: Sensor) -> np.ndarray:
-    """Samples of the second, measured as a whole, in which the rate varies least; none where there is no such second."""
+    """Samples of the second, measured as a whole, in which the rate varies least; empty where there is none."""
     assert sensor.gyro_S is not None
     n = len(recording)
     size = min(n, max(2, round(recording.rate_hz)))
@@ -165,11 +165,13 @@ def _gyro_unit(sensor: Sensor, rate_hz: float, place: str) -> None:
 
 
 def _coherence(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
-    """How near the mean of specific force, turned by the gyroscope's rotation, is to gravity: 1 where its norm is, 0
-    where it is nothing, or twice as much. The specific force of an arm that swings is several times gravity in the
-    sensor, where it points along the arm all the time, and in the world's mean gravity alone is left."""
+    """How near the mean of specific force, turned by the gyroscope's rotation, is to gravity, from 1 to 0.
+
+    In the sensor the specific force of an arm that swings is several times gravity, and points along the arm all the
+    time; of its mean in the world gravity alone is left.
+    """
     turned = Rotation.from_quat(so3.integrate(gyro_S[1:] / rate_hz)).apply(accel_S)
-    return float(max(0.0, 1.0 - abs(np.linalg.norm(turned.mean(axis=0)) / GRAVITY - 1.0)))
+    return max(0.0, 1.0 - abs(float(np.linalg.norm(turned.mean(axis=0))) / GRAVITY - 1.0))
 
 
 def _range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: str) -> None:

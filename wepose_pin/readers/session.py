@@ -20,7 +20,7 @@ from ..recording import (
     Sensor,
     check,
     check_phases,
-    format_time,
+    span_text,
 )
 from .arrays import ArrayFile, is_array_file
 from .clocks import BRIDGED, GOOD, LONG, Clock, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time, runs
@@ -338,7 +338,8 @@ class SessionReader:
             for segment, plan in self._plans.items():
                 values = []
                 for name, names in plan.signals.items():
-                    read = columns(tables[plan.table], names, str(plan.path), f"{self.path}: {plan.place}.{name}", first)
+                    place = f"{self.path}: {plan.place}.{name}"
+                    read = columns(tables[plan.table], names, str(plan.path), place, first)
                     values.append(read * plan.units.get(name, 1.0))
                 blocks[segment] = times[id(plan.clock)][rows], np.column_stack(values)
             scan.push(blocks)
@@ -418,7 +419,7 @@ class SessionReader:
                 lost_a_while &= self._scan().orientations[segment].rows > 0
             if not good.any() and not lost_a_while:
                 columns_ = ", ".join(plan.signals[name])
-                raise BadData(f"{place}: no numbers from {format_time(clock.time[0])} to {format_time(clock.time[-1])} s in {columns_}")
+                raise BadData(f"{place}: no numbers from {span_text(clock.time[[0, -1]])} in {columns_}")
             marks[name] = lost_samples(clock, good)
             if not self.gaps and (marks[name] == LONG).any():
                 first, last = runs(marks[name] == LONG)[0]
