@@ -22,7 +22,7 @@ from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
 from .filters.start import ACCEL_BIAS_STD
 from .noise import SensorNoise, noise_of, quietest
-from .recording import SEGMENTS, Recording, format_time
+from .recording import SEGMENTS, Recording, format_time, span_text
 from .static import StaticTest
 from .subject import Subject
 
@@ -268,6 +268,8 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
         A mount that gravity contradicts.
     """
     start, warnings = found.start, list(found.warnings)
+    named = bool(recording.phases.get("start"))
+    guessed = "" if named else ", which was only guessed: [phases] start = [[from, to]] is missing"
     mount, turn, heading = {}, {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
@@ -288,14 +290,20 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
         if off > STATED_LIMIT_DEG:
             calibrated = subject is not None and segment in subject.mounts and recording.strapping != "new"
             of, do = ".mount", "check which sensor axis points up and which forward"
+            if guessed:
+                do = f"name its seconds, or {do}"
             if calibrated:
                 of, do = ": its calibrated mount", 'strapped on anew? then state strapping = "new" and the mounts'
+                if guessed:
+                    do = f"name its seconds; {do}"
             raise BadSession(
                 f"{recording.where()}: sensors.{segment}{of} is {off:.0f} deg off gravity in the start pose "
-                f"({start[0]:g} to {start[1]:g} s); {do}"
+                f"({span_text(start)}){guessed}; {do}"
             )
         if off > STATED_WARNING_DEG:
-            warnings.append(f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose")
+            warnings.append(
+                f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose{guessed}"
+            )
         known = mount_covariance(recording, segment, subject)
         if known is not None:
             # The tilt's misfit is the pose's error and the mount's together; each takes its share. Of the heading,
@@ -312,7 +320,7 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
                 off = np.degrees(np.linalg.norm(misfit))
                 warnings.append(
                     f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "
-                    f'pose; strapped on anew? then state strapping = "new"'
+                    f'pose{guessed}; strapped on anew? then state strapping = "new"'
                 )
         mount[segment], heading[segment] = R_LS, psi
         turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi])
@@ -409,7 +417,7 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
     if recording.phases.get("start"):
         start = recording.phases["start"][0]
         if len(recording.phases["start"]) > 1:
-            notes.append(f"phases.start holds several intervals; the first, {start[0]:g} to {start[1]:g} s, is used")
+            notes.append(f"phases.start holds several intervals; the first, {span_text(start)}, is used")
     elif recording.phases.get("still"):
         raise BadPhase(
             f"{recording.where()}: phases.still without phases.start; name the seconds of the start pose, "
@@ -417,12 +425,10 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
         )
     else:
         start = quietest(recording)
-        notes.append(
-            f"no phases.start: the quietest window, {start[0]:g} to {start[1]:g} s, is taken for the start pose"
-        )
+        notes.append(f"no phases.start: the quietest window, {span_text(start)}, is taken for the start pose")
     still = recording.phases.get("still", ())
     if len(still) > 1:
-        notes.append(f"phases.still holds several intervals; the first, {still[0][0]:g} to {still[0][1]:g} s, is used")
+        notes.append(f"phases.still holds several intervals; the first, {span_text(still[0])}, is used")
     for name, interval in (("start", start), *(("still", span) for span in still[:1])):
         place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
@@ -489,10 +495,9 @@ def _motion(recording: Recording, segment: str, interval: tuple[float, float], p
         R = Rotation.from_quat(so3.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
     turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
-    found = (
-        f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in phases.{phase} "
-        f"({interval[0]:g} to {interval[1]:g} s)"
-    )
+    guessed = phase not in recording.phases or not recording.phases[phase]
+    place = "the quietest window, taken for the start pose" if guessed else f"phases.{phase}"
+    found = f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} ({span_text(interval)})"
     if rms > MOVES_DEG_S or turn > MOVES_DEG:
         raise BadPhase(
             f"{recording.where()}: {found}; name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "

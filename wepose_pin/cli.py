@@ -328,6 +328,7 @@ def evaluate(
     from .pose import pose_from_table
     from .readers import load_session
     from .readers.tables import read_table
+    from .recording import span_text
     from .writers import read_result
 
     if interval is not None and not interval[0] < interval[1]:
@@ -339,7 +340,7 @@ def evaluate(
             raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
         truth = named
     errors = compare(pose, pose_from_table(read_table(truth), str(truth)), interval)
-    _say(f"{errors.samples} samples from {errors.interval[0]:g} to {errors.interval[1]:g} s")
+    _say(f"{errors.samples} samples from {span_text(errors.interval)}")
     if errors.attitude:
         _print_table(
             "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
