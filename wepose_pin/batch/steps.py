@@ -160,7 +160,11 @@ class Work:
 
             page = retarget_html(body, pose, trajectory, title=f"{self._recording(False).name} on {model.map.name}")
             (folder / "view.html").write_text(page, encoding="utf-8")
-        return {"trajectory_s": float(trajectory.time[-1])}
+        return {
+            "trajectory_s": float(trajectory.time[-1]),
+            "trajectory_limits_kept": held.all,
+            "trajectory_touching": touched.samples,
+        }
 
     def _export(self, folder: Path, *, formats: tuple[str, ...], names: str | None, rate_hz: float | None) -> Row:
         from ..writers.export import SUFFIXES, export

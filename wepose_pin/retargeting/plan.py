@@ -147,18 +147,23 @@ def retarget(
         )
     lean = CubicSpline(np.arange(n) * dt, gaussian_filter1d(path[0], 0.03 / dt, axis=0, mode="nearest"))
     tight: tuple[float, ...] = ()
+    settle = SETTLE_S
     for runs in range(1 + TIGHT_RUNS):
         stretched = np.concatenate([[0.0], np.cumsum(0.5 * (factor[1:] + factor[:-1])) * dt])
         stretched = _fading(stretched)
-        time = np.arange(0.0, stretched[-1] + SETTLE_S + HALT_S, dt)
+        time = np.arange(0.0, stretched[-1] + settle + HALT_S, dt)
         index = np.interp(time, stretched, np.arange(n))
         targets = _on(first, index, time, dt)
         reference = lean(np.minimum(index, n - 1) * dt)
         exact = Stepper(robot, shapes, dt, replace(tasks, posture=50.0 * tasks.posture, posture_gain=8.0))
         found, seen = _run(exact, targets, reference, round(HALT_S / dt), lambda share: progress("solving", share))
         near = np.flatnonzero(seen.room < TIGHT)
-        if not len(near) or runs == TIGHT_RUNS:
+        rests = float(np.abs([found[1][-1], found[2][-1]]).max()) < 1e-9  # a robot that lags far behind needs longer
+        if (rests and not len(near)) or runs == TIGHT_RUNS:
             break
+        settle += 0.0 if rests else SETTLE_S
+        if not len(near):
+            continue
         moment = index[near[np.diff(near, prepend=-2) > 1]]
         if strict:
             raise NoSolution(
