@@ -647,6 +647,10 @@ def retarget(
 ) -> None:
     """A person's arms to a robot's: a joint trajectory within its limits that does not hit itself.
 
+    Exit code: 0 the trajectory keeps the robot's limits and it does not touch itself, as the check of what was written
+    says; 3 it does not: the files are there to be looked at, no robot should run them. 2: the input is wrong, and
+    nothing is written.
+
     Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (of example-robot-data). Any other by its URDF with a map
     beside it that says which links are shoulder, elbow and hand (docs/retargeting.md).
 
@@ -724,10 +728,12 @@ def retarget(
             )
             writer.add_warnings("summary.json")
             _warn(writer.warnings)
-    _retarget_tables(found)
+    sound = _retarget_tables(found)
     _say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
     if view:
         _say_pages(out, {"Motion to look at": "view.html"})
+    if not sound:
+        sys.exit(3)
 
 
 def export(
@@ -1585,8 +1591,8 @@ def _driven_table(driven: Driven) -> None:
         _warn([f"{driven.dropped} commands were not taken by the network or by their receiver"])
 
 
-def _retarget_tables(found: dict[str, Any]) -> None:
-    """How well the hands follow and why they do not, and what the trajectory keeps."""
+def _retarget_tables(found: dict[str, Any]) -> bool:
+    """How well the hands follow and why they do not, and what the trajectory keeps; whether a robot can run it."""
     rows, reasons = [], []
     for side, of in found["arms"].items():
         inside, turn, swivel, possible = (
@@ -1619,12 +1625,21 @@ def _retarget_tables(found: dict[str, Any]) -> None:
     slow = found["slowest"]
     if slow is not None:
         _say(f"Slowed most for {slow['joint']} at {slow['time']:.1f} s of the recording ({slow['what']})")
+    if found["slowed_for_contact_s"]:
+        moments = ", ".join(f"{moment:.1f}" for moment in found["slowed_for_contact_s"][:6])
+        _say(f"Slowed so that it can stop before it touches itself, about {moments} s of the recording")
     if touched["samples_touching"]:
-        _warn([f"the robot touches itself in {touched['samples_touching']} samples, first {touched['first']}"])
+        _warn(
+            [
+                f"the robot touches itself in {touched['samples_touching']} samples, first {touched['first']}: do not "
+                f"run this trajectory; a smaller --scale keeps the hands apart"
+            ]
+        )
     else:
         closest = touched["closest_hulls_mm"]
         _say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
     _say(f"Solved in {found['solve_ms']['p50']:.2f} ms (p50), {found['solve_ms']['p99']:.2f} ms (p99) a step")
+    return bool(found["limits_kept"]) and not touched["samples_touching"]
 
 
 def _mean_std(error: Any) -> str:
