@@ -8,7 +8,7 @@ calibrated mount's covariance says is weighed against the few degrees by which t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -249,14 +249,43 @@ def segment_orientations(
     return oriented_segments(recording, align(recording, subject, found), found.orientation, subject)
 
 
+# Which protocols in calibration/ see a segment's sensor; a sensor that is not here none of them sees.
+_FOUND_BY = {
+    "torso": "clasp, handle, poses or touch",
+    **{f"{side}_upper_arm": f"clasp, handle, poses or touch_{side}" for side in ("left", "right")},
+    **{f"{side}_forearm": f"clasp, handle, poses or touch_{side}" for side in ("left", "right")},
+    **{f"{side}_hand": f"clasp, handle or touch_{side}" for side in ("left", "right")},
+}
+
+
 def need_mounts(recording: Recording, subject: Subject | None) -> None:
     """Raises `BadSession` where neither the subject nor the session knows the mount of a sensor."""
     missing = [segment for segment in recording.sensors if nominal_mount(recording, segment, subject) is None]
     if missing:
-        raise BadSession(
-            f'{recording.where()}: sensors.{missing[0]}.mount is not known: state it, as in mount = {{ up = "+x", '
-            f'forward = "-z" }}, or give a subject with calibrated mounts (`wepose calibrate` finds them)'
-        )
+        of = f"sensors.{missing[0]}.mount is not known"
+        if len(missing) > 1:
+            of += f", nor that of {', '.join(missing[1:])}"
+        if subject is not None and recording.strapping == "new" and set(missing) & set(subject.mounts):
+            of += ' (strapping = "new": the subject\'s are of another strapping)'
+        elif subject is not None and subject.mounts:
+            of += f"; the subject '{subject.name}' has none for it"
+        raise BadSession(f"{recording.where()}: {of}: {mount_advice(missing)}")
+
+
+def mount_advice(segments: Sequence[str]) -> str:
+    """What to do where mounts of these segments' sensors are not known: state them, or which calibration finds them."""
+    do = 'state it, as in mount = { up = "+x", forward = "-z" }'
+    by_protocols: dict[str, list[str]] = {}
+    for segment in segments:
+        by_protocols.setdefault(_FOUND_BY.get(segment, ""), []).append(segment)
+    for protocols, of in by_protocols.items():
+        if protocols:
+            do += (
+                f"; or find that of {', '.join(of)} by `wepose calibrate --protocol` {protocols}, and give that subject"
+            )
+    if "" in by_protocols:
+        do += f"; no calibration finds that of {', '.join(by_protocols[''])}"
+    return do
 
 
 def align(recording: Recording, subject: Subject | None, found: Filtered) -> Alignment:

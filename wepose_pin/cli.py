@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of, printable
+from .errors import BadData, BadOption, ExistingOutput, MissingFile, WeposeError, one_of, printable
 
 if TYPE_CHECKING:
     from .calibration import Calibration, Verdict
@@ -797,7 +797,8 @@ def validate(
     """
     import json
 
-    from .validation import document_text, experiments, run
+    from .page import reason
+    from .validation import Skipped, document_text, experiments, run
     from .validation.document import as_document, read_document
     from .validation.page import write_pages
     from .writers import whole_folder
@@ -809,21 +810,36 @@ def validate(
     todo = experiments(quick, data) if document is None else {}
     jobs = [job for of in todo.values() for job in of]
     place = whole_folder(out, force) if out is not None else contextlib.nullcontext(None)
-    with place as folder, _steps(len(jobs) + (folder is not None)) as step:
-        if document is None:
-            results = []
-            for job, found in zip(jobs, run(jobs), strict=True):
-                step(job.experiment)
-                results += found
-            text = document_text(results, quick, versions())
-            if folder is not None:
-                (folder / "validation.json").write_text(text, encoding="utf-8")
-            document = as_document(json.loads(text), "this run")
-        if folder is not None:
+    failed: list[str] = []
+    with _steps(len(jobs) + (out is not None)) as step:
+        with place as folder:
+            if document is None:
+                results, skipped = [], []
+                for job, found in zip(jobs, run(jobs), strict=True):
+                    step(job.experiment)
+                    if isinstance(found, Skipped):
+                        skipped.append(found)
+                    else:
+                        results += found
+                if not results:
+                    raise BadData(f"nothing could be scored; {skipped[0].line()}")
+                text = document_text(results, quick, versions(), skipped)
+                if folder is not None:
+                    (folder / "validation.json").write_text(text, encoding="utf-8")
+                document = as_document(json.loads(text), "this run")
+            elif folder is not None:
+                step("drawing the figures")
+                failed = write_pages(folder, document)
+        if out is not None and from_ is None:
             step("drawing the figures")
-            write_pages(folder, document)
+            try:
+                with whole_folder(out, force=True) as folder:
+                    failed = write_pages(folder, document)
+            except Exception as error:
+                failed = [f"validation.html and validation.md: cannot be made: {reason(error)}"]
     _validation_tables(document)
-    if out is not None:
+    _warn([*(each.line() for each in document.skipped), *failed])
+    if out is not None and (out / "validation.html").is_file():
         _say(f"Page: {out / 'validation.html'}  {out / 'validation.md'}  {out / 'validation'}/*.png")
     if out is not None and from_ is None:
         _say(f"Every trial: {out / 'validation.json'}")
