@@ -175,7 +175,7 @@ def track(
     options = set(options)
     argv = ["track", str(session), "-o", str(out), *_gaps(options)]
     argv += [] if method == "amekf" else ["--method", method]
-    argv += [f"--{name}" for name in ("covariance", "causal") if name in options]
+    argv += [f"--{name}" for name in ("covariance", "causal", "torques", "no-limits") if name in options]
     argv += [] if "report" in options else ["--no-report"]
     argv += ["--subject", str(subject)] if subject else []
     return argv + (["--pieces", f"{chunk:g}"] if chunk else [])
@@ -197,8 +197,8 @@ def export(result: Path, out: Path) -> list[str]:
     return ["export", str(result), "-o", str(out)]
 
 
-def info(file: Path) -> list[str]:
-    return ["info", str(file)]
+def info(file: Path, session: Path | None = None) -> list[str]:
+    return ["info", str(file), *(["-o", str(session)] if session else [])]
 
 
 def reproduce(result: Path) -> list[str]:

@@ -146,7 +146,12 @@ class Trial:
         self.command(adapter.info(self.session), acceptance="may: a damaged recording" if self.case.refusal else "")
         for path in sorted(self.folder.glob(f"*{self.case.layout.suffix}"))[:1]:
             if path.name != "truth.parquet":
-                self.command(adapter.info(path), acceptance="may: the format is guessed")
+                written = self.folder / "proposed.toml"
+                outcome = self.command(adapter.info(path, written), acceptance="may: the format is guessed")
+                if outcome.code == 0:  # what is proposed may lack a mount, and says so in a line
+                    out = self.folder / "proposed"
+                    argv = adapter.track(written, out, "amekf", self.case.options & {"gaps"})
+                    self.command(argv, out, "may: mounts and phases are guessed")
 
     def reproduce(self) -> None:
         outcome = self.command(adapter.reproduce(self.result_folder), acceptance="")
