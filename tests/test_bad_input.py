@@ -251,7 +251,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "time in milliseconds": (
         lambda f: f.scale("time", 1000.0),
-        "arm.csv: time grows by 10 from row to row; it must be in seconds; looks like milliseconds",
+        'arm.csv: time grows by 10 s from row to row, slower than any body sensor; time_unit = "ms" would fit',
     ),
     "a jump in time": (
         lambda f: setattr(f, "table", f.table.with_columns(time=pl.col("time") + 1e6 * (pl.col("time") > 5))),

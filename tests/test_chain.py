@@ -275,8 +275,10 @@ def test_a_chain_and_a_person_are_not_mixed_up(urdf: Path) -> None:
     recording, _ = made(model, ["forearm_link"], 6.0)
     with pytest.raises(BadOption, match="give its URDF"):
         track(recording)
-    with pytest.raises(BadOption, match="is a person's"):
+    with pytest.raises(BadOption, match=r"forearm_link.*start_pose.*configuration"):
         track_chain(Recording("p", recording.time, RATE, recording.sensors), model)
+    with pytest.raises(BadOption, match="is a person's"):
+        track_chain(Recording("p", recording.time, RATE, {"torso": recording.sensors["forearm_link"]}), model)
 
 
 def test_a_urdf_in_which_nothing_moves(tmp_path: Path) -> None:

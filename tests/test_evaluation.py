@@ -126,7 +126,7 @@ def test_uncertainty_goes_through_the_table() -> None:
 def test_nothing_in_common_is_named() -> None:
     with pytest.raises(BadData, match="no time in common"):
         evaluate(pose(), replace(pose(), time=TIME + 100.0))
-    with pytest.raises(BadData, match="no time in common within 20 to 30 s"):
+    with pytest.raises(BadData, match="no time in common within the interval 20 to 30 s"):
         evaluate(pose(), pose(), (20.0, 30.0))
     with pytest.raises(BadData, match="no segment and no point in common"):
         evaluate(pose(), Pose(TIME, {"head": pose().quat_WL["torso"]}, {}))

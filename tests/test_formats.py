@@ -11,6 +11,7 @@ import polars as pl
 import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
+from test_mvnx import mvnx, turning
 
 import wepose_pin as wp
 from wepose_pin.errors import BadData, BadSession, MissingFile, UnknownColumn, WeposeError
@@ -44,6 +45,11 @@ def check_raw(recording: Recording, segment: str = "torso") -> None:
     np.testing.assert_allclose(recording.time, TIME, atol=1e-6)
 
 
+def own(values: np.ndarray, path: Path) -> np.ndarray:
+    """With a noise of its own, far below what is compared: no two sensors give the same values."""
+    return values + 1e-7 * np.random.default_rng(list(str(path).encode())).standard_normal(values.shape)
+
+
 def check_orientation(recording: Recording, segment: str = "torso") -> None:
     sensor = recording.sensors[segment]
     assert sensor.gyro_S is None
@@ -66,12 +72,14 @@ def mt_manager(
     names = ["PacketCounter", "SampleTimeFine", *(MT_RAW if raw else [])]
     names += [f"Mat[{row}][{column}]" for column in (1, 2, 3) for row in (1, 2, 3)]
     columns: list[Any] = [[f"{(first + k) % 65536:05d}" for k in range(N)], [""] * N]
-    columns += [*ACCEL.T, *GYRO.T, *matrix.T] if raw else [*matrix.T]
+    columns += [*own(ACCEL, path).T, *GYRO.T, *matrix.T] if raw else [*matrix.T]
     path.write_text(preamble + separator.join(names) + "\n" + rows(columns, separator, decimal), encoding="utf-8")
     return path
 
 
-@pytest.mark.parametrize(("separator", "decimal"), [("\t", "."), (",", "."), (";", "."), (";", ","), ("\t", ",")])
+@pytest.mark.parametrize(
+    ("separator", "decimal"), [("\t", "."), (",", "."), (";", "."), (";", ","), ("\t", ","), (" ", ".")]
+)
 def test_mt_manager_in_every_separator(separator: str, decimal: str, tmp_path: Path) -> None:
     path = mt_manager(tmp_path / "MT_012345_001-000_00B40001.txt", separator=separator, decimal=decimal)
     assert format_of(path) == "mt_manager"
@@ -116,6 +124,183 @@ def test_without_a_rate_the_fine_time_counts_tenths_of_milliseconds(tmp_path: Pa
     check_raw(load(tmp_path, '[data]\nfile = "a.txt"\n[sensors.torso]'))
 
 
+@pytest.mark.parametrize("separator", ["\t", ",", ";", " "])
+@pytest.mark.parametrize("fine", ["NaN", ""])
+def test_mt_manager_without_a_rate_is_read_with_that_of_the_session(fine: str, separator: str, tmp_path: Path) -> None:
+    """MT Manager 2022 states no update rate, and writes NaN for what was not measured; its counter shows lost rows."""
+    for name in ("a.txt", "b.txt"):
+        lines = mt_manager(tmp_path / name, separator=separator, preamble="// MT Manager version: 2022.2.0\n")
+        rows_ = lines.read_text().splitlines(keepends=True)
+        rows_[2:] = [row.replace(separator, f"{separator}{fine}", 1) for row in rows_[2:]]
+        lines.write_text("".join(rows_))
+    check_raw(load(tmp_path, '[data]\nfile = "a.txt"\nrate_hz = 100.0\n[sensors.torso]'))
+    # Without a file in [data] its rate is that of all; a sensor's own goes before it.
+    both = '[sensors.torso]\nfile = "a.txt"\n[sensors.left_forearm]\nfile = "b.txt"\n'
+    check_raw(load(tmp_path, f"[data]\nrate_hz = 100\n{both}"), "left_forearm")
+    own = both.replace('"\n', '"\nrate_hz = 100\n')
+    check_raw(load(tmp_path, f"[data]\n{own}"))
+    (tmp_path / "c.txt").write_text("".join(rows_[:50] + rows_[53:]))
+    lost = load(tmp_path, '[data]\nfile = "c.txt"\nrate_hz = 100.0\n[sensors.torso]')
+    assert len(lost) == N
+    assert "3 samples" in lost.notes[0]
+    with pytest.raises(BadData, match=r"state the update rate as rate_hz in \[data\]"):
+        load(tmp_path, f"[data]\n{both}")
+    with pytest.raises(BadData, match="rate_hz"):  # the rate of [data] is that of its own file
+        load(tmp_path, '[data]\nfile = "b.txt"\nrate_hz = 100\n[sensors.torso]\nfile = "a.txt"\n[sensors.head]')
+
+
+def test_real_exports_of_mt_manager_2022(data: Path, tmp_path: Path) -> None:
+    values = []
+    for file in sorted((data / "mt_manager").glob("MT2022_*.txt")):
+        recording = load(tmp_path, f"[data]\nfile = '{file}'\nrate_hz = 100.0\n[sensors.torso]")
+        assert len(recording) == 5
+        sensor = recording.sensors["torso"]
+        np.testing.assert_allclose(sensor.accel_S[3], [0.045482, -0.00984, 9.967645])
+        np.testing.assert_allclose(sensor.gyro_S[3], [0.002354, 0.003944, 0.001659])
+        ready = load(tmp_path, f"[data]\nfile = '{file}'\nrate_hz = 100.0\nuse = 'orientation'\n[sensors.torso]")
+        values.append(Rotation.from_quat(ready.sensors["torso"].quat_WS))
+    assert len(values) == 2
+    assert (values[0].inv() * values[1]).magnitude().max() < 1e-5  # one as a quaternion, one as a matrix
+
+
+# Keys that nothing uses ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("format", ["mt_manager", "dot", "ximu3", "opensim", "apdm", "mvnx"])
+@pytest.mark.parametrize(
+    ("key", "where"),
+    [
+        ('gyro_unit = "deg/s"', "data"),
+        ('accel_unit = "g"', "data"),
+        ('time = "SampleTimeFine"', "data"),
+        ('time_unit = "ms"', "data"),
+        ('time = "SampleTimeFine"', "sensor"),
+        ('time_unit = "ms"', "sensor"),
+        ('file = "a.csv"', "data"),
+    ],
+)
+def test_a_key_that_a_format_does_not_use_is_refused(format: str, key: str, where: str, tmp_path: Path) -> None:
+    path = made(format, tmp_path).relative_to(tmp_path)
+    label = {"apdm": 'label = "Chest"', "opensim": 'label = "torso_imu"'}.get(format, "")
+    text = "[data]\nDATA\n[sensors.torso]\nfile = 'PATH'\nLABEL\nSENSOR\n".replace("PATH", str(path))
+    text = text.replace("LABEL", label)
+    load(tmp_path, text.replace("DATA", "").replace("SENSOR", ""))
+    with pytest.raises(BadSession, match=f"{key.split()[0]}: .*; leave it out"):
+        load(tmp_path, text.replace("DATA", key * (where == "data")).replace("SENSOR", key * (where == "sensor")))
+
+
+@pytest.mark.parametrize("key", ['use = "raw"', 'format = "dot"', 'file = "b.csv"', 'time_unit = "ms"', 'time = "t"'])
+def test_a_key_that_a_table_does_not_use_is_refused(key: str, tmp_path: Path) -> None:
+    pl.DataFrame(dict.fromkeys("abcdef", TIME)).write_csv(tmp_path / "a.csv")
+    sensor = "[sensors.torso]\nfile = 'a.csv'\nrate_hz = 100\ngyro = ['a', 'b', 'c']\naccel = ['d', 'e', 'f']"
+    with pytest.raises(BadSession, match=f"{key.split()[0]}.*; leave it out"):
+        load(tmp_path, f"[data]\ngyro_unit = 'rad/s'\naccel_unit = 'm/s^2'\n{key}\n{sensor}")
+
+
+@pytest.mark.parametrize("format", ["mt_manager", "dot", "ximu3", "opensim", "apdm", "mvnx"])
+@pytest.mark.parametrize("where", ["data", "sensor"])
+def test_a_rate_goes_before_the_files_own_times(format: str, where: str, tmp_path: Path) -> None:
+    path = made(format, tmp_path).relative_to(tmp_path)
+    label = {"apdm": 'label = "Chest"', "opensim": 'label = "torso_imu"'}.get(format, "")
+    rate = "rate_hz = 50.0"
+    sensor = f"[sensors.torso]\n{label}\n{rate}" if where == "sensor" else f"{rate}\n[sensors.torso]\n{label}"
+    recording = load(tmp_path, f'[data]\nfile = "{path}"\n{sensor}')
+    assert recording.rate_hz == pytest.approx(50.0)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("where", ["data", "sensor"])
+@pytest.mark.parametrize(("unit", "a_second"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_times_in_the_unit_that_is_stated(unit: str, a_second: float, where: str, suffix: str, tmp_path: Path) -> None:
+    frame = pl.DataFrame(np.column_stack([a_second * TIME, GYRO, ACCEL]), schema=["t", *"abcdef"])
+    frame.write_csv(tmp_path / "a.csv") if suffix == ".csv" else frame.write_parquet(tmp_path / "a.parquet")
+    own = f"file = 'a{suffix}'\ntime = 't'\ntime_unit = '{unit}'"
+    sensor = "[sensors.torso]\ngyro = ['a', 'b', 'c']\naccel = ['d', 'e', 'f']"
+    text = f"[data]\ngyro_unit = 'rad/s'\naccel_unit = 'm/s^2'\n{own}\n{sensor}"
+    if where == "sensor":
+        text = f"[data]\ngyro_unit = 'rad/s'\naccel_unit = 'm/s^2'\n{sensor}\n{own}"
+    check_raw(load(tmp_path, text))
+    pieces = list(wp.readers.iter_session(tmp_path / "session.toml", 1.0))
+    np.testing.assert_allclose(np.concatenate([piece.time for piece in pieces]), TIME, atol=1e-9)
+    with pytest.raises(BadSession, match=r"time_unit = 'min' is not known; there is: s, ms, us, ns"):
+        load(tmp_path, text.replace(f"'{unit}'", "'min'"))
+
+
+def test_where_data_names_no_file_its_clock_is_that_of_all(tmp_path: Path) -> None:
+    frame = pl.DataFrame(np.column_stack([1e3 * TIME, GYRO, ACCEL]), schema=["t", *"abcdef"])
+    frame.write_csv(tmp_path / "a.csv")
+    values = "gyro = ['a', 'b', 'c']\naccel = ['d', 'e', 'f']\n"
+    sensors = "".join(f"[sensors.{name}]\nfile = 'a.csv'\n{values}" for name in ("torso", "left_forearm"))
+    units = "[data]\ngyro_unit = 'rad/s'\naccel_unit = 'm/s^2'\n"
+    check_raw(load(tmp_path, f"{units}time = 't'\ntime_unit = 'ms'\n{sensors}"), "left_forearm")
+    check_raw(load(tmp_path, f"{units}rate_hz = 100\n{sensors}"), "left_forearm")
+    with pytest.raises(BadSession, match=r"sensors\.torso\.time or rate_hz is needed"):  # never half of a clock
+        load(tmp_path, f"{units}time = 't'\n[sensors.torso]\nfile = 'a.csv'\ntime_unit = 'ms'\n{values}")
+    with pytest.raises(BadSession, match=r"data\.time_unit: .*; leave it out"):
+        load(tmp_path, f"{units}rate_hz = 100\ntime_unit = 'ms'\n{sensors}")
+
+
+# APDM --------------------------------------------------------------------------------------------------------------
+
+
+def apdm(path: Path) -> Path:
+    """``Format=7``: two sensors, the first without orientation."""
+    first = ["Format=7"]
+    for number, name in (("5718", "Left Wrist"), ("6575", "Chest")):
+        first += [number, "", "", name, *[""] * 10]
+    kinds = "Accelerometer,,,Gyroscope,,,Magnetometer,,,Barometer,Orientation,,,".split(",")
+    axes = [*"XYZXYZXYZ", "", *"SXYZ"]
+    zero = np.zeros(N)
+    gone: list[Any] = [[""] * N] * 4
+    one = [*ACCEL.T, *GYRO.T, zero, zero, zero, zero]
+    columns: list[Any] = [[str(1550879504438281 + 10_000 * k) for k in range(N)], *one, *gone, *one, *WXYZ.T]
+    head = [first, ["Time", *kinds, *kinds], ["", *axes, *axes]]
+    path.write_text("".join(",".join(line) + "\n" for line in head) + rows(columns))
+    return path
+
+
+def apdm_by_name(path: Path) -> Path:
+    """As before ``Format=7``."""
+    names = [
+        f"Chest/{kind}/{axis}" for kind in ("Acceleration", "Angular Velocity", "Magnetic Field") for axis in "XYZ"
+    ]
+    names += [f"Chest/Orientation/{axis}" for axis in ("Scalar", "X", "Y", "Z")]
+    units = ["s", *["m/s^2"] * 3, *["deg/s"] * 3, *["uT"] * 3, *[""] * 4]
+    head = f"Test Name:,walk,,\nSample Rate:,100,Hz,\n{','.join(['Time', *names])}\n{','.join(units)}\n"
+    magnetic = [np.zeros(N)] * 3
+    path.write_text(head + rows([TIME, *ACCEL.T, *np.degrees(GYRO).T, *magnetic, *WXYZ.T]))
+    return path
+
+
+@pytest.mark.parametrize("make", [apdm, apdm_by_name])
+def test_apdm(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    assert format_of(make(tmp_path / "a.csv")) == "apdm"
+    check_raw(load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.torso]'))
+    check_orientation(load(tmp_path, '[data]\nfile = "a.csv"\nuse = "orientation"\n[sensors.torso]'))
+
+
+def test_apdm_knows_its_sensors_by_name(tmp_path: Path) -> None:
+    apdm(tmp_path / "a.csv")
+    check_raw(load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.torso]\n[sensors.left_forearm]'), "left_forearm")
+    with pytest.raises(BadSession, match=r"label is missing; which of a\.csv is it\? there is: Left Wrist, Chest"):
+        load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.head]')
+    device = read_device(tmp_path / "a.csv", "apdm", "orientation")
+    assert list(device.labels) == ["Chest"]
+    assert "Left Wrist" in device.notes[0]
+
+
+def test_a_real_export_of_apdm(data: Path, tmp_path: Path) -> None:
+    """Gravity is up in the world of its orientations, and 128 Hz come from its microseconds."""
+    file = data / "mt_manager" / "apdm_format7.csv"
+    device = read_device(file, "apdm")
+    assert list(device.labels) == ["Lumbar", "Right Ankle", "Left Ankle", "Left Foot", "Chest", "Right Foot"]
+    recording = load(tmp_path, f"[data]\nfile = '{file}'\n[sensors.torso]\nlabel = 'Right Foot'")
+    assert recording.rate_hz == pytest.approx(128.0, rel=1e-3)
+    ready = load(tmp_path, f"[data]\nfile = '{file}'\nuse = 'orientation'\n[sensors.torso]\nlabel = 'Right Foot'")
+    up = Rotation.from_quat(ready.sensors["torso"].quat_WS).apply(recording.sensors["torso"].accel_S)
+    np.testing.assert_allclose(up, np.tile([0.0, 0.0, 9.81], (3, 1)), atol=0.3)
+
+
 # Movella DOT -------------------------------------------------------------------------------------------------------
 
 DOT = (
@@ -131,7 +316,7 @@ def dot(path: Path, mode: str = "rates", *, tag: str = "left_wrist", sync: str =
     modes: dict[str, dict[str, np.ndarray]] = {
         "rates": {
             "Quat_W,Quat_X,Quat_Y,Quat_Z": WXYZ,
-            "Acc_X,Acc_Y,Acc_Z": ACCEL,
+            "Acc_X,Acc_Y,Acc_Z": own(ACCEL, path),
             "Gyr_X,Gyr_Y,Gyr_Z": np.degrees(GYRO),
         },
         "increments": {
@@ -204,7 +389,7 @@ def ximu3(folder: Path, first_us: int = 52100347) -> Path:
     fine = [str(first_us + 10000 * k) for k in range(N)]
     names = "Timestamp (us),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),"
     names += "Accelerometer X (g),Accelerometer Y (g),Accelerometer Z (g)\n"
-    (folder / "Inertial.csv").write_text(names + rows([fine, *np.degrees(GYRO).T, *(ACCEL / 9.80665).T]))
+    (folder / "Inertial.csv").write_text(names + rows([fine, *np.degrees(GYRO).T, *(own(ACCEL, folder) / 9.80665).T]))
     (folder / "Quaternion.csv").write_text("Timestamp (us),W,X,Y,Z\n" + rows([fine, *WXYZ.T]))
     return folder
 
@@ -375,10 +560,13 @@ MAKERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "dot": ("a.csv", dot),
     "ximu3": ("x", ximu3),
     "opensim": ("a.sto", sto),
+    "apdm": ("apdm.csv", apdm),
 }
 
 
 def made(format: str, folder: Path) -> Path:
+    if format == "mvnx":
+        return mvnx(folder, turning(100))
     name, make = MAKERS[format]
     path = make(folder / name)
     return path / "Inertial.csv" if path.is_dir() else path
@@ -408,7 +596,7 @@ def test_a_damaged_file_is_one_line_that_names_it(
     assert path.name in str(error.value)
 
 
-@pytest.mark.parametrize("format", ["mt_manager", "dot", "ximu3"])
+@pytest.mark.parametrize("format", ["mt_manager", "dot", "ximu3", "apdm"])
 def test_a_last_line_that_was_cut_off_is_left_out(format: str, tmp_path: Path) -> None:
     path = made(format, tmp_path)
     path.write_bytes(path.read_bytes()[:-60])
@@ -417,14 +605,14 @@ def test_a_last_line_that_was_cut_off_is_left_out(format: str, tmp_path: Path) -
     np.testing.assert_allclose(recording.sensors["torso"].accel_S, ACCEL[: len(recording)], atol=1e-6)
 
 
-@pytest.mark.parametrize("format", ["mt_manager", "dot", "ximu3"])
+@pytest.mark.parametrize("format", ["mt_manager", "dot", "ximu3", "apdm"])
 def test_gigantic_numbers_are_refused(format: str, tmp_path: Path) -> None:
     path = made(format, tmp_path)
     text = path.read_text(encoding="latin-1")
     lines = text.splitlines()
     cell = "\t" if format == "mt_manager" else ","
     cells = lines[-40].split(cell)
-    cells[{"mt_manager": 2, "dot": 7, "ximu3": 4}[format]] = "1e300"
+    cells[{"mt_manager": 2, "dot": 7, "ximu3": 4, "apdm": 16}[format]] = "1e300"
     lines[-40] = cell.join(cells)
     path.write_text("\n".join(lines) + "\n", encoding="latin-1")
     with pytest.raises(BadData, match=r"in row 361; no device measures as much"):
@@ -439,6 +627,7 @@ def test_raw_data_that_are_not_there_cannot_be_used(format: str, tmp_path: Path)
             read_device(path, format, "raw")
         return
     path.write_bytes(path.read_bytes().replace(b"Gyr", b"Gxx"))
+    assert format != "apdm" or b"Gxx" in path.read_bytes()
     if format == "ximu3":
         with pytest.raises(BadData, match="neither Gyroscope X"):
             read_device(path, format, "raw")
@@ -495,8 +684,7 @@ def test_columns_by_their_names() -> None:
     assert list(found.sensors) == ["torso"]
     assert found.sensors["torso"]["accel"] == ["chest_acc_x", "chest_acc_y", "chest_acc_z"]
     found = guess_columns(["t", "gx", "gy", "gz", "ax", "ay", "az"])
-    assert found.sensors == {"torso": {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
-    assert not found.sure
+    assert found.sensors == {"?": {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
     found = guess_columns(["head_q0", "head_q1", "head_q2", "head_q3"])
     assert found.sensors == {"head": {"orientation": ["head_q1", "head_q2", "head_q3", "head_q0"]}}
     assert guess_columns(["a", "b", "velocity_x"]).sensors == {}

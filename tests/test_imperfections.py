@@ -133,11 +133,11 @@ def test_the_perfect_world_is_the_default_and_what_it_was() -> None:
     ("wrong", "text"),
     [
         ({"palm_slip": -0.001}, r"palm_slip -0\.001"),
-        ({"mount": "some"}, "mount 'some'"),
+        ({"mount": "some"}, "mount = 'some'"),
         ({"bits": 16}, "bits 16 need a finite"),
         ({"gyro_range_deg_s": 0.0}, "gyro_range_deg_s"),
         ({"dropped": 0.5}, r"dropped 0\.5"),
-        ({"sway_deg_s": np.nan}, "sway_deg_s nan"),
+        ({"sway_deg_s": np.nan}, "sway_deg_s = nan"),
     ],
 )
 def test_wrong_sizes_are_named(wrong: dict, text: str) -> None:

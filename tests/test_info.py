@@ -14,7 +14,7 @@ from test_mvnx import mvnx, turning
 
 import wepose_pin as wp
 from wepose_pin.cli import main
-from wepose_pin.recording import Recording
+from wepose_pin.recording import SEGMENTS, Recording
 
 
 def info(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> str:
@@ -85,6 +85,21 @@ def test_files_of_one_recording_make_one_session(capsys: pytest.CaptureFixture[s
     assert recording.time[0] == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_rate_is_proposed_for_files_without_one_alone(
+    stated: bool, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    mt_manager(tmp_path / "chest.txt", preamble="// MT Manager version: 2022.2.0\n")
+    beside = "// Update Rate: 50.0Hz\n" if stated else "// MT Manager version: 2022.2.0\n"
+    mt_manager(tmp_path / "left_wrist.txt", preamble=beside)
+    text = info(capsys, tmp_path / "chest.txt", "--write")
+    recording = wp.load_session(tmp_path)
+    session = (tmp_path / "session.toml").read_text(encoding="utf-8")
+    assert session.count("rate_hz = 100.0   # CHECK: the file does not say its rate") == 1
+    assert ("rate_hz" in session.partition("[sensors.")[0]) is not stated
+    assert recording.rate_hz == pytest.approx(50.0 if stated else 100.0, rel=0.01), text
+
+
 @pytest.mark.parametrize(
     ("make", "name"),
     [
@@ -92,7 +107,6 @@ def test_files_of_one_recording_make_one_session(capsys: pytest.CaptureFixture[s
         (lambda path: dot(path, tag="D422CD00"), "chest.csv"),
         (sto, "a.sto"),
         (mat, "a.mat"),
-        (lambda path: dot(path, tag="D422CD00"), "D422CD00.csv"),
     ],
 )
 def test_each_format_by_what_it_says_of_its_segment(
@@ -106,9 +120,13 @@ def test_each_format_by_what_it_says_of_its_segment(
 def test_an_ximu3_folder_and_what_to_check(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     ximu3(tmp_path / "x-IMU3 12AB34CD (UDP)")
     text = info(capsys, tmp_path / "x-IMU3 12AB34CD (UDP)")
-    assert 'file = "x-IMU3 12AB34CD (UDP)"   # CHECK: which segment?' in text
-    recording = written(capsys, tmp_path / "x-IMU3 12AB34CD (UDP)")
-    np.testing.assert_allclose(recording.sensors["torso"].gyro_S, GYRO, atol=1e-6)
+    assert "400 samples at 100 Hz" in text  # it was read, though nobody knows where it was worn
+    assert '# [sensors.SEGMENT]\n# file = "x-IMU3 12AB34CD (UDP)"' in text
+    assert "torso" not in text
+    info(capsys, tmp_path / "x-IMU3 12AB34CD (UDP)", "--write")
+    session = tmp_path / "session.toml"
+    session.write_text(session.read_text().replace("# [sensors.SEGMENT]\n# file", "[sensors.left_forearm]\nfile"))
+    np.testing.assert_allclose(wp.load_session(session).sensors["left_forearm"].gyro_S, GYRO, atol=1e-6)
 
 
 def test_a_session_elsewhere_names_the_data_from_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -151,13 +169,78 @@ def test_rest_is_found_and_proposed(capsys: pytest.CaptureFixture[str], tmp_path
     assert 'mount = { up = "+z", forward = "+x" }' in text
 
 
-def test_time_in_another_unit_becomes_a_rate(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    frame = table(time="timestamp").with_columns(timestamp=(1e6 * pl.col("timestamp")).round().cast(pl.Int64))
-    frame.write_csv(tmp_path / "a.csv")
+@pytest.mark.parametrize(
+    ("name", "unit", "a_second", "first"),
+    [
+        ("timestamp", "us", 10**6, 0),
+        ("time_ms", "ms", 10**3, 0),
+        ("Timestamp [µs]", "us", 10**6, 1_700_000_000 * 10**6),
+        ("unix_timestamp_microsec", "us", 10**6, 1_700_000_000 * 10**6),
+        ("t_ns", "ns", 10**9, 5),
+        ("SensorTime", "ms", 10**3, 77),
+    ],
+)
+def test_times_in_another_unit_are_named_with_it(
+    name: str, unit: str, a_second: int, first: int, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Lost rows are seen by the times, which a rate in their place would hide."""
+    frame = table(time=name).with_columns(pl.Series(name, [first + k * a_second // 100 for k in range(len(TIME))]))
+    pl.concat([frame[:100], frame[103:]]).write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv")
-    assert "rate_hz = 100" in text
-    assert "'timestamp' is in microseconds" in text
-    assert written(capsys, tmp_path / "a.csv").rate_hz == pytest.approx(RATE)
+    assert f"'{name}' is in {unit}" in text
+    assert f'time_unit = "{unit}"' in text
+    assert "rate_hz" not in text
+    recording = written(capsys, tmp_path / "a.csv")
+    assert recording.rate_hz == pytest.approx(RATE, rel=1e-4)
+    assert len(recording) == len(TIME)
+    assert recording.time[0] == pytest.approx(first / a_second)
+
+
+def test_a_fast_clock_in_milliseconds_is_told_by_its_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Steps of 0.4 could be seconds; the name says that they are not."""
+    frame = table(time="time_ms").with_columns(time_ms=0.4 * pl.int_range(pl.len()))
+    frame.write_csv(tmp_path / "a.csv")
+    assert "2500 Hz" in info(capsys, tmp_path / "a.csv")
+
+
+def test_the_start_phase_is_one_in_which_no_sensor_moves(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Not even one whose segment nobody knows."""
+    gyro, accel = np.full((600, 3), 0.002), np.tile([0.0, 0.0, 9.81], (600, 1))
+    other = gyro.copy()
+    other[:250] += np.sin(0.2 * np.arange(250))[:, None]
+    values = np.column_stack([np.arange(600) / 100.0, gyro, accel, other, accel])
+    names = [f"{who}_{kind}_{axis}" for who in ("torso", "imu7") for kind in ("gyr", "acc") for axis in "xyz"]
+    pl.DataFrame(values, schema=["time", *names]).write_csv(tmp_path / "a.csv")
+    text = info(capsys, tmp_path / "a.csv")
+    assert "start = [[2.50" in text
+
+
+@pytest.mark.parametrize("mounts", [True, False])
+def test_what_can_be_done_with_the_session_is_said(
+    mounts: bool, capsys: pytest.CaptureFixture[str], simulation, tmp_path: Path
+) -> None:
+    """Raw sensors of unknown mount cannot be tracked; `wepose calibrate` finds the mounts of five of them."""
+    recording = simulation.recording("made")
+    columns = {"time": recording.time[:500]}
+    for segment in SEGMENTS[: 5 if mounts else 2]:
+        sensor = recording.sensors[segment]
+        for k, axis in enumerate("xyz"):
+            columns |= {
+                f"{segment}_gyr_{axis}": sensor.gyro_S[:500, k],
+                f"{segment}_acc_{axis}": sensor.accel_S[:500, k],
+            }
+    pl.DataFrame(columns).write_csv(tmp_path / "a.csv")
+    text = info(capsys, tmp_path / "a.csv", "--write")
+    assert ("wepose calibrate" in text) == mounts
+    assert mounts or "state the mounts of torso, left_upper_arm" in text
+    session = (tmp_path / "session.toml").read_text(encoding="utf-8")
+    assert ("# clasp = [[" in session) == mounts
+
+
+def test_aligned_orientations_can_be_tracked_at_once(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    text = info(capsys, mvnx(tmp_path, turning(100)), "--write")
+    assert f"wepose track {tmp_path / 'session.toml'} -o result" in text
+    assert "calibrate" not in text
 
 
 def test_gaps_are_counted(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -249,6 +332,7 @@ def test_sensors_without_a_segment_are_left_to_the_user(capsys: pytest.CaptureFi
     frames = [table(f"seg{k}_gyr_{{}} seg{k}_acc_{{}}").drop("time") for k in (1, 2, 3)]
     pl.concat([table().select("time"), *frames], how="horizontal").write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv")
-    assert "which segment is not said by the names of: seg2, seg3" in text
-    assert text.count("# [sensors.SEGMENT]") == 2
-    assert list(written(capsys, tmp_path / "a.csv").sensors) == ["torso"]
+    assert "which segment is not said by the names of: seg1, seg2, seg3" in text
+    assert text.count("# [sensors.SEGMENT]") == 3
+    assert "[sensors.torso]" not in text
+    assert "name the segment of each sensor" in info(capsys, tmp_path / "a.csv", "--write")

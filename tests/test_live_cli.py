@@ -18,6 +18,7 @@ from test_causal import first
 from wepose_pin import cli
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
+from wepose_pin.recording import SEGMENTS
 from wepose_pin.simulation import Simulation
 from wepose_pin.writers import write_session
 
@@ -106,6 +107,36 @@ def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest
         assert len(err.splitlines()) == 1
     assert file.read_bytes() == b"something"
     run("track", str(file), "-o", str(tmp_path / "r"), code=2)
+
+
+def test_a_live_recording_is_described_and_gets_its_phases_by_a_session(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "a.wepose"
+    run("live", "--source", f"replay:{session}", "--speed", "max", "--record", str(file), "--no-page")
+    before = load_session(file)
+    capsys.readouterr()
+    run("calibrate", str(file), "-o", str(tmp_path / "s"), code=2)
+    err = capsys.readouterr().err.strip()
+    assert "phases.clasp is needed" in err
+    assert "wepose info a.wepose --write" in err
+    assert len(err.splitlines()) == 1
+    run("info", str(file), "--write")
+    out = capsys.readouterr().out
+    assert f"{len(before)} samples at {before.rate_hz:g} Hz" in out
+    for said in ("torso", "left_forearm", "amekf", "no subject", "start pose held [s]", "mounts: torso stated"):
+        assert said in out
+    again = load_session(tmp_path / "session.toml")
+    np.testing.assert_allclose(again.phases["start"], before.phases["start"], atol=0.006)
+    assert list(again.sensors) == [name for name in SEGMENTS if name in before.sensors]
+    for name, sensor in before.sensors.items():
+        np.testing.assert_array_equal(again.sensors[name].gyro_S, sensor.gyro_S)
+        np.testing.assert_array_equal(again.sensors[name].accel_S, sensor.accel_S)
+        np.testing.assert_allclose(again.sensors[name].stated_quat_LS, sensor.stated_quat_LS)
+    text = (tmp_path / "session.toml").read_text(encoding="utf-8")
+    (tmp_path / "session.toml").write_text(text.replace("# clasp = [[10.0, 70.0]]", "clasp = [[20.0, 30.0]]"))
+    assert load_session(tmp_path / "session.toml").phases["clasp"] == ((20.0, 30.0),)
+    run("track", str(tmp_path / "session.toml"), "-o", str(tmp_path / "result"), "--no-report")
 
 
 def test_unknown_mounts_are_said_before_anybody_stands_still(capsys: pytest.CaptureFixture[str]) -> None:

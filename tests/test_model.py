@@ -15,12 +15,18 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.assets import asset
 from wepose_pin.errors import BadModel, MissingFile
 from wepose_pin.model import POINTS, BodyModel, SegmentLink, chains, load_model
+from wepose_pin.pose import forward_kinematics, pose_of
+from wepose_pin.tracking import track
 
 OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"
 SEGMENTS = ["torso", "pelvis", "head"] + [
     f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm", "hand")
 ]
-GAZEBO = {"48": "humanSubject01_48dof.urdf", "66": "humanSubject01_66dof.urdf"}
+GAZEBO = {
+    "48": "humanSubject01_48dof.urdf",
+    "66": "humanSubject01_66dof.urdf",
+    "spine": "humanSubjectWithSpinalCordMeshes.urdf",
+}
 
 
 def example_robot_data_human() -> Path:
@@ -31,7 +37,7 @@ def example_robot_data_human() -> Path:
     return Path(next(file for file in files if str(file).endswith("human_description/robots/human.urdf")).locate())
 
 
-@pytest.fixture(params=["ours", "48", "66", "human"])
+@pytest.fixture(params=["ours", "48", "66", "spine", "human"])
 def urdf(request: pytest.FixtureRequest) -> Path:
     """Each of the models we know."""
     if request.param == "ours":
@@ -489,8 +495,134 @@ def test_a_mimic_joint_follows(tmp_path: Path) -> None:
     np.testing.assert_allclose(link_placements(body.pin, q)["tip"], link_placements(raw, q_raw)["tip"], atol=1e-12)
 
 
+def inertial(mass: str = "5", izz: str = "0.1", ixx: str = "0.1", at: str = "0 0 0") -> str:
+    inertia = f'<inertia ixx="{ixx}" iyy="0.1" izz="{izz}" ixy="0" ixz="0" iyz="0"/>'
+    return f'<inertial><origin xyz="{at}"/><mass value="{mass}"/>{inertia}</inertial>'
+
+
+TURNED = ("0 0 1.5707963267948966", "0 -1.5707963267948966 0.4")  # axes that are orthogonal all the same
+
+
+def test_light_links_between_the_axes_do_not_keep_a_triple_apart(tmp_path: Path) -> None:
+    """Their mass, its place and its inertia go with the segment."""
+    axes = ("1 0 0",) * 3
+    text = small(elbow=triple("left_upper_arm", "left_forearm", "0 0 -0.3", axes, rpy=("0.3 -0.2 0.5", *TURNED)))
+    for k, at in ((0, "0.1 0.2 0.3"), (1, "-0.3 0.5 0.1")):
+        light = inertial(mass="1e-4", at=at)
+        text = text.replace(f'<link name="left_forearm_{k}"/>', f'<link name="left_forearm_{k}">{light}</link>')
+    body = load_model(written(tmp_path, text))
+    raw = pin.buildModelFromXML(text)
+    assert "left_forearm" in body.joints
+    assert pin.computeTotalMass(body.pin) == pytest.approx(2e-4, rel=1e-12)
+    ours, theirs = (pin.centerOfMass(m, m.createData(), pin.neutral(m)) for m in (body.pin, raw))
+    np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    whole = []
+    for model in (body.pin, raw):
+        data = model.createData()
+        pin.ccrba(model, data, pin.neutral(model), np.zeros(model.nv))
+        whole.append(data.Ig.inertia)
+    np.testing.assert_allclose(*whole, atol=1e-12)
+    worst, _ = largest_difference(text, body)
+    assert worst < 1e-12
+
+
+def test_a_torso_on_light_links_follows_exactly(data: Path) -> None:
+    """As hinges its joints miss one that is turned about the vertical by 170 degrees by 70."""
+    body = load_model(data / "human_urdf" / GAZEBO["spine"])
+    assert chains(body.pin)["torso"].exact
+    assert body.warnings == ()
+    quat = {"torso": Rotation.from_euler("ZYX", [[170.0, 0.0, 0.0], [60.0, 20.0, -30.0]], degrees=True).as_quat()}
+    pose = pose_of(body, np.arange(2) / 100.0, quat)
+    stands, _ = forward_kinematics(body, pose.q, ["torso"])
+    missed = Rotation.from_matrix(stands[:, 0]).inv() * Rotation.from_quat(quat["torso"])
+    assert np.degrees(missed.magnitude()).max() < 1e-6
+
+
+def test_textures_without_a_file_do_not_matter(tmp_path: Path) -> None:
+    blank = '<material name="m"><texture/><color rgba="0 1 1 0.5"/></material>'
+    seen = f"<visual><geometry><sphere radius='0.1'/></geometry>{blank}</visual>"
+    text = small(more=blank).replace('<link name="left_hand"/>', f'<link name="left_hand">{seen}</link>')
+    body = load_model(written(tmp_path, text))
+    again = load_model(written(tmp_path, body.with_lengths({"left_forearm": 0.25}).urdf(), "again.urdf"))
+    assert again.lengths["left_forearm"] == pytest.approx(0.25)
+    assert again.visuals[0].rgba == (0.0, 1.0, 1.0, 0.5)
+
+
+def test_a_human_with_such_textures_is_tracked(data: Path) -> None:
+    sides = {"left": "L", "right": "R"}
+    segments = {"torso": "torso", "pelvis": "pelvis"}
+    points = {}
+    for side, letter in sides.items():
+        segments |= {f"{side}_upper_arm": f"upperarm{letter}", f"{side}_forearm": f"lowerarm{letter}"}
+        points[f"{side}_wrist"] = {"link": f"lowerarm{letter}", "at": [0.0, -0.26, 0.0]}
+    body = load_model(
+        data / "human_urdf" / "cosmik_human.urdf", segments=segments, points=points, up="+y", root="pelvis"
+    )
+    # Its links are turned by 1.57 in place of a quarter turn.
+    assert body.lengths["left_upper_arm"] == pytest.approx(0.2737, abs=1e-4)
+    assert "lowerarmL" in body.urdf()
+    with pytest.raises(BadModel) as raised:
+        load_model(data / "human_urdf" / "cosmik_human.urdf")
+    for name in ("left_upper_arm", "upperarmL", "left_forearm", "lowerarmL", "right_upper_arm", "right_forearm"):
+        assert name in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"left_upper_arm": 1.10}, "left_upper_arm is 1.1 m long; adults have 0.1"),
+        ({"trunk": 0.1}, "trunk is 0.1 m long"),
+        ({}, ""),
+    ],
+)
+def test_implausible_lengths_are_warned_of(change: dict[str, float], says: str) -> None:
+    warnings = load_model(lengths=change).warnings
+    assert len(warnings) == len(change)
+    assert all(says in warning and "de Leva" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize(
+    ("mass", "izz", "ixx", "says"),
+    [
+        ("2044", "0.1", "0.1", "a body of 2044 kg"),
+        ("0.05", "0.1", "0.1", "a body of 0.05 kg"),
+        ("50", "-0.1", "0.1", "moments of inertia of torso"),
+        ("50", "9", "0.1", "moments of inertia of torso"),
+        ("50", "0.1", "0.1", ""),
+        ("50", "0.2", "0.1", ""),  # flat as a disc
+        ("50", "0", "0", "moments of inertia of torso"),
+    ],
+)
+def test_masses_and_inertias_that_nobody_has_are_read_and_warned_of(
+    mass: str, izz: str, ixx: str, says: str, tmp_path: Path
+) -> None:
+    """Pinocchio reads them, and its mass and inertia are ours."""
+    text = small().replace('<link name="torso"/>', f'<link name="torso">{inertial(mass, izz, ixx)}</link>')
+    body, raw = load_model(written(tmp_path, text)), pin.buildModelFromXML(text)
+    own = [inertia for inertia in body.pin.inertias if inertia.mass > 0.0]
+    theirs = [inertia for inertia in raw.inertias if inertia.mass > 0.0]
+    assert len(own) == len(theirs) == 1
+    np.testing.assert_allclose(own[0].matrix(), theirs[0].matrix(), atol=1e-12)
+    told = [text for text in body.warnings if " m long" not in text]
+    assert len(told) == bool(says)
+    assert says in " ".join(told)
+
+
+def test_a_torso_that_cannot_move_is_warned_of(tmp_path: Path) -> None:
+    body = load_model(written(tmp_path, small(torso=fixed("root", "torso", "0 0 0.1"))))
+    assert any("no joint moves the torso" in text and "torso_fixed" in text for text in body.warnings)
+
+
+def test_warnings_of_the_body_reach_the_summary(simulation) -> None:
+    recording = simulation.recording("long arm")
+    body = load_model(lengths={"left_upper_arm": 1.1})
+    warnings = track(recording, model=body).summary()["warnings"]
+    assert sum("left_upper_arm is 1.1 m long" in text for text in warnings) == 1
+
+
 HINGE = triple("left_upper_arm", "left_forearm", "0 0 -0.3", ("0 1 0",), ("0 0 0",))
 MIMIC_HINGE = HINGE.replace("</joint>", '<mimic joint="finger_j"/></joint>')
+A = "left_upper_arm"
 WRONG = {
     "no xml": ("no robot", "is no whole XML file"),
     "loop": (small(more=fixed("left_palm", "right_palm", "0 0 0", "floating")), "right_palm' hangs on two joints"),
@@ -509,7 +641,23 @@ WRONG = {
         small(torso=finger("", parent="root") + triple("root", "torso", "0 0 0"), elbow=MIMIC_HINGE),
         "carries 'left_forearm'",
     ),
+    "a rigid elbow": (
+        small(elbow='<link name="cuff"/>' + fixed(A, "cuff", "0 0 -0.1") + fixed("cuff", "left_forearm", "0 0 -0.2")),
+        "moves left_forearm against left_upper_arm (between them: 'cuff_fixed' (fixed), 'left_forearm_fixed' (fixed))",
+    ),
+    "a sliding elbow": (
+        small(elbow=fixed(A, "left_forearm", "0 0 -0.3", "prismatic")),
+        "left_forearm against left_upper_arm (between them: 'left_forearm_prismatic' (prismatic))",
+    ),
+    "no mass at all": (
+        small().replace('<link name="left_hand"/>', f'<link name="left_hand">{inertial(mass="nan")}</link>'),
+        "link 'left_hand': mass nan kg",
+    ),
     "other names": (small().replace("left_forearm", "ulna"), "no link 'left_forearm'; name the segments' links"),
+    "several other names": (
+        small().replace("left_forearm", "l_ulna").replace("right_upper_arm", "humerus_r"),
+        "no link 'left_forearm' (maybe l_ulna or l_ulna_0 or l_ulna_1), 'right_upper_arm' (maybe humerus_r or",
+    ),
 }
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin.errors import BadData, BadSession, MissingFile
-from wepose_pin.readers.mvnx import read_mvnx
+from wepose_pin.readers.mvnx import read_frames, read_mvnx
 from wepose_pin.subject import Hinge
 
 SEGMENTS = ("Pelvis", "T8", "LeftUpperArm", "LeftForeArm", "LeftHand", "RightUpperArm")
@@ -30,8 +30,12 @@ def mvnx(
     index: list[int] | None = None,
     before: str = "",
     end: str = "</frames></subject></mvnx>",
+    arm: tuple[float, float, float] | None = None,
 ) -> Path:
-    """A file with these orientations (n, 6, 4) and, with `raw`, two sensors that rest with gravity on z."""
+    """A file with these orientations (n, 6, 4) and, with `raw`, two sensors that rest with gravity on z.
+
+    `arm`: from joint to joint in the frames of the left arm's segments; its positions are in the file then.
+    """
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', before, HEAD.format(version=version, rate=rate), "<segments>"]
     lines += [f'<segment label="{name}" id="{k}"><points/></segment>' for k, name in enumerate(SEGMENTS, 1)]
     lines += ["</segments><sensors>", '<sensor label="T8"/><sensor label="LeftForeArm"/>', "</sensors><frames>"]
@@ -42,6 +46,11 @@ def mvnx(
         number = k if index is None else index[k]
         lines.append(f'<frame time="{round(20 * number)}" index="{number}" type="normal">')
         lines.append(f"<orientation>{' '.join(f'{value:.9f}' for value in quats.ravel())}</orientation>")
+        if arm is not None:
+            p_W = np.zeros((len(SEGMENTS), 3))
+            for part in (2, 3):
+                p_W[part + 1] = p_W[part] + 0.3 * Rotation.from_quat(quats[part][[1, 2, 3, 0]]).apply(arm)
+            lines.append(f"<position>{' '.join(f'{value:.6f}' for value in p_W.ravel())}</position>")
         if raw:
             lines.append("<sensorAcceleration>0 0 9.81 0 9.81 0</sensorAcceleration>")
             lines.append(f"<sensorAngularVelocity>0.1 0 0 0 0 {0.001 * k}</sensorAngularVelocity>")
@@ -184,6 +193,46 @@ def test_poses_are_no_motion_and_segment_frames_are_those_of_the_n_pose(version:
     np.testing.assert_allclose(right.apply([0.0, 0.0, -1.0]), [0.0, -1.0, 0.0], atol=1e-9)
 
 
+@pytest.mark.parametrize("arm", [(0.0, 1.0, 0.0), (0.0, 0.0, -1.0), None])
+def test_arms_referred_to_either_pose_are_told_by_the_positions(
+    arm: tuple[float, float, float] | None, tmp_path: Path
+) -> None:
+    """Our forearm lies along −z of its frame, whatever MVN's does; without positions it is as in the T-pose."""
+    quat = turning()
+    device = read_mvnx(mvnx(tmp_path, quat, arm=arm))
+    for k, label in ((2, "LeftUpperArm"), (3, "LeftForeArm"), (4, "LeftHand")):
+        ours = Rotation.from_quat(device.table.select([f"{label} orientation {c}" for c in "xyzw"]).to_numpy())
+        along_W = Rotation.from_quat(quat[:, k][:, [1, 2, 3, 0]]).apply(arm or (0.0, 1.0, 0.0))
+        np.testing.assert_allclose(ours.apply([0.0, 0.0, -1.0]), along_W, atol=1e-6)
+    assert any("no positions" in note for note in device.notes) == (arm is None)
+    torso = device.table.select([f"T8 orientation {c}" for c in "xyzw"]).to_numpy()
+    np.testing.assert_allclose(torso, quat[:, 1][:, [1, 2, 3, 0]], atol=1e-8)
+
+
+@pytest.mark.parametrize("arm", [(1.0, 0.0, 0.0), (0.0, 0.7, -0.7), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)])
+def test_arms_of_neither_pose_are_refused(arm: tuple[float, float, float], tmp_path: Path) -> None:
+    with pytest.raises(BadData, match=r"LeftUpperArm lies \d+ deg off y .* and \d+ deg off -z") as error:
+        read_mvnx(mvnx(tmp_path, turning(), arm=arm))
+    assert "\n" not in str(error.value)
+    assert read_mvnx(mvnx(tmp_path, turning(), arm=arm, raw=True)).kind == "raw"  # raw data do not need them
+
+
+@pytest.mark.parametrize("name", ["Meri-020.mvnx", "test_mocap.mvnx"])
+def test_real_arms_lie_along_their_frames(name: str, data: Path) -> None:
+    """The one export refers the arms to the N-pose, the other to the T-pose."""
+    path = data / "mvnx" / name
+    device = read_mvnx(path, "orientation")
+    frames = read_frames(path)
+    at = {label: k for k, label in enumerate(frames.segments)}
+    for side in ("Left", "Right"):
+        for part, end in (("UpperArm", "ForeArm"), ("ForeArm", "Hand")):
+            p_W = frames.values["position"]
+            along_W = p_W[:, at[side + end]] - p_W[:, at[side + part]]
+            along_W /= np.linalg.norm(along_W, axis=1, keepdims=True)
+            quat = device.table.select([f"{side}{part} orientation {c}" for c in "xyzw"]).to_numpy()
+            np.testing.assert_allclose(Rotation.from_quat(quat).apply([0.0, 0.0, -1.0]), along_W, atol=1e-3)
+
+
 def test_raw_data_come_first_and_orientations_when_asked_for(tmp_path: Path) -> None:
     path = mvnx(tmp_path, turning(200), raw=True)
     raw = wp.load_session(session(tmp_path, path.name, ("torso", "left_forearm")))
@@ -202,7 +251,7 @@ def test_lost_frames_are_gaps(tmp_path: Path) -> None:
     path = mvnx(tmp_path, turning(58), index=index)
     recording = wp.load_session(session(tmp_path, path.name, ("torso",)))
     assert len(recording) == 60
-    assert "bridged: 2 samples" in recording.notes[0]
+    assert any("bridged: 2 samples" in note for note in recording.notes)
     path = mvnx(tmp_path, turning(58), index=[k + 40 * (k > 20) for k in range(58)])
     with pytest.raises(BadData, match=r"rows are missing after row 21"):
         wp.load_session(session(tmp_path, path.name, ("torso",)))

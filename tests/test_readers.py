@@ -111,13 +111,16 @@ def test_values_come_through_untouched_and_in_si(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("file", ["hand.csv", "hand.parquet"])
 def test_several_sensors_in_one_file_keep_every_bit(file: str, tmp_path: Path) -> None:
-    table = table_at(np.arange(800) / 100.0, 0.01)
-    path = write(tmp_path, table, file=file)
-    sensor = path.read_text()[path.read_text().index("[sensors") :]
-    path.write_text(path.read_text() + sensor.replace("torso", "head") + "offset_s = 0.0\n")
+    time = np.arange(800) / 100.0
+    own = {"torso": table_at(time, 0.01), "head": table_at(time, 0.02).rename({name: f"h{name}" for name in RAW})}
+    path = write(tmp_path, own["torso"].hstack(own["head"].select(pl.col("^h.*$"))), file=file)
+    sensor = path.read_text()[path.read_text().index("[sensors") :].replace("torso", "head")
+    path.write_text(path.read_text() + sensor.replace('["', '["h').replace(', "', ', "h') + "offset_s = 0.0\n")
+    path.write_text(path.read_text().replace('forward = "h', 'forward = "'))
     recording = load_session(path)
-    for segment in ("torso", "head"):
-        np.testing.assert_array_equal(recording.sensors[segment].gyro_S, table[SIGNALS["gyro"]])
+    for segment, table in own.items():
+        names = [name if segment == "torso" else f"h{name}" for name in SIGNALS["gyro"]]
+        np.testing.assert_array_equal(recording.sensors[segment].gyro_S, table[names])
 
 
 def test_float32_integer_and_nullable_columns_load(tmp_path: Path) -> None:
@@ -359,10 +362,11 @@ def test_a_faster_sensor_is_averaged_so_that_its_noise_does_not_fold_down() -> N
 
 
 def test_the_same_clock_in_two_files_is_not_resampled(tmp_path: Path) -> None:
-    table = table_at(np.arange(1000) / 100.0, 0.01)
-    recording = load_session(write(tmp_path, table, head=table.with_columns(pl.col("time") + 1e-7)))
+    time = np.arange(1000) / 100.0
+    head = table_at(time, 0.02)
+    recording = load_session(write(tmp_path, table_at(time, 0.01), head=head.with_columns(pl.col("time") + 1e-7)))
     assert recording.notes == ()
-    np.testing.assert_array_equal(recording.sensors["head"].gyro_S, table[SIGNALS["gyro"]])
+    np.testing.assert_array_equal(recording.sensors["head"].gyro_S, head[SIGNALS["gyro"]])
 
 
 def test_a_gap_is_marked_on_the_common_time(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +13,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import Calibration, calibrate_lengths, judge
+from wepose_pin.calibration import Calibration, calibrate, calibrate_lengths, judge
 from wepose_pin.calibration.anatomy import Arms, check_labels
 from wepose_pin.calibration.verdict import APART, GRADES
 from wepose_pin.cli import main
+from wepose_pin.errors import CalibrationFailed, WeposeWarning
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import REALISTIC, Imperfections, Person, Simulation, simulate, simulated_person
 from wepose_pin.simulation import motion as motions
@@ -175,6 +177,20 @@ def test_of_sensors_that_sit_elsewhere_nothing_is_learned(anywhere: Simulation, 
     assert found.subject.std("mounts.left_forearm.z") > 1.5
     assert not found.subject.hinges
     assert not found.subject.start_tilt
+
+
+def test_python_hands_out_no_subject_of_a_failed_calibration_in_silence(anywhere: Simulation, person: Person) -> None:
+    taped = {"gauge": {"shoulder_width": person.taped["shoulder_width"]}, "prior": person.average}
+    recording = anywhere.recording()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", WeposeWarning)
+        assert calibrate(recording, **taped, gauge_std=person.taped_std).mounts
+    with pytest.raises(CalibrationFailed, match="look exchanged") as failed:
+        calibrate(exchanged(recording, ("left_upper_arm", "left_forearm")), **taped)
+    assert failed.value.verdict.grade == "fail"
+    assert failed.value.calibration.subject.lengths
+    with pytest.warns(WeposeWarning, match="nothing was taped"):
+        assert calibrate(recording).lengths
 
 
 @pytest.mark.parametrize(

@@ -18,12 +18,14 @@ from typing import Any
 
 # Loaded on first use, so that the command line answers at once.
 _WHERE = {
+    "CalibrationFailed": "errors",
     "Pose": "pose",
     "Recording": "recording",
     "Sensor": "recording",
     "StaticTest": "static",
     "Subject": "subject",
     "WeposeError": "errors",
+    "WeposeWarning": "errors",
     "average_subject": "subject",
     "calibrate": "calibration",
     "estimate_orientation": "filters",

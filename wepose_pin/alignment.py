@@ -22,7 +22,7 @@ from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
 from .filters.start import ACCEL_BIAS_STD
 from .noise import SensorNoise, noise_of, quietest
-from .recording import SEGMENTS, Recording
+from .recording import SEGMENTS, Recording, format_time
 from .static import StaticTest
 from .subject import Subject
 
@@ -49,6 +49,10 @@ SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
 # chance once in a thousand times. Of one or two sensors, a rate above what data sheets give for a bias.
 COMMON_RATE, COMMON_RATE_CHANCE = float(np.deg2rad(0.5)), 1e-3
 LARGEST_BIAS = float(np.deg2rad(5.0))
+
+
+# Samples of a phase at rest, and the share of them that each sensor must have measured.
+FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 
 
 @dataclass(frozen=True)
@@ -113,8 +117,6 @@ class SensorFilters:
     def __init__(self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> None:
         check_method(method)
         self.start, self.still, self.warnings = _phases(first)
-        self._window = (static_test or StaticTest()).samples(first.rate_hz)
-        self._first = True
         self._held: Recording | None = None  # the piece that the smoother has not given yet
         self._runs: dict[str, SensorRun] = {}
         noises: dict[str, SensorNoise] = {}
@@ -127,7 +129,7 @@ class SensorFilters:
                 continue
             assert sensor.gyro_S is not None
             assert sensor.accel_S is not None
-            at_rest = first.span(self.still)
+            at_rest = first.measured(segment, self.still)
             try:
                 worn = self.still == self.start
                 noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
@@ -136,9 +138,14 @@ class SensorFilters:
             noises[segment] = noise
         self.warnings += _common_rotation(first, noises, self.still)
         for segment, noise in noises.items():
-            start = first.span(self.start)
             self._runs[segment] = SensorRun(
-                first.rate_hz, noise, method, static_test=static_test, measured_start=True, start=start
+                first.rate_hz,
+                noise,
+                method,
+                static_test=static_test,
+                measured_start=True,
+                start=first.span(self.start),
+                gyro_range=first.sensors[segment].gyro_range,
             )
         self.ahead = method in OFFLINE and bool(self._runs)
 
@@ -152,13 +159,8 @@ class SensorFilters:
             assert accel_S is not None
             if sensor.gap is not None:
                 # A long bridge is a guess that no filter may take for measured: lost, its covariance grows over it.
-                # The first window starts the filter and has to be there.
-                lost = sensor.gap.copy()
-                if self._first:
-                    lost[: self._window] = False
-                gyro_S, accel_S = (np.where(lost[:, None], np.nan, values) for values in (gyro_S, accel_S))
+                gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
             measured.append((gyro_S, accel_S))
-        self._first = False
         before, self._held = self._held, piece
         done = in_parallel(lambda run, of: run.push(*of), self._runs.values(), measured)
         found = {segment: of for segment, of in zip(self._runs, done, strict=True) if of is not None}
@@ -191,7 +193,7 @@ def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTes
 def filtered_piece(filters: SensorFilters, piece: Recording, orientation: Mapping[str, Orientation]) -> Filtered:
     """A piece that `filters` gave, if the start pose is in it."""
     R_VS = _in_sensor_worlds(piece, orientation)
-    at_start = {segment: R[piece.span(filters.start)].mean() for segment, R in R_VS.items()}
+    at_start = {segment: R[piece.measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
     return Filtered(R_VS, at_start, dict(orientation), filters.start, filters.still, filters.warnings)
 
 
@@ -411,12 +413,17 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
     if len(still) > 1:
         notes.append(f"phases.still holds several intervals; the first, {still[0][0]:g} to {still[0][1]:g} s, is used")
     for name, interval in (("start", start), *(("still", span) for span in still[:1])):
+        place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
-        if samples < 10:
-            raise BadPhase(
-                f"{recording.where()}: phases.{name}: [{interval[0]:g}, {interval[1]:g}] holds {samples} samples; it "
-                f"needs at least 10, better two seconds"
-            )
+        if samples < FEWEST_AT_START:
+            raise BadPhase(f"{place} holds {samples} samples; it needs at least {FEWEST_AT_START}, better two seconds")
+        for segment in recording.sensors:
+            measured = len(recording.measured(segment, interval))
+            if measured < max(FEWEST_AT_START, LEAST_SHARE_AT_START * samples):
+                raise BadPhase(
+                    f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: nothing "
+                    f"there says how it sits; name seconds in which it measures, or take [sensors.{segment}] out"
+                )
     return start, still[0] if still else start, notes
 
 
@@ -426,9 +433,12 @@ def _common_rotation(recording: Recording, noises: dict[str, SensorNoise], inter
     The biases of several sensors about the vertical are as different as sensors are; the same rate in all is the
     person's (one-sample t-test). What it may be stays in the biases' covariance, in place.
     """
-    span = recording.span(interval)
-    up_S = {segment: recording.sensors[segment].accel_S[span].mean(axis=0) for segment in noises}  # type: ignore[index]
-    up_S = {segment: up / np.linalg.norm(up) for segment, up in up_S.items()}
+    up_S = {}
+    for segment in noises:
+        accel_S = recording.sensors[segment].accel_S
+        assert accel_S is not None
+        mean_S = accel_S[recording.measured(segment, interval)].mean(axis=0)
+        up_S[segment] = mean_S / np.linalg.norm(mean_S)
     rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
     if len(rates) == 0:
         return []
@@ -444,8 +454,8 @@ def _common_rotation(recording: Recording, noises: dict[str, SensorNoise], inter
     found = f"all sensors turn about the vertical at {np.degrees(mean):.1f} deg/s, by {turn_deg:.0f} deg in all"
     if turn_deg > MOVES_DEG:
         raise BadPhase(
-            f"{recording.where()}: phases.start ({interval[0]:g} to {interval[1]:g} s): {found}, where gyroscopes have "
-            f"biases of their own: name seconds in which the person does not turn"
+            f"{recording.where()}: phases.start ({format_time(interval[0])} to {format_time(interval[1])} s): {found}, "
+            f"where gyroscopes have biases of their own: name seconds in which the person does not turn"
         )
     for segment, noise in noises.items():
         up = up_S[segment]
@@ -458,13 +468,13 @@ def _motion(recording: Recording, segment: str, interval: tuple[float, float], p
 
     The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
     """
-    sensor, span = recording.sensors[segment], recording.span(interval)
+    sensor, measured = recording.sensors[segment], recording.measured(segment, interval)
     if sensor.quat_WS is not None:
-        R = Rotation.from_quat(sensor.quat_WS[span])
+        R = Rotation.from_quat(sensor.quat_WS[measured])
         rate = (R[:-1].inv() * R[1:]).as_rotvec() * recording.rate_hz
     else:
         assert sensor.gyro_S is not None
-        rate = sensor.gyro_S[span]
+        rate = sensor.gyro_S[measured]
         R = Rotation.from_quat(so3.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
     turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))

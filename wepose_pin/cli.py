@@ -58,10 +58,10 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
     from .calibration import calibrate_lengths
     from .evaluation import evaluate as compare
     from .filters import BEST, METHODS
+    from .report import write_track_pages
     from .simulation import simulate as make
     from .simulation import simulated_person
     from .tracking import track as follow
-    from .viewer import pose_html
     from .writers import whole_folder, write_result, write_session
     from .writers.provenance import made_by, write_made_by
     from .writers.result import as_json, write_subject
@@ -94,9 +94,7 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
                 write_result(folder / "result", pose, phases=recording.phases)
                 best = pose
         step("making the page")
-        assert best.model is not None
-        page = pose_html(best.model, best, phases=recording.phases, title=f"wepose demo, person {seed}")
-        (folder / "result" / "view.html").write_text(page, encoding="utf-8")
+        failed = write_track_pages(folder / "result", best, report=False)
         report = {
             "seed": seed,
             "lengths": {
@@ -126,7 +124,8 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
     )
     _say("One person, one motion: the order of the filters changes with both, see --seed. Each filter tracks with the")
     _say("lengths that it calibrated. From the root the trunk counts too, whose length joined hands do not show.")
-    _say(f"Motion to look at:  {out / 'result' / 'view.html'}")
+    _warn(failed)
+    _say_pages(out / "result", {"Motion to look at": "view.html"})
     _say(f"Session, subject, result, figures:  {out}/session  {out}/subject  {out}/result  {out}/demo.json")
 
 
@@ -176,10 +175,10 @@ def track(
     from .model import load_model
     from .readers import data_bytes, is_live_log, load_session, read_live_log
     from .recording import CONFIGURATION
+    from .report import write_track_pages
     from .subject import load_subject, subject_of
     from .tracking import LARGE
     from .tracking import track as follow
-    from .viewer import pose_html
     from .writers import whole_folder, write_result
     from .writers.provenance import made_by, write_made_by
 
@@ -189,47 +188,40 @@ def track(
     if pieces or (pieces is None and not causal and not torques and data_bytes(session) >= LARGE):
         _track_pieces(session, out, subject, model, method or BEST, pieces, gaps, covariance, limits, report, given)
         return
-    with whole_folder(out, force) as folder, _steps(4 if report else 3) as step:
-        step("reading")
-        who = load_subject(subject) if subject else None
-        if is_live_log(session):
-            log = read_live_log(session)
-            recording, causal = log.recording, causal or (method is None and subject is None)
-            by = str(method or log.header["method"])
-            if who is None and log.header["subject"]:
-                who = subject_of(log.header["subject"], session)
-        else:
-            recording, by = load_session(session, gaps=gaps), method or BEST
-        if model is not None and recording.start_pose == CONFIGURATION:
-            if who is not None or causal:
-                raise BadOption(f"--{'subject' if who else 'causal'}: for a person; {session} is of another chain")
-            _track_chain(recording, model, folder, step, method=by, limits=limits, torques=torques)
-            write_made_by(folder, made_by("track", given))
-            files = ["joints.parquet", *(["torques.parquet"] if torques else []), "pose.parquet", "summary.json"]
-            _say(f"Chain: {'  '.join(str(out / file) for file in files)}")
-            return
-        body = load_model(model) if model else None
-        step(f"tracking by {by}")
-        pose = follow(recording, who, method=by, model=body, causal=causal, limits=limits)
-        found = None
-        if torques:
-            from .angles.torques import pose_torques
+    with _steps(3) as step:
+        with whole_folder(out, force) as folder:
+            step("reading")
+            who = load_subject(subject) if subject else None
+            if is_live_log(session):
+                log = read_live_log(session)
+                recording, causal = log.recording, causal or (method is None and subject is None)
+                by = str(method or log.header["method"])
+                if who is None and log.header["subject"]:
+                    who = subject_of(log.header["subject"], session)
+            else:
+                recording, by = load_session(session, gaps=gaps), method or BEST
+            if model is not None and recording.start_pose == CONFIGURATION:
+                if who is not None or causal:
+                    raise BadOption(f"--{'subject' if who else 'causal'}: for a person; {session} is of another chain")
+                _track_chain(recording, model, folder, step, method=by, limits=limits, torques=torques)
+                write_made_by(folder, made_by("track", given))
+                files = ["joints.parquet", *(["torques.parquet"] if torques else []), "pose.parquet", "summary.json"]
+                _say(f"Chain: {'  '.join(str(out / file) for file in files)}")
+                return
+            body = load_model(model) if model else None
+            step(f"tracking by {by}")
+            pose = follow(recording, who, method=by, model=body, causal=causal, limits=limits)
+            found = None
+            if torques:
+                from .angles.torques import pose_torques
 
-            found = pose_torques(pose)
-        write_result(folder, pose, covariance, recording.phases, found, made_by("track", given))
-        step("making the page")
-        assert pose.model is not None
-        page = pose_html(pose.model, pose, phases=recording.phases, title=recording.name)
-        (folder / "view.html").write_text(page, encoding="utf-8")
-        if report:
-            from .report import track_report
-
-            step("writing the report")
-            (folder / "report.html").write_text(track_report(pose, view=page), encoding="utf-8")
+                found = pose_torques(pose)
+            write_result(folder, pose, covariance, recording.phases, found, made_by("track", given))
+        step("making the pages")
+        failed = write_track_pages(out, pose, report=report)
     _tracked_table(pose.summary())
-    if report:
-        _say(f"Report to look at:  {out / 'report.html'}")
-    _say(f"Motion to look at:  {out / 'view.html'}")
+    _warn(failed)
+    _say_pages(out, {**_reported(report), "Motion to look at": "view.html"})
     _say(f"Pose: {out / 'pose.parquet'}  ({len(pose.quat_WL)} segments, {len(pose.points)} points)")
     if torques:
         _say(f"Torques, estimates: {out / 'torques.parquet'}")
@@ -276,7 +268,7 @@ def calibrate(
     from .calibration import calibrate_lengths, judge, load_protocol
     from .model import load_model
     from .readers import load_session
-    from .report import calibration_report, unsaid
+    from .report import unsaid, write_calibration_page
     from .subject import average_subject
     from .writers import whole_folder
     from .writers.calibration import write_calibration
@@ -285,19 +277,19 @@ def calibrate(
 
     what = load_protocol(protocol)
     taped = _gauges(gauge, what.gauges)
-    with whole_folder(out, force) as folder, _steps(3) as step:
-        step("reading")
-        average = average_subject(stature, sex)
-        recording = load_session(session, gaps=gaps)
-        step("calibrating")
-        found = calibrate_lengths(recording, gauge=taped, prior=average, protocol=what, method=method)
-        verdict = judge(found)
-        write_subject(folder, found.subject, load_model(lengths=found.subject.lengths))
-        write_calibration(folder, found, verdict, made_by("calibrate", given))
+    with _steps(3) as step:
+        with whole_folder(out, force) as folder:
+            step("reading")
+            average = average_subject(stature, sex)
+            recording = load_session(session, gaps=gaps)
+            step("calibrating")
+            found = calibrate_lengths(recording, gauge=taped, prior=average, protocol=what, method=method)
+            verdict = judge(found)
+            write_subject(folder, found.subject, load_model(lengths=found.subject.lengths))
+            write_calibration(folder, found, verdict, made_by("calibrate", given))
         step("writing the report")
-        report = calibration_report(found, recording, method=method, protocol=what, verdict=verdict)
-        (folder / "report.html").write_text(report, encoding="utf-8")
-    _warn(unsaid(found.warnings, verdict))
+        failed = write_calibration_page(out, found, recording, method=method, protocol=what, verdict=verdict)
+    _warn([*unsaid(found.warnings, verdict), *failed])
     _lengths_table(f"Lengths, by {what.title}", found.subject, average, None, taped)
     _mounts_table(found)
     if what.closures:
@@ -309,7 +301,7 @@ def calibrate(
             f"lengths"
         )
         _say(f"the motion counts as {found.independent:.0f} independent measurements")
-    _say(f"Report to look at:  {out / 'report.html'}")
+    _say_pages(out, _reported(True))
     _say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}  {out / 'calibration.json'}")
     _verdict(verdict)
     if verdict.grade != "pass":
@@ -521,6 +513,7 @@ def live(
     stream = open_source(source, sensors=named or None, speed=speed)
     wearing = stated or wearing_of(stream, subject, None)
     body = wearer_model(wearing.subject, load_model(model) if model else None)
+    _warn(body.warnings)
     outputs: list[Output] = []
     follower: RobotOut | None = None
     try:
@@ -684,49 +677,56 @@ def retarget(
 
     sides = None if arm is None else ("left", "right") if arm == "both" else (arm,)
     tasks = replace(Tasks(), **{name: 0.0 for name in ("position", "orientation") if task not in ("both", name)})
-    with whole_folder(out, force) as folder, _steps(104) as step:
-        step("reading")
-        pose, body, _ = read_result(result)
-        model = load(find_map(robot), sides)
-        seen = 0
+    with _steps(104) as step:
+        with whole_folder(out, force) as folder:
+            step("reading")
+            pose, body, _ = read_result(result)
+            model = load(find_map(robot), sides)
+            seen = 0
 
-        def progress(text: str, share: float) -> None:
-            nonlocal seen
-            at = int(50 * share) + (50 if text == "solving" else 0)
-            while seen < at:
-                seen += 1
-                step(text)
+            def progress(text: str, share: float) -> None:
+                nonlocal seen
+                at = int(50 * share) + (50 if text == "solving" else 0)
+                while seen < at:
+                    seen += 1
+                    step(text)
 
-        trajectory = follow(
-            pose,
-            model,
-            rate_hz=rate_hz,
-            tasks=tasks,
-            scale=scale,
-            smoothing_hz=smoothing_hz,
-            strict=strict,
-            progress=progress,
-        )
-        step("checking")
-        held = kept(table(trajectory), model.map.urdf, model.map.acceleration, model.map.jerk)
-        touched = touching(model, trajectory.time, trajectory.u)
-        step("writing")
-        write_trajectory(folder, trajectory)
-        if episode:
-            write_episode(folder / "episode", trajectory, f"follow the arms of {result.name}")
-        found = summary(trajectory, held, touched)
-        text = json.dumps(as_json(found) | {"made_by": made_by("retarget", given)}, indent=2)
-        (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+            trajectory = follow(
+                pose,
+                model,
+                rate_hz=rate_hz,
+                tasks=tasks,
+                scale=scale,
+                smoothing_hz=smoothing_hz,
+                strict=strict,
+                progress=progress,
+            )
+            step("checking")
+            held = kept(table(trajectory), model.map.urdf, model.map.acceleration, model.map.jerk)
+            touched = touching(model, trajectory.time, trajectory.u)
+            step("writing")
+            write_trajectory(folder, trajectory)
+            if episode:
+                write_episode(folder / "episode", trajectory, f"follow the arms of {result.name}")
+            found = summary(trajectory, held, touched)
+            text = json.dumps(as_json(found) | {"made_by": made_by("retarget", given)}, indent=2)
+            (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
         if view:
             step("making the page")
             from .viewer import retarget_html
+            from .writers.pages import PageWriter
 
-            page = retarget_html(body, pose, trajectory, title=f"{result.name} on {model.map.name}")
-            (folder / "view.html").write_text(page, encoding="utf-8")
+            writer = PageWriter(out, ["view.html"])
+            writer.write(
+                "view.html",
+                lambda _: retarget_html(body, pose, trajectory, title=f"{result.name} on {model.map.name}"),
+            )
+            writer.add_warnings("summary.json")
+            _warn(writer.warnings)
     _retarget_tables(found)
     _say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
     if view:
-        _say(f"Motion to look at: {out / 'view.html'}")
+        _say_pages(out, {"Motion to look at": "view.html"})
 
 
 def export(
@@ -921,8 +921,9 @@ def info(
 ) -> None:
     """What a file is: its sensors, rates and gaps, and a session file that is ready for it.
 
-    Knows Xsens MVNX, MT Manager's text, Movella DOT, x-IMU3, OpenSim .sto of orientations, CSV, Parquet, HDF5, MATLAB
-    (docs/formats/), and sessions, subjects and results. What is marked CHECK in the session is guessed.
+    Knows Xsens MVNX, MT Manager's text, Movella DOT, x-IMU3, APDM, OpenSim .sto of orientations, CSV, Parquet, HDF5,
+    MATLAB (docs/formats/), recordings of wepose live, and sessions, subjects and results. What is marked CHECK in the
+    session is guessed.
 
     Example: wepose info trial.mvnx --write
 
@@ -963,7 +964,7 @@ def info(
         partial.replace(target)
     finally:
         partial.unlink(missing_ok=True)
-    _say(f"Session: {target}  (check the lines marked CHECK, then: wepose track {target} -o result)")
+    _say(f"Session: {target}  (check the lines marked CHECK, then: {found.then.replace('SESSION', str(target))})")
 
 
 def batch(
@@ -1010,6 +1011,7 @@ def batch(
         first = failed.unique("error", keep="first", maintain_order=True)
         for item, message in first.select("item", "message").iter_rows():
             _say(f"  {item}: {message}")
+    _warn(study.warnings)
     kept = f", {study.kept} of them before" if study.kept else ""
     _say(f"{study.table.height - failed.height} of {study.table.height} items done{kept}")
     _say(f"Report to look at:  {out.rstrip('/')}/report.html")
@@ -1236,6 +1238,17 @@ def _changed(imperfections: Imperfections, changes: tuple[str, ...]) -> Imperfec
     return imperfections
 
 
+def _reported(report: bool) -> dict[str, str]:
+    return {"Report to look at": "report.html"} if report else {}
+
+
+def _say_pages(folder: Path, pages: Mapping[str, str]) -> None:
+    """What each of the pages is and where it lies; not of those that could not be made."""
+    for what, name in pages.items():
+        if (folder / name).is_file():
+            _say(f"{what}:  {folder / name}")
+
+
 def _tracked_table(summary: Mapping[str, Any]) -> None:
     """What `track` found of the sensors."""
     _warn(summary["warnings"])
@@ -1273,41 +1286,38 @@ def _track_pieces(
     """`track` in a memory that does not grow with the recording."""
     from .model import load_model
     from .readers.session import SessionReader
-    from .report import track_report
+    from .report import write_thinned_pages
     from .report.thinned import Thinner
     from .report.track import MOST_FRAMES
     from .subject import load_subject
     from .tracking import track_pieces
-    from .viewer import pose_html
     from .writers import whole_folder
     from .writers.pieces import PieceWriter
     from .writers.provenance import made_by
 
-    with whole_folder(out, given["force"]) as folder, _shares() as told:
-        told("reading the times", 0.0)
-        who = load_subject(subject) if subject else None
-        body = load_model(model) if model else None
-        reader = SessionReader(session, gaps=gaps, in_memory=False)
-        writer, thinner = PieceWriter(folder, covariance), Thinner(len(reader.time))
-        for piece in track_pieces(reader, who, seconds=seconds, method=method, model=body, limits=limits, told=told):
-            writer.add(piece)
-            thinner.add(piece)
-        told("making the page", 1.0)
-        writer.finish(reader.phases, made_by("track", given))
-        summary = writer.tally.summary()
-        pose, whole = thinner.thinned(reader.phases, summary["warnings"])
-        assert pose.model is not None
-        fps = min(30.0, MOST_FRAMES / max(float(pose.time[-1] - pose.time[0]), 1e-3))
-        page = pose_html(pose.model, pose, phases=reader.phases, title=summary["recording"], fps=fps)
-        (folder / "view.html").write_text(page, encoding="utf-8")
-        if report:
-            told("writing the report", 1.0)
-            (folder / "report.html").write_text(track_report(pose, view=page, whole=whole), encoding="utf-8")
+    with _shares() as told:
+        with whole_folder(out, given["force"]) as folder:
+            told("reading the times", 0.0)
+            who = load_subject(subject) if subject else None
+            body = load_model(model) if model else None
+            reader = SessionReader(session, gaps=gaps, in_memory=False)
+            writer, thinner = PieceWriter(folder, covariance), Thinner(len(reader.time))
+            for piece in track_pieces(
+                reader, who, seconds=seconds, method=method, model=body, limits=limits, told=told
+            ):
+                writer.add(piece)
+                thinner.add(piece)
+            told("writing the result", 1.0)
+            writer.finish(reader.phases, made_by("track", given))
+            summary = writer.tally.summary()
+        told("making the pages", 1.0)
+        fps = min(30.0, MOST_FRAMES / max(summary["duration_s"], 1e-3))
+        failed = write_thinned_pages(out, thinner, reader.phases, summary["warnings"], report=report, fps=fps)
     _tracked_table(summary)
-    if report:
-        _say(f"Report to look at:  {out / 'report.html'}")
-    _say(f"Motion to look at, {fps:.2g} pictures a second:  {out / 'view.html'}")
-    _say(f"Pose: {out / 'pose.parquet'}  ({len(pose.quat_WL)} segments, {len(pose.points)} points)")
+    _warn(failed)
+    motion = f"Motion to look at, {fps:.2g} pictures a second"
+    _say_pages(out, {**_reported(report), motion: "view.html"})
+    _say(f"Pose: {out / 'pose.parquet'}  ({len(summary['sensors'])} segments, {len(summary['points'])} points)")
 
 
 def _track_chain(

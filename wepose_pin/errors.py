@@ -10,7 +10,8 @@ import contextlib
 import os
 import threading
 from collections.abc import Iterable, Iterator
-from difflib import get_close_matches
+from difflib import SequenceMatcher, get_close_matches
+from typing import Any
 
 LONGEST = 2000  # letters of an error's text
 _END = 500  # of these, what is kept of the end, where it says what would be right
@@ -56,8 +57,8 @@ class BadModel(WeposeError):
     """A URDF that cannot be read, or that is not the body this work needs."""
 
 
-class BadOption(WeposeError):
-    """An option's value is outside what it may be."""
+class BadOption(WeposeError, ValueError):
+    """An option or argument is not of the kind that is needed, or outside what it may be."""
 
 
 class BadSource(WeposeError):
@@ -70,6 +71,23 @@ class BadPlan(WeposeError):
 
 class LostWorker(WeposeError):
     """Workers died at an item, again and again: too little memory, say."""
+
+
+class CalibrationFailed(WeposeError):
+    """A calibration whose verdict is "fail": what it found must not be used unread.
+
+    Parameters
+    ----------
+    calibration, verdict : what was found, and what is wrong with it
+    """
+
+    def __init__(self, text: str, calibration: Any = None, verdict: Any = None) -> None:
+        super().__init__(text)
+        self.calibration, self.verdict = calibration, verdict
+
+
+class WeposeWarning(UserWarning):
+    """A result that can be used, but is worth less than it should be: what is wrong with it, and what to do."""
 
 
 class NoSolution(WeposeError):
@@ -113,8 +131,14 @@ def native_stderr_muted() -> Iterator[None]:
 
 
 def one_of(names: Iterable[str], found: str | None = None, most: int = 12) -> str:
-    """The choices for an error's end: ``a, b, c`` with the closest to `found` named first."""
+    """The choices for an error's end: ``a, b, c`` with the closest to `found` named first.
+
+    Of more than `most` those are listed that are nearest to `found`, the nearest first.
+    """
     choices = list(names)
-    listed = ", ".join(choices[:most]) + (", …" if len(choices) > most else "")
+    nearest = choices
+    if found and len(choices) > most:
+        nearest = sorted(choices, key=lambda name: -SequenceMatcher(None, found.lower(), name.lower()).ratio())
+    listed = ", ".join(nearest[:most]) + (f", … ({len(choices)} in all)" if len(choices) > most else "")
     close = get_close_matches(found, choices, n=1) if found else []
     return f"did you mean '{close[0]}'? there is: {listed}" if close else f"there is: {listed or 'none'}"

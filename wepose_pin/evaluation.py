@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from . import so3
-from .errors import BadData
+from .arguments import check_arguments
+from .errors import BadData, BadOption
 from .pose import Pose
 
 
@@ -74,13 +75,17 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
     BadData
         No time in common, or nothing to compare.
     """
+    check_arguments(evaluate, locals())
+    if interval is not None and not interval[0] < interval[1]:
+        raise BadOption(f"interval = {interval}: from and to in seconds are needed, the earlier one first")
     first = max(pose.time[0], truth.time[0], interval[0] if interval else -np.inf)
     last = min(pose.time[-1], truth.time[-1], interval[1] if interval else np.inf)
     inside = (pose.time >= first - 1e-9) & (pose.time <= last + 1e-9)
     if not np.any(inside):
         raise BadData(
             f"pose ({pose.time[0]:g} to {pose.time[-1]:g} s) and reference ({truth.time[0]:g} to {truth.time[-1]:g} s) "
-            f"have no time in common" + (f" within {interval[0]:g} to {interval[1]:g} s" if interval else "")
+            f"have no time in common"
+            + (f" within the interval {interval[0]:g} to {interval[1]:g} s" if interval else "")
         )
     time = np.clip(pose.time[inside], truth.time[0], truth.time[-1])
     attitude, position = {}, {}

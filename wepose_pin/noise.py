@@ -126,12 +126,21 @@ def _floored(cov: np.ndarray, std: float) -> np.ndarray:
 
 
 def quietest(recording: Recording) -> tuple[float, float]:
-    """Interval [s] of `QUIET_S` within the first `BEGINNING_S` in which all sensors together move least."""
+    """Interval [s] of `QUIET_S` within the first `BEGINNING_S` in which all sensors measure and together move least.
+
+    A steady rotation about the vertical varies nothing: what all sensors have of it in common counts as motion.
+
+    Raises
+    ------
+    BadPhase
+        In each of them a sensor was lost.
+    """
     time, rate_hz = recording.time, recording.rate_hz
     n = int(np.searchsorted(time, time[0] + BEGINNING_S, side="right"))
     window = min(max(round(QUIET_S * rate_hz), 10), n)
     stride = max(1, window // 40)  # the windows need not begin at every sample
     motion = np.zeros(len(range(0, n - window + 1, stride)))
+    vertical_rate = np.zeros((0, len(motion)))
     for sensor in recording.sensors.values():
         if sensor.gyro_S is not None:
             signal = sensor.gyro_S[:n]
@@ -143,5 +152,20 @@ def quietest(recording: Recording) -> tuple[float, float]:
             signal = 2.0 * rate_hz * np.concatenate([np.zeros((1, 4)), quat[1:] - flips * quat[:-1]])
         windows = np.lib.stride_tricks.sliding_window_view(signal, window, axis=0)[::stride]
         motion += windows.var(axis=-1).sum(axis=-1)
+        if sensor.accel_S is not None:
+            up = np.lib.stride_tricks.sliding_window_view(sensor.accel_S[:n], window, axis=0)[::stride].mean(axis=-1)
+            rate = np.einsum("ni,ni->n", windows.mean(axis=-1), up) / np.linalg.norm(up, axis=1)
+            vertical_rate = np.vstack([vertical_rate, rate])
+        if sensor.gap is not None:  # what was bridged is quieter than any person
+            motion[np.lib.stride_tricks.sliding_window_view(sensor.gap[:n], window)[::stride].any(axis=-1)] = np.inf
+    if len(vertical_rate):
+        motion += len(vertical_rate) * vertical_rate.mean(axis=0) ** 2
+    if not np.isfinite(motion).any():
+        lost = [name for name, sensor in recording.sensors.items() if sensor.gap is not None and sensor.gap[:n].any()]
+        raise BadPhase(
+            f"{recording.where()}: no {QUIET_S:g} s in the first {BEGINNING_S:g} s in which all sensors measure: "
+            f"{', '.join(f'sensors.{name}' for name in lost)} are lost there; take them out, or name the start pose, "
+            f"[phases] start = [[from, to]]"
+        )
     first = int(np.argmin(motion)) * stride
     return float(time[first]), float(time[first + window - 1])

@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,6 +75,32 @@ class Frame(NamedTuple):
 
 
 Block = str | Heading | Bullets | Table | Facts | Banner | Picture | Frame  # text: a paragraph
+
+
+class Sections:
+    """Makes the sections of a page, each by itself: one that fails leaves a line in its place and takes nothing along.
+
+    Parameters
+    ----------
+    failures : takes a line for each section that cannot be made
+    """
+
+    def __init__(self, failures: list[str] | None) -> None:
+        self._failures = failures if failures is not None else []
+
+    def __call__(self, name: str, make: Callable[[], list[Block]]) -> list[Block]:
+        try:
+            return make()
+        except Exception as error:
+            said = f"the section '{name}' cannot be made: {reason(error)}"
+            self._failures.append(said)
+            return [f"**{capital(said)}.** All else of the page is as it should be."]
+
+
+def reason(error: Exception) -> str:
+    """Kind and text of an error, in one line of bounded length."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text[:200]}" if text else type(error).__name__
 
 
 def stem(text: str) -> str:

@@ -11,10 +11,11 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from . import so3
+from .arguments import check_array, check_covariance, check_fields, check_finite, check_names, check_unit
 from .errors import BadData, BadModel, one_of
 from .model import POINTS, BodyModel, chains
 from .model.follow import Follower, groups
-from .recording import SEGMENTS
+from .recording import EACH_TIME, SEGMENTS, check_time
 from .so3 import kernel
 from .subject import LENGTHS
 
@@ -45,6 +46,42 @@ class Pose:
     segment_cov: Mapping[str, np.ndarray] = field(default_factory=dict)
     point_cov: Mapping[str, np.ndarray] = field(default_factory=dict)
     gap: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def check(self) -> Pose:
+        """The same pose, if it can be one: made by hand it may be anything. NaN stands for what is missing.
+
+        Raises
+        ------
+        BadOption, BadData
+            A field that is not of its kind; a segment or point that is not known; shapes that differ; time that goes
+            back; quaternions that are no unit ones; covariances that are none.
+        """
+        where = "pose: "
+        check_fields(self, where, Pose)
+        n = np.size(self.time)
+        check_array(f"{where}time", self.time, (n,))
+        if not n:
+            raise BadData(f"{where}time has no samples")
+        check_time("pose", self.time)
+        for name, known, shape in (
+            ("quat_WL", SEGMENTS, (n, 4)),
+            ("points", POINTS, (n, 3)),
+            ("segment_cov", SEGMENTS, (n, 3, 3)),
+            ("point_cov", POINTS, (n, 3, 3)),
+        ):
+            check_names(f"{where}{name}", getattr(self, name), tuple(known))
+            for key, values in getattr(self, name).items():
+                place = f"{where}{name}.{key}"
+                check_array(place, values, shape, rows=EACH_TIME)
+                check_finite(place, values, missing=True)
+                if name == "quat_WL":
+                    check_unit(place, values, 1e-3)
+                elif shape == (n, 3, 3):
+                    check_covariance(place, values)
+        check_names(f"{where}gap", self.gap, SEGMENTS)
+        for segment, gap in self.gap.items():
+            check_array(f"{where}gap.{segment}", gap, (n,), "b", EACH_TIME)
+        return self
 
 
 def pose_of(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .errors import BadData, BadPhase, one_of
+from .arguments import Positive, check_array, check_fields, check_finite, check_names, check_unit
+from .errors import BadData, BadOption, BadPhase, one_of
 
 SEGMENTS = (
     "torso",
@@ -26,12 +27,23 @@ SEGMENTS = (
     "right_hand",
 )
 START_POSES = ("n_pose",)
+STRAPPINGS = ("as_calibrated", "new")
 CONFIGURATION = "configuration"  # the start pose of any other chain: values of its joints; sensors are named by links
 
 # The sensor axes that a mount can be stated with.
 AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) for k, axis in enumerate("xyz")}
 
+RATE_OFF = 0.01  # share by which the stated rate may be off that of the times: its error is one of all angles
+LONGEST_STEP = 2.5  # steps of the rate from one time to the next; uneven clocks are resampled while read
+
+EACH_TIME = ", a row for each time"  # why an array has another shape
+
 Intervals = tuple[tuple[float, float], ...]
+
+
+def format_time(time: float) -> str:
+    """A time [s] as it stands in the file, to the millisecond: on a clock that counts from 1970 as well."""
+    return f"{time:.3f}".rstrip("0").rstrip(".")
 
 
 def mount_from_axes(up: str, forward: str) -> np.ndarray:
@@ -60,7 +72,9 @@ class Sensor:
     accel_S : (n, 3) [m/s²], specific force, +g up at rest; None for ready orientations
     quat_WS : (n, 4) xyzw, sensor to a world of its own whose z points up; None for raw sensors
     stated_quat_LS : (4,) xyzw, the mount as the session states it, sensor to segment; None where it says nothing
-    gap : (n,) bool, true where samples were lost for longer than is bridged in silence; None where that is not allowed
+    gap : (n,) bool, true where samples were lost for longer than is bridged in silence, or the sensor was frozen; None
+        where neither can be
+    gyro_range : [rad/s] from which on an axis of gyro is cut off; infinite where that is not known
     aligned : `quat_WS` is the segment's own orientation, in a world that is common to all that are aligned: only where
         that world's x points is taken from the start pose
     """
@@ -71,6 +85,7 @@ class Sensor:
     stated_quat_LS: np.ndarray | None = None
     gap: np.ndarray | None = None
     aligned: bool = False
+    gyro_range: float = np.inf
 
     @property
     def ready(self) -> bool:
@@ -97,7 +112,7 @@ class Recording:
 
     name: str
     time: np.ndarray
-    rate_hz: float
+    rate_hz: Positive
     sensors: Mapping[str, Sensor]
     phases: Mapping[str, Intervals] = field(default_factory=dict)
     start_pose: str = "n_pose"
@@ -111,6 +126,10 @@ class Recording:
     def __len__(self) -> int:
         return len(self.time)
 
+    def check(self) -> Recording:
+        """The same recording, if it can be one, as the function `check` says: made by hand it may be anything."""
+        return check(self)
+
     def where(self) -> str:
         """Beginning of an error's text: the file, or the recording's name."""
         return str(self.source) if self.source else self.name
@@ -119,6 +138,12 @@ class Recording:
         """Samples within the interval [s], both ends included."""
         first, last = np.searchsorted(self.time, [interval[0] - 1e-9, interval[1] + 1e-9])
         return slice(int(first), int(last))
+
+    def measured(self, segment: str, interval: tuple[float, float]) -> np.ndarray:
+        """Samples (k,) within the interval [s] that the sensor measured: what lies in its gaps was bridged."""
+        span, gap = self.span(interval), self.sensors[segment].gap
+        samples = np.arange(len(self))[span]
+        return samples if gap is None else samples[~gap[span]]
 
     def phase(self, name: str) -> Intervals:
         """Intervals of a phase that must be there.
@@ -129,6 +154,12 @@ class Recording:
             The recording has no such phase.
         """
         intervals = self.phases.get(name, ())
+        if not intervals and self.source is not None and self.source.suffix == ".wepose":
+            raise BadPhase(
+                f"{self.where()}: phases.{name} is needed here, and a live recording has phases.start alone; `wepose "
+                f"info {self.source.name} --write` writes a session that names it: add {name} = [[from, to]] to its "
+                f"[phases]"
+            )
         if not intervals:
             raise BadPhase(
                 f"{self.where()}: phases.{name} is needed here and missing; add [phases] {name} = "
@@ -142,17 +173,31 @@ def check(recording: Recording) -> Recording:
 
     Raises
     ------
+    BadOption
+        A field that is not of its kind, or a name that is not known.
     BadData
-        Shapes that differ, too few samples, numbers that are not finite, time that stands still or goes back.
+        Shapes that differ, too few samples, numbers that are not finite, time that stands still or goes back, or that
+        has not the rate.
     BadPhase
         A phase that is empty or outside the recording.
     """
     where, time = recording.where(), recording.time
+    check_fields(recording, f"{where}: ")
+    for name, choices in (("start_pose", (*START_POSES, CONFIGURATION)), ("strapping", STRAPPINGS)):
+        if getattr(recording, name) not in choices:
+            raise BadOption(f"{where}: {name} = '{getattr(recording, name)}' is not known; {one_of(choices)}")
+    if recording.start_pose != CONFIGURATION:  # else they are links
+        links = f'; a chain\'s links need start_pose = "{CONFIGURATION}"'
+        check_names(f"{where}: sensors", recording.sensors, SEGMENTS, links)
     if not recording.sensors:
         raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}")
     if len(time) < 2:
-        raise BadData(f"{where}: {len(time)} samples; a recording has at least 2")
+        raise BadData(f"{where}: time has {len(time)} samples; a recording has at least 2")
+    check_array(f"{where}: time", time, (len(time),))
     check_time(where, time)
+    _check_rate(where, time, recording.rate_hz)
+    if not all(0 <= tick < len(time) for tick in recording.resets):
+        raise BadOption(f"{where}: resets = {recording.resets}: samples from 0 to {len(time) - 1} are needed")
     for segment, sensor in recording.sensors.items():
         for name, values, width in (
             ("gyro", sensor.gyro_S, 3),
@@ -162,8 +207,7 @@ def check(recording: Recording) -> Recording:
             if values is None:
                 continue
             place = f"{where}: sensors.{segment}.{name}"
-            if values.shape != (len(time), width):
-                raise BadData(f"{place}: shape {values.shape} beside {len(time)} times; expected {(len(time), width)}")
+            check_array(place, values, (len(time), width), rows=EACH_TIME)
             bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
             if bad.size:
                 raise BadData(
@@ -173,10 +217,34 @@ def check(recording: Recording) -> Recording:
             if name == "orientation" and np.any(np.abs(np.linalg.norm(values, axis=1) - 1.0) > 1e-6):
                 k = int(np.argmax(np.abs(np.linalg.norm(values, axis=1) - 1.0)))
                 raise BadData(f"{place}: no unit quaternion at {time[k]:.3f} s: length {np.linalg.norm(values[k]):.6g}")
+        place = f"{where}: sensors.{segment}"
+        if sensor.stated_quat_LS is not None:
+            check_array(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,))
+            check_finite(f"{place}.stated_quat_LS", sensor.stated_quat_LS)
+            check_unit(f"{place}.stated_quat_LS", sensor.stated_quat_LS, 1e-6)
+        if sensor.gap is not None:
+            check_array(f"{place}.gap", sensor.gap, (len(time),), "b", EACH_TIME)
         if (sensor.gyro_S is None) != (sensor.accel_S is None) or (sensor.gyro_S is None) == (sensor.quat_WS is None):
             raise BadData(f"{where}: sensors.{segment} has neither gyro and accel nor orientation")
     check_phases(where, time, recording.phases)
     return recording
+
+
+def _check_rate(where: str, time: np.ndarray, rate_hz: float) -> None:
+    """Times (n,) [s] go on evenly at the rate, their jitter aside."""
+    steps = len(time) - 1
+    stated = (time[-1] - time[0]) * rate_hz
+    if abs(stated - steps) > max(1.0, RATE_OFF * steps):
+        raise BadData(
+            f"{where}: rate_hz = {rate_hz:g}, and time has {steps / (time[-1] - time[0]):.6g} samples a second; they "
+            f"must agree to {100.0 * RATE_OFF:g} %"
+        )
+    k = int(np.argmax(np.diff(time)))
+    if (time[k + 1] - time[k]) * rate_hz > LONGEST_STEP:
+        raise BadData(
+            f"{where}: time goes from {time[k]:.3f} to {time[k + 1]:.3f} s in one step at {rate_hz:g} Hz; fill or cut "
+            f"the gap first"
+        )
 
 
 def check_time(where: str, time: np.ndarray) -> None:

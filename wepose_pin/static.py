@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .arguments import NonNegative, Positive, check_fields
 from .errors import BadData, BadOption
 from .noise import BLOCK_S, SensorNoise
 from .so3 import inlined, kernel
@@ -37,23 +38,25 @@ class StaticTest:
     noise and sway as measured in the start phase, and of `bias_spread`.
     """
 
-    window_s: float = 0.5  # [s] W
-    alpha: float = 2.0  # (1) gyro covariance against the still one
-    beta: float = 2.0  # (2) accel/g covariance against the still one
-    gamma1: float = 0.01  # (3) |mean ‖accel/g‖ − 1| at most
-    gamma2: float = 0.01  # (4) variance of ‖accel/g‖ at most
+    window_s: Positive = 0.5  # [s] W
+    alpha: NonNegative = 2.0  # (1) gyro covariance against the still one
+    beta: NonNegative = 2.0  # (2) accel/g covariance against the still one
+    gamma1: NonNegative = 0.01  # (3) |mean ‖accel/g‖ − 1| at most
+    gamma2: NonNegative = 0.01  # (4) variance of ‖accel/g‖ at most
     rate_stds: float = 3.0  # (5) standard deviations by which the rate about the vertical may be off the known bias
-    averaging_s: float = 4.0  # [s] of (5)'s average, about two periods of a standing person's sway
+    averaging_s: Positive = 4.0  # [s] of (5)'s average, about two periods of a standing person's sway
     # [rad/s] by which the bias depends on how the sensor lies; 0.01 deg/s, twice what BROAD's sensors show at rest
-    bias_spread: float = float(np.deg2rad(0.01))
+    bias_spread: NonNegative = float(np.deg2rad(0.01))
     # [rad/s/√s] by which it drifts: a strapped sensor warms by 5 to 10 K in a quarter of an hour, at 0.02 deg/s a
     # kelvin that is 0.2 deg/s, here three standard deviations
-    bias_walk: float = float(np.deg2rad(0.002))
+    bias_walk: NonNegative = float(np.deg2rad(0.002))
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value >= 0.0 or (value == 0.0 and name in ("window_s", "averaging_s")):
-                raise BadOption(f"{name} = {value}: a number from 0 on is needed, seconds above 0")
+        check_fields(self, "")
+        if not self.rate_stds >= 0.0:
+            raise BadOption(
+                f"rate_stds = {self.rate_stds}: a number from 0 on is needed, infinite for the paper's test"
+            )
 
     def samples(self, rate_hz: float) -> int:
         """N, the window in samples (at least 4: a covariance of three axes needs them)."""

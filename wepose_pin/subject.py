@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from .arguments import (
+    NonNegative,
+    check_arguments,
+    check_array,
+    check_covariance,
+    check_fields,
+    check_finite,
+    check_names,
+    check_unit,
+)
 from .assets import asset
-from .errors import BadOption, BadSubject, MissingFile, one_of
+from .errors import BadData, BadOption, BadSubject, MissingFile, one_of
 from .readers.keys import is_number, parsed_toml
 from .recording import SEGMENTS
 
@@ -26,6 +36,7 @@ LENGTHS = (
     "right_forearm",
     "right_hand",
 )
+LONGEST = 3.0  # [m] longer is no part of a person
 SEXES = ("f", "m")
 FORMAT = 1
 
@@ -34,21 +45,21 @@ class Hinge(NamedTuple):
     """An elbow's axis."""
 
     axis: np.ndarray  # (3,) unit, in the upper arm's frame, y towards the left
-    std: float  # [rad] by which the forearm leaves the plane across it, soft tissue included
+    std: NonNegative  # [rad] by which the forearm leaves the plane across it, soft tissue included
 
 
 class StartTilt(NamedTuple):
     """How far a segment was off the start pose when its mount was calibrated."""
 
     tilt: np.ndarray  # (2,) [rad] about x and y of W
-    std: float  # [rad] of each
+    std: NonNegative  # [rad] of each
 
 
 class Drift(NamedTuple):
     """How fast a sensor's heading drifted in the calibration, which is its gyroscope's bias as far as it was left."""
 
     rate: float  # [rad/s]
-    std: float  # [rad/s]
+    std: NonNegative  # [rad/s]
 
 
 @dataclass(frozen=True)
@@ -77,6 +88,42 @@ class Subject:
     hinges: Mapping[str, Hinge] = field(default_factory=dict)
     start_tilt: Mapping[str, StartTilt] = field(default_factory=dict)
     drift: Mapping[str, Drift] = field(default_factory=dict)
+
+    def check(self) -> Subject:
+        """The same subject, if it can be one: made by hand it may be anything.
+
+        Raises
+        ------
+        BadOption, BadSubject
+            A field that is not of its kind; a length, mount, hinge, tilt or drift that cannot be; a covariance that is
+            none, or has not the rows of `order`.
+        """
+        where = f"subject {self.name!r}: "
+        check_fields(self, where)
+        try:
+            check_lengths(f"{where}lengths", self.lengths, LENGTHS)
+            if set(self.lengths) != set(LENGTHS):
+                raise BadData(f"{where}lengths: {', '.join(n for n in LENGTHS if n not in self.lengths)} is missing")
+            check_names(f"{where}order", self.order, _ROWS)
+            if len(set(self.order)) < len(self.order):
+                raise BadData(f"{where}order = {self.order}: each name once")
+            check_array(f"{where}covariance", self.covariance, (len(self.order), len(self.order)))
+            check_finite(f"{where}covariance", self.covariance)
+            check_covariance(f"{where}covariance", self.covariance)
+            for name in ("mounts", "start_tilt", "drift"):
+                check_names(f"{where}{name}", getattr(self, name), SEGMENTS)
+            check_names(f"{where}hinges", self.hinges, ("left", "right"))
+            arrays = [(f"mounts.{s}", quat, (4,)) for s, quat in self.mounts.items()]
+            arrays += [(f"hinges.{side}.axis", hinge.axis, (3,)) for side, hinge in self.hinges.items()]
+            arrays += [(f"start_tilt.{s}.tilt", start.tilt, (2,)) for s, start in self.start_tilt.items()]
+            for name, values, shape in arrays:
+                check_array(f"{where}{name}", values, shape)
+                check_finite(f"{where}{name}", values)
+                if shape != (2,):
+                    check_unit(f"{where}{name}", values, 1e-3)
+        except (BadData, BadOption) as error:
+            raise BadSubject(str(error)) from None
+        return self
 
     def std(self, name: str) -> float:
         """One standard deviation of a length [m], or of a mount's axis [rad]; NaN where nothing is known."""
@@ -122,6 +169,23 @@ def mount_rows(segment: str) -> list[str]:
     return [f"mounts.{segment}.{axis}" for axis in "xyz"]
 
 
+_ROWS = (*LENGTHS, *(row for segment in SEGMENTS for row in mount_rows(segment)))  # what a covariance may be of
+
+
+def check_lengths(place: str, lengths: Mapping[str, float], names: Collection[str]) -> None:
+    """Each length [m] has one of the names and is that of a person's part.
+
+    Raises
+    ------
+    BadOption
+        One has, or is, not.
+    """
+    check_names(place, lengths, names)
+    for name, value in lengths.items():
+        if not 0.0 < value < LONGEST:
+            raise BadOption(f"{place}.{name} = {value:g}: a length in metres is needed, above 0 and below {LONGEST:g}")
+
+
 def average_subject(stature: float | None = None, sex: str | None = None) -> Subject:
     """The anthropometric prior: mean lengths and their covariance over people.
 
@@ -138,6 +202,7 @@ def average_subject(stature: float | None = None, sex: str | None = None) -> Sub
     BadOption
         A stature outside 1.0 to 2.5 m, or another sex.
     """
+    check_arguments(average_subject, locals())
     if stature is not None and not 1.0 <= stature <= 2.5:
         raise BadOption(f"stature {stature:g} is not a body height in metres; between 1.0 and 2.5")
     if sex is not None and sex not in SEXES:
@@ -207,6 +272,7 @@ def load_subject(path: str | Path) -> Subject:
     MissingFile, BadSubject
         Not there; a length missing, not positive, unknown; a covariance that does not fit.
     """
+    check_arguments(load_subject, locals())
     path = Path(path)
     if path.is_dir():
         path = path / "subject.toml"
@@ -243,7 +309,7 @@ def subject_of(text: str, path: Path) -> Subject:
             raise BadSubject(f"{path}: '{name}' is not a length; {one_of(LENGTHS, name)}")
     for name in LENGTHS:
         value = lengths.get(name)
-        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 < value < 3.0:
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 < value < LONGEST:
             raise BadSubject(f"{path}: lengths.{name} = {value!r}; a number in metres is needed, above 0")
     order, matrix = _covariance(path, table.get("covariance", {}), table.get("lengths_std", {}))
     return Subject(
@@ -274,13 +340,12 @@ def _covariance(path: Path, table: Mapping, std: Mapping) -> tuple[tuple[str, ..
     if not table:
         order = tuple(name for name in LENGTHS if name in std)
         return order, np.diag([float(std[name]) ** 2 for name in order])
-    known = (*LENGTHS, *(row for segment in SEGMENTS for row in mount_rows(segment)))
     order = table.get("order", ())
     if not isinstance(order, list | tuple) or len(set(map(str, order))) != len(order):
         raise BadSubject(f"{path}: covariance.order = {order!r}; a list of names is needed, each once")
     for name in order:
-        if name not in known:
-            raise BadSubject(f"{path}: covariance.order: {name!r} is not known; {one_of(known, str(name))}")
+        if name not in _ROWS:
+            raise BadSubject(f"{path}: covariance.order: {name!r} is not known; {one_of(_ROWS, str(name))}")
     order = tuple(order)
     try:
         matrix = np.array(table.get("matrix"), dtype=float)

@@ -197,6 +197,17 @@ def ximu3() -> list[bytes]:
     return [inertial.encode(), quaternion.encode()]
 
 
+def apdm() -> list[bytes]:
+    kinds, axes = "Accelerometer,,,Gyroscope,,,Orientation,,,", "X,Y,Z,X,Y,Z,S,X,Y,Z"
+    names = f"Format=7,5718,,,Chest,,,,,,,6575,,,Left Wrist{',' * 6}\nTime,{kinds},{kinds}\n,{axes},{axes}\n"
+    values = (ACCEL, GYRO, QUAT[:, [3, 0, 1, 2]])
+    newer = names + rows(1550879504438281 + 10000 * np.arange(N), *values, *values)
+    labels = [f"Chest/{kind}/{axis}" for kind in ("Acceleration", "Angular Velocity") for axis in "XYZ"]
+    units = ["s", *["m/s^2"] * 3, *["deg/s"] * 3]
+    older = f"Test Name:,a,\nSample Rate:,100,Hz\n{','.join(['Time', *labels])}\n{','.join(units)}\n"
+    return [newer.encode(), (older + rows(TIME, ACCEL, GYRO)).encode()]
+
+
 def opensim() -> bytes:
     lines = [f"{t:.3f}\t0.8,0,0.6,0\t1,0,0,0\n" for t in TIME]
     return (

@@ -30,7 +30,7 @@ def _described(folder: Path, data: bytes) -> object:
 def _described_seeds() -> list[bytes]:
     """One of each kind."""
     of = {
-        ".csv": [seeds.csv(), *seeds.dot(), *seeds.ximu3()],
+        ".csv": [seeds.csv(), *seeds.dot(), *seeds.ximu3(), *seeds.apdm()],
         ".txt": seeds.mt_manager(),
         **{".sto": [seeds.opensim()], ".mvnx": [seeds.mvnx(True)], ".xml": [seeds.mvnx(False)]},
         **{".mat": [seeds.mat(True)], ".h5": [seeds.hdf5()], ".parquet": [seeds.parquet(), seeds.pose()]},
@@ -282,6 +282,7 @@ TARGETS = (
     Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES, "readers.mt_manager"),
     Target("dot", seeds.dot, _device("a.csv", "dot"), LINES, "readers.dot"),
     Target("ximu3", seeds.ximu3, _device("Inertial.csv", "ximu3"), LINES, "readers.ximu3"),
+    Target("apdm", seeds.apdm, _device("a.csv", "apdm"), LINES, "readers.apdm"),
     Target("opensim", lambda: [seeds.opensim()], _device("a.sto", "opensim"), LINES, "readers.opensim"),
     Target("info", _described_seeds, _described, LINES, "readers.describe"),
     Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML, "readers.session"),

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import so3
+from ..arguments import check_arguments
 from ..errors import BadData, BadOption, one_of
 from ..model.chains import conjugate, multiply
 from ..pose import Pose
@@ -128,6 +129,7 @@ def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK
     BadData
         No joint has both of its segments in the pose.
     """
+    check_arguments(joint_angles, locals())
     if sequence not in SHOULDER_SEQUENCES:
         raise BadOption(f"shoulder sequence '{sequence}' is not known; {one_of(SHOULDER_SEQUENCES, sequence)}")
     if not LEAST_NEAR_LOCK <= near_lock <= np.pi / 4.0:

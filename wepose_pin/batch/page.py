@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 from matplotlib import rc_context
 
-from ..page import ACCENT, STYLE, Banner, Block, Facts, Heading, Picture, Table, as_html, new_figure, png_of
+from ..page import ACCENT, STYLE, Banner, Block, Facts, Heading, Picture, Sections, Table, as_html, new_figure, png_of
 from .plan import Plan
 
 APART = 5.0  # robust deviations: of 10 000 normal figures not one is so far off
@@ -42,19 +42,23 @@ class Apart(NamedTuple):
     deviations: float  # robust standard deviations off the median
 
 
-def study_page(plan: Plan, table: pl.DataFrame) -> str:
-    """The page of a study; `table` as in ``results.parquet``, items' folders in ``items/`` beside it."""
+def study_page(plan: Plan, table: pl.DataFrame, failures: list[str] | None = None) -> str:
+    """The page of a study; `table` as in ``results.parquet``, items' folders in ``items/`` beside it.
+
+    `failures` takes a line for each section that cannot be made; the page says so in its place.
+    """
     failed, done = table.filter(pl.col("status") != "done"), table.filter(pl.col("status") == "done")
     columns = _figures(done)
+    sections = Sections(failures)
     return as_html(
         [
             Heading(f"Study: {plan.name}", 1),
             _verdict(done.height, failed.height),
-            Facts(_facts(plan, table, done)),
-            *_failures(failed),
-            *_distributions(done, columns),
-            *_outliers(done, columns),
-            *_all(table, columns),
+            *sections("Facts", lambda: [Facts(_facts(plan, table, done))]),
+            *sections("Not done, by cause", lambda: _failures(failed)),
+            *sections("Distributions", lambda: _distributions(done, columns)),
+            *sections("Outliers", lambda: _outliers(done, columns)),
+            *sections("All items", lambda: _all(table, columns)),
         ],
         f"{plan.name}: {table.height} items",
     )
@@ -148,8 +152,12 @@ def _histograms(done: pl.DataFrame, columns: Sequence[str]) -> Picture:
         for k, column in enumerate(columns):
             axes = figure.add_subplot(lines, 3, k + 1)
             values = _values(done, column)
-            axes.hist(values, bins=min(40, max(5, round(2 * len(values) ** 0.5))), color=ACCENT)
-            axes.axvline(float(np.median(values)), color="#d9772b", linewidth=1.2)
+            median = float(np.median(values))
+            ends = float(values.min()), float(values.max())
+            if ends[1] - ends[0] <= 1e-9 * abs(median):  # all one value, up to rounding: no bins fit in between
+                ends = median - max(0.5, 0.5 * abs(median)), median + max(0.5, 0.5 * abs(median))
+            axes.hist(values, bins=min(40, max(5, round(2 * len(values) ** 0.5))), range=ends, color=ACCENT)
+            axes.axvline(median, color="#d9772b", linewidth=1.2)
             axes.set_title(_in_words(column), loc="left")
             axes.locator_params(nbins=5)
         return Picture("distributions", "Items by figure; the line is the median.", png_of(figure))

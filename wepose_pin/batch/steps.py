@@ -72,10 +72,9 @@ class Work:
         self.subject = load_subject(folder)  # as it stands there: the same as for the commands one by one
         write_calibration(folder, found, verdict, self.given.made_by)
         if report:
-            from ..report import calibration_report
+            from ..report import write_calibration_page
 
-            page = calibration_report(found, recording, method=method, protocol=what, verdict=verdict)
-            (folder / "report.html").write_text(page, encoding="utf-8")
+            write_calibration_page(folder, found, recording, method=method, protocol=what, verdict=verdict)
         row: Row = {"grade": verdict.grade, "gap_mm": _finite(1e3 * found.rms_gap), "independent": found.independent}
         for name, value in found.subject.lengths.items():
             row |= {f"{name}_mm": 1e3 * value, f"{name}_std_mm": _finite(1e3 * found.subject.std(name))}
@@ -110,18 +109,11 @@ class Work:
             found = pose_torques(pose)
         write_result(folder, pose, covariance, recording.phases, found, self.given.made_by)
         self.pose = pose
-        page = None
+        failed: list[str] = []
         if view or report:
-            from ..viewer import pose_html
+            from ..report import write_track_pages
 
-            assert pose.model is not None
-            page = pose_html(pose.model, pose, phases=recording.phases, title=recording.name)
-        if view and page is not None:
-            (folder / "view.html").write_text(page, encoding="utf-8")
-        if report:
-            from ..report import track_report
-
-            (folder / "report.html").write_text(track_report(pose, view=page), encoding="utf-8")
+            failed = write_track_pages(folder, pose, view=view, report=report)
         about = pose.summary()
         still = [of["static_share"] for of in about["sensors"].values() if "static_share" in of]
         return {
@@ -130,7 +122,7 @@ class Work:
             "duration_s": about["duration_s"],
             "sensors": len(about["sensors"]),
             "static_share": float(np.mean(still)) if still else None,
-            "warnings": len(about["warnings"]),
+            "warnings": len(about["warnings"]) + len(failed),
         }
 
     def _retarget(self, folder: Path, **options: Any) -> Row:
@@ -157,9 +149,12 @@ class Work:
         (folder / "summary.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
         if options["view"]:
             from ..viewer import retarget_html
+            from ..writers.pages import PageWriter
 
-            page = retarget_html(body, pose, trajectory, title=f"{self._recording(False).name} on {model.map.name}")
-            (folder / "view.html").write_text(page, encoding="utf-8")
+            title = f"{self._recording(False).name} on {model.map.name}"
+            writer = PageWriter(folder, ["view.html"])
+            writer.write("view.html", lambda _: retarget_html(body, pose, trajectory, title=title))
+            writer.add_warnings("summary.json")
         return {"trajectory_s": float(trajectory.time[-1])}
 
     def _export(self, folder: Path, *, formats: tuple[str, ...], names: str | None, rate_hz: float | None) -> Row:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import polars as pl
 
 from ..errors import ExistingOutput
+from ..page import reason
 from ..writers.provenance import code, made_by
 from .cluster import connected, made
 from .items import FAILED, MADE, Row, failed
@@ -32,6 +33,7 @@ class Study(NamedTuple):
     plan: Plan
     table: pl.DataFrame  # a row an item, in the order of the plan
     kept: int  # items that were done before
+    warnings: list[str]  # of the page, where it or a part of it cannot be made
 
 
 def run_study(
@@ -71,8 +73,13 @@ def run_study(
         content = io.BytesIO()
         table.write_parquet(content)
         write_bytes(f"{out}/{RESULTS}", content.getvalue())
-        write_bytes(f"{out}/{REPORT}", study_page(plan, table).encode())
-    return Study(plan, table, sum(bool(row.get("kept")) and row["status"] == MADE for row in rows.values()))
+        failures: list[str] = []
+        try:
+            write_bytes(f"{out}/{REPORT}", study_page(plan, table, failures).encode())
+        except Exception as error:
+            failures.append(f"cannot be made: {reason(error)}; {RESULTS} is whole")
+    kept = sum(bool(row.get("kept")) and row["status"] == MADE for row in rows.values())
+    return Study(plan, table, kept, [f"{REPORT}: {failure}" for failure in failures])
 
 
 def _claim(out: str, path: Path) -> None:

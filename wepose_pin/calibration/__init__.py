@@ -9,8 +9,15 @@ them, `weighing` what the looks are worth, `lengths` is the calibration from a r
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
+
+from ..errors import CalibrationFailed, WeposeWarning
+from ..filters import BEST
+from ..recording import Recording
+from ..subject import Subject
 from .chain import ARMS, CHAIN, palm_gap, rotate
-from .lengths import GAUGE_STD, Calibration, calibrate, calibrate_lengths
+from .lengths import GAUGE_STD, Calibration, calibrate_lengths
 from .protocols import PROTOCOLS, Protocol, load_protocol
 from .verdict import Finding, Verdict, document, judge
 
@@ -31,3 +38,40 @@ __all__ = [
     "palm_gap",
     "rotate",
 ]
+
+
+def calibrate(
+    recording: Recording,
+    *,
+    gauge: Mapping[str, float] | None = None,
+    prior: Subject | None = None,
+    protocol: str | Protocol = "clasp",
+    method: str = BEST,
+    gauge_std: float = GAUGE_STD,
+) -> Subject:
+    """The subject of a hands-together recording, if the calibration does not fail. Parameters as `calibrate_lengths`.
+
+    What else was found: `calibrate_lengths`, and `judge` for what it is worth.
+
+    Raises
+    ------
+    CalibrationFailed
+        The verdict is "fail"; the error has what was found all the same, in `calibration.subject`, and the `verdict`.
+    WeposeError
+        As `calibrate_lengths`.
+
+    Warns
+    -----
+    WeposeWarning
+        The verdict is "poor": what is uncertain, and what to do better.
+    """
+    found = calibrate_lengths(
+        recording, gauge=gauge, prior=prior, protocol=protocol, method=method, gauge_std=gauge_std
+    )
+    verdict = judge(found)
+    text = f"{recording.where()}: the calibration is of grade '{verdict.grade}': {'; '.join(verdict.in_words())}"
+    if verdict.grade == "fail":
+        raise CalibrationFailed(f"{text}; what was found is in this error's calibration.subject", found, verdict)
+    if verdict.grade == "poor":
+        warnings.warn(text, WeposeWarning, stacklevel=2)
+    return found.subject

@@ -50,7 +50,7 @@ def known_before(
         information[row, row] = (gauge_std if name in gauge else stated.metres_std) ** -2
     information[layout.points, layout.points] = np.eye(3 * layout.fixed) / POINT_STD**2
 
-    guess = headings(looks, center[:K], center[layout.distances], _stated_headings(recording, found, layout, prior))
+    guess = headings(looks, center[:K], center[layout.distances], stated_headings(recording, found, layout, prior))
     for i, name in enumerate(layout.sensors):
         # What is known of this sensor's (ε_x, ε_y, ψ): the person stands nearly so, and of a mount R_LS = exp(m) R_0
         # that m = μ − ε + ψ' e_z is small, with μ the misfit of the start pose at the heading nearest to R_0.
@@ -105,7 +105,7 @@ def known_lengths(prior: Subject, gauge: Mapping[str, float], gauge_std: float) 
     return np.linalg.solve(information, target), information
 
 
-def _stated_headings(recording: Recording, found: Filtered, layout: Layout, prior: Subject) -> dict[str, float]:
+def stated_headings(recording: Recording, found: Filtered, layout: Layout, prior: Subject) -> dict[str, float]:
     """Sensor → ψ [rad] to its nominal mount, of those that have one."""
     mounts = {name: nominal_mount(recording, name, prior) for name in layout.sensors}
     return {

@@ -24,16 +24,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import Filtered, filtered, heading_to, nominal_mount
+from ..arguments import Positive, check_arguments
 from ..errors import BadOption, BadPhase, BadSession, NoSolution, one_of
-from ..filters import BEST
+from ..filters import BEST, check_method
 from ..recording import Recording
 from ..subject import LENGTHS, Drift, Hinge, StartTilt, Subject, average_subject
+from .alternatives import Alternative, alternatives, on_others, spread_over
 from .anatomy import (
     BETTER,
     Arms,
@@ -48,7 +49,7 @@ from .anatomy import (
 )
 from .chain import CHAIN, SIDES
 from .joints import coupled, couplings
-from .known import known_before, known_lengths
+from .known import known_before, known_lengths, stated_headings
 from .problem import HINGE_STD, K, Layout, Looks, carrier, placed, residuals
 from .protocols import Closure, Protocol, load_protocol
 from .remarks import on_headings, on_lengths, on_looks
@@ -131,13 +132,6 @@ class Calibration:
         return arms(quat_WL, self.subject.lengths, float(gap))
 
 
-def calibrate(
-    recording: Recording, *, gauge: Mapping[str, float] | None = None, prior: Subject | None = None, **options: Any
-) -> Subject:
-    """The subject of a hands-together recording; options, and what else was found: see `calibrate_lengths`."""
-    return calibrate_lengths(recording, gauge=gauge, prior=prior, **options).subject
-
-
 def calibrate_lengths(
     recording: Recording,
     *,
@@ -145,7 +139,7 @@ def calibrate_lengths(
     prior: Subject | None = None,
     protocol: str | Protocol = "clasp",
     method: str = BEST,
-    gauge_std: float = GAUGE_STD,
+    gauge_std: Positive = GAUGE_STD,
 ) -> Calibration:
     """Link lengths with their covariance, and what was found beside them.
 
@@ -164,6 +158,8 @@ def calibrate_lengths(
     BadSession, BadPhase
         A sensor that the protocol needs is missing; there is no such phase.
     """
+    check_arguments(calibrate_lengths, locals())
+    check_method(method)
     if not isinstance(protocol, Protocol):
         protocol = load_protocol(protocol)
     gauge = dict(gauge or {})
@@ -172,8 +168,6 @@ def calibrate_lengths(
             raise BadOption(f"gauge {name}: not a length; {one_of((*LENGTHS, *protocol.gauges), name)}")
         if not 0.02 < value < 1.0:
             raise BadOption(f"gauge {name}={value:g}: a length in metres is needed, between 0.02 and 1.0")
-    if not gauge_std > 0.0:
-        raise BadOption(f"gauge_std={gauge_std:g}: a standard deviation in metres is needed, above 0")
     if len(set(gauge) & set(protocol.chain)) < protocol.taped:
         raise BadOption(
             f"protocol '{protocol.name}' needs {protocol.taped} taped length of its chain, as in --gauge "
@@ -262,15 +256,19 @@ def _looks(
     """The looks of all conditions, and their samples (n,)."""
     stride = max(1, round(recording.rate_hz / rate_hz))
     samples = []
+    gaps = {name: of.gap for name, of in recording.sensors.items() if of.gap is not None}
     for condition in protocol.conditions:
         spans = [recording.span(interval) for interval in recording.phase(condition.phase)]
         # Each look once, however the intervals overlap.
-        samples.append(np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride])
+        phase = np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride]
+        lost = [name for name, gap in gaps.items() if gap[phase].any()]
+        samples.append(phase[~np.any([gaps[name][phase] for name in lost], axis=0)] if lost else phase)
         if len(samples[-1]) < LEAST_LOOKS * rate_hz / LOOK_RATE_HZ:
             raise BadPhase(
                 f"{recording.where()}: phases.{condition.phase} holds {len(samples[-1])} looks at {LOOK_RATE_HZ:g} a "
                 f"second; at least {LEAST_LOOKS} are needed"
                 + (", better a minute" if isinstance(condition, Closure) else ", better five seconds")
+                + (f"; in the others {', '.join(f'sensors.{name}' for name in lost)} is lost" if lost else "")
             )
     at = np.concatenate(samples)
     seen = {carrier(segment, found.R_VS) for segment in protocol.segments}
@@ -295,8 +293,9 @@ def _solve(
     looks, at = _looks(recording, found, protocol, QUICK_RATE_HZ if quick else LOOK_RATE_HZ)
     layout = looks.layout
     center, known = known_before(recording, found, looks, prior, gauge, gauge_std)
-    information = known
+    uncoupled, information = center, known
     start, touching = center, np.ones(len(at))
+    others: list[Alternative] = []
     if not quick:
         start, touching = touching_start(
             looks, lambda some: known_before(recording, found, some, prior, gauge, gauge_std)[0]
@@ -306,6 +305,16 @@ def _solve(
         center, information = coupled(center, known, layout, told, start)
 
     fit, weights, weight, independent = weighed(looks, center, information, start, touching, quick)
+    if not quick:
+        headings = stated_headings(recording, found, layout, prior)
+        free = layout.heading.start + np.flatnonzero([name not in headings for name in layout.sensors])
+
+        def known_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            begun = uncoupled.copy()
+            begun[free] = x[free]
+            return coupled(begun, known, layout, told, x)
+
+        others = alternatives(looks, known_at, fit, weights, independent, headings)
     lengths = fit.x[:K]
     if not quick and np.min(lengths) < 0.01:
         raise NoSolution(
@@ -316,7 +325,7 @@ def _solve(
     covariance = np.linalg.inv(fit.information)
     if not quick:
         learned = learned_of(fit, looks.layout, weights, covariance)
-        covariance = covariance_of(looks, fit, information, weights, weight)
+        covariance = spread_over(covariance_of(looks, fit, information, weights, weight), others, layout)
     order, joint = handed_on(layout, covariance)
     mounts = {name: _mount(found, fit.x, layout, name).as_quat() for name in layout.sensors}
     # Of sensors that are not in the chain the start pose has measured what it can.
@@ -336,9 +345,10 @@ def _solve(
     measured = {name: (value, gauge_std) for name, value in gauge.items()}
     measured |= {c.gauge: (c.metres, c.metres_std) for c in protocol.closures if c.gauge and c.gauge not in gauge}
     tapes = taped(fit, layout, measured)
-    free = None if scaling else scale_std
-    warnings = on_lengths(protocol, lengths, covariance[:K, :K], without_data, prior, free, tapes)
+    loose = None if scaling else scale_std
+    warnings = on_lengths(protocol, lengths, covariance[:K, :K], without_data, prior, loose, tapes)
     warnings += on_headings(protocol, layout, covariance, gauge)
+    warnings += on_others(others, layout)
     seen = {side: SIDES.index(side) for side in (layout.arms if looks.closed.any() else ())}
     axes = {side: np.array([x, 1.0, z]) for side, (x, z) in zip(SIDES, fit.x[layout.hinge].reshape(2, 2), strict=True)}
     hinge = {side: axes[side] / np.linalg.norm(axes[side]) for side in seen}

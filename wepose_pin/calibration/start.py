@@ -24,6 +24,8 @@ from .problem import Looks, carrier
 from .protocols import Axis, Closure, Direction, coefficients
 
 STARTS, NEARER = 256, 24  # how many there are, and how many of the best go on after some rounds
+MINIMA, MOST_DISTINCT = 64, 12  # as `NEARER` where all minima are wanted, and how many of these at most
+DISTINCT = np.deg2rad(15.0)  # [rad] of one heading, by which two minima differ
 FIRST_ROUNDS, MORE_ROUNDS = 6, 16
 SEARCHED = 48  # looks of each closure
 GAP_STD = 0.03  # [m] of a closure in the search, that stands for all that is not searched
@@ -102,7 +104,36 @@ def _linear(looks: Looks) -> np.ndarray:
     return np.array([torso, *(np.arctan2(z[1:, 1], z[1:, 0]) + torso)])
 
 
+def distinct_headings(
+    looks: Looks, lengths: np.ndarray, distances: np.ndarray, told: Mapping[str, float]
+) -> np.ndarray:
+    """Headings (k, m) [rad] of the m sensors at which the closures have a minimum each, the best first.
+
+    Parameters
+    ----------
+    told : sensor → ψ [rad] where a mount or a pose tells it; the others may be anywhere
+    """
+    x, _ = _minima(looks, lengths, distances, told, MINIMA)
+    found: list[np.ndarray] = []
+    for psi in x[:, : len(looks.layout.sensors)]:
+        if all(np.abs(_within_half_turn(psi - other)).max() > DISTINCT for other in found):
+            found.append(psi)
+    return np.array(found[:MOST_DISTINCT])
+
+
+def _within_half_turn(angle: np.ndarray) -> np.ndarray:
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
 def _searched(looks: Looks, lengths: np.ndarray, distances: np.ndarray, told: Mapping[str, float]) -> np.ndarray:
+    x, _ = _minima(looks, lengths, distances, told, NEARER)
+    return x[0, : len(looks.layout.sensors)]
+
+
+def _minima(
+    looks: Looks, lengths: np.ndarray, distances: np.ndarray, told: Mapping[str, float], nearer: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Headings and sizes (`nearer`, 2 m) where the best of many starts end, and their costs, the lowest first."""
     sensors = looks.layout.sensors
     m = len(sensors)
     parts = []  # of each closure: it, Q (m, n, 3, 3), and u (m, 3), each sensor's part of the way in its own frame
@@ -122,9 +153,10 @@ def _searched(looks: Looks, lengths: np.ndarray, distances: np.ndarray, told: Ma
     drawn = 2.0 * np.pi * qmc.Sobol(m, scramble=False).random(STARTS)
     x = np.column_stack([np.where(known, center[:m], drawn), np.zeros((STARTS, m))])
     x, cost = _descended(x, center, prior, parts, looks, distances, FIRST_ROUNDS)
-    x = x[np.argsort(cost)[:NEARER]]
+    x = x[np.argsort(cost)[:nearer]]
     x, cost = _descended(x, center, prior, parts, looks, distances, MORE_ROUNDS)
-    return x[int(np.argmin(cost)), :m]
+    best = np.argsort(cost, kind="stable")
+    return x[best], cost[best]
 
 
 def _descended(

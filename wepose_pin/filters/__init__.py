@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import so3
+from ..arguments import check_arguments
 from ..errors import BadData, BadOption, BadPhase, one_of
 from ..noise import SensorNoise, noise_of
 from ..static import StaticDetector, StaticTest
@@ -120,7 +121,9 @@ def estimate_orientation(
     BadOption, BadData, BadPhase
         An unknown method; arrays that do not fit each other; a still phase outside the data.
     """
+    check_arguments(estimate_orientation, locals())
     check_method(method)
+    check_arguments(METHODS[method], {"params": params})
     try:
         gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
     except (TypeError, ValueError) as error:
@@ -154,6 +157,15 @@ def estimate_orientation(
     )
 
 
+def with_range(method: str, params: Any, gyro_range: float) -> Any:
+    """The filter's parameters with the range [rad/s] at which gyro is cut off, for those filters that know of one."""
+    kinds: dict[str, type] = {"amekf": AmekfParams, "smoother": AmekfParams, "smekf": SmekfParams}
+    if method not in kinds:
+        return params
+    params = params or kinds[method]()
+    return replace(params, gyro_range=min(gyro_range, params.gyro_range))
+
+
 def piece_multiple(method: str, rate_hz: float) -> int:
     """How many samples the pieces of a recording are a multiple of, the last one excepted."""
     return max(1, round(AmekfParams().block_s * rate_hz)) if method in OFFLINE else 1
@@ -182,8 +194,10 @@ class SensorRun:
         static_test: StaticTest | None = None,
         measured_start: bool = False,
         start: slice | None = None,
+        gyro_range: float = np.inf,
     ) -> None:
         self.test = static_test or StaticTest()
+        self._gyro_range = gyro_range
         self._noise, self._rate_hz, self._method, self._params = noise, rate_hz, method, params
         self._measured_start, self._start = measured_start, start
         self._detector = StaticDetector(noise, rate_hz, self.test)
@@ -237,6 +251,8 @@ class SensorRun:
             params = AmekfParams(tilt_std=start.tilt_std)
         if params is None and self._method == "smekf" and self._measured_start:
             params = starting_params(noise, self._rate_hz, start.quat_WS, start.tilt_std)
+        if np.isfinite(self._gyro_range):
+            params = with_range(self._method, params, self._gyro_range)
         return METHODS[self._method](noise, self._rate_hz, start.quat_WS, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:

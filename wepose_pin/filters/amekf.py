@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..arguments import check_fields
 from ..errors import BadOption
 from ..noise import BLOCK_S, SensorNoise
 from ..so3 import inlined, kernel
@@ -96,6 +97,7 @@ class AmekfParams:
     accel_bias: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [m/s²]
 
     def __post_init__(self) -> None:
+        check_fields(self, "")
         for name, value in vars(self).items():
             if name in ("gyro_matrix", "accel_matrix", "accel_bias"):
                 shape = (3,) if name == "accel_bias" else (3, 3)

@@ -43,10 +43,9 @@ class SmekfParams:
     bias_cov0: float | np.ndarray = 1e-3  # [rad²/s²], a number or (3, 3)
     bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the still phase's first differences
     rest_gyro_cov: np.ndarray | None = None  # (3, 3) [rad²/s²] by which gyro at rest is not the bias; None: Σ_ω
-    rest_turn_noise: float = (
-        0.0  # [rad/√s] by which a sensor at rest may turn about the vertical unseen; the paper: none
-    )
+    rest_turn_noise: float = 0.0  # [rad/√s] by which a sensor at rest may turn about the vertical unseen; the paper: 0
     first_order: bool = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
+    gyro_range: float = np.inf  # [rad/s]; a sample at it is cut off: turned by it, but what is beyond went unseen
 
 
 def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, tilt_std: float) -> SmekfParams:
@@ -157,27 +156,30 @@ def _matrix(cov: float | np.ndarray) -> np.ndarray:
 
 
 def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
-    """(29,): δt, 1/g, δt² Σ_ω, δt² Σ_b, gyro's at rest, Σ_g as upper triangles, what is left of a held rate after a
-    sample, whether the transition is of first order, variance of an unseen turn in a sample at rest."""
+    """(30,): δt, 1/g, δt² Σ_ω, δt² Σ_b, gyro's at rest, Σ_g as upper triangles, what is left of a held rate after a
+    sample, whether the transition is of first order, variance of an unseen turn in a sample at rest,
+    the gyroscope's range."""
     step, rest = params.bias_step_cov, params.rest_gyro_cov
     bias_step_cov = noise.bias_step_cov if step is None else _matrix(step)
     rest_gyro_cov = noise.gyro_cov if rest is None else _matrix(rest)
     covs = dt * dt * noise.gyro_cov, dt * dt * bias_step_cov, rest_gyro_cov, noise.accel_cov
-    ends = [np.exp(-dt / HOLD_S), float(params.first_order), params.rest_turn_noise**2 * dt]
+    ends = [np.exp(-dt / HOLD_S), float(params.first_order), params.rest_turn_noise**2 * dt, params.gyro_range]
     return np.concatenate([[dt, 1.0 / noise.gravity], *(cov[_UPPER] for cov in covs), ends])
 
 
 @inlined
 def step(x, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
-    """One sample of one sensor: `x` (32,) its state, `model` (29,), gyro [rad/s], accel [m/s²]."""
+    """One sample of one sensor: `x` (32,) its state, `model` (30,), gyro [rad/s], accel [m/s²]."""
     dt = model[0]
     seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE  # false for NaN
     unseen_cov = 0.0
     if seen:
         wx, wy, wz = gx - x[4], gy - x[5], gz - x[6]
-        x[31] = 0.0
     else:
         wx, wy, wz = model[26] * x[28], model[26] * x[29], model[26] * x[30]
+    if seen and max(abs(gx), abs(gy), abs(gz)) < model[29]:
+        x[31] = 0.0
+    else:
         before, after = x[31], x[31] + dt
         std_before = min(np.pi, UNSEEN_RATE_STD * before * before / (before + HOLD_S))
         std_after = min(np.pi, UNSEEN_RATE_STD * after * after / (after + HOLD_S))

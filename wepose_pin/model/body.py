@@ -10,16 +10,23 @@ from xml.parsers import expat
 
 import pinocchio as pin
 
+from ..arguments import check_arguments
 from ..assets import asset
 from ..errors import BadModel, MissingFile, one_of
+from ..subject import average_subject
 from . import lengths as _lengths
 from . import visuals as _visuals
 from .chains import chains
-from .table import NEEDED, LinkTable, find_table, named, read_table, table_from
-from .tree import AxisLimits, build, tree_of
+from .table import MOST_LINKS, NEEDED, LinkTable, closest_links, find_table, named, read_table, table_from
+from .tree import AxisLimits, build, impossible_inertia, tree_of
 from .visuals import Visual
 
 DEFAULT_URDF = "upper_body.urdf"
+# A length is implausible that many standard deviations off the mean of adults (calibration/anthropometry.toml).
+FAR_OFF = 5.0
+# So is a mass [kg] beyond ten standard deviations above the mean of men, 85.5 ± 14.2 kg (ANSUR II), or below an upper
+# body's share (de Leva 1996: 68 %) of five below the mean of women, 67.8 ± 11.0 kg.
+HEAVIEST, LIGHTEST = 230.0, 8.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,40 @@ class BodyModel:
     def lengths(self) -> dict[str, float]:
         """The lengths [m] that this model has, measured on it in the neutral configuration."""
         return _lengths.lengths(self.robot)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a person's body can hardly have: lengths, mass, moments of inertia; a trunk that cannot move."""
+        name, average = self.robot.name, average_subject()
+        found = []
+        for length, value in self.lengths.items():
+            mean, std = average.lengths[length], average.std(length)
+            if abs(value - mean) > FAR_OFF * std:
+                found.append(
+                    f"{name}: {length} is {value:.3g} m long; adults have {max(0.0, mean - FAR_OFF * std):.3f} to "
+                    f"{mean + FAR_OFF * std:.3f} m ({FAR_OFF:g} standard deviations, de Leva 1996 and ANSUR II): check "
+                    f"the lengths and units of the body"
+                )
+        mass = sum(inertia.mass for inertia in self.pin.inertias)
+        if mass and not LIGHTEST <= mass <= HEAVIEST:
+            found.append(
+                f"{name}: a body of {mass:.4g} kg; {LIGHTEST:g} to {HEAVIEST:g} kg are plausible (ANSUR II), and its "
+                f"torques are as wrong as that"
+            )
+        impossible = impossible_inertia(self.robot)
+        if impossible:
+            found.append(
+                f"{name}: no body can have the moments of inertia of {', '.join(impossible)}, one below 0 or above the "
+                f"two others together; its torques are wrong"
+            )
+        torso = chains(self.pin).get("torso")
+        if torso is not None and not torso.joints:
+            rigid = ", ".join(joint.name for joint in tree_of(self.robot, name).path("torso"))
+            found.append(
+                f"{name}: no joint moves the torso against the root{f' ({rigid})' if rigid else ''}: it stands still, "
+                f"whatever its sensor measures"
+            )
+        return tuple(found)
 
     @property
     def visuals(self) -> list[Visual]:
@@ -108,8 +149,10 @@ def load_model(
     Raises
     ------
     MissingFile, BadModel
-        Not there; not a URDF; no tree with one root; a table that names what is not there; no links for the segments.
+        Not there; not a URDF; no tree with one root; a table that names what is not there; no links for the segments;
+        an arm without a joint that could move it.
     """
+    check_arguments(load_model, locals())
     path = Path(path) if path is not None else asset("urdf", DEFAULT_URDF)
     table: LinkTable | None = None
     if path.suffix.lower() == ".toml":
@@ -130,11 +173,11 @@ def load_model(
     lacking = [link for link in NEEDED if link not in tree_of(robot, str(path)).below]
     if lacking:
         raise BadModel(
-            f"{path}: no link '{lacking[0]}'; name the segments' links in a table, as docs/models.md shows; "
-            f"{one_of(tree.below, lacking[0])}"
+            f"{path}: no link {closest_links(lacking, tree.below)}; name the segments' links in a table, as "
+            f"docs/models.md shows; {one_of(tree.below, most=MOST_LINKS)}"
         )
     body = _body(robot, str(path))
-    chains(body.pin)  # raises what no segment could follow
+    _check_arms(body, str(path))
     return body.with_lengths(lengths) if lengths else body
 
 
@@ -157,10 +200,32 @@ def read_urdf(path: Path) -> Any:
     except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: of an encoding that nobody knows
         raise BadModel(f"{path}: is no whole XML file, as a URDF is: {error}") from error
     try:
-        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+        robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # yourdfpy and lxml raise many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadModel(f"{path}: cannot be read as a URDF: {reason}") from error
+    materials = [visual.material for link in robot.links for visual in link.visuals if visual.material is not None]
+    for material in [*robot.materials, *materials]:
+        if material.texture is not None and material.texture.filename is None:
+            material.texture = None  # <texture/>: yourdfpy cannot write what it read there
+    return robot
+
+
+def _check_arms(body: BodyModel, where: str) -> None:
+    """Raise an error on arm segments that no joint moves against the segment above, or that no joint could follow."""
+    found, tree = chains(body.pin), tree_of(body.robot, where)
+    rigid = []
+    for segment in NEEDED[1:]:
+        if not found[segment].joints:
+            above = segment.replace("forearm", "upper_arm") if segment.endswith("forearm") else "torso"
+            shared = {joint.name for joint in tree.path(above)}
+            between = [f"'{joint.name}' ({joint.type})" for joint in tree.path(segment) if joint.name not in shared]
+            rigid.append(f"{segment} against {above} (between them: {', '.join(between) or 'nothing'})")
+    if rigid:
+        raise BadModel(
+            f"{where}: no joint moves {'; '.join(rigid)}: the arm could not follow a person's; revolute joints are "
+            f"needed there"
+        )
 
 
 def _check_xml(path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from ..arguments import check_arguments
 from ..errors import BadModel, BadSession, native_stderr_muted, one_of
 from .body import read_urdf
 from .tree import tree_of
@@ -21,6 +22,7 @@ def load_robot(path: str | Path) -> pin.Model:
     MissingFile, BadModel
         Not there; not a URDF; no tree with one root; nothing in it moves.
     """
+    check_arguments(load_robot, locals())
     path = Path(path)
     tree_of(read_urdf(path), str(path))
     try:

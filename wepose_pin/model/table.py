@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ..assets import asset
 from ..errors import BadModel, MissingFile, one_of
+from ..readers.device import segment_of
 from ..readers.keys import is_number, parsed_toml
 from ..recording import AXES, SEGMENTS, mount_from_axes
 from .tree import Tree, tree_of
@@ -29,6 +31,7 @@ POINTS = {
 }
 NEEDED = SEGMENTS[:5]
 MODEL_TABLE = "model.toml"
+MOST_LINKS = 100  # that an error lists; a person's body has fewer
 
 
 class SegmentLink(NamedTuple):
@@ -240,18 +243,34 @@ def _check_links(table: LinkTable, tree: Tree) -> None:
     for key, entries in (("segments", table.segments), ("points", table.points)):
         for name, entry in entries.items():
             if entry.link not in tree.below:
-                raise BadModel(f"{where}: {key}.{name}: no link '{entry.link}'; {one_of(tree.below, entry.link)}")
+                raise BadModel(
+                    f"{where}: {key}.{name}: no link '{entry.link}'; {one_of(tree.below, entry.link, MOST_LINKS)}"
+                )
     for link in table.root:
         if link not in tree.below:
-            raise BadModel(f"{where}: root: no link '{link}'; {one_of(tree.below, link)}")
-    for segment in NEEDED:
-        if segment not in table.segments:
-            raise BadModel(
-                f"{where}: no link for segment '{segment}'; name one in segments; {one_of(tree.below, segment)}"
-            )
-    for side in ("left", "right"):
-        if f"{side}_wrist" not in _points(table):
-            raise BadModel(f"{where}: no wrist; name a link in segments.{side}_hand or points.{side}_wrist")
+            raise BadModel(f"{where}: root: no link '{link}'; {one_of(tree.below, link, MOST_LINKS)}")
+    lacking = [segment for segment in NEEDED if segment not in table.segments]
+    if lacking:
+        raise BadModel(
+            f"{where}: no link for segment {closest_links(lacking, tree.below)}; name it in segments; "
+            f"{one_of(tree.below, most=MOST_LINKS)}"
+        )
+    handless = [side for side in ("left", "right") if f"{side}_wrist" not in _points(table)]
+    if handless:
+        names = " and ".join(f"segments.{side}_hand or points.{side}_wrist" for side in handless)
+        raise BadModel(f"{where}: no wrist; name a link in {names}")
+
+
+def closest_links(segments: Iterable[str], links: Iterable[str]) -> str:
+    """Segments that have no link, each with the links whose names speak of it or come closest."""
+    links = list(links)
+    told = []
+    for segment in segments:
+        close = [link for link in links if segment_of(link) == segment]
+        others = [link for link in links if segment_of(link) is None]
+        close = close or get_close_matches(segment, others, n=3, cutoff=0.5)
+        told.append(f"'{segment}'" + (f" (maybe {' or '.join(close[:4])})" if close else ""))
+    return ", ".join(told)
 
 
 def _points(table: LinkTable) -> dict[str, PointLink]:

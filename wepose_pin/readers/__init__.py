@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..arguments import check_arguments
 from ..recording import Recording
 from . import session
 from .live_log import is_live_log, read_live_log
@@ -26,6 +27,7 @@ def load_session(path: str | Path, gaps: bool = False) -> Recording:
     WeposeError
         With one line that names the file, the key or column, the value found and what would be right.
     """
+    check_arguments(load_session, locals())
     if is_live_log(Path(path)):
         return read_live_log(Path(path)).recording
     return session.load_session(path, gaps)

@@ -29,7 +29,7 @@ REGULAR = 0.2
 SAME = 0.01
 # No body sensor measures more slowly [s]: the times are in another unit.
 SLOWEST_STEP_S = 0.5
-TIME_UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # So many times are looked at together, so that what is in memory beside them does not grow.
 BLOCK = 1 << 20
 # In a long gap the rate falls to the sensor's rate at rest within this time [s]: a person's motion goes on no longer.
@@ -73,9 +73,9 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
     usual = np.diff(time[: BLOCK + 1])  # of a day's times not all are needed to know it
     step = float(np.median(usual))
     if step > SLOWEST_STEP_S:
-        fits = [name for name, unit in TIME_UNITS if 1e-4 < step * unit < SLOWEST_STEP_S]
-        guess = f"; looks like {fits[0]}" if fits else ""
-        raise BadData(f"{place}: time grows by {step:g} from row to row; it must be in seconds{guess}")
+        unit = time_unit_of(step)
+        guess = f'; time_unit = "{unit}" would fit' if unit else ""
+        raise BadData(f"{place}: time grows by {step:g} s from row to row, slower than any body sensor{guess}")
     wide = np.concatenate([first + np.flatnonzero(s > (1.0 + UNEVEN) * step) for first, s in _steps(time)])
     lost = np.round((time[wide + 1] - time[wide]) / step) - 1.0
     if np.quantile(np.abs(usual / step - 1.0), 0.75) > REGULAR:
@@ -95,6 +95,14 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
     nth = np.arange(len(row)) - np.searchsorted(row, row)  # 0 is the row itself, then the lost ones after it
     filled = time[row] + nth * np.append(np.diff(time) / (counts[:-1] + 1), 0.0)[row]
     return Clock(filled, np.where(nth == 0, row, -1), step)
+
+
+def time_unit_of(step: float) -> str | None:
+    """The unit in which the usual `step` of a column of times is that of a body sensor; None: in none.
+
+    A step at which two units would do (0.2 to 0.5 s, or ms) is taken for seconds.
+    """
+    return next((name for name, unit in TIME_UNITS.items() if 1e-4 < step * unit < SLOWEST_STEP_S), None)
 
 
 def _steps(time: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, MissingFile, WeposeError, one_of
-from ..recording import AXES, SEGMENTS, Recording, Sensor
+from ..recording import AXES, CONFIGURATION, SEGMENTS, Recording, Sensor
 from .arrays import ArrayFile, is_array_file
-from .clocks import SLOWEST_STEP_S, TIME_UNITS, runs
+from .clocks import SLOWEST_STEP_S, TIME_UNITS, runs, time_unit_of
 from .device import Device
 from .formats import TITLES, format_of, read_device
 from .guess import Guess, guess_arrays, guess_columns
-from .keys import is_number, read_toml
+from .keys import is_number, parsed_toml, read_toml
+from .live_log import read_live_log
 from .session import SessionReader
 from .tables import FORMATS as TABLES
 from .tables import Rows, columns, read_table
@@ -31,6 +33,8 @@ BLOCK_S, REST_GYRO, REST_ACCEL = 0.25, np.deg2rad(3.0), 0.4
 SHORTEST_REST_S = 1.0
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
+# Segments whose sensors' mounts `wepose calibrate` finds.
+ARMS = frozenset(SEGMENTS[:5])
 
 
 class Description(NamedTuple):
@@ -40,6 +44,7 @@ class Description(NamedTuple):
     facts: tuple[str, ...]  # a line each
     sensors: tuple[tuple[str, ...], ...]  # segment, its name in the file, what it holds, rate, time, gaps
     session: str | None  # a ready session file, for data
+    then: str = ""  # what to do with that session
 
 
 def describe(path: Path, folder: Path | None = None) -> Description:
@@ -79,7 +84,8 @@ def describe(path: Path, folder: Path | None = None) -> Description:
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
         return _described(path, folder, *_of_columns(path, folder, guess_columns(names), names, None))
     known = (
-        ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat; a result's folder, an x-IMU3's folder"
+        ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose; a result's folder, an "
+        "x-IMU3's folder"
     )
     raise BadData(f"{path}: is nothing that is known here; there is: {known}")
 
@@ -147,11 +153,16 @@ def _described(
     notes = list(notes)
     if not tables:
         return Description(f"{path}: {what}", tuple(notes), (), None)
-    text = _session_text(path, head, [], tables, {})
+    phases = [line for line in head if line.startswith("start = ")]
+    head = [line for line in head if line not in phases]
     recording: Recording | None = None
     for _ in range(3):
         try:
-            reader = SessionReader(folder / "session.toml", gaps=True, values=tomllib.loads(text))
+            # All sensors are read, those too of which nobody knows yet where they were worn.
+            values = tomllib.loads("\n".join(["[data]", *head]))
+            values["start_pose"] = CONFIGURATION
+            values["sensors"] = {who: tomllib.loads("\n".join(table)) for who, table in tables.items()}
+            reader = SessionReader(folder / "session.toml", gaps=True, values=values)
             recording = reader.recording(0, len(reader.time))
             break
         except WeposeError as error:
@@ -161,28 +172,52 @@ def _described(
                 notes.append(f"cannot be read so: {str(error).removeprefix(str(folder / 'session.toml') + ': ')}")
                 break
             head = [f"{fits[1]} = {fits[2]}" if line.startswith(fits[1]) else line for line in head]
-            text = _session_text(path, head, [], tables, {})
     if recording is None:
-        return Description(f"{path}: {what}", tuple(notes), (), text)
+        text = _session_text(path, head, phases, tables, {})
+        return Description(f"{path}: {what}", tuple(notes), (), text, "mend what cannot be read")
     still = rests(recording)
     comments = {segment: _mount_comment(recording, segment, still) for segment in tables}
-    text = _session_text(path, head, still, tables, comments)
-    return Description(f"{path}: {what}", (*notes, *_facts(recording)), _rows(recording, labels), text)
+    text = _session_text(path, head, phases or _start_lines(still), tables, comments)
+    facts = (*notes, *_facts(recording))
+    return Description(f"{path}: {what}", facts, _rows(recording, labels), text, _then(recording))
+
+
+def _then(recording: Recording) -> str:
+    """What a session of these sensors can be used for, once its lines marked CHECK are right."""
+    worn = {who: sensor for who, sensor in recording.sensors.items() if who in SEGMENTS}
+    if not worn:
+        return "name the segment of each sensor in place of SEGMENT"
+    without = [who for who, sensor in worn.items() if not sensor.aligned and sensor.stated_quat_LS is None]
+    if not without:
+        return "wepose track SESSION -o result"
+    if set(worn) >= ARMS and set(without) <= ARMS:
+        return (
+            "name the seconds of clasp and wepose calibrate SESSION -o subject finds the mounts; or state them and "
+            "wepose track SESSION -o result"
+        )
+    return f"state the mounts of {', '.join(without)}, then wepose track SESSION -o result"
+
+
+def _start_lines(still: list[tuple[float, float]]) -> list[str]:
+    if still and still[0][1] - still[0][0] >= SHORTEST_REST_S:
+        first, last = still[0]
+        return [f"start = [[{first:.2f}, {last:.2f}]]{CHECK}all sensors rest there; is it the start pose?"]
+    return ["# start = [[0.5, 4.5]]   # name the seconds in which the person stands still in the start pose"]
 
 
 def _session_text(
     path: Path,
     head: list[str],
-    still: list[tuple[float, float]],
+    phases: list[str],
     tables: Mapping[str, list[str]],
     comments: Mapping[str, list[str]],
 ) -> str:
     lines = [f"name = {_quoted(path.stem)}", 'start_pose = "n_pose"', "", "[data]", *head, "", "[phases]   # seconds"]
-    if still and still[0][1] - still[0][0] >= SHORTEST_REST_S:
-        first, last = still[0]
-        lines.append(f"start = [[{first:.2f}, {last:.2f}]]{CHECK}all sensors rest there; is it the start pose?")
-    else:
-        lines.append("# start = [[0.5, 4.5]]   # name the seconds in which the person stands still in the start pose")
+    lines += phases
+    if set(tables) >= ARMS or not any(name in SEGMENTS for name in tables):
+        lines.append(
+            "# clasp = [[10.0, 70.0]]   # for wepose calibrate: the seconds in which the palms are held together"
+        )
     for segment in sorted(tables, key=lambda name: SEGMENTS.index(name) if name in SEGMENTS else 99):
         commented = segment not in SEGMENTS
         table = [f"[sensors.{'SEGMENT' if commented else segment}]", *tables[segment], *comments.get(segment, [])]
@@ -194,11 +229,15 @@ def _of_devices(
     path: Path, folder: Path, format: str
 ) -> tuple[str, list[str], list[str], dict[str, list[str]], dict[str, str]]:
     """What a known format's file holds; with those beside it where the device wrote one a sensor."""
-    device = read_device(path, format)
+    device, rate = _read(path, format)
     title = (
         f"{TITLES[format]}, {'gyroscope and accelerometer' if device.kind == 'raw' else 'orientations, no raw data'}"
     )
-    if len(device.labels) > 1 or format in ("mvnx", "opensim"):
+    if format == "wepose_live":
+        notes, phases = _of_live(path)
+        worn = {str(segment): list[str]() for segment in device.labels.values()}
+        return title, notes, [f"file = {_relative(path, folder)}", *phases], worn, {}
+    if len(device.labels) > 1 or format in ("mvnx", "opensim", "apdm"):
         tables: dict[str, list[str]] = {}
         for label, segment in device.labels.items():
             where = segment if segment and segment not in tables else f"?{label}"
@@ -206,27 +245,60 @@ def _of_devices(
         labels = {segment: str(device_label) for device_label, segment in device.labels.items() if segment}
         unknown = [label for label, segment in device.labels.items() if segment is None]
         notes = [f"segments of these are not known by their names: {', '.join(unknown)}"] if unknown else []
-        return title, notes, [f"file = {_relative(path, folder)}"], tables, labels
+        return title, notes, [f"file = {_relative(path, folder)}", *rate], tables, labels
     tables, labels, notes = {}, {}, []
+    rates: list[list[str]] = []
     for file in _siblings(path, format):
-        its = device if file == path else _try(file, format, notes)
-        if its is None:
+        try:
+            its, its_rate = (device, rate) if file == path else _read(file, format)
+        except WeposeError as error:
+            notes.append(f"left out: {error}")
             continue
         (label, segment), *_ = its.labels.items()
         where = segment if segment and segment not in tables else f"?{file.name}"
-        tables[where] = [f"file = {_relative(file, folder)}"]
+        tables[where] = [f"file = {_relative(file, folder)}", *its_rate]
         labels[where] = label
-    if not any(name in SEGMENTS for name in tables):
-        # Nothing names a segment: the file that was asked about stands for the torso until somebody says better.
-        key = f"?{path.name}"
-        tables["torso"] = [tables.pop(key)[0] + f"{CHECK}which segment?"]
-        labels["torso"] = labels.pop(key)
+        rates.append(its_rate)
+    if all(rates):  # one line says it for all
+        tables = {where: lines[:1] for where, lines in tables.items()}
+    else:
+        rate = []
     unknown = [name.removeprefix("?") for name in tables if name.startswith("?")]
     if unknown:
         notes.append(f"which segment is not said by the names of: {', '.join(unknown)}")
     if format not in ("mvnx", "opensim") and len(tables) - len(unknown) > 1:
         title += f", {len(tables) - len(unknown)} files"
-    return title, notes, [f'format = "{format}"'], tables, labels
+    return title, notes, [f'format = "{format}"', *rate], tables, labels
+
+
+def _of_live(path: Path) -> tuple[list[str], list[str]]:
+    """What is said of a recording of `wepose live`, and the phases of a session for it."""
+    log = read_live_log(path)
+    recording, header = log.recording, log.header
+    subject = header["subject"]
+    first, last = recording.phases["start"][0]
+    names = {who: "stated" for who, sensor in recording.sensors.items() if sensor.stated_quat_LS is not None}
+    about: dict[str, Any] = {}
+    if subject:
+        with contextlib.suppress(ValueError):  # of a file that somebody else wrote
+            about = parsed_toml(subject)
+        calibrated = _texts(about.get("mounts"))
+        names |= {who: "calibrated" for who in recording.sensors if who in calibrated}
+    mounts = ", ".join(f"{who} {how}" for who, how in names.items())
+    facts = [
+        f"of {header['name']}, live by {header['method']}: {len(log.quat_WL)} poses were shown",
+        f"subject: {about.get('name') or 'without a name'}" if subject else "no subject",
+        f"mounts: {mounts}" if mounts else "no mounts",
+        f"start pose held [s]: {first:.2f} to {last:.2f}",
+    ]
+    if recording.resets:
+        times = ", ".join(f"{recording.time[tick]:.1f}" for tick in recording.resets)
+        facts.append(f"headings set anew at [s]: {times}")
+    if log.broken_off:
+        facts.append("note: its last block is not whole; the session was killed, and it is read up to there")
+    facts.append(f"track it as it was: wepose track {path} -o result; to add phases, for wepose calibrate: --write")
+    first, last = np.ceil(1e3 * first) / 1e3, np.floor(1e3 * last) / 1e3
+    return facts, [f"start = [[{first:.3f}, {last:.3f}]]   # as it was held live"]
 
 
 def _siblings(path: Path, format: str) -> list[Path]:
@@ -241,12 +313,14 @@ def _siblings(path: Path, format: str) -> list[Path]:
     return found[:MOST_SIBLINGS] if path in found[:MOST_SIBLINGS] else [path]
 
 
-def _try(file: Path, format: str, notes: list[str]) -> Device | None:
+def _read(path: Path, format: str) -> tuple[Device, list[str]]:
+    """The device's file, and the line that states a rate for it to be read, where it has none."""
     try:
-        return read_device(file, format)
-    except WeposeError as error:
-        notes.append(f"left out: {error}")
-        return None
+        return read_device(path, format), []
+    except BadData as error:
+        if "as rate_hz in" not in str(error):
+            raise
+        return read_device(path, format, None, 100.0), [f"rate_hz = 100.0{CHECK}the file does not say its rate"]
 
 
 def _of_columns(
@@ -260,15 +334,14 @@ def _of_columns(
     if not guess.sensors:
         listed = one_of(names).removeprefix("there is: ")
         return title, [f"no gyroscope and accelerometer, and no quaternions, by their names: {listed}"], [], {}, {}
-    time, note = _time(path, guess.time, arrays)
+    time, note = _time(path, guess, arrays)
     raw = any("gyro" in signals for signals in guess.sensors.values())
-    head = [f"file = {_relative(path, folder)}", time]
+    head = [f"file = {_relative(path, folder)}", *time]
     if raw:
         head += [
             f'gyro_unit = "{"deg/s" if guess.degrees else "rad/s"}"',
             f'accel_unit = "{"g" if guess.g else "m/s^2"}"',
         ]
-    check = "" if guess.sure else f"{CHECK}which segment?"
     tables = {}
     for segment, signals in guess.sensors.items():
         lines = [f"{key} = {_listed(columns)}" for key, columns in signals.items()]
@@ -277,30 +350,34 @@ def _of_columns(
             lines[-1] += (
                 f'{CHECK}x, y, z, w? if w comes first: ["{path_}[1]", "{path_}[2]", "{path_}[3]", "{path_}[0]"]'
             )
-        lines[0] += check if segment == "torso" else ""
         tables[segment] = lines
-    unknown = [name.removeprefix("?") for name in tables if name.startswith("?")]
+    columns_of = {name: next(iter(signals.values()))[0] for name, signals in guess.sensors.items()}
+    unknown = [name.removeprefix("?") or f"{columns_of[name]}, …" for name in tables if name.startswith("?")]
     if unknown:
         note = [*note, f"which segment is not said by the names of: {', '.join(unknown)}"]
     return title, note, head, tables, {}
 
 
-def _time(path: Path, name: str | None, arrays: ArrayFile | None) -> tuple[str, list[str]]:
-    """The line that says the time, `time` or `rate_hz`, and what to tell of it."""
+def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str], list[str]]:
+    """The lines that say the time, `time` and its unit or `rate_hz`, and what to tell of it."""
+    name = guess.time
     if name is None:
-        return f"rate_hz = 100.0{CHECK}no column looks like time", ["no column looks like time: state the rate"]
+        return [f"rate_hz = 100.0{CHECK}no column looks like time"], ["no column looks like time: state the rate"]
     table = arrays.table({name: str(path)}) if arrays else read_table(path)
-    time = columns(table, [name], str(path), "time")[:, 0]
+    try:
+        time = columns(table, [name], str(path), "time")[:, 0]
+    except BadData as error:  # dates, say
+        return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {error}"]
     steps = np.diff(time)
-    step = float(np.nanmedian(steps)) if len(steps) else 0.0
-    if not step > SLOWEST_STEP_S:
-        return f"time = {_quoted(name)}", []
-    for unit, seconds in TIME_UNITS:
-        if 1e-4 < step * seconds < SLOWEST_STEP_S:
-            rate = round(1.0 / (step * seconds), 3)
-            note = f"'{name}' is in {unit}, a session wants seconds: a rate stands for it, and lost rows go unseen"
-            return f"rate_hz = {rate:g}{CHECK}'{name}' is in {unit}; divide it and name it as time", [note]
-    return f"time = {_quoted(name)}", []
+    step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
+    said = guess.time_unit
+    fits = said if said is not None and 0.0 < step * TIME_UNITS[said] < SLOWEST_STEP_S else time_unit_of(step)
+    line = f"time = {_quoted(name)}"
+    if fits in (None, "s"):
+        return [line], []
+    by = "its name says" if fits == said else f"it grows by {step:g} from row to row"
+    note = f"'{name}' is in {fits}, as {by}: {1.0 / (step * TIME_UNITS[fits]):g} Hz"
+    return [line, f'time_unit = "{fits}"' + ("" if fits == said else f"{CHECK}{by}")], [note]
 
 
 # What a recording holds --------------------------------------------------------------------------------------------
@@ -375,7 +452,10 @@ def _rows(recording: Recording, labels: Mapping[str, str]) -> tuple[tuple[str, .
         lost = runs(sensor.gap) if sensor.gap is not None else []
         longest = max((b - a for a, b in lost), default=0) / recording.rate_hz
         gaps = f"{len(lost)}, up to {longest:.2f} s" if lost else "none"
-        rows.append((segment, labels.get(segment, ""), holds, fast, gravity, gaps))
+        named = (
+            ("?", labels.get(segment, segment[1:])) if segment.startswith("?") else (segment, labels.get(segment, ""))
+        )
+        rows.append((*named, holds, fast, gravity, gaps))
     return tuple(rows)
 
 

@@ -11,11 +11,11 @@ import numpy as np
 import polars as pl
 
 from ..errors import BadData, MissingFile
-from .tables import columns
+from .tables import NO_VALUE, columns
 
 # A table begins within this many lines of a file; what comes before it is about the device.
 PREAMBLE_LINES = 100
-SEPARATORS = "\t,;"
+SEPARATORS = "\t,; "
 # Beyond this no number is a measurement in any unit; squares of smaller ones are still numbers.
 HUGE = 1e30
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
@@ -46,6 +46,7 @@ class Device:
     since_power_on : the clock counts from when the device was switched on, or another moment that says nothing
     wraps_s : such a clock begins anew after so long [s]; None where it does not
     aligned : the orientations are the segments' own, in one world
+    mounts : label → (4,) xyzw, sensor to segment, where the file states it
     notes : what was assumed while reading
     """
 
@@ -56,6 +57,7 @@ class Device:
     since_power_on: bool = False
     wraps_s: float | None = None
     aligned: bool = False
+    mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
     notes: tuple[str, ...] = field(default=())
 
     def signals(self, label: str) -> dict[str, list[str]]:
@@ -137,7 +139,7 @@ class Text:
 
 
 def read_text(path: Path, first: str, what: str) -> Text:
-    """The table whose line of names holds the column `first`, separated by tabs, commas or semicolons.
+    """The table whose line of names holds the column `first`, separated by tabs, commas, semicolons or single spaces.
 
     Raises
     ------
@@ -160,14 +162,27 @@ def read_text(path: Path, first: str, what: str) -> Text:
     rest = rest.removeprefix(b"\xef\xbb\xbf")
     header, _, body = rest.partition(b"\n")
     wanted = [cell.strip(' "\r') for cell in header.decode("utf-8", errors="replace").split(separator)]
-    if len(set(wanted)) < len([name for name in wanted if name]) or b"\0" in rest:
-        why = "zero bytes in it" if b"\0" in rest else "two columns of one name"
-        raise BadData(f"{path}: is no {what}: there are {why}")
     while wanted and not wanted[-1]:
         wanted.pop()
+    return Text(path, about, parsed_rows(path, body, wanted, separator, head + 1, what))
+
+
+def parsed_rows(
+    path: Path, body: bytes, wanted: Sequence[str], separator: str, names_line: int, what: str
+) -> pl.DataFrame:
+    """The rows after the line of names, number `names_line` of the file: all cells text, null where there is no value.
+
+    Raises
+    ------
+    BadData
+        Two columns of one name; zero bytes; no rows.
+    """
+    if len(set(wanted)) < len([name for name in wanted if name]) or b"\0" in body:
+        why = "zero bytes in it" if b"\0" in body else "two columns of one name"
+        raise BadData(f"{path}: is no {what}: there are {why}")
     if not body.strip():
         raise BadData(
-            f"{path}: has no line of numbers after its names in line {head + 1}; the export is empty or cut off"
+            f"{path}: has no line of numbers after its names in line {names_line}; the export is empty or cut off"
         )
     schema = {name or f"column {k}": pl.String for k, name in enumerate(wanted)}
     try:
@@ -182,22 +197,32 @@ def read_text(path: Path, first: str, what: str) -> Text:
         )
     except pl.exceptions.PolarsError as error:
         raise BadData(f"{path}: cannot be read as {what}: {' '.join(str(error).split())[:120]}") from error
-    cells = cells.with_columns(pl.all().str.strip_chars(' "\r').replace("", None))
+    cells = cells.with_columns(pl.all().str.strip_chars(' "\r'))
+    cells = cells.with_columns(pl.when(~pl.all().is_in(NO_VALUE)).then(pl.all()).name.keep())
     if separator != ",":
         cells = cells.with_columns(pl.all().str.replace(",", ".", literal=True))
     filled = cells.select(pl.any_horizontal(pl.all().is_not_null()))[:, 0]
     cells = cells.filter(filled)
     if cells.height and not body.endswith(b"\n") and cells[-1, cells.width - 1] is None:
         cells = cells.head(-1)  # the writer was stopped within its last line
-    return Text(path, about, cells)
+    return cells
 
 
 def _line_of_names(lines: Sequence[str], first: str) -> tuple[int | None, str]:
     for k, line in enumerate(lines):
+        if line.startswith("//"):
+            continue
         for separator in SEPARATORS:
             if first in (cell.strip(' "') for cell in line.split(separator)):
                 return k, separator
     return None, ""
+
+
+def counted_time(counter: np.ndarray, rate_hz: float, wraps: float) -> tuple[np.ndarray, float]:
+    """Times (n,) [s] of packets that are counted, and after how long [s] the counter begins anew."""
+    packets = unwrapped(counter, wraps)
+    usual = max(1.0, float(np.median(np.diff(packets)))) if len(packets) > 1 else 1.0
+    return packets / (usual * rate_hz), wraps / (usual * rate_hz)
 
 
 def unwrapped(counter: np.ndarray, wraps: float) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData
-from .device import Device, Text, read_text, segment_of, table_of, unwrapped
+from .device import Device, Text, counted_time, read_text, segment_of, table_of, unwrapped
 from .mt_manager import RAW, orientation
 
 FINE_S, WRAPS = 1e-6, 2.0**32
@@ -26,8 +26,10 @@ INCREMENTS = (
 )
 
 
-def read_dot(path: Path, use: str | None = None) -> Device:
+def read_dot(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """The sensor's rates or increments where the file has them, else its orientation; `use` asks for one of the two.
+
+    `rate_hz` is the output rate; it goes before SampleTimeFine.
 
     Raises
     ------
@@ -35,7 +37,7 @@ def read_dot(path: Path, use: str | None = None) -> Device:
         Not there; no DOT CSV; no time in it; not what `use` asks for.
     """
     text = read_text(path, "PacketCounter", "a CSV of a DOT")
-    time, wraps_s = _time(text)
+    time, wraps_s = _time(text, rate_hz)
     increments = next((names for names in INCREMENTS if names in text), None)
     kind = "orientation" if use == "orientation" or (RAW not in text and increments is None) else "raw"
     if use == "raw" and kind != "raw":
@@ -77,12 +79,16 @@ def _usual_step(text: Text, time: np.ndarray) -> float:
     return step
 
 
-def _time(text: Text) -> tuple[np.ndarray, float | None]:
+def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
     """Times (n,) [s] on the device's clock, and after how long it begins anew."""
-    if ["SampleTimeFine"] in text:
+    if ["SampleTimeFine"] in text and rate_hz is None:
         time = FINE_S * unwrapped(text.numbers(["SampleTimeFine"])[:, 0], WRAPS)
         return time, FINE_S * WRAPS
     number = re.match(r"\d+(\.\d+)?", text.about.get("OutputRate", ""))
-    if number is None or float(number[0]) <= 0.0:
-        raise BadData(f"{text.path}: no SampleTimeFine and no OutputRate to tell the time by; export one of the two")
-    return text.numbers(["PacketCounter"])[:, 0] / float(number[0]), None
+    rate = rate_hz or (float(number[0]) if number else 0.0)
+    if rate <= 0.0:
+        raise BadData(
+            f"{text.path}: no SampleTimeFine and no OutputRate to tell the time by; state the output rate as rate_hz "
+            f"in [data], or export one of the two"
+        )
+    return counted_time(text.numbers(["PacketCounter"])[:, 0], rate, WRAPS)[0], None

@@ -16,7 +16,15 @@ SIGNALS = (
     ("orientation", r"quat|ori(entation)?|rotation|(^|[^a-z])q$"),
 )
 NOT = r"mag|free|linear|lin[ _]?acc|earth|std|cov"  # no raw data, whatever else the name says
-TIME = r"(time|time ?stamp|t|timestamps?|seconds|sec|clock)\s*([\[(].*[\])])?"
+# Words of a name that make it a column of times, units of it, and words that may stand beside them.
+TIME = {"time", "times", "timestamp", "timestamps", "t", "ts", "clock", "elapsed", "epoch"}
+TIME_UNIT = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "milli", "millis", "millisec", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "micro", "micros", "microsec", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nano", "nanos", "nanosec", "nanosecond", "nanoseconds"), "ns"),
+}
+BESIDE_TIME = {"stamp", "unix", "utc", "since", "start", "sync", "system", "host", "device", "sensor", "shimmer", "cal"}
 ORDER = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 
 
@@ -24,8 +32,8 @@ class Guess(NamedTuple):
     """What the names of columns say."""
 
     time: str | None
+    time_unit: str | None  # "s", "ms", "us" or "ns", where the name says it
     sensors: Mapping[str, Mapping[str, list[str]]]  # segment, or ?name where it is not known → signal → columns
-    sure: bool  # no name stands for a segment without saying so
     degrees: bool  # a name said deg/s
     g: bool  # a name said g
 
@@ -71,6 +79,17 @@ def signal_of(stem: str) -> str | None:
     return next((signal for signal, pattern in SIGNALS if re.search(pattern, text)), None)
 
 
+def _is_time(name: str) -> bool:
+    words = _words(name)
+    rest = [word for word in words if word not in TIME and word not in TIME_UNIT]
+    says = any(word in TIME for word in words) or (len(words) == 1 and words[0] in TIME_UNIT and words[0] != "s")
+    return says and all(word in BESIDE_TIME or word.isdigit() for word in rest)
+
+
+def _words(name: str) -> list[str]:
+    return re.sub(r"(?<=[a-z])(?=[A-Z])|[\W_]+", " ", name).lower().split()
+
+
 def _size(shape: tuple[int, ...]) -> int:
     size = 1
     for k in shape:
@@ -90,7 +109,7 @@ def _owner(stem: str) -> str:
 
 
 def _guess(names: list[str], found: dict[str, dict[str, list[str]]]) -> Guess:
-    time = next((name for name in names if re.fullmatch(TIME, name.strip().lower())), None)
+    time = next((name for name in names if _is_time(name)), None)
     whole = {who: signals for who, signals in found.items() if "orientation" in signals or len(signals) == 2}
     sensors = {
         who: {
@@ -100,16 +119,11 @@ def _guess(names: list[str], found: dict[str, dict[str, list[str]]]) -> Guess:
         }
         for who, signals in whole.items()
     }
-    unnamed = [who for who in sensors if who.startswith("?")]
-    sure = not unnamed or len(unnamed) < len(sensors)
-    if not sure:
-        # One sensor without a name can be tried; of the others nobody can say which is which.
-        sensors = {"torso" if who == unnamed[0] else who: signals for who, signals in sensors.items()}
     text = " ".join(names).lower()
     return Guess(
         time,
+        next((TIME_UNIT[word] for word in _words(time or "") if word in TIME_UNIT), None),
         sensors,
-        sure,
         bool(re.search(r"dps|deg ?/ ?s|deg_s|deg/s", text)),
         bool(re.search(r"[\[( ]g[\]) ]", f"{text} ")),
     )

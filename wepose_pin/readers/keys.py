@@ -11,7 +11,7 @@ from typing import Any
 from ..errors import BadSession, MissingFile, one_of
 
 # Endings of files that hold the data themselves.
-DATA = (".csv", ".parquet", ".txt", ".mat", ".h5", ".hdf5", ".mvnx", ".sto")
+DATA = (".csv", ".parquet", ".txt", ".mat", ".h5", ".hdf5", ".mvnx", ".sto", ".wepose")
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

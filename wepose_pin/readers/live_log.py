@@ -25,6 +25,7 @@ from ..errors import BadData, MissingFile
 from ..recording import SEGMENTS, Recording, Sensor, check
 from .arrivals import Aligner, Arrivals, Ticks
 from .clocks import GOOD, LONG, Clock, bridge
+from .device import Device, table_of
 from .keys import Keys, is_number
 from .stated import phases_stated
 
@@ -114,6 +115,44 @@ def read_live_log(path: Path) -> LiveRecording:
     recording = check(recording_of(header, aligner.rate_hz, ticks, start, path, tuple(resets)))
     quat_WL = np.concatenate([quat for _, quat in poses]) if poses else np.empty((0, len(header["sensors"]), 4))
     return LiveRecording(recording, header, poses[0][0] if poses else start[1] + 1, quat_WL, broken_off)
+
+
+def read_live_device(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
+    """What `read_live_log` reads, for a session that names the file and adds phases; lost samples are NaN.
+
+    Raises
+    ------
+    MissingFile, BadData
+        As `read_live_log`; orientations or another rate asked for.
+    """
+    if use == "orientation" or rate_hz is not None:
+        what = 'use = "orientation"' if rate_hz is None else f"rate_hz = {rate_hz:g}"
+        raise BadData(f"{path}: {what}: a live recording holds raw data with times of their own; leave it out")
+    log = read_live_log(path)
+    values = {}
+    for label, sensor in log.recording.sensors.items():
+        assert sensor.gyro_S is not None
+        assert sensor.accel_S is not None
+        lost = np.zeros((len(log.recording), 1), dtype=bool) if sensor.gap is None else sensor.gap[:, None]
+        values[label] = {
+            "gyro": np.where(lost, np.nan, sensor.gyro_S),
+            "accel": np.where(lost, np.nan, sensor.accel_S),
+        }
+    mounts = {
+        label: sensor.stated_quat_LS
+        for label, sensor in log.recording.sensors.items()
+        if sensor.stated_quat_LS is not None
+    }
+    resets = log.recording.resets
+    notes = (f"{path.name}: headings were set anew live {len(resets)} times, which a session does not repeat",)
+    return Device(
+        "wepose_live",
+        table_of(log.recording.time, values),
+        {label: label for label in values},
+        "raw",
+        mounts=mounts,
+        notes=notes if resets else (),
+    )
 
 
 def blocks(path: Path) -> Iterator[tuple[bytes, bytes]]:

@@ -1,6 +1,7 @@
 """Xsens MT Manager text exports (MTi, MTw, MTx), one file a sensor.
 
-Lines that begin with ``//`` say how it was recorded; then a line of names, separated by tabs, commas or semicolons.
+Lines that begin with ``//`` say how it was recorded; then a line of names, separated by tabs, commas, semicolons or
+single spaces. What was not measured is empty or ``NaN``.
 Acc [m/s²] and Gyr [rad/s] in the sensor's frame, orientation to a world with z up as quaternion (q0 is w), matrix
 (``Mat[row][column]``) or Roll, Pitch, Yaw [deg]. PacketCounter begins anew at 65536, SampleTimeFine counts 0.1 ms.
 
@@ -16,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData
-from .device import Device, Text, read_text, segment_of, table_of, unwrapped
+from .device import Device, Text, counted_time, read_text, segment_of, table_of, unwrapped
 
 COUNTER_WRAPS = 65536.0
 FINE_S, FINE_WRAPS = 1e-4, 2.0**32
@@ -31,8 +32,10 @@ EULERS = (("Roll", "Pitch", "Yaw"), ("Euler_X", "Euler_Y", "Euler_Z"))
 MATRIX = tuple(f"Mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2, 3))
 
 
-def read_mt_manager(path: Path, use: str | None = None) -> Device:
+def read_mt_manager(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """The sensor's raw data where the export has them, else its orientation; `use` asks for one of the two.
+
+    `rate_hz` is the update rate, where the export does not state it or states another.
 
     Raises
     ------
@@ -40,7 +43,7 @@ def read_mt_manager(path: Path, use: str | None = None) -> Device:
         Not there; no such export; neither rate nor time in it; not what `use` asks for.
     """
     text = read_text(path, "PacketCounter", "an export of MT Manager")
-    time, wraps_s = _time(text)
+    time, wraps_s = _time(text, rate_hz)
     kind = "raw" if RAW in text and use != "orientation" else "orientation"
     if use == "raw" and kind != "raw":
         raise BadData(f"{path}: no Acc and Gyr; export them too, or leave out data.use and its orientation is read")
@@ -91,7 +94,7 @@ def orientation(text: Text) -> np.ndarray:
     return quat
 
 
-def _time(text: Text) -> tuple[np.ndarray, float | None]:
+def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
     """Times (n,) [s] on the device's clock, and after how long it begins anew.
 
     The counter over the rate where the rate is stated: it is the same for all sensors of a station, and shows what was
@@ -99,14 +102,15 @@ def _time(text: Text) -> tuple[np.ndarray, float | None]:
     """
     stated = next((value for name, value in text.about.items() if name in ("Update Rate", "Output Rate")), "")
     number = re.match(r"\d+(\.\d*)?(?![\d.])", stated)
-    rate_hz = float(number[0]) if number else 0.0
+    rate = rate_hz or (float(number[0]) if number else 0.0)
     counter = text.numbers(["PacketCounter"])[:, 0]
-    if rate_hz > 0.0 and np.isfinite(counter).all() and len(counter) > 1:
-        packets = unwrapped(counter, COUNTER_WRAPS)
-        usual = max(1.0, float(np.median(np.diff(packets))))
-        return packets / (usual * rate_hz), COUNTER_WRAPS / (usual * rate_hz)
+    if rate > 0.0 and np.isfinite(counter).all() and len(counter) > 1:
+        return counted_time(counter, rate, COUNTER_WRAPS)
+    if rate_hz:
+        return np.arange(len(counter)) / rate_hz, None
     if ["SampleTimeFine"] in text:
         return FINE_S * unwrapped(text.numbers(["SampleTimeFine"])[:, 0], FINE_WRAPS), FINE_S * FINE_WRAPS
     raise BadData(
-        f"{text.path}: no line '// Update Rate: …' and no SampleTimeFine to tell the time by; export one of the two"
+        f"{text.path}: no line '// Update Rate: …' and no SampleTimeFine to tell the time by; state the update rate "
+        f"as rate_hz in [data], or export one of the two"
     )

@@ -3,7 +3,8 @@
 Each frame of type `normal` holds the segments' orientations (w x y z, to a world with z up) and, in exports before MVN
 2018, the sensors' `sensorAcceleration` [m/s²] and `sensorAngularVelocity` [rad/s]. An Xsens segment's frame is the
 world's (x forward, y left, z up) in the T-pose with palms down; ours is in the N-pose, an arm's thus a quarter turn
-about x away.
+about x away. Some exports (MVN 4.2) refer the arms to the N-pose, as we do. Which of the two it is, the segments'
+positions in the same frames say: from joint to joint an arm's segment lies along y of its frame, or along −z.
 
 Source: MVN User Manual, MVNX structure; the frames `identity` and `tpose` of exported files.
 """
@@ -33,7 +34,15 @@ SEGMENT_OF = {
 }
 # R_BL, our segment frame in Xsens's: arms fall from the T-pose to the N-pose by a quarter turn about x.
 _QUARTER = {"left": 0.5 * np.pi, "right": -0.5 * np.pi}
-WIDTH = {"orientation": 4, "sensorAngularVelocity": 3, "sensorAcceleration": 3}
+WIDTH = {"orientation": 4, "position": 3, "sensorAngularVelocity": 3, "sensorAcceleration": 3}
+# An arm's segment and the one that begins at its other end.
+ARM = {
+    f"{side}{part}": f"{side}{end}"
+    for side in ("Left", "Right")
+    for part, end in (("UpperArm", "ForeArm"), ("ForeArm", "Hand"))
+}
+# MVN draws its joints on the axis, to 0.03 deg: what is off by more than this is of another convention.
+ALONG_DEG = 5.0
 
 
 class Frames(NamedTuple):
@@ -45,15 +54,18 @@ class Frames(NamedTuple):
     values: dict[str, np.ndarray]  # element → (n, count, width)
 
 
-def read_mvnx(path: Path, use: str | None = None) -> Device:
+def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """The sensors' raw data where the file has them, else the segments' orientations; `use` asks for one of the two.
+
+    `rate_hz` goes before the file's frameRate.
 
     Raises
     ------
     MissingFile, BadData
-        Not there; no MVNX, damaged, cut off, or without what `use` asks for.
+        Not there; no MVNX, damaged, cut off, or without what `use` asks for; arms whose frames fit neither pose.
     """
-    frames = read_frames(path)
+    frames = read_frames(path, rate_hz)
+    notes: tuple[str, ...] = ()
     raw = {"sensorAngularVelocity", "sensorAcceleration"} <= set(frames.values)
     if use == "raw" and not raw:
         raise BadData(
@@ -69,8 +81,13 @@ def read_mvnx(path: Path, use: str | None = None) -> Device:
         }
     else:
         quat = frames.values["orientation"]
+        pose = _reference_pose(path, frames)
+        if pose is None:
+            notes = (
+                f"{path.name}: no positions of the arms' segments: their frames are taken for those of the T-pose",
+            )
         values = {
-            label: {"orientation": _segment_quat(label, quat[:, k])}
+            label: {"orientation": _segment_quat(label, quat[:, k], pose or "T")}
             for k, label in enumerate(frames.segments)
             if label in SEGMENT_OF
         }
@@ -83,22 +100,65 @@ def read_mvnx(path: Path, use: str | None = None) -> Device:
         {label: SEGMENT_OF[label] for label in values},
         "raw" if raw and use != "orientation" else "orientation",
         aligned=not raw or use == "orientation",
+        notes=notes,
     )
 
 
-def _segment_quat(label: str, quat_WB: np.ndarray) -> np.ndarray:
-    """`quat_WL` (n, 4) xyzw of our frame from Xsens's (n, 4) wxyz; rows of zeros or NaN become NaN."""
+def _reference_pose(path: Path, frames: Frames) -> str | None:
+    """The pose, "T" or "N", in which the frames of the arms' segments are the world's; None without their positions.
+
+    Raises
+    ------
+    BadData
+        A segment's axis fits neither, or another one's says otherwise.
+    """
+    if "position" not in frames.values:
+        return None
+    at = {label: k for k, label in enumerate(frames.segments)}
+    poses = {}
+    for label, end in ARM.items():
+        if label not in at or end not in at:
+            continue
+        quat = so3.xyzw_from_wxyz(frames.values["orientation"][:, at[label]])
+        along_W = frames.values["position"][:, at[end]] - frames.values["position"][:, at[label]]
+        good = np.isfinite(quat).all(axis=1) & (np.linalg.norm(np.nan_to_num(quat), axis=1) > 0.5)
+        good &= np.linalg.norm(np.nan_to_num(along_W), axis=1) > 1e-3
+        if not good.any():
+            continue
+        along_B = np.median(Rotation.from_quat(quat[good]).inv().apply(along_W[good]), axis=0)
+        along_B /= np.linalg.norm(along_B)
+        axes = {"T": [0.0, 1.0 if label.startswith("Left") else -1.0, 0.0], "N": [0.0, 0.0, -1.0]}
+        off = {pose: float(np.degrees(np.arccos(np.clip(along_B @ axis, -1.0, 1.0)))) for pose, axis in axes.items()}
+        poses[label] = min(off, key=lambda pose: off[pose])
+        if off[poses[label]] > ALONG_DEG:
+            raise BadData(
+                f"{path}: by its <position> and {end}'s, {label} lies {off['T']:.0f} deg off y of its frame (as in the "
+                f"T-pose) and {off['N']:.0f} deg off -z (N-pose); its orientations are of neither and are not read"
+            )
+    if len(set(poses.values())) > 1:
+        told = ", ".join(f"{label} {pose}-pose" for label, pose in poses.items())
+        raise BadData(
+            f"{path}: the arms' frames are the world's in two poses: {told}; export it again, with one of them"
+        )
+    return next(iter(poses.values()), None)
+
+
+def _segment_quat(label: str, quat_WB: np.ndarray, pose: str) -> np.ndarray:
+    """`quat_WL` (n, 4) xyzw of our frame from Xsens's (n, 4) wxyz, an arm's being the world's in the T- or N-pose.
+
+    Rows of zeros or NaN become NaN.
+    """
     quat = so3.xyzw_from_wxyz(quat_WB)
     good = np.isfinite(quat).all(axis=1) & (np.linalg.norm(np.nan_to_num(quat), axis=1) > 0.5)
     turned = np.full(quat.shape, np.nan)
     side = SEGMENT_OF[label].partition("_")[0]
-    R_BL = Rotation.from_rotvec([_QUARTER.get(side, 0.0), 0.0, 0.0])
+    R_BL = Rotation.from_rotvec([_QUARTER.get(side, 0.0) if pose == "T" else 0.0, 0.0, 0.0])
     turned[good] = (Rotation.from_quat(quat[good]) * R_BL).as_quat()
     return turned
 
 
-def read_frames(path: Path) -> Frames:
-    """All frames of type `normal`.
+def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
+    """All frames of type `normal`; `rate_hz` goes before the file's frameRate.
 
     Raises
     ------
@@ -111,7 +171,7 @@ def read_frames(path: Path) -> Frames:
     sensors: list[str] = []
     times: list[tuple[str, str]] = []
     texts: dict[str, list[str]] = {}
-    rate_hz = 0.0
+    own_rate_hz = 0.0
     try:
         with path.open("rb") as file:
             # Nothing is expanded and nothing fetched: a file can neither grow in memory nor name others.
@@ -125,8 +185,8 @@ def read_frames(path: Path) -> Frames:
                     _check_root(path, root)
                 name = _name(element)
                 if event == "start":
-                    if name == "subject":
-                        rate_hz = _number(path, element, "frameRate")
+                    if name == "subject" and rate_hz is None:
+                        own_rate_hz = _number(path, element, "frameRate")
                 elif name in ("segment", "sensor") and element.get("label"):
                     (segments if name == "segment" else sensors).append(element.get("label"))
                 elif name == "frame":
@@ -151,10 +211,10 @@ def read_frames(path: Path) -> Frames:
     if "orientation" not in texts:
         raise BadData(f"{path}: its frames hold no <orientation>; export it with the segments' orientations")
     values = {
-        tag: _values(path, tag, rows, len(segments) if tag == "orientation" else len(sensors), len(times))
+        tag: _values(path, tag, rows, len(segments) if tag in ("orientation", "position") else len(sensors), len(times))
         for tag, rows in texts.items()
     }
-    return Frames(_times(path, times, rate_hz), segments, sensors, values)
+    return Frames(_times(path, times, rate_hz or own_rate_hz), segments, sensors, values)
 
 
 def _name(element: Any) -> str:

@@ -35,8 +35,8 @@ def in_n_pose(body: str) -> Rotation:
     return Rotation.from_rotvec(np.pi / 2.0 * mirror * PRONATION / np.linalg.norm(PRONATION))
 
 
-def read_opensim(path: Path, use: str | None = None) -> Device:
-    """The orientations of each column but time.
+def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
+    """The orientations of each column but time; `rate_hz` goes before the file's own times.
 
     Raises
     ------
@@ -71,6 +71,8 @@ def read_opensim(path: Path, use: str | None = None) -> Device:
     if len(set(labels)) < len(labels):
         raise BadData(f"{path}: two columns have one name; each needs its own: {', '.join(labels)}")
     time = columns(pl.DataFrame({"time": [row[0] for row in rows]}), ["time"], str(path), str(path))[:, 0]
+    if rate_hz:
+        time = np.arange(len(rows)) / rate_hz
     quats = {label: _quat(path, label, [row[k] for row in rows]) for k, label in enumerate(labels, 1)}
     own = about.get(OWN[0].lower()) == OWN[1]
     if own:

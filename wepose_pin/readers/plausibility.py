@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..errors import BadData
-from ..recording import Recording, Sensor
+from ..recording import Recording, Sensor, format_time
 from .clocks import runs
 
 GRAVITY = 9.80665
@@ -57,7 +57,7 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
         if sensor.gyro_S is None or sensor.accel_S is None:
             continue
         place = f"{recording.where()}: sensors.{segment}"
-        notes += _gravity(recording, sensor, place, whole)
+        notes += _gravity(recording, segment, place, whole)
         if units:
             _gyro_unit(sensor.gyro_S, sensor.accel_S, recording.rate_hz, place)
         _range(recording.time, sensor.gyro_S, MOST_GYRO, "rad/s", f"{place}.gyro")
@@ -70,22 +70,22 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
     return tuple(notes)
 
 
-def _gravity(recording: Recording, sensor: Sensor, place: str, whole: bool) -> list[str]:
+def _gravity(recording: Recording, segment: str, place: str, whole: bool) -> list[str]:
+    sensor = recording.sensors[segment]
     assert sensor.accel_S is not None
     name = next((name for name in ("still", "start") if recording.phases.get(name)), "")
     if name:
-        first, last = recording.phases[name][0]
-        at_rest, when = recording.span((first, last)), f"in phases.{name}"
+        at_rest, when = recording.measured(segment, recording.phases[name][0]), f"in phases.{name}"
     elif whole:
         at_rest, when = _quiet_second(recording, sensor), "in its quietest second"
     else:
         return []
-    if at_rest.stop - at_rest.start < 2:
+    if len(at_rest) < 2:
         return []
-    when += f" ({recording.time[at_rest.start]:g} to {recording.time[at_rest.stop - 1]:g} s)"
+    first, last = (format_time(recording.time[k]) for k in at_rest[[0, -1]])
     norm = float(np.linalg.norm(sensor.accel_S[at_rest], axis=1).mean())
     off = abs(norm / GRAVITY - 1.0)
-    found = f"norm {norm:.4g} m/s^2 {when}, where gravity's {GRAVITY:.3g} is expected"
+    found = f"norm {norm:.4g} m/s^2 {when} ({first} to {last} s), where gravity's {GRAVITY:.3g} is expected"
     if off > GRAVITY_OFF:
         raise BadData(f"{place}.accel: {found}; {_accel_unit(norm)}")
     return [f"{place.split(': ')[-1]}.accel: {found}: the scale is taken from it"] if off > GRAVITY_NOTE else []
@@ -104,14 +104,17 @@ def _accel_unit(norm: float) -> str:
     return "check data.accel_unit and the sensor's calibration, and that it rests there"
 
 
-def _quiet_second(recording: Recording, sensor: Sensor) -> slice:
-    """Samples of the second in which the rate varies least."""
+def _quiet_second(recording: Recording, sensor: Sensor) -> np.ndarray:
+    """Samples of the second, measured as a whole, in which the rate varies least; none where there is no such second."""
     assert sensor.gyro_S is not None
     n = len(recording)
     size = min(n, max(2, round(recording.rate_hz)))
-    blocks = sensor.gyro_S[: n // size * size].reshape(-1, size, 3)
-    first = int(np.argmin(blocks.var(axis=1).sum(axis=1))) * size
-    return slice(first, first + size)
+    count = n // size
+    motion = sensor.gyro_S[: count * size].reshape(count, size, 3).var(axis=1).sum(axis=1)
+    if sensor.gap is not None:
+        motion[sensor.gap[: count * size].reshape(count, size).any(axis=1)] = np.inf
+    first = int(np.argmin(motion))
+    return np.arange(first * size, (first + 1) * size) if np.isfinite(motion[first]) else np.empty(0, dtype=int)
 
 
 def _gyro_unit(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, place: str) -> None:

@@ -11,10 +11,32 @@ import numpy as np
 import polars as pl
 
 from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, one_of, printable
-from ..recording import CONFIGURATION, SEGMENTS, START_POSES, Intervals, Recording, Sensor, check, check_phases
+from ..recording import (
+    CONFIGURATION,
+    SEGMENTS,
+    START_POSES,
+    Intervals,
+    Recording,
+    Sensor,
+    check,
+    check_phases,
+)
 from .arrays import ArrayFile, is_array_file
-from .clocks import BRIDGED, LONG, Clock, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time, runs
+from .clocks import (
+    BRIDGED,
+    LONG,
+    TIME_UNITS,
+    Clock,
+    bridge,
+    bridge_quat,
+    clock_of,
+    common_time,
+    lost_samples,
+    on_time,
+    runs,
+)
 from .device import HUGE, Device
+from .faults import Scan
 from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
 from .plausibility import sensor_notes
@@ -27,7 +49,10 @@ ACCEL_UNITS = {"m/s^2": 1.0, "g": 9.80665}
 # How far a quaternion's norm may be off 1: decimals that were cut.
 NORM_OFF = 1e-2
 SI = {"gyro": 1.0, "accel": 1.0}
+# Keys of [data] that a session need not have; one that no sensor has a use for is an error.
+_FOR_SENSORS = ("file", "time", "time_unit", "rate_hz", "gyro_unit", "accel_unit", "format", "use")
 _NO_ROW = 2**31 - 1
+_SCAN_ROWS = 1 << 16  # that are looked at together for faults
 _BEGINNING_S = 20.0  # [s] of a recording in which somebody stands still for a second
 
 
@@ -129,7 +154,8 @@ class SessionReader:
         top = Keys(read_toml(self.path, "a session file") if values is None else values, str(self.path))
         top.allow("name", "start_pose", "strapping", "data", "phases", "sensors", "joints")
         data, sensors = top.table("data"), top.table("sensors", {})
-        data.allow("file", "time", "rate_hz", "gyro_unit", "accel_unit", "truth", "format", "use")
+        data.allow(*_FOR_SENSORS, "truth")
+        self._used: set[str] = set()  # which of `_FOR_SENSORS` some sensor had a use for
         start_pose = top.choice("start_pose", (*START_POSES, CONFIGURATION), "n_pose")
         for segment in sensors.values:
             if segment not in SEGMENTS and start_pose != CONFIGURATION:  # else links, of a model that is not known here
@@ -152,21 +178,27 @@ class SessionReader:
         )
         stated = {segment: sensor_stated(sensors.table(segment)) for segment in sensors.values}
         self._units: Mapping[str, float] = SI
-        if any("gyro" in (said.signals or ()) for said in stated.values()):
+        if any(said.signals is not None for said in stated.values()):
+            raw = any("gyro" in (said.signals or ()) for said in stated.values())
             self._units = {
-                "gyro": GYRO_UNITS[data.choice("gyro_unit", GYRO_UNITS)],
-                "accel": ACCEL_UNITS[data.choice("accel_unit", ACCEL_UNITS)],
+                signal: known[data.choice(key, known)] if raw or key in data else 1.0
+                for signal, key, known in (("gyro", "gyro_unit", GYRO_UNITS), ("accel", "accel_unit", ACCEL_UNITS))
             }
+            self._used |= {"gyro_unit", "accel_unit"}
         self._tables: dict[str, pl.DataFrame | Rows] = {}
-        self._clocks: dict[tuple[str, str | None, float | None, float], Clock] = {}
+        self._clocks: dict[tuple[str, str | None, float, float | None, float], Clock] = {}
         self._array_files: dict[Path, ArrayFile] = {}
         self._in_memory = in_memory
         self.devices: dict[Path, Device] = {}
+        self._device_rates: dict[Path, float | None] = {}
         for segment, said in stated.items():
             if said.signals is None:
                 self._read_device(sensors.table(segment), data)
         self._on_one_clock()
         self._plans = {segment: self._plan(sensors.table(segment), data, said) for segment, said in stated.items()}
+        unused = [key for key in _FOR_SENSORS if key in data and key not in self._used]
+        if unused:
+            raise BadSession(f"{data.at(unused[0])}: {_useless(unused[0])}; leave it out")
         clocks = {segment: plan.clock for segment, plan in self._plans.items()}
         self.time, self._notes = common_time(str(self.path), clocks)
         self._resampled = bool(self._notes)
@@ -175,11 +207,27 @@ class SessionReader:
         check_phases(str(self.path), self.time, self._head.phases)
         self.phases, self.start_pose, self.strapping = self._head.phases, start_pose, self._head.strapping
         self.any_aligned = any(plan.aligned for plan in self._plans.values())
+        self._refuse_shared_columns()
+        self._scanned: Scan | None = None
+
+    def _refuse_shared_columns(self) -> None:
+        """Two sensors that are read from the same columns are one."""
+        owner: dict[tuple[Path, str], str] = {}
+        for segment, plan in self._plans.items():
+            for signal, name in ((signal, name) for signal, names in plan.signals.items() for name in names):
+                other = owner.setdefault((plan.path, name), segment)
+                if other != segment:
+                    raise BadSession(
+                        f"{self.path}: {plan.place}.{signal} names column '{name}' of {plan.path.name}, which is that "
+                        f"of sensors.{other}; each sensor has columns of its own"
+                    )
 
     def _file(self, keys: Keys, data: Keys) -> Path:
         file = (keys if "file" in keys else data).text("file", None)
         if file is None:
             raise BadSession(f"{data.at('file')} is missing; the .csv or .parquet file beside {self.path}")
+        if "file" not in keys:
+            self._used.add("file")
         return self.path.parent / file
 
     def _read_device(self, keys: Keys, data: Keys) -> None:
@@ -187,13 +235,26 @@ class SessionReader:
         path = self._file(keys, data)
         own = keys if "format" in keys else data
         format = own.choice("format", FORMATS) if "format" in own else format_of(path) if path.exists() else None
+        self._used |= {"format", "use"} if own is data else {"use"}
         if format is None:
-            if not path.exists() and path.suffix.lower() in (".mvnx", ".sto", ".txt", ""):
+            if not path.exists():
                 raise MissingFile(f"{path}: no such file or folder")
             keys.names("gyro", 3)  # a table of which the session must say what it holds
-        elif path not in self.devices:
+        else:
             use = data.choice("use", USES) if "use" in data else None
-            self.devices[path] = read_device(path, format, use)
+            # The rate of [data] is that of its file; where it names none, of all.
+            of_rate = keys if "rate_hz" in keys or ("file" in keys and "file" in data) else data
+            rate_hz = of_rate.number("rate_hz", None, positive=True)
+            if of_rate is data:
+                self._used.add("rate_hz")
+            for key in ("time", "time_unit"):
+                if key in keys:
+                    raise BadSession(f"{keys.at(key)}: {_useless(key)}; leave it out")
+            if path in self.devices and rate_hz != self._device_rates[path]:
+                raise BadSession(f"{of_rate.at('rate_hz')}: {path.name} is read with another rate for another sensor")
+            if path not in self.devices:
+                self.devices[path] = read_device(path, format, use, rate_hz)
+                self._device_rates[path] = rate_hz
 
     def _on_one_clock(self) -> None:
         """Times of devices that count since they were switched on begin at zero, with the earliest of them."""
@@ -214,21 +275,29 @@ class SessionReader:
     def _plan(self, keys: Keys, data: Keys, stated: Stated) -> _Plan:
         path, segment = self._file(keys, data), keys.place.removeprefix("sensors.")[:-1]
         device = self.devices.get(path) if stated.signals is None else None
-        # A file of its own has a clock of its own.
-        own = keys if any(key in keys for key in ("file", "time", "rate_hz")) else data
+        # A file of its own has a clock of its own beside that of [data], or where [data] names no file that of all.
+        states = any(key in keys for key in ("time", "time_unit", "rate_hz"))
+        own = keys if states or ("file" in keys and "file" in data) else data
         name, rate_hz = own.text("time", None), own.number("rate_hz", None, positive=True)
-        if device is not None and name is None and rate_hz is None:
-            name = "time"
+        unit = TIME_UNITS[own.choice("time_unit", TIME_UNITS, "s")]
+        if device is not None:
+            name, rate_hz, unit = "time", None, 1.0
+        else:
+            if own is data:
+                self._used |= {"time", "rate_hz"} | ({"time_unit"} if name is not None else set())
+            elif "time_unit" in keys and rate_hz is not None:
+                raise BadSession(f"{keys.at('time_unit')}: {_useless('time_unit')}; leave it out")
         if (name is None) == (rate_hz is None):
             found = "neither" if name is None else "both"
             raise BadSession(
-                f"{own.at('time')} or rate_hz is needed, one of the two, and {found} is there: a column in seconds, "
+                f"{own.at('time')} or rate_hz is needed, one of the two, and {found} is there: a column of times, "
                 f"or a rate"
             )
         offset = keys.number("offset_s", 0.0) or 0.0
         which = str(path)
         if device is not None:
-            signals: Mapping[str, list[str]] = device.signals(label_stated(keys, device, segment, path))
+            label = label_stated(keys, device, segment, path)
+            signals: Mapping[str, list[str]] = device.signals(label)
         else:
             assert stated.signals is not None
             signals = stated.signals
@@ -241,7 +310,7 @@ class SessionReader:
                         keys.names(signal, WIDTHS[signal])
         if which not in self._tables:
             self._tables[which] = read_table(path) if self._in_memory else Rows(path)
-        key = (which, name, rate_hz, offset)
+        key = (which, name, unit, rate_hz, offset)
         if key not in self._clocks:
             table, place = self._tables[which], own.at("time")
             if isinstance(table, Rows):
@@ -249,8 +318,7 @@ class SessionReader:
             else:
                 time = columns(table, [name], str(path), place)[:, 0] if name is not None else np.empty(0)
                 height = table.height
-            if rate_hz is not None:
-                time = np.arange(height) / rate_hz
+            time = np.arange(height) / rate_hz if rate_hz is not None else unit * time
             self._clocks[key] = clock = clock_of(time + offset, str(path))
             lost = runs(lost_samples(clock, clock.row >= 0) == LONG)
             if lost and not self.gaps:
@@ -269,7 +337,8 @@ class SessionReader:
             raise BadSession(f"{keys.at('aligned')} = true needs orientations; leave it out where there are none")
         units = SI if device is not None else self._units
         place = keys.place.rstrip(".")
-        return _Plan(place, path, which, signals, units, self._clocks[key], stated.mount, aligned)
+        mount = stated.mount if device is None or stated.mount is not None else device.mounts.get(label)
+        return _Plan(place, path, which, signals, units, self._clocks[key], mount, aligned)
 
     def _arrays(
         self, keys: Keys, path: Path, signals: Mapping[str, list[str]], time: str | None, own: Keys
@@ -287,8 +356,39 @@ class SessionReader:
             wanted[time] = own.at("time")
         return file.table(wanted), named
 
+    def _scan(self) -> Scan:
+        """What all rows say of the sensors, in a pass over them; once.
+
+        Raises
+        ------
+        BadData
+            As `Scan.finish`, and where values are no numbers.
+        """
+        if self._scanned is not None:
+            return self._scanned
+        clocks = {id(plan.clock): plan.clock for plan in self._plans.values()}
+        times = {key: clock.time[clock.row >= 0] for key, clock in clocks.items()}
+        scan = Scan()
+        for first in range(0, max(map(len, times.values())), _SCAN_ROWS):
+            rows = slice(first, first + _SCAN_ROWS)
+            tables = {plan.table: self._tables[plan.table][rows] for plan in self._plans.values()}
+            blocks = {}
+            for segment, plan in self._plans.items():
+                values = []
+                for name, names in plan.signals.items():
+                    read = columns(
+                        tables[plan.table], names, str(plan.path), f"{self.path}: {plan.place}.{name}", first
+                    )
+                    values.append(read * plan.units.get(name, 1.0))
+                blocks[segment] = times[id(plan.clock)][rows], np.column_stack(values)
+            scan.push(blocks)
+        scan.finish(str(self.path), next(iter(self.phases.get("start", ())), None))
+        self._scanned = scan
+        return scan
+
     def recording(self, first: int, last: int) -> Recording:
         """The recording from sample `first` of the common time to before `last`, checked."""
+        scan = self._scan()
         time = self.time[first:last]
         windows = {segment: self._window(plan, first, last) for segment, plan in self._plans.items()}
         rows: dict[str, slice] = {}
@@ -323,7 +423,7 @@ class SessionReader:
             rate_hz=self.rate_hz,
             sensors=sensors,
             phases=self._head.phases if whole else _within(self._head.phases, time),
-            notes=(*self._notes, *gap_notes),
+            notes=(*self._notes, *scan.notes(), *gap_notes),
         )
         check(recording)
         begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
@@ -346,6 +446,11 @@ class SessionReader:
             name: self._signal(plan, name, clock, table, first_row) for name in plan.signals
         }  # (values, good) each
         marks = {}
+        segment = plan.place.removeprefix("sensors.")
+        faults = self._scan().faults.get(segment, [])
+        frozen = np.zeros(len(clock.time), dtype=bool)
+        for fault in faults:
+            frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
         for name, (_, good) in found.items():
             place = f"{plan.path}: {plan.place}.{name}"
             lost_a_while = self.gaps and len(clock.time) < len(plan.clock.time) and name != "orientation"
@@ -359,14 +464,17 @@ class SessionReader:
                     f"{place}: {last - first} samples without numbers, {(last - first) * clock.step:.3f} s from "
                     f"{clock.time[first]:.3f} s; {_too_long(clock)}"
                 )
+            if frozen.any():
+                marks[name] = lost_samples(clock, good & ~frozen)
         every = np.max(list(marks.values()), axis=0)
-        gap = every == LONG if self.gaps else None
+        gap = every == LONG if self.gaps or faults else None
         if "orientation" in found:
             quat = bridge_quat(found["orientation"][0], marks["orientation"], clock)
             return Sensor(quat_WS=quat, stated_quat_LS=plan.mount, gap=gap, aligned=plan.aligned), every
         gyro_S = bridge(found["gyro"][0], marks["gyro"], clock, rate=True)
         accel_S = bridge(found["accel"][0], marks["accel"], clock)
-        return Sensor(gyro_S=gyro_S, accel_S=accel_S, stated_quat_LS=plan.mount, gap=gap), every
+        gyro_range = self._scan().sensors[segment].gyro_range
+        return Sensor(gyro_S=gyro_S, accel_S=accel_S, stated_quat_LS=plan.mount, gap=gap, gyro_range=gyro_range), every
 
     def _signal(
         self, plan: _Plan, name: str, clock: Clock, table: pl.DataFrame, first_row: int
@@ -398,6 +506,20 @@ class SessionReader:
                 f"{clock.row[odd[0]] + 1}; a unit quaternion is needed, columns in the order x, y, z, w"
             )
         return values / np.where(good, norm, np.nan)[:, None], good
+
+
+def _useless(key: str) -> str:
+    """Why a key that is known does nothing here."""
+    if key in ("time", "time_unit"):
+        return "no sensor here has times in a column: the format knows its own, or rate_hz stands for them"
+    return {
+        "file": "every sensor names a file of its own",
+        "rate_hz": "every sensor has a time of its own",
+        "gyro_unit": "the format of every sensor here knows its units",
+        "accel_unit": "the format of every sensor here knows its units",
+        "format": "no sensor here is read by it: they state columns, or a format of their own",
+        "use": "no sensor here is of a format that holds both; state the columns that are wanted",
+    }[key]
 
 
 def _within(phases: Mapping[str, Intervals], time: np.ndarray) -> dict[str, Intervals]:

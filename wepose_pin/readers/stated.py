@@ -27,7 +27,8 @@ class Stated(NamedTuple):
 def sensor_stated(keys: Keys) -> Stated:
     """Columns by signal, the mount, and whether the orientations are the segment's own."""
     keys.allow(
-        *("gyro", "accel", "orientation", "mount", "file", "time", "rate_hz", "offset_s", "format", "label", "aligned")
+        *("gyro", "accel", "orientation", "mount", "file", "time", "time_unit", "rate_hz", "offset_s"),
+        *("format", "label", "aligned"),
     )
     mount = _mount(keys.table("mount")) if "mount" in keys else None
     aligned = keys.values.get("aligned")
@@ -36,10 +37,11 @@ def sensor_stated(keys: Keys) -> Stated:
     named = [key for key in WIDTHS if key in keys]
     if not named:
         return Stated(None, mount, aligned)
-    if "label" in keys:
-        raise BadSession(
-            f"{keys.at('label')} stands beside {named[0]}; a known format has a label, a table has columns"
-        )
+    for key in ("label", "format"):
+        if key in keys:
+            raise BadSession(
+                f"{keys.at(key)} stands beside {named[0]}; a known format has a {key}, a table has columns"
+            )
     if "orientation" not in keys:
         return Stated({"gyro": _names(keys, "gyro"), "accel": _names(keys, "accel")}, mount, aligned)
     if "gyro" in keys or "accel" in keys:

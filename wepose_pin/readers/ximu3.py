@@ -22,8 +22,10 @@ UNITS = ("(deg/s)",) * 3 + ("(g)",) * 3
 STANDARD_GRAVITY = 9.80665  # [m/s²]
 
 
-def read_ximu3(path: Path, use: str | None = None) -> Device:
+def read_ximu3(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """A device's folder, or one of its two files; Inertial.csv where it is there, unless `use` asks for "orientation".
+
+    `rate_hz` goes before the file's own times.
 
     Raises
     ------
@@ -42,7 +44,7 @@ def read_ximu3(path: Path, use: str | None = None) -> Device:
         file = there[0]
     first = next((name for name in TIMES if _has(file, name)), "Timestamp (us)")
     text = read_text(file, first, "a CSV of an x-IMU3")
-    time = TIMES[first] * text.numbers([first])[:, 0]
+    time = np.arange(text.cells.height) / rate_hz if rate_hz else TIMES[first] * text.numbers([first])[:, 0]
     names = tuple(f"{name} {unit}" for name, unit in zip(RAW, UNITS, strict=True))
     if names in text:
         numbers = text.numbers(names)

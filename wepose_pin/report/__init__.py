@@ -6,8 +6,22 @@ from importlib import import_module
 from typing import Any
 
 # Loaded on first use: who tracks does not wait for the rooms of the calibration.
-_WHERE = {"calibration_report": "calibration", "track_report": "track", "unsaid": "calibration"}
-__all__ = ["calibration_report", "track_report", "unsaid"]
+_WHERE = {
+    "calibration_report": "calibration",
+    "track_report": "track",
+    "unsaid": "calibration",
+    "write_calibration_page": "pages",
+    "write_thinned_pages": "pages",
+    "write_track_pages": "pages",
+}
+__all__ = [
+    "calibration_report",
+    "track_report",
+    "unsaid",
+    "write_calibration_page",
+    "write_thinned_pages",
+    "write_track_pages",
+]
 
 
 def __getattr__(name: str) -> Any:

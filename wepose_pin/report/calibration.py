@@ -18,7 +18,7 @@ from ..calibration.verdict import Verdict
 from ..calibration.weighing import TOUCHED
 from ..errors import WeposeError
 from ..filters import BEST
-from ..page import Banner, Block, Bullets, Facts, Frame, Heading, Table, as_html, capital
+from ..page import Banner, Block, Bullets, Facts, Frame, Heading, Sections, Table, as_html, capital, reason
 from ..pose import Pose
 from ..recording import Recording, axes_from_mount, mount_from_axes
 from ..subject import Subject, mount_rows
@@ -59,6 +59,7 @@ def calibration_report(
     method: str = BEST,
     protocol: str | Path | Protocol = "clasp",
     gauge_std: float = GAUGE_STD,
+    failures: list[str] | None = None,
 ) -> str:
     """``report.html``: one page that opens offline and prints; equal arguments give equal text.
 
@@ -67,14 +68,18 @@ def calibration_report(
     verdict : of `judge`, or "pass", "poor" or "fail" and its reasons in words; None: the page gives none
     pose : the recording tracked with the calibrated subject, for the hands and the 3D view; None: it is tracked here
     method, protocol, gauge_std : as the calibration was run
+    failures : takes a line for each section that cannot be made; the page says so in its place
     """
     contact = _contact(protocol if isinstance(protocol, Protocol) else load_protocol(protocol))
     trouble = ""
     if pose is None:
         try:
             pose = track(recording, calibration.subject, method=method)
-        except WeposeError as error:
+        except Exception as error:
             trouble = f"Without the tracked motion, hence without hand positions and 3D view: {error}"
+            if not isinstance(error, WeposeError) and failures is not None:
+                failures.append(f"the motion cannot be tracked: {reason(error)}")
+    sections = Sections(failures)
     blocks: list[Block] = [Heading(f"Calibration of {recording.name or 'a recording'}", 1)]
     if verdict is not None:
         grade, reasons = verdict if isinstance(verdict, tuple) else (verdict.grade, verdict.in_words())
@@ -86,17 +91,17 @@ def calibration_report(
     if notes:
         blocks.append(Banner("note", "What to know" if len(notes) > 1 else "One thing to know", notes))
     blocks += [
-        Bullets(_in_short(calibration, contact)),
+        *sections("In short", lambda: [Bullets(_in_short(calibration, contact))]),
         "± is one standard deviation throughout: two times out of three the truth lies within.",
-        *_lengths(calibration, contact),
-        *_sensors(calibration, recording),
-        *_gap(calibration, contact),
-        *(_hands(calibration, contact, pose) if pose is not None else []),
-        *_posture(calibration),
-        *_elbows(calibration),
-        *(_view(calibration, recording, pose) if pose is not None else []),
-        *(_findings(verdict, contact) if isinstance(verdict, Verdict) else []),
-        *_run(calibration, recording, contact, method, gauge_std),
+        *sections("Lengths", lambda: _lengths(calibration, contact)),
+        *sections("Sensors", lambda: _sensors(calibration, recording)),
+        *sections(f"{capital(contact.gap)} over time", lambda: _gap(calibration, contact)),
+        *sections("Where the motion was informative", lambda: _hands(calibration, contact, pose) if pose else []),
+        *sections("The start pose", lambda: _posture(calibration)),
+        *sections("The elbows as hinges", lambda: _elbows(calibration)),
+        *sections("The motion in 3D", lambda: _view(calibration, recording, pose) if pose else []),
+        *sections("Behind the verdict", lambda: _findings(verdict, contact) if isinstance(verdict, Verdict) else []),
+        *sections("What was run", lambda: _run(calibration, recording, contact, method, gauge_std)),
     ]
     return as_html(blocks, f"Calibration of {recording.name}" if recording.name else "Calibration")
 
@@ -263,7 +268,7 @@ def _hands(calibration: Calibration, contact: _Contact, pose: Pose) -> list[Bloc
     reach = reach - np.mean([pose.points[name][at] for name in shoulders], axis=0)
     reach = Rotation.from_quat(pose.quat_WL["torso"][at]).inv().apply(reach)
     share = np.mean(told, axis=0)[order]
-    touched = calibration.kept[order] >= TOUCHED
+    touched = (calibration.kept[order] >= TOUCHED) & np.isfinite(reach).all(axis=1)
     if not touched.any():
         return []
     arm = np.mean([[lengths[f"{name[:-5]}_{part}"] for part in PARTS] for name in contact.hands]) * len(PARTS)

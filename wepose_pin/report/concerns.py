@@ -11,7 +11,7 @@ import numpy as np
 from ..page import capital
 from ..readers.plausibility import GRAVITY
 from ..tracking import TrackedPose
-from .measures import BENT, Budget, Elbow, Signal, between, longest
+from .measures import BENT, Budget, Elbow, Hand, Signal, between, from_start, largest, longest
 from .words import listed, plain
 
 GRAVITY_OFF = 0.02
@@ -22,6 +22,7 @@ LATE_START_S = 10.0
 LOST = 0.01  # share of samples
 JITTER = 0.2  # of a step, one standard deviation
 HEADING = np.deg2rad(10.0)  # one standard deviation, between the segments of a joint
+PLACE = 0.1  # [m], one standard deviation of a hand: what 10 deg of heading do at the end of an arm
 TURNED_DEG = 10.0  # by which elbows and joined hands turned a heading
 # An elbow: what the start pose calls straight is bent by some 5 to 15 deg, and few elbows open by more than 10 beyond.
 BACKWARD, FOLDED = np.deg2rad(-20.0), np.deg2rad(160.0)
@@ -71,6 +72,7 @@ def concerns(
     signals: Mapping[str, Signal],
     budgets: Mapping[str, Budget],
     elbows: Mapping[str, Elbow],
+    hands: Mapping[str, Hand],
     warnings: list[str],
 ) -> list[Concern]:
     """The grave ones first; `warnings` are those of the pose's summary."""
@@ -79,6 +81,8 @@ def concerns(
         *(_of_warning(text) for text in warnings),
         *_of_signals(pose, signals, "\n".join(warnings)),
         *_of_headings(pose, budgets),
+        *_of_hands(pose, hands),
+        *_of_the_time_before(pose, budgets, hands),
         *_of_elbows(pose.recording.rate_hz, elbows),
         *_of_subject(pose),
     ]
@@ -181,7 +185,8 @@ def _of_signals(pose: TrackedPose, signals: Mapping[str, Signal], told: str) -> 
 
 
 def _of_headings(pose: TrackedPose, budgets: Mapping[str, Budget]) -> Iterator[Concern]:
-    wide = {joint: float(std.max()) for joint, std in between(budgets).items() if std.max() > HEADING}
+    since = from_start(pose)
+    wide = {joint: most for joint, std in between(budgets).items() if (most := largest(std[since])) > HEADING}
     if wide:
         worst = max(wide, key=wide.__getitem__)
         others = f", and of {len(wide) - 1} more joint{'s' * (len(wide) > 2)} by over {np.degrees(HEADING):.0f}°"
@@ -201,6 +206,42 @@ def _of_headings(pose: TrackedPose, budgets: Mapping[str, Budget]) -> Iterator[C
             + listed([f"{plain(name)} by {value:.0f}°" for name, value in turned.items()]),
             "What they cannot see stays uncertain. Let the person rest more often, and warm the sensors up before.",
         )
+
+
+def _of_hands(pose: TrackedPose, hands: Mapping[str, Hand]) -> Iterator[Concern]:
+    since = from_start(pose)
+    wide = {name: most for name, hand in hands.items() if (most := _largest_mm(hand, since)) > 1e3 * PLACE}
+    if wide:
+        each = [f"the {plain(name)} by ± {most:.0f} mm" for name, most in wide.items()]
+        yield Concern(True, f"places may be off: {listed(each)}", hold(pose))
+
+
+def _of_the_time_before(
+    pose: TrackedPose, budgets: Mapping[str, Budget], hands: Mapping[str, Hand]
+) -> Iterator[Concern]:
+    """What is less certain before the start pose than ever after it."""
+    since = from_start(pose)
+    headings = [np.degrees([largest(std[~since]), largest(std[since])]) for std in between(budgets).values()]
+    places = [np.array([_largest_mm(hand, ~since), _largest_mm(hand, since)]) for hand in hands.values()]
+    said = [
+        f"{what} ± {worst:.0f}{unit}"
+        for what, of, unit, limit in (
+            ("headings between neighbours", headings, "°", np.degrees(HEADING)),
+            ("the hands", places, " mm", 1e3 * PLACE),
+        )
+        if (worst := max((float(before) for before, after in of if before > max(after, limit)), default=0.0))
+    ]
+    if said:
+        seconds = float(pose.time[np.argmax(since)] - pose.time[0])
+        yield Concern(
+            False,
+            f"the pose is less certain in the {seconds:.3g} s before the start pose: {' and '.join(said)}",
+            "Use the motion from the start pose on; the ± summed up below counts from there.",
+        )
+
+
+def _largest_mm(hand: Hand, which: np.ndarray) -> float:
+    return 1e3 * largest(hand.std[which]) if hand.std is not None else float("nan")
 
 
 def hold(pose: TrackedPose) -> str:
@@ -231,7 +272,7 @@ def _of_elbows(rate_hz: float, elbows: Mapping[str, Elbow]) -> Iterator[Concern]
         if np.count_nonzero(folded) / rate_hz > LASTING_S:
             yield Concern(
                 True,
-                f"the {side} elbow is bent by {np.degrees(elbow.bend.max()):.0f}°, more than an elbow can",
+                f"the {side} elbow is bent by {np.degrees(largest(elbow.bend)):.0f}°, more than an elbow can",
                 "Check the mounts of the two sensors, and whether one slipped.",
             )
         aside = (elbow.bend > BENT) & (np.abs(elbow.aside) > ASIDE)

@@ -164,7 +164,7 @@ def gap_picture(
         touched = ~np.any([(time >= a) & (time <= b) for a, b in apart] or [np.zeros(len(time), bool)], axis=0)
         usual = np.concatenate([gap[touched], prior_gap[touched]]) * 1e3 if touched.any() else shown
         usual = usual[np.isfinite(usual)]
-        top.set_ylim(0.0, 1.12 * float(usual.max()) if len(usual) else 1.0)  # the palms apart may leave the picture
+        top.set_ylim(0.0, 1.12 * max(float(usual.max(initial=0.0)), 1.0))  # the palms apart may leave the picture
         handles: list[Any] = [
             Line2D([], [], color=BEFORE, linestyle=(0, (4, 1.5)), label="with the average person's lengths"),
             Line2D([], [], color=ACCENT, label="with the lengths found"),

@@ -8,7 +8,7 @@ from ..angles import JointAngles, joint_angles, summary
 from ..errors import BadData
 from ..page import Block, Heading, Table
 from ..tracking import TrackedPose
-from .measures import stated_mounts
+from .measures import stated_mounts, usual
 from .track_figures import Angle, angles_picture
 from .words import plain, whole
 
@@ -52,10 +52,10 @@ def joint_angle_section(pose: TrackedPose) -> list[Block]:
     for joint, found in summary(angles).items():
         stds = angles[joint].std
         for k, name in enumerate(angles[joint].names):
-            usual = f"± {np.degrees(np.nanmedian(stds[:, k])):.1f}°" if stds is not None else "not known"
+            std = np.degrees(usual(stds[:, k])) if stds is not None else np.nan
             ends = [f"{whole(np.degrees(value))}°" for value in (found.lowest[k], found.highest[k], found.range[k])]
             if not np.isfinite(found.range[k]):
-                ends = ["", "", ""]
+                ends = ["", "", ""]  # every sample is in a gap or near the lock, as of an arm that hangs
             elif found.range[k] >= FULL_TURN and found.near_lock:
                 ends = ["", "", "all round"]
             lines.append(
@@ -63,7 +63,7 @@ def joint_angle_section(pose: TrackedPose) -> list[Block]:
                     f"{plain(joint)}, {plain(name)}",
                     *ends,
                     f"{np.degrees(found.peak_rate[k]):.0f} °/s" if np.isfinite(found.peak_rate[k]) else "",
-                    usual,
+                    f"± {std:.1f}°" if np.isfinite(std) else "not known",
                     f"{100 * found.near_lock:.0f} %" if k != 1 else "",
                 ]
             )

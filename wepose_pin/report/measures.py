@@ -73,6 +73,24 @@ def signal_of(recording: Recording, name: str, pose: TrackedPose) -> Signal:
     )
 
 
+def largest(values: np.ndarray) -> float:
+    """The largest of the finite values; NaN where there is none."""
+    return float(np.max(values, initial=-np.inf, where=np.isfinite(values))) if np.isfinite(values).any() else np.nan
+
+
+def usual(values: np.ndarray) -> float:
+    """The median of the finite values; NaN where there is none."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def from_start(pose: TrackedPose) -> np.ndarray:
+    """(n,) bool, the samples from the start pose on: only of these the stated uncertainties are summed up."""
+    assert pose.segments is not None
+    since = pose.time >= pose.segments.start[0] - 1e-9
+    return since if since.any() else ~since
+
+
 def longest(which: np.ndarray, rate_hz: float) -> float:
     """The longest run of true values [s]."""
     return max((b - a for a, b in runs(which)), default=0) / rate_hz
@@ -127,7 +145,7 @@ def between(budgets: Mapping[str, Budget]) -> dict[str, np.ndarray]:
 
 
 class Elbow(NamedTuple):
-    """An elbow over time, from the directions of upper arm and forearm."""
+    """An elbow over time, from the directions of upper arm and forearm; NaN where one of them is not known."""
 
     bend: np.ndarray  # (n,) [rad] between the two, 0 in line
     std: np.ndarray | None  # (n,) [rad]; None where the filter has no covariance
@@ -140,7 +158,10 @@ def elbow_of(pose: Pose, side: str, subject: Subject | None = None) -> Elbow | N
     names = f"{side}_upper_arm", f"{side}_forearm"
     if not set(names) <= set(pose.quat_WL):
         return None
-    R_U, R_F = (Rotation.from_quat(pose.quat_WL[name]) for name in names)
+    known: np.ndarray = np.all([np.isfinite(pose.quat_WL[name]).all(axis=1) for name in names], axis=0)
+    if not known.any():
+        return None
+    R_U, R_F = (_rotations(pose.quat_WL[name], known) for name in names)
     upper_W, fore_W = (R.apply([0.0, 0.0, -1.0]) for R in (R_U, R_F))
     axis_W = np.cross(upper_W, fore_W)
     sine = np.linalg.norm(axis_W, axis=1)
@@ -157,7 +178,10 @@ def elbow_of(pose: Pose, side: str, subject: Subject | None = None) -> Elbow | N
     ahead_U = np.cross(axis_U, [0.0, 0.0, 1.0])
     fore_U = R_U.inv().apply(fore_W)
     forward = np.arctan2(fore_U @ (ahead_U / np.linalg.norm(ahead_U)), -fore_U[:, 2])
-    return Elbow(bend, std, forward, np.arcsin(np.clip(fore_U @ axis_U, -1.0, 1.0)))
+    aside = np.arcsin(np.clip(fore_U @ axis_U, -1.0, 1.0))
+    for values in (bend, forward, aside):
+        values[~known] = np.nan
+    return Elbow(bend, std, forward, aside)
 
 
 # Hands ----------------------------------------------------------------------------------------------------------------
@@ -166,7 +190,7 @@ def elbow_of(pose: Pose, side: str, subject: Subject | None = None) -> Elbow | N
 class Hand(NamedTuple):
     """Where a hand went."""
 
-    reach: np.ndarray  # (n, 3) [m] from the middle of the shoulders, in the torso's frame
+    reach: np.ndarray  # (n, 3) [m] from the middle of the shoulders, in the torso's frame; NaN where not known
     std: np.ndarray | None  # (n,) [m], one axis, from the root; None where the filter has no covariance
     peak_speed: float  # [m/s]
 
@@ -177,18 +201,27 @@ def hands_of(pose: Pose, rate_hz: float) -> dict[str, Hand]:
     if not {"left_shoulder", "right_shoulder"} <= set(points) or "torso" not in pose.quat_WL:
         return {}
     middle = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
-    R_LW = Rotation.from_quat(pose.quat_WL["torso"]).inv()
+    known = np.isfinite(pose.quat_WL["torso"]).all(axis=1)
+    R_LW = _rotations(pose.quat_WL["torso"], known).inv()
     found = {}
     for name in ("left_hand", "right_hand"):
         if name not in points:
             continue
         reach = R_LW.apply(points[name] - middle)
+        reach[~known] = np.nan
+        if not np.isfinite(reach).all(axis=1).any():
+            continue
         size = max(1, round(PEAK_OVER_S * rate_hz))
         moved = reach[size:] - reach[:-size]
-        peak = float(np.linalg.norm(moved, axis=1).max(initial=0.0)) * rate_hz / size
+        peak = float(np.nan_to_num(np.linalg.norm(moved, axis=1)).max(initial=0.0)) * rate_hz / size
         std = spread(pose.point_cov[name]) if name in pose.point_cov else None
         found[name] = Hand(reach, std, peak)
     return found
+
+
+def _rotations(quat: np.ndarray, known: np.ndarray) -> Rotation:
+    """Rotations of quaternions (n, 4), the identity where they are not `known`."""
+    return Rotation.from_quat(np.where(known[:, None], quat, [0.0, 0.0, 0.0, 1.0]))
 
 
 def _rms(cov: np.ndarray) -> float:

@@ -61,9 +61,16 @@ class Thinner:
         self._peak_speed: dict[str, float] = {}
         self._steps = (np.inf, 0.0)
         self._last = np.nan  # [s]
+        self._error: Exception | None = None
 
     def add(self, piece: TrackedPose) -> None:
-        """The next piece."""
+        """The next piece. What fails here is kept for `thinned`: it must not stop what the pieces are for."""
+        try:
+            self._add(piece)
+        except Exception as error:
+            self._error = self._error or error
+
+    def _add(self, piece: TrackedPose) -> None:
         recording = piece.recording
         assert recording is not None
         at = np.arange(-self._seen % self._every, len(recording), self._every)
@@ -78,7 +85,12 @@ class Thinner:
             self._kept.append(_rows(piece, at, recording.rate_hz / self._every))
 
     def thinned(self, phases: Mapping[str, Intervals], warnings: list[str]) -> tuple[TrackedPose, Whole]:
-        """The pose, and what it no longer tells; `phases` and `warnings` of the whole recording."""
+        """The pose, and what it no longer tells; `phases` and `warnings` of the whole recording.
+
+        Raises the first error of `add`, of any kind.
+        """
+        if self._error is not None:
+            raise self._error
         last = self._kept[-1]
         assert last.recording is not None
         pose = _joined(self._kept, phases)

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..page import Banner, Block, Bullets, Facts, Frame, Heading, Table, as_html
-from ..pose import deviation
+from ..page import Banner, Block, Bullets, Facts, Frame, Heading, Sections, Table, as_html
+from ..pose import deviation, spread
 from ..recording import Recording, Sensor
 from ..tracking import TrackedPose
 from ..viewer import pose_html
@@ -19,10 +19,13 @@ from .measures import (
     Signal,
     between,
     elbow_of,
+    from_start,
     hands_of,
     heading_budgets,
+    largest,
     longest,
     stated_mounts,
+    usual,
 )
 from .thinned import Whole, whole_of
 from .track_figures import (
@@ -39,7 +42,9 @@ MOST_FRAMES = 5000  # of the 3D view
 LARGEST_VIEW = 3_000_000  # of a view that comes ready, in characters
 
 
-def track_report(pose: TrackedPose, *, view: str | None = None, whole: Whole | None = None) -> str:
+def track_report(
+    pose: TrackedPose, *, view: str | None = None, whole: Whole | None = None, failures: list[str] | None = None
+) -> str:
     """``report.html``: one page that opens offline and prints; equal arguments give equal text.
 
     Its size does not grow with the recording's length.
@@ -49,6 +54,7 @@ def track_report(pose: TrackedPose, *, view: str | None = None, whole: Whole | N
     pose : of `track`
     view : the page of `pose_html` where it is made already, to be shown here unless it is large; None: it is made here
     whole : of a `pose` that `Thinner` thinned
+    failures : takes a line for each section that cannot be made; the page says so in its place
     """
     recording = pose.recording
     assert recording is not None
@@ -61,26 +67,28 @@ def track_report(pose: TrackedPose, *, view: str | None = None, whole: Whole | N
         name: hand._replace(peak_speed=whole.peak_speed[name])
         for name, hand in hands_of(pose, recording.rate_hz).items()
     }
+    thinned = (
+        f"Times, angles and places are shown of {len(recording)} samples, one in "
+        f"{whole.samples / len(recording):.0f}; extremes, rest and what was lost are of all."
+    )
+    sections = Sections(failures)
     blocks: list[Block] = [
         Heading(f"Motion of {recording.name or 'a recording'}", 1),
-        _looked_at(concerns(pose, signals, budgets, elbows, whole.warnings)),
-        Bullets(_in_short(pose, whole, budgets)),
+        *sections(
+            "What to look at", lambda: [_looked_at(concerns(pose, signals, budgets, elbows, hands, whole.warnings))]
+        ),
+        *sections("In short", lambda: [Bullets(_in_short(pose, whole, budgets))]),
+        *([thinned] if whole.samples > len(recording) else []),
         "± is one standard deviation throughout: two times out of three the truth lies within, 19 times out of 20 "
         "within twice as much.",
-        *_recorded(recording, whole),
-        *_noise(signals),
-        *_drift(pose, budgets),
-        *_hands(pose, hands),
-        *joint_angle_section(pose),
-        *_view(pose, view),
-        *_run(pose),
+        *sections("What was recorded", lambda: _recorded(recording, whole)),
+        *sections("Noise and bias", lambda: _noise(signals)),
+        *sections("Drift of the headings", lambda: _drift(pose, budgets)),
+        *sections("The hands", lambda: _hands(pose, hands)),
+        *sections("Joint angles", lambda: joint_angle_section(pose)),
+        *sections("The motion in 3D", lambda: _view(pose, view)),
+        *sections("What was run", lambda: _run(pose)),
     ]
-    if whole.samples > len(recording):
-        blocks.insert(
-            3,
-            f"Times, angles and places are shown of {len(recording)} samples, one in "
-            f"{whole.samples / len(recording):.0f}; extremes, rest and what was lost are of all.",
-        )
     return as_html(blocks, f"Motion of {recording.name}" if recording.name else "Motion")
 
 
@@ -105,18 +113,19 @@ def _in_short(pose: TrackedPose, whole: Whole, budgets: Mapping[str, Budget]) ->
     assert pose.subject is not None
     seconds = float(recording.time[-1] - recording.time[0])
     said = [f"**{_duration(seconds)}** at {whole.rate_hz:g} Hz from {len(whole.signals)} sensors."]
-    pairs = between(budgets)
+    since = from_start(pose)
+    pairs = {joint: std[since] for joint, std in between(budgets).items()}
     if pairs:
-        worst = max(pairs, key=lambda joint: float(pairs[joint].max()))
+        worst = max(pairs, key=lambda joint: largest(pairs[joint]))
         said.append(
-            f"Headings: known at every joint to **± {np.degrees(pairs[worst].max()):.1f}°** or better (worst: the "
+            f"Headings: known at every joint to **± {np.degrees(largest(pairs[worst])):.1f}°** or better (worst: the "
             f"{worst}); tilt is held by gravity."
         )
-    stds = {name: np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3.0) for name, cov in pose.point_cov.items()}
+    stds = {name: spread(cov[since]) for name, cov in pose.point_cov.items()}
     seen = [name for name in ("left_hand", "right_hand") if name in stds]
     if seen:
-        usual = listed([f"{plain(name)} ± {1e3 * np.median(stds[name]):.0f} mm" for name in seen])
-        said.append(f"Positions, each axis, counted from between the hips, half of the time better than: {usual}.")
+        half = listed([f"{plain(name)} ± {1e3 * usual(stds[name]):.0f} mm" for name in seen])
+        said.append(f"Positions, each axis, counted from between the hips, half of the time better than: {half}.")
     said.append(f"Lengths: {plain(pose.subject.note or pose.subject.name)}.")
     return said
 
@@ -172,6 +181,7 @@ def _noise(signals: Mapping[str, Signal]) -> list[Block]:
 
 def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> list[Block]:
     title = Heading("Drift of the headings")
+    since = from_start(pose)
     recording = pose.recording
     assert recording is not None
     if not budgets:
@@ -197,6 +207,8 @@ def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> list[Block]:
     without = [plain(name) for name in recording.sensors if name not in budgets]
     if without:
         text.append(f"Of {listed(without)} it is not known: ready orientations.")
+    if before := _counted(pose):
+        text.append(f"What is summed up here{before}.")
     text.append(
         "A mount that is stated and not calibrated counts as exact: a sensor turned by 5° about the vertical turns its "
         "segment by 5° more than is said here."
@@ -206,7 +218,7 @@ def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> list[Block]:
     lines = [
         [
             plain(name),
-            degrees(float(np.degrees(budget.std.max()))),
+            degrees(float(np.degrees(largest(budget.std[since])))),
             degrees(float(np.degrees(budget.std[-1]))),
             degrees(float(np.degrees(budget.filter_end))),
             f"{np.degrees(budget.growth):.2f} °/min" if np.isfinite(budget.growth) else "never in motion",
@@ -214,8 +226,8 @@ def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> list[Block]:
         for name, budget in budgets.items()
     ]
     pairs = [
-        [joint, degrees(float(np.degrees(np.median(std)))), degrees(float(np.degrees(std.max())))]
-        for joint, std in between(budgets).items()
+        [joint, degrees(float(np.degrees(usual(std)))), degrees(float(np.degrees(largest(std))))]
+        for joint, std in ((joint, std[since]) for joint, std in between(budgets).items())
     ]
     picture = headings_picture(
         recording.time,
@@ -233,9 +245,17 @@ def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> list[Block]:
     return blocks
 
 
+def _counted(pose: TrackedPose) -> str:
+    """A clause on the time that uncertainties are summed up over, where it is not all."""
+    before = float(pose.time[np.argmax(from_start(pose))] - pose.time[0])
+    return f" counts from the start pose on, without the {_duration(before)} before" if before >= 1.0 else ""
+
+
 def _worst(pose: TrackedPose, budgets: Mapping[str, Budget]) -> str:
-    name = max(budgets, key=lambda name: float(budgets[name].std.max()))
-    std = budgets[name].std
+    since = from_start(pose)
+    stds = {name: np.where(since, budget.std, 0.0) for name, budget in budgets.items()}
+    name = max(stds, key=lambda name: largest(stds[name]))
+    std = np.nan_to_num(stds[name])
     at = int(np.argmax(std))
     said = f"**The {plain(name)}'s heading may be off by ± {np.degrees(std[at]):.1f}°**"
     said += f" {_duration(float(pose.time[at] - pose.time[0]))} after the beginning, the most of all."
@@ -253,30 +273,33 @@ def _hands(pose: TrackedPose, hands: Mapping[str, Hand]) -> list[Block]:
     if not hands:
         return []
     assert pose.subject is not None
+    since = from_start(pose)
     lines = []
     for name, hand in hands.items():
-        low, high = np.percentile(100 * hand.reach, [1.0, 99.0], axis=0)
-        usual, largest = ("not known", "not known")
+        low, high = np.nanpercentile(100 * hand.reach, [1.0, 99.0], axis=0)
+        half, most = ("not known", "not known")
         if hand.std is not None:
-            usual, largest = (f"± {1e3 * float(of(hand.std)):.0f} mm" for of in (np.median, np.max))
+            half, most = (f"± {whole(1e3 * of(hand.std[since]))} mm" for of in (usual, largest))
         lines.append(
             [
                 plain(name),
                 *(f"{whole(a)} to {whole(b)}" for a, b in zip(low, high, strict=True)),
                 f"{hand.peak_speed:.1f} m/s",
-                usual,
-                largest,
+                half,
+                most,
             ]
         )
+    after = (
+        "Ranges hold 98 % of the time; the fastest is over a tenth of a second. The ± is of one axis and counted from "
+        "between the hips, so that the trunk's lean and length are in it."
+    )
+    if before := _counted(pose):
+        after += f" The ±{before}."
     rigid = [plain(name) for name in hands if name not in pose.quat_WL]
     text = "Middle of the palm, from the middle of the shoulders along the torso's own axes."
     if rigid:
         text += f" Without a sensor on it a hand is taken as straight with its forearm: {listed(rigid)}."
     header = ["", "forwards [cm]", "to the left [cm]", "above shoulders [cm]", "fastest", "usual ±", "largest ±"]
-    after = (
-        "Ranges hold 98 % of the time; the fastest is over a tenth of a second. The ± is of one axis and counted from "
-        "between the hips, so that the trunk's lean and length are in it."
-    )
     lengths = pose.subject.lengths
     return [
         Heading("The hands"),

@@ -16,7 +16,7 @@ from ..page import ACCENT, INK, LINE, SOFT, STYLE, Picture, new_figure, png_of
 from ..readers.clocks import runs
 from ..viewer import LEFT_COLOUR, OTHER_COLOUR, RIGHT_COLOUR
 from .drawing import BEFORE, HATCHED, above, body, envelope, line_of
-from .measures import Hand, Signal
+from .measures import Hand, Signal, largest
 from .words import plain
 
 PHASE: dict[str, Any] = {"facecolor": "#f6ecc8", "linewidth": 0.0}
@@ -136,7 +136,7 @@ def headings_picture(
         for name, values in std_deg.items():
             axes.plot(*envelope(time, values), **line_of(name))
         axes.set_xlim(time[0], time[-1])
-        axes.set_ylim(0.0, 1.06 * max(0.1, *(float(values.max()) for values in std_deg.values())))
+        axes.set_ylim(0.0, 1.06 * max(0.1, *(largest(values) for values in std_deg.values())))
         axes.set_xlabel("time in the recording [s]")
         axes.set_ylabel("heading, ± [deg]")
         axes.grid(color=LINE, linewidth=0.7)

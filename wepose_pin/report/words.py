@@ -41,12 +41,14 @@ def plus_minus(value: float, std: float, unit: str, digits: int = 1) -> str:
 
 def signed(value: float) -> str:
     """A number with its sign, to a tenth."""
+    if not np.isfinite(value):
+        return "not known"
     return f"{value:+.1f}".replace("-", "−") if abs(value) >= 0.05 else "0.0"
 
 
 def whole(value: float) -> str:
     """A number without decimals, its minus a minus."""
-    return f"{round(float(value)):d}".replace("-", "−")
+    return f"{round(float(value)):d}".replace("-", "−") if np.isfinite(value) else "not known"
 
 
 def versions() -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,11 +18,13 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
+from ..arguments import check_arguments
 from ..errors import BadOption, NoSolution
 from ..pose import Pose
 from .collision import Shapes
+from .maps import find_map
 from .person import SMOOTHING_HZ, ArmTarget, Wish, bend_of, replace_rates, resampled, wish
-from .robot import Robot
+from .robot import Robot, load
 from .solver import Counts, Held, State, Stepper, Tasks, aims_at
 
 RATE_HZ = 100.0
@@ -91,7 +94,7 @@ class Trajectory:
 
 def retarget(
     pose: Pose,
-    robot: Robot,
+    robot: Robot | str | Path,
     *,
     rate_hz: float = RATE_HZ,
     tasks: Tasks | None = None,
@@ -104,6 +107,7 @@ def retarget(
 
     Parameters
     ----------
+    robot : as `load` gives it; or as `find_map` takes it, a name such as "panda" or a file: then with all its arms
     rate_hz : of the trajectory
     scale, smoothing_hz : as `wish`
     strict : refuse a motion that is too fast for the robot, in place of slowing it
@@ -116,6 +120,9 @@ def retarget(
     NoSolution
         `strict`, and the motion is too fast.
     """
+    check_arguments(retarget, locals())
+    if not isinstance(robot, Robot):
+        robot = load(find_map(str(robot)))
     if not 10.0 <= rate_hz <= 2000.0:
         raise BadOption(f"--rate-hz {rate_hz:g}: from 10 to 2000 samples a second")
     tasks, dt = tasks or Tasks(), 1.0 / rate_hz

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from ..arguments import NonNegative
 from ..errors import WeposeError
 from .collision import Shapes
 from .limits import acceleration_bounds, opening_bounds, usable
@@ -33,18 +34,18 @@ _NONE = np.empty((0, 0))
 class Tasks:
     """How much each task counts, against 1 m/s of the hand, and how fast an error is made good."""
 
-    position: float = 1.0  # a hand's velocity [m/s]
-    orientation: float = 0.02  # its rate [rad/s]: 1 rad/s counts as 0.14 m/s
-    swivel: float = 0.05  # the elbow's velocity about the line shoulder-hand [m/s]
-    posture: float = 2e-4  # a joint's velocity [rad/s] away from the rest posture
-    still: float = 5e-4  # a joint's velocity [rad/s]
-    smooth: float = 2e-3  # a joint's velocity step beyond that of the step before [rad/s]
-    gain: float = 12.0  # [1/s] of hand and elbow
-    posture_gain: float = 0.5  # [1/s]
-    brake: float = 8.0  # [m/s², rad/s²]: an error is made good no faster than this stops it
-    straight: float = 0.06  # [m] of the hand per rad/s: below it the arm counts as singular, and is damped
-    damping: float = 0.05  # at most, where it is singular
-    curved: float = 1.0  # how far an error damps the arm, as the path of its hand bends; 0: not at all
+    position: NonNegative = 1.0  # a hand's velocity [m/s]
+    orientation: NonNegative = 0.02  # its rate [rad/s]: 1 rad/s counts as 0.14 m/s
+    swivel: NonNegative = 0.05  # the elbow's velocity about the line shoulder-hand [m/s]
+    posture: NonNegative = 2e-4  # a joint's velocity [rad/s] away from the rest posture
+    still: NonNegative = 5e-4  # a joint's velocity [rad/s]
+    smooth: NonNegative = 2e-3  # a joint's velocity step beyond that of the step before [rad/s]
+    gain: NonNegative = 12.0  # [1/s] of hand and elbow
+    posture_gain: NonNegative = 0.5  # [1/s]
+    brake: NonNegative = 8.0  # [m/s², rad/s²]: an error is made good no faster than this stops it
+    straight: NonNegative = 0.06  # [m] of the hand per rad/s: below it the arm counts as singular, and is damped
+    damping: NonNegative = 0.05  # at most, where it is singular
+    curved: NonNegative = 1.0  # how far an error damps the arm, as the path of its hand bends; 0: not at all
 
 
 class Aim(NamedTuple):

@@ -7,6 +7,9 @@ from typing import Literal
 
 import numpy as np
 
+from ..arguments import check_fields
+from ..errors import BadOption
+
 
 @dataclass(frozen=True)
 class Imperfections:
@@ -70,17 +73,16 @@ class Imperfections:
     mount: Literal["stated", "any"] = "stated"
 
     def __post_init__(self) -> None:
+        check_fields(self, "")
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == "mount":
-                if value not in ("stated", "any"):
-                    raise ValueError(f"mount {value!r} must be 'stated' or 'any'")
-            elif not value >= 0.0 or ("range" in field.name and value == 0.0):
-                raise ValueError(f"{field.name} {value} must be above 0, or 0 for off (a range: infinity)")
+            off = np.inf if "range" in field.name else 0.0
+            if field.name != "mount" and value != off and not 0.0 < value < np.inf:
+                raise BadOption(f"{field.name} {value} must be above 0, or 0 for off (a range: infinity)")
         if self.bits and not np.isfinite([self.gyro_range_deg_s, self.accel_range_g]).all():
-            raise ValueError(f"bits {self.bits} need a finite gyro_range_deg_s and accel_range_g")
+            raise BadOption(f"bits {self.bits} need a finite gyro_range_deg_s and accel_range_g")
         if self.dropped > 0.2:
-            raise ValueError(f"dropped {self.dropped} must be at most 0.2: runs of 50 ms would meet")
+            raise BadOption(f"dropped {self.dropped} must be at most 0.2: runs of 50 ms would meet")
 
 
 PERFECT_WORLD = Imperfections()

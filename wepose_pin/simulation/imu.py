@@ -8,9 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
+from ..arguments import NonNegative, Positive
+from ..errors import BadOption
 from .imperfections import Imperfections
 
 GRAVITY = 9.81  # [m/s^2]
+_GYRO_DENSITY = np.deg2rad(0.007)  # [rad/s/sqrt(Hz)]
+_GYRO_BIAS_STD = np.deg2rad(0.2)  # [rad/s], turn-on, each axis
 LONGEST_RUN_S = 0.05  # of lost samples
 _MEAN_RUN_S = 0.02
 
@@ -28,13 +32,13 @@ class ImuNoise:
     assumption as well.
     """
 
-    gyro_density: float = np.deg2rad(0.007)  # [rad/s/sqrt(Hz)]
-    gyro_bias_std: float = np.deg2rad(0.2)  # [rad/s], turn-on, each axis
-    gyro_bias_instability: float = np.deg2rad(10.0) / 3600.0  # [rad/s]
-    accel_density: float = 120e-6 * GRAVITY  # [m/s^2/sqrt(Hz)]
-    accel_bias_std: float = 3e-3 * GRAVITY  # [m/s^2], turn-on, each axis
-    accel_bias_instability: float = 0.03e-3 * GRAVITY  # [m/s^2]
-    correlation_s: float = 100.0  # [s], of the in-run biases
+    gyro_density: NonNegative = _GYRO_DENSITY
+    gyro_bias_std: NonNegative = _GYRO_BIAS_STD
+    gyro_bias_instability: NonNegative = np.deg2rad(10.0) / 3600.0  # [rad/s]
+    accel_density: NonNegative = 120e-6 * GRAVITY  # [m/s^2/sqrt(Hz)]
+    accel_bias_std: NonNegative = 3e-3 * GRAVITY  # [m/s^2], turn-on, each axis
+    accel_bias_instability: NonNegative = 0.03e-3 * GRAVITY  # [m/s^2]
+    correlation_s: Positive = 100.0  # [s], of the in-run biases
 
 
 MTI_3 = ImuNoise()
@@ -122,11 +126,11 @@ def jittered(rng: np.random.Generator, time: np.ndarray, rate_hz: float, std: fl
 
     Raises
     ------
-    ValueError
+    BadOption
         The jitter is too large for the rate.
     """
     if std * rate_hz > 0.25:
-        raise ValueError(f"clock_jitter {std} s must be at most a quarter of a step at {rate_hz} Hz")
+        raise BadOption(f"clock_jitter {std} s must be at most a quarter of a step at {rate_hz} Hz")
     return time + np.clip(std * rng.standard_normal(len(time)), -0.45 / rate_hz, 0.45 / rate_hz)
 
 

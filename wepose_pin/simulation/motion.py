@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..errors import BadOption
 from .imperfections import Imperfections
 
 SIDES = {"left": 1.0, "right": -1.0}  # y of the side in W
@@ -223,7 +224,7 @@ class Motion:
         distance = np.linalg.norm(palm_T, axis=1)
         cos_flexion = (distance**2 - upper**2 - lower**2) / (2.0 * upper * lower)
         if not np.all(np.abs(cos_flexion) < np.cos(np.deg2rad(3.0))):
-            raise ValueError(
+            raise BadOption(
                 f"lengths: the {side} arm ({upper:.3f} m + {lower:.3f} m) does not reach through the motion"
             )
         flexion = np.arccos(cos_flexion)

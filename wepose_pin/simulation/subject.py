@@ -9,10 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..arguments import Count, NonNegative, Positive, check_arguments
+from ..errors import BadOption
 from ..pose import Pose
 from ..readers.clocks import Clock, bridge, lost_samples
 from ..recording import Recording, Sensor, check, mount_from_axes
-from ..subject import LENGTHS, SEXES, Subject, average_subject
+from ..subject import LENGTHS, SEXES, Subject, average_subject, check_lengths
 from .imperfections import PERFECT_WORLD, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, jittered, lost
 from .motion import (
@@ -170,14 +172,14 @@ class _SoftTissue:
 def simulate(
     lengths: Mapping[str, float],
     *,
-    seed: int,
-    rate_hz: float = 100.0,
+    seed: Count,
+    rate_hz: Positive = 100.0,
     noise: ImuNoise = MTI_3,
     imperfections: Imperfections = PERFECT_WORLD,
-    clasp_s: float = 60.0,
-    circles: int = 6,
+    clasp_s: Positive = 60.0,
+    circles: Count = 6,
     protocol: str = "clasp",
-    pose_deg: float = 0.0,
+    pose_deg: NonNegative = 0.0,
 ) -> Simulation:
     """A recording of the paper's upper-body experiment with known truth.
 
@@ -209,16 +211,18 @@ def simulate(
 
     Raises
     ------
-    ValueError
+    BadOption
         A length is missing or not positive, the arms cannot do the motion, or a parameter is out of range.
     """
-    wrong = {name: lengths.get(name) for name in LENGTHS if not 0.0 < lengths.get(name, 0.0) < np.inf}
-    if wrong:
-        raise ValueError(f"lengths: must be given in metres and above 0: {wrong}")
+    check_arguments(simulate, locals())
+    check_lengths("lengths", lengths, LENGTHS)
+    missing = [name for name in LENGTHS if name not in lengths]
+    if missing:
+        raise BadOption(f"lengths: {', '.join(missing)} is missing; each is needed, in metres")
     if not (clasp_s >= 5.0 and circles >= 0 and rate_hz > 0.0):
-        raise ValueError(f"clasp_s {clasp_s} must be >= 5, circles {circles} >= 0, rate_hz {rate_hz} > 0")
+        raise BadOption(f"clasp_s {clasp_s} must be >= 5, circles {circles} >= 0, rate_hz {rate_hz} > 0")
     if protocol not in TASKS or (protocol == "poses" and circles):
-        raise ValueError(f"protocol {protocol!r} must be one of {', '.join(TASKS)}; with 'poses' circles must be 0")
+        raise BadOption(f"protocol {protocol!r} must be one of {', '.join(TASKS)}; with 'poses' circles must be 0")
     lengths = {name: float(lengths[name]) for name in LENGTHS}
     motion_rng, mount_rng, noise_rng, *others = np.random.default_rng(seed).spawn(3 + len(_STREAMS))
     rngs = dict(zip(_STREAMS, others, strict=True))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from ..alignment import segment_orientations
+from ..arguments import check_arguments
 from ..errors import BadOption
-from ..filters import BEST
+from ..filters import BEST, check_method
 from ..model import BodyModel
 from ..recording import CONFIGURATION, Recording
 from ..static import StaticTest
@@ -54,6 +55,8 @@ def track(
     WeposeError
         What the recording, the subject or the model lacks; sensors on links that are no segments.
     """
+    check_arguments(track, locals())
+    check_method(method)
     if recording.start_pose == CONFIGURATION:
         raise BadOption(
             f'{recording.where()}: start_pose = "{CONFIGURATION}" is that of a chain: give its URDF (--model; in '

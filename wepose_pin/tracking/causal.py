@@ -216,19 +216,23 @@ class CausalTracker:
         return None if cov is None else vertical_var(self._recent[self._at - 1], cov)
 
     def heading_std(self) -> np.ndarray:
-        """(k,) [rad] one standard deviation of each heading since it was last set; NaN where the filter has none."""
-        var = self.heading_var()
-        if var is None:
-            return np.full(len(self.names), np.nan)
-        return np.sqrt(var if self._forgiven is None else np.maximum(0.0, var - self._forgiven) + START_POSE_STD**2)
+        """(k,) [rad] one standard deviation of each segment's heading now, as `track` states it: the mounts' part too.
+
+        NaN where the filter has none.
+        """
+        return np.sqrt([cov[2, 2] for cov in self._covariances_W()])
 
     def std(self) -> np.ndarray:
         """(k,) [rad] one standard deviation of an axis of each segment now; NaN where the filter has none."""
+        return spread(self._covariances_W())
+
+    def _covariances_W(self) -> np.ndarray:
+        """(k, 3, 3) [rad²] of each segment in W now; NaN where the filter has none."""
         cov = self._bank.attitude_cov
         if cov is None:
-            return np.full(len(self.names), np.nan)
+            return np.full((len(self.names), 3, 3), np.nan)
         now = self._recent[self._at - 1]
-        return np.array([spread(self.covariance_W(i, now[i : i + 1], cov[i : i + 1]))[0] for i in range(len(cov))])
+        return np.concatenate([self.covariance_W(i, now[i : i + 1], cov[i : i + 1]) for i in range(len(cov))])
 
     def covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
         """(n, 3, 3) [rad²] of sensor i's segment in W, error on the left of `quat_WL`, since the last reset.
@@ -240,8 +244,10 @@ class CausalTracker:
         mount = Rotation.from_quat(self._mount[i])
         cov = covariance_of(self._until, self.names[i], self._subject, R_WS, mount, of)
         if self._forgiven is not None:
-            grown = np.maximum(0.0, vertical_var(quat_VS, attitude_cov) - self._forgiven[i])
-            share = np.sqrt((grown + START_POSE_STD**2) / cov[:, 2, 2])
+            var = vertical_var(quat_VS, attitude_cov)
+            grown = np.maximum(0.0, var - self._forgiven[i])
+            # The mount's part of the heading stays: the reset has set that of the start pose alone.
+            share = np.sqrt((np.maximum(cov[:, 2, 2] - var, 0.0) + grown + START_POSE_STD**2) / cov[:, 2, 2])
             cov[:, 2, :] *= share[:, None]
             cov[:, :, 2] *= share[:, None]
         return cov

@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..alignment import Segments, segment_orientations
+from ..arguments import check_arguments
 from ..errors import BadOption, BadSession, one_of
-from ..filters import BEST
+from ..filters import BEST, check_method
 from ..model.fit import fit, unseen
 from ..model.robot import joint_values, start_configuration
 from ..recording import CONFIGURATION, Recording
@@ -102,6 +103,8 @@ def track_chain(
     WeposeError
         Another start pose; a link or joint that the model does not have; as `segment_orientations`.
     """
+    check_arguments(track_chain, locals())
+    check_method(method)
     where = recording.where()
     if recording.start_pose != CONFIGURATION:
         raise BadOption(f'{where}: start_pose = "{recording.start_pose}" is a person\'s; "{CONFIGURATION}" is needed')

@@ -120,7 +120,13 @@ class Tally:
             "points": sorted(last.points),
             "not_followed_rms_deg": missed,
             "headings_held_together": _held_together(last.reset),
-            "warnings": [*last.segments.warnings, *self._later(), *_not_known(last), *lame],
+            "warnings": [
+                *last.segments.warnings,
+                *self._later(),
+                *_not_known(last),
+                *lame,
+                *(last.model.warnings if last.model else ()),
+            ],
         }
 
     def _later(self) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..calibration import calibrate
+from ..calibration import calibrate_lengths
 from ..evaluation import evaluate
 from ..simulation import REALISTIC, Person, Simulation, simulate, simulated_person
 from ..subject import LENGTHS, Subject, mount_rows
@@ -30,9 +30,9 @@ def _anywhere(experiment: str, trial: str, seed: int) -> list[Result]:
     recording, truth = simulation.recording(), simulation.truth()
     results = []
     for method in METHODS:
-        subject = calibrate(
+        subject = calibrate_lengths(
             recording, gauge=person.taped, prior=person.average, method=method, gauge_std=person.taped_std
-        )
+        ).subject
         errors = evaluate(track(recording, subject, method=method), truth, simulation.phases["circles"][0])
         found = _found(subject, person, simulation) | {
             "hand_mm": errors.position["right_hand"]._asdict(),

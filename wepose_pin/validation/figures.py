@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ..page import ACCENT, FONT, INK, LINE, SOFT, STYLE, Picture, capital, new_figure, png_of, stem
+from ..page import ACCENT, FONT, INK, LINE, SOFT, STYLE, Picture, capital, new_figure, png_of, reason, stem
 from .document import Document
 from .findings import FROM, OURS, TARGETS, WATERFALL, Waterfall, waterfall
 from .jobs import Result
@@ -37,19 +37,28 @@ THEIRS: dict[str, Any] = {"facecolor": "white", "edgecolor": SOFT, "hatch": "///
 WINDOWS = 60  # of the running root mean square, over a curve's time
 
 
-def pictures(document: Document) -> Iterator[tuple[str, Picture]]:
-    """Experiment and figure, in the order of the page; what cannot be drawn from the results is left out."""
+def pictures(document: Document, failures: list[str] | None = None) -> Iterator[tuple[str, Picture]]:
+    """Experiment and figure, in the order of the page; what cannot be drawn from the results is left out.
+
+    `failures` takes a line for each figure whose drawing fails.
+    """
     rows = summary(document.results)
     for experiment in dict.fromkeys(row.experiment for row in rows):
         of = [row for row in rows if row.experiment == experiment]
         results = [result for result in document.results if result.experiment == experiment]
         for draw in (_waterfall, _bars, _trials, _over_time, _paths):
-            with rc_context(STYLE):
-                drawn = draw(experiment, of, results)
-                if drawn is None:
-                    continue
-                kind, caption, figure = drawn
-                picture = Picture(f"{stem(experiment)}-{kind}", caption, png_of(figure))
+            try:
+                with rc_context(STYLE):
+                    drawn = draw(experiment, of, results)
+                    if drawn is None:
+                        continue
+                    kind, caption, figure = drawn
+                    picture = Picture(f"{stem(experiment)}-{kind}", caption, png_of(figure))
+            except Exception as error:
+                if failures is not None:
+                    what = draw.__name__.strip("_").replace("_", " ")
+                    failures.append(f"{experiment}: the figure of {what} cannot be drawn: {reason(error)}")
+                continue
             yield experiment, picture
 
 

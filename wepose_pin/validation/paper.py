@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from .. import so3
-from ..calibration import calibrate
+from ..calibration import calibrate_lengths
 from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
 from ..noise import noise_of
 from ..recording import Recording, Sensor
@@ -169,7 +169,8 @@ def _millimetres(experiment: str, trial: str, seed: int) -> list[Result]:
 
 
 def _calibrated(recording: Recording, person: Person, prior: Subject, method: str) -> Subject:
-    return calibrate(recording, gauge=person.taped, prior=prior, method=method, gauge_std=person.taped_std)
+    found = calibrate_lengths(recording, gauge=person.taped, prior=prior, method=method, gauge_std=person.taped_std)
+    return found.subject
 
 
 def _hand(errors: Evaluation) -> dict[str, dict[str, float]]:

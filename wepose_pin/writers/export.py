@@ -9,11 +9,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..arguments import check_arguments
 from ..errors import BadData, BadOption, MissingFile, one_of
 from .bvh import write_bvh
 from .c3d import write_c3d
 from .folder import whole_file
-from .motion import Motion, resampled
+from .motion import Motion, check_rate, resampled
 from .opensim import write_mot, write_placement, write_sto, write_trc
 from .provenance import beside, block_text
 from .result import read_result
@@ -44,8 +45,8 @@ class Exported(NamedTuple):
 
 
 def export(
-    result: Path,
-    file: Path,
+    result: str | Path,
+    file: str | Path,
     format: str | None = None,
     *,
     names: str | None = None,
@@ -71,11 +72,15 @@ def export(
     ExistingOutput
         The file is there and `force` is not given, or it cannot be written.
     """
+    check_arguments(export, locals())
+    result, file = Path(result), Path(file)
     format = _format(file, format)
     if names is not None and format != "mot":
         raise BadOption(f"--names {names}: only a .mot has names to choose, and the format is {format}")
     if names not in (None, *NAMES):
         raise BadOption(f"--names {names}: not known; {one_of(NAMES, names)}")
+    if rate_hz is not None:
+        check_rate(rate_hz)
     if rate_hz is not None and format in ("urdf", "placement"):
         raise BadOption(f"--rate-hz {rate_hz:g}: there is no motion in a file of format {format}")
     with contextlib.ExitStack() as files:

@@ -53,6 +53,12 @@ def even(motion: Motion) -> tuple[Motion, list[str]]:
     return resampled(motion, rate_hz), [note]
 
 
+def check_rate(rate_hz: float) -> None:
+    """Raises `BadOption` where no recording has that rate."""
+    if not 1.0 <= rate_hz <= 10000.0:
+        raise BadOption(f"--rate-hz {rate_hz:g}: between 1 and 10000 samples a second")
+
+
 def resampled(motion: Motion, rate_hz: float) -> Motion:
     """The motion at another rate: orientations by the shortest way between two samples, points from the body in them.
 
@@ -65,8 +71,7 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
     BadData
         An orientation is not known; times leap so far that hardly a sample would be a measured one.
     """
-    if not 1.0 <= rate_hz <= 10000.0:
-        raise BadOption(f"--rate-hz {rate_hz:g}: between 1 and 10000 samples a second")
+    check_rate(rate_hz)
     whole(motion, "resampling")
     pose = motion.pose
     old = pose.time

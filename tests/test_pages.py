@@ -1,0 +1,231 @@
+"""Pages beside a result: one that fails is a warning; the result has landed before, and nothing is half written."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.batch.items import make_items
+from wepose_pin.batch.page import study_page
+from wepose_pin.batch.plan import STEPS, Item, Plan
+from wepose_pin.cli import main
+from wepose_pin.recording import Recording, Sensor, check, mount_from_axes
+from wepose_pin.report import track_report, write_thinned_pages
+from wepose_pin.report.thinned import Thinner
+from wepose_pin.simulation import Simulation
+from wepose_pin.tracking import TrackedPose, track
+from wepose_pin.writers import write_session
+
+RESULT = {"pose.parquet", "subject.toml", "subject.urdf", "summary.json"}
+ARM = {"right_upper_arm": 0.8, "right_forearm": 1.4}  # [rad], swung to and fro; everything else hangs
+
+
+def recorded(moved: dict[str, float], *, seconds: float = 6.0, noise: float = 1e-3, sensors: str = "both") -> Recording:
+    """A person who stands for two seconds and then swings `moved` about the y axis."""
+    rate_hz, rng = 100.0, np.random.default_rng(1)
+    time = np.arange(round(seconds * rate_hz)) / rate_hz
+    R_LS = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    segments = {
+        "both": ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"),
+        "one arm": ("torso", "right_upper_arm", "right_forearm"),
+        "forearm": ("right_forearm",),
+    }[sensors]
+    made = {}
+    for segment in segments:
+        later = np.maximum(time - 2.0, 0.0)
+        angle = moved.get(segment, 0.0) * np.sin(2.0 * later) * (1.0 - np.exp(-later))
+        R_WS = Rotation.from_rotvec(np.outer(angle, [0.0, 1.0, 0.0])) * R_LS
+        rate = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * rate_hz
+        made[segment] = Sensor(
+            gyro_S=np.vstack([np.zeros(3), rate]) + noise * rng.standard_normal((len(time), 3)),
+            accel_S=R_WS.inv().apply([0.0, 0.0, 9.81]) + 10.0 * noise * rng.standard_normal((len(time), 3)),
+            stated_quat_LS=R_LS.as_quat(),
+        )
+    until = min(1.9, seconds - 0.1)
+    return check(Recording("hangs", time, rate_hz, made, {"start": ((0.2, until),)}))
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("hangs")
+    write_session(folder, recorded(ARM))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pose() -> TrackedPose:
+    return track(recorded(ARM))
+
+
+def run(*words: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in words])
+    return int(stop.value.code or 0)
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def fails(*_: Any, **__: Any) -> Any:
+    raise ValueError("cannot convert\nfloat NaN to integer")
+
+
+# The causes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [[], ["--pieces", "3"], ["--causal"]])
+def test_an_arm_that_hangs_throughout_is_tracked(
+    session: Path, tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The shoulder of an arm that hangs is at gimbal lock all the time: there are no angles to sum up."""
+    assert run("track", session, *options, "-o", tmp_path / "out") == 0
+    assert names(tmp_path / "out") == RESULT | {"view.html", "report.html"}
+    assert "cannot be made" not in capsys.readouterr().err
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "left shoulder, plane of elevation" in page
+    assert "cannot be made" not in page
+
+
+@pytest.mark.parametrize("sensors", ["both", "one arm", "forearm"])
+@pytest.mark.parametrize(("seconds", "noise"), [(2.0, 1e-3), (1.2, 1e-3), (6.0, 1e-9)])
+def test_a_report_of_nothing_that_moves(sensors: str, seconds: float, noise: float) -> None:
+    failures: list[str] = []
+    found = track(recorded({}, seconds=seconds, noise=noise, sensors=sensors))
+    page = track_report(found, view="<p>", failures=failures)
+    assert failures == []
+    assert "nan" not in page.split("<body>")[1].replace("base64", "").split("data:image")[0]
+
+
+def nowhere(values: np.ndarray, rows: slice) -> np.ndarray:
+    values = values.copy()
+    values[rows] = np.nan
+    return values
+
+
+@pytest.mark.parametrize("rows", [slice(None), slice(0, 300), slice(300, None), slice(1, None), slice(None, None, 2)])
+@pytest.mark.parametrize("segments", ["arm", "all"])
+def test_a_report_where_segments_are_not_known(pose: TrackedPose, rows: slice, segments: str) -> None:
+    """No filter should give NaN undeclared; where one does, the report still stands."""
+    lost = [name for name in pose.quat_WL if segments == "all" or name.startswith("left")]
+    changed = replace(
+        pose,
+        quat_WL={k: nowhere(v, rows) if k in lost else v for k, v in pose.quat_WL.items()},
+        segment_cov={k: nowhere(v, rows) if k in lost else v for k, v in pose.segment_cov.items()},
+        points={k: nowhere(v, rows) for k, v in pose.points.items()},
+        point_cov={k: nowhere(v, rows) for k, v in pose.point_cov.items()},
+    )
+    failures: list[str] = []
+    track_report(changed, view="<p>", failures=failures)
+    assert failures == []
+
+
+def test_a_study_whose_figures_are_all_one_up_to_rounding() -> None:
+    told = {"item": "a", "session": "a", "status": "done", "seconds": 1.0, "rate_hz": 100.0}
+    rows = [told, told | {"item": "b", "rate_hz": 100.0 * (1.0 + 4e-16)}]
+    table = pl.DataFrame([{**row, **dict.fromkeys(("subject", "error", "message", "page"), None)} for row in rows])
+    table = table.with_columns(pl.col("subject", "error", "message", "page").cast(pl.String))
+    failures: list[str] = []
+    study_page(Plan("p", (), ()), table, failures)
+    assert failures == []
+
+
+# What fails all the same ----------------------------------------------------------------------------------------------
+
+BROKEN = {
+    "wepose_pin.report.track.timeline_picture": ("report.html", {"view.html", "report.html"}),
+    "wepose_pin.report.track.concerns": ("report.html", {"view.html", "report.html"}),
+    "wepose_pin.report.pages.track_report": ("report.html", {"view.html"}),
+    "wepose_pin.report.pages.pose_html": ("view.html", {"report.html"}),
+}
+
+
+@pytest.mark.parametrize("options", [[], ["--pieces", "3"]])
+@pytest.mark.parametrize("broken", BROKEN)
+def test_a_page_that_fails_is_a_warning(
+    broken: str,
+    options: list[str],
+    session: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    page, left = BROKEN[broken]
+    (tmp_path / "out").mkdir()
+    for name in ("view.html", "report.html"):
+        (tmp_path / "out" / name).write_text("of another motion")
+    monkeypatch.setattr(broken, fails)
+    assert run("track", session, *options, "--force", "-o", tmp_path / "out") == 0
+    assert names(tmp_path / "out") == RESULT | left
+    said = capsys.readouterr()
+    (line,) = [line for line in said.err.splitlines() if page in line]
+    assert "ValueError: cannot convert float NaN to integer" in line
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert line.removeprefix("note: ") in summary["warnings"]
+    for name in left:
+        assert "of another motion" not in (tmp_path / "out" / name).read_text()
+    for name in {"view.html", "report.html"} - left:
+        assert str(tmp_path / "out" / name) not in said.out
+    assert run("evaluate", tmp_path / "out", tmp_path / "out" / "pose.parquet") == 0
+
+
+def test_a_recording_in_pieces_whose_pages_cannot_be_gathered(pose: TrackedPose, tmp_path: Path) -> None:
+    thinner = Thinner(len(pose.time))
+    thinner.add(replace(pose, segments=None))
+    (tmp_path / "summary.json").write_text('{"warnings": ["before"]}')
+    (warning,) = write_thinned_pages(tmp_path, thinner, {}, [])
+    assert "view.html" in warning
+    assert json.loads((tmp_path / "summary.json").read_text())["warnings"] == ["before", warning]
+    assert names(tmp_path) == {"summary.json"}
+
+
+def test_the_result_is_there_when_the_page_is_stopped(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: Any, **__: Any) -> str:
+        assert names(tmp_path / "out") == RESULT
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("wepose_pin.report.pages.pose_html", stopped)
+    assert run("track", session, "-o", tmp_path / "out") == 130
+    assert names(tmp_path / "out") == RESULT
+    assert f"{tmp_path / 'out'} was written before" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("broken", "left"),
+    [
+        ("wepose_pin.report.calibration.lengths_picture", {"report.html"}),
+        ("wepose_pin.report.calibration.track", {"report.html"}),
+        ("wepose_pin.report.pages.calibration_report", set()),
+    ],
+)
+def test_a_calibration_outlasts_its_report(
+    broken: str,
+    left: set[str],
+    simulation: Simulation,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    write_session(tmp_path, simulation.recording())
+    monkeypatch.setattr(broken, fails)
+    assert run("calibrate", tmp_path, "-o", tmp_path / "anna") in (0, 3)
+    assert names(tmp_path / "anna") == {"subject.toml", "subject.urdf", "calibration.json"} | left
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "ValueError" in line]
+    assert line.removeprefix("note: ") in json.loads((tmp_path / "anna" / "calibration.json").read_text())["warnings"]
+
+
+def test_an_item_of_a_batch_outlasts_its_pages(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wepose_pin.report.pages.pose_html", fails)
+    steps = {"track": {**STEPS["track"], "method": "ncf"}}
+    (row,) = make_items([Item(name="one", session=str(session), steps=steps)], str(tmp_path))
+    assert row["status"] == "done", row
+    assert names(tmp_path / "one" / "track") == RESULT | {"report.html"}

@@ -1,0 +1,208 @@
+"""Sensors that do not measure: named while reading, lost from where they stop, never believed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial.transform import Rotation
+from test_bad_input import refused
+
+from wepose_pin import load_session, so3
+from wepose_pin.alignment import START_POSE_STD, segment_orientations
+from wepose_pin.errors import BadData, BadPhase
+from wepose_pin.noise import quietest
+from wepose_pin.readers import iter_session
+from wepose_pin.readers.plausibility import sensor_notes
+from wepose_pin.recording import Recording, Sensor
+from wepose_pin.simulation import Simulation, simulate, simulated_person
+from wepose_pin.tracking import track, track_pieces
+from wepose_pin.writers import write_session
+
+BROKEN = "left_forearm"
+RATE = 100.0
+
+
+@pytest.fixture(scope="module")
+def made() -> Simulation:
+    """Twenty-five seconds: start pose from 0.5 to 4.5 s, then the arms move."""
+    return simulate(simulated_person(1).lengths, seed=1, clasp_s=5.0, circles=1)
+
+
+def with_sensor(recording: Recording, name: str, **changes: object) -> Recording:
+    return replace(recording, sensors={**recording.sensors, name: replace(recording.sensors[name], **changes)})
+
+
+def stopped(recording: Recording, signals: str, first: float, last: float = np.inf, value: float | None = None):
+    """The recording with a sensor that stays at its value, or at this one, in these seconds."""
+    sensor, stands = recording.sensors[BROKEN], (recording.time >= first) & (recording.time <= last)
+    changes = {}
+    for name in signals.split():
+        values = getattr(sensor, f"{name}_S").copy()
+        values[stands] = values[int(np.argmax(stands))] if value is None else value
+        changes[f"{name}_S"] = values
+    return with_sensor(recording, BROKEN, **changes)
+
+
+def written(folder: Path, recording: Recording) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_session(folder, recording)
+    return folder
+
+
+def off_by(recording: Recording, made: Simulation, method: str) -> np.ndarray:
+    """Angle to the truth of the broken sensor's segment over its standard deviation, for each sample."""
+    pose, truth = track(recording, method=method), made.truth()
+    off = Rotation.from_quat(truth.quat_WL[BROKEN]).inv() * Rotation.from_quat(pose.quat_WL[BROKEN])
+    # A stated mount counts as exact, and the start pose is held to some degrees.
+    std = np.sqrt(np.linalg.eigvalsh(pose.segment_cov[BROKEN])[:, -1])
+    return off.magnitude() / np.hypot(std, START_POSE_STD)
+
+
+@pytest.mark.parametrize(
+    ("signals", "value"),
+    [("gyro", 0.0), ("gyro", None), ("accel", None), ("gyro accel", None), ("gyro accel", 0.0)],
+)
+def test_a_sensor_that_never_measures_is_refused_by_name(
+    signals: str, value: float | None, made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path / "in", stopped(made.recording("dead"), signals, 0.0, value=value))
+    line = refused(["track", str(path), "-o", str(tmp_path / "out")], capsys)
+    assert f"sensors.{BROKEN}: " in line
+    assert all(name in line for name in signals.split())
+    assert f"take [sensors.{BROKEN}] out" in line
+    with pytest.raises(BadData, match=f"sensors.{BROKEN}: "):
+        next(iter_session(path, 5.0))
+
+
+@pytest.mark.parametrize(("signals", "since"), [("gyro accel", 9.0), ("gyro accel", 16.3), ("gyro", 9.0), ("accel", 9.0)])
+def test_a_sensor_that_freezes_is_lost_from_there(signals: str, since: float, made: Simulation, tmp_path: Path) -> None:
+    whole = made.recording("frozen")
+    path = written(tmp_path / "in", stopped(whole, signals, since))
+    read = load_session(path)
+    gap = read.sensors[BROKEN].gap
+    assert gap is not None
+    assert read.time[np.argmax(gap)] == pytest.approx(since + 0.01, abs=0.011)
+    assert gap[read.time > since + 0.02].all()
+    (note,) = (note for note in read.notes if BROKEN in note and "lost" in note and "from" in note)
+    assert f"from {since:g} to " in note
+    assert all(sensor.gap is None for name, sensor in read.sensors.items() if name != BROKEN)
+    pieces = [piece.sensors[BROKEN].gap for piece in iter_session(path, 3.7)]
+    np.testing.assert_array_equal(np.concatenate(pieces), gap)
+
+
+@pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
+@pytest.mark.parametrize(("since", "until"), [(9.0, 99.0), (16.3, 18.0)])
+def test_an_arm_whose_sensor_froze_is_where_its_uncertainty_says(
+    since: float, until: float, method: str, made: Simulation, tmp_path: Path
+) -> None:
+    read = load_session(written(tmp_path / "in", stopped(made.recording("frozen"), "gyro accel", since, until)))
+    unmarked = with_sensor(read, BROKEN, gap=None)
+    assert off_by(unmarked, made, method).max() > 6.0
+    assert off_by(read, made, method).max() < 6.0
+
+
+@pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
+@pytest.mark.parametrize("method", ["amekf", "smoother"])
+def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
+    unit: str, method: str, made: Simulation, tmp_path: Path
+) -> None:
+    """A wide swing is cut off in the middle; whoever believes it is off by many standard deviations."""
+    whole, level = made.recording("cut"), np.deg2rad(120.0)
+    fast = 4.0 * whole.sensors[BROKEN].gyro_S.copy()
+    turned = Rotation.from_quat(so3.integrate(fast[1:] / RATE))
+    accel = turned.inv().apply(whole.sensors[BROKEN].accel_S[0])
+    accel += 0.01 * np.random.default_rng(0).standard_normal(accel.shape)
+    path = written(tmp_path / "in", with_sensor(whole, BROKEN, gyro_S=np.clip(fast, -level, level), accel_S=accel))
+    if unit == "deg/s":
+        text, table = (path / "session.toml").read_text(), pl.read_parquet(path / "recording.parquet")
+        (path / "session.toml").write_text(text.replace('"rad/s"', '"deg/s"'))
+        rates = [name for name in table.columns if "gyr" in name]
+        table.with_columns(pl.col(rates).degrees()).write_parquet(path / "recording.parquet")
+    read = load_session(path)
+    assert read.sensors[BROKEN].gyro_range == pytest.approx(level, rel=0.03)
+    assert any(f"sensors.{BROKEN}.gyro" in note and "cut off" in note for note in read.notes)
+    assert all(np.isinf(sensor.gyro_range) for name, sensor in read.sensors.items() if name != BROKEN)
+
+    def worst(recording: Recording) -> float:
+        of = segment_orientations(recording, method=method).orientation[BROKEN]
+        off = (turned[300].inv() * turned).inv() * (Rotation.from_quat(of.quat_WS[300]).inv() * Rotation.from_quat(of.quat_WS))
+        return float((off.magnitude() / np.sqrt(np.linalg.eigvalsh(of.attitude_cov)[:, -1]))[450:].max())
+
+    assert worst(with_sensor(read, BROKEN, gyro_range=np.inf)) > 6.0
+    assert worst(read) < 6.0
+    pieces = [piece.segments.orientation[BROKEN].quat_WS for piece in track_pieces(path, method=method, seconds=6.0)]
+    if method != "smoother":
+        of = segment_orientations(read, method=method).orientation[BROKEN]
+        np.testing.assert_array_equal(np.concatenate(pieces), of.quat_WS)
+
+
+# Lost samples are not measured ones --------------------------------------------------------------------------------
+
+
+def lost(recording: Recording, name: str, first: float, last: float) -> Recording:
+    """The recording with a sensor's samples bridged from `first` to `last` [s] as reading does: at rest, on a line."""
+    gap = (recording.time >= first) & (recording.time <= last)
+    sensor = recording.sensors[name]
+    gyro, accel = sensor.gyro_S.copy(), sensor.accel_S.copy()
+    gyro[gap] = 0.0
+    ends = [max(int(np.argmax(gap)) - 1, 0), min(len(gap) - 1, len(gap) - int(np.argmax(gap[::-1])))]
+    accel[gap] = np.column_stack(
+        [np.interp(recording.time[gap], recording.time[ends], accel[ends, axis]) for axis in range(3)]
+    )
+    return with_sensor(recording, name, gyro_S=gyro, accel_S=accel, gap=gap)
+
+
+def test_the_quietest_window_is_one_that_was_measured(made: Simulation) -> None:
+    whole = replace(made.recording("gap"), phases={})
+    first, last = quietest(lost(whole, "torso", 1.0, 3.0))
+    assert last < 1.0 or first > 3.0
+    with pytest.raises(BadPhase, match=r"sensors\.torso"):
+        quietest(lost(whole, "torso", 0.0, 25.0))
+
+
+def test_gravity_and_noise_are_those_of_measured_samples(made: Simulation) -> None:
+    whole = made.recording("gap")
+    gap = lost(whole, "torso", 1.0, 2.9)
+    gap.sensors["torso"].accel_S[100:290] *= 0.7
+    for phases in (gap.phases, {}):
+        assert sensor_notes(replace(gap, phases=phases)) == ()
+    torso = segment_orientations(gap).orientation["torso"].noise
+    right = segment_orientations(whole).orientation["torso"].noise
+    assert torso.gravity == pytest.approx(right.gravity, rel=1e-3)
+    np.testing.assert_allclose(np.diag(torso.gyro_cov), np.diag(right.gyro_cov), rtol=0.3)
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_sensor_that_is_lost_in_the_start_pose_is_not_aligned_by_invention(
+    frozen: bool, made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = made.recording("lost")
+    if frozen:
+        whole = stopped(whole, "gyro accel", 0.3, 4.8)
+    path = written(tmp_path / "in", whole)
+    if not frozen:
+        table = pl.read_parquet(path / "recording.parquet")
+        cells = [name for name in table.columns if name.startswith(BROKEN)]
+        keep = ~table["time"].is_between(0.3, 4.8)
+        table.with_columns(pl.when(keep).then(pl.col(cells)).name.keep()).write_parquet(path / "recording.parquet")
+    line = refused(["track", str(path), "--gaps", "-o", str(tmp_path / "out")], capsys)
+    assert f"sensors.{BROKEN}" in line
+    assert f"take [sensors.{BROKEN}] out" in line
+
+
+def test_a_start_pose_with_a_gap_in_it_is_that_of_what_was_measured(made: Simulation) -> None:
+    """Orientations of an arm that was lost before it was raised, and bridged towards where it was seen again."""
+    whole, n = made.recording("gap"), len(made.recording("gap"))
+    gap = (whole.time > 2.7) & (whole.time < 5.5)
+    raised = np.clip((whole.time - 2.7) / 2.8, 0.0, 1.0)[:, None] * [0.0, -1.5, 0.0]
+    quat_WS = Rotation.from_rotvec(raised).as_quat()
+    ready = replace(whole, sensors={"torso": Sensor(quat_WS=quat_WS, gap=gap), "head": Sensor(quat_WS=quat_WS[:n])})
+    with pytest.raises(BadPhase, match=r"sensors\.head turns by"):
+        segment_orientations(ready)
+    alone = segment_orientations(replace(ready, sensors={"torso": ready.sensors["torso"]}))
+    assert Rotation.from_quat(alone.quat_LS["torso"]).magnitude() < 1e-6

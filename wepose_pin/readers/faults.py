@@ -1,0 +1,348 @@
+"""Sensors that do not measure: dead, stuck or frozen at one value, cut off at their range, or copies of one another.
+
+A value that repeats says little by itself: a coarse sensor on a table repeats for minutes, and data without noise do.
+It is a fault where physics contradicts it, or where the sensor shows noise whenever it does not repeat:
+
+- specific force that stays the same in the sensor while it turns about a horizontal axis;
+- a rate that stays the same while the specific force changes as only motion does;
+- both the same, of a sensor whose noise is finer than its digits: then two samples in a row are never alike.
+
+All is gathered block by block, so that a recording in pieces is judged as the whole is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import BadData
+from ..recording import format_time
+from .clocks import runs
+from .plausibility import SATURATED_GYRO, cut_off
+
+FROZEN_S, FROZEN_SAMPLES = 0.2, 5  # of rate and force both at one value: longer than gaps that are bridged in silence
+STUCK_S = 1.0  # of one of them alone
+# While accel stays the same: how fast gyro tips it [rad/s], beyond any bias, and by how much in all [rad], one alone.
+TIPS, TIPPED = 0.2, 1.0
+MOVES = 2.0  # [m/s²] by which accel changes on an axis only where the sensor moves
+# A series of noise turns back at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
+TURNS_BACK, TURNS_BACK_HZ = 0.3, 15.0
+ROUNDING = 1e-9  # steps below this share of the largest value are rounding, not noise
+NOISY_S = 1.5  # [s] of noise that show a sensor to be noisy
+COARSE = 1e-4  # share of runs of equal samples that are longer than twice the usual, from which the digits are coarse
+
+SAME_RANGE = 0.1  # share by which the ranges of a sensor's axes may differ: each has its own scale
+COPIED = 0.5  # share of a sensor's rows, those that repeat aside, that another has as well only if it is a copy
+AT_RANGE = 0.02  # share below its range from which on a sample counts as cut off: resampled ones mix with others
+
+
+class Fault(NamedTuple):
+    """A stretch in which a sensor gave one value over and over."""
+
+    signals: str  # which: "gyro", "accel" or "gyro and accel"
+    first: float  # [s], the last sample that was measured
+    last: float  # [s], the last that was not
+    value: tuple[float, ...]  # at which it stood, SI
+
+    def described(self, since: float) -> str:
+        """In words, from the time [s] `since`."""
+        value = ", ".join(f"{v:.4g}" for v in self.value[:3])
+        unit = "m/s^2" if self.signals == "accel" else "rad/s"
+        stands = "stand still, gyro" if " " in self.signals else "stands still"
+        return f"{self.signals} {stands} at {value} {unit} from {format_time(since)} to {format_time(self.last)} s"
+
+
+@dataclass
+class _Run:
+    """Rows that are equal in some signals, with what the others do meanwhile."""
+
+    rows: int
+    first: float  # [s]
+    last: float  # [s]
+    value: np.ndarray  # (6,) gyro and accel of the first row
+    low: np.ndarray  # (3,) of accel
+    high: np.ndarray  # (3,)
+    tipped: float  # [rad], ∫ |gyro × up|
+    first_row: bool  # of the recording
+
+    def joined(self, after: _Run) -> _Run:
+        """Both as one; the last row of this is the first of the one after it."""
+        low, high = np.minimum(self.low, after.low), np.maximum(self.high, after.high)
+        rows, tipped = self.rows + after.rows - 1, self.tipped + after.tipped
+        return _Run(rows, self.first, after.last, self.value, low, high, tipped, self.first_row)
+
+    @property
+    def seconds(self) -> float:
+        return self.last - self.first
+
+    @property
+    def tips(self) -> float:
+        """How fast gyro tips accel [rad/s]."""
+        return self.tipped / max(self.seconds, 1e-9)
+
+
+_LONGEST = 1000  # rows of a run that are counted
+_SIGNALS = {"gyro and accel": slice(0, 6), "gyro": slice(0, 3), "accel": slice(3, 6)}
+
+
+@dataclass
+class SensorScan:
+    """What a sensor's rows show of its faults, gathered block by block, in SI and in the order of time."""
+
+    rows: int = 0
+    first: float = 0.0  # [s]
+    last: float = 0.0  # [s]
+    _before: np.ndarray | None = None  # (7,) time and values of the last row
+    _long: dict[str, list[_Run]] = field(default_factory=lambda: {name: [] for name in _SIGNALS})
+    _open: dict[str, _Run | None] = field(default_factory=lambda: dict.fromkeys(_SIGNALS))
+    _lengths: np.ndarray = field(default_factory=lambda: np.zeros(_LONGEST + 1, dtype=np.int64))  # rows → runs
+    _noisy_s: float = 0.0  # [s] in which it turns back as noise does
+    _peak: float = 0.0  # [rad/s] the largest of all axes
+    _levels: list[float] = field(default_factory=list)  # [rad/s] at which an axis seems cut off
+
+    def push(self, time: np.ndarray, values: np.ndarray) -> None:
+        """The next rows: times (n,) [s], gyro and accel (n, 6)."""
+        if not len(time):
+            return
+        block = np.column_stack([time, values])
+        first_row = self._before is None
+        if self._before is None:
+            self.first = float(time[0])
+        else:
+            block = np.concatenate([self._before[None], block])
+        self.rows += len(time)
+        self.last, self._before = float(time[-1]), block[-1].copy()
+        if len(block) < 2:
+            return
+        equal = np.stack([axis[1:] == axis[:-1] for axis in block[:, 1:].T])
+        for name, axes in _SIGNALS.items():
+            self._gather(name, block, np.logical_and.reduce(equal[axes]), first_row)
+        changing = block[np.concatenate([[True], ~np.logical_and.reduce(equal)])]
+        if self._noisy_s < NOISY_S:
+            self._noise(changing)
+        self._cut_off(changing[:, 1:])
+
+    def _gather(self, name: str, block: np.ndarray, same: np.ndarray, first_row: bool) -> None:
+        spans = np.array(runs(same), dtype=np.int64).reshape(-1, 2)
+        length = spans[:, 1] - spans[:, 0] + 1
+        if name == "gyro and accel":
+            length = np.minimum(length, _LONGEST)
+            self._lengths += np.bincount(length, minlength=_LONGEST + 1)
+            self._lengths[1] += int(len(same) - same.sum()) - len(spans)
+        edge = (spans[:, 0] == 0) | (spans[:, 1] == len(same))
+        open_, self._open[name] = self._open[name], None
+        if open_ is not None and not same[0]:
+            self._close(name, open_)
+            open_ = None
+        for a, b in spans[(length >= FROZEN_SAMPLES) | edge]:
+            run = _run(block[a : b + 1], first_row and a == 0)
+            if open_ is not None and a == 0:
+                run, open_ = open_.joined(run), None
+            if b == len(same):
+                self._open[name] = run
+            else:
+                self._close(name, run)
+
+    def _close(self, name: str, run: _Run) -> None:
+        least = FROZEN_S if name == "gyro and accel" else STUCK_S
+        if run.rows >= FROZEN_SAMPLES and run.seconds >= least * (1.0 - 1e-6):
+            self._long[name].append(run)
+
+    def _noise(self, distinct: np.ndarray) -> None:
+        """Count the seconds in which the signal turns back as noise does on all axes: at rest, where it does not drown."""
+        if len(distinct) < 2 * FROZEN_SAMPLES:
+            return
+        usual = max(float(np.median(np.diff(distinct[:, 0]))), 1e-9)
+        size = min(len(distinct) - 2, max(FROZEN_SAMPLES, round(1.0 / usual)))
+        steps = np.diff(distinct[:, 1:], axis=0)
+        steps[np.abs(steps) < ROUNDING * np.abs(distinct[1:, 1:]).max(axis=0)] = 0.0
+        count = (len(steps) - 1) // size
+        turns = (steps[1:] * steps[:-1] < 0.0)[: count * size].reshape(count, size, 6).mean(axis=1)
+        varies = (steps[1:] != 0.0)[: count * size].reshape(count, size, 6).any(axis=1)
+        share = np.where(varies, turns, np.inf).min(axis=1)  # of all axes: in motion some go on
+        share[~varies.any(axis=1)] = 0.0
+        self._noisy_s += float(np.count_nonzero(share > min(TURNS_BACK, TURNS_BACK_HZ * usual))) * size * usual
+
+    def _cut_off(self, values: np.ndarray) -> None:
+        """The levels at which an axis of gyro stays though something else changes."""
+        gyro = values[:, :3]
+        self._peak = max(self._peak, float(np.abs(gyro).max()))
+        cut = cut_off(gyro, SATURATED_GYRO)
+        if cut.any():
+            changes = (np.abs(np.diff(values, axis=0)) > ROUNDING * np.abs(values).max(axis=0)).any(axis=1)
+            stays = cut[1:] & cut[:-1] & changes[:, None]
+            if stays.any():
+                self._levels.append(float(np.abs(gyro[1:][stays]).min()))
+
+    @property
+    def gyro_range(self) -> float:
+        """[rad/s] from which on an axis counts as cut off; infinite where none was. A sensor's axes have one range."""
+        return (1.0 - AT_RANGE) * min((v for v in self._levels if v > (1.0 - SAME_RANGE) * self._peak), default=np.inf)
+
+    def long_runs(self, name: str) -> list[_Run]:
+        """Runs of rows that are equal in the signal, as far as they have come."""
+        open_, least = self._open[name], FROZEN_S if name == "gyro and accel" else STUCK_S
+        known = self._long[name]
+        if open_ is None or open_.rows < FROZEN_SAMPLES or open_.seconds < least * (1.0 - 1e-6):
+            return known
+        return [*known, open_]
+
+    def noisy(self) -> bool:
+        """Whether two samples in a row are never alike but by a fault: there is noise, and the digits show it."""
+        if self._noisy_s < NOISY_S:
+            return False
+        long_ = sum(run.rows >= FROZEN_SAMPLES for run in self.long_runs("gyro and accel"))
+        short = self._lengths.copy()
+        usual = int(np.searchsorted(np.cumsum(short), 0.5 * short.sum()))
+        longer = int(short[2 * usual + 1 :].sum()) - long_
+        return longer <= 2 * long_ + COARSE * short.sum()
+
+    def constant(self, name: str) -> bool:
+        """Whether the signal has one value in all rows."""
+        return any(run.rows == self.rows for run in self.long_runs(name))
+
+
+def _run(rows: np.ndarray, first_row: bool) -> _Run:
+    time, gyro, accel = rows[:, 0], rows[1:, 1:4], rows[1:, 4:]
+    up = accel / np.maximum(np.linalg.norm(accel, axis=1), 1e-9)[:, None]
+    tipped = float(np.sum(np.linalg.norm(np.cross(gyro, up), axis=1) * np.diff(time)))
+    low, high = rows[:, 4:].min(axis=0), rows[:, 4:].max(axis=0)
+    return _Run(len(rows), float(time[0]), float(time[-1]), rows[0, 1:].copy(), low, high, tipped, first_row)
+
+
+def faults_of(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
+    """Sensor → the stretches in which it was frozen or stuck, in the order of time; none where all measure."""
+    noisy = {name: scan.noisy() for name, scan in scans.items()}
+    found = {}
+    for name, scan in scans.items():
+        others = [other for other in scans if other != name]
+        faults = []
+        for run in scan.long_runs("gyro and accel"):
+            # One that never gave anything else shows no noise of its own; the others are of its kind.
+            fine = any(noisy[other] for other in others) if run.rows == scan.rows else noisy[name]
+            if fine or run.tips > TIPS:
+                faults.append(_fault("gyro and accel", run))
+        whole = [(fault.first, fault.last) for fault in faults]
+        for run in scan.long_runs("gyro"):
+            dead = scan.constant("gyro") and not scan.constant("accel") and noisy[name]
+            dead &= any(not scans[other].constant("gyro") for other in others)
+            if (dead or np.max(run.high - run.low) > MOVES) and not _within(run, whole):
+                faults.append(_fault("gyro", run))
+        for run in scan.long_runs("accel"):
+            if run.tipped > TIPPED and run.tips > TIPS and not _within(run, whole):
+                faults.append(_fault("accel", run))
+        if faults:
+            found[name] = sorted(faults, key=lambda fault: fault.first)
+    return found
+
+
+def _within(run: _Run, spans: list[tuple[float, float]]) -> bool:
+    return any(first <= run.first and run.last <= last for first, last in spans)
+
+
+def _fault(signals: str, run: _Run) -> Fault:
+    # What a sensor begins with was not measured either.
+    first = float(np.nextafter(run.first, -np.inf)) if run.first_row else run.first
+    return Fault(signals, first, run.last, tuple(run.value[_SIGNALS[signals]].tolist()))
+
+
+@dataclass
+class Scan:
+    """All sensors of a recording, gathered block by block: what is wrong with them as a whole."""
+
+    sensors: dict[str, SensorScan] = field(default_factory=dict)  # those with gyro and accel
+    orientations: dict[str, OrientationScan] = field(default_factory=dict)
+    _alike: dict[tuple[str, str], int] = field(default_factory=dict)  # rows that are equal in both and change
+    _changes: dict[str, int] = field(default_factory=dict)  # rows that change
+    faults: dict[str, list[Fault]] = field(default_factory=dict)  # known when all was pushed
+
+    def push(self, blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+        """The next rows of each sensor: times (n,) [s] and values (n, 6), gyro and accel, or (n, 4), an orientation."""
+        changed = {}
+        for name, (time, values) in blocks.items():
+            changed[name] = np.concatenate([[True], (np.diff(values, axis=0) != 0.0).any(axis=1)])[: len(values)]
+            self._changes[name] = self._changes.get(name, 0) + int(changed[name].sum())
+            good = np.isfinite(values).all(axis=1)
+            if values.shape[1] == 4:
+                self.orientations.setdefault(name, OrientationScan()).push(time[good], values[good])
+            else:
+                self.sensors.setdefault(name, SensorScan()).push(time[good], values[good])
+        for name, other in combinations(blocks, 2):
+            a, b = blocks[name][1], blocks[other][1]
+            if a.shape == b.shape:
+                alike = int(((a == b).all(axis=1) & changed[name]).sum())
+                self._alike[name, other] = self._alike.get((name, other), 0) + alike
+
+    def finish(self, where: str, start: tuple[float, float] | None) -> None:
+        """Judge what was pushed; `start` [s] is the start pose, where it is stated.
+
+        Raises
+        ------
+        BadData
+            Two sensors with the same values; one that is dead all along, or in the start pose.
+        """
+        for name, other in self._copies(self.sensors):
+            raise BadData(
+                f"{where}: sensors.{name} and sensors.{other} hold the same values in {self._alike[name, other]} rows: "
+                f"one is a copy of the other; name the file and columns in which each was recorded"
+            )
+        self.faults = faults_of(self.sensors)
+        for name, faults in self.faults.items():
+            scan = self.sensors[name]
+            for fault in faults:
+                first, last = max(fault.first, scan.first), fault.last
+                whole = fault.first < scan.first and last >= scan.last
+                if whole or (start is not None and first <= start[0] and last >= start[1]):
+                    when = "all along" if whole else "through the start pose"
+                    raise BadData(
+                        f"{where}: sensors.{name}: {fault.described(first)}, {when}, which no sensor does that "
+                        f"measures; take [sensors.{name}] out to track the others"
+                        + ("" if whole else ", or name another start pose")
+                    )
+
+    def _copies(self, among: Iterable[str]) -> list[tuple[str, str]]:
+        return [
+            pair
+            for pair, alike in self._alike.items()
+            if pair[0] in among and alike >= FROZEN_SAMPLES and alike > COPIED * self._changes[pair[0]]
+        ]
+
+    def notes(self) -> list[str]:
+        """What was found, in words."""
+        notes = []
+        for name, faults in self.faults.items():
+            seconds = sum(fault.last - max(fault.first, self.sensors[name].first) for fault in faults)
+            more = f", and {len(faults) - 1} times more" if len(faults) > 1 else ""
+            notes.append(f"sensors.{name}: {faults[0].described(faults[0].first)}{more}: {seconds:.3g} s count as lost")
+        notes += [
+            f"sensors.{name}: the orientation is the same in all {scan.rows} rows: is the sensor dead?"
+            for name, scan in self.orientations.items()
+            if scan.rows >= FROZEN_SAMPLES and scan.constant
+        ]
+        notes += [
+            f"sensors.{name} and sensors.{other} hold the same orientations: is one a copy of the other?"
+            for name, other in self._copies(self.orientations)
+        ]
+        return notes
+
+
+@dataclass
+class OrientationScan:
+    """What the rows of measured orientations show."""
+
+    rows: int = 0
+    constant: bool = True
+    _first: np.ndarray | None = None
+
+    def push(self, time: np.ndarray, quat_WS: np.ndarray) -> None:
+        """The next rows: times (n,) [s], orientations (n, 4) xyzw."""
+        if not len(time):
+            return
+        if self._first is None:
+            self._first = quat_WS[0].copy()
+        self.rows += len(time)
+        self.constant &= bool((quat_WS == self._first).all())

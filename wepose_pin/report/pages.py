@@ -1,0 +1,98 @@
+"""The pages beside a result that is written already: of a tracked recording, of a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from ..calibration import Calibration
+from ..calibration.protocols import Protocol
+from ..calibration.verdict import Verdict
+from ..page import reason
+from ..recording import Intervals, Recording
+from ..tracking import TrackedPose
+from ..viewer import pose_html
+from ..writers.pages import PageWriter
+from .calibration import calibration_report
+from .thinned import Thinner, Whole
+from .track import track_report
+
+PAGES = ("view.html", "report.html")
+
+
+def write_track_pages(
+    folder: Path,
+    pose: TrackedPose,
+    *,
+    view: bool = True,
+    report: bool = True,
+    whole: Whole | None = None,
+    fps: float = 30.0,
+) -> list[str]:
+    """Write ``view.html`` and ``report.html`` beside a result that is there already.
+
+    Parameters
+    ----------
+    view, report : which of them
+    whole : of a `pose` that `Thinner` thinned
+    fps : of ``view.html``
+
+    Returns
+    -------
+    list[str]
+        A line for each page, or part of one, that cannot be made; they stand in ``summary.json`` too.
+    """
+    model, recording = pose.model, pose.recording
+    assert model is not None
+    assert recording is not None
+    writer = PageWriter(folder, [name for name, wanted in zip(PAGES, (view, report), strict=True) if wanted])
+    page = None
+    if view:
+        page = writer.write(
+            "view.html", lambda _: pose_html(model, pose, phases=recording.phases, title=recording.name, fps=fps)
+        )
+    if report:
+        writer.write("report.html", lambda failures: track_report(pose, view=page, whole=whole, failures=failures))
+    writer.add_warnings("summary.json")
+    return writer.warnings
+
+
+def write_thinned_pages(
+    folder: Path,
+    thinner: Thinner,
+    phases: Mapping[str, Intervals],
+    warnings: list[str],
+    *,
+    report: bool = True,
+    fps: float = 30.0,
+) -> list[str]:
+    """`write_track_pages` of a recording that came in pieces; `phases` and `warnings` of the whole recording."""
+    try:
+        pose, whole = thinner.thinned(phases, warnings)
+    except Exception as error:
+        writer = PageWriter(folder, PAGES)
+        writer.warnings.append(f"{' and '.join(PAGES)}: cannot be made: {reason(error)}")
+        writer.add_warnings("summary.json")
+        return writer.warnings
+    return write_track_pages(folder, pose, report=report, whole=whole, fps=fps)
+
+
+def write_calibration_page(
+    folder: Path,
+    calibration: Calibration,
+    recording: Recording,
+    *,
+    method: str,
+    protocol: Protocol,
+    verdict: Verdict,
+) -> list[str]:
+    """Write ``report.html`` beside a calibration's result; what cannot be made, as of `write_track_pages`."""
+    writer = PageWriter(folder, ["report.html"])
+    writer.write(
+        "report.html",
+        lambda failures: calibration_report(
+            calibration, recording, method=method, protocol=protocol, verdict=verdict, failures=failures
+        ),
+    )
+    writer.add_warnings("calibration.json")
+    return writer.warnings
