@@ -115,6 +115,11 @@ def write_session(folder: Path, recorded: Recorded, layout: Layout, unit: str = 
     return session
 
 
+def data_files(folder: Path) -> list[Path]:
+    """What `write_session` wrote beside the session."""
+    return sorted([*folder.glob("recording.*"), *folder.glob("sensor_*")])
+
+
 def _clock_line(table: Table) -> str:
     return f"rate_hz = {table.rate_hz!r}" if table.stamps is None else 'time = "time"'
 

@@ -39,8 +39,8 @@ class Clock:
     """When a sensor samples and what the file says of it.
 
     `stamps`: even, rounded (to a millisecond), jitter (of the stamps), uneven (of the sampling), packets (of four,
-    which are stamped as they arrive), none (the rate is stated). `origin` [s] is what the file's clock shows at time zero;
-    `separate`: every sensor has its file, its own clock and rate. `twice`: rows written twice.
+    which are stamped as they arrive), none (the rate is stated). `origin` [s] is what the file's clock shows at time
+    zero; `separate`: every sensor has its file, its own clock and rate. `twice`: rows written twice.
     """
 
     rate_hz: float
