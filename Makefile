@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test check lint types wheel fuzz clean
+.PHONY: demo test check lint types wheel fuzz recordings clean
 
 demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 	$(BIN)/wepose demo -o demo --force
@@ -24,6 +24,10 @@ SECONDS ?= 60
 fuzz: $(READY)            ## fuzz all that is parsed, SECONDS=60 a target; TARGETS="csv body" for some
 	$(BIN)/python tests/fuzz/run.py $(TARGETS) --seconds $(SECONDS)
 
+SEEDS ?= 0:1000
+recordings: $(READY)      ## random recordings of ordinary behaviour, SEEDS=0:1000; goes on where it was stopped
+	$(BIN)/python tests/random_recordings/run.py --seeds $(SEEDS) --jobs 2
+
 wheel: $(READY)
 	$(BIN)/python -m build --wheel --outdir dist .
 
@@ -35,4 +39,4 @@ $(READY): pyproject.toml
 	@touch $(READY)
 
 clean:
-	rm -rf $(VENV) build dist demo .fuzz *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist demo .fuzz .random_recordings *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -15,7 +15,7 @@ import time
 import traceback
 import warnings as python_warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,22 +34,19 @@ NO_COVARIANCE = ("ncf", "gdc")  # methods that state no uncertainty
 EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet", "out.urdf")
 HAND_POINTS = {"left_palm": "left_hand", "right_palm": "right_hand"}  # our point → the project's
 
-# Words of a warning that says why a segment is not to be believed, by cause; it counts where it names the segment too.
-# One of GENERAL need not.
+# Words of a warning that says why a segment is not to be believed, by cause; it counts where it names the segment too,
+# or all of them. Causes of ALWAYS may be there in any recording, the others only where the case has them.
 CAUSES = {
     "range": r"cut off|saturat|range",
     "fault": r"does not measure|stands? still|stuck|fro[zs]en?|constant|same value|not change|dead|zero|lost|gap",
-    "identical": r"same (?:values|columns|samples|data|signal)|identical|equal to|copy|one sensor|two sensors",
-    "swapped": r"swap|exchanged|other'?s? name|each other|under",
-    "mount": r"off what gravity|mount|strapp",
-    "start": r"start",
-    "gravity": r"gravity|scale",
-    "moves": r"turns|moves|sway|swing",
+    "identical": r"same|identical|equal to|copy|one sensor|two sensors",
+    "swapped": r"swap|exchanged|other'?s? name|each other",
     "gap": r"gap|lost|bridged",
-    "heading": r"heading",
-    "rate": r"bias|drift|rotation",
+    "start": r"in phases\.start|in the start pose|no phases\.start|guess|quietest",
+    "bias": r"bias|drift",
 }
-GENERAL = {"start": r"guess|quietest|no phases\.start"}
+ALWAYS = ("start", "bias")
+ALL_SEGMENTS = r"no phases\.start|guess|quietest|all sensors|all headings"
 NOT_A_CAUSE = r"no sensor on|not known and not written|short gaps? bridged|no gauge|resampled"
 
 
@@ -79,8 +76,6 @@ class Result:
     lengths: dict[str, float]
     start: tuple[float, float]
     warnings: list[str]
-    guessed: bool = False
-    notes: list[str] = field(default_factory=list)
 
 
 # Session -----------------------------------------------------------------------------------------------------------
@@ -113,6 +108,11 @@ def write_session(folder: Path, recorded: Recorded, layout: Layout, unit: str = 
     session = folder / "session.toml"
     session.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return session
+
+
+def data_files(folder: Path) -> list[Path]:
+    """What `write_session` wrote beside the session."""
+    return sorted([*folder.glob("recording.*"), *folder.glob("sensor_*")])
 
 
 def _clock_line(table: Table) -> str:
@@ -175,7 +175,7 @@ def track(
     options = set(options)
     argv = ["track", str(session), "-o", str(out), *_gaps(options)]
     argv += [] if method == "amekf" else ["--method", method]
-    argv += [f"--{name}" for name in ("covariance", "causal") if name in options]
+    argv += [f"--{name}" for name in ("covariance", "causal", "torques", "no-limits") if name in options]
     argv += [] if "report" in options else ["--no-report"]
     argv += ["--subject", str(subject)] if subject else []
     return argv + (["--pieces", f"{chunk:g}"] if chunk else [])
@@ -197,8 +197,8 @@ def export(result: Path, out: Path) -> list[str]:
     return ["export", str(result), "-o", str(out)]
 
 
-def info(file: Path) -> list[str]:
-    return ["info", str(file)]
+def info(file: Path, session: Path | None = None) -> list[str]:
+    return ["info", str(file), *(["-o", str(session)] if session else [])]
 
 
 def reproduce(result: Path) -> list[str]:
@@ -275,7 +275,6 @@ def read_result(folder: Path) -> Result:
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     subject = (folder / "subject.toml").read_text(encoding="utf-8")
     lengths = dict(re.findall(r"^(\w+) = ([-0-9.e]+)", subject.split("[lengths]")[1].split("\n[")[0], re.MULTILINE))
-    texts = warnings_of(summary)
     std = {name: values.get(f"{name}_q_std", values.get(f"{name}_std")) for name in segments}
     return Result(
         time=values["time"],
@@ -287,8 +286,7 @@ def read_result(folder: Path) -> Result:
         table=table,
         lengths={name: float(value) for name, value in lengths.items()},
         start=_first_span(summary["phases"]["start"]),
-        warnings=texts,
-        guessed=any(re.search(GENERAL["start"], text) for text in texts),
+        warnings=warnings_of(summary),
     )
 
 
@@ -325,16 +323,12 @@ def write_truth(
 # Words -------------------------------------------------------------------------------------------------------------
 
 
-def names_cause(texts: Iterable[str], segments: Iterable[str]) -> str:
-    """The first warning that says why these segments may be wrong: it names one and a cause, or a general one."""
-    segments = list(segments)
+def names_cause(texts: Iterable[str], segments: Iterable[str], causes: Iterable[str]) -> str:
+    """The first warning that says why these segments may be wrong: it names one of them, or all, and a cause."""
+    segments, patterns = list(segments), [CAUSES[cause] for cause in {*causes, *ALWAYS}]
     for text in texts:
-        if re.search(NOT_A_CAUSE, text):
-            continue
-        named = any(re.search(rf"\b{segment}\b", text.replace("sensors.", "")) for segment in segments)
-        if named and any(re.search(pattern, text) for pattern in CAUSES.values()):
-            return text
-        if any(re.search(pattern, text) for pattern in GENERAL.values()):
+        named = any(re.search(rf"\b{segment}\b", text) for segment in segments) or re.search(ALL_SEGMENTS, text)
+        if named and not re.search(NOT_A_CAUSE, text) and any(re.search(pattern, text) for pattern in patterns):
             return text
     return ""
 

@@ -38,9 +38,9 @@ MOST_SAMPLES = 24_000  # of a recording
 class Clock:
     """When a sensor samples and what the file says of it.
 
-    `stamps`: even, jitter (of the stamps), uneven (of the sampling), packets (of four, stamped late), none (the rate is
-    stated). `origin` [s] is what the file's clock shows at time zero; `separate`: every sensor has its file, its own
-    clock and rate.
+    `stamps`: even, rounded (to a millisecond), jitter (of the stamps), uneven (of the sampling), packets (of four,
+    which are stamped as they arrive), none (the rate is stated). `origin` [s] is what the file's clock shows at time
+    zero; `separate`: every sensor has its file, its own clock and rate. `twice`: rows written twice.
     """
 
     rate_hz: float
@@ -48,15 +48,15 @@ class Clock:
     origin: float = 0.0
     separate: bool = False
     unit: str = "s"
-    equal_stamps: bool = False
     lost: list[tuple[float, float, str]] = field(default_factory=list)  # begin [s], duration [s], segment or "" for all
-    twice: int = 0  # rows written twice
+    twice: int = 0
 
     @property
     def late(self) -> float:
         """How far [s] a stamp may be off."""
         step = 1.0 / self.rate_hz
-        return {"jitter": 0.35 * step, "packets": 4.0 * step}.get(self.stamps, 0.0) + (1e-6 if self.origin else 0.0)
+        late = {"jitter": 0.35 * step, "packets": 4.0 * step, "rounded": 1e-3}
+        return late.get(self.stamps, 0.0) + (1e-6 if self.origin else 0.0)
 
 
 @dataclass
@@ -167,7 +167,10 @@ def draw_case(seed: int, seconds: float | None = None) -> Case:
 def _clock(rng: np.random.Generator) -> Clock:
     rates, weights = np.array(list(RATES)), np.array(list(RATES.values()))
     clock = Clock(float(rng.choice(rates, p=weights / weights.sum())))
-    clock.stamps = str(rng.choice(["even", "none", "jitter", "uneven", "packets"], p=[0.66, 0.1, 0.12, 0.06, 0.06]))
+    kinds = {"even": 0.6, "none": 0.1, "rounded": 0.08, "jitter": 0.1, "uneven": 0.06, "packets": 0.06}
+    clock.stamps = str(rng.choice(list(kinds), p=list(kinds.values())))
+    if clock.stamps == "rounded" and clock.rate_hz > 200.0:
+        clock.stamps = "even"
     if clock.stamps != "none":
         clock.origin = float(
             rng.choice([0.0, rng.uniform(1.0, 5000.0), 1.7e9 + rng.uniform(0, 1e6)], p=[0.65, 0.15, 0.2])
@@ -269,9 +272,16 @@ def _layout(rng: np.random.Generator) -> Layout:
 def _commands(case: Case, rng: np.random.Generator) -> None:
     """Method, options, and what follows `track`."""
     case.method = str(rng.choice(list(METHODS), p=list(METHODS.values())))
-    for option, share in (("covariance", 0.3), ("report", 0.2), ("causal", 0.12)):
+    for option, share in (
+        ("covariance", 0.3),
+        ("report", 0.2),
+        ("causal", 0.12),
+        ("torques", 0.04),
+        ("no-limits", 0.04),
+    ):
         if rng.random() < share and not (option == "causal" and case.method == "smoother"):
             case.options.add(option)
+    whole = case.method == "smoother" or bool(case.options & {"causal", "torques"})  # not tracked in chunks
     steps = ["calibrate"] if case.clasp else []
     steps.append("track")
     for step, share in (
@@ -284,7 +294,7 @@ def _commands(case: Case, rng: np.random.Generator) -> None:
         ("chunks", 0.3),
         ("retarget", 0.03),
     ):
-        if rng.random() < share and not (step == "chunks" and ("causal" in case.options or case.method == "smoother")):
+        if rng.random() < share and not (step == "chunks" and whole):
             steps.append(step)
     case.steps = steps
     if case.clasp:

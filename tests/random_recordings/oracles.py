@@ -156,8 +156,9 @@ def of_errors(result: Result, case: Case, recorded: Recorded, stated: bool, show
         z = np.maximum(error - truth.moved[name] - FLOOR_M, 0.0) / (ALL_AXES * np.maximum(std, 1e-9))
         k = int(np.argmax(z))
         worst.append((float(z[k]), name, k, f"{1e3 * error[k]:.0f} mm at ± {1e3 * std[k]:.0f}"))
+    causes = {*case.suspects.values(), *(["gap"] if case.clock.lost else [])}
     for z_, name, k, error_ in sorted(worst, reverse=True):
-        excuse = adapter.names_cause(result.warnings, _behind(name, case)) if z_ > MOST_Z else ""
+        excuse = adapter.names_cause(result.warnings, _behind(name, case), causes) if z_ > MOST_Z else ""
         if z_ > found.z:
             found.z, found.of, found.at, found.error, found.excuse = z_, name, float(result.time[k]), error_, excuse
         if not excuse:

@@ -85,6 +85,8 @@ def record(case: Case, variant: Variant | None = None) -> Recorded:
                 t = t[keep]
                 signals = {name: _rows(s, keep) for name, s in signals.items()}
         stamps = t + _stamp_errors(clock.stamps, t, own_rate, rng) + origin
+        if clock.stamps == "rounded":
+            stamps = np.round(stamps, 3)
         if clock.twice:
             double = np.sort(np.concatenate([np.arange(len(t)), rng.choice(len(t), clock.twice, replace=False)]))
             stamps, signals = stamps[double], {name: _rows(s, double) for name, s in signals.items()}
@@ -123,9 +125,9 @@ def _stamp_errors(kind: str, t: np.ndarray, rate_hz: float, rng: np.random.Gener
     """What the stamps are late by [s]."""
     if kind == "jitter":
         return np.clip(rng.normal(0.0, 0.08, len(t)), -0.3, 0.3) / rate_hz
-    if kind == "packets":  # of four, stamped as they arrive, a hair apart, with the last of them
+    if kind == "packets":  # of four, stamped when the last is there, a hundredth of a step apart
         place = np.arange(len(t)) % 4
-        return (3 - place) / rate_hz + place * 1e-4 / rate_hz * 100.0 * 0.05
+        return (3.0 - 0.99 * place) / rate_hz
     return np.zeros(len(t))
 
 

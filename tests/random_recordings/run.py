@@ -12,6 +12,7 @@ import json
 import multiprocessing
 import os
 import sys
+import tomllib
 import traceback
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,12 @@ def read_reports(file: Path) -> list[dict[str, Any]]:
     return reports
 
 
+def failed_once() -> list[int]:
+    """Seeds that run for ever."""
+    values = tomllib.loads((Path(__file__).parent / "regressions.toml").read_text(encoding="utf-8"))
+    return [entry["number"] for entry in values.get("seed", [])]
+
+
 def main() -> int:
     """Run, and say what came of it: exit code 1 where an oracle failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -92,6 +99,8 @@ def main() -> int:
         return 1 if report.failures else 0
     first, _, last = options.seeds.partition(":")
     seeds = list(range(int(first), int(last))) if last else [int(seed) for seed in first.split(",")]
+    if last:
+        seeds = list(dict.fromkeys([*failed_once(), *seeds]))
     if not options.report:
         run_seeds(seeds, options.out, options.jobs, options.as_process)
     reports = [report for report in read_reports(options.out / "seeds.jsonl") if report["seed"] in set(seeds)]

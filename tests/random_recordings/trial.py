@@ -144,9 +144,11 @@ class Trial:
 
     def info(self) -> None:
         self.command(adapter.info(self.session), acceptance="may: a damaged recording" if self.case.refusal else "")
-        for path in sorted(self.folder.glob(f"*{self.case.layout.suffix}"))[:1]:
-            if path.name != "truth.parquet":
-                self.command(adapter.info(path), acceptance="may: the format is guessed")
+        path, written, out = adapter.data_files(self.folder)[0], self.folder / "proposed.toml", self.folder / "proposed"
+        outcome = self.command(adapter.info(path, written), acceptance="may: the file alone does not say")
+        if outcome.code == 0:  # what is proposed may lack a mount, and says so in a line
+            argv = adapter.track(written, out, "amekf", self.case.options & {"gaps"})
+            self.command(argv, out, "may: a proposal is to be completed")
 
     def reproduce(self) -> None:
         outcome = self.command(adapter.reproduce(self.result_folder), acceptance="")
