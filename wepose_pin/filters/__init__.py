@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
 from ..arguments import check_arguments
 from ..errors import BadData, BadOption, BadPhase, one_of
 from ..noise import SensorNoise, noise_of
@@ -175,10 +174,10 @@ class SensorRun:
     """`run_filter` of a recording that comes in chunks; all that it gives, put together, is that of the whole.
 
     The filter starts with the tilt of the start phase and goes forward from its first sample; what lies before is
-    filtered backward from there, so that a recording may begin in motion. The smoother goes forward over all, from where
-    the way back has ended; it alone looks ahead, by one chunk: `push` gives the chunk before, and what lies further
-    ahead does not count. Its chunks are multiples of `piece_multiple`. Parameters as `run_filter`; the start phase is in
-    the first chunk.
+    filtered backward from there, so that a recording may begin in motion. The smoother goes forward over all, from
+    where the way back has ended; it alone looks ahead, by one chunk: `push` gives the chunk before, and what lies
+    further ahead does not count. Its chunks are multiples of `piece_multiple`. Parameters as `run_filter`; the start
+    phase is in the first chunk.
 
     Raises
     ------
@@ -223,7 +222,7 @@ class SensorRun:
         return self._orientation(self._filter.finish(), self._static)
 
     def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> int:
-        """Make the filter, and filter what lies before the start phase; gives the sample that the filter goes on with."""
+        """Make the filter, and filter what lies before the start phase; gives the filter's first sample."""
         phase = self._start or slice(0, self.test.samples(self._rate_hz))
         first = phase.start
         start = start_tilt(gyro_S[phase], accel_S[phase], self._noise, self._rate_hz)
@@ -236,9 +235,7 @@ class SensorRun:
             if self._method in OFFLINE:  # goes forward over all, from where the way back has ended
                 turn = np.nan_to_num(gyro_S[0] - before.gyro_bias[0]) / self._rate_hz
                 quat_WS = (Rotation.from_quat(before.quat_WS[0]) * Rotation.from_rotvec(-turn)).as_quat()
-                assert before.attitude_cov is not None
-                tilt_std = float(np.sqrt(np.trace(before.attitude_cov[0]) / 2.0))
-                start, first = StartTilt(quat_WS, tilt_std), 0
+                start, first = StartTilt(quat_WS, MOVING_TILT_STD), 0  # what the way back knows counts but once
             else:
                 self._before = before
         self._filter = self._made(self._method, self._noise, start)
