@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from .arguments import NonNegative, Positive
+from .arguments import NonNegative, Range
 from .errors import BadData
 from .noise import SensorNoise
 from .so3 import inlined, kernel
@@ -26,7 +26,7 @@ class StaticTest:
     The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite.
     """
 
-    window_s: Positive = 0.5  # [s] W
+    window_s: Annotated[float, Range(0.0, closed=False, high=60.0)] = 0.5  # [s] W
     alpha: NonNegative = 2.0  # (1) gyro covariance against the still one
     beta: NonNegative = 2.0  # (2) accel/g covariance against the still one
     gamma1: NonNegative = 0.01  # (3) |mean ‖accel/g‖ − 1| at most
