@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import heading_to, segment_orientations
+from wepose_pin.alignment import heading_to, mount_advice, need_mounts, segment_orientations
+from wepose_pin.calibration import load_protocol
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
-from wepose_pin.recording import Recording, Sensor, axes_from_mount, mount_from_axes
+from wepose_pin.recording import SEGMENTS, Recording, Sensor, axes_from_mount, mount_from_axes
 from wepose_pin.simulation import Simulation, paper_dynamic
 from wepose_pin.subject import StartTilt, Subject, average_subject, mount_rows
 
@@ -228,3 +229,31 @@ def test_what_is_bridged_is_uncertain(method: str) -> None:
         nees.append(uncertainty(error, found.covariance_W["torso"][2050:2600]).nees)
     print(method, "NEES after the gap:", np.round(nees, 2))
     assert np.mean(nees) < 6.0
+
+
+def test_it_says_which_calibration_finds_a_mount() -> None:
+    """And of which segments none does: what is said of the protocols is what they look at."""
+    protocols = {name: load_protocol(name) for name in ("clasp", "handle", "poses", "touch_left", "touch_right")}
+    for segment in SEGMENTS:
+        advice = mount_advice([segment])
+        assert 'mount = { up = "+x"' in advice
+        finding = {name for name, protocol in protocols.items() if segment in protocol.segments}
+        said = {name for name in protocols if name in advice}
+        if segment == "torso":
+            assert "touch" in advice
+            said |= {"touch_left", "touch_right"}
+        assert said == finding
+        assert ("no calibration finds" in advice) == (not finding)
+
+
+@pytest.mark.parametrize("segment", ["head", "pelvis", "left_forearm"])
+def test_an_unknown_mount_beside_a_subject_that_has_none_for_it(simulation: Simulation, segment: str) -> None:
+    recording = simulation.recording()
+    bare = replace(recording.sensors["torso"], stated_quat_LS=None)
+    recording = replace(recording, sensors={**recording.sensors, segment: bare})
+    known = {name: quat for name, quat in simulation.quat_LS.items() if name != segment}
+    subject = replace(average_subject(), name="anna", mounts=known)
+    with pytest.raises(BadSession, match=rf"sensors\.{segment}\.mount is not known.*'anna' has none for it") as told:
+        need_mounts(recording, subject)
+    assert ("no calibration finds" in str(told.value)) == (segment in ("head", "pelvis"))
+    assert "\n" not in str(told.value)

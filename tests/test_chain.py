@@ -17,7 +17,7 @@ from wepose_pin.errors import BadModel, BadOption, BadSession, WeposeError
 from wepose_pin.model.robot import joint_values, load_robot, start_configuration
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe
-from wepose_pin.readers.trials import UR5_SENSORS, read_ur5
+from wepose_pin.readers.trials import find_ur5, read_ur5
 from wepose_pin.recording import CONFIGURATION, Recording, Sensor, mount_from_axes
 from wepose_pin.tracking import track, track_chain
 from wepose_pin.validation.real import UNSCORED_S, UR5_OFF
@@ -129,8 +129,8 @@ def ur5_session(data: Path, run: str, folder: Path) -> dict[str, Rotation]:
     The encoders' frames equal each other at the start, where the arm stands upright; their x is W's y there. That their
     joint angles, taken so, have the tool drawn in a plane to 0.1 mm is what says that the start is `HOME`.
     """
-    sensors = [sensor for sensor in UR5_SENSORS if (run, sensor) not in UR5_OFF]
-    trials = {sensor: read_ur5(data / "ur5", run, sensor) for sensor in sensors}
+    files = [each for each in find_ur5(data) if each.recording == run and (run, each.sensor) not in UR5_OFF]
+    trials = {each.sensor: read_ur5(each) for each in files}
     table, text, truth = {}, "", {}
     for sensor, trial in trials.items():
         for kind, values in (("gyr", trial.gyro_S), ("acc", trial.accel_S)):

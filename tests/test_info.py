@@ -159,7 +159,7 @@ def test_units_of_a_table_are_told_by_its_values(
 
 def test_rest_is_found_and_proposed(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     gyro, accel = np.full((600, 3), 0.002), np.tile([0.0, 0.0, 9.81], (600, 1))
-    gyro[250:] += np.sin(0.2 * np.arange(350))[:, None]
+    gyro[250:, 2] += np.sin(0.2 * np.arange(350))  # about the vertical, as accel says
     values = np.column_stack([np.arange(600) / 100.0, gyro, accel])
     names = ["time", *table().columns[1::2], *table().columns[2::2]]
     pl.DataFrame(values, schema=names).write_csv(tmp_path / "a.csv")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from functools import cache
 from pathlib import Path
 
@@ -9,8 +11,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.cli import main
 from wepose_pin.errors import BadData, MissingFile, UnknownColumn
-from wepose_pin.readers.trials import RING_MOUNTS, RING_SEGMENTS, Referenced, read_broad, read_ring, read_ur5
+from wepose_pin.readers.trials import (
+    RING_MOUNTS,
+    RING_SEGMENTS,
+    Referenced,
+    RingFiles,
+    Ur5Files,
+    find_ring,
+    find_ur5,
+    read_broad,
+    read_ring,
+    read_ur5,
+)
 from wepose_pin.simulation import SingleSensor, paper_dynamic
 from wepose_pin.validation import Result, real, summary
 from wepose_pin.validation.registration import register
@@ -19,6 +33,18 @@ from wepose_pin.validation.registration import register
 OFFSET_S = -0.028
 R_BS = Rotation.from_rotvec([8.0, -3.0, 95.0], degrees=True)
 R_VW = Rotation.from_rotvec([0.0, 0.0, 130.0], degrees=True) * Rotation.from_rotvec([0.9, -0.5, 0.0], degrees=True)
+
+
+def ring_files(folder: Path) -> RingFiles:
+    """As the data set names them."""
+    imu = dict(zip(RING_MOUNTS, (folder / "imu_rigid.csv", folder / "imu_nonrigid.csv"), strict=True))
+    return RingFiles(folder, folder / "omc.csv", imu)
+
+
+def ur5_files(folder: Path, recording: str, sensor: str) -> Ur5Files:
+    """As the data set names them."""
+    imu, encoder = folder / "imu" / recording / f"{sensor}_adx.csv", folder / "encoder" / recording / f"{sensor}.csv"
+    return Ur5Files(recording, sensor, imu, encoder)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +99,7 @@ def test_links_are_fitted_from_orientations_and_tip() -> None:
 
 
 def test_ring_is_read_as_it_is(data: Path) -> None:
-    chain = read_ring(data / "ring" / "trial1")
+    chain = read_ring(ring_files(data / "ring" / "trial1"))
     assert set(chain.sensors) == {(mount, segment) for mount in RING_MOUNTS for segment in RING_SEGMENTS}
     lost = [np.isnan(quat).any(axis=1) for quat in chain.quat_VB.values()]
     assert all(np.array_equal(lost[0], each) for each in lost)
@@ -89,7 +115,7 @@ def test_ring_is_read_as_it_is(data: Path) -> None:
 
 def test_optical_orientations_give_the_optical_lengths(data: Path) -> None:
     """Shares with `optical_links` only the tip: what is left is play in the joints."""
-    chain = read_ring(data / "ring" / "trial1")
+    chain = read_ring(ring_files(data / "ring" / "trial1"))
     links = real.optical_links(chain)
     seen = np.isfinite(links.tip_V).all(axis=1)
     R = [Rotation.from_quat(chain.quat_VB[segment][seen]) for segment in ("seg2", "seg3", "seg4")]
@@ -149,7 +175,7 @@ def test_link_lengths_from_orientations_and_tip(data: Path) -> None:
 
 def test_ur5_is_read_as_it_is(data: Path) -> None:
     for recording, sensor, begins_s in (("circle-100", "carpus", 0.9), ("triangle-250", "radius", 4.2)):
-        found = read_ur5(data / "ur5", recording, sensor)
+        found = read_ur5(ur5_files(data / "ur5", recording, sensor))
         assert found.rate_hz == pytest.approx(125.0)
         assert found.still.stop / found.rate_hz == pytest.approx(begins_s, abs=0.3)
         at_rest = np.linalg.norm(found.accel_S[found.still], axis=1).mean()
@@ -186,15 +212,15 @@ def test_broad_needs_no_registration(data: Path) -> None:
 
 def test_broken_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(MissingFile, match=r"omc\.csv"):
-        read_ring(tmp_path)
+        read_ring(ring_files(tmp_path))
     with pytest.raises(MissingFile, match=r"carpus_adx\.csv"):
-        read_ur5(tmp_path, "circle-250", "carpus")
+        read_ur5(ur5_files(tmp_path, "circle-250", "carpus"))
     (tmp_path / "omc.csv").write_text("a,b\n1,2\n")
     with pytest.raises(BadData, match=r"omc\.csv: begins with 'a,b'.*sampling frequency"):
-        read_ring(tmp_path)
+        read_ring(ring_files(tmp_path))
     (tmp_path / "omc.csv").write_text("# sampling frequency: 30\na,b\n1,2\n")
     with pytest.raises(UnknownColumn, match=r"no column 'seg1_quat_w' in .*omc\.csv"):
-        read_ring(tmp_path)
+        read_ring(ring_files(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -216,7 +242,7 @@ def test_a_ur5_that_does_not_fit_is_said(
         path.parent.mkdir(parents=True)
         path.write_text("\n".join([head, *rows]) + "\n")
     with pytest.raises(BadData, match=said):
-        read_ur5(tmp_path, "r", "s")
+        read_ur5(ur5_files(tmp_path, "r", "s"))
 
 
 def test_quick_takes_two_of_broad_and_one_of_the_others(data: Path) -> None:
@@ -224,3 +250,59 @@ def test_quick_takes_two_of_broad_and_one_of_the_others(data: Path) -> None:
     assert len(quick["BROAD"]) == 2
     assert len(quick["RING, rigid mounts"]) == len(quick["UR5"]) == 1
     assert len(real.experiments(data)["RING, loose mounts"]) == 5
+
+
+def test_files_are_found_by_their_columns_wherever_they_lie(data: Path, tmp_path: Path) -> None:
+    """Another folder's name, other files' names, all in one place, among what is none of them."""
+    assert find_ring(data) == [ring_files(data / "ring" / "trial1")]
+    known = {(files.recording, files.sensor): files for files in find_ur5(data)}
+    assert len(known) == 8
+    assert known["circle-250", "radius"] == ur5_files(data / "ur5", "circle-250", "radius")
+    place = tmp_path / "what the student" / "sent"
+    place.mkdir(parents=True)
+    for old, new in (("imu_rigid", "Rigid IMUs"), ("imu_nonrigid", "imu LOOSE"), ("omc", "optical")):
+        shutil.copyfile(data / "ring" / "trial1" / f"{old}.csv", place / f"{new}.csv")
+    run = tmp_path / "robot" / "monday"
+    run.mkdir(parents=True)
+    shutil.copyfile(data / "ur5" / "imu" / "circle-250" / "carpus_adx.csv", run / "carpus_adx.csv")
+    shutil.copyfile(data / "ur5" / "encoder" / "circle-250" / "carpus.csv", run / "carpus.csv")
+    (run / "notes.csv").write_text("a,b\n1,2\n")
+    (run / "damaged.csv").write_bytes(b"\xff\xfe\x00")
+    (run / "folder.csv").mkdir()
+    found = real.experiments(tmp_path)
+    assert [job.trial for job in found["UR5"]] == ["monday carpus"]
+    assert [job.trial for job in found["RING, loose mounts"]] == list(RING_SEGMENTS)
+    assert find_ring(tmp_path)[0].imu["loose"].name == "imu LOOSE.csv"
+    assert read_ur5(find_ur5(tmp_path)[0]).still.stop > 50
+
+
+def test_a_trial_that_cannot_be_scored_is_told_and_skipped(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "broad").mkdir()
+    good = sorted((data / "broad").glob("*.mat"))[0]
+    (tmp_path / "broad" / "00_damaged.mat").write_bytes(b"no trial")
+    (tmp_path / "broad" / good.name).symlink_to(good)
+    monkeypatch.setattr("wepose_pin.validation.experiments", lambda _, folder: real.experiments(folder))
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as stop:
+        main(["validate", "--data", str(tmp_path), "-o", str(out)])
+    assert not stop.value.code
+    said = capsys.readouterr()
+    (line,) = said.err.splitlines()
+    for words in ("BROAD", "00_damaged", "not scored", "is no trial"):
+        assert words in line
+    document = json.loads((out / "validation.json").read_text())
+    assert [each["trial"] for each in document["skipped"]] == ["00_damaged"]
+    assert {result["trial"] for result in document["results"]} == {good.stem}
+    for page in ("validation.md", "validation.html"):
+        assert "00_damaged: not scored" in (out / page).read_text()
+    with pytest.raises(SystemExit) as stop:  # from the file, the same is said
+        main(["validate", "--from", str(out / "validation.json"), "-o", str(tmp_path / "again")])
+    assert capsys.readouterr().err.splitlines() == [line]
+    (tmp_path / "broad" / good.name).unlink()
+    with pytest.raises(SystemExit) as stop:
+        main(["validate", "--data", str(tmp_path), "-o", str(tmp_path / "none")])
+    assert stop.value.code == 2
+    assert "nothing could be scored" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()

@@ -30,6 +30,7 @@ from wepose_pin.retargeting import (
     write_trajectory,
 )
 from wepose_pin.retargeting.causes import causes, possible
+from wepose_pin.retargeting.check import Touching
 from wepose_pin.retargeting.collision import Shapes
 from wepose_pin.retargeting.limits import acceleration_bounds, urdf_limits, usable
 from wepose_pin.retargeting.person import CLAMP_FROM, CLAMP_TO, drawn_in
@@ -361,7 +362,7 @@ def test_an_arm_that_is_never_known_is_refused(arm) -> None:
     nowhere = {name: np.full_like(p, np.nan) for name, p in pose.points.items()}
     with pytest.raises(BadData, match="right arm is not known anywhere"):
         retarget(replace(pose, points=nowhere), arm)
-    with pytest.raises(BadData, match=r"right arm is not in the pose: right_upper_arm.*--arm"):
+    with pytest.raises(BadData, match=r"right arm is not in the pose: right_upper_arm"):
         retarget(person(2.0, side="left"), arm)
 
 
@@ -432,6 +433,60 @@ def test_a_map_that_is_wrong_says_where(tmp_path: Path, old: str, new: str, text
     urdf.with_suffix(".toml").write_text(said.replace(old, new, 1))
     with pytest.raises(BadModel, match=text):
         load(find_map(str(urdf)))
+
+
+def with_gripper(urdf: Path, link: str) -> None:
+    """Two fingers that slide, the first of them named as a joint of the arm, whose hand is `link`."""
+    fingers = "".join(
+        f'<link name="finger_{k}"/><joint name="finger_{k}_joint" type="prismatic"><parent link="hand"/>'
+        f'<child link="finger_{k}"/><origin xyz="0 0 -0.1"/><axis xyz="1 0 0"/>'
+        f'<limit lower="0" upper="0.04" velocity="0.2" effort="10"/></joint>'
+        for k in (1, 2)
+    )
+    urdf.write_text(urdf.read_text().replace("</robot>", f"{fingers}</robot>"))
+    said = urdf.with_suffix(".toml").read_text()
+    said = said.replace('"yaw"]', '"yaw", "finger_1_joint"]').replace("yaw = 12.0", "yaw = 12.0\nfinger_1_joint = 1.0")
+    urdf.with_suffix(".toml").write_text(said.replace('hand = { link = "hand"', f'hand = {{ link = "{link}"'))
+
+
+@pytest.mark.parametrize("link", ["hand", "finger_1", "finger_2"])
+def test_a_gripper_is_no_joint_of_the_arm(tmp_path: Path, link: str) -> None:
+    urdf = write_arm(tmp_path)
+    with_gripper(urdf, link)
+    with pytest.raises(BadModel, match=r"arms.right.joints: 'finger_1_joint' is no joint of the arm"):
+        load(find_map(str(urdf)))
+
+
+@pytest.mark.parametrize(("up", "forward"), [("-z", "+x"), ("+z", "-x"), ("+x", "+y")])
+def test_a_rest_of_another_mount_is_refused(tmp_path: Path, up: str, forward: str) -> None:
+    urdf = write_arm(tmp_path, up=up, forward=forward)
+    with pytest.raises(BadModel, match=r"arm.toml: rest: the right hand is .* give a rest for this mount"):
+        load(find_map(str(urdf)))
+    text = urdf.with_suffix(".toml").read_text()
+    urdf.with_suffix(".toml").write_text(text.replace("[rest]\nelbow = -1.2", ""))
+    load(find_map(str(urdf)))
+
+
+def test_of_an_arm_that_is_not_there_the_message_says_what_to_do(arm) -> None:
+    pose = person(2.0)
+
+    def without(*parts: str) -> Pose:
+        quat = {name: quat for name, quat in pose.quat_WL.items() if name not in parts}
+        return replace(pose, quat_WL=quat, points={n: p for n, p in pose.points.items() if "torso" not in parts})
+
+    with pytest.raises(BadData, match="right_forearm is missing; an arm needs sensors on torso, upper arm and forearm"):
+        retarget(without("right_forearm"), arm)
+    with pytest.raises(BadData, match="torso, right_shoulder"):
+        retarget(without("torso"), arm)
+    with pytest.raises(BadData, match=r"right arm is not in the pose.*arm has no arm for the left one, which is there"):
+        retarget(person(2.0, side="left"), arm)
+
+
+def test_a_robot_is_taken_by_its_file_too(tmp_path: Path, arm) -> None:
+    urdf = write_arm(tmp_path)
+    pose = person(1.0)
+    for robot in (str(urdf), urdf):
+        np.testing.assert_array_equal(retarget(pose, robot).u, retarget(pose, arm).u)
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
@@ -524,6 +579,19 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert '"right_robot"' in page
     code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
     assert (code, "--force replaces" in text) == (2, True)
+
+
+def test_the_exit_code_says_that_no_robot_should_run_it(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the check of the written trajectory finds decides, not what the solver thinks of it."""
+    urdf = write_arm(tmp_path)
+    hit = Touching(3, "hand_0 and base_0 at 2.00 s", 10, {"touch at rest": []})
+    monkeypatch.setattr("wepose_pin.retargeting.touching", lambda *_: hit)
+    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
+    assert code == 3
+    assert "touches itself in 3 samples, first hand_0 and base_0 at 2.00 s" in " ".join(text.split())
+    assert (tmp_path / "out" / "trajectory.parquet").is_file()
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,9 @@ from wepose_pin.alignment import START_POSE_STD, segment_orientations
 from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.noise import quietest
 from wepose_pin.readers import iter_session
+from wepose_pin.readers.clocks import clock_of
 from wepose_pin.readers.plausibility import sensor_notes
+from wepose_pin.readers.session import SessionReader
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.simulation import Simulation, simulate, simulated_person
 from wepose_pin.tracking import track, track_pieces
@@ -79,7 +80,9 @@ def test_a_sensor_that_never_measures_is_refused_by_name(
         next(iter_session(path, 5.0))
 
 
-@pytest.mark.parametrize(("signals", "since"), [("gyro accel", 9.0), ("gyro accel", 16.3), ("gyro", 9.0), ("accel", 9.0)])
+@pytest.mark.parametrize(
+    ("signals", "since"), [("gyro accel", 9.0), ("gyro accel", 16.3), ("gyro", 9.0), ("accel", 9.0)]
+)
 def test_a_sensor_that_freezes_is_lost_from_there(signals: str, since: float, made: Simulation, tmp_path: Path) -> None:
     whole = made.recording("frozen")
     path = written(tmp_path / "in", stopped(whole, signals, since))
@@ -95,8 +98,10 @@ def test_a_sensor_that_freezes_is_lost_from_there(signals: str, since: float, ma
     np.testing.assert_array_equal(np.concatenate(pieces), gap)
 
 
-@pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
-@pytest.mark.parametrize(("since", "until"), [(9.0, 99.0), (16.3, 18.0)])
+@pytest.mark.parametrize(
+    ("since", "until", "method"),
+    [*((9.0, 99.0, method) for method in ("amekf", "smoother", "smekf")), (5.0, 7.4, "amekf"), (5.0, 7.4, "smoother")],
+)
 def test_an_arm_whose_sensor_froze_is_where_its_uncertainty_says(
     since: float, until: float, method: str, made: Simulation, tmp_path: Path
 ) -> None:
@@ -113,7 +118,8 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
 ) -> None:
     """A wide swing is cut off in the middle; whoever believes it is off by many standard deviations."""
     whole, level = made.recording("cut"), np.deg2rad(120.0)
-    fast = 4.0 * whole.sensors[BROKEN].gyro_S.copy()
+    gyro_S = whole.sensors[BROKEN].gyro_S
+    fast = 4.0 * (gyro_S - gyro_S[50:450].mean(axis=0))
     turned = Rotation.from_quat(so3.integrate(fast[1:] / RATE))
     accel = turned.inv().apply(whole.sensors[BROKEN].accel_S[0])
     accel += 0.01 * np.random.default_rng(0).standard_normal(accel.shape)
@@ -130,7 +136,8 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
 
     def worst(recording: Recording) -> float:
         of = segment_orientations(recording, method=method).orientation[BROKEN]
-        off = (turned[300].inv() * turned).inv() * (Rotation.from_quat(of.quat_WS[300]).inv() * Rotation.from_quat(of.quat_WS))
+        R_VS = Rotation.from_quat(of.quat_WS)
+        off = (turned[300].inv() * turned).inv() * (R_VS[300].inv() * R_VS)
         return float((off.magnitude() / np.sqrt(np.linalg.eigvalsh(of.attitude_cov)[:, -1]))[450:].max())
 
     assert worst(with_sensor(read, BROKEN, gyro_range=np.inf)) > 6.0
@@ -206,3 +213,96 @@ def test_a_start_pose_with_a_gap_in_it_is_that_of_what_was_measured(made: Simula
         segment_orientations(ready)
     alone = segment_orientations(replace(ready, sensors={"torso": ready.sensors["torso"]}))
     assert Rotation.from_quat(alone.quat_LS["torso"]).magnitude() < 1e-6
+
+
+# Right, and once refused -------------------------------------------------------------------------------------------
+
+
+def swing(hertz: float, peak_deg_s: float, radius: float = 0.55) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time [s], gyro and accel of a wrist on an arm that swings about the shoulder, after five seconds of standing."""
+    time = np.arange(2500) / RATE
+    on = np.clip(time - 5.0, 0.0, 1.0)
+    angle = on * np.deg2rad(peak_deg_s) / (2.0 * np.pi * hertz) * np.sin(2.0 * np.pi * hertz * time)
+    R = Rotation.from_rotvec(angle[:, None] * [0.1, 0.99, 0.1])
+    place = R.apply([0.0, 0.0, -radius])
+    force = R.inv().apply(np.gradient(np.gradient(place, time, axis=0), time, axis=0) + [0.0, 0.0, 9.81])
+    rate = np.concatenate([np.zeros((1, 3)), (R[:-1].inv() * R[1:]).as_rotvec() * RATE])
+    noise = np.random.default_rng(0).standard_normal((2, len(time), 3))
+    return time, rate + 0.002 * noise[0], force + 0.02 * noise[1]
+
+
+@pytest.mark.parametrize(("hertz", "peak"), [(1.5, 800.0), (1.0, 500.0), (2.5, 900.0), (0.8, 1200.0)])
+def test_arms_that_swing_fast_are_measured_in_the_unit_that_is_stated(hertz: float, peak: float) -> None:
+    time, gyro, accel = swing(hertz, peak)
+
+    def notes(scale: float) -> tuple[str, ...]:
+        phases = {"start": ((0.5, 4.5),)}
+        sensor = Sensor(gyro_S=scale * gyro, accel_S=accel)
+        return sensor_notes(Recording("swing", time, RATE, {"torso": sensor}, phases))
+
+    assert notes(1.0) == ()
+    if peak > 1000.0:  # speeds that two seconds do not average out: either unit may be
+        return
+    with pytest.raises(BadData, match="gyro"):
+        notes(180.0 / np.pi)
+    with pytest.raises(BadData, match='"rad/s" would fit'):
+        notes(np.pi / 180.0)
+
+
+@pytest.mark.parametrize("within", [0.0, 1e-4, 2e-3])
+@pytest.mark.parametrize("packet", [2, 4, 10])
+def test_time_stamps_of_packets_are_spread_over_their_samples(packet: int, within: float) -> None:
+    true = 1.7e9 + np.arange(2000) / RATE
+    stamps = true[packet - 1 :: packet].repeat(packet)
+    stamps += np.tile(np.arange(packet) - packet + 1, 2000 // packet) * within
+    clock = clock_of(stamps, "x")
+    assert clock.packet == packet
+    np.testing.assert_allclose(clock.time, true, atol=1e-4 + 0.02 * within)
+    lost = np.r_[0:1000, 1000 + packet : 2000]
+    clock = clock_of(stamps[lost], "x")
+    np.testing.assert_allclose(clock.time[clock.row >= 0], true[lost], atol=1e-4 + 0.02 * within)
+    assert np.count_nonzero(clock.row < 0) == packet
+
+
+def test_a_measured_orientation_that_is_lost_for_long_is_the_same_in_chunks(tmp_path: Path) -> None:
+    time = np.arange(3000) / RATE
+    quat = Rotation.from_rotvec(np.clip(time - 5.0, 0.0, 1e9)[:, None] * [0.01, 0.02, 0.03]).as_quat()
+    for first, last in ((8.0, 15.2), (12.0, 31.0), (-1.0, 12.0)):
+        cells = np.where(((time > first) & (time < last))[:, None], 0.0, quat)
+        pl.DataFrame(np.column_stack([time, cells]), schema=["time", *"xyzw"]).write_csv(tmp_path / "a.csv")
+        (tmp_path / "session.toml").write_text(
+            '[data]\nfile = "a.csv"\ntime = "time"\n[sensors.torso]\norientation = ["x", "y", "z", "w"]\n'
+        )
+        whole = load_session(tmp_path, gaps=True).sensors["torso"]
+        reader = SessionReader(tmp_path, gaps=True, in_memory=False)
+        pieces = [reader.recording(k, min(k + 250, 3000)).sensors["torso"] for k in range(0, 3000, 250)]
+        for name in ("quat_WS", "gap"):
+            np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in pieces]), getattr(whole, name))
+
+
+def test_a_start_pose_that_was_guessed_says_so(
+    made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path / "in", made.recording("guessed"))
+    text = (path / "session.toml").read_text()
+    mount, phases = text.index("mount = {"), text.index("[phases]")
+    wrong = text[:mount] + 'mount = { up = "+y", forward = "+x" }' + text[text.index("}", mount) + 1 :]
+    (path / "session.toml").write_text(wrong)
+    line = refused(["track", str(path), "-o", str(tmp_path / "out")], capsys)
+    assert "guessed" not in line
+    (path / "session.toml").write_text(wrong[:phases] + wrong[wrong.index("[sensors") :])
+    line = refused(["track", str(path), "-o", str(tmp_path / "out")], capsys)
+    assert "guessed" in line
+    assert "[phases] start = [[from, to]]" in line
+
+
+def test_times_on_a_clock_since_1970_can_be_found(made: Simulation, tmp_path: Path) -> None:
+    whole = stopped(made.recording("epoch"), "gyro accel", 9.0)
+    epoch = replace(whole, time=whole.time + 1.7e9, phases={"start": ((1.7e9 + 0.5, 1.7e9 + 4.5),)})
+    read = load_session(written(tmp_path / "in", epoch))
+    notes = " ".join(read.notes)
+    assert "1700000009 to 1700000025.38 s" in notes
+    assert "e+09" not in notes
+    quiet = segment_orientations(replace(read, phases={})).warnings
+    assert any(" 17000000" in note for note in quiet)
+    assert not any("e+09" in note for note in quiet)

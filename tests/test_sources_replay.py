@@ -109,7 +109,7 @@ def test_a_wrong_spec_says_what_is_right(spec: str, options: dict, words: str) -
 
 
 def test_a_session_is_replayed(tmp_path) -> None:
-    lines = ["time,gx,gy,gz,ax,ay,az", *(f"{k / 100},0.1,0.2,0.3,0,0,9.81" for k in range(200))]
+    lines = ["time,gx,gy,gz,ax,ay,az", *(f"{k / 100},0.0,0.0,0.3,0,0,9.81" for k in range(200))]
     (tmp_path / "r.csv").write_text("\n".join(lines))
     (tmp_path / "session.toml").write_text(
         '[data]\nfile = "r.csv"\ntime = "time"\ngyro_unit = "rad/s"\naccel_unit = "m/s^2"\n'

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from wepose_pin.errors import BadOption, BadSubject, MissingFile
-from wepose_pin.subject import LENGTHS, Drift, StartTilt, Subject, average_subject, load_subject, subject_toml
+from wepose_pin.recording import SEGMENTS
+from wepose_pin.subject import (
+    LENGTHS,
+    Drift,
+    Hinge,
+    StartTilt,
+    Subject,
+    average_subject,
+    load_subject,
+    mount_rows,
+    subject_toml,
+)
 
 
 def test_the_average_man_of_de_leva() -> None:
@@ -115,3 +128,33 @@ def test_missing_files_and_people_that_are_none() -> None:
         average_subject(175.0)
     with pytest.raises(BadOption, match="sex 'x' is not known"):
         average_subject(1.7, "x")
+
+
+EXTREME: dict[str, dict[str, Any]] = {
+    "a start tilt beyond 90 deg": {"start_tilt": {"torso": StartTilt(np.deg2rad([-118.0, 60.0]), np.deg2rad(170.0))}},
+    "a start tilt of half a turn": {"start_tilt": {"left_hand": StartTilt(np.array([0.0, np.pi]), np.pi)}},
+    "a drift of tens of degrees a second": {"drift": {"head": Drift(-1.5, 1.5)}},
+    "a hinge that is hardly one": {"hinges": {"left": Hinge(np.array([0.6, 0.0, -0.8]), 0.999)}},
+    "a name that TOML wants escaped": {"name": 'a\x7f\x00\n"\\\u2028é\ud800', "note": "\x7f"},
+    "headings that may be anywhere": {
+        "order": (*LENGTHS, *(row for s in SEGMENTS for row in mount_rows(s))),
+        "covariance": np.full((len(LENGTHS) + 3 * len(SEGMENTS),) * 2, np.pi**2 / 3.0),
+    },
+}
+
+
+@pytest.mark.parametrize("case", EXTREME)
+def test_what_is_written_can_be_read(case: str, tmp_path: Path) -> None:
+    """Whether it is plausible the quality of the calibration says; a subject that cannot be read helps nobody."""
+    subject = replace(average_subject(), **EXTREME[case])
+    (tmp_path / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
+    again = load_subject(tmp_path)
+    assert again.name.replace("?", "") == subject.name.replace("\ud800", "")
+    assert again.note == subject.note
+    for name, start in subject.start_tilt.items():
+        np.testing.assert_allclose(again.start_tilt[name].tilt, start.tilt, atol=1e-5)
+        assert again.start_tilt[name].std == pytest.approx(start.std, abs=1e-5)
+    for name, drift in subject.drift.items():
+        assert again.drift[name].rate == pytest.approx(drift.rate, rel=1e-4)
+    np.testing.assert_allclose(again.covariance, subject.covariance, rtol=1e-8, atol=1e-12)
+    assert subject_toml(again) == subject_toml(replace(subject, name=again.name))

@@ -8,7 +8,7 @@ calibrated mount's covariance says is weighed against the few degrees by which t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
 from .filters.start import ACCEL_BIAS_STD
 from .noise import SensorNoise, noise_of, quietest
-from .recording import SEGMENTS, Recording, format_time
+from .recording import SEGMENTS, Recording, format_time, span_text
 from .static import StaticTest
 from .subject import Subject
 
@@ -249,14 +249,43 @@ def segment_orientations(
     return oriented_segments(recording, align(recording, subject, found), found.orientation, subject)
 
 
+# Which protocols in calibration/ see a segment's sensor; a sensor that is not here none of them sees.
+_FOUND_BY = {
+    "torso": "clasp, handle, poses or touch",
+    **{f"{side}_upper_arm": f"clasp, handle, poses or touch_{side}" for side in ("left", "right")},
+    **{f"{side}_forearm": f"clasp, handle, poses or touch_{side}" for side in ("left", "right")},
+    **{f"{side}_hand": f"clasp, handle or touch_{side}" for side in ("left", "right")},
+}
+
+
 def need_mounts(recording: Recording, subject: Subject | None) -> None:
     """Raises `BadSession` where neither the subject nor the session knows the mount of a sensor."""
     missing = [segment for segment in recording.sensors if nominal_mount(recording, segment, subject) is None]
     if missing:
-        raise BadSession(
-            f'{recording.where()}: sensors.{missing[0]}.mount is not known: state it, as in mount = {{ up = "+x", '
-            f'forward = "-z" }}, or give a subject with calibrated mounts (`wepose calibrate` finds them)'
-        )
+        of = f"sensors.{missing[0]}.mount is not known"
+        if len(missing) > 1:
+            of += f", nor that of {', '.join(missing[1:])}"
+        if subject is not None and recording.strapping == "new" and set(missing) & set(subject.mounts):
+            of += ' (strapping = "new": the subject\'s are of another strapping)'
+        elif subject is not None and subject.mounts:
+            of += f"; the subject '{subject.name}' has none for it"
+        raise BadSession(f"{recording.where()}: {of}: {mount_advice(missing)}")
+
+
+def mount_advice(segments: Sequence[str]) -> str:
+    """What to do where mounts of these segments' sensors are not known: state them, or which calibration finds them."""
+    do = 'state it, as in mount = { up = "+x", forward = "-z" }'
+    by_protocols: dict[str, list[str]] = {}
+    for segment in segments:
+        by_protocols.setdefault(_FOUND_BY.get(segment, ""), []).append(segment)
+    for protocols, of in by_protocols.items():
+        if protocols:
+            do += (
+                f"; or find that of {', '.join(of)} by `wepose calibrate --protocol` {protocols}, and give that subject"
+            )
+    if "" in by_protocols:
+        do += f"; no calibration finds that of {', '.join(by_protocols[''])}"
+    return do
 
 
 def align(recording: Recording, subject: Subject | None, found: Filtered) -> Alignment:
@@ -268,6 +297,8 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
         A mount that gravity contradicts.
     """
     start, warnings = found.start, list(found.warnings)
+    named = bool(recording.phases.get("start"))
+    guessed = "" if named else ", which was only guessed: [phases] start = [[from, to]] is missing"
     mount, turn, heading = {}, {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
@@ -288,14 +319,20 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
         if off > STATED_LIMIT_DEG:
             calibrated = subject is not None and segment in subject.mounts and recording.strapping != "new"
             of, do = ".mount", "check which sensor axis points up and which forward"
+            if guessed:
+                do = f"name its seconds, or {do}"
             if calibrated:
                 of, do = ": its calibrated mount", 'strapped on anew? then state strapping = "new" and the mounts'
+                if guessed:
+                    do = f"name its seconds; {do}"
             raise BadSession(
                 f"{recording.where()}: sensors.{segment}{of} is {off:.0f} deg off gravity in the start pose "
-                f"({start[0]:g} to {start[1]:g} s); {do}"
+                f"({span_text(start)}){guessed}; {do}"
             )
         if off > STATED_WARNING_DEG:
-            warnings.append(f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose")
+            warnings.append(
+                f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose{guessed}"
+            )
         known = mount_covariance(recording, segment, subject)
         if known is not None:
             # The tilt's misfit is the pose's error and the mount's together; each takes its share. Of the heading,
@@ -312,7 +349,7 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
                 off = np.degrees(np.linalg.norm(misfit))
                 warnings.append(
                     f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "
-                    f'pose; strapped on anew? then state strapping = "new"'
+                    f'pose{guessed}; strapped on anew? then state strapping = "new"'
                 )
         mount[segment], heading[segment] = R_LS, psi
         turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi])
@@ -384,7 +421,18 @@ def covariance_of(
         tilt = known[:2]
         left = known - tilt.T @ np.linalg.solve(tilt[:, :2] + START_POSE_STD**2 * np.eye(2), tilt)
         cov_W += lever @ left @ lever.swapaxes(1, 2)
+        cov_W[:, 2, 2] += start_heading_var(recording, segment, subject)
     return cov_W
+
+
+def start_heading_var(recording: Recording, segment: str, subject: Subject | None) -> float:
+    """Variance [rad²] of the heading that a segment's start pose gives its sensor's world: nobody stands exactly so.
+
+    The torso's is zero: it says where x points. Nor does it count where the mount is stated, since what a person means
+    by it is the start pose.
+    """
+    calibrated = mount_covariance(recording, segment, subject) is not None
+    return START_POSE_STD**2 if calibrated and segment != "torso" else 0.0
 
 
 def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
@@ -398,7 +446,7 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
     if recording.phases.get("start"):
         start = recording.phases["start"][0]
         if len(recording.phases["start"]) > 1:
-            notes.append(f"phases.start holds several intervals; the first, {start[0]:g} to {start[1]:g} s, is used")
+            notes.append(f"phases.start holds several intervals; the first, {span_text(start)}, is used")
     elif recording.phases.get("still"):
         raise BadPhase(
             f"{recording.where()}: phases.still without phases.start; name the seconds of the start pose, "
@@ -406,12 +454,10 @@ def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, flo
         )
     else:
         start = quietest(recording)
-        notes.append(
-            f"no phases.start: the quietest window, {start[0]:g} to {start[1]:g} s, is taken for the start pose"
-        )
+        notes.append(f"no phases.start: the quietest window, {span_text(start)}, is taken for the start pose")
     still = recording.phases.get("still", ())
     if len(still) > 1:
-        notes.append(f"phases.still holds several intervals; the first, {still[0][0]:g} to {still[0][1]:g} s, is used")
+        notes.append(f"phases.still holds several intervals; the first, {span_text(still[0])}, is used")
     for name, interval in (("start", start), *(("still", span) for span in still[:1])):
         place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
@@ -478,10 +524,9 @@ def _motion(recording: Recording, segment: str, interval: tuple[float, float], p
         R = Rotation.from_quat(so3.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
     turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
-    found = (
-        f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in phases.{phase} "
-        f"({interval[0]:g} to {interval[1]:g} s)"
-    )
+    guessed = phase not in recording.phases or not recording.phases[phase]
+    place = "the quietest window, taken for the start pose" if guessed else f"phases.{phase}"
+    found = f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} ({span_text(interval)})"
     if rms > MOVES_DEG_S or turn > MOVES_DEG:
         raise BadPhase(
             f"{recording.where()}: {found}; name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from .errors import BadOption, ExistingOutput, MissingFile, WeposeError, one_of, printable
+from .errors import BadData, BadOption, ExistingOutput, MissingFile, WeposeError, one_of, printable
 
 if TYPE_CHECKING:
     from .calibration import Calibration, Verdict
@@ -328,6 +328,7 @@ def evaluate(
     from .pose import pose_from_table
     from .readers import load_session
     from .readers.tables import read_table
+    from .recording import span_text
     from .writers import read_result
 
     if interval is not None and not interval[0] < interval[1]:
@@ -339,7 +340,7 @@ def evaluate(
             raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
         truth = named
     errors = compare(pose, pose_from_table(read_table(truth), str(truth)), interval)
-    _say(f"{errors.samples} samples from {errors.interval[0]:g} to {errors.interval[1]:g} s")
+    _say(f"{errors.samples} samples from {span_text(errors.interval)}")
     if errors.attitude:
         _print_table(
             "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
@@ -646,6 +647,10 @@ def retarget(
 ) -> None:
     """A person's arms to a robot's: a joint trajectory within its limits that does not hit itself.
 
+    Exit code: 0 the trajectory keeps the robot's limits and it does not touch itself, as the check of what was written
+    says; 3 it does not: the files are there to be looked at, no robot should run them. 2: the input is wrong, and
+    nothing is written.
+
     Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (of example-robot-data). Any other by its URDF with a map
     beside it that says which links are shoulder, elbow and hand (docs/retargeting.md).
 
@@ -723,10 +728,12 @@ def retarget(
             )
             writer.add_warnings("summary.json")
             _warn(writer.warnings)
-    _retarget_tables(found)
+    sound = _retarget_tables(found)
     _say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
     if view:
         _say_pages(out, {"Motion to look at": "view.html"})
+    if not sound:
+        sys.exit(3)
 
 
 def export(
@@ -790,7 +797,8 @@ def validate(
     """
     import json
 
-    from .validation import document_text, experiments, run
+    from .page import reason
+    from .validation import Skipped, document_text, experiments, run
     from .validation.document import as_document, read_document
     from .validation.page import write_pages
     from .writers import whole_folder
@@ -802,21 +810,36 @@ def validate(
     todo = experiments(quick, data) if document is None else {}
     jobs = [job for of in todo.values() for job in of]
     place = whole_folder(out, force) if out is not None else contextlib.nullcontext(None)
-    with place as folder, _steps(len(jobs) + (folder is not None)) as step:
-        if document is None:
-            results = []
-            for job, found in zip(jobs, run(jobs), strict=True):
-                step(job.experiment)
-                results += found
-            text = document_text(results, quick, versions())
-            if folder is not None:
-                (folder / "validation.json").write_text(text, encoding="utf-8")
-            document = as_document(json.loads(text), "this run")
-        if folder is not None:
+    failed: list[str] = []
+    with _steps(len(jobs) + (out is not None)) as step:
+        with place as folder:
+            if document is None:
+                results, skipped = [], []
+                for job, found in zip(jobs, run(jobs), strict=True):
+                    step(job.experiment)
+                    if isinstance(found, Skipped):
+                        skipped.append(found)
+                    else:
+                        results += found
+                if not results:
+                    raise BadData(f"nothing could be scored; {skipped[0].line()}")
+                text = document_text(results, quick, versions(), skipped)
+                if folder is not None:
+                    (folder / "validation.json").write_text(text, encoding="utf-8")
+                document = as_document(json.loads(text), "this run")
+            elif folder is not None:
+                step("drawing the figures")
+                failed = write_pages(folder, document)
+        if out is not None and from_ is None:
             step("drawing the figures")
-            write_pages(folder, document)
+            try:
+                with whole_folder(out, force=True) as folder:
+                    failed = write_pages(folder, document)
+            except Exception as error:
+                failed = [f"validation.html and validation.md: cannot be made: {reason(error)}"]
     _validation_tables(document)
-    if out is not None:
+    _warn([*(each.line() for each in document.skipped), *failed])
+    if out is not None and (out / "validation.html").is_file():
         _say(f"Page: {out / 'validation.html'}  {out / 'validation.md'}  {out / 'validation'}/*.png")
     if out is not None and from_ is None:
         _say(f"Every trial: {out / 'validation.json'}")
@@ -1584,8 +1607,8 @@ def _driven_table(driven: Driven) -> None:
         _warn([f"{driven.dropped} commands were not taken by the network or by their receiver"])
 
 
-def _retarget_tables(found: dict[str, Any]) -> None:
-    """How well the hands follow and why they do not, and what the trajectory keeps."""
+def _retarget_tables(found: dict[str, Any]) -> bool:
+    """How well the hands follow and why they do not, and what the trajectory keeps; whether a robot can run it."""
     rows, reasons = [], []
     for side, of in found["arms"].items():
         inside, turn, swivel, possible = (
@@ -1618,12 +1641,21 @@ def _retarget_tables(found: dict[str, Any]) -> None:
     slow = found["slowest"]
     if slow is not None:
         _say(f"Slowed most for {slow['joint']} at {slow['time']:.1f} s of the recording ({slow['what']})")
+    if found["slowed_for_contact_s"]:
+        moments = ", ".join(f"{moment:.1f}" for moment in found["slowed_for_contact_s"][:6])
+        _say(f"Slowed so that it can stop before it touches itself, about {moments} s of the recording")
     if touched["samples_touching"]:
-        _warn([f"the robot touches itself in {touched['samples_touching']} samples, first {touched['first']}"])
+        _warn(
+            [
+                f"the robot touches itself in {touched['samples_touching']} samples, first {touched['first']}: do not "
+                f"run this trajectory; a smaller --scale keeps the hands apart"
+            ]
+        )
     else:
         closest = touched["closest_hulls_mm"]
         _say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
     _say(f"Solved in {found['solve_ms']['p50']:.2f} ms (p50), {found['solve_ms']['p99']:.2f} ms (p99) a step")
+    return bool(found["limits_kept"]) and not touched["samples_touching"]
 
 
 def _mean_std(error: Any) -> str:

@@ -12,6 +12,7 @@ from . import so3
 from .arguments import check_arguments
 from .errors import BadData, BadOption
 from .pose import Pose
+from .recording import span_text
 
 
 class AttitudeError(NamedTuple):
@@ -83,9 +84,9 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
     inside = (pose.time >= first - 1e-9) & (pose.time <= last + 1e-9)
     if not np.any(inside):
         raise BadData(
-            f"pose ({pose.time[0]:g} to {pose.time[-1]:g} s) and reference ({truth.time[0]:g} to {truth.time[-1]:g} s) "
-            f"have no time in common"
-            + (f" within the interval {interval[0]:g} to {interval[1]:g} s" if interval else "")
+            f"pose ({span_text((pose.time[0], pose.time[-1]))}) and reference "
+            f"({span_text((truth.time[0], truth.time[-1]))}) have no time in common"
+            + (f" within {span_text(interval)}" if interval else "")
         )
     time = np.clip(pose.time[inside], truth.time[0], truth.time[-1])
     attitude, position = {}, {}

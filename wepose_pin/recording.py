@@ -41,9 +41,14 @@ EACH_TIME = ", a row for each time"  # why an array has another shape
 Intervals = tuple[tuple[float, float], ...]
 
 
-def format_time(time: float) -> str:
+def format_time(time: float, decimals: int = 3) -> str:
     """A time [s] as it stands in the file, to the millisecond: on a clock that counts from 1970 as well."""
-    return f"{time:.3f}".rstrip("0").rstrip(".")
+    return f"{time:.{decimals}f}".rstrip("0").rstrip(".")
+
+
+def span_text(interval: Sequence[float] | np.ndarray) -> str:
+    """From when to when [s], in words."""
+    return f"{format_time(interval[0])} to {format_time(interval[1])} s"
 
 
 def mount_from_axes(up: str, forward: str) -> np.ndarray:
@@ -257,7 +262,8 @@ def check_time(where: str, time: np.ndarray) -> None:
         k = int(back[0])
         how = "stands still" if time[k + 1] == time[k] else "goes back"
         raise BadData(
-            f"{where}: time {how} in row {k + 2}: {time[k + 1]:.6g} s after {time[k]:.6g} s; it must grow in every row"
+            f"{where}: time {how} in row {k + 2}: {format_time(time[k + 1], 6)} s after {format_time(time[k], 6)} s; "
+            f"it must grow in every row"
         )
 
 
@@ -265,7 +271,7 @@ def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tup
     """Every interval [s] has a length and lies in the recording."""
     for name, intervals in phases.items():
         for first, last in intervals:
-            place = f"{where}: phases.{name}: [{first:g}, {last:g}]"
+            place = f"{where}: phases.{name}: [{format_time(first)}, {format_time(last)}]"
             if not first < last:
                 raise BadPhase(f"{place} is empty; the first number is the earlier one, in seconds")
             if first < time[0] - 1e-6 or last > time[-1] + 1e-6:

@@ -39,6 +39,8 @@ LENGTHS = (
 LONGEST = 3.0  # [m] longer is no part of a person
 SEXES = ("f", "m")
 FORMAT = 1
+MOST_TILT_DEG = 180.0  # off the start pose: all that a turn can be; whether it is plausible, the calibration says
+MOST_DRIFT_DEG_MIN = 6000.0  # of a heading: 100 deg/s, beyond any gyroscope's bias
 
 
 class Hinge(NamedTuple):
@@ -231,9 +233,9 @@ def average_subject(stature: float | None = None, sex: str | None = None) -> Sub
 
 def subject_toml(subject: Subject) -> str:
     """The text of ``subject.toml``."""
-    lines = [f"format = {FORMAT}", f"name = {json.dumps(subject.name, ensure_ascii=False)}"]
+    lines = [f"format = {FORMAT}", f"name = {_quoted(subject.name)}"]
     if subject.note:
-        lines.append(f"note = {json.dumps(subject.note, ensure_ascii=False)}")
+        lines.append(f"note = {_quoted(subject.note)}")
     lines += ["", "[lengths]       # m", *(f"{k} = {v:.6f}" for k, v in subject.lengths.items())]
     lines += ["", "[lengths_std]   # m, one standard deviation"]
     lines += [f"{k} = {subject.std(k):.6f}" for k in subject.lengths if k in subject.order]
@@ -262,6 +264,12 @@ def subject_toml(subject: Subject) -> str:
         lines += ["    [" + ", ".join(f"{v:.9e}" for v in row) + "]," for row in subject.covariance]
         lines.append("]")
     return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """A string as TOML has it: as JSON, but for what cannot be encoded and for DEL, which TOML wants escaped."""
+    sound = text.encode("utf-8", "replace").decode("utf-8")
+    return json.dumps(sound, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def load_subject(path: str | Path) -> Subject:
@@ -323,12 +331,14 @@ def subject_of(text: str, path: Path) -> Subject:
         start_tilt={
             segment: StartTilt(np.radians([x, y]), float(np.radians(std)))
             for segment in table.get("start_tilt", {})
-            for x, y, std in [_spread(path, table, "start_tilt", segment, ("x_deg", "y_deg", "std_deg"), 90.0)]
+            for x, y, std in [_spread(path, table, "start_tilt", segment, ("x_deg", "y_deg", "std_deg"), MOST_TILT_DEG)]
         },
         drift={
             segment: Drift(float(np.radians(rate)) / 60.0, float(np.radians(std)) / 60.0)
             for segment in table.get("drift", {})
-            for rate, std in [_spread(path, table, "drift", segment, ("rate_deg_min", "std_deg_min"), 600.0)]
+            for rate, std in [
+                _spread(path, table, "drift", segment, ("rate_deg_min", "std_deg_min"), MOST_DRIFT_DEG_MIN)
+            ]
         },
     )
 
@@ -353,10 +363,11 @@ def _covariance(path: Path, table: Mapping, std: Mapping) -> tuple[tuple[str, ..
         raise BadSubject(f"{path}: covariance.matrix holds something that is no number, or rows that differ") from None
     if matrix.shape != (len(order), len(order)):
         raise BadSubject(f"{path}: covariance.matrix is {matrix.shape}; {len(order)} names in order need as many rows")
+    least = -1e-9 * max(1.0, float(np.trace(matrix)))  # what rounding to the file's digits may do
     if (
         not (np.abs(matrix) < 1e6).all()
         or not np.allclose(matrix, matrix.T, atol=1e-12)
-        or np.linalg.eigvalsh(matrix)[0] < -1e-9
+        or np.linalg.eigvalsh(matrix)[0] < least
     ):
         raise BadSubject(f"{path}: covariance.matrix is not symmetric and positive semidefinite")
     return order, matrix

@@ -147,20 +147,21 @@ authors = file("prova_HR.txt", _authors)
 
 def ring(folder: Path, data: bytes) -> object:
     """One text for all three tables."""
-    from wepose_pin.readers.trials import read_ring
+    from wepose_pin.readers.trials import RING_MOUNTS, RingFiles, read_ring
 
     for name in ("omc", "imu_rigid", "imu_nonrigid"):
         (folder / f"{name}.csv").write_bytes(data)
-    return read_ring(folder)
+    imu = dict(zip(RING_MOUNTS, (folder / "imu_rigid.csv", folder / "imu_nonrigid.csv"), strict=True))
+    return read_ring(RingFiles(folder, folder / "omc.csv", imu))
 
 
 def ur5(folder: Path, data: bytes) -> object:
-    from wepose_pin.readers.trials import read_ur5
+    from wepose_pin.readers.trials import Ur5Files, read_ur5
 
     for name in ("imu/a/radius_adx.csv", "encoder/a/radius.csv"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
-    return read_ur5(folder, "a", "radius")
+    return read_ur5(Ur5Files("a", "radius", folder / "imu/a/radius_adx.csv", folder / "encoder/a/radius.csv"))
 
 
 # A result, to what is made of it ------------------------------------------------------------------------------------

@@ -155,7 +155,11 @@ class Work:
             writer = PageWriter(folder, ["view.html"])
             writer.write("view.html", lambda _: retarget_html(body, pose, trajectory, title=title))
             writer.add_warnings("summary.json")
-        return {"trajectory_s": float(trajectory.time[-1])}
+        return {
+            "trajectory_s": float(trajectory.time[-1]),
+            "trajectory_limits_kept": held.all,
+            "trajectory_touching": touched.samples,
+        }
 
     def _export(self, folder: Path, *, formats: tuple[str, ...], names: str | None, rate_hz: float | None) -> Row:
         from ..writers.export import SUFFIXES, export

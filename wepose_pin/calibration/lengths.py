@@ -52,7 +52,7 @@ from .joints import coupled, couplings
 from .known import known_before, known_lengths, stated_headings
 from .problem import HINGE_STD, K, Layout, Looks, carrier, placed, residuals
 from .protocols import Closure, Protocol, load_protocol
-from .remarks import on_headings, on_lengths, on_looks
+from .remarks import on_headings, on_lengths, on_looks, on_unseen
 from .touching import touching_start
 from .weighing import TOUCHED, Tape, covariance_of, handed_on, learned_of, taped, weighed
 
@@ -349,11 +349,15 @@ def _solve(
     warnings = on_lengths(protocol, lengths, covariance[:K, :K], without_data, prior, loose, tapes)
     warnings += on_headings(protocol, layout, covariance, gauge)
     warnings += on_others(others, layout)
+    warnings += on_unseen([name for name in found.R_VS if name not in mounts], protocol)
     seen = {side: SIDES.index(side) for side in (layout.arms if looks.closed.any() else ())}
     axes = {side: np.array([x, 1.0, z]) for side, (x, z) in zip(SIDES, fit.x[layout.hinge].reshape(2, 2), strict=True)}
     hinge = {side: axes[side] / np.linalg.norm(axes[side]) for side in seen}
     hinge_rms = {side: HINGE_STD * _rms(fit.hinge[looks.closed, i]) for side, i in seen.items()}
     tilts, spread = fit.x[layout.tilt].reshape(-1, 2), np.sqrt(np.diag(covariance))
+    # Half a turn and more is the same turn the other way round, and no uncertainty is larger.
+    tilts = Rotation.from_rotvec(np.pad(tilts, ((0, 0), (0, 1)))).as_rotvec()[:, :2]
+    spread[layout.tilt] = np.minimum(spread[layout.tilt], np.pi)
     subject = replace(
         prior,
         name=recording.name,

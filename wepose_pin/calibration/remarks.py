@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ..alignment import mount_advice
 from ..subject import LENGTHS, Subject
 from .problem import K, Layout, Looks
 from .protocols import Closure, Protocol
@@ -96,6 +97,16 @@ def on_headings(protocol: Protocol, layout: Layout, covariance: np.ndarray, gaug
         if closure.gauge and closure.gauge not in gauge
     ]
     return lines
+
+
+def on_unseen(unseen: Sequence[str], protocol: Protocol) -> list[str]:
+    """Sensors whose mount neither the session states nor this protocol finds."""
+    if not unseen:
+        return []
+    return [
+        f"protocol '{protocol.name}' does not see {', '.join(unseen)}: no mount is stated for them and none is found; "
+        f"before `wepose track`, {mount_advice(unseen)}"
+    ]
 
 
 def on_looks(time: np.ndarray, kept: np.ndarray, looks: Looks) -> list[str]:

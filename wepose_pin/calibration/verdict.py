@@ -23,17 +23,20 @@ from .weighing import CONTRADICTED, TOUCHED
 
 Grade = Literal["pass", "poor", "fail"]
 GRADES: tuple[Grade, ...] = ("pass", "poor", "fail")
+EFFECTIVE = "independent measurements"  # the unit of an effective sample size
 
 
 class Limits(NamedTuple):
-    """Up to `passes` a value passes, up to `poor` it is poor."""
+    """Up to `passes` a value passes, up to `poor` it is poor; from them on where `passes` is the larger one."""
 
     passes: float
     poor: float
 
     def grade(self, value: float) -> Grade:
         """NaN is of what was not looked at, and passes."""
-        return "fail" if value > self.poor else "poor" if value > self.passes else "pass"
+        sign = -1.0 if self.passes > self.poor else 1.0
+        value, passes, poor = sign * value, sign * self.passes, sign * self.poor
+        return "fail" if value > poor else "poor" if value > passes else "pass"
 
 
 # One standard deviation of each result. A hand is off by about as much as its arm's lengths, and by up to 10 mm a
@@ -50,7 +53,7 @@ APART = Limits(0.10, 0.60)  # share of looks
 TILT = Limits(np.deg2rad(12.0), np.deg2rad(20.0))  # [rad] of a segment in the start pose; elbows hang 5 to 8 deg bent
 UNUSUAL = Limits(4.0, 6.0)  # standard deviations of a length from the average person
 TAPE = Limits(CONTRADICTED, 5.0)  # of a taped length from what the motion and the average person say of it
-SHARE = Limits(1.0 / 6.0, 1.0 / 2.0)  # of one independent look in all: some six carry a calibration
+SAMPLES = Limits(6.0, 2.0)  # effective sample size, at least: some six independent ones carry a calibration
 DOUBT = Limits(1.0, 1.0)  # of anatomy, see `anatomy`
 
 # What moved less than this is said to be the cause of what is uncertain.
@@ -72,6 +75,12 @@ class Finding(NamedTuple):
     said: str  # what it is, in words
     why: str  # what moved too little for it; empty where nothing did
     do: str  # what would make it better
+
+    @property
+    def excess(self) -> float:
+        """How many times the limit up to which it passes it is, or that limit is the value where it is a least one."""
+        value, limit = (self.passes, self.value) if self.passes > self.poor else (self.value, self.passes)
+        return value / max(limit, 1e-9)
 
 
 class Range(NamedTuple):
@@ -129,7 +138,7 @@ class Verdict:
     def reasons(self) -> tuple[Finding, ...]:
         """What keeps it from passing, the worst first."""
         wanting = [finding for finding in self.findings if finding.grade != "pass"]
-        return tuple(sorted(wanting, key=lambda f: (f.grade != "fail", -f.value / max(f.passes, 1e-9))))
+        return tuple(sorted(wanting, key=lambda f: (f.grade != "fail", -f.excess)))
 
     def in_words(self) -> list[str]:
         """What keeps it from passing, a line for each remedy."""
@@ -288,9 +297,9 @@ def _left_over(calibration: Calibration) -> list[Finding]:
             _finding("gap", gap, GAP, "m", advice.gap.format(1e3 * gap), advice.closer),
             _finding(
                 "motion",
-                1.0 / max(looks, 1e-9),
-                SHARE,
-                "of one independent look",
+                looks,
+                SAMPLES,
+                EFFECTIVE,
                 f"the motion is worth {looks:.0f} independent looks only",
                 advice.longer,
             ),

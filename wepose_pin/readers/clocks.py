@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from .. import so3
 from ..errors import BadData
-from ..recording import Sensor, check_time
+from ..recording import Sensor, check_time, span_text
 
 LONGEST_GAP_S = 0.05
 # A step this far from the usual one (as a share of it) is uneven, or a lost row; clocks of devices jitter less.
@@ -25,6 +25,8 @@ UNEVEN = 0.5
 DRIFT = 0.003
 # A clock is regular, and a longer step in it a lost row, where three quarters of its steps are as usual to this share.
 REGULAR = 0.2
+# Rows come in packets where most steps are below this share of the mean, in packets of one size, this share of them.
+WITHIN_PACKET, SAME_SIZE, FEWEST_PACKETS = 0.5, 0.8, 5
 # Clocks that agree to this share of a step are one clock.
 SAME = 0.01
 # No body sensor measures more slowly [s]: the times are in another unit.
@@ -47,11 +49,13 @@ class Clock:
     time : (n,) [s]
     row : (n,) row of the file, −1 for a lost one
     step : the usual step [s]
+    packet : so many rows came at a time, and their times were spread evenly
     """
 
     time: np.ndarray
     row: np.ndarray
     step: float
+    packet: int = 1
 
     @property
     def longest_bridge(self) -> float:
@@ -69,6 +73,7 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
     """
     if len(time) < 2:
         raise BadData(f"{place}: {len(time)} samples; a recording has at least 2")
+    packet, time = _unpacked(time)
     check_time(place, time)
     usual = np.diff(time[: BLOCK + 1])  # of a day's times not all are needed to know it
     step = float(np.median(usual))
@@ -84,17 +89,43 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
     if lost.sum() > 10 * len(time) + 1000:
         k = int(wide[np.argmax(time[wide + 1] - time[wide])])
         raise BadData(
-            f"{place}: time jumps from {time[k]:g} to {time[k + 1]:g} s in row {k + 2}, by more than the recording "
+            f"{place}: time jumps from {span_text(time[k : k + 2])} in row {k + 2}, by more than the recording "
             f"is long; cut the recording there"
         )
     if not lost.any():
-        return Clock(time, np.arange(len(time), dtype=np.int32 if len(time) < 2**31 else np.int64), step)
+        return Clock(time, np.arange(len(time), dtype=np.int32 if len(time) < 2**31 else np.int64), step, packet)
     counts = np.zeros(len(time), dtype=int)
     counts[wide] = lost.astype(int)
     row = np.repeat(np.arange(len(time)), counts + 1)
     nth = np.arange(len(row)) - np.searchsorted(row, row)  # 0 is the row itself, then the lost ones after it
     filled = time[row] + nth * np.append(np.diff(time) / (counts[:-1] + 1), 0.0)[row]
-    return Clock(filled, np.where(nth == 0, row, -1), step)
+    return Clock(filled, np.where(nth == 0, row, -1), step, packet)
+
+
+def _unpacked(time: np.ndarray) -> tuple[int, np.ndarray]:
+    """Rows in a packet, and times (n,) [s] spread evenly where rows carry those at which their packet came.
+
+    The last row of a packet is as old as the packet. One row where they do not come in packets.
+    """
+    n, steps = len(time), np.diff(time)
+    if n < 4 * FEWEST_PACKETS or not np.isfinite(time).all() or (steps < 0.0).any():
+        return 1, time
+    mean = (time[-1] - time[0]) / (n - 1)
+    if np.median(steps) > WITHIN_PACKET * mean:
+        return 1, time
+    ends = np.append(np.flatnonzero(steps > mean), n - 1)  # the last row of each packet
+    sizes = np.diff(ends, prepend=-1)
+    usual = int(np.median(sizes))
+    if len(ends) < FEWEST_PACKETS or usual < 2 or np.mean(sizes == usual) < SAME_SIZE:
+        return 1, time
+    spans = np.diff(time[ends])
+    step = float(np.median(spans)) / usual
+    if step > SLOWEST_STEP_S:
+        return 1, time
+    # After a lost packet the rows keep to the time that a packet takes.
+    own = np.append(step, np.where(spans < (1.0 + UNEVEN) * usual * step, spans / sizes[1:], step))
+    packet = np.repeat(np.arange(len(ends)), sizes)
+    return usual, time[ends][packet] - own[packet] * (ends[packet] - np.arange(n))
 
 
 def time_unit_of(step: float) -> str | None:
@@ -133,7 +164,7 @@ def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tu
     end = min(float(clock.time[-1]) for clock in clocks.values())
     usual = max(float(clock.time[-1] - clock.time[0]) / (len(clock.time) - 1) for clock in clocks.values())
     if end - begin < 2.0 * usual:
-        spans = ", ".join(f"{name} {c.time[0]:g} to {c.time[-1]:g} s" for name, c in clocks.items())
+        spans = ", ".join(f"{name} {span_text(c.time[[0, -1]])}" for name, c in clocks.items())
         raise BadData(
             f"{where}: the sensors' clocks do not overlap ({spans}); check each sensor's time and offset_s, in seconds"
         )
@@ -218,15 +249,29 @@ def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = 
     return filled
 
 
-def bridge_quat(quat: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray:
-    """Unit quaternions (n, 4) with lost ones filled along the shortest rotation."""
+def bridge_quat(
+    quat: np.ndarray,
+    marks: np.ndarray,
+    clock: Clock,
+    before: tuple[float, np.ndarray] | None = None,
+    after: tuple[float, np.ndarray] | None = None,
+) -> np.ndarray:
+    """Unit quaternions (n, 4) with lost ones filled along the shortest rotation.
+
+    `before` and `after` are the time [s] and the quaternion (4,) last and next measured beyond a piece of a recording.
+    """
     filled = quat.copy()
     for first, last in runs(marks != GOOD):
-        if first == 0 or last == len(quat):
-            filled[first:last] = quat[last if first == 0 else first - 1]
+        ends = [
+            before if first == 0 else (clock.time[first - 1], quat[first - 1]),
+            after if last == len(quat) else (clock.time[last], quat[last]),
+        ]
+        near = [end for end in ends if end is not None]
+        if len(near) < 2:
+            filled[first:last] = near[0][1]
             continue
-        ends = Rotation.from_quat(quat[[first - 1, last]])
-        filled[first:last] = Slerp(clock.time[[first - 1, last]], ends)(clock.time[first:last]).as_quat()
+        times, quats = zip(*near, strict=True)
+        filled[first:last] = Slerp(times, Rotation.from_quat(np.array(quats)))(clock.time[first:last]).as_quat()
     return filled
 
 

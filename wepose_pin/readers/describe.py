@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, MissingFile, WeposeError, one_of
-from ..recording import AXES, CONFIGURATION, SEGMENTS, Recording, Sensor
+from ..recording import AXES, CONFIGURATION, SEGMENTS, Recording, Sensor, span_text
 from .arrays import ArrayFile, is_array_file
 from .clocks import SLOWEST_STEP_S, TIME_UNITS, runs, time_unit_of
 from .device import Device
@@ -428,12 +428,12 @@ def _mount_comment(recording: Recording, segment: str, still: list[tuple[float, 
 
 def _facts(recording: Recording) -> tuple[str, ...]:
     first, last = float(recording.time[0]), float(recording.time[-1])
-    facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {first:g} to {last:g} s"]
+    facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {span_text((first, last))}"]
     still = rests(recording)
     listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in still[:8]) + (" …" if len(still) > 8 else "")
     facts.append(f"all sensors at rest [s]: {listed}" if still else "never are all sensors at rest for a second")
     for name, spans in recording.phases.items():
-        facts.append(f"phase {name} [s]: " + (", ".join(f"{a:g} to {b:g}" for a, b in spans) or "none"))
+        facts.append(f"phase {name}: " + (", ".join(map(span_text, spans)) or "none"))
     facts += [f"note: {note}" for note in recording.notes]
     return tuple(facts)
 

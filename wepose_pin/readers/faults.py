@@ -21,7 +21,7 @@ import numpy as np
 
 from ..errors import BadData
 from ..recording import format_time
-from .clocks import runs
+from .clocks import GOOD, LONGEST_GAP_S, Clock, runs
 from .plausibility import SATURATED_GYRO, cut_off
 
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5  # of rate and force both at one value: longer than gaps that are bridged in silence
@@ -29,7 +29,7 @@ STUCK_S = 1.0  # of one of them alone
 # While accel stays the same: how fast gyro tips it [rad/s], beyond any bias, and by how much in all [rad], one alone.
 TIPS, TIPPED = 0.2, 1.0
 MOVES = 2.0  # [m/s²] by which accel changes on an axis only where the sensor moves
-# A series of noise turns back at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
+# Noise turns back at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
 TURNS_BACK, TURNS_BACK_HZ = 0.3, 15.0
 ROUNDING = 1e-9  # steps below this share of the largest value are rounding, not noise
 NOISY_S = 1.5  # [s] of noise that show a sensor to be noisy
@@ -85,6 +85,7 @@ class _Run:
         return self.tipped / max(self.seconds, 1e-9)
 
 
+_Sample = tuple[float, np.ndarray]  # when [s], what
 _LONGEST = 1000  # rows of a run that are counted
 _SIGNALS = {"gyro and accel": slice(0, 6), "gyro": slice(0, 3), "accel": slice(3, 6)}
 
@@ -153,7 +154,7 @@ class SensorScan:
             self._long[name].append(run)
 
     def _noise(self, distinct: np.ndarray) -> None:
-        """Count the seconds in which the signal turns back as noise does on all axes: at rest, where it does not drown."""
+        """Count the seconds in which all axes turn back as noise does: at rest, where it does not drown."""
         if len(distinct) < 2 * FROZEN_SAMPLES:
             return
         usual = max(float(np.median(np.diff(distinct[:, 0]))), 1e-9)
@@ -268,7 +269,10 @@ class Scan:
             self._changes[name] = self._changes.get(name, 0) + int(changed[name].sum())
             good = np.isfinite(values).all(axis=1)
             if values.shape[1] == 4:
-                self.orientations.setdefault(name, OrientationScan()).push(time[good], values[good])
+                norm = np.linalg.norm(values, axis=1)
+                good &= norm > 0.0  # zeros stand for "not seen"
+                quat_WS = values[good] / norm[good, None]
+                self.orientations.setdefault(name, OrientationScan()).push(time[good], quat_WS)
             else:
                 self.sensors.setdefault(name, SensorScan()).push(time[good], values[good])
         for name, other in combinations(blocks, 2):
@@ -332,11 +336,13 @@ class Scan:
 
 @dataclass
 class OrientationScan:
-    """What the rows of measured orientations show."""
+    """What the rows of measured orientations show; between which samples nothing was measured for a while."""
 
     rows: int = 0
     constant: bool = True
     _first: np.ndarray | None = None
+    _last: _Sample | None = None
+    _gaps: list[tuple[_Sample | None, _Sample | None]] = field(default_factory=list)  # last before, first after
 
     def push(self, time: np.ndarray, quat_WS: np.ndarray) -> None:
         """The next rows: times (n,) [s], orientations (n, 4) xyzw."""
@@ -344,5 +350,27 @@ class OrientationScan:
             return
         if self._first is None:
             self._first = quat_WS[0].copy()
+            self._gaps.append((None, (float(time[0]), quat_WS[0].copy())))
+        elif self._last is not None and time[0] - self._last[0] > LONGEST_GAP_S:
+            self._gaps.append((self._last, (float(time[0]), quat_WS[0].copy())))
+        for k in np.flatnonzero(np.diff(time) > LONGEST_GAP_S):
+            ends = [(float(time[i]), quat_WS[i].copy()) for i in (k, k + 1)]
+            self._gaps.append((ends[0], ends[1]))
         self.rows += len(time)
         self.constant &= bool((quat_WS == self._first).all())
+        self._last = float(time[-1]), quat_WS[-1].copy()
+
+    def around(self, clock: Clock, marks: np.ndarray) -> tuple[_Sample | None, _Sample | None]:
+        """The samples last measured before a stretch of the clock and next after it, where its ends are lost."""
+        before, after = (
+            next(
+                (
+                    gap
+                    for gap in [*self._gaps, (self._last, None)]
+                    if (gap[0] is None or gap[0][0] < time) and (gap[1] is None or gap[1][0] > time)
+                ),
+                (None, None),
+            )
+            for time in clock.time[[0, -1]]
+        )
+        return before[0] if marks[0] != GOOD else None, after[1] if marks[-1] != GOOD else None

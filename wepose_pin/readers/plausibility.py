@@ -27,7 +27,7 @@ MOST_ACCEL = 4000.0  # [m/s²]
 WINDOW_S = 2.0  # over which specific force averages to gravity
 WINDOWS = 40  # those with most motion
 FEWEST_WINDOWS = 3
-# Coherence is the norm of the mean of turned specific force over the mean of its norm. Taking deg/s for rad/s makes it
+# Coherence is how near the mean of turned specific force is to gravity. Taking deg/s for rad/s makes it
 # tumble: it falls below one of these shares of that of rates a factor 57.3 smaller. By stretches of three windows or
 # more of 41 real sensors, the first is met by none, the second by none that turns so fast.
 TUMBLES, COHERENT = 0.6, 0.8  # the share, where the smaller rates themselves are coherent at least so
@@ -59,7 +59,7 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
         place = f"{recording.where()}: sensors.{segment}"
         notes += _gravity(recording, segment, place, whole)
         if units:
-            _gyro_unit(sensor.gyro_S, sensor.accel_S, recording.rate_hz, place)
+            _gyro_unit(sensor, recording.rate_hz, place)
         _range(recording.time, sensor.gyro_S, MOST_GYRO, "rad/s", f"{place}.gyro")
         _range(recording.time, sensor.accel_S, MOST_ACCEL, "m/s^2", f"{place}.accel")
         for name, values, least in (
@@ -105,7 +105,7 @@ def _accel_unit(norm: float) -> str:
 
 
 def _quiet_second(recording: Recording, sensor: Sensor) -> np.ndarray:
-    """Samples of the second, measured as a whole, in which the rate varies least; none where there is no such second."""
+    """Samples of the second, measured as a whole, in which the rate varies least; empty where there is none."""
     assert sensor.gyro_S is not None
     n = len(recording)
     size = min(n, max(2, round(recording.rate_hz)))
@@ -117,14 +117,20 @@ def _quiet_second(recording: Recording, sensor: Sensor) -> np.ndarray:
     return np.arange(first * size, (first + 1) * size) if np.isfinite(motion[first]) else np.empty(0, dtype=int)
 
 
-def _gyro_unit(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, place: str) -> None:
+def _gyro_unit(sensor: Sensor, rate_hz: float, place: str) -> None:
+    assert sensor.gyro_S is not None
+    assert sensor.accel_S is not None
+    gyro_S = sensor.gyro_S
     size = round(WINDOW_S * rate_hz)
     count = len(gyro_S) // size
-    if count < FEWEST_WINDOWS:
+    gyro, accel = (values[: count * size].reshape(count, size, 3) for values in (gyro_S, sensor.accel_S))
+    at = np.arange(count)
+    if sensor.gap is not None:  # what was bridged says nothing
+        at = at[~sensor.gap[: count * size].reshape(count, size).any(axis=1)]
+    if len(at) < FEWEST_WINDOWS:
         return
-    gyro, accel = gyro_S[: count * size].reshape(count, size, 3), accel_S[: count * size].reshape(count, size, 3)
     speed = np.linalg.norm(gyro, axis=2).mean(axis=1)
-    moving = np.argsort(-speed, kind="stable")[:WINDOWS]
+    moving = at[np.argsort(-speed[at], kind="stable")[:WINDOWS]]
     as_stated, smaller, larger = (
         np.mean([_coherence(scale * gyro[k], accel[k], rate_hz) for k in moving])
         for scale in (1.0, np.pi / 180.0, 180.0 / np.pi)
@@ -145,7 +151,7 @@ def _gyro_unit(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, place: s
     norm = np.linalg.norm(mean, axis=1)
     up = mean / np.maximum(norm, 1e-9)[:, None]
     tilt = np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0))
-    steady = np.abs(norm / GRAVITY - 1.0) < 0.1
+    steady = (np.abs(norm / GRAVITY - 1.0) < 0.1) & np.isin(np.arange(count), at)
     tilt[~(steady[1:] & steady[:-1])] = 0.0
     path = WINDOW_S * speed
     unseen = (tilt > TILTED) & (path[1:] + path[:-1] < UNSEEN * tilt)
@@ -159,9 +165,13 @@ def _gyro_unit(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, place: s
 
 
 def _coherence(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
-    """Norm of the mean of specific force, turned by the gyroscope's rotation, over the mean of its norm."""
+    """How near the mean of specific force, turned by the gyroscope's rotation, is to gravity, from 1 to 0.
+
+    In the sensor the specific force of an arm that swings is several times gravity, and points along the arm all the
+    time; of its mean in the world gravity alone is left.
+    """
     turned = Rotation.from_quat(so3.integrate(gyro_S[1:] / rate_hz)).apply(accel_S)
-    return float(np.linalg.norm(turned.mean(axis=0)) / max(np.linalg.norm(accel_S, axis=1).mean(), 1e-9))
+    return max(0.0, 1.0 - abs(float(np.linalg.norm(turned.mean(axis=0))) / GRAVITY - 1.0))
 
 
 def _range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: str) -> None:

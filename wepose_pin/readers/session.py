@@ -20,10 +20,12 @@ from ..recording import (
     Sensor,
     check,
     check_phases,
+    span_text,
 )
 from .arrays import ArrayFile, is_array_file
 from .clocks import (
     BRIDGED,
+    GOOD,
     LONG,
     TIME_UNITS,
     Clock,
@@ -203,6 +205,11 @@ class SessionReader:
         self.time, self._notes = common_time(str(self.path), clocks)
         self._resampled = bool(self._notes)
         self._notes += tuple(note for device in self.devices.values() for note in device.notes)
+        packets = {plan.path: clock.packet for plan in self._plans.values() if (clock := plan.clock).packet > 1}
+        self._notes += tuple(
+            f"{path.name}: rows came in packets of {packet}; their times are spread evenly between those of the packets"
+            for path, packet in packets.items()
+        )
         self.rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
         check_phases(str(self.path), self.time, self._head.phases)
         self.phases, self.start_pose, self.strapping = self._head.phases, start_pose, self._head.strapping
@@ -376,9 +383,8 @@ class SessionReader:
             for segment, plan in self._plans.items():
                 values = []
                 for name, names in plan.signals.items():
-                    read = columns(
-                        tables[plan.table], names, str(plan.path), f"{self.path}: {plan.place}.{name}", first
-                    )
+                    place = f"{self.path}: {plan.place}.{name}"
+                    read = columns(tables[plan.table], names, str(plan.path), place, first)
                     values.append(read * plan.units.get(name, 1.0))
                 blocks[segment] = times[id(plan.clock)][rows], np.column_stack(values)
             scan.push(blocks)
@@ -453,10 +459,12 @@ class SessionReader:
             frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
         for name, (_, good) in found.items():
             place = f"{plan.path}: {plan.place}.{name}"
-            lost_a_while = self.gaps and len(clock.time) < len(plan.clock.time) and name != "orientation"
+            lost_a_while = self.gaps and len(clock.time) < len(plan.clock.time)
+            if name == "orientation":
+                lost_a_while &= self._scan().orientations[segment].rows > 0
             if not good.any() and not lost_a_while:
                 columns_ = ", ".join(plan.signals[name])
-                raise BadData(f"{place}: no numbers from {clock.time[0]:g} to {clock.time[-1]:g} s in {columns_}")
+                raise BadData(f"{place}: no numbers from {span_text(clock.time[[0, -1]])} in {columns_}")
             marks[name] = lost_samples(clock, good)
             if not self.gaps and (marks[name] == LONG).any():
                 first, last = runs(marks[name] == LONG)[0]
@@ -469,12 +477,14 @@ class SessionReader:
         every = np.max(list(marks.values()), axis=0)
         gap = every == LONG if self.gaps or faults else None
         if "orientation" in found:
-            quat = bridge_quat(found["orientation"][0], marks["orientation"], clock)
+            edges = self._scan().orientations[segment].around(clock, marks["orientation"])
+            quat = bridge_quat(found["orientation"][0], marks["orientation"], clock, *edges)
             return Sensor(quat_WS=quat, stated_quat_LS=plan.mount, gap=gap, aligned=plan.aligned), every
         gyro_S = bridge(found["gyro"][0], marks["gyro"], clock, rate=True)
         accel_S = bridge(found["accel"][0], marks["accel"], clock)
+        marked = np.where(frozen, GOOD, every)  # what the notes call gaps
         gyro_range = self._scan().sensors[segment].gyro_range
-        return Sensor(gyro_S=gyro_S, accel_S=accel_S, stated_quat_LS=plan.mount, gap=gap, gyro_range=gyro_range), every
+        return Sensor(gyro_S=gyro_S, accel_S=accel_S, stated_quat_LS=plan.mount, gap=gap, gyro_range=gyro_range), marked
 
     def _signal(
         self, plan: _Plan, name: str, clock: Clock, table: pl.DataFrame, first_row: int

@@ -14,7 +14,7 @@ from ..calibration import Calibration
 from ..calibration.known import DRIFT_STD
 from ..calibration.lengths import GAUGE_STD
 from ..calibration.protocols import Protocol, load_protocol
-from ..calibration.verdict import Verdict
+from ..calibration.verdict import EFFECTIVE, Finding, Verdict
 from ..calibration.weighing import TOUCHED
 from ..errors import WeposeError
 from ..filters import BEST
@@ -412,8 +412,8 @@ def _findings(verdict: Verdict, contact: _Contact) -> list[Block]:
     lines = [
         [
             _looked_at(found.name, contact),
-            _shown(found.value, found.unit, ".1f"),
-            *(_shown(limit, found.unit, ".3g") for limit in (found.passes, found.poor)),
+            _shown(found.value, found.unit, ".0f" if found.unit == EFFECTIVE else ".1f"),
+            *(f"{_bound(found)} {_shown(limit, found.unit, '.3g')}" for limit in (found.passes, found.poor)),
             found.grade,
         ]
         for found in verdict.findings
@@ -425,7 +425,7 @@ def _findings(verdict: Verdict, contact: _Contact) -> list[Block]:
     )
     if not lines:
         return []
-    header = ["looked at", "found", "passes up to", "poor up to", "verdict"]
+    header = ["looked at", "found", "passes", "poor", "verdict"]
     return [Heading("Behind the verdict"), text, Table(header, lines)]
 
 
@@ -493,11 +493,15 @@ def _looked_at(name: str, contact: _Contact) -> str:
         "shoulder_width": "± shoulder width, the scale apart",
         "scale": "± scale, all lengths together",
         "gap": f"{contact.gap}, root mean square",
-        "motion": "1 / independent measurements",
+        "motion": "effective sample size: what the motion is worth",
         "apart": "share of the time apart",
         "start_pose": "segment farthest off the start pose",
         "person": "length farthest from the average person",
     }.get(what, plain(name))
+
+
+def _bound(found: Finding) -> str:
+    return "at least" if found.passes > found.poor else "up to"
 
 
 def _shown(value: float, unit: str, digits: str) -> str:
@@ -509,7 +513,7 @@ def _shown(value: float, unit: str, digits: str) -> str:
         "share": (100.0, "%"),
         "std of the average person": (1.0, "std"),
         "std of what is known without it": (1.0, "std"),
-        "of one independent look": (1.0, ""),
+        EFFECTIVE: (1.0, ""),
     }.get(unit, (1.0, unit))
     return f"{scale * value:{digits}} {shown}".replace(" °", "°").strip()
 

@@ -9,6 +9,7 @@ from importlib.metadata import version
 import numpy as np
 
 from .. import __version__
+from ..recording import span_text
 
 
 def plain(name: str) -> str:
@@ -28,7 +29,7 @@ def degrees(value: float) -> str:
 
 def intervals(spans: Sequence[tuple[float, float]]) -> str:
     """Intervals [s]."""
-    return ", ".join(f"{a:g} to {b:g} s" for a, b in spans)
+    return ", ".join(map(span_text, spans))
 
 
 def plus_minus(value: float, std: float, unit: str, digits: int = 1) -> str:

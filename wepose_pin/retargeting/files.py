@@ -156,6 +156,7 @@ def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, 
         "recorded_s": round(recorded_s, 3),
         "slowed": round(shown_s / recorded_s, 3) if recorded_s else None,
         "slowest": None if slow is None else slow._asdict(),
+        "slowed_for_contact_s": list(trajectory.tight),
         "arms": arms,
         "limits_kept": held.all,
         "limit_margins": {

@@ -167,14 +167,27 @@ def replace_rates(target: ArmTarget, clock: np.ndarray) -> ArmTarget:
 
 
 def _needed(pose: Pose, robot: Robot) -> None:
-    for arm in robot.arms:
-        segments = ("torso", f"{arm.side}_upper_arm", f"{arm.side}_forearm")
-        points = tuple(f"{arm.side}_{name}" for name in ("shoulder", "elbow", "wrist", "hand"))
-        missing = [name for name in segments if name not in pose.quat_WL] + [n for n in points if n not in pose.points]
-        if missing:
-            raise BadData(
-                f"the {arm.side} arm is not in the pose: {', '.join(missing)} is missing; --arm names the other"
-            )
+    missing = {side: _missing(pose, side) for side in ("left", "right")}
+    lacking = [arm.side for arm in robot.arms if missing[arm.side]]
+    if not lacking:
+        return
+    said = "; ".join(f"the {side} arm is not in the pose: {', '.join(missing[side])} is missing" for side in lacking)
+    other = next((side for side in robot.map.arms if not missing[side]), None)
+    if other is not None:
+        raise BadData(f"{said}; --arm {other} takes the other")
+    have = next((side for side in missing if not missing[side]), None)
+    raise BadData(
+        f"{said}; {robot.map.name} has no arm for the {have} one, which is there"
+        if have
+        else f"{said}; an arm needs sensors on torso, upper arm and forearm"
+    )
+
+
+def _missing(pose: Pose, side: str) -> list[str]:
+    """Segments and points of an arm that the pose has not."""
+    segments = ("torso", f"{side}_upper_arm", f"{side}_forearm")
+    points = tuple(f"{side}_{name}" for name in ("shoulder", "elbow", "wrist", "hand"))
+    return [name for name in segments if name not in pose.quat_WL] + [n for n in points if n not in pose.points]
 
 
 def _gaps(pose: Pose, side: str) -> np.ndarray:

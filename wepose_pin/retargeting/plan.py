@@ -40,6 +40,9 @@ APPROACH_SPEED, APPROACH_RATE = 0.25, 0.6  # [m/s], [rad/s] of the hands on thei
 APPROACH_LEAST_S, SETTLE_S = 2.0, 1.0
 FADE_S = 0.5  # [s] of the motion's end that take twice as long, fading to rest
 HALT_S = 0.3  # [s] in which the very last of it fades
+TIGHT = 0.25  # share of the clearance: shapes that come nearer are slowed where they do
+TIGHT_BEFORE_S, TIGHT_AFTER_S = 0.6, 0.2  # [s] of the motion about such a moment that are slowed, each time twice
+TIGHT_RUNS = 3  # so often the motion is slowed and run again
 STRICT = 1.02  # slower than this, and --strict refuses
 
 
@@ -69,6 +72,7 @@ class Trajectory:
     held : what held joints and arms in the step from each sample
     solve_s : (n,) [s] that each step took
     slowest : None where nothing had to be slowed for a limit
+    tight : moments [s] of the recording that were slowed so that the robot does not touch itself
     """
 
     robot: Robot
@@ -90,6 +94,7 @@ class Trajectory:
     solve_s: np.ndarray
     counts: Counts
     slowest: Slowest | None
+    tight: tuple[float, ...] = ()
 
 
 def retarget(
@@ -140,15 +145,33 @@ def retarget(
             f"{robot.map.name}: too fast at {slowest.time:.2f} s of the recording: {slowest.joint} would need "
             f"{slowest.factor:.1f} times its {slowest.what} limit; without --strict the motion is slowed there"
         )
-    stretched = np.concatenate([[0.0], np.cumsum(0.5 * (factor[1:] + factor[:-1])) * dt])
-    stretched = _fading(stretched)
-    time = np.arange(0.0, stretched[-1] + SETTLE_S + HALT_S, dt)
-    index = np.interp(time, stretched, np.arange(n))
-    targets = _on(first, index, time, dt)
     lean = CubicSpline(np.arange(n) * dt, gaussian_filter1d(path[0], 0.03 / dt, axis=0, mode="nearest"))
-    reference = lean(np.minimum(index, n - 1) * dt)
-    exact = Stepper(robot, shapes, dt, replace(tasks, posture=50.0 * tasks.posture, posture_gain=8.0))
-    found, seen = _run(exact, targets, reference, round(HALT_S / dt), lambda share: progress("solving", share))
+    tight: tuple[float, ...] = ()
+    settle = SETTLE_S
+    for runs in range(1 + TIGHT_RUNS):
+        stretched = np.concatenate([[0.0], np.cumsum(0.5 * (factor[1:] + factor[:-1])) * dt])
+        stretched = _fading(stretched)
+        time = np.arange(0.0, stretched[-1] + settle + HALT_S, dt)
+        index = np.interp(time, stretched, np.arange(n))
+        targets = _on(first, index, time, dt)
+        reference = lean(np.minimum(index, n - 1) * dt)
+        exact = Stepper(robot, shapes, dt, replace(tasks, posture=50.0 * tasks.posture, posture_gain=8.0))
+        found, seen = _run(exact, targets, reference, round(HALT_S / dt), lambda share: progress("solving", share))
+        near = np.flatnonzero(seen.room < TIGHT)
+        rests = float(np.abs([found[1][-1], found[2][-1]]).max()) < 1e-9  # a robot that lags far behind needs longer
+        if (rests and not len(near)) or runs == TIGHT_RUNS:
+            break
+        settle += 0.0 if rests else SETTLE_S
+        if not len(near):
+            continue
+        moment = index[near[np.diff(near, prepend=-2) > 1]]
+        if strict:
+            raise NoSolution(
+                f"{robot.map.name}: too fast at {first.time[int(moment[0])]:.2f} s of the recording: it could not stop "
+                f"before it touches itself; without --strict the motion is slowed there"
+            )
+        tight = tuple(sorted({*tight, *np.round(first.time[moment.astype(int)], 2).tolist()}))
+        factor = factor * _slower_about(index[near], n, dt)
     return Trajectory(
         robot=robot,
         shapes=shapes,
@@ -169,6 +192,7 @@ def retarget(
         solve_s=seen.solve_s,
         counts=exact.counts,
         slowest=slowest,
+        tight=tight,
     )
 
 
@@ -177,6 +201,7 @@ class _Seen(NamedTuple):
     turn: list[np.ndarray]
     bend: list[np.ndarray]
     closest: np.ndarray
+    room: np.ndarray
     held: Held
     solve_s: np.ndarray
 
@@ -189,7 +214,7 @@ def _run(
     u, v, a = (np.zeros((n, len(robot.names))) for _ in range(3))
     seen = _Seen(
         [np.empty((n, 3)) for _ in range(arms)], [np.empty((n, 3, 3)) for _ in range(arms)],
-        [np.empty((n, 3)) for _ in range(arms)], np.full(n, np.inf),
+        [np.empty((n, 3)) for _ in range(arms)], np.full(n, np.inf), np.full(n, np.inf),
         Held(np.zeros(u.shape, dtype=bool), np.zeros((n, arms), dtype=bool)), np.zeros(n),
     )  # fmt: skip
     state = State(robot.rest.copy(), np.zeros(len(robot.names)), np.zeros(len(robot.names)))
@@ -202,7 +227,7 @@ def _run(
         left = n - 1 - k
         after = stepper.halt(state, left) if left < halts else stepper.step(state, aims_at(motion.arms, k, stepper.dt))
         seen.solve_s[k] = clock.perf_counter() - begin
-        seen.closest[k] = stepper.closest
+        seen.closest[k], seen.room[k] = stepper.closest, stepper.room
         seen.held.joints[k], seen.held.shapes[k] = stepper.held
         for i in range(arms):
             seen.hand[i][k], seen.turn[i][k], seen.bend[i][k] = stepper.place(i)
@@ -276,6 +301,14 @@ def _slower(
     width = max(1, round(SPREAD_S / dt))
     wide = maximum_filter1d(whole, 2 * width + 1, mode="nearest")
     return np.asarray(gaussian_filter1d(wide, 0.5 * width, mode="nearest")), slowest
+
+
+def _slower_about(near: np.ndarray, n: int, dt: float) -> np.ndarray:
+    """(n,) from 1 to 2: how much longer than before each moment about the samples `near` takes."""
+    slow = np.zeros(n, dtype=bool)
+    for k in np.unique(near.astype(int)).tolist():
+        slow[max(0, k - round(TIGHT_BEFORE_S / dt)) : k + round(TIGHT_AFTER_S / dt) + 1] = True
+    return 1.0 + np.asarray(gaussian_filter1d(slow.astype(float), 0.5 * SPREAD_S / dt, mode="nearest"))
 
 
 def _fading(time: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from .maps import AXES, ArmMap, LinkPoint, RobotMap, example_data
 
 POSITION_MARGIN = 1e-4  # [rad or m] kept from every limit, so that what is written with fewer digits keeps it too
 SHARE = 0.999  # of velocity and acceleration limits, for the same reason
+REST_OFF_DEG = 60.0  # by which a hand at rest may be off the direction ahead and below, seen from its shoulder
 _REACH_STARTS = 8
 
 
@@ -137,6 +138,8 @@ def load(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
         pin.framesForwardKinematics(model, data, q)
         at = data.oMf[shoulder].translation.copy()
         arms.append(Arm(side, own, at, hand, elbow, _reach(made, own, at, hand)))
+        if any(name in robot.rest for name in arm.joints):
+            _check_rest(made, arms[-1], data.oMf[hand].translation)
     return replace(made, arms=tuple(arms))
 
 
@@ -154,6 +157,12 @@ def _check(robot: RobotMap, arms: dict[str, ArmMap], full: Any, said: dict[str, 
             if name not in said:
                 raise BadModel(
                     f"{where}.joints: no joint '{name}' that moves in {robot.urdf.name}; {one_of(said, name)}"
+                )
+            other = _not_of_the_arm(full, name, arm.hand.link)
+            if other:
+                raise BadModel(
+                    f"{where}.joints: '{name}' is no joint of the arm: it {other}; leave it out, it stays where `rest` "
+                    f"has it"
                 )
             limit = said[name]
             if limit.kind != "continuous" and not limit.lower < limit.upper:
@@ -185,6 +194,34 @@ def _check(robot: RobotMap, arms: dict[str, ArmMap], full: Any, said: dict[str, 
             )
     if robot.base and robot.base not in links:
         raise BadModel(f"{robot.where}: base: no link '{robot.base}' in {robot.urdf.name}; {one_of(links, robot.base)}")
+
+
+def _not_of_the_arm(full: Any, name: str, hand: str) -> str:
+    """Why a joint is none between the root and the hand's link; empty where it is one."""
+    joint = full.getJointId(name)
+    above = full.frames[full.getFrameId(hand)].parentJoint
+    while above > joint:
+        above = full.parents[above]
+    if above != joint:
+        return f"does not move the hand's link '{hand}'"
+    beside = [k for k in range(1, full.njoints) if k != joint and full.parents[k] == full.parents[joint]]
+    slides = [full.joints[k].shortname().startswith("JointModelP") for k in (joint, *beside)]
+    if slides[0] and any(slides[1:]):
+        return f"slides beside '{full.names[beside[slides.index(True, 1) - 1]]}' as a gripper's fingers do"
+    return ""
+
+
+def _check_rest(robot: Robot, arm: Arm, hand: np.ndarray) -> None:
+    """The stated rest is one for this mount: the hand, at `hand` (3,) [m] in the root, is below or ahead."""
+    offset = robot.R_BT.T @ (hand - arm.shoulder)
+    off = np.degrees(np.arccos((offset[0] - offset[2]) / np.sqrt(2.0) / max(np.linalg.norm(offset), 1e-9)))
+    if off > REST_OFF_DEG:
+        x, y, z = offset
+        raise BadModel(
+            f"{robot.map.where}: rest: the {arm.side} hand is {x:+.2f} m ahead of its shoulder, {y:+.2f} m to the left "
+            f"and {z:+.2f} m up, with base, up and forward as they are: {off:.0f} deg off ahead and below, at most "
+            f"{REST_OFF_DEG:g}; give a rest for this mount, the arm hanging, the forearm ahead, or none"
+        )
 
 
 def _driven(limit: JointLimit, joints: list[str]) -> bool:

@@ -102,6 +102,7 @@ class Stepper:
     loose: float = 1.0
     counts: Counts = field(default_factory=Counts)
     closest: float = np.inf  # [m] between hulls in the last step; inf where nothing was near
+    room: float = np.inf  # the least share of its clearance that a pair had in the last step
     held: Held = field(init=False)  # by what, in the last step
     lean: tuple[np.ndarray, np.ndarray] | None = None  # posture and its velocity in place of the rest
 
@@ -173,6 +174,8 @@ class Stepper:
         """Rows @ w ≥ bound: near shapes come no closer than they can stop."""
         near = self.shapes.near(self.data)
         self.closest = float(near.distance.min()) if len(near.distance) else np.inf
+        clear = near.clearance > 0.0  # the hulls of others are in each other at rest, and their shapes need not be
+        self.room = float((near.distance[clear] / near.clearance[clear]).min(initial=np.inf))
         growth = near.growth if self._plain else near.growth @ self.robot.coupling
         _, a_most, j_most = self._most
         self.counts.near += bool((near.distance - near.clearance < 0.01).any())

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import ATTITUDE_STD, SLIP_STD, Segments
+from ..alignment import ATTITUDE_STD, SLIP_STD, START_POSE_STD, Segments, start_heading_var
 from ..recording import SEGMENTS, Intervals, Recording
 from ..subject import Subject
 
@@ -31,7 +31,7 @@ LOOK_RATE_HZ = 8.0
 # mounts' errors come back in every pose, so that a minute of joined hands is worth three looks. Found on simulated
 # people, where less takes a good filter's headings for worse than they are.
 CORRELATION_S = 20.0
-START_STD = np.deg2rad(0.5)  # [rad] of each heading when the start pose ends
+TORSO_START_STD = np.deg2rad(0.5)  # [rad] of the torso's heading when the start pose ends: it says where x points
 UNKNOWN_DRIFT = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance
 APART = 5.0  # standard deviations from which on palms are not joined, or an elbow is no hinge
 
@@ -130,22 +130,22 @@ class HeadingHold:
                 at = np.concatenate([at, np.full(len(middle) + 1 - len(at), self._last[name][1])])
                 steps[:, i] = np.maximum(np.diff(at), 1e-10)
         delta, self._cov = _smoothed(information, pull, steps)
-        # Constant before the first middle and after the last, and in the start pose exactly zero.
-        self._middle, self._knot_times = middle, np.concatenate([[self._start], middle])
-        self._delta = np.concatenate([np.zeros((1, len(self._chain))), delta])
+        self._middle, self._delta = middle, delta  # constant before the first middle and after the last
         return True
 
     def apply(self, piece: Recording, segments: Segments) -> Segments:
         """The piece's segments corrected, the second time that it comes."""
         corrected, covariance = dict(segments.quat_WL), dict(segments.covariance_W)
         for i, name in enumerate(self._chain):
-            turn = np.interp(piece.time, self._knot_times, self._delta[:, i])
+            turn = np.interp(piece.time, self._middle, self._delta[:, i])
             about_z = Rotation.from_rotvec(turn[:, None] * [0.0, 0.0, 1.0])
             corrected[name] = (about_z * Rotation.from_quat(corrected[name])).as_quat()
             self._largest[name] = max(self._largest[name], float(np.degrees(np.abs(turn).max())))
             if name in covariance:
                 variance = np.interp(piece.time, self._middle, self._cov[:, i, i])
-                covariance[name] = _narrowed(covariance[name], *_of_filter(segments, name), variance)
+                with_heading, of_filter = _of_filter(segments, name)
+                start = start_heading_var(piece, name, self._subject)
+                covariance[name] = _narrowed(covariance[name], with_heading, of_filter + start, variance)
         held = replace(segments, quat_WL=corrected, covariance_W=covariance)
         time, quats = self._looks(piece, held, 1)
         self._measure("after", time, {name: Rotation.from_quat(quat) for name, quat in quats.items()})
@@ -336,7 +336,8 @@ def _of_filter(segments: Segments, name: str) -> tuple[np.ndarray, np.ndarray]:
 def _smoothed(information: np.ndarray, pull: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Random walks (knots, k) and their covariances (knots, k, k), seen through information matrices."""
     n, size = pull.shape
-    x, P = np.zeros(size), START_STD**2 * np.eye(size)
+    # How a person stands is part of the start: each segment's heading is off by it, the torso's by definition not.
+    x, P = np.zeros(size), np.diag([TORSO_START_STD**2] + [START_POSE_STD**2] * (size - 1))
     before, filtered = [], []
     for k in range(n):
         P = P + np.diag(steps[k])
@@ -355,7 +356,7 @@ def _smoothed(information: np.ndarray, pull: np.ndarray, steps: np.ndarray) -> t
 
 
 def _narrowed(cov_W: np.ndarray, filter_W: np.ndarray, filter_var: np.ndarray, heading_var: np.ndarray) -> np.ndarray:
-    """Covariances (n, 3, 3) in which the filter's part of the heading is no larger than `heading_var` (n,).
+    """Covariances (n, 3, 3) in which the heading's part of filter and start pose is no larger than `heading_var` (n,).
 
     What comes from elsewhere, as from a mount's heading, joined hands and elbows do not take away: it stays.
     """

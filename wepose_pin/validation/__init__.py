@@ -12,7 +12,7 @@ from pathlib import Path
 from . import anywhere, gains, paper, real
 from .contenders import Contender, contenders
 from .document import Document, document_text, read_document
-from .jobs import Job, Result, run
+from .jobs import Job, Result, Skipped, run
 from .tables import Row, summary
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "Job",
     "Result",
     "Row",
+    "Skipped",
     "contenders",
     "document_text",
     "experiments",

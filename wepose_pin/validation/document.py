@@ -12,7 +12,7 @@ from ..errors import BadData, MissingFile
 from ..simulation import MTI_3
 from .contenders import AS_IT_COMES
 from .gains import STATED
-from .jobs import Result
+from .jobs import Result, Skipped
 from .paper import WORLDS
 
 
@@ -25,9 +25,12 @@ class Document(NamedTuple):
     worlds: dict[str, dict[str, Any]]  # name → mounts_known, and imperfections with their sizes
     noise: dict[str, float]  # of the simulated sensors, in `ImuNoise`'s units
     gains: dict[str, dict[str, Any]]  # setting → "ncf", "gdc" → gains as stated
+    skipped: list[Skipped] = []  # trials that could not be scored  # noqa: RUF012
 
 
-def document_text(results: Sequence[Result], quick: bool, versions: Mapping[str, str]) -> str:
+def document_text(
+    results: Sequence[Result], quick: bool, versions: Mapping[str, str], skipped: Sequence[Skipped] = ()
+) -> str:
     """The file's text: a line a result. No time stamp, so that two runs give the same file.
 
     JSON knows no infinity and no NaN: a range without end, and a figure that is none, are null.
@@ -35,6 +38,7 @@ def document_text(results: Sequence[Result], quick: bool, versions: Mapping[str,
     head = {
         "versions": dict(versions),
         "quick": quick,
+        **({"skipped": [each._asdict() for each in skipped]} if skipped else {}),
         "worlds": {
             name: {"mounts_known": True, "imperfections": asdict(imperfections)}
             for name, imperfections in WORLDS.items()
@@ -104,6 +108,10 @@ def as_document(found: Any, where: str) -> Document:
         wanted(found, "worlds", dict, "", {}),
         wanted(found, "noise", dict, "", {}),
         wanted(found, "gains", dict, "", {}),
+        [
+            Skipped(*(wanted(item, key, str, f"skipped[{k}].") for key in Skipped._fields))
+            for k, item in enumerate(wanted(found, "skipped", list, "", []))
+        ],
     )
 
 

@@ -8,6 +8,9 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any, NamedTuple
 
+from ..errors import WeposeError
+from ..page import reason
+
 
 class Result(NamedTuple):
     """One filter in one trial."""
@@ -17,6 +20,17 @@ class Result(NamedTuple):
     method: str  # a contender's label
     figures: dict[str, Any]
     series: dict[str, list[float]] = {}  # over time, for the figures; of the first trial only  # noqa: RUF012
+
+
+class Skipped(NamedTuple):
+    """A trial that could not be scored."""
+
+    experiment: str
+    trial: str
+    reason: str
+
+    def line(self) -> str:
+        return f"{self.experiment}, {self.trial}: not scored: {self.reason}"
 
 
 class Job(NamedTuple):
@@ -31,11 +45,14 @@ class Job(NamedTuple):
         return self.function(self.experiment, self.trial, *self.arguments)
 
 
-def run(jobs: Sequence[Job], workers: int | None = None) -> Iterator[list[Result]]:
-    """Results of each job in the order of the jobs, whatever the number of `workers` (None: one a core)."""
+def run(jobs: Sequence[Job], workers: int | None = None) -> Iterator[list[Result] | Skipped]:
+    """Results of each job in the order of the jobs, whatever the number of `workers` (None: one a core).
+
+    One that fails, as by a recording that cannot be read, is told and takes none of the others with it.
+    """
     count = min(workers or os.cpu_count() or 1, len(jobs))
     if count <= 1:
-        yield from (job() for job in jobs)
+        yield from map(_called, jobs)
         return
     with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
         try:
@@ -45,5 +62,10 @@ def run(jobs: Sequence[Job], workers: int | None = None) -> Iterator[list[Result
             raise
 
 
-def _called(job: Job) -> list[Result]:
-    return job()
+def _called(job: Job) -> list[Result] | Skipped:
+    try:
+        return job()
+    except WeposeError as error:
+        return Skipped(job.experiment, job.trial, " ".join(str(error).split()))
+    except Exception as error:
+        return Skipped(job.experiment, job.trial, reason(error))

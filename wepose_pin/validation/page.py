@@ -34,24 +34,33 @@ GAINS = {"gain", "integral"}  # of the grid search: small numbers, three digits
 
 
 def write_pages(folder: Path, document: Document) -> list[str]:
-    """``validation.md`` with its figures in ``validation/``, and ``validation.html``; their names."""
-    blocks = page(document)
+    """``validation.md`` with its figures in ``validation/``, and ``validation.html``.
+
+    Returns
+    -------
+    list[str]
+        A line for each figure that could not be drawn.
+    """
+    failures: list[str] = []
+    blocks = page(document, failures)
     (folder / FOLDER).mkdir()
     for picture in (block for block in blocks if isinstance(block, Picture)):
         (folder / FOLDER / f"{picture.stem}.png").write_bytes(picture.png)
     (folder / "validation.md").write_text(markdown(blocks), encoding="utf-8")
     (folder / "validation.html").write_text(as_html(blocks), encoding="utf-8")
-    return ["validation.html", "validation.md", f"{FOLDER}/*.png"]
+    return failures
 
 
-def page(document: Document) -> list[Block]:
-    """The page's content; every figure in it comes from the document."""
+def page(document: Document, failures: list[str] | None = None) -> list[Block]:
+    """The page's content; every figure in it comes from the document. `failures` as of `figures.pictures`."""
     rows = summary(document.results)
     experiments = list(dict.fromkeys(row.experiment for row in rows))
     drawn: dict[str, list[Picture]] = {}
-    for experiment, picture in pictures(document):
+    for experiment, picture in pictures(document, failures):
         drawn.setdefault(experiment, []).append(picture)
     blocks: list[Block] = [Heading(TITLE, 1), *_head(document, experiments), *_in_short(document, rows)]
+    if document.skipped:
+        blocks += ["**Not scored, and in no figure below:**", Bullets([each.line() for each in document.skipped])]
     blocks += [Heading("How to read it"), *_reading(document, rows)]
     for experiment in experiments:
         of = [row for row in rows if row.experiment == experiment]

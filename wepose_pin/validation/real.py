@@ -24,10 +24,13 @@ from ..noise import SensorNoise, noise_of
 from ..readers.trials import (
     RING_MOUNTS,
     RING_SEGMENTS,
-    UR5_SENSORS,
     Chain,
     Referenced,
+    RingFiles,
     Trial,
+    Ur5Files,
+    find_ring,
+    find_ur5,
     read_authors_trial,
     read_broad,
     read_ring,
@@ -61,30 +64,33 @@ def experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
         ]
     if authors.is_file():
         found["the authors' trial"] = [Job("the authors' trial", authors.stem, _authors, (authors,))]
-    ring, ur5 = data / "ring" / "trial1", data / "ur5"
-    if ring.is_dir():
-        for mount, bias in product(RING_MOUNTS, ("", ", bias unknown")):
-            name = f"RING, {mount} mounts{bias}"
-            found[name] = [
-                Job(name, segment, _ring, (ring, mount, not bias)) for segment in RING_SEGMENTS[: 1 if quick else None]
-            ]
-        for mount in RING_MOUNTS:
-            name = f"RING, link lengths, {mount} mounts"
-            found[name] = [Job(name, ring.name, _links, (ring, mount))]
-    if (ur5 / "imu").is_dir():
-        recordings = [
-            (path.name, sensor)
-            for path in sorted((ur5 / "imu").iterdir())
-            for sensor in UR5_SENSORS
-            if (path.name, sensor) not in UR5_OFF
+    rings = find_ring(data)[: 1 if quick else None]
+    for mount, bias in product(RING_MOUNTS, ("", ", bias unknown")):
+        name = f"RING, {mount} mounts{bias}"
+        found[name] = [
+            Job(
+                name,
+                segment if len(rings) == 1 else f"{ring.folder.name} {segment}",
+                _ring,
+                (ring, segment, mount, not bias),
+            )
+            for ring in rings
+            if mount in ring.imu
+            for segment in RING_SEGMENTS[: 1 if quick else None]
         ]
-        found["UR5"] = [
-            Job("UR5", " ".join(which), _ur5, (ur5, *which, n == 0))
-            for n, which in enumerate(recordings[: 1 if quick else None])
-        ]
+    for mount in RING_MOUNTS:
+        name = f"RING, link lengths, {mount} mounts"
+        found[name] = [Job(name, ring.folder.name, _links, (ring, mount)) for ring in rings if mount in ring.imu]
+    ur5 = [files for files in find_ur5(data) if (files.recording, files.sensor) not in UR5_OFF]
+    found["UR5"] = [
+        Job("UR5", f"{files.recording} {files.sensor}", _ur5, (files, n == 0))
+        for n, files in enumerate(ur5[: 1 if quick else None])
+    ]
+    found = {name: jobs for name, jobs in found.items() if jobs}
     if not found:
         raise MissingFile(
-            f"{data}: neither broad/*.mat nor wepose_hr/prova_HR.txt, ring/trial1 or ur5/imu in it; see its README"
+            f"{data}: neither broad/*.mat nor wepose_hr/prova_HR.txt, nor files with the columns of RING or UR5 in it; "
+            f"see docs/validation.md"
         )
     return found
 
@@ -138,29 +144,29 @@ def _errors(
     return figures, over_time(time, total_deg=angle) if keep else {}
 
 
-def _ring(experiment: str, segment: str, folder: Path, mount: str, bias_known: bool) -> list[Result]:
+def _ring(experiment: str, name: str, files: RingFiles, segment: str, mount: str, bias_known: bool) -> list[Result]:
     """Errors of one segment from 10 s on."""
-    chain, registered = _registered_ring(folder)
+    chain, registered = _registered_ring(files.folder)
     sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
     noise = assumed_noise(sensor.rate_hz, registration.gyro_bias if bias_known else None)
-    return _referenced(experiment, segment, sensor, registration, noise, segment == RING_SEGMENTS[0])
+    return _referenced(experiment, name, sensor, registration, noise, segment == RING_SEGMENTS[0])
 
 
-def _ur5(experiment: str, name: str, folder: Path, recording: str, sensor: str, keep: bool) -> list[Result]:
+def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result]:
     """Errors from 10 s on, noise and bias from the 0.6 s to 4 s before the arm moves.
 
     The tilt of the world comes out as 1.0 to 2.6 deg where it is one robot on one base: some 20 mg of error of the
     accelerometers are in it, and in the inclinations.
     """
-    found = read_ur5(folder, recording, sensor)
+    found = read_ur5(files)
     (registration,) = register([found], (0.0, UNSCORED_S))
     noise = noise_of(found.gyro_S[found.still], found.accel_S[found.still], found.rate_hz)
     return _referenced(experiment, name, found, registration, noise, keep)
 
 
-def _links(experiment: str, name: str, folder: Path, mount: str) -> list[Result]:
+def _links(experiment: str, name: str, files: RingFiles, mount: str) -> list[Result]:
     """Lengths of the chain's links from each contender's orientations and the optical tip, beside the optical ones."""
-    chain, registered = _registered_ring(folder)
+    chain, registered = _registered_ring(files.folder)
     links = optical_links(chain)
     optical = (links.lengths["seg2"] + links.lengths["seg3"], links.lengths["seg4"])
     orientations = []
@@ -227,7 +233,8 @@ def fitted_links(tip_W: np.ndarray, R_W2: Rotation, R_W3: Rotation, R_W4: Rotati
 @lru_cache(maxsize=1)
 def _registered_ring(folder: Path) -> tuple[Chain, dict[tuple[str, str], Registration]]:
     """The chain, and all ten sensors registered together: one clock, one optical world."""
-    chain = read_ring(folder)
+    (files,) = [files for files in find_ring(folder) if files.folder == folder]
+    chain = read_ring(files)
     return chain, dict(zip(chain.sensors, register(list(chain.sensors.values()), (0.0, UNSCORED_S)), strict=True))
 
 

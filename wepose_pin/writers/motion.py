@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..errors import BadData, BadOption
 from ..model import BodyModel
 from ..pose import Pose, pose_of
+from ..recording import span_text
 
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
@@ -79,8 +80,8 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
     if samples > max(_FEW, _MOST_NEW * len(old)):
         leap = int(np.argmax(np.diff(old)))
         raise BadData(
-            f"{motion.where}: time leaps from {old[leap]:g} to {old[leap + 1]:g} s in row {leap + 2} of pose.parquet; "
-            f"at {rate_hz:g} Hz that is {samples} samples of {len(old)}"
+            f"{motion.where}: time leaps from {span_text((old[leap], old[leap + 1]))} in row {leap + 2} of "
+            f"pose.parquet; at {rate_hz:g} Hz that is {samples} samples of {len(old)}"
         )
     time = old[0] + np.arange(samples) / rate_hz
     time = np.minimum(time, old[-1])
