@@ -64,7 +64,7 @@ class Outcome:
 
 @dataclass
 class Result:
-    """What `track` wrote: rotations as xyzw, standard deviations of one axis; `calibrated`: segments of known mount."""
+    """What `track` wrote: rotations as xyzw, standard deviations of one axis; `calibrated`: segments whose mount has a ±."""
 
     time: np.ndarray
     quat: dict[str, np.ndarray]
@@ -288,7 +288,7 @@ def read_result(folder: Path) -> Result:
         lengths={name: float(value) for name, value in lengths.items()},
         start=_first_span(summary["phases"]["start"]),
         warnings=warnings_of(summary),
-        calibrated=set(re.findall(r"^\[mounts\.(\w+)\]", subject, re.MULTILINE)),
+        calibrated=set(re.findall(r"^\[mounts\.(\w+)\][^\[]*?^std_deg", subject, re.MULTILINE | re.DOTALL)),
     )
 
 

@@ -215,7 +215,7 @@ def truth_at(
 ) -> Truth:
     """The motion at a file's times (n,) [s].
 
-    Where a mount is stated the project says: as a segment is in the start pose on the mean, so is the N-pose, and a stated
+    Where a mount is stated the project says: as a segment is in the start pose on the mean, so is the N-pose, and the
     mount is exact. Truth is then a segment's motion since that mean, in a world that is off by what the heading of the
     stated mount is off. Of the `calibrated` ones truth is anatomy, where the trunk faces x in the start pose.
     """
