@@ -64,7 +64,7 @@ class Outcome:
 
 @dataclass
 class Result:
-    """What `track` wrote: rotations as xyzw, standard deviations of one axis; `calibrated`: segments whose mount has a ±."""
+    """What `track` wrote: rotations as xyzw, deviations of one axis; `calibrated`: segments whose mount has a ±."""
 
     time: np.ndarray
     quat: dict[str, np.ndarray]
