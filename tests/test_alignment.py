@@ -257,3 +257,27 @@ def test_an_unknown_mount_beside_a_subject_that_has_none_for_it(simulation: Simu
         need_mounts(recording, subject)
     assert ("no calibration finds" in str(told.value)) == (segment in ("head", "pelvis"))
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("rate_deg_s", [2.0, 10.0])
+def test_a_person_who_turns_in_the_start_pose_is_named(simulation: Simulation, rate_deg_s: float) -> None:
+    """The same rate about the vertical in all sensors: little of it makes the biases uncertain, much is refused."""
+    recording = simulation.recording()
+    begin, end = recording.phases["start"][0]
+    turning = {}
+    for segment, sensor in recording.sensors.items():
+        assert sensor.gyro_S is not None
+        assert sensor.accel_S is not None
+        up = sensor.accel_S[recording.span((begin, end))].mean(axis=0)
+        turning[segment] = replace(sensor, gyro_S=sensor.gyro_S + np.deg2rad(rate_deg_s) * up / np.linalg.norm(up))
+    turned = replace(recording, sensors=turning)
+    if rate_deg_s * (end - begin) > 15.0:
+        with pytest.raises(BadPhase, match="all sensors turn about the vertical"):
+            segment_orientations(turned)
+        return
+    found = segment_orientations(turned)
+    assert any("turn about the vertical" in warning for warning in found.warnings)
+    assert not any("turn about the vertical" in warning for warning in segment_orientations(recording).warnings)
+    for segment, orientation in found.orientation.items():
+        still = segment_orientations(recording).orientation[segment]
+        assert np.trace(orientation.noise.gyro_bias_cov - still.noise.gyro_bias_cov) > 0.9 * np.deg2rad(rate_deg_s) ** 2

@@ -16,6 +16,7 @@ from wepose_pin.filters import (
     Gdc,
     GdcParams,
     Ncf,
+    SensorRun,
     Smekf,
     SmekfParams,
     check_method,
@@ -27,6 +28,7 @@ from wepose_pin.filters.base import in_parallel
 from wepose_pin.filters.smekf import starting_params
 from wepose_pin.noise import SensorNoise, noise_of
 from wepose_pin.readers.trials import read_authors_trial
+from wepose_pin.simulation import paper_dynamic
 from wepose_pin.so3 import tilt
 from wepose_pin.static import StaticDetector, StaticTest
 
@@ -345,6 +347,69 @@ def test_how_the_sensors_axes_lie_changes_nothing(method: str) -> None:
     # amekf doubts each axis of a measurement by itself (three standard deviations), the others none
     bound = 0.5 if method in ("amekf", "smoother") else 1e-4
     assert np.degrees((runs[0].inv() * runs[1]).magnitude()).max() < bound
+
+
+def tilt_error_deg(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
+    up = (Rotation.from_quat(estimated) * Rotation.from_quat(true).inv()).apply([0.0, 0.0, 1.0])
+    return np.degrees(np.arccos(np.clip(up[:, 2], -1.0, 1.0)))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_recording_may_begin_in_motion(method: str) -> None:
+    """The start phase is the rest after 47 s of free motion by hand; what lies before is filtered backward from it."""
+    worst: list[float] = []
+    for seed in range(3):
+        trial = paper_dynamic(seed)
+        gyro, accel, true = trial.gyro_S[800:], trial.accel_S[800:], trial.quat_WS[800:]
+        found = estimate_orientation(gyro, accel, RATE, method=method, still=(47.6, 51.6))
+        tilt_deg = tilt_error_deg(found.quat_WS, true)
+        assert tilt_deg[4760:].max() < 0.5
+        assert len(found.static) == len(gyro)
+        assert found.static[4900:].mean() > 0.8
+        worst.append(float(tilt_deg.max()))
+    print(f"{method}: tilt within {np.round(worst, 2)} deg")
+    assert max(worst) < (3.5 if method in ("ncf", "gdc") else 1.0)
+
+
+@pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
+def test_what_is_before_the_start_phase_comes_with_the_first_chunk(method: str) -> None:
+    gyro, accel, _, _ = measured(np.random.default_rng(3), 60.0)
+    noise = noise_of(gyro[1000:1180], accel[1000:1180], RATE)
+    run = SensorRun(RATE, noise, method, measured_start=True, start=slice(1003, 1180))
+    chunks = [run.push(gyro[a:b], accel[a:b]) for a, b in ((0, 2000), (2000, 4000), (4000, 6000))]
+    chunks += [run.finish()] if method == "smoother" else []
+    whole = run_filter(gyro, accel, RATE, noise, method, measured_start=True, start=slice(1003, 1180))
+    quat = np.concatenate([chunk.quat_WS for chunk in chunks if chunk is not None])
+    assert quat.shape == whole.quat_WS.shape
+    turned = np.degrees((Rotation.from_quat(quat).inv() * Rotation.from_quat(whole.quat_WS)).magnitude())
+    assert turned.max() < (3.0 if method == "smoother" else 1e-12)  # it looks one chunk ahead
+    # There is no step where the two runs meet.
+    step = (Rotation.from_quat(whole.quat_WS[990:1010]).inv() * Rotation.from_quat(whole.quat_WS[991:1011])).magnitude()
+    assert np.degrees(step).max() < 0.3
+
+
+@pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
+def test_the_rate_changes_little(method: str) -> None:
+    """The same motion and noise density at 100 and 200 Hz: orientations within 2 deg in a minute, ± within a tenth."""
+    std, quats = [], []
+    for rate in (100.0, 200.0):
+        n = round(60.0 * rate)
+        time = np.arange(n + 1) / rate
+        amount = np.clip((time - 5.0) / 1.5, 0.0, 1.0) * np.clip((55.0 - time) / 1.5, 0.0, 1.0)
+        angles = np.column_stack([0.8 * amount * np.sin(2 * np.pi * f * time) for f in (0.31, 0.77, 1.13)])
+        R = Rotation.from_euler("ZYX", angles)
+        rng = np.random.default_rng(0)
+        gyro = (R[:-1].inv() * R[1:]).as_rotvec() * rate + rng.normal(scale=1e-4 * np.sqrt(rate), size=(n, 3))
+        accel = R[1:].inv().apply([0.0, 0.0, GRAVITY]) + rng.normal(scale=1e-3 * np.sqrt(rate), size=(n, 3))
+        k = round(4.5 * rate)
+        noise = noise_of(gyro[:k], accel[:k], rate)
+        found = run_filter(gyro, accel, rate, noise, method, measured_start=True, start=slice(0, k))
+        assert found.attitude_cov is not None
+        std.append(np.sqrt(np.trace(found.attitude_cov[round(50.0 * rate)])))
+        every = round(rate / 100.0)
+        quats.append(Rotation.from_quat(found.quat_WS[every - 1 :: every]))
+    assert np.degrees((quats[0].inv() * quats[1]).magnitude()).max() < 2.0
+    assert abs(std[1] / std[0] - 1.0) < 0.1
 
 
 def test_gdc_is_madgwicks_equations() -> None:

@@ -40,6 +40,47 @@ def test_sway_makes_the_bias_uncertain() -> None:
     assert error < 4 * np.sqrt(swaying.gyro_bias_cov[1, 1])
 
 
+@pytest.mark.parametrize("seconds", [0.6, 1.0, 1.9, 2.5, 4.0, 10.0])
+def test_a_worn_sensor_s_bias_is_as_uncertain_as_sway_makes_it(seconds: float) -> None:
+    """People who sway at 0.3 to 1 deg/s below 0.5 Hz: the mean rate of a phase is within its standard deviation."""
+    z = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        time = np.arange(round(seconds * RATE)) / RATE
+        omega, phase = 2.0 * np.pi * rng.uniform(0.1, 0.5, (3, 3, 1)), rng.uniform(0.0, 6.3, (3, 3, 1))
+        sway = np.deg2rad(rng.uniform(0.3, 1.0)) * np.sqrt(2.0 / 3.0) * np.cos(omega * time + phase).sum(axis=1).T
+        gyro = sway + rng.normal(scale=np.deg2rad(0.07), size=(len(time), 3))
+        noise = noise_of(gyro, np.tile([0.0, 0.0, 9.8], (len(time), 1)), RATE, worn=True)
+        z += list(noise.gyro_bias / np.sqrt(np.diag(noise.gyro_bias_cov)))
+    print(f"{seconds} s: rms {np.sqrt(np.mean(np.square(z))):.2f}, largest {np.abs(z).max():.1f} standard deviations")
+    assert np.sqrt(np.mean(np.square(z))) < 1.7
+    assert np.abs(z).max() < 6.0
+
+
+def test_a_sensor_that_does_not_sway_is_not_taken_for_a_person() -> None:
+    rng = np.random.default_rng(0)
+    for seconds in (0.6, 1.9, 4.0):
+        gyro = rng.normal(scale=1e-3, size=(round(seconds * RATE), 3))
+        accel = np.tile([0.0, 0.0, 9.8], (len(gyro), 1))
+        worn, lying = (noise_of(gyro, accel, RATE, worn).gyro_bias_cov for worn in (True, False))
+        assert np.sqrt(np.trace(worn) / 3) < np.deg2rad(0.15)
+        assert np.trace(worn) >= np.trace(lying)
+
+
+def test_a_steady_turn_is_not_the_quietest_window() -> None:
+    rng = np.random.default_rng(5)
+    n = 2000
+    time = np.arange(n) / RATE
+    sensors = {}
+    for k, segment in enumerate(("torso", "left_forearm", "right_forearm")):
+        gyro = rng.normal(scale=2e-3, size=(n, 3)) + np.deg2rad([0.3, -0.2, 0.4]) * (k + 1)
+        gyro[:1000, 2] += np.deg2rad(20.0)  # a chair, very evenly
+        gyro[1000:] += np.deg2rad(0.5) * np.sin(2.0 * time[1000:, None] + [0.0, 1.0, 2.0])  # standing, with sway
+        sensors[segment] = Sensor(gyro_S=gyro, accel_S=rng.normal(scale=0.02, size=(n, 3)) + [0.0, 0.0, 9.8])
+    first, _ = quietest(Recording("chair", time, RATE, sensors, {}))
+    assert first >= 9.9
+
+
 def test_a_quantised_signal_leaves_invertible_covariances() -> None:
     noise = noise_of(np.zeros((50, 3)), np.tile([0.0, 0.0, 9.8], (50, 1)), RATE)
     assert np.linalg.eigvalsh(noise.gyro_cov)[0] >= 0.99 * GYRO_FLOOR**2

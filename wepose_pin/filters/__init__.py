@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
 from ..arguments import check_arguments
 from ..errors import BadData, BadOption, BadPhase, one_of
 from ..noise import SensorNoise, noise_of
@@ -175,9 +174,10 @@ class SensorRun:
     """`run_filter` of a recording that comes in chunks; all that it gives, put together, is that of the whole.
 
     The filter starts with the tilt of the start phase and goes forward from its first sample; what lies before is
-    filtered backward from there, so that a recording may begin in motion. The smoother alone looks ahead, by one chunk:
-    `push` gives the chunk before, and what lies further ahead does not count. Its chunks are multiples of
-    `piece_multiple`. Parameters as `run_filter`; the start phase is in the first chunk.
+    filtered backward from there, so that a recording may begin in motion. The smoother goes forward over all, from
+    where the way back has ended; it alone looks ahead, by one chunk: `push` gives the chunk before, and what lies
+    further ahead does not count. Its chunks are multiples of `piece_multiple`. Parameters as `run_filter`; the start
+    phase is in the first chunk.
 
     Raises
     ------
@@ -222,38 +222,49 @@ class SensorRun:
         return self._orientation(self._filter.finish(), self._static)
 
     def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> int:
-        """Make the filter, and filter what lies before its first sample; gives that sample's index."""
-        multiple = piece_multiple(self._method, self._rate_hz)
+        """Make the filter, and filter what lies before the start phase; gives the filter's first sample."""
         phase = self._start or slice(0, self.test.samples(self._rate_hz))
-        first = phase.start // multiple * multiple
-        samples = slice(first, phase.stop)
-        start = start_tilt(gyro_S[samples], accel_S[samples], self._noise, self._rate_hz)
+        first = phase.start
+        start = start_tilt(gyro_S[phase], accel_S[phase], self._noise, self._rate_hz)
         if self._start is None:  # nobody says that it rests there
-            static = StaticDetector(self._noise, self._rate_hz, self.test).run(gyro_S[samples], accel_S[samples])
+            static = StaticDetector(self._noise, self._rate_hz, self.test).run(gyro_S[phase], accel_S[phase])
             if not static[-1]:
                 start = start._replace(tilt_std=MOVING_TILT_STD)
-        self._filter = self._made(self._noise, start)
         if first > 0:
-            turn = so3.exp(np.nan_to_num(gyro_S[first] - self._noise.gyro_bias) / self._rate_hz)
-            quat_WS = (Rotation.from_quat(start.quat_WS) * Rotation.from_quat(turn)).as_quat()
-            # Backward in time rates change their sign, the bias' too; specific forces do not.
-            noise = replace(self._noise, gyro_bias=-self._noise.gyro_bias)
-            gyro, accel = -gyro_S[first:0:-1], accel_S[first - 1 :: -1]
-            static = StaticDetector(noise, self._rate_hz, self.test).run(gyro, accel)
-            run = self._made(noise, start._replace(quat_WS=quat_WS)).run(gyro, accel, static)
-            cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
-            self._before = Orientation(run.quat_WS[::-1], -run.gyro_bias[::-1], static[::-1], cov, self._noise)
+            before = self._backward(start, gyro_S[: first + 1], accel_S[:first])
+            if self._method in OFFLINE:  # goes forward over all, from where the way back has ended
+                turn = np.nan_to_num(gyro_S[0] - before.gyro_bias[0]) / self._rate_hz
+                quat_WS = (Rotation.from_quat(before.quat_WS[0]) * Rotation.from_rotvec(-turn)).as_quat()
+                start, first = StartTilt(quat_WS, MOVING_TILT_STD), 0  # what the way back knows counts but once
+            else:
+                self._before = before
+        self._filter = self._made(self._method, self._noise, start)
         return first
 
-    def _made(self, noise: SensorNoise, start: StartTilt) -> Any:
+    def _backward(self, start: StartTilt, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation:
+        """Of the samples `accel_S` before the start phase; `gyro_S` has its first sample as well, which leads to it.
+
+        Backward in time rates change their sign, the bias' too; specific forces do not.
+        """
+        turn = np.nan_to_num(gyro_S[-1] - self._noise.gyro_bias) / self._rate_hz
+        quat_WS = (Rotation.from_quat(start.quat_WS) * Rotation.from_rotvec(turn)).as_quat()
+        noise = replace(self._noise, gyro_bias=-self._noise.gyro_bias)
+        gyro, accel = -gyro_S[:0:-1], accel_S[::-1]
+        static = StaticDetector(noise, self._rate_hz, self.test).run(gyro, accel)
+        method = BEST if self._method in OFFLINE else self._method
+        run = self._made(method, noise, start._replace(quat_WS=quat_WS)).run(gyro, accel, static)
+        cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
+        return Orientation(run.quat_WS[::-1], -run.gyro_bias[::-1], static[::-1], cov, self._noise)
+
+    def _made(self, method: str, noise: SensorNoise, start: StartTilt) -> Any:
         params = self._params
-        if params is None and self._method in ("amekf", "smoother") and self._start is not None:
+        if params is None and method in ("amekf", "smoother") and self._start is not None:
             params = AmekfParams(tilt_std=start.tilt_std)
-        if params is None and self._method == "smekf" and self._measured_start:
+        if params is None and method == "smekf" and self._measured_start:
             params = starting_params(noise, self._rate_hz, start.quat_WS, start.tilt_std)
         if np.isfinite(self._gyro_range):
-            params = with_range(self._method, params, self._gyro_range)
-        return METHODS[self._method](noise, self._rate_hz, start.quat_WS, params)
+            params = with_range(method, params, self._gyro_range)
+        return METHODS[method](noise, self._rate_hz, start.quat_WS, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
         live = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
