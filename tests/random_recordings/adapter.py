@@ -64,7 +64,7 @@ class Outcome:
 
 @dataclass
 class Result:
-    """What `track` wrote: rotations as xyzw, standard deviations of one axis."""
+    """What `track` wrote: rotations as xyzw, deviations of one axis; `calibrated`: segments whose mount has a ±."""
 
     time: np.ndarray
     quat: dict[str, np.ndarray]
@@ -76,6 +76,7 @@ class Result:
     lengths: dict[str, float]
     start: tuple[float, float]
     warnings: list[str]
+    calibrated: set[str]
 
 
 # Session -----------------------------------------------------------------------------------------------------------
@@ -287,6 +288,7 @@ def read_result(folder: Path) -> Result:
         lengths={name: float(value) for name, value in lengths.items()},
         start=_first_span(summary["phases"]["start"]),
         warnings=warnings_of(summary),
+        calibrated=set(re.findall(r"^\[mounts\.(\w+)\][^\[]*?^std_deg", subject, re.MULTILINE | re.DOTALL)),
     )
 
 
@@ -336,6 +338,11 @@ def names_cause(texts: Iterable[str], segments: Iterable[str], causes: Iterable[
 def refusal(outcome: Outcome) -> str:
     """The one line by which a command refuses."""
     return outcome.err.strip().removeprefix("wepose: ")
+
+
+def advises_calibration(outcome: Outcome) -> bool:
+    """Whether a refusal says that a calibration will find what is not known."""
+    return "calibrate` finds" in outcome.err
 
 
 def is_one_line(outcome: Outcome) -> bool:

@@ -132,16 +132,16 @@ def _rigid(result: Result) -> dict[tuple[str, str], float]:
     return pairs
 
 
-def of_errors(result: Result, case: Case, recorded: Recorded, stated: bool, shown: str) -> tuple[Accuracy, Truth]:
+def of_errors(result: Result, case: Case, recorded: Recorded, shown: str) -> tuple[Accuracy, Truth]:
     """Errors within six stated deviations, or a warning that names the cause."""
-    truth = truth_at(case, result.time, recorded.origin, result.start, stated)
+    truth = truth_at(case, result.time, recorded.origin, result.start, result.calibrated)
     found = Accuracy()
     worst: list[tuple[float, str, int, str]] = []
     for name, quat in result.quat.items():
         error = (truth.R_WL[name].inv() * Rotation.from_quat(quat)).magnitude()
         over = np.maximum(error - truth.turned[name] - FLOOR_RAD, 0.0)
         fused = case.worn[name].orientation
-        if result.quat_std.get(name) is None and fused is not None and not stated:
+        if result.quat_std.get(name) is None and fused is not None and name in result.calibrated:
             continue  # a calibrated mount's own error, of which the result says nothing
         z = _z(over, result.quat_std.get(name), fused, truth.R_WL[name], quat)
         k = int(np.argmax(z))

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -209,24 +210,28 @@ class Truth:
     moved: dict[str, np.ndarray]  # point → (n,) [m]
 
 
-def truth_at(case: Case, stamps: np.ndarray, origin: float, start: tuple[float, float], stated: bool) -> Truth:
+def truth_at(
+    case: Case, stamps: np.ndarray, origin: float, start: tuple[float, float], calibrated: Collection[str] = ()
+) -> Truth:
     """The motion at a file's times (n,) [s].
 
-    With `stated` mounts the project says: as a segment is in the start pose on the mean, so is the N-pose, and a stated
+    Where a mount is stated the project says: as a segment is in the start pose on the mean, so is the N-pose, and the
     mount is exact. Truth is then a segment's motion since that mean, in a world that is off by what the heading of the
-    stated mount is off. Else, with calibrated mounts, truth is anatomy, and the trunk faces x in the start pose.
+    stated mount is off. Of the `calibrated` ones truth is anatomy, where the trunk faces x in the start pose.
     """
     t = stamps - origin
     late = case.clock.late
     held = np.linspace(start[0] - origin, start[1] - origin, 200)
     at_start = {name: R.mean() for name, R in case.motion.orientations(held).items()}
-    R_WL = {name: _aligned(case, name, R, at_start, stated) for name, R in case.motion.orientations(t).items()}
+    R_WL = {
+        name: _aligned(case, name, R, at_start, name in calibrated) for name, R in case.motion.orientations(t).items()
+    }
     points = joint_points(case.person.lengths, _worn_only(case, R_WL))
     turned = {name: np.zeros(len(t)) for name in R_WL}
     moved = {name: np.zeros(len(t)) for name in points}
     if late > 0.0:
         before = case.motion.orientations(t - late)
-        near = {name: _aligned(case, name, R, at_start, stated) for name, R in before.items()}
+        near = {name: _aligned(case, name, R, at_start, name in calibrated) for name, R in before.items()}
         turned = {name: (R.inv() * near[name]).magnitude() for name, R in R_WL.items()}
         near_points = joint_points(case.person.lengths, _worn_only(case, near))
         moved = {name: np.linalg.norm(p - near_points[name], axis=1) for name, p in points.items()}
@@ -237,9 +242,9 @@ def _worn_only(case: Case, R_WL: dict[str, Rotation]) -> dict[str, Rotation]:
     return {name: R for name, R in R_WL.items() if name in case.worn}
 
 
-def _aligned(case: Case, name: str, R: Rotation, at_start: dict[str, Rotation], stated: bool) -> Rotation:
+def _aligned(case: Case, name: str, R: Rotation, at_start: dict[str, Rotation], calibrated: bool) -> Rotation:
     facing = Rotation.from_rotvec([0.0, 0.0, -at_start["torso"].as_euler("ZYX")[0]])
-    if not stated or name not in case.worn:
+    if calibrated or name not in case.worn:
         return facing * R
     sensor = case.worn[name]
     assert sensor.axes is not None

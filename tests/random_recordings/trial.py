@@ -103,15 +103,18 @@ class Trial:
         case, out = self.case, self.result_folder
         known = all(sensor.axes is not None for sensor in case.worn.values())
         acceptance = case.refusal
-        if not known and self.subject is None and not acceptance:
+        beyond = [name for name, sensor in case.worn.items() if sensor.axes is None and name in ("pelvis", "head")]
+        if not known and (self.subject is None or beyond) and not acceptance:
             acceptance = "may: no mount is known"
         if self.subject_failed and not acceptance:
             acceptance = "may: the calibration failed"
         argv = adapter.track(self.session, out, case.method, case.options, self.subject)
         outcome = self.command(argv, out, acceptance)
+        shown = " ".join(argv)
+        if outcome.code == 2 and self.subject is not None and beyond and adapter.advises_calibration(outcome):
+            self.report.failures.append(Failure("advice that helps", shown, adapter.refusal(outcome)))
         if outcome.code or outcome.traceback:
             return
-        shown = " ".join(argv)
         self.result = adapter.read_result(out)
         broken = of_result(self.result, shown)
         self.report.failures += broken
@@ -119,8 +122,7 @@ class Trial:
             return
         if self.subject_failed or "swapped" in case.suspects.values():
             return
-        stated = self.subject is None
-        accuracy, truth = of_errors(self.result, case, self.recorded, stated, shown)
+        accuracy, truth = of_errors(self.result, case, self.recorded, shown)
         self.report.failures += accuracy.failures
         self.report.accuracy = _rounded(accuracy) | {"method": case.method}
         worn = {name: R.as_quat() for name, R in truth.R_WL.items() if name in case.worn}
