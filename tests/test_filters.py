@@ -311,8 +311,8 @@ def test_where_the_papers_start_and_bias_noise_are_wrong() -> None:
     for name, (nees, rms) in mean.items():
         print(f"{name:24s} NEES {nees:.1f}, heading {rms:.2f} deg rms")
     np.testing.assert_allclose(mean["paper"], (1.9, 0.57), rtol=0.1)
-    np.testing.assert_allclose(mean["measured P0"], (1.3, 0.10), rtol=0.1)
-    np.testing.assert_allclose(mean["measured P0, real bias"], (2.3, 0.08), rtol=0.1)
+    np.testing.assert_allclose(mean["measured P0"], (0.52, 0.10), rtol=0.1)
+    np.testing.assert_allclose(mean["measured P0, real bias"], (0.8, 0.08), rtol=0.1)
 
 
 # The other two -----------------------------------------------------------------------------------------------------

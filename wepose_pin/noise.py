@@ -24,6 +24,7 @@ BLOCK_S = 0.5
 SWAY_RATE_STD = float(np.deg2rad(0.7))  # [rad/s] of a worn sensor
 SWAY_RATE = 2.0 * np.pi * 0.25  # [rad/s] ω
 PRIOR_BLOCKS = 4.0
+SWAY_CORRELATION_S = 2.0  # half a sway: so long half-second means go on alike
 LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks, beyond white noise: less is no person
 
 # Without stated phases: the quietest stretch of this length within the beginning is taken.
@@ -53,6 +54,13 @@ class SensorNoise:
     bias_step_cov: np.ndarray
     gravity: float
     gyro_half_second_cov: np.ndarray | None = None
+
+    def sway_density(self, rate_hz: float) -> float:
+        """Density [rad²/s] of slow motion at rest, each axis: the variance of the mean rate over T s is 1/T of it."""
+        if self.gyro_half_second_cov is None:
+            return 0.0
+        white = float(np.trace(self.gyro_cov)) / 3.0 / (BLOCK_S * rate_hz)
+        return max(0.0, float(np.trace(self.gyro_half_second_cov)) / 3.0 - white) * SWAY_CORRELATION_S
 
 
 def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool = False) -> SensorNoise:

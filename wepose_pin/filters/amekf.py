@@ -27,7 +27,7 @@ import numpy as np
 
 from ..arguments import check_fields
 from ..errors import BadOption
-from ..noise import BLOCK_S, SensorNoise
+from ..noise import SensorNoise
 from ..so3 import inlined, kernel
 from ..static import static_step
 from .base import HIGHEST_ACCEL, HIGHEST_RATE, REST_TURN_NOISE, FilterRun, OneSample, samples
@@ -145,9 +145,7 @@ class Amekf:
         self.block = max(1, round(p.block_s * rate_hz))
         length = self.block / rate_hz
         # By how much the mean of gyro over a static block is off: a person who stands still sways.
-        white = float(np.trace(noise.gyro_cov)) / 3.0 / self.block
-        slow = noise.gyro_half_second_cov
-        swaying = 0.0 if slow is None else float(np.trace(slow)) / 3.0 * BLOCK_S / length
+        white, sway = float(np.trace(noise.gyro_cov)) / 3.0 / self.block, noise.sway_density(rate_hz)
         known = {
             "gravity": noise.gravity,
             "gyro_noise": float(np.trace(noise.gyro_cov)) / 3.0 / rate_hz,  # [rad²/s]
@@ -161,14 +159,14 @@ class Amekf:
             "matrix_walk": p.gyro_matrix_walk**2,
             "accel_bias_walk": p.accel_bias_walk**2,
             "motion_bias_walk": p.motion_bias_walk**2,
-            "rest_bias": p.rest_bias_std**2 + max(white, swaying),
+            "rest_bias": p.rest_bias_std**2 + white + sway / length,
             "lost_rate": p.lost_rate_std,
             "lost_force": p.lost_force_std**2,
             "gyro_limit": p.gyro_range,
             "accel_limit": p.accel_range,
             "knock": p.knock,
-            # Who sways may turn slowly as well: half of what the sway's rate adds up to.
-            "rest_turn": p.rest_turn_noise**2 + (0.0 if slow is None else float(np.trace(slow)) / 6.0 * BLOCK_S),
+            # Who sways may turn slowly as well: an eighth of what the sway adds up to (our assumption).
+            "rest_turn": p.rest_turn_noise**2 + sway / 8.0,
         }
         accel = np.linalg.inv(np.eye(3) + p.accel_matrix)  # measured to true
         self.model = np.concatenate(

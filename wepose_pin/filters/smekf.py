@@ -17,10 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import BadOption
-from ..noise import BLOCK_S, SensorNoise
+from ..noise import SWAY_CORRELATION_S, SensorNoise
 from ..so3 import inlined, kernel, rotate_by_vector, up_in_sensor
 from ..static import static_step
 from .base import HIGHEST_ACCEL, HIGHEST_RATE, REST_TURN_NOISE, FilterRun, OneSample, samples
+from .start import ACCEL_BIAS_STD
 
 HEADING_FLOOR = 1e-5  # [rad] keeps P₀ positive definite about the vertical
 
@@ -35,14 +36,15 @@ class SmekfParams:
 
     By how much, over two minutes of simulated motion with rests (`tests/test_filters.py` measures it; a NEES of 3 is
     right, below is a covariance too large): NEES 1.9 and 0.57 deg of heading (rms) with the paper's P₀, Σ_b and first
-    order, 1.3 and 0.10 deg exact and with a measured P₀, 2.3 and 0.08 deg with the Σ_b of a bias that drifts by
-    10 deg/h as well.
+    order, 0.5 and 0.10 deg exact and with `starting_params`, 0.8 and 0.08 deg with the Σ_b of a bias that drifts by
+    10 deg/h as well. The simulated accelerometer has no bias, which `starting_params` allows for.
     """
 
     attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
     bias_cov0: float | np.ndarray = 1e-3  # [rad²/s²], a number or (3, 3)
     bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the still phase's first differences
     rest_gyro_cov: np.ndarray | None = None  # (3, 3) [rad²/s²] by which gyro at rest is not the bias; None: Σ_ω
+    rest_accel_cov: np.ndarray | None = None  # (3, 3) by which accel/g at rest is not the vertical; None: Σ_g
     rest_turn_noise: float = 0.0  # [rad/√s] by which a sensor at rest may turn about the vertical unseen; the paper: 0
     first_order: bool = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
     gyro_range: float = np.inf  # [rad/s]; a sample at it is cut off: turned by it, but what is beyond went unseen
@@ -51,8 +53,8 @@ class SmekfParams:
 def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, tilt_std: float) -> SmekfParams:
     """P₀ from what the start phase says: the tilt as good as it is known, the heading exact by definition.
 
-    A person's sway goes on from sample to sample, where Σ_ω is taken for white: what gyro measures of the bias at rest
-    counts as much as the sway's means over half seconds allow.
+    A person's sway goes on from sample to sample, where Σ_ω and Σ_g are taken for white, and so does the bias of the
+    accelerometer: what gyro says of its bias at rest, and accel of the vertical, counts as little as that allows.
 
     Parameters
     ----------
@@ -61,13 +63,11 @@ def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, til
     """
     up_S = np.array(up_in_sensor(quat_WS))
     across = np.eye(3) - np.outer(up_S, up_S)
-    rest, slow = noise.gyro_cov, noise.gyro_half_second_cov
-    if slow is not None:
-        rest = max(rest, BLOCK_S * rate_hz * slow, key=np.trace)
     return SmekfParams(
         attitude_cov0=tilt_std**2 * across + HEADING_FLOOR**2 * np.eye(3),
         bias_cov0=noise.gyro_bias_cov,
-        rest_gyro_cov=rest,
+        rest_gyro_cov=noise.gyro_cov + noise.sway_density(rate_hz) * rate_hz * np.eye(3),
+        rest_accel_cov=noise.accel_cov + ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz * np.eye(3),
         rest_turn_noise=REST_TURN_NOISE,
     )
 
@@ -162,7 +162,9 @@ def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
     step, rest = params.bias_step_cov, params.rest_gyro_cov
     bias_step_cov = noise.bias_step_cov if step is None else _matrix(step)
     rest_gyro_cov = noise.gyro_cov if rest is None else _matrix(rest)
-    covs = dt * dt * noise.gyro_cov, dt * dt * bias_step_cov, rest_gyro_cov, noise.accel_cov
+    accel = params.rest_accel_cov
+    rest_accel_cov = noise.accel_cov if accel is None else _matrix(accel)
+    covs = dt * dt * noise.gyro_cov, dt * dt * bias_step_cov, rest_gyro_cov, rest_accel_cov
     ends = [np.exp(-dt / HOLD_S), float(params.first_order), params.rest_turn_noise**2 * dt, params.gyro_range]
     return np.concatenate([[dt, 1.0 / noise.gravity], *(cov[_UPPER] for cov in covs), ends])
 
