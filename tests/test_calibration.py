@@ -11,11 +11,13 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import ARMS, CHAIN, calibrate, calibrate_lengths, palm_gap, rotate
+from wepose_pin.calibration.verdict import judge
 from wepose_pin.errors import BadOption, BadPhase, BadSession
 from wepose_pin.model import load_model
 from wepose_pin.pose import pose_of
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.simulation import PERFECT, PERFECT_WORLD, Person, Simulation, simulate, simulated_person
+from wepose_pin.simulation.motion import Motion, Wander
 from wepose_pin.subject import LENGTHS, average_subject, mount_rows
 
 
@@ -241,3 +243,29 @@ def test_wrong_requests_are_named(exact: tuple[Person, Recording]) -> None:
 
 def test_arms_are_in_the_order_of_the_lengths() -> None:
     assert set(ARMS) < set(LENGTHS)
+
+
+@pytest.mark.parametrize(("seed", "scale"), [(1, 0.1), (3, 0.1)])
+def test_hands_that_hardly_move_leave_the_headings_open(
+    seed: int, scale: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The closure has several minima then: ± 2.4 deg of one of them was stated at 118 deg off."""
+    point, wander = Motion._clasp_point, Wander.__call__
+    monkeypatch.setattr(Motion, "_clasp_point", lambda self, t, moving: point(self, t, scale * moving))
+    monkeypatch.setattr(Motion, "lean_deg", scale * Motion.lean_deg)
+    monkeypatch.setattr(Wander, "__call__", lambda self, t: scale * wander(self, t))
+    person = simulated_person(seed)
+    made = simulate(
+        person.lengths, seed=seed, clasp_s=30.0, circles=0, imperfections=replace(PERFECT_WORLD, mount="any")
+    )
+    found = calibrate_lengths(made.recording(), gauge=person.taped, prior=person.average)
+    for name, quat in found.subject.mounts.items():
+        off = (Rotation.from_quat(quat) * Rotation.from_quat(made.quat_LS[name]).inv()).as_rotvec()
+        assert abs(off[2]) < 3.0 * found.subject.std(f"mounts.{name}.z"), name
+    assert judge(found).grade == "fail"
+    assert any("fits other headings nearly as well" in warning for warning in found.warnings)
+
+
+def test_a_motion_that_tells_the_headings_has_no_other(simulation: Simulation, person: Person) -> None:
+    found = calibrate_lengths(simulation.recording(), gauge=person.taped, prior=person.average)
+    assert not any("other headings" in warning for warning in found.warnings)

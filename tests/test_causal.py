@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption, BadPhase
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import Simulation
+from wepose_pin.subject import LENGTHS, average_subject, mount_rows
 from wepose_pin.tracking import track
 from wepose_pin.tracking.causal import HOLD_S, CausalTracker, StartGuide, start_of
 
@@ -131,6 +133,30 @@ def test_a_reset_turns_headings_to_where_the_person_stands(recording: Recording)
     assert (tracker.heading_std() > std).all()  # a person stands to some degrees, a filter drifts by tenths
     gyro, accel = columns(recording)
     np.testing.assert_allclose(np.abs(tracker.step(gyro[begin], accel[begin])[:, 3]), 1.0, atol=0.01)
+
+
+def test_a_heading_is_stated_as_track_states_it(recording: Recording, simulation: Simulation) -> None:
+    """With what the mounts' uncertainty turns a segment by as it moves, not the filter's part alone."""
+    order = tuple(row for name in recording.sensors for row in mount_rows(name))
+    covariance = np.diag(np.tile(np.deg2rad([2.0, 2.0, 4.0]) ** 2, len(recording.sensors)))
+    average = average_subject()
+    subject = replace(average, mounts=simulation.quat_LS, order=(*LENGTHS, *order),
+                      covariance=block_diag(average.covariance, covariance))  # fmt: skip
+    until, begin = start_of(recording)
+    tracker = CausalTracker(until, subject)
+    gyro, accel = columns(recording)
+    for k in range(begin, begin + 3000):
+        tracker.step(gyro[k], accel[k])
+    tracked = track(recording, subject, causal=True)
+    stated = [np.sqrt(tracked.segment_cov[name][2999, 2, 2]) for name in tracker.names]
+    np.testing.assert_allclose(tracker.heading_std(), stated, rtol=1e-9)
+    moved = np.array([name != "torso" for name in tracker.names])
+    assert (np.degrees(tracker.heading_std())[moved] > 1.0).all()
+    var = tracker.heading_var()
+    assert var is not None
+    tracker.reset()  # sets the heading of the start pose, and says nothing of how the mount turns a raised arm
+    after = np.degrees(tracker.heading_std())
+    assert (after[moved] > np.degrees(np.sqrt(np.maximum(np.square(stated) - var, 0.0)))[moved]).all()
 
 
 def test_the_guide_finds_the_first_stillness_and_says_who_moves() -> None:

@@ -81,6 +81,7 @@ def with_gap(pose: Pose) -> Pose:
 def test_tables_hold_pose_and_angles(result: Path, pose: Pose, tmp_path: Path, format: str) -> None:
     file = tmp_path / f"all.{format}"
     assert export(result, file) == (format, [])
+    assert export(str(result), str(tmp_path / f"text.{format}")) == (format, [])
     table = pl.read_csv(file) if format == "csv" else pl.read_parquet(file)
     stored = pl.read_parquet(result / "pose.parquet")
     for segment in SEGMENTS:

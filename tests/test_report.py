@@ -219,3 +219,13 @@ def test_a_line_breaks_where_time_jumps() -> None:
     assert np.flatnonzero(np.isnan(time)).tolist() == [3]
     assert np.isnan(values[3])
     assert plus_minus(float("nan"), 1.0, "mm") == "not known"
+
+
+def test_the_effective_sample_size_stands_as_itself_beside_its_limits(made: Made) -> None:
+    found = replace(made[0], independent=18.2)
+    page = calibration_report(found, made[1], verdict=judge(found), pose=made[2])
+    text = re.sub(r"<[^>]+>", "|", without_frame(page))
+    assert re.search(r"effective sample size[^|]*\|+18\|+at least 6\|+at least 2\|+pass", text)
+    for size, grade in ((6.0, "pass"), (5.9, "poor"), (2.0, "poor"), (1.9, "fail")):
+        (finding,) = [each for each in judge(replace(found, independent=size)).findings if each.name == "motion"]
+        assert (finding.value, finding.grade) == (size, grade)

@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
-from wepose_pin.pose import Pose
+from wepose_pin.pose import Pose, spread
 from wepose_pin.readers.plausibility import cut_off
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.report import track_report
@@ -78,7 +78,8 @@ def looked_at(pose: TrackedPose) -> list[Concern]:
     signals = {name: signal_of(pose.recording, name, pose) for name in pose.recording.sensors}
     found = {side: elbow_of(pose, side, pose.subject) for side in ("left", "right")}
     elbows = {side: elbow for side, elbow in found.items() if elbow is not None}
-    return concerns(pose, signals, heading_budgets(pose), elbows, pose.summary()["warnings"])
+    hands = hands_of(pose, pose.recording.rate_hz)
+    return concerns(pose, signals, heading_budgets(pose), elbows, hands, pose.summary()["warnings"])
 
 
 def said(pose: TrackedPose, words: str) -> Concern:
@@ -117,13 +118,15 @@ def test_it_gives_the_sensors_in_numbers(page: str, pose: TrackedPose) -> None:
 def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedPose) -> None:
     table = rows(page)
     std = {name: np.degrees(np.sqrt(cov[:, 2, 2])) for name, cov in pose.segment_cov.items()}
+    assert pose.segments is not None
+    since = pose.time >= pose.segments.start[1]
     for name, values in std.items():
         line = [row for row in table if row[0] == name.replace("_", " ")][2]
-        assert line[1:3] == [f"{values.max():.1f}°", f"{values[-1]:.1f}°"]
+        assert line[1:3] == [f"{values[since].max():.1f}°", f"{values[-1]:.1f}°"]
         assert line[4].endswith("°/min")
-    worst = max(std, key=lambda name: float(std[name].max()))
-    assert f"The {worst.replace('_', ' ')}'s heading may be off by ± {std[worst].max():.1f}°" in text_of(page)
-    elbow = np.hypot(std["right_upper_arm"], std["right_forearm"])
+    worst = max(std, key=lambda name: float(std[name][since].max()))
+    assert f"The {worst.replace('_', ' ')}'s heading may be off by ± {std[worst][since].max():.1f}°" in text_of(page)
+    elbow = np.hypot(std["right_upper_arm"], std["right_forearm"])[since]
     assert ["right elbow", f"{np.median(elbow):.1f}°", f"{elbow.max():.1f}°"] in table
 
 
@@ -491,3 +494,35 @@ def test_in_a_browser_it_has_its_sections_light_and_dark(page: str, tmp_path: Pa
         corner[scheme] = np.asarray(Image.open(picture).convert("L"))[5, 5]
     assert corner["dark"] < 60
     assert corner["light"] > 250
+
+
+def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: TrackedPose) -> None:
+    """A peak before the start pose: it was the largest ± of the page, beside "Nothing stands out"."""
+    assert pose.segments is not None
+    begin = float(pose.time[0]) + 5.0
+    before = pose.time < begin
+
+    def wider(cov: np.ndarray, factor: float) -> np.ndarray:
+        return np.where(before[:, None, None], factor**2 * cov, cov)
+
+    late = replace(pose, segments=replace(pose.segments, start=(begin, begin + 2.0)))
+    peak = replace(late, point_cov={name: wider(cov, 60.0) for name, cov in late.point_cov.items()})
+    assert rows_of_hands(track_report(peak, view="<p>")) == rows_of_hands(track_report(late, view="<p>"))
+    concern = said(peak, "before the start pose")
+    most = max(1e3 * float(spread(peak.point_cov[name]).max()) for name in ("left_hand", "right_hand"))
+    assert f"± {most:.0f} mm" in concern.said
+    assert not any("before the start pose" in each.said for each in looked_at(late))
+    text = text_of(track_report(peak, view="<p>"))
+    assert "Nothing stands out" not in text
+    assert "counts from the end of the start pose on, without the 7 s before" in text
+
+
+def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackedPose) -> None:
+    cov = {name: np.broadcast_to(0.12**2 * np.eye(3), cov.shape) for name, cov in pose.point_cov.items()}
+    concern = said(replace(pose, point_cov=cov), "places may be off")
+    assert concern.grave
+    assert "the right hand by ± 120 mm" in concern.said
+
+
+def rows_of_hands(page: str) -> list[list[str]]:
+    return [row for row in rows(page) if row[0] in ("left hand", "right hand") and len(row) == 7 and "m/s" in row[4]]

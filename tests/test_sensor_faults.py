@@ -218,7 +218,7 @@ def test_a_start_pose_with_a_gap_in_it_is_that_of_what_was_measured(made: Simula
 # Right, and once refused -------------------------------------------------------------------------------------------
 
 
-def swing(hertz: float, peak_deg_s: float, radius: float = 0.55) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def swing(hertz: float, peak_deg_s: float, radius: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time [s], gyro and accel of a wrist on an arm that swings about the shoulder, after five seconds of standing."""
     time = np.arange(2500) / RATE
     on = np.clip(time - 5.0, 0.0, 1.0)

@@ -38,7 +38,18 @@ COUNT = (*NUMBER, -1, 1.5)
 NAME = ("nonsense", "", 3, 1.5, True, ["amekf"], {}, b"amekf", ANYTHING)
 THING = ("x", 3, NAN, True, [], {}, ANYTHING, np.zeros(3))
 PATH = (3, 1.5, True, [], {}, b"x", ANYTHING)
-INTERVAL = ("x", 3.0, (1.0,), (1.0, 2.0, 3.0), (NAN, 2.0), ("0", "2"), (2.0, 1.0), (1.0, 1.0), ANYTHING)
+INTERVAL = (
+    "x",
+    3.0,
+    (1.0,),
+    (1.0, 2.0, 3.0),
+    (NAN, 2.0),
+    ("0", "2"),
+    (2.0, 1.0),
+    (1.0, 1.0),
+    np.array([0.5, 2.0]),
+    ANYTHING,
+)
 LENGTHS = (
     "x",
     3.0,
@@ -273,6 +284,8 @@ def wrong_recordings(recording: wp.Recording) -> Iterator[tuple[str, wp.Recordin
             values.astype(complex),
         ):
             yield "torso", sensor(**{name: samples})
+    for unit in (1.0 / 9.81, 1e3 / 9.81):
+        yield "torso.accel_S", sensor(accel_S=unit * torso.accel_S)
     quat = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
     fused = {"gyro_S": None, "accel_S": None}
     for quats in (2.0 * quat, np.zeros((n, 4)), quat[:, :3], quat[:-1], at(quat, 5, NAN), quat.tolist(), "x"):
@@ -301,6 +314,7 @@ def wrong_recordings(recording: wp.Recording) -> Iterator[tuple[str, wp.Recordin
         {"start": ((0.5, 1e6),)},
         {"start": ((NAN, 4.5),)},
         {"start": (("0.5", "4.5"),)},
+        {"start": np.array([[0.5, 4.5]])},
         {"start": ((None, 4.5),)},
         {3: ((0.5, 4.5),)},
     ):

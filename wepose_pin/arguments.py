@@ -26,16 +26,18 @@ _LONGEST = 60  # letters of a value in a message
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers above `low`, or from it on where `closed`, that are finite."""
+    """Numbers above `low`, or from it on where `closed`, up to `high`, that are finite."""
 
     low: float
     closed: bool
+    high: float = math.inf
 
     def __str__(self) -> str:
-        return f"a finite number {'from' if self.closed else 'above'} {self.low:g}{' on' if self.closed else ''}"
+        up_to = "" if math.isinf(self.high) else f", up to {self.high:g}"
+        return f"a finite number {'at least' if self.closed else 'above'} {self.low:g}{up_to}"
 
     def __contains__(self, value: float) -> bool:
-        return (self.low <= value if self.closed else self.low < value) and value < math.inf
+        return (self.low <= value if self.closed else self.low < value) and value <= self.high and value < math.inf
 
 
 Positive = Annotated[float, Range(0.0, closed=False)]
@@ -172,7 +174,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return number and value == value
     if hint is np.ndarray:
         return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.dtype.kind in "biuf")
-    kind: dict[Any, Any] = {bool: (bool, np.bool_), Path: os.PathLike, Literal: str, tuple: (tuple, list, np.ndarray)}
+    kind: dict[Any, Any] = {bool: (bool, np.bool_), Path: os.PathLike, Literal: str, tuple: (tuple, list)}
     return isinstance(value, kind.get(origin or hint, origin or hint))
 
 
@@ -188,7 +190,7 @@ def _needed(hint: Any) -> str:
         int: "a whole number",
         str: "a text",
         Path: "a path",
-        tuple: "a sequence",
+        tuple: "a tuple",
         Mapping: "a mapping of names to values",
         Callable: "a function",
         NoneType: "None",

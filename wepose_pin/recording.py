@@ -36,6 +36,7 @@ AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) f
 RATE_OFF = 0.01  # share by which the stated rate may be off that of the times: its error is one of all angles
 LONGEST_STEP = 2.5  # steps of the rate from one time to the next; uneven clocks are resampled while read
 
+FORCES = (3.0, 300.0)  # [m/s²] nobody falls, or is thrown at 30 g, for half of a recording
 EACH_TIME = ", a row for each time"  # why an array has another shape
 
 Intervals = tuple[tuple[float, float], ...]
@@ -132,8 +133,22 @@ class Recording:
         return len(self.time)
 
     def check(self) -> Recording:
-        """The same recording, if it can be one, as the function `check` says: made by hand it may be anything."""
-        return check(self)
+        """The same recording, if it can be one, as the function `check` says: made by hand it may be anything.
+
+        Raises
+        ------
+        BadOption, BadData, BadPhase
+            As `check`; specific forces in another unit, which reading a file would have found.
+        """
+        check(self)
+        for segment, sensor in self.sensors.items():
+            force = 0.0 if sensor.accel_S is None else float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
+            if force and not FORCES[0] < force < FORCES[1]:
+                raise BadData(
+                    f"{self.where()}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed, 9.8 "
+                    f"where nothing moves"
+                )
+        return self
 
     def where(self) -> str:
         """Beginning of an error's text: the file, or the recording's name."""

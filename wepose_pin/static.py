@@ -9,11 +9,11 @@ phase, then from each rest that was accepted. About horizontal axes gravity woul
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from .arguments import NonNegative, Positive, check_fields
+from .arguments import NonNegative, Positive, Range, check_fields
 from .errors import BadData, BadOption
 from .noise import BLOCK_S, SensorNoise
 from .so3 import inlined, kernel
@@ -38,7 +38,7 @@ class StaticTest:
     noise and sway as measured in the start phase, and of `bias_spread`.
     """
 
-    window_s: Positive = 0.5  # [s] W
+    window_s: Annotated[float, Range(0.0, closed=False, high=60.0)] = 0.5  # [s] W
     alpha: NonNegative = 2.0  # (1) gyro covariance against the still one
     beta: NonNegative = 2.0  # (2) accel/g covariance against the still one
     gamma1: NonNegative = 0.01  # (3) |mean ‖accel/g‖ − 1| at most

@@ -345,7 +345,7 @@ def subject_of(text: str, path: Path) -> Subject:
 
 def _covariance(path: Path, table: Mapping, std: Mapping) -> tuple[tuple[str, ...], np.ndarray]:
     for name, value in std.items():
-        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < 1.0:
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < 3.0:
             raise BadSubject(f"{path}: lengths_std.{name} = {value!r}; a standard deviation in metres is needed")
     if not table:
         order = tuple(name for name in LENGTHS if name in std)

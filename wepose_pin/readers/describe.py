@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, MissingFile, WeposeError, one_of
-from ..recording import AXES, CONFIGURATION, SEGMENTS, Recording, Sensor, span_text
+from ..recording import AXES, CONFIGURATION, SEGMENTS, Recording, Sensor, format_time, span_text
 from .arrays import ArrayFile, is_array_file
 from .clocks import SLOWEST_STEP_S, TIME_UNITS, runs, time_unit_of
 from .device import Device
@@ -433,7 +433,8 @@ def _facts(recording: Recording) -> tuple[str, ...]:
     listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in still[:8]) + (" …" if len(still) > 8 else "")
     facts.append(f"all sensors at rest [s]: {listed}" if still else "never are all sensors at rest for a second")
     for name, spans in recording.phases.items():
-        facts.append(f"phase {name}: " + (", ".join(map(span_text, spans)) or "none"))
+        listed = ", ".join(f"{format_time(a)} to {format_time(b)}" for a, b in spans)
+        facts.append(f"phase {name} [s]: {listed or 'none'}")
     facts += [f"note: {note}" for note in recording.notes]
     return tuple(facts)
 

@@ -303,9 +303,8 @@ class Scan:
                 if whole or (start is not None and first <= start[0] and last >= start[1]):
                     when = "all along" if whole else "through the start pose"
                     raise BadData(
-                        f"{where}: sensors.{name}: {fault.described(first)}, {when}, which no sensor does that "
-                        f"measures; take [sensors.{name}] out to track the others"
-                        + ("" if whole else ", or name another start pose")
+                        f"{where}: sensors.{name}: {fault.described(first)}, {when}: it does not measure; take "
+                        f"[sensors.{name}] out to track the others" + ("" if whole else ", or name another start pose")
                     )
 
     def _copies(self, among: Iterable[str]) -> list[tuple[str, str]]:

@@ -374,7 +374,10 @@ class SessionReader:
         if self._scanned is not None:
             return self._scanned
         clocks = {id(plan.clock): plan.clock for plan in self._plans.values()}
-        times = {key: clock.time[clock.row >= 0] for key, clock in clocks.items()}
+        times = {
+            key: clock.time if clock.row[-1] == len(clock.row) - 1 else clock.time[clock.row >= 0]  # no copy of a day
+            for key, clock in clocks.items()
+        }
         scan = Scan()
         for first in range(0, max(map(len, times.values())), _SCAN_ROWS):
             rows = slice(first, first + _SCAN_ROWS)

@@ -219,24 +219,26 @@ def _of_hands(pose: TrackedPose, hands: Mapping[str, Hand]) -> Iterator[Concern]
 def _of_the_time_before(
     pose: TrackedPose, budgets: Mapping[str, Budget], hands: Mapping[str, Hand]
 ) -> Iterator[Concern]:
-    """What is less certain before the start pose than ever after it."""
-    since = from_start(pose)
-    headings = [np.degrees([largest(std[~since]), largest(std[since])]) for std in between(budgets).values()]
-    places = [np.array([_largest_mm(hand, ~since), _largest_mm(hand, since)]) for hand in hands.values()]
-    said = [
-        f"{what} ± {worst:.0f}{unit}"
-        for what, of, unit, limit in (
-            ("headings between neighbours", headings, "°", np.degrees(HEADING)),
-            ("the hands", places, " mm", 1e3 * PLACE),
-        )
-        if (worst := max((float(before) for before, after in of if before > max(after, limit)), default=0.0))
+    """What is less certain before the start pose than ever after it, for longer than filters take to begin."""
+    assert pose.recording is not None
+    assert pose.segments is not None
+    since, before = from_start(pose), pose.time < pose.segments.start[0]
+    stds = [
+        ("headings between neighbours", np.degrees(1.0), "°", HEADING, list(between(budgets).values())),
+        ("the hands", 1e3, " mm", PLACE, [hand.std for hand in hands.values() if hand.std is not None]),
     ]
+    said = []
+    for what, scale, unit, limit, of in stds:
+        wide = [std[before & (std > max(limit, largest(std[since])))] for std in of]
+        wide = [std for std in wide if len(std) / pose.recording.rate_hz > LASTING_S]
+        if wide:
+            said.append(f"{what} ± {scale * max(map(largest, wide)):.0f}{unit}")
     if said:
-        seconds = float(pose.time[np.argmax(since)] - pose.time[0])
         yield Concern(
             False,
-            f"the pose is less certain in the {seconds:.3g} s before the start pose: {' and '.join(said)}",
-            "Use the motion from the start pose on; the ± summed up below counts from there.",
+            f"the pose is less certain in the {pose.segments.start[0] - pose.time[0]:.3g} s before the start pose: "
+            f"{' and '.join(said)}",
+            "Use the motion from the start pose on; the ± summed up below counts from its end.",
         )
 
 

@@ -85,9 +85,12 @@ def usual(values: np.ndarray) -> float:
 
 
 def from_start(pose: TrackedPose) -> np.ndarray:
-    """(n,) bool, the samples from the start pose on: only of these the stated uncertainties are summed up."""
+    """(n,) bool, the samples from the end of the start pose on: only of these the stated uncertainties are summed up.
+
+    Before it the filters have only begun, and headings are followed back in time.
+    """
     assert pose.segments is not None
-    since = pose.time >= pose.segments.start[0] - 1e-9
+    since = pose.time >= pose.segments.start[1] - 1e-9
     return since if since.any() else ~since
 
 

@@ -248,7 +248,7 @@ def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> list[Block]:
 def _counted(pose: TrackedPose) -> str:
     """A clause on the time that uncertainties are summed up over, where it is not all."""
     before = float(pose.time[np.argmax(from_start(pose))] - pose.time[0])
-    return f" counts from the start pose on, without the {_duration(before)} before" if before >= 1.0 else ""
+    return f" counts from the end of the start pose on, without the {_duration(before)} before" if before >= 1.0 else ""
 
 
 def _worst(pose: TrackedPose, budgets: Mapping[str, Budget]) -> str:
