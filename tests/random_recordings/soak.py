@@ -21,8 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "tests")) if path not in sys.path]
 
 EVERY_S = 2.0
-# What memory and files may grow by from the middle third to the last, and be called flat. Each third holds recordings of
-# each rate; which of them meet in the workers is chance.
+# What memory and files may grow by from the middle third to the last, and be called flat. Each third holds recordings
+# of each rate; which of them meet in the workers is chance.
 MEMORY_GROWTH, FILES_GROWTH = 0.10, 5
 PAGE = os.sysconf("SC_PAGE_SIZE")
 
@@ -90,7 +90,7 @@ def soak(out: Path, workers: int, pages: bool) -> tuple[int, list[dict[str, floa
 
 
 def verdict(series: list[dict[str, float]]) -> list[str]:
-    """Whether memory and files are flat, in lines: the highest and the median of the last third against the middle one."""
+    """Whether memory and files are flat, by the highest and the median of the last third and the middle one."""
     third = len(series) // 3
     if not third:
         return ["too short to say"]
