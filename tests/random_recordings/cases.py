@@ -115,14 +115,16 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 
 def draw_case(seed: int, seconds: float | None = None) -> Case:
-    """The case of a seed: always the same. With `seconds`, one as long as that, at 25 to 100 Hz, wholly ordinary."""
+    """The case of a seed: always the same. With `seconds`, one as long as that, at 25, 50, 100 Hz by turns,
+    of five sensors, wholly ordinary.
+    """
     person = draw_person(stream(seed, "person"))
     clock = _clock(stream(seed, "clock"))
     rng = stream(seed, "motion")
     calibrates = rng.random() < 0.35 and seconds is None
     if seconds is not None:
-        clock = Clock(float(rng.choice([25.0, 50.0, 100.0])), "even", clock.origin)
-    sensors = _segments(stream(seed, "segments"), calibrates)
+        clock = Clock((25.0, 50.0, 100.0)[seed % 3], "even", clock.origin)
+    sensors = _segments(stream(seed, "segments"), calibrates) if seconds is None else CORE
     activities, begins, joins, spans, duration, in_motion = _timeline(rng, person, clock.rate_hz, calibrates, seconds)
     sway, size = draw_sway(stream(seed, "sway"))
     bending = frozenset(side for side in SIDES if f"{side}_hand" in sensors)
