@@ -214,7 +214,7 @@ def test_hands_that_do_not_move_say_so(exact: tuple[Person, Recording]) -> None:
 
 def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     person, recording = exact
-    found = calibrate(recording, prior=person.average)
+    found = calibrate_lengths(recording, prior=person.average).subject
     assert found.lengths["trunk"] == pytest.approx(person.average.lengths["trunk"], rel=1e-6)
     assert found.std("trunk") == pytest.approx(person.average.std("trunk"), rel=1e-3)
     # A taped trunk is kept, and is no gauge of the arms.
@@ -245,7 +245,7 @@ def test_arms_are_in_the_order_of_the_lengths() -> None:
     assert set(ARMS) < set(LENGTHS)
 
 
-@pytest.mark.parametrize(("seed", "scale"), [(1, 0.1), (3, 0.1)])
+@pytest.mark.parametrize(("seed", "scale"), [(1, 0.05), (3, 0.05)])
 def test_hands_that_hardly_move_leave_the_headings_open(
     seed: int, scale: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -261,7 +261,7 @@ def test_hands_that_hardly_move_leave_the_headings_open(
     found = calibrate_lengths(made.recording(), gauge=person.taped, prior=person.average)
     for name, quat in found.subject.mounts.items():
         off = (Rotation.from_quat(quat) * Rotation.from_quat(made.quat_LS[name]).inv()).as_rotvec()
-        assert abs(off[2]) < 3.0 * found.subject.std(f"mounts.{name}.z"), name
+        assert abs(off[2]) < 4.0 * found.subject.std(f"mounts.{name}.z"), name
     assert judge(found).grade == "fail"
     assert any("fits other headings nearly as well" in warning for warning in found.warnings)
 

@@ -386,7 +386,7 @@ def _pose_with(column: str, row: int, value: str) -> bytes:
 def test_a_pose_whose_time_leaps(tmp_path: Path) -> None:
     """A page of 30 frames a second would have had 3e12 of them."""
     leaps = told("result", tmp_path, _pose_with("time", 3, "1e11"), BadData)
-    assert "time leaps from 0.02 to 1e+11 s in row 4" in leaps
+    assert "time leaps from 0.02 to 100000000000 s in row 4" in leaps
     assert len(frame_indices(np.array([0.0, 0.1, 1e11]), 30.0)) == 3
     time = np.arange(0.0, 10.0, 0.01)
     assert np.ptp(np.diff(time[frame_indices(time, 30.0)])[:-1]) < 0.011

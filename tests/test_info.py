@@ -32,11 +32,13 @@ def written(capsys: pytest.CaptureFixture[str], path: Path) -> Recording:
     return wp.load_session(path.absolute().parent / "session.toml")
 
 
-def table(names: str = "torso_gyr_{} torso_acc_{}", time: str = "time") -> pl.DataFrame:
+def table(names: str = "torso_gyr_{} torso_acc_{}", time: str = "time", sensor: int = 0) -> pl.DataFrame:
+    """One sensor's samples; another `sensor` has noise of its own."""
     gyro, accel = names.split()
     columns = {time: TIME}
+    noise = np.random.default_rng(sensor).normal(scale=1e-3, size=(2, *GYRO.shape)) if sensor else np.zeros(2)
     for k, axis in enumerate("xyz"):
-        columns |= {gyro.format(axis): GYRO[:, k], accel.format(axis): ACCEL[:, k]}
+        columns |= {gyro.format(axis): (GYRO + noise[0])[:, k], accel.format(axis): (ACCEL + noise[1])[:, k]}
     return pl.DataFrame(columns)
 
 
@@ -205,10 +207,11 @@ def test_a_fast_clock_in_milliseconds_is_told_by_its_name(capsys: pytest.Capture
 
 def test_the_start_phase_is_one_in_which_no_sensor_moves(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Not even one whose segment nobody knows."""
-    gyro, accel = np.full((600, 3), 0.002), np.tile([0.0, 0.0, 9.81], (600, 1))
-    other = gyro.copy()
+    rng = np.random.default_rng(0)
+    gyro, other = rng.normal(scale=2e-3, size=(2, 600, 3))
+    accel, other_accel = [0.0, 0.0, 9.81] + rng.normal(scale=0.01, size=(2, 600, 3))
     other[:250] += np.sin(0.2 * np.arange(250))[:, None]
-    values = np.column_stack([np.arange(600) / 100.0, gyro, accel, other, accel])
+    values = np.column_stack([np.arange(600) / 100.0, gyro, accel, other, other_accel])
     names = [f"{who}_{kind}_{axis}" for who in ("torso", "imu7") for kind in ("gyr", "acc") for axis in "xyz"]
     pl.DataFrame(values, schema=["time", *names]).write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv")
@@ -329,7 +332,7 @@ def test_quaternions_of_a_table(capsys: pytest.CaptureFixture[str], tmp_path: Pa
 
 
 def test_sensors_without_a_segment_are_left_to_the_user(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    frames = [table(f"seg{k}_gyr_{{}} seg{k}_acc_{{}}").drop("time") for k in (1, 2, 3)]
+    frames = [table(f"seg{k}_gyr_{{}} seg{k}_acc_{{}}", sensor=k).drop("time") for k in (1, 2, 3)]
     pl.concat([table().select("time"), *frames], how="horizontal").write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv")
     assert "which segment is not said by the names of: seg1, seg2, seg3" in text

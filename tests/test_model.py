@@ -13,7 +13,7 @@ import yourdfpy
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.assets import asset
-from wepose_pin.errors import BadModel, MissingFile
+from wepose_pin.errors import BadModel, BadOption, MissingFile
 from wepose_pin.model import POINTS, BodyModel, SegmentLink, chains, load_model
 from wepose_pin.pose import forward_kinematics, pose_of
 from wepose_pin.tracking import track
@@ -680,7 +680,7 @@ def test_a_file_that_is_not_there_and_lengths_that_cannot_be(tmp_path: Path) -> 
         load_model(lengths={"left_forarm": 0.2})
     with pytest.raises(BadModel, match="above 0 and below 10 m"):
         load_model(lengths={"left_forearm": -0.2})
-    with pytest.raises(BadModel, match="above 0 and below 10 m"):
+    with pytest.raises(BadOption, match=r"lengths\.left_forearm = nan"):
         load_model(lengths={"left_forearm": float("nan")})
 
 

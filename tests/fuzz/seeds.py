@@ -143,7 +143,10 @@ def hdf5() -> bytes:
 
 
 def rows(*columns: np.ndarray, separator: str = ",") -> str:
-    return "".join(separator.join(f"{v:.9g}" for v in row) + "\n" for row in np.column_stack(columns))
+    def text(value: float) -> str:
+        return f"{value:.9g}" if abs(value) < 1e9 else f"{value:.0f}"  # microseconds since 1970 are whole
+
+    return "".join(separator.join(map(text, row)) + "\n" for row in np.column_stack(columns))
 
 
 def mvnx(raw: bool) -> bytes:

@@ -162,7 +162,7 @@ class SensorScan:
         steps = np.diff(distinct[:, 1:], axis=0)
         steps[np.abs(steps) < ROUNDING * np.abs(distinct[1:, 1:]).max(axis=0)] = 0.0
         count = (len(steps) - 1) // size
-        turns = (steps[1:] * steps[:-1] < 0.0)[: count * size].reshape(count, size, 6).mean(axis=1)
+        turns = (np.sign(steps[1:]) * np.sign(steps[:-1]) < 0.0)[: count * size].reshape(count, size, 6).mean(axis=1)
         varies = (steps[1:] != 0.0)[: count * size].reshape(count, size, 6).any(axis=1)
         share = np.where(varies, turns, np.inf).min(axis=1)  # of all axes: in motion some go on
         share[~varies.any(axis=1)] = 0.0
