@@ -22,7 +22,7 @@ from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
 from .filters.start import ACCEL_BIAS_STD
 from .noise import SensorNoise, noise_of, quietest
-from .recording import SEGMENTS, Recording, format_time, span_text
+from .recording import CONFIGURATION, SEGMENTS, Recording, format_time, span_text
 from .static import StaticTest
 from .subject import Subject
 
@@ -131,7 +131,7 @@ class SensorFilters:
             assert sensor.accel_S is not None
             at_rest = first.measured(segment, self.still)
             try:
-                worn = self.still == self.start
+                worn = self.still == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
                 noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
             except WeposeError as error:
                 raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
