@@ -227,10 +227,12 @@ def test_times_in_the_unit_that_is_stated(unit: str, a_second: float, where: str
 
 
 def test_where_data_names_no_file_its_clock_is_that_of_all(tmp_path: Path) -> None:
-    frame = pl.DataFrame(np.column_stack([1e3 * TIME, GYRO, ACCEL]), schema=["t", *"abcdef"])
-    frame.write_csv(tmp_path / "a.csv")
     values = "gyro = ['a', 'b', 'c']\naccel = ['d', 'e', 'f']\n"
-    sensors = "".join(f"[sensors.{name}]\nfile = 'a.csv'\n{values}" for name in ("torso", "left_forearm"))
+    sensors = ""
+    for file, name in (("a.csv", "torso"), ("b.csv", "left_forearm")):
+        accel = own(ACCEL, Path(file))
+        pl.DataFrame(np.column_stack([1e3 * TIME, GYRO, accel]), schema=["t", *"abcdef"]).write_csv(tmp_path / file)
+        sensors += f"[sensors.{name}]\nfile = '{file}'\n{values}"
     units = "[data]\ngyro_unit = 'rad/s'\naccel_unit = 'm/s^2'\n"
     check_raw(load(tmp_path, f"{units}time = 't'\ntime_unit = 'ms'\n{sensors}"), "left_forearm")
     check_raw(load(tmp_path, f"{units}rate_hz = 100\n{sensors}"), "left_forearm")
@@ -252,8 +254,8 @@ def apdm(path: Path) -> Path:
     axes = [*"XYZXYZXYZ", "", *"SXYZ"]
     zero = np.zeros(N)
     gone: list[Any] = [[""] * N] * 4
-    one = [*ACCEL.T, *GYRO.T, zero, zero, zero, zero]
-    columns: list[Any] = [[str(1550879504438281 + 10_000 * k) for k in range(N)], *one, *gone, *one, *WXYZ.T]
+    one, other = ([*own(ACCEL, Path(name)).T, *GYRO.T, zero, zero, zero, zero] for name in ("wrist", "chest"))
+    columns: list[Any] = [[str(1550879504438281 + 10_000 * k) for k in range(N)], *one, *gone, *other, *WXYZ.T]
     head = [first, ["Time", *kinds, *kinds], ["", *axes, *axes]]
     path.write_text("".join(",".join(line) + "\n" for line in head) + rows(columns))
     return path

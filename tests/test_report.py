@@ -81,7 +81,7 @@ def test_the_judges_verdict_with_its_numbers(made: Made) -> None:
     assert "Behind the verdict" in headings(page)
     for finding in verdict.reasons:
         assert finding.said in unescape(page)
-    assert "<td>10 mm</td><td>20 mm</td>" in page  # limits of the lengths
+    assert "<td>up to 10 mm</td><td>up to 20 mm</td>" in page  # limits of the lengths
     assert " rad<" not in page
 
 

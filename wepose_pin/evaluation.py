@@ -86,7 +86,7 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         raise BadData(
             f"pose ({span_text((pose.time[0], pose.time[-1]))}) and reference "
             f"({span_text((truth.time[0], truth.time[-1]))}) have no time in common"
-            + (f" within {span_text(interval)}" if interval else "")
+            + (f" within the interval {span_text(interval)}" if interval else "")
         )
     time = np.clip(pose.time[inside], truth.time[0], truth.time[-1])
     attitude, position = {}, {}

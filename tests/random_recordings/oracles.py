@@ -84,7 +84,8 @@ def of_acceptance(outcome: Outcome, case: Case, extra: str = "") -> list[Failure
     shown, refusal = " ".join(outcome.argv), extra or case.refusal
     if outcome.code == 2 and not refusal:
         return [Failure("accepts what is possible", shown, adapter.refusal(outcome))]
-    if outcome.code == 2 and "guessed" in refusal and "guess" not in outcome.err:
+    # Refused for another reason, as a row that is written twice, it need not say so.
+    if outcome.code == 2 and "guessed" in refusal and "mount" in outcome.err and "guess" not in outcome.err:
         return [Failure("says that it was guessed", shown, adapter.refusal(outcome))]
     if outcome.code != 2 and refusal.startswith("must"):
         return [Failure("refuses what cannot be", shown, f"exit {outcome.code}, though {refusal}")]

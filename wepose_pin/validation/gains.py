@@ -64,7 +64,7 @@ STATED = {
     "simulated 100 Hz": _on_grid(0.0032, 1e-4, 0.0),
     "simulated 1 kHz": _on_grid(0.0032, 3.2e-5, 0.0),
     "upper body, MTi-3 noise alone": _on_grid(0.032, 1e-5, 5.6e-4),
-    "upper body, realistic": _on_grid(0.1, 0.0, 3.2e-3),
+    "upper body, realistic": _on_grid(0.1, 0.0, 1.8e-3),
     "BROAD, first half": _on_grid(0.1, 1e-3, 0.018),
     "BROAD, second half": _on_grid(0.056, 3.2e-4, 0.01),
     "BROAD": _on_grid(0.1, 1e-3, 0.018),
