@@ -22,7 +22,7 @@ BLOCK_S = 0.5
 # breathing chest turn faster. What a sensor's mean rate over T seconds is off by is that rate, and at most what such a
 # tilt allows: √2 σ/(ω T).
 SWAY_RATE_STD = float(np.deg2rad(0.7))  # [rad/s] of a worn sensor
-SWAY_RATE = 2.0 * np.pi * 0.25  # [rad/s] ω
+SWAY_RATE = 2.0 * np.pi * 0.2  # [rad/s] ω, of the slower sways
 PRIOR_BLOCKS = 4.0
 SWAY_CORRELATION_S = 2.0  # half a sway: so long half-second means go on alike
 LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks, beyond white noise: less is no person

@@ -124,8 +124,12 @@ def _unpacked(time: np.ndarray) -> tuple[int, np.ndarray]:
         return 1, time
     # After a lost packet the rows keep to the time that a packet takes.
     own = np.append(step, np.where(spans < (1.0 + UNEVEN) * usual * step, spans / sizes[1:], step))
+    came = time[ends]
+    if sizes[-1] < usual:  # the recording ends within a packet: its rows go on from the one before
+        came[-1] = min(came[-1], came[-2] + sizes[-1] * step)
+        own[-1] = (came[-1] - came[-2]) / sizes[-1]
     packet = np.repeat(np.arange(len(ends)), sizes)
-    return usual, time[ends][packet] - own[packet] * (ends[packet] - np.arange(n))
+    return usual, came[packet] - own[packet] * (ends[packet] - np.arange(n))
 
 
 def time_unit_of(step: float) -> str | None:
