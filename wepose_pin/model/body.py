@@ -25,7 +25,7 @@ DEFAULT_URDF = "upper_body.urdf"
 # A length is implausible that many standard deviations off the mean of adults (calibration/anthropometry.toml).
 FAR_OFF = 5.0
 # So is a mass [kg] beyond ten standard deviations above the mean of men, 85.5 ± 14.2 kg (ANSUR II), or below an upper
-# body's share (de Leva 1996: 68 %) of five below the mean of women, 67.8 ± 11.0 kg.
+# body's share (head, arms and trunk: 68 %, Winter 2009, table 4.1) of five below the mean of women, 67.8 ± 11.0 kg.
 HEAVIEST, LIGHTEST = 230.0, 8.0
 
 
