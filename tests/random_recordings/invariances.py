@@ -19,6 +19,8 @@ from .recordings import Variant, other_side, record
 # what decides by a threshold may then decide otherwise for one sample, and a sample's noise moves a filter by less than
 # a hundredth of a degree.
 ROUNDING_DEG = 0.01
+# amekf takes the axes of a measurement one after the other and doubts each by itself: their order tells where it does.
+AXES_DEG = 0.05
 # The others give a filter more, or other samples of the same noise: two estimates of one thing, each within its ±, of
 # which this many together are allowed; where nothing is stated, so many degrees.
 MOST_Z, UNSTATED_DEG = 4.0, 5.0
@@ -34,7 +36,7 @@ class Invariance:
 
 
 INVARIANCES: Mapping[str, Invariance] = {
-    "sensor axes rotated": Invariance(Variant(axes=True)),
+    "sensor axes rotated": Invariance(Variant(axes=True), most_deg=AXES_DEG),
     "units changed": Invariance(Variant(other_units=True)),
     "mirrored": Invariance(Variant(mirrored=True)),
     "time shifted by 1.7e9 s": Invariance(Variant(shift=1.7e9)),
