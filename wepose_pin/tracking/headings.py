@@ -205,13 +205,12 @@ class HeadingHold:
 
     def _ask(self, piece: Recording, segments: Segments) -> None:
         """The filters' heading variances at the end of the start pose and in the middles of the knots."""
-        times: np.ndarray = np.empty(0)
+        # The start pose may end in a piece whose first look is in the next one.
+        times = np.array([self._start] if self._asked == 0 else [])
         if self._first is not None:
             last = int(np.floor((piece.time[-1] - self._first) / KNOT_S - 0.5))
-            times = self._first + KNOT_S * (np.arange(self._asked - 1, last + 1) + 0.5)
-            if self._asked == 0:
-                times = np.concatenate([[self._start], times[1:]])
-            times = times[times <= piece.time[-1]]
+            times = np.append(times, self._first + KNOT_S * (np.arange(max(0, self._asked - 1), last + 1) + 0.5))
+        times = times[times <= piece.time[-1]]
         self._asked += len(times)
         for name in self._chain:
             if name not in segments.covariance_W:
