@@ -22,6 +22,7 @@ import numpy as np
 import polars as pl
 
 from .cases import Case, Layout
+from .people import SEGMENTS
 from .recordings import Recorded, Table
 from .sensors import DEG, GRAVITY
 
@@ -351,11 +352,11 @@ def is_one_line(outcome: Outcome) -> bool:
     return len(lines) == 1 and lines[0].startswith("wepose: ")
 
 
-def names_something(outcome: Outcome, case: Case) -> bool:
+def names_something(outcome: Outcome) -> bool:
     """Whether a refusal names what it refuses: a file, key, column, sensor, option or a time."""
     text = refusal(outcome)
     named = re.search(r"\.(toml|csv|parquet)|--\w|phases\.|\d+\.?\d* s\b", text)
-    return named is not None or any(segment in text for segment in case.worn)
+    return named is not None or any(segment in text for segment in SEGMENTS)
 
 
 def left_behind(out: Path) -> list[str]:

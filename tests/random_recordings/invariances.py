@@ -21,6 +21,7 @@ from .recordings import Variant, other_side, record
 ROUNDING_DEG = 0.01
 # amekf takes the axes of a measurement one after the other and doubts each by itself: their order tells where it does.
 AXES_DEG = 0.05
+THRESHOLD_SHARE = 0.1  # of the stated standard deviation
 # The others give a filter more, or other samples of the same noise: two estimates of one thing, each within its ±, of
 # which this many together are allowed; where nothing is stated, so many degrees.
 MOST_Z, UNSTATED_DEG = 4.0, 5.0
@@ -126,6 +127,8 @@ def _deviation(
             found.degrees, found.of = degrees, segment
         found.z = max(found.z, z)
         most = of.most_deg if of.most_deg is not None else UNSTATED_DEG if std is None else None
+        if of.most_deg is not None and std is not None:  # what is known to degrees may turn on a threshold by a tenth
+            most = max(of.most_deg, THRESHOLD_SHARE * float(np.degrees(std[rows][k])))
         if (most is not None and degrees > most) or z > MOST_Z:
             over = (
                 over

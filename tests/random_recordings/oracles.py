@@ -53,7 +53,7 @@ class Accuracy:
     failures: list[Failure] = field(default_factory=list)
 
 
-def of_outcome(outcome: Outcome, case: Case, out: object = None) -> list[Failure]:
+def of_outcome(outcome: Outcome, out: object = None) -> list[Failure]:
     """The exit code, and how a refusal is said."""
     command = outcome.argv[0]
     ours = next((name for name, of in adapter.COMMANDS.items() if of == command), command)
@@ -67,7 +67,7 @@ def of_outcome(outcome: Outcome, case: Case, out: object = None) -> list[Failure
     if outcome.code == 2:
         if not adapter.is_one_line(outcome):
             found.append(Failure("one line", shown, outcome.err.strip()[:500]))
-        elif not adapter.names_something(outcome, case):
+        elif not adapter.names_something(outcome):
             found.append(Failure("names the offender", shown, adapter.refusal(outcome)))
         if out is not None and (left := adapter.left_behind(out)):  # type: ignore[arg-type]
             found.append(Failure("nothing half-written", shown, ", ".join(left)))

@@ -76,7 +76,7 @@ class Trial:
         """Run one, with the oracles of every command; `acceptance`: why it may be refused, None: as the case says."""
         outcome = adapter.run(argv, self.as_process)
         self._count(outcome)
-        found = of_outcome(outcome, self.case, out)
+        found = of_outcome(outcome, out)
         if not found:
             found = of_acceptance(outcome, self.case, self.case.refusal if acceptance is None else acceptance)
         self.report.failures += found

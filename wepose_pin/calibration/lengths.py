@@ -225,7 +225,10 @@ def _believed(
         )
         if labels.moved:
             return _nothing_learned(stated, labels, (labels.said(), *notes, *stated.warnings), gauge, gauge_std)
-    best = _solve(recording, found, protocol, prior, gauge, gauge_std)
+    try:
+        best = _solve(recording, found, protocol, prior, gauge, gauge_std)
+    except NoSolution as error:
+        raise NoSolution(f"{recording.where()}: {error}") from error
     how = best.arms()
     labels = Labels(how.doubt(), how.contradiction() if how.doubt() > 1.0 else "")
     said = [labels.said()] if labels.said() else []
