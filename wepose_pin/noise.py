@@ -25,6 +25,7 @@ SWAY_RATE_STD = float(np.deg2rad(0.7))  # [rad/s] of a worn sensor
 SWAY_RATE = 2.0 * np.pi * 0.2  # [rad/s] ω, of the slower sways
 PRIOR_BLOCKS = 4.0
 SWAY_CORRELATION_S = 2.0  # half a sway: so long half-second means go on alike
+STEADY_TURN_S = 20.0  # so long may a person turn steadily, as on an office chair
 LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks, beyond white noise: less is no person
 
 # Without stated phases: the quietest stretch of this length within the beginning is taken.
@@ -60,7 +61,10 @@ class SensorNoise:
         if self.gyro_half_second_cov is None:
             return 0.0
         white = float(np.trace(self.gyro_cov)) / 3.0 / (BLOCK_S * rate_hz)
-        return max(0.0, float(np.trace(self.gyro_half_second_cov)) / 3.0 - white) * SWAY_CORRELATION_S
+        sway = max(0.0, float(np.trace(self.gyro_half_second_cov)) / 3.0 - white)
+        # Where the bias is no better known than the sway, a steady turn is as likely as a bias, while it lasts.
+        bias = float(np.trace(self.gyro_bias_cov)) / 3.0
+        return max(sway * SWAY_CORRELATION_S, min(sway, bias) * STEADY_TURN_S)
 
 
 def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool = False) -> SensorNoise:
@@ -99,17 +103,18 @@ def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool
 
 def _sway_cov(gyro_S: np.ndarray, rate_hz: float, measured: np.ndarray | None) -> np.ndarray:
     """Covariance (3, 3) [rad²/s²] of a worn sensor's half-second means by sway: as `measured`, with `SWAY_RATE_STD`
-    counted as `PRIOR_BLOCKS` more of them, or as none where even shorter means vary by no more than white noise."""
+    counted as `PRIOR_BLOCKS` more of them, or as none where they vary by no more than white noise.
+
+    Of fewer than two seconds, in which half a sway is a steady turn, nothing can be told: it is `SWAY_RATE_STD`.
+    """
+    if measured is None:
+        return SWAY_RATE_STD**2 * np.eye(3)
     half_second = max(1, round(BLOCK_S * rate_hz))
-    size = max(1, min(half_second, len(gyro_S) // 4))
-    blocks = len(gyro_S) // size
-    means = gyro_S[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
-    white = float(np.diff(gyro_S, axis=0).var(axis=0).mean()) / 2.0 / size
-    excess = float(means.var(axis=0, ddof=1).mean()) - white
+    white = float(np.diff(gyro_S, axis=0).var(axis=0).mean()) / 2.0 / half_second
+    excess = float(np.trace(measured)) / 3.0 - white
     prior = PRIOR_BLOCKS * min(1.0, max(0.0, excess) / LEAST_SWAY_STD**2)
-    degrees = 0 if measured is None else len(gyro_S) // half_second - 1
-    total = prior * SWAY_RATE_STD**2 * np.eye(3) + (0.0 if measured is None else degrees * measured)
-    return total / max(1.0, prior + degrees)
+    degrees = len(gyro_S) // half_second - 1
+    return (prior * SWAY_RATE_STD**2 * np.eye(3) + degrees * measured) / (prior + degrees)
 
 
 def _cov_of_mean(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray:

@@ -236,8 +236,7 @@ class SensorRun:
                 turn = np.nan_to_num(gyro_S[0] - before.gyro_bias[0]) / self._rate_hz
                 quat_WS = (Rotation.from_quat(before.quat_WS[0]) * Rotation.from_rotvec(-turn)).as_quat()
                 start, first = StartTilt(quat_WS, MOVING_TILT_STD), 0  # what the way back knows counts but once
-            else:
-                self._before = before
+            self._before = before
         self._filter = self._made(self._method, self._noise, start)
         return first
 
@@ -269,7 +268,11 @@ class SensorRun:
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
         live = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
         before, self._before = self._before, None
-        if before is not None:
+        if before is not None and self._method in OFFLINE:
+            # Its own heading is exact where the recording begins; the headings are aligned in the start phase.
+            assert run.attitude_cov is not None
+            run.attitude_cov[: len(before.static)] = before.attitude_cov
+        elif before is not None:
             run = FilterRun(
                 np.concatenate([before.quat_WS, run.quat_WS]),
                 np.concatenate([before.gyro_bias, run.gyro_bias]),
