@@ -61,10 +61,10 @@ class SensorNoise:
         if self.gyro_half_second_cov is None:
             return 0.0
         white = float(np.trace(self.gyro_cov)) / 3.0 / (BLOCK_S * rate_hz)
-        sway = max(0.0, float(np.trace(self.gyro_half_second_cov)) / 3.0 - white)
-        # Where the bias is no better known than the sway, a steady turn is as likely as a bias, while it lasts.
-        bias = float(np.trace(self.gyro_bias_cov)) / 3.0
-        return max(sway * SWAY_CORRELATION_S, min(sway, bias) * STEADY_TURN_S)
+        total, bias = float(np.trace(self.gyro_half_second_cov)) / 3.0, float(np.trace(self.gyro_bias_cov)) / 3.0
+        # Where the bias is hardly better known than the sway, a steady turn is as likely as a bias, while it lasts.
+        lasts_s = STEADY_TURN_S * bias / total if bias > 0.3 * total else SWAY_CORRELATION_S
+        return max(0.0, total - white) * lasts_s
 
 
 def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool = False) -> SensorNoise:
