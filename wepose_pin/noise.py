@@ -62,9 +62,11 @@ class SensorNoise:
             return 0.0
         white = float(np.trace(self.gyro_cov)) / 3.0 / (BLOCK_S * rate_hz)
         total, bias = float(np.trace(self.gyro_half_second_cov)) / 3.0, float(np.trace(self.gyro_bias_cov)) / 3.0
+        if total <= white:
+            return 0.0
         # Where the bias is hardly better known than the sway, a steady turn is as likely as a bias, while it lasts.
         lasts_s = STEADY_TURN_S * min(1.0, bias / total) if bias > 0.3 * total else SWAY_CORRELATION_S
-        return max(0.0, total - white) * lasts_s
+        return (total - white) * lasts_s
 
 
 def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool = False) -> SensorNoise:
