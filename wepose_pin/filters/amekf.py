@@ -59,6 +59,9 @@ TAPE_STEP = STATES + 3
 TAPE_D = TAPE_FIRST + MEASUREMENTS * TAPE_STEP
 TAPE_P = TAPE_D + len(TAPE_ROWS)
 TAPE = TAPE_P + len(TAPE_ROWS) * STATES
+
+# Squared Mahalanobis distance beyond which an innovation of two, of three axes is doubted: as rare as 3 σ of one.
+_DOUBTED_2, _DOUBTED_3 = 11.83, 14.16
 _NO_TAPE = np.empty((0, TAPE))
 
 
@@ -264,6 +267,37 @@ def transition_rows(sums, length, gravity, P, out):  # type: ignore[no-untyped-d
 
 
 @inlined
+def _doubt_of_pair(P, at, r, y0, y1):  # type: ignore[no-untyped-def]
+    """Variance to add to `r` of two axes, so that their innovation is at most `_DOUBTED_2` off: a knock, a walk."""
+    a, b, c = P[at, at] + r, P[at, at + 1], P[at + 1, at + 1] + r
+    size, trace = y0 * y0 + y1 * y1, a + c
+    determinant, scaled = a * c - b * b, y0 * y0 * c + y1 * y1 * a - 2.0 * y0 * y1 * b
+    missing = _DOUBTED_2 * determinant - scaled
+    if missing >= 0.0:
+        return 0.0
+    half = 0.5 * (_DOUBTED_2 * trace - size)
+    root = np.sqrt(half * half - _DOUBTED_2 * missing)
+    return (root - half) / _DOUBTED_2 if half < 0.0 else -missing / (root + half)
+
+
+@inlined
+def _distance_of_three(P, at, r, y0, y1, y2):  # type: ignore[no-untyped-def]
+    """Squared Mahalanobis distance of an innovation of three axes with variance `r` each."""
+    a, b, c = P[at, at] + r, P[at, at + 1], P[at, at + 2]
+    e, f, i = P[at + 1, at + 1] + r, P[at + 1, at + 2], P[at + 2, at + 2] + r
+    # Cholesky
+    l0 = np.sqrt(a)
+    l1, l2 = b / l0, c / l0
+    l3 = np.sqrt(e - l1 * l1)
+    l4 = (f - l1 * l2) / l3
+    l5 = np.sqrt(i - l2 * l2 - l4 * l4)
+    z0 = y0 / l0
+    z1 = (y1 - l1 * z0) / l3
+    z2 = (y2 - l2 * z0 - l4 * z1) / l5
+    return z0 * z0 + z1 * z1 + z2 * z2
+
+
+@inlined
 def _close(state, quat, x, P, sums, dt, numbers, tape, row):  # type: ignore[no-untyped-def]
     """End a block: propagate P over it, correct by what bounds the motion, or by rest."""
     at = _ROOM + 9
@@ -317,27 +351,29 @@ def _close(state, quat, x, P, sums, dt, numbers, tape, row):  # type: ignore[no-
     for j in range(STATES):
         d[j] = 0.0
     n = MEASUREMENTS if still else 4
+    r = 0.0
     for m in range(n):
-        if m < 2:
-            at = _V + m
-            y = -x[at]
+        # Pairs and triples of axes are doubted together, so that it does not matter where the sensor's axes point.
+        at = _V + m if m < 2 else (_B if still else _P) + m - 2
+        if m == 0:
             r = zero_speed if still else speed
-        elif still:
-            at = _B + m - 2
-            y = sums[_GYRO + m - 2] / count - x[at]
+            r += _doubt_of_pair(P, _V, r, -x[_V] - d[_V], -x[_V + 1] - d[_V + 1])
+        elif m == 2 and still:
             r = rest_bias
-        else:
-            at = _P + m - 2
-            y = -x[at]
-            r = position
-        y -= d[at]
+            y0 = sums[_GYRO] / count - x[_B] - d[_B]
+            y1 = sums[_GYRO + 1] / count - x[_B + 1] - d[_B + 1]
+            y2 = sums[_GYRO + 2] / count - x[_B + 2] - d[_B + 2]
+            if _distance_of_three(P, _B, r, y0, y1, y2) > _DOUBTED_3:  # the bias has jumped, by as much
+                P[_B, _B] += y0 * y0
+                P[_B + 1, _B + 1] += y1 * y1
+                P[_B + 2, _B + 2] += y2 * y2
+                for i, j, product in ((0, 1, y0 * y1), (0, 2, y0 * y2), (1, 2, y1 * y2)):
+                    P[_B + i, _B + j] += product
+                    P[_B + j, _B + i] += product
+        elif m == 2:
+            r = position + _doubt_of_pair(P, _P, position, -x[_P] - d[_P], -x[_P + 1] - d[_P + 1])
+        y = (sums[_GYRO + m - 2] / count if m >= 2 and still else 0.0) - x[at] - d[at]
         s = P[at, at] + r
-        if y * y > 9.0 * s:
-            if still and m >= 2:  # the bias has jumped
-                P[at, at] += y * y
-                s += y * y
-            else:  # a knock, a walk: not more than three standard deviations of it are believed
-                s = y * y / 9.0
         root = 1.0 / np.sqrt(s)
         for j in range(STATES):
             scaled[j] = P[at, j] * root
