@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from wepose_pin.readers.arrivals import (
+from wepose_pin.recording.arrivals import (
     BAD,
-    BRIDGE_S,
     DUPLICATE,
     JUMP_S,
     LATE,
+    LONGEST_GAP_S,
     MISSING,
     REORDER_S,
     TAKEN,
@@ -139,7 +139,7 @@ def test_duplicates_and_what_is_no_measurement_are_counted_and_change_nothing() 
 
 @pytest.mark.parametrize(("lost", "bridged"), [(1, True), (5, True), (6, False), (40, False)])
 def test_holes_are_bridged_up_to_a_limit_and_then_nan(lost: int, bridged: bool) -> None:
-    assert round(BRIDGE_S * RATE) == 5
+    assert round(LONGEST_GAP_S * RATE) == 5
     gyro, accel = signals(200)
     came = [c for c in in_order(gyro, accel) if not (c[0] == 2 and 60 <= round((c[1] - BEGIN) * RATE) < 60 + lost)]
     ticks = fed(Aligner(NAMES, RATE, BEGIN), came)

@@ -19,9 +19,9 @@ from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, Stage, Status
 from wepose_pin.live.wearing import Wearing
-from wepose_pin.readers.arrivals import Samples
 from wepose_pin.readers.live_log import SAMPLES, blocks, read_live_log
 from wepose_pin.recording import Recording
+from wepose_pin.recording.arrivals import Samples
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import LENGTHS, average_subject, mount_rows, subject_of
 from wepose_pin.tracking import track

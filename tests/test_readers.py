@@ -17,10 +17,12 @@ from wepose_pin import load_session, so3
 from wepose_pin.cli import main
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.readers import iter_session
-from wepose_pin.readers.clocks import BRIDGED, LONG, bridge, bridge_quat, clock_of, common_time, lost_samples, on_time
-from wepose_pin.readers.plausibility import sensor_notes
 from wepose_pin.readers.tables import Rows, one_column, read_table
 from wepose_pin.recording import Recording, Sensor, check
+from wepose_pin.recording.clocks import clock_of, common_time
+from wepose_pin.recording.gaps import BRIDGED, LONG, bridge, bridge_quat, lost_samples
+from wepose_pin.recording.plausibility import sensor_notes
+from wepose_pin.recording.resampling import on_time
 
 SIGNALS = {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"], "orientation": ["qx", "qy", "qz", "qw"]}
 RAW = [*SIGNALS["gyro"], *SIGNALS["accel"]]

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
 from wepose_pin.pose import Pose, spread
-from wepose_pin.readers.plausibility import cut_off
 from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording.plausibility import cut_off
 from wepose_pin.report import track_report
 from wepose_pin.report.concerns import ADVICE, Concern, concerns
 from wepose_pin.report.drawing import COLUMNS, envelope

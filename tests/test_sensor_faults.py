@@ -16,10 +16,10 @@ from wepose_pin.alignment import START_POSE_STD, segment_orientations
 from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.noise import quietest
 from wepose_pin.readers import iter_session
-from wepose_pin.readers.clocks import clock_of
-from wepose_pin.readers.plausibility import sensor_notes
 from wepose_pin.readers.session import SessionReader
 from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording.clocks import clock_of
+from wepose_pin.recording.plausibility import sensor_notes
 from wepose_pin.simulation import Simulation, simulate, simulated_person
 from wepose_pin.tracking import track, track_pieces
 from wepose_pin.writers import write_session

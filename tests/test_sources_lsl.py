@@ -17,7 +17,7 @@ import pytest
 from wepose_pin.errors import BadOption, BadSource
 from wepose_pin.live.sources import lsl, open_source
 from wepose_pin.live.sources.udp import UdpSource
-from wepose_pin.readers.arrivals import Samples
+from wepose_pin.recording.arrivals import Samples
 
 RATE = 100.0
 Outlet = Callable[..., Any]

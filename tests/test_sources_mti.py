@@ -19,7 +19,7 @@ from test_sources_xbus import ACCEL, GYRO, mtdata2, whole
 
 from wepose_pin.errors import BadSource
 from wepose_pin.live.sources import mti, open_source
-from wepose_pin.readers.arrivals import Samples
+from wepose_pin.recording.arrivals import Samples
 
 serial = pytest.importorskip("serial")
 

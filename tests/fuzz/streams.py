@@ -177,7 +177,7 @@ class _Wild:
 
     def read(self, _timeout_s: float) -> list[Any] | None:
         from wepose_pin.live.sources.checks import sound
-        from wepose_pin.readers.arrivals import Samples
+        from wepose_pin.recording.arrivals import Samples
 
         self._at += 1
         if self._at <= 150:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from ..arguments import check_arguments
 from ..errors import BadData, BadOption, BadPhase, one_of
 from ..noise import SensorNoise, noise_of
+from ..recording.limits import STANDARD_GRAVITY
 from ..static import StaticDetector, StaticTest
 from .amekf import Amekf, AmekfParams
 from .base import FilterRun, OrientationFilter
@@ -60,7 +61,7 @@ TYPICAL = SensorNoise(
     gyro_cov=np.deg2rad(0.1) ** 2 * np.eye(3),
     accel_cov=0.003**2 * np.eye(3),
     bias_step_cov=2.0 * np.deg2rad(0.1) ** 2 * np.eye(3),
-    gravity=9.80665,
+    gravity=STANDARD_GRAVITY,
 )
 
 

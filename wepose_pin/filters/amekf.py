@@ -28,9 +28,10 @@ import numpy as np
 from ..arguments import check_fields
 from ..errors import BadOption
 from ..noise import SensorNoise
+from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..so3 import inlined, kernel
 from ..static import static_step
-from .base import HIGHEST_ACCEL, HIGHEST_RATE, REST_TURN_NOISE, FilterRun, OneSample, samples
+from .base import REST_TURN_NOISE, FilterRun, OneSample, samples
 
 # Error states
 _V, _P, _B, _M, _F, _D = 3, 5, 7, 10, 19, 22  # velocity, position, bias, matrix, accel (force) bias, bias in motion
@@ -446,7 +447,7 @@ def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: igno
     dt = model[28]
     moving = 0.0 if static else 1.0
     bx, by, bz = x[_B] + moving * x[_D], x[_B + 1] + moving * x[_D + 1], x[_B + 2] + moving * x[_D + 2]
-    if gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE:  # false for NaN
+    if gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED:  # false for NaN
         ux, uy, uz = gx - bx, gy - by, gz - bz
         good = max(abs(gx), abs(gy), abs(gz)) < gyro_limit
         sums[_GYRO] += gx
@@ -488,7 +489,7 @@ def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: igno
         sums[27 + i] += R[i] * uz
         sums[_MOVING + i] += R[i] * moving
 
-    if ax * ax + ay * ay + az * az < HIGHEST_ACCEL * HIGHEST_ACCEL:
+    if ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
         if max(abs(ax), abs(ay), abs(az)) >= accel_limit:
             sums[_LOST_FORCE] += dt
         ax, ay, az = ax - x[_F], ay - x[_F + 1], az - x[_F + 2]

@@ -14,10 +14,6 @@ from ..noise import SensorNoise
 
 T = TypeVar("T")
 
-# What is no number, or beyond any sensor (real ones end at 70 rad/s and 400 g), was not measured: a missing sample.
-HIGHEST_RATE = 1e3  # [rad/s]
-HIGHEST_ACCEL = 1e4  # [m/s²]
-
 # [rad/√s] by which a sensor that counts as static may turn about the vertical unseen: 0.01 deg/s for 10 s at a time
 REST_TURN_NOISE = 8e-4
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..noise import SensorNoise
+from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..so3 import inlined, kernel
-from .base import HIGHEST_RATE, FilterRun, OneSample, samples
+from .base import FilterRun, OneSample, samples
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Gdc:
 def _run(quat, bias, gyro_S, accel_S, dt, gain, out_quat):  # type: ignore[no-untyped-def]
     for k in range(len(gyro_S)):
         wx, wy, wz = gyro_S[k, 0] - bias[0], gyro_S[k, 1] - bias[1], gyro_S[k, 2] - bias[2]
-        if wx * wx + wy * wy + wz * wz < HIGHEST_RATE * HIGHEST_RATE:  # false for NaN
+        if wx * wx + wy * wy + wz * wz < HIGHEST_RATE_SQUARED:  # false for NaN
             _step(quat, wx, wy, wz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2], dt, gain)
         for i in range(4):
             out_quat[k, i] = quat[i]

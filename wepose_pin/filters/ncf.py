@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..noise import SensorNoise
+from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..so3 import kernel, rotate_by_vector, up_in_sensor
-from .base import HIGHEST_RATE, FilterRun, OneSample, samples
+from .base import FilterRun, OneSample, samples
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def _run(quat, bias, gyro_S, accel_S, dt, proportional, integral, out_quat, out_
     for k in range(len(gyro_S)):
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
-        if gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE:  # false for NaN
+        if gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED:  # false for NaN
             norm = np.sqrt(ax * ax + ay * ay + az * az)
             ex = ey = ez = 0.0
             if 0.0 < norm < np.inf:  # in free fall there is no direction to follow

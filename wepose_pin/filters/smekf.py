@@ -18,9 +18,10 @@ import numpy as np
 
 from ..errors import BadOption
 from ..noise import SWAY_CORRELATION_S, SensorNoise
+from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..so3 import inlined, kernel, rotate_by_vector, up_in_sensor
 from ..static import static_step
-from .base import HIGHEST_ACCEL, HIGHEST_RATE, REST_TURN_NOISE, FilterRun, OneSample, samples
+from .base import REST_TURN_NOISE, FilterRun, OneSample, samples
 from .start import ACCEL_BIAS_STD
 
 HEADING_FLOOR = 1e-5  # [rad] keeps P₀ positive definite about the vertical
@@ -72,7 +73,7 @@ def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, til
     )
 
 
-# At a missing sample (base.HIGHEST_RATE) the last rate is held and fades away with HOLD_S, the correction is left out,
+# At a missing sample (`recording.limits`) the last rate is held and fades away with HOLD_S, the correction is left out,
 # and the attitude is trusted less by the motion that may have gone unseen: after T seconds σ T²/(T + HOLD_S), up to π.
 HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
 UNSEEN_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
@@ -173,7 +174,7 @@ def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
 def step(x, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """One sample of one sensor: `x` (32,) its state, `model` (30,), gyro [rad/s], accel [m/s²]."""
     dt = model[0]
-    seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE * HIGHEST_RATE  # false for NaN
+    seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
     unseen_cov = 0.0
     if seen:
         wx, wy, wz = gx - x[4], gy - x[5], gz - x[6]
@@ -189,7 +190,7 @@ def step(x, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-d
         x[31] = after
     x[28], x[29], x[30] = wx, wy, wz
     predict(x, model, wx * dt, wy * dt, wz * dt, unseen_cov)
-    if static and seen and ax * ax + ay * ay + az * az < HIGHEST_ACCEL * HIGHEST_ACCEL:
+    if static and seen and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
         correct(x, model, gx, gy, gz, ax, ay, az)
 
 

@@ -13,7 +13,9 @@ import numpy as np
 from ..filters import BEST
 from ..model import BodyModel, load_model
 from ..pose import LiveKinematics
-from ..readers.arrivals import (
+from ..readers.live_log import recording_of
+from ..recording import SEGMENTS, Recording, Sensor
+from ..recording.arrivals import (
     DUPLICATE,
     JUMP_S,
     LATE,
@@ -26,8 +28,6 @@ from ..readers.arrivals import (
     Ticks,
     arrivals,
 )
-from ..readers.live_log import recording_of
-from ..recording import SEGMENTS, Recording, Sensor
 from ..subject import Subject, average_subject
 from ..tracking.causal import HOLD_S, CausalTracker, StartGuide, until_start
 from ..writers.live_log import LiveLog

@@ -16,8 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, MissingFile, WeposeError, one_of
 from ..recording import AXES, CONFIGURATION, SEGMENTS, Recording, Sensor, format_time, span_text
+from ..recording.clocks import TIME_UNITS, time_unit_of
+from ..recording.gaps import runs
+from ..recording.limits import LONGEST_STEP_S
 from .arrays import ArrayFile, is_array_file
-from .clocks import SLOWEST_STEP_S, TIME_UNITS, runs, time_unit_of
 from .device import Device
 from .formats import TITLES, format_of, read_device
 from .guess import Guess, guess_arrays, guess_columns
@@ -371,7 +373,7 @@ def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str]
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     said = guess.time_unit
-    fits = said if said is not None and 0.0 < step * TIME_UNITS[said] < SLOWEST_STEP_S else time_unit_of(step)
+    fits = said if said is not None and 0.0 < step * TIME_UNITS[said] < LONGEST_STEP_S else time_unit_of(step)
     line = f"time = {_quoted(name)}"
     if fits in (None, "s"):
         return [line], []

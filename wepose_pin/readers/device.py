@@ -11,13 +11,12 @@ import numpy as np
 import polars as pl
 
 from ..errors import BadData, MissingFile
+from ..recording.limits import LARGEST_NUMBER
 from .tables import NO_VALUE, columns
 
 # A table begins within this many lines of a file; what comes before it is about the device.
 PREAMBLE_LINES = 100
 SEPARATORS = "\t,; "
-# Beyond this no number is a measurement in any unit; squares of smaller ones are still numbers.
-HUGE = 1e30
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 
 # Words that name a segment in a label or a file's name, after its side.
@@ -79,8 +78,8 @@ def table_of(time: np.ndarray, values: Mapping[str, Mapping[str, np.ndarray]]) -
 
 
 def must_be_measured(path: Path, values: np.ndarray, what: str) -> None:
-    """Raise an error on numbers (n, k) beyond `HUGE`."""
-    huge = np.flatnonzero((np.abs(values) > HUGE).any(axis=1))
+    """Raise an error on numbers (n, k) beyond `LARGEST_NUMBER`."""
+    huge = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
     if huge.size:
         found = np.nanmax(np.abs(values[huge[0]]))
         raise BadData(f"{path}: {what} holds {found:.3g} in row {huge[0] + 1}; no device measures as much")

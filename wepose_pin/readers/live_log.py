@@ -23,8 +23,9 @@ import numpy as np
 
 from ..errors import BadData, MissingFile
 from ..recording import SEGMENTS, Recording, Sensor, check
-from .arrivals import Aligner, Arrivals, Ticks
-from .clocks import GOOD, LONG, Clock, bridge
+from ..recording.arrivals import Aligner, Arrivals, Ticks
+from ..recording.clocks import Clock
+from ..recording.gaps import GOOD, LONG, bridge
 from .device import Device, table_of
 from .keys import Keys, is_number
 from .stated import phases_stated

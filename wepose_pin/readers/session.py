@@ -22,32 +22,22 @@ from ..recording import (
     check_phases,
     span_text,
 )
+from ..recording.clocks import TIME_UNITS, Clock, clock_of, common_time
+from ..recording.faults import Scan
+from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, lost_samples, runs
+from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
+from ..recording.plausibility import sensor_notes
+from ..recording.resampling import on_time
 from .arrays import ArrayFile, is_array_file
-from .clocks import (
-    BRIDGED,
-    GOOD,
-    LONG,
-    TIME_UNITS,
-    Clock,
-    bridge,
-    bridge_quat,
-    clock_of,
-    common_time,
-    lost_samples,
-    on_time,
-    runs,
-)
-from .device import HUGE, Device
-from .faults import Scan
+from .device import Device
 from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
-from .plausibility import sensor_notes
 from .stated import WIDTHS, Stated, joints_stated, label_stated, phases_stated, sensor_stated, truth_stated
 from .tables import FORMATS as TABLES
 from .tables import Rows, columns, one_column, read_table
 
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
-ACCEL_UNITS = {"m/s^2": 1.0, "g": 9.80665}
+ACCEL_UNITS = {"m/s^2": 1.0, "g": STANDARD_GRAVITY}
 # How far a quaternion's norm may be off 1: decimals that were cut.
 NORM_OFF = 1e-2
 SI = {"gyro": 1.0, "accel": 1.0}
@@ -502,7 +492,7 @@ class SessionReader:
             values = np.full((len(clock.row), read.shape[1]), np.nan)
             values[there] = read[clock.row[there] - first_row]
         good = np.isfinite(values).all(axis=1)
-        huge = np.flatnonzero((np.abs(values) > HUGE).any(axis=1))
+        huge = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
         if huge.size:
             raise BadData(
                 f"{plan.path}: {plan.place}.{name} holds {np.nanmax(np.abs(values[huge[0]])):.3g} in row "

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import BadData, MissingFile
+from ..recording.limits import STANDARD_GRAVITY
 from .device import Device, Text, first_lines, read_text, segment_of, table_of
 
 INERTIAL, QUATERNION = "Inertial.csv", "Quaternion.csv"
 TIMES = {"Timestamp (us)": 1e-6, "Time (s)": 1.0}
 RAW = tuple(f"{kind} {axis}" for kind, unit in (("Gyroscope", "(deg/s)"), ("Accelerometer", "(g)")) for axis in "XYZ")
 UNITS = ("(deg/s)",) * 3 + ("(g)",) * 3
-STANDARD_GRAVITY = 9.80665  # [m/s²]
 
 
 def read_ximu3(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..page import capital
-from ..readers.plausibility import GRAVITY
+from ..recording.limits import STANDARD_GRAVITY
 from ..tracking import TrackedPose
 from .measures import BENT, Budget, Elbow, Hand, Signal, between, from_start, largest, longest
 from .words import listed, plain
@@ -130,14 +130,14 @@ def _of_signals(pose: TrackedPose, signals: Mapping[str, Signal], told: str) -> 
             "Such stamps are often those of arrival: give `rate_hz` in place of the time column if the sensor is even.",
         )
     off = {
-        name: f"{signal.gravity:.2f} m/s² ({100 * (signal.gravity / GRAVITY - 1):+.1f} %)"
+        name: f"{signal.gravity:.2f} m/s² ({100 * (signal.gravity / STANDARD_GRAVITY - 1):+.1f} %)"
         for name, signal in signals.items()
-        if abs(signal.gravity / GRAVITY - 1.0) > GRAVITY_OFF and f"sensors.{name}.accel: norm" not in told
+        if abs(signal.gravity / STANDARD_GRAVITY - 1.0) > GRAVITY_OFF and f"sensors.{name}.accel: norm" not in told
     }
     if off:
         yield Concern(
             False,
-            f"gravity does not measure as {GRAVITY:.2f} m/s²: {which(off)}",
+            f"gravity does not measure as {STANDARD_GRAVITY:.2f} m/s²: {which(off)}",
             "The common scale is taken out, so that it does little harm; axes that differ from each other tilt the "
             "segment. Calibrate the accelerometer by resting it on its six sides.",
         )

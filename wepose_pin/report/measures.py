@@ -9,9 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..pose import Pose, spread
-from ..readers.clocks import runs
-from ..readers.plausibility import SATURATED_ACCEL, SATURATED_GYRO, cut_off
 from ..recording import Recording, Sensor
+from ..recording.gaps import runs
+from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
+from ..recording.plausibility import cut_off
 from ..subject import Subject
 from ..tracking import TrackedPose
 
@@ -59,7 +60,7 @@ def signal_of(recording: Recording, name: str, pose: TrackedPose) -> Signal:
         return Signal(np.concatenate([rate[:1], rate]), nan, nothing, gap, None, nan, nan, nan, None)
     assert pose.segments is not None
     of = pose.segments.orientation[name]
-    cut = cut_off(sensor.gyro_S, SATURATED_GYRO) | cut_off(sensor.accel_S, SATURATED_ACCEL)
+    cut = cut_off(sensor.gyro_S, NARROWEST_GYRO_RANGE) | cut_off(sensor.accel_S, NARROWEST_ACCEL_RANGE)
     return Signal(
         np.linalg.norm(sensor.gyro_S, axis=1),
         float(np.linalg.norm(sensor.accel_S, axis=1).max()),

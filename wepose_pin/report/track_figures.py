@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..page import ACCENT, INK, LINE, SOFT, STYLE, Picture, new_figure, png_of
-from ..readers.clocks import runs
+from ..recording.gaps import runs
 from ..viewer import LEFT_COLOUR, OTHER_COLOUR, RIGHT_COLOUR
 from .drawing import BEFORE, HATCHED, above, body, envelope, line_of
 from .measures import Hand, Signal, largest

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from ..arguments import Count, NonNegative, Positive, check_arguments
 from ..errors import BadOption
 from ..pose import Pose
-from ..readers.clocks import Clock, bridge, lost_samples
 from ..recording import Recording, Sensor, check, mount_from_axes
+from ..recording.clocks import Clock
+from ..recording.gaps import bridge, lost_samples
 from ..subject import LENGTHS, SEXES, Subject, average_subject, check_lengths
 from .imperfections import PERFECT_WORLD, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, jittered, lost

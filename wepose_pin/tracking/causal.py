@@ -28,8 +28,9 @@ from ..filters import BEST, OFFLINE, Orientation, check_method
 from ..filters.bank import bank_of
 from ..filters.base import in_parallel
 from ..pose import spread
-from ..readers.clocks import GOOD, LONG, Clock, bridge
 from ..recording import Intervals, Recording, Sensor
+from ..recording.clocks import Clock
+from ..recording.gaps import GOOD, LONG, bridge
 from ..so3 import kernel
 from ..static import StaticTest
 from ..subject import Subject

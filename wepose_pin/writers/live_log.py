@@ -16,8 +16,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ..errors import ExistingOutput
-from ..readers.arrivals import Arrivals
 from ..readers.live_log import BLOCK, EVENT, HEAD, MAGIC, POSES, SAMPLES
+from ..recording.arrivals import Arrivals
 
 FLUSH_S = 0.25  # [s] what a kill may cost at most
 FLUSH_SAMPLES = 4096  # or as many, of a replay that goes faster

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from ...readers.arrivals import Samples
+from ...recording.arrivals import Samples
 
 
 class Source(Protocol):

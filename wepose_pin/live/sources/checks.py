@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-# Sensors for the body end at 4000 °/s and 200 g at most; what is beyond was damaged on its way.
-MOST_RATE = 100.0  # [rad/s]
-MOST_ACCEL = 2000.0  # [m/s²]
+from ...recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
+
 # Seconds since 1970 have ten digits; what has more is in another unit, or damaged.
 MOST_TIME = 1e10  # [s]
-_MOST = np.repeat([MOST_RATE, MOST_ACCEL], 3)
+_MOST = np.repeat([HIGHEST_RATE, HIGHEST_ACCEL], 3)
 
 UNSOUND = "samples with values that no body sensor gives"
 

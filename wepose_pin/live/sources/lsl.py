@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import BadOption, BadSource, one_of
-from ...readers.arrivals import Samples
 from ...recording import SEGMENTS
+from ...recording.arrivals import Samples
+from ...recording.limits import STANDARD_GRAVITY
 from .checks import UNSOUND, sound
 
 # What liblsl calls the reach of its search → its configuration. On one machine there is one clock and one loopback.
@@ -30,7 +31,7 @@ SCOPES = {
 }
 SIGNALS = ("gyr_x", "gyr_y", "gyr_z", "acc_x", "acc_y", "acc_z")
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "": 1.0}
-ACCEL_UNITS = {"m/s^2": 1.0, "m/s²": 1.0, "m/s2": 1.0, "g": 9.80665, "": 1.0}
+ACCEL_UNITS = {"m/s^2": 1.0, "m/s²": 1.0, "m/s2": 1.0, "g": STANDARD_GRAVITY, "": 1.0}
 # The inlet keeps this much [s] while nobody reads.
 BUFFER_S = 10
 MOST_SAMPLES = 4096

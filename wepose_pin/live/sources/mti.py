@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from ...errors import BadSource
-from ...readers.arrivals import Samples
+from ...recording.arrivals import Samples
 from . import xbus
 from .checks import UNSOUND, sound
 from .clocks import HostClock

@@ -8,8 +8,8 @@ import time
 import numpy as np
 
 from ...errors import BadOption
-from ...readers.arrivals import Samples
 from ...recording import Recording
+from ...recording.arrivals import Samples
 
 # As fast as possible: so many samples of every sensor at once.
 BLOCK = 64

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...errors import BadSource
-from ...readers.arrivals import Samples
 from ...recording import SEGMENTS
+from ...recording.arrivals import Samples
 from .checks import MOST_TIME, UNSOUND, sound
 from .clocks import HostClock
 from .packets import Batch, decode

@@ -14,15 +14,19 @@ from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..errors import BadData
-from ..recording import Recording, Sensor, format_time
-from .clocks import runs
-
-GRAVITY = 9.80665
-# Mean of ‖accel‖ at rest over gravity: what no sensor is off by, and what is worth a word.
-GRAVITY_OFF, GRAVITY_NOTE = 0.2, 0.06
-# No body sensor measures more; beyond is a wrong unit or a number that stands for a missing value.
-MOST_GYRO = 80.0  # [rad/s]
-MOST_ACCEL = 4000.0  # [m/s²]
+from .gaps import runs
+from .intervals import format_time
+from .limits import (
+    GRAVITY_ERROR_NOTED,
+    GRAVITY_ERROR_REFUSED,
+    HIGHEST_ACCEL,
+    HIGHEST_RATE,
+    NARROWEST_ACCEL_RANGE,
+    NARROWEST_GYRO_RANGE,
+    STANDARD_GRAVITY,
+)
+from .recording import Recording
+from .sensors import Sensor
 
 WINDOW_S = 2.0  # over which specific force averages to gravity
 WINDOWS = 40  # those with most motion
@@ -36,10 +40,7 @@ STIFF = 0.93  # the share of the coherence of rates a factor 57.3 larger, where 
 TILTED = np.deg2rad(20.0)  # between two windows, from which the gyroscope must have seen it
 UNSEEN = 0.25  # share of that tilt which the gyroscope has seen at most, where its unit is too small
 
-# Below the smallest ranges that are built (±125 deg/s, ±2 g) nothing saturates.
-SATURATED_GYRO = 2.0  # [rad/s]
-SATURATED_ACCEL = 15.0  # [m/s²]
-PLATEAU = 3  # samples
+PLATEAU = 3  # samples at one value, where an axis seems cut off
 
 
 def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True) -> tuple[str, ...]:
@@ -60,11 +61,11 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
         notes += _gravity(recording, segment, place, whole)
         if units:
             _gyro_unit(sensor, recording.rate_hz, place)
-        _range(recording.time, sensor.gyro_S, MOST_GYRO, "rad/s", f"{place}.gyro")
-        _range(recording.time, sensor.accel_S, MOST_ACCEL, "m/s^2", f"{place}.accel")
+        _range(recording.time, sensor.gyro_S, HIGHEST_RATE, "rad/s", f"{place}.gyro")
+        _range(recording.time, sensor.accel_S, HIGHEST_ACCEL, "m/s^2", f"{place}.accel")
         for name, values, least in (
-            ("gyro", sensor.gyro_S, SATURATED_GYRO),
-            ("accel", sensor.accel_S, SATURATED_ACCEL),
+            ("gyro", sensor.gyro_S, NARROWEST_GYRO_RANGE),
+            ("accel", sensor.accel_S, NARROWEST_ACCEL_RANGE),
         ):
             notes += _saturation(values, least, f"sensors.{segment}.{name}")
     return tuple(notes)
@@ -84,20 +85,20 @@ def _gravity(recording: Recording, segment: str, place: str, whole: bool) -> lis
         return []
     first, last = (format_time(recording.time[k]) for k in at_rest[[0, -1]])
     norm = float(np.linalg.norm(sensor.accel_S[at_rest], axis=1).mean())
-    off = abs(norm / GRAVITY - 1.0)
-    found = f"norm {norm:.4g} m/s^2 {when} ({first} to {last} s), where gravity's {GRAVITY:.3g} is expected"
-    if off > GRAVITY_OFF:
+    off = abs(norm / STANDARD_GRAVITY - 1.0)
+    found = f"norm {norm:.4g} m/s^2 {when} ({first} to {last} s), where gravity's {STANDARD_GRAVITY:.3g} is expected"
+    if off > GRAVITY_ERROR_REFUSED:
         raise BadData(f"{place}.accel: {found}; {_accel_unit(norm)}")
-    return [f"{place.split(': ')[-1]}.accel: {found}: the scale is taken from it"] if off > GRAVITY_NOTE else []
+    return [f"{place.split(': ')[-1]}.accel: {found}: the scale is taken from it"] if off > GRAVITY_ERROR_NOTED else []
 
 
 def _accel_unit(norm: float) -> str:
     """Which unit makes gravity of a norm that is not."""
-    for factor, unit in ((GRAVITY, '"g"'), (1.0 / GRAVITY, '"m/s^2"')):
-        if abs(norm * factor / GRAVITY - 1.0) < GRAVITY_OFF:
+    for factor, unit in ((STANDARD_GRAVITY, '"g"'), (1.0 / STANDARD_GRAVITY, '"m/s^2"')):
+        if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
             return f"data.accel_unit = {unit} would fit"
-    for factor in (1e-3, 1e-3 * GRAVITY):
-        if abs(norm * factor / GRAVITY - 1.0) < GRAVITY_OFF:
+    for factor in (1e-3, 1e-3 * STANDARD_GRAVITY):
+        if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
             return 'the values look like thousandths of g (mg); divide them by 1000 and state accel_unit = "g"'
     if norm < 0.5:
         return "gravity seems to have been taken out; specific force is needed, +g up at rest"
@@ -151,7 +152,7 @@ def _gyro_unit(sensor: Sensor, rate_hz: float, place: str) -> None:
     norm = np.linalg.norm(mean, axis=1)
     up = mean / np.maximum(norm, 1e-9)[:, None]
     tilt = np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0))
-    steady = (np.abs(norm / GRAVITY - 1.0) < 0.1) & np.isin(np.arange(count), at)
+    steady = (np.abs(norm / STANDARD_GRAVITY - 1.0) < 0.1) & np.isin(np.arange(count), at)
     tilt[~(steady[1:] & steady[:-1])] = 0.0
     path = WINDOW_S * speed
     unseen = (tilt > TILTED) & (path[1:] + path[:-1] < UNSEEN * tilt)
@@ -171,7 +172,7 @@ def _coherence(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float
     time; of its mean in the world gravity alone is left.
     """
     turned = Rotation.from_quat(so3.integrate(gyro_S[1:] / rate_hz)).apply(accel_S)
-    return max(0.0, 1.0 - abs(float(np.linalg.norm(turned.mean(axis=0))) / GRAVITY - 1.0))
+    return max(0.0, 1.0 - abs(float(np.linalg.norm(turned.mean(axis=0))) / STANDARD_GRAVITY - 1.0))
 
 
 def _range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: str) -> None:

@@ -12,17 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ..so3 import kernel
+from .clocks import LONGEST_GAP_S
+from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 
 # A sample this near to a tick, as a share of a step, is the tick's own.
 SAME = 0.01
 # A longer step than this many usual ones holds a lost sample.
 HOLE = 1.5
-BRIDGE_S = 0.05  # [s] up to which what was lost is bridged, as `clocks.LONGEST_GAP_S`
 REORDER_S = 0.02  # [s] for how long a sample may come after one that is later, while its tick waits
 WAIT_S = 0.1  # [s] for how long a tick waits for a sensor; then the sensor is lost until it comes again
 JUMP_S = 1.0  # [s] a time further ahead of all others is an error, unless the sensor goes on from there
-# What no body sensor measures was not measured (filters.base has the same limits).
-HIGHEST_RATE, HIGHEST_ACCEL = 1e3, 1e4  # [rad/s], [m/s²]
 
 MISSING, LATE, DUPLICATE, BAD, TAKEN = range(5)
 COUNTS = ("missing", "late", "duplicate", "bad", "taken")
@@ -78,7 +77,7 @@ class Aligner:
     overtaken and `wait_s` for a silent sensor, measured on the samples' own times; from then on the sensor is lost and
     none waits for it until it comes again. A sample on its tick is taken as it is; between ticks the rate is the mean
     over the step (each sample's rate holds for the interval that ends there) and the specific force is interpolated.
-    Holes of up to `BRIDGE_S` are bridged linearly, longer ones are NaN.
+    Holes of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN.
 
     Parameters
     ----------
@@ -94,7 +93,7 @@ class Aligner:
         self.counts = np.zeros((k, len(COUNTS)), dtype=np.int64)
         self.lost = np.zeros(k, dtype=np.bool_)
         # A sensor may be much faster than the ticks.
-        room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, BRIDGE_S))
+        room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, LONGEST_GAP_S))
         self._kept, self._held = np.zeros((k, room, _WIDTH)), np.zeros(k, dtype=np.int64)
         self._jump = np.zeros((k, 2))  # samples in a row that were too far ahead, and the last of their times
         self._scalars = np.array([0.0, -np.inf])
@@ -162,7 +161,7 @@ def _insert(kept, held, jump, scalars, settings, counts, lost, s, t, gyro, accel
     dt = settings[1]
     size = gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2]
     force = accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2]
-    if not (abs(t) < 1e12 and size < HIGHEST_RATE * HIGHEST_RATE and force < HIGHEST_ACCEL * HIGHEST_ACCEL):
+    if not (abs(t) < 1e12 and size < HIGHEST_RATE_SQUARED and force < HIGHEST_ACCEL_SQUARED):
         counts[s, BAD] += 1
         return
     if t > scalars[_NEWEST] + JUMP_S and scalars[_NEWEST] > -np.inf:
@@ -280,7 +279,7 @@ def _value(room, n, i, t, dt, out):  # type: ignore[no-untyped-def]
         for m in range(6):
             out[m] = room[i, 1 + m]
         return True
-    bridged = max(BRIDGE_S, dt) * (1.0 + 1e-6)  # lost time, as in `clocks`: one sample always is
+    bridged = max(LONGEST_GAP_S, dt) * (1.0 + 1e-6)  # lost time, as in `clocks`: one sample always is
     if first or step - dt > bridged:
         return False
     if step > HOLE * dt:

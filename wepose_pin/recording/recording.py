@@ -1,102 +1,27 @@
-"""`Recording`: what the sensors measured, checked once; everything after this room trusts it.
-
-SI units, one time base, sensors named by the segment they are strapped on.
-"""
+"""`Recording`: what the sensors measured, checked once; everything after this room trusts it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from .arguments import Positive, check_array, check_fields, check_finite, check_names, check_unit
-from .errors import BadData, BadOption, BadPhase, one_of
+from ..arguments import Positive, check_array, check_fields, check_finite, check_names, check_unit
+from ..errors import BadData, BadOption, BadPhase, one_of
+from .intervals import Intervals, check_phases, check_time
+from .limits import MEDIAN_FORCE
+from .sensors import SEGMENTS, Sensor
 
-SEGMENTS = (
-    "torso",
-    "left_upper_arm",
-    "left_forearm",
-    "right_upper_arm",
-    "right_forearm",
-    "pelvis",
-    "head",
-    "left_hand",
-    "right_hand",
-)
 START_POSES = ("n_pose",)
 STRAPPINGS = ("as_calibrated", "new")
 CONFIGURATION = "configuration"  # the start pose of any other chain: values of its joints; sensors are named by links
 
-# The sensor axes that a mount can be stated with.
-AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) for k, axis in enumerate("xyz")}
-
 RATE_OFF = 0.01  # share by which the stated rate may be off that of the times: its error is one of all angles
 LONGEST_STEP = 2.5  # steps of the rate from one time to the next; uneven clocks are resampled while read
 
-FORCES = (3.0, 300.0)  # [m/s²] nobody falls, or is thrown at 30 g, for half of a recording
 EACH_TIME = ", a row for each time"  # why an array has another shape
-
-Intervals = tuple[tuple[float, float], ...]
-
-
-def format_time(time: float, decimals: int = 3) -> str:
-    """A time [s] as it stands in the file, to the millisecond: on a clock that counts from 1970 as well."""
-    return f"{time:.{decimals}f}".rstrip("0").rstrip(".")
-
-
-def span_text(interval: Sequence[float] | np.ndarray) -> str:
-    """From when to when [s], in words."""
-    return f"{format_time(interval[0])} to {format_time(interval[1])} s"
-
-
-def mount_from_axes(up: str, forward: str) -> np.ndarray:
-    """`quat_LS` (4,) xyzw of the sensor axes that point up and forward in the start pose, as in ``"+x", "-z"``.
-
-    The rows of R_LS are the segment's axes in the sensor.
-    """
-    up_S, forward_S = AXES[up], AXES[forward]
-    return Rotation.from_matrix([forward_S, np.cross(up_S, forward_S), up_S]).as_quat()
-
-
-def axes_from_mount(quat_LS: np.ndarray) -> tuple[str, str]:
-    """The two axis names, up and forward, that `mount_from_axes` gives this mount for, or the nearest mount of all."""
-    R_LS = Rotation.from_quat(quat_LS)
-    pairs = [(up, forward) for up in AXES for forward in AXES if AXES[up] @ AXES[forward] == 0.0]
-    return min(pairs, key=lambda pair: (R_LS * Rotation.from_quat(mount_from_axes(*pair)).inv()).magnitude())
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """One sensor: either `gyro_S` and `accel_S`, or `quat_WS` from a device that fuses by itself.
-
-    Parameters
-    ----------
-    gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample; None for ready orientations
-    accel_S : (n, 3) [m/s²], specific force, +g up at rest; None for ready orientations
-    quat_WS : (n, 4) xyzw, sensor to a world of its own whose z points up; None for raw sensors
-    stated_quat_LS : (4,) xyzw, the mount as the session states it, sensor to segment; None where it says nothing
-    gap : (n,) bool, true where samples were lost for longer than is bridged in silence, or the sensor was frozen; None
-        where neither can be
-    gyro_range : [rad/s] from which on an axis of gyro is cut off; infinite where that is not known
-    aligned : `quat_WS` is the segment's own orientation, in a world that is common to all that are aligned: only where
-        that world's x points is taken from the start pose
-    """
-
-    gyro_S: np.ndarray | None = None
-    accel_S: np.ndarray | None = None
-    quat_WS: np.ndarray | None = None
-    stated_quat_LS: np.ndarray | None = None
-    gap: np.ndarray | None = None
-    aligned: bool = False
-    gyro_range: float = np.inf
-
-    @property
-    def ready(self) -> bool:
-        """The sensor came with orientations."""
-        return self.quat_WS is not None
 
 
 @dataclass(frozen=True)
@@ -143,7 +68,7 @@ class Recording:
         check(self)
         for segment, sensor in self.sensors.items():
             force = 0.0 if sensor.accel_S is None else float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
-            if force and not FORCES[0] < force < FORCES[1]:
+            if force and not MEDIAN_FORCE[0] < force < MEDIAN_FORCE[1]:
                 raise BadData(
                     f"{self.where()}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed, 9.8 "
                     f"where nothing moves"
@@ -265,29 +190,3 @@ def _check_rate(where: str, time: np.ndarray, rate_hz: float) -> None:
             f"{where}: time goes from {time[k]:.3f} to {time[k + 1]:.3f} s in one step at {rate_hz:g} Hz; fill or cut "
             f"the gap first"
         )
-
-
-def check_time(where: str, time: np.ndarray) -> None:
-    """Every time (n,) [s] is finite and later than the one before; `where` begins the error's text."""
-    bad = np.flatnonzero(~np.isfinite(time))
-    if bad.size:
-        raise BadData(f"{where}: time: not a finite number in row {bad[0] + 1}; every row needs its time in seconds")
-    back = np.flatnonzero(time[1:] <= time[:-1])
-    if back.size:
-        k = int(back[0])
-        how = "stands still" if time[k + 1] == time[k] else "goes back"
-        raise BadData(
-            f"{where}: time {how} in row {k + 2}: {format_time(time[k + 1], 6)} s after {format_time(time[k], 6)} s; "
-            f"it must grow in every row"
-        )
-
-
-def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tuple[float, float]]]) -> None:
-    """Every interval [s] has a length and lies in the recording."""
-    for name, intervals in phases.items():
-        for first, last in intervals:
-            place = f"{where}: phases.{name}: [{format_time(first)}, {format_time(last)}]"
-            if not first < last:
-                raise BadPhase(f"{place} is empty; the first number is the earlier one, in seconds")
-            if first < time[0] - 1e-6 or last > time[-1] + 1e-6:
-                raise BadPhase(f"{place} is outside the recording, which runs from {time[0]:.3f} to {time[-1]:.3f} s")

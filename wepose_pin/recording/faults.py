@@ -20,9 +20,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import BadData
-from ..recording import format_time
-from .clocks import GOOD, LONGEST_GAP_S, Clock, runs
-from .plausibility import SATURATED_GYRO, cut_off
+from .clocks import LONGEST_GAP_S, Clock
+from .gaps import GOOD, runs
+from .intervals import format_time
+from .limits import NARROWEST_GYRO_RANGE
+from .plausibility import cut_off
 
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5  # of rate and force both at one value: longer than gaps that are bridged in silence
 STUCK_S = 1.0  # of one of them alone
@@ -172,7 +174,7 @@ class SensorScan:
         """The levels at which an axis of gyro stays though something else changes."""
         gyro = values[:, :3]
         self._peak = max(self._peak, float(np.abs(gyro).max()))
-        cut = cut_off(gyro, SATURATED_GYRO)
+        cut = cut_off(gyro, NARROWEST_GYRO_RANGE)
         if cut.any():
             changes = (np.abs(np.diff(values, axis=0)) > ROUNDING * np.abs(values).max(axis=0)).any(axis=1)
             stays = cut[1:] & cut[:-1] & changes[:, None]

@@ -1,0 +1,96 @@
+"""Lost samples: which are bridged in silence, which are marked, and what stands in their place.
+
+A sample is lost where its row is not there (a step in time) or its cells are empty. Up to `clocks.LONGEST_GAP_S` of
+lost samples are bridged: the rate and the specific force linearly, ready orientations along the shortest rotation. What
+is longer is an error, or is bridged and marked where the user allows it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from .clocks import Clock
+
+# In a long gap the rate falls to the sensor's rate at rest within this time [s]: a person's motion goes on no longer.
+FADE_S = 0.1
+
+GOOD, BRIDGED, LONG = 0, 1, 2
+
+
+def lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
+    """`GOOD`, `BRIDGED` or `LONG` for every sample (n,), of the runs that are not `good` (n,)."""
+    marks = np.zeros(len(good), dtype=np.int8)
+    for first, last in runs(~good):
+        marks[first:last] = LONG if (last - first) * clock.step > clock.longest_bridge else BRIDGED
+    return marks
+
+
+def runs(which: np.ndarray) -> list[tuple[int, int]]:
+    """First and one past the last index of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = False) -> np.ndarray:
+    """`values` (n, k) with lost samples filled linearly in time; before the first and after the last they stay.
+
+    Where all are lost, as in a piece of a recording, they are zero.
+
+    With `rate` these are angular rates, which in long gaps fall to the rate at rest: the bias, that is.
+    """
+    lost = marks != GOOD
+    if not lost.any():
+        return values
+    if lost.all():
+        return np.zeros_like(values)
+    time, filled = clock.time, values.copy()
+    for k in range(values.shape[1]):
+        filled[lost, k] = np.interp(time[lost], time[~lost], values[~lost, k])
+    if rate and (marks == LONG).any():
+        rest = _rate_at_rest(values, ~lost, clock)
+        for first, last in runs(marks == LONG):
+            edges = [edge for edge in (first - 1, last) if 0 <= edge < len(time)]
+            near = [np.clip(1.0 - np.abs(time[first:last] - time[edge]) / FADE_S, 0.0, None) for edge in edges]
+            whole = np.maximum(1.0, np.sum(near, axis=0))
+            filled[first:last] = rest
+            for edge, weight in zip(edges, near, strict=True):
+                filled[first:last] += (weight / whole)[:, None] * (values[edge] - rest)
+    return filled
+
+
+def bridge_quat(
+    quat: np.ndarray,
+    marks: np.ndarray,
+    clock: Clock,
+    before: tuple[float, np.ndarray] | None = None,
+    after: tuple[float, np.ndarray] | None = None,
+) -> np.ndarray:
+    """Unit quaternions (n, 4) with lost ones filled along the shortest rotation.
+
+    `before` and `after` are the time [s] and the quaternion (4,) last and next measured beyond a piece of a recording.
+    """
+    filled = quat.copy()
+    for first, last in runs(marks != GOOD):
+        ends = [
+            before if first == 0 else (clock.time[first - 1], quat[first - 1]),
+            after if last == len(quat) else (clock.time[last], quat[last]),
+        ]
+        near = [end for end in ends if end is not None]
+        if len(near) < 2:
+            filled[first:last] = near[0][1]
+            continue
+        times, quats = zip(*near, strict=True)
+        filled[first:last] = Slerp(times, Rotation.from_quat(np.array(quats)))(clock.time[first:last]).as_quat()
+    return filled
+
+
+def _rate_at_rest(gyro_S: np.ndarray, good: np.ndarray, clock: Clock) -> np.ndarray:
+    """Mean rate (3,) of the second in which it varies least; zero where no second is whole."""
+    size = max(2, round(1.0 / clock.step))
+    blocks = len(gyro_S) // size
+    whole = good[: blocks * size].reshape(blocks, size).all(axis=1)
+    seconds = gyro_S[: blocks * size].reshape(blocks, size, 3)[whole]
+    if not len(seconds):
+        return np.zeros(3)
+    return seconds[int(np.argmin(seconds.var(axis=1).sum(axis=1)))].mean(axis=0)
