@@ -604,7 +604,7 @@ def view(
     """
     import webbrowser
 
-    from .viewer import pose_html
+    from .report.viewer import pose_html
     from .writers import read_result
 
     page = out or result / "view.html"
@@ -718,7 +718,7 @@ def retarget(
             (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
         if view:
             step("making the page")
-            from .viewer import retarget_html
+            from .report.viewer import retarget_html
             from .writers.pages import PageWriter
 
             writer = PageWriter(out, ["view.html"])
@@ -797,7 +797,7 @@ def validate(
     """
     import json
 
-    from .page import reason
+    from .errors import reason
     from .validation import Skipped, document_text, experiments, run
     from .validation.document import as_document, read_document
     from .validation.page import write_pages

@@ -130,6 +130,12 @@ def native_stderr_muted() -> Iterator[None]:
                 os.close(kept)
 
 
+def reason(error: Exception) -> str:
+    """Kind and text of an error, in one line of bounded length."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text[:200]}" if text else type(error).__name__
+
+
 def one_of(names: Iterable[str], found: str | None = None, most: int = 12) -> str:
     """The choices for an error's end: ``a, b, c`` with the closest to `found` named first.
 

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 
 import polars as pl
 
-from ..errors import ExistingOutput
-from ..page import reason
+from ..errors import ExistingOutput, reason
 from ..writers.provenance import code, made_by
 from .cluster import connected, made
 from .items import FAILED, MADE, Row, failed

@@ -11,7 +11,7 @@ import pinocchio as pin
 from ..model import BodyModel
 from ..model.chains import chains
 from ..pose import LiveKinematics, known_links
-from ..viewer import visible
+from ..report.viewer import visible
 from .state import LivePose, Stage
 
 HANDS = ("left_hand", "right_hand")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import secrets
 from collections import deque
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +16,7 @@ import pinocchio as pin
 from ..model import POINTS, BodyModel
 from ..model.chains import chains
 from ..pose import known_points
-from ..viewer import DARK, LIGHT, as_base64, backdrop, filled, scene, trail_colour, view
+from ..report.viewer import DARK, LIGHT, backdrop, filled, scene, trail_colour, view
 from .figure import HANDS, Figure
 from .server import Server
 from .state import LivePose, Stage, Status
@@ -108,12 +107,12 @@ def _html(model: BodyModel, figure: Figure, title: str, identity: str) -> str:
     data = {
         "id": identity,
         "links": list(figure.links),
-        "commands": as_base64(scene(figure.visuals, figure.links)),
-        "backdrops": {"light": as_base64(backdrop(LIGHT)), "dark": as_base64(backdrop(DARK))},
+        "scene": scene(figure.visuals, figure.links),
+        "backdrops": {"light": backdrop(LIGHT), "dark": backdrop(DARK)},
         "view": view(figure.visuals, figure.links, motion, [_reach(model)]),
         "trails": [{"name": hand, "colour": trail_colour(hand, figure.visuals)} for hand in HANDS],
     }
-    return filled(Path(__file__).with_name("live_page.html"), data, title or "wepose live")
+    return filled("live/templates/live.html.j2", data, title or "wepose live")
 
 
 def _reach(model: BodyModel) -> np.ndarray:

@@ -10,7 +10,7 @@ _WHERE = {
     "calibration_report": "calibration",
     "track_report": "track",
     "unsaid": "calibration",
-    "write_calibration_page": "pages",
+    "write_calibration_page": "calibration",
     "write_thinned_pages": "pages",
     "write_track_pages": "pages",
 }

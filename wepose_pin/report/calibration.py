@@ -1,10 +1,10 @@
-"""The report of a calibration: what was found, how well it is known, and what of the motion told it."""
+"""The report of a calibration: what was estimated, how well it is known, and what of the motion showed it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,15 +16,13 @@ from ..calibration.lengths import GAUGE_STD
 from ..calibration.protocols import Protocol, load_protocol
 from ..calibration.verdict import EFFECTIVE, Finding, Verdict
 from ..calibration.weighing import TOUCHED
-from ..errors import WeposeError
+from ..errors import WeposeError, reason
 from ..filters import BEST
-from ..page import Banner, Block, Bullets, Facts, Frame, Heading, Sections, Table, as_html, capital, reason
 from ..pose import Pose
 from ..recording import Recording, axes_from_mount, mount_from_axes
 from ..subject import Subject, mount_rows
 from ..tracking import TrackedPose, track
-from ..viewer import pose_html
-from .figures import (
+from .calibration_figures import (
     Hands,
     Length,
     Sensor,
@@ -36,18 +34,37 @@ from .figures import (
     sensors_picture,
     smoothed,
 )
-from .words import degrees, intervals, plain, plus_minus, signed, versions
+from .page import Page, PageWriter, Table
+from .viewer import pose_html
+from .words import capital, degrees, intervals, plain, plus_minus, signed, versions
 
+TEMPLATE = "report/templates/calibration.html.j2"
 SIDES, PARTS = ("left", "right"), ("upper_arm", "forearm", "hand")
 FRAMES_A_SECOND = 20.0  # of the 3D view
-VERDICTS = {
-    "pass": "**Pass:** the calibration is good to use.",
-    "poor": "**Poor:** usable, with larger errors than usual.",
-    "fail": "**Fail:** do not use this calibration.",
-}
-UNSEEN = 0.97  # of the standard deviation that the start pose has anyway: the motion told nothing
+UNSEEN = 0.97  # of the standard deviation that the start pose has anyway: the motion showed nothing
 # Zones of the joined hands, seen from the middle of the shoulders [m], and of their distance over the arm's length.
 LOW, ASIDE, BENT, STRETCHED = -0.25, 0.10, 0.60, 0.80
+
+
+def write_calibration_page(
+    folder: Path,
+    calibration: Calibration,
+    recording: Recording,
+    *,
+    method: str,
+    protocol: Protocol,
+    verdict: Verdict,
+) -> list[str]:
+    """Write ``report.html`` beside a calibration's result; what cannot be made, as of `write_track_pages`."""
+    writer = PageWriter(folder, ["report.html"])
+    writer.write(
+        "report.html",
+        lambda failures: calibration_report(
+            calibration, recording, method=method, protocol=protocol, verdict=verdict, failures=failures
+        ),
+    )
+    writer.add_warnings("calibration.json")
+    return writer.warnings
 
 
 def calibration_report(
@@ -79,31 +96,19 @@ def calibration_report(
             trouble = f"Without the tracked motion, hence without hand positions and 3D view: {error}"
             if not isinstance(error, WeposeError) and failures is not None:
                 failures.append(f"the motion cannot be tracked: {reason(error)}")
-    sections = Sections(failures)
-    blocks: list[Block] = [Heading(f"Calibration of {recording.name or 'a recording'}", 1)]
-    if verdict is not None:
-        grade, reasons = verdict if isinstance(verdict, tuple) else (verdict.grade, verdict.in_words())
-        blocks.append(Banner(grade, VERDICTS.get(grade, grade), [capital(reason) for reason in reasons]))
-    warnings = calibration.warnings
-    if isinstance(verdict, Verdict):
-        warnings = tuple(unsaid(warnings, verdict))
-    notes = [capital(warning) for warning in (*warnings, *([trouble] if trouble else []))]
-    if notes:
-        blocks.append(Banner("note", "What to know" if len(notes) > 1 else "One thing to know", notes))
-    blocks += [
-        *sections("In short", lambda: [Bullets(_in_short(calibration, contact))]),
-        "± is one standard deviation throughout: two times out of three the truth lies within.",
-        *sections("Lengths", lambda: _lengths(calibration, contact)),
-        *sections("Sensors", lambda: _sensors(calibration, recording)),
-        *sections(f"{capital(contact.gap)} over time", lambda: _gap(calibration, contact)),
-        *sections("Where the motion was informative", lambda: _hands(calibration, contact, pose) if pose else []),
-        *sections("The start pose", lambda: _posture(calibration)),
-        *sections("The elbows as hinges", lambda: _elbows(calibration)),
-        *sections("The motion in 3D", lambda: _view(calibration, recording, pose) if pose else []),
-        *sections("Behind the verdict", lambda: _findings(verdict, contact) if isinstance(verdict, Verdict) else []),
-        *sections("What was run", lambda: _run(calibration, recording, contact, method, gauge_std)),
-    ]
-    return as_html(blocks, f"Calibration of {recording.name}" if recording.name else "Calibration")
+    page = Page(TEMPLATE, f"Calibration of {recording.name or 'a recording'}", failures)
+    page.add("first", lambda: _first(calibration, verdict, trouble), name="The verdict")
+    page.add("short", lambda: _short(calibration, contact), name="In short")
+    page.add("lengths", lambda: _lengths(calibration, contact), "Lengths")
+    page.add("sensors", lambda: _sensors(calibration, recording), "Sensors")
+    page.add("gap", lambda: _gap(calibration, contact), f"{capital(contact.gap)} over time")
+    page.add("hands", lambda: _hands(calibration, contact, pose), "Where the motion was informative")
+    page.add("posture", lambda: _posture(calibration), "The start pose")
+    page.add("elbows", lambda: _elbows(calibration), "The elbows as hinges")
+    page.add("view", lambda: _view(calibration, recording, pose), "The motion in 3D")
+    page.add("findings", lambda: _findings(verdict, contact), "Behind the verdict")
+    page.add("run", lambda: _run(calibration, recording, contact, method, gauge_std), "What was run")
+    return page.html(f"Calibration of {recording.name}" if recording.name else "Calibration")
 
 
 def unsaid(warnings: Sequence[str], verdict: Verdict) -> list[str]:
@@ -132,33 +137,41 @@ def _contact(protocol: Protocol) -> _Contact:
     return _Contact(protocol.name, hands, noun, gap, protocol.chain)
 
 
-# The sections ---------------------------------------------------------------------------------------------------------
+# The sections: the values that their macros of the template take --------------------------------------------------------
 
 
-def _in_short(calibration: Calibration, contact: _Contact) -> list[str]:
+def _first(
+    calibration: Calibration, verdict: Verdict | tuple[str, Sequence[str]] | None, trouble: str
+) -> dict[str, Any]:
+    warnings: Sequence[str] = calibration.warnings
+    grade, reasons = verdict if isinstance(verdict, tuple) else ("", ())
+    if isinstance(verdict, Verdict):
+        grade, reasons, warnings = verdict.grade, verdict.in_words(), unsaid(warnings, verdict)
+    return {
+        "grade": grade,
+        "reasons": [("warning", capital(each)) for each in reasons],
+        "notes": [("info", capital(each)) for each in (*warnings, *([trouble] if trouble else []))],
+    }
+
+
+def _short(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
     subject = calibration.subject
     scaling = [name for name in calibration.gauge if name in contact.chain or name not in subject.lengths]
-    scale = f"from the tape ({', '.join(map(plain, scaling))})" if scaling else "the average person's, nothing taped"
-    said = []
-    if contact.chain:
-        said.append(f"Scale {scale}: all lengths together may be off by {100 * calibration.scale_std:.1f} %.")
-    if np.isfinite(calibration.rms_gap):
-        said.append(
-            f"{capital(contact.gap)}: **{1e3 * calibration.rms_gap:.0f} mm** are left (root mean square), of "
-            f"{1e3 * calibration.prior_rms_gap:.0f} mm with the average person's lengths."
-        )
     tilts = {name: _mount_stds(subject, name) for name in subject.mounts}
     known = {name: std for name, std in tilts.items() if np.isfinite(std).all()}
-    if known:
-        tilt, heading = (max(known, key=lambda name, k=k: known[name][k]) for k in (0, 1))  # type: ignore[misc]
-        said.append(
-            f"Mounts: tilt known to ± {known[tilt][0]:.1f}° or better ({plain(tilt)}), heading to "
-            f"± {known[heading][1]:.1f}° or better ({plain(heading)})."
-        )
-    return said
+    worst = [max(known, key=lambda name, k=k: known[name][k]) for k in (0, 1)] if known else []  # type: ignore[misc]
+    return {
+        "chain": bool(contact.chain),
+        "scaling": [plain(name) for name in scaling],
+        "scale_percent": 100 * calibration.scale_std,
+        "gap": contact.gap if np.isfinite(calibration.rms_gap) else None,
+        "gap_mm": 1e3 * calibration.rms_gap,
+        "prior_gap_mm": 1e3 * calibration.prior_rms_gap,
+        "mounts": [(known[name][k], plain(name)) for k, name in enumerate(worst)],
+    }
 
 
-def _lengths(calibration: Calibration, contact: _Contact) -> list[Block]:
+def _lengths(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
     subject, prior = calibration.subject, calibration.prior
     rows, lines = [], []
     for parts in _ROWS:
@@ -178,21 +191,17 @@ def _lengths(calibration: Calibration, contact: _Contact) -> list[Block]:
                 f"{100 * float(np.sum(learned)):.0f} %" if learned is not None else "",
             ]
         )
-    said = []
-    if any(f"{side}_hand" in contact.chain for side in SIDES):
-        said.append(
-            "A hand without a sensor moves with its forearm: only their sum is seen, the average ratio splits it."
-        )
-    outside = [plain(name) for name in subject.lengths if name not in contact.chain and name not in calibration.gauge]
-    if outside:
-        said.append(f"Not in the chain, known by the average person's proportions alone: {', '.join(outside)}.")
-    if calibration.learned:
-        said.append("Learned from the motion: its share of what is now known; the rest is average and tape.")
-    header = ["length", "found", "average person", "taped", "learned from the motion"]
-    return [Heading("Lengths"), lengths_picture(rows), *([" ".join(said)] if said else []), Table(header, lines)]
+    header = ["length", "estimated", "population prior", "measured", "learned from the motion"]
+    return {
+        "hands": any(f"{side}_hand" in contact.chain for side in SIDES),
+        "outside": [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.gauge],
+        "learned": bool(calibration.learned),
+        "picture": lengths_picture(rows),
+        "lengths": Table(header, lines),
+    }
 
 
-def _sensors(calibration: Calibration, recording: Recording) -> list[Block]:
+def _sensors(calibration: Calibration, recording: Recording) -> dict[str, Any] | None:
     subject = calibration.subject
     rows, lines = [], []
     for name, quat_LS in subject.mounts.items():
@@ -215,53 +224,50 @@ def _sensors(calibration: Calibration, recording: Recording) -> list[Block]:
             ]
         )
     if not rows:
-        return []
+        return None
     header = ["sensor", "nearest axes in the start pose", "stated before", "tilt ±", "heading ±", "heading drift"]
     picture = sensors_picture(rows, float(np.degrees(START_POSE_STD)), float(np.degrees(DRIFT_STD)) * 60.0)
-    text = (
-        "How each sensor sits on its segment: which of its axes point up and forward, and by how much it is turned "
-        "from there; the exact rotations are in `subject.toml`. Without a magnetometer a heading drifts; what drifted "
-        "during the calibration was found and taken out."
-    )
-    return [Heading("Sensors"), text, picture, Table(header, lines)]
+    return {"picture": picture, "sensors": Table(header, lines)}
 
 
-def _gap(calibration: Calibration, contact: _Contact) -> list[Block]:
-    order = _looked(calibration)
+def _gap(calibration: Calibration, contact: _Contact) -> dict[str, Any] | None:
+    order = _observed(calibration)
     if len(order) < 2:
-        return []
+        return None
     time = calibration.time[order]
-    told = {
+    learned = {
         label: smoothed(time, np.mean([calibration.learned[name] for name in names], axis=0)[order])
-        for label, names in _told(calibration, contact).items()
+        for label, names in _learned(calibration, contact).items()
     }
-    blocks: list[Block] = [Heading(f"{capital(contact.gap)} over time")]
+    step = float(np.median(np.diff(time)))
+    half = {}
+    for label, values in learned.items():
+        share = np.cumsum(np.sort(values)[::-1]) / max(float(np.sum(values)), 1e-12)
+        half[label] = (int(np.searchsorted(share, 0.5)) + 1) * step
     gap, prior_gap = calibration.gap[order], calibration.prior_gap[order]
-    blocks.append(gap_picture(time, gap, prior_gap, _apart(time, calibration.kept[order]), told, contact.gap))
-    said = []
-    for label, values in told.items():
-        kept = np.argsort(values)[::-1]
-        share = np.cumsum(values[kept]) / max(float(np.sum(values)), 1e-12)
-        step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-        half = (int(np.searchsorted(share, 0.5)) + 1) * step
-        said.append(f"{half:.0f} s of {len(time) * step:.0f} s told half of what the motion told about {label}")
-    rms = f"{1e3 * calibration.prior_rms_gap:.1f} mm before, {1e3 * calibration.rms_gap:.1f} mm after"
-    said.insert(0, f"{contact.gap}, root mean square where they touched: {rms}")
-    said.append(
-        f"the motion counts as {calibration.independent:.0f} independent measurements: neighbours tell the same"
-    )
-    return [*blocks, Bullets([f"{capital(text)}." for text in said])]
+    apart = _apart(time, calibration.kept[order])
+    return {
+        "picture": gap_picture(time, gap, prior_gap, apart, learned, contact.gap),
+        "gap": contact.gap,
+        "before_mm": 1e3 * calibration.prior_rms_gap,
+        "after_mm": 1e3 * calibration.rms_gap,
+        "half": half,
+        "seconds": len(time) * step,
+        "samples": calibration.independent,
+    }
 
 
-def _hands(calibration: Calibration, contact: _Contact, pose: Pose) -> list[Block]:
+def _hands(calibration: Calibration, contact: _Contact, pose: Pose | None) -> dict[str, Any] | None:
     """Where the motion was informative."""
-    told = [calibration.learned[name] for names in _told(calibration, contact).values() for name in names]
-    order = _looked(calibration)
+    if pose is None:
+        return None
+    told = [calibration.learned[name] for names in _learned(calibration, contact).values() for name in names]
+    order = _observed(calibration)
     shoulders = [name.replace("hand", "shoulder") for name in contact.hands]
     if not (told and len(order) and contact.hands) or not {*contact.hands, *shoulders} <= set(pose.points):
-        return []
+        return None
     if "torso" not in pose.quat_WL:
-        return []
+        return None
     lengths = calibration.subject.lengths
     at = np.clip(np.searchsorted(pose.time, calibration.time[order] - 1e-6), 0, len(pose.time) - 1)
     reach = np.mean([pose.points[name][at] for name in contact.hands], axis=0)
@@ -270,7 +276,7 @@ def _hands(calibration: Calibration, contact: _Contact, pose: Pose) -> list[Bloc
     share = np.mean(told, axis=0)[order]
     touched = (calibration.kept[order] >= TOUCHED) & np.isfinite(reach).all(axis=1)
     if not touched.any():
-        return []
+        return None
     arm = np.mean([[lengths[f"{name[:-5]}_{part}"] for part in PARTS] for name in contact.hands]) * len(PARTS)
     far = np.linalg.norm(reach, axis=1) / arm
     sides = [0.5 if name.startswith("left") else -0.5 for name in contact.hands]
@@ -297,48 +303,45 @@ def _hands(calibration: Calibration, contact: _Contact, pose: Pose) -> list[Bloc
             rare.append(name.split(":")[0])
     low, high = np.percentile(reach[touched], [2.0, 98.0], axis=0) * 100
     near, away = np.percentile(far[touched], [2.0, 98.0]) * 100
-    plural = "s" if len(shoulders) > 1 else ""
-    text = (
-        f"{capital(contact.noun)} went from {_side(low[1], 'right', 'left')} to {_side(high[1], 'right', 'left')}, "
-        f"from {_side(low[2], 'below', 'above')} to {_side(high[2], 'below', 'above')} the shoulder{plural}, "
-        f"{near:.0f} to {away:.0f} % of the arm's length away."
-    )
-    if rare and plural:
-        text += f" Hardly visited: {', '.join(rare)}; a repeat that goes there too tells more."
-    header = [f"{contact.noun} {'were' if plural else 'was'}", "of the time", "of what was learned", "per second"]
-    return [Heading("Where the motion was informative"), text, hands_picture(hands, contact.noun), Table(header, lines)]
+    both = len(shoulders) > 1
+    header = [f"{contact.noun} {'were' if both else 'was'}", "of the time", "of what was learned", "per second"]
+    return {
+        "noun": contact.noun,
+        "both": both,
+        "across": [_side(end[1], "right", "left") for end in (low, high)],
+        "up": [_side(end[2], "below", "above") for end in (low, high)],
+        "stretch": [near, away],
+        "rare": rare if both else [],
+        "picture": hands_picture(hands, contact.noun),
+        "zones": Table(header, lines),
+    }
 
 
-def _posture(calibration: Calibration) -> list[Block]:
+def _posture(calibration: Calibration) -> dict[str, Any] | None:
     tilt = {name: np.asarray(t, dtype=float) for name, t in calibration.start_tilt.items()}
     tilt = {name: t for name, t in tilt.items() if np.isfinite(t).all()}
     if not tilt:
-        return []
+        return None
     lines, seen = [], {}
     for name, (x, y) in tilt.items():
         std = np.degrees([calibration.subject.std(row) for row in mount_rows(name)[:2]])
         seen[name] = (~(std > UNSEEN * np.degrees(START_POSE_STD))).tolist()
         of = ((1, x, std[0], seen[name][0]), (0, y, std[1], seen[name][1]))
         lines.append([plain(name), *(_tilt(name, *about) for about in of)])
-    said = []
+    elbows = {}
     for side in SIDES:
         upper, fore = (tilt.get(f"{side}_{part}") for part in ("upper_arm", "forearm"))
         if upper is not None and fore is not None:
             down = [Rotation.from_rotvec([*t, 0.0]).apply([0.0, 0.0, -1.0]) for t in (upper, fore)]
-            bend = np.degrees(np.arccos(np.clip(down[0] @ down[1], -1.0, 1.0)))
-            said.append(f"{side} elbow bent by {bend:.1f}°")
-    text = "Nobody stands exactly upright with hanging arms. How far each segment was off was found with the rest"
-    text += f": {', '.join(said)}." if said else "."
-    header = ["segment", "sideways", "forwards or backwards"]
-    return [
-        Heading("The start pose"),
-        text,
-        posture_picture(tilt, seen, calibration.subject.lengths),
-        Table(header, lines),
-    ]
+            elbows[side] = float(np.degrees(np.arccos(np.clip(down[0] @ down[1], -1.0, 1.0))))
+    return {
+        "elbows": elbows,
+        "picture": posture_picture(tilt, seen, calibration.subject.lengths),
+        "tilts": Table(["segment", "sideways", "forwards or backwards"], lines),
+    }
 
 
-def _elbows(calibration: Calibration) -> list[Block]:
+def _elbows(calibration: Calibration) -> dict[str, Any] | None:
     lines = []
     for side, axis in calibration.hinge.items():
         x, y, z = np.asarray(axis, dtype=float)
@@ -350,24 +353,17 @@ def _elbows(calibration: Calibration) -> list[Block]:
             continue
         ends = f"{abs(forward):.1f}° {'forwards' if forward > 0 else 'backwards'}", f"{abs(up):.1f}° "
         lines.append([side, ends[0], ends[1] + ("up" if up > 0 else "down"), degrees(softness)])
-    if not lines:
-        return []
-    text = (
-        "An elbow is nearly a hinge. With a hanging upper arm its axis points sideways; the outer end of the axis is "
-        "turned as stated. Softness: how far the forearm leaves the plane of that hinge, root mean square; over 5° "
-        "points to a sensor that slides or to soft tissue."
-    )
     header = ["elbow", "axis turned", "axis raised", "softness"]
-    return [Heading("The elbows as hinges"), text, Table(header, lines)]
+    return {"elbows": Table(header, lines)} if lines else None
 
 
-def _view(calibration: Calibration, recording: Recording, pose: TrackedPose) -> list[Block]:
-    if pose.model is None or not len(calibration.time):
-        return []
+def _view(calibration: Calibration, recording: Recording, pose: TrackedPose | None) -> dict[str, Any] | None:
+    if pose is None or pose.model is None or not len(calibration.time):
+        return None
     begin, end = float(calibration.time.min()), float(calibration.time.max())
     of = slice(*np.searchsorted(pose.time, [begin - 1e-6, end + 1e-6]))
     if of.stop - of.start < 2:
-        return []
+        return None
     cut = Pose(
         pose.time[of],
         {name: quat[of] for name, quat in pose.quat_WL.items()},
@@ -378,16 +374,12 @@ def _view(calibration: Calibration, recording: Recording, pose: TrackedPose) -> 
         for name, spans in recording.phases.items()
     }
     phases: Mapping[str, Sequence[tuple[float, float]]] = {name: spans for name, spans in shown.items() if spans}
-    inside = pose_html(pose.model, cut, phases=phases, title=recording.name, fps=FRAMES_A_SECOND)
-    caption = (
-        "The calibration motion as tracked with the calibrated subject. Drag to turn, scroll to zoom, space to pause."
-    )
-    return [Heading("The motion in 3D"), Frame("The motion in 3D", caption, inside)]
+    return {"page": pose_html(pose.model, cut, phases=phases, title=recording.name, fps=FRAMES_A_SECOND)}
 
 
 def _run(
     calibration: Calibration, recording: Recording, contact: _Contact, method: str, gauge_std: float
-) -> list[Block]:
+) -> dict[str, Any]:
     gauge = [f"{plain(name)} {1e3 * v:.0f} ± {1e3 * gauge_std:.0f} mm" for name, v in calibration.gauge.items()]
     raw = sorted(
         {"ready orientations" if s.ready else "gyroscope and accelerometer" for s in recording.sensors.values()}
@@ -399,19 +391,21 @@ def _run(
         *((f"phase {name}", intervals(spans)) for name, spans in recording.phases.items()),
         ("protocol", f"{contact.protocol}, {len(calibration.time)} moments of it"),
         ("filter", method),
-        ("gauge", ", ".join(gauge) or "none"),
-        ("average person", calibration.prior.note or calibration.prior.name),
+        ("measured lengths", ", ".join(gauge) or "none"),
+        ("population prior", calibration.prior.note or calibration.prior.name),
         ("strapping", recording.strapping.replace("_", " ")),
         *(("while reading", note) for note in recording.notes),
         ("made with", versions()),
     ]
-    return [Heading("What was run"), Facts(rows)]
+    return {"rows": rows}
 
 
-def _findings(verdict: Verdict, contact: _Contact) -> list[Block]:
+def _findings(verdict: Verdict | tuple[str, Sequence[str]] | None, contact: _Contact) -> dict[str, Any] | None:
+    if not isinstance(verdict, Verdict):
+        return None
     lines = [
         [
-            _looked_at(found.name, contact),
+            _checked(found.name, contact),
             _shown(found.value, found.unit, ".0f" if found.unit == EFFECTIVE else ".1f"),
             *(f"{_bound(found)} {_shown(limit, found.unit, '.3g')}" for limit in (found.passes, found.poor)),
             found.grade,
@@ -419,14 +413,9 @@ def _findings(verdict: Verdict, contact: _Contact) -> list[Block]:
         for found in verdict.findings
         if np.isfinite(found.value)
     ]
-    text = (
-        f"Of {verdict.unknowns} unknown directions of lengths and mounts the motion showed {verdict.rank}, and told "
-        f"{verdict.determined} of them better than they were known before."
-    )
-    if not lines:
-        return []
-    header = ["looked at", "found", "passes", "poor", "verdict"]
-    return [Heading("Behind the verdict"), text, Table(header, lines)]
+    header = ["checked", "value", "passes", "poor", "verdict"]
+    unknowns = {"unknowns": verdict.unknowns, "rank": verdict.rank, "determined": verdict.determined}
+    return {**unknowns, "findings": Table(header, lines)} if lines else None
 
 
 # Words and small sums -------------------------------------------------------------------------------------------------
@@ -435,8 +424,8 @@ _SIDED = [((f"{s}_upper_arm",), (f"{s}_forearm",), (f"{s}_hand",), (f"{s}_forear
 _ROWS: list[tuple[str, ...]] = [("shoulder_width",), *_SIDED[0], *_SIDED[1], ("trunk",)]
 
 
-def _told(calibration: Calibration, contact: _Contact) -> dict[str, list[str]]:
-    """What the motion can tell: label → names in `Calibration.learned`."""
+def _learned(calibration: Calibration, contact: _Contact) -> dict[str, list[str]]:
+    """What the motion can show: label → names in `Calibration.learned`."""
     learned = calibration.learned
     arms = [f"{s}_upper_arm" for s in SIDES] + [f"{s}_forearm + {s}_hand" for s in SIDES]
     groups = {
@@ -446,8 +435,8 @@ def _told(calibration: Calibration, contact: _Contact) -> dict[str, list[str]]:
     return {label: names for label, names in groups.items() if names}
 
 
-def _looked(calibration: Calibration) -> np.ndarray:
-    """Indices, in the order of time, of the looks at which a gap was to close."""
+def _observed(calibration: Calibration) -> np.ndarray:
+    """Indices, in the order of time, of the observations at which a gap was to close."""
     order = np.argsort(calibration.time, kind="stable")
     return order[np.isfinite(calibration.gap[order])]
 
@@ -479,7 +468,7 @@ def _sign(axis: str) -> str:
     return axis.replace("-", "−")
 
 
-def _looked_at(name: str, contact: _Contact) -> str:
+def _checked(name: str, contact: _Contact) -> str:
     """What a finding is about."""
     what, _, of = name.partition(".")
     if what == "heading":

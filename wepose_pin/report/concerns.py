@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..page import capital
 from ..recording.limits import STANDARD_GRAVITY
 from ..tracking import TrackedPose
 from .measures import BENT, Budget, Elbow, Hand, Signal, between, from_start, largest, longest
-from .words import listed, plain
+from .words import capital, listed, plain
 
 GRAVITY_OFF = 0.02
 BIAS_LARGE = np.deg2rad(1.5)  # [rad/s], three times what is usual from the factory

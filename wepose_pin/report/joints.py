@@ -2,53 +2,43 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ..angles import JointAngles, joint_angles, summary
 from ..errors import BadData
-from ..page import Block, Heading, Table
 from ..tracking import TrackedPose
 from .measures import stated_mounts, usual
-from .track_figures import Angle, angles_picture
+from .page import Table
+from .track_figures import over_time_picture
 from .words import plain, whole
 
 FULL_TURN = 2.0 * np.pi - 1e-9
 
 
-def joint_angle_section(pose: TrackedPose) -> list[Block]:
-    """Heading, figures and table; nothing where no joint has both of its segments."""
+def joint_angles_section(pose: TrackedPose) -> dict[str, Any] | None:
+    """Charts and table; None where no joint has both of its segments."""
     try:
         angles = joint_angles(pose)
     except BadData:  # no joint has both of its segments
-        return []
-    text = (
-        "After the recommendations of the International Society of Biomechanics (Wu et al. 2005), left and right with "
-        "the same signs. A name says which way is positive; elevation alone is negative where the arm is raised, as "
-        "the Society has it, and pronation is 90° with the palms at the thighs."
-    )
-    if stated_mounts(pose):
-        text += (
-            " What the arms did in the start pose counts as the N-pose: who stood with elbows bent by 10° reads 10° "
-            "too little."
-        )
-    blocks: list[Block] = [Heading("Joint angles"), text]
+        return None
     groups: dict[str, list[str]] = {}
     for joint in angles.joints:
         groups.setdefault(joint.removeprefix("left_").removeprefix("right_"), []).append(joint)
+    pictures = []
     for group, members in groups.items():
-        names = angles[members[0]].names
-        panels = {}
-        for k, name in enumerate(names):
-            panels[f"{plain(name)} [deg]"] = [
-                Angle(joint.removesuffix(f"_{group}"), np.degrees(_shown(angles[joint], k))) for joint in members
-            ]
-        of = [angles[joint] for joint in members]
-        broken = ""
-        if any((joint.near_lock | joint.gap).any() for joint in of):
-            broken = " Lines break where a sensor gave nothing, and near gimbal lock, where the angle says little."
-        caption = f"The {group if len(members) == 1 else group + 's'} over time.{broken}"
-        blocks.append(angles_picture(angles.time, panels, f"angles-{group}", caption))
-    lines = []
+        panels = {
+            f"{plain(name)} [°]": {
+                joint.removesuffix(f"_{group}"): np.degrees(_shown(angles[joint], k)) for joint in members
+            }
+            for k, name in enumerate(angles[members[0]].names)
+        }
+        caption = f"The {group if len(members) == 1 else group + 's'} over time."
+        if any((angles[joint].near_lock | angles[joint].gap).any() for joint in members):
+            caption += " Lines break where a sensor gave nothing, and near gimbal lock, where the angle says little."
+        pictures.append(over_time_picture(angles.time, panels, f"angles-{group}", caption))
+    rows = []
     for joint, found in summary(angles).items():
         stds = angles[joint].std
         for k, name in enumerate(angles[joint].names):
@@ -58,7 +48,7 @@ def joint_angle_section(pose: TrackedPose) -> list[Block]:
                 ends = ["", "", ""]  # every sample is in a gap or near the lock, as of an arm that hangs
             elif found.range[k] >= FULL_TURN and found.near_lock:
                 ends = ["", "", "all round"]
-            lines.append(
+            rows.append(
                 [
                     f"{plain(joint)}, {plain(name)}",
                     *ends,
@@ -68,11 +58,7 @@ def joint_angle_section(pose: TrackedPose) -> list[Block]:
                 ]
             )
     header = ["angle", "least", "most", "range", "fastest", "usual ±", "near gimbal lock"]
-    after = (
-        "Near gimbal lock (10°) the first and the third angle of a joint trade places and are left out; the "
-        "quaternions in pose.parquet have no such place."
-    )
-    return [*blocks, Table(header, lines), after]
+    return {"stated": stated_mounts(pose), "pictures": pictures, "ranges": Table(header, rows)}
 
 
 def _shown(joint: JointAngles, k: int) -> np.ndarray:

@@ -1,21 +1,17 @@
-"""The pages beside a result that is written already: of a tracked recording, of a calibration."""
+"""The pages beside the result of a tracked recording that is written already."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
 
-from ..calibration import Calibration
-from ..calibration.protocols import Protocol
-from ..calibration.verdict import Verdict
-from ..page import reason
-from ..recording import Intervals, Recording
+from ..errors import reason
+from ..recording import Intervals
 from ..tracking import TrackedPose
-from ..viewer import pose_html
-from ..writers.pages import PageWriter
-from .calibration import calibration_report
+from .page import PageWriter
 from .thinned import Thinner, Whole
 from .track import track_report
+from .viewer import pose_html
 
 PAGES = ("view.html", "report.html")
 
@@ -75,24 +71,3 @@ def write_thinned_pages(
         writer.add_warnings("summary.json")
         return writer.warnings
     return write_track_pages(folder, pose, report=report, whole=whole, fps=fps)
-
-
-def write_calibration_page(
-    folder: Path,
-    calibration: Calibration,
-    recording: Recording,
-    *,
-    method: str,
-    protocol: Protocol,
-    verdict: Verdict,
-) -> list[str]:
-    """Write ``report.html`` beside a calibration's result; what cannot be made, as of `write_track_pages`."""
-    writer = PageWriter(folder, ["report.html"])
-    writer.write(
-        "report.html",
-        lambda failures: calibration_report(
-            calibration, recording, method=method, protocol=protocol, verdict=verdict, failures=failures
-        ),
-    )
-    writer.add_warnings("calibration.json")
-    return writer.warnings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from collections.abc import Sequence
 from importlib.metadata import version
 
@@ -10,6 +11,15 @@ import numpy as np
 
 from .. import __version__
 from ..recording import span_text
+
+
+def capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def slug(text: str) -> str:
+    """A name as a file's or an anchor's: "upper body, realistic" → "upper-body-realistic"."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower().replace("'", "")).strip("-") or "experiment"
 
 
 def plain(name: str) -> str:

@@ -8,8 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any, NamedTuple
 
-from ..errors import WeposeError
-from ..page import reason
+from ..errors import WeposeError, reason
 
 
 class Result(NamedTuple):

@@ -1,138 +1,3 @@
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<link rel="icon" href="data:,">
-<title>@@window_title@@</title>
-<style>
-  :root { --ink: #1d2935; --soft: #566477; --line: #d5dbe3; --accent: #24618f; --panel: #fff; --back: #e3e8ee;
-          --chip: rgba(255, 255, 255, .88); --alarm: #a3230f; --alarm-back: #fbe9e5; --button: #f3f6f9; }
-  @media screen and (prefers-color-scheme: dark) {
-    :root { --ink: #e6ebf1; --soft: #9fadbd; --line: #35414e; --accent: #7fbbe6; --panel: #171d24; --back: #1b222a;
-            --chip: rgba(23, 29, 36, .88); --alarm: #ffab98; --alarm-back: #47231d; --button: #232c36;
-            color-scheme: dark; }
-  }
-  * { box-sizing: border-box; }
-  html, body { margin: 0; height: 100%; }
-  body { display: flex; overflow: hidden; color: var(--ink); background: var(--back);
-         font: 13px/1.4 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-  .dg { display: none !important; }                    /* meshcat's own controls */
-  [hidden] { display: none !important; }
-  main { flex: 1; min-width: 0; min-height: 0; position: relative; display: flex; flex-direction: column; }
-  #stage { flex: 1; min-height: 0; position: relative; overflow: hidden; cursor: grab; }
-  #stage canvas { display: block; }
-  #printed { display: none; }
-  #head { position: absolute; left: 22px; top: 16px; right: 22px; pointer-events: none; }
-  h1 { margin: 0 0 4px; font-size: 19px; font-weight: 600; letter-spacing: -.01em; }
-  #legend { display: flex; flex-wrap: wrap; gap: 2px 16px; color: var(--soft); }
-  #legend i { display: inline-block; width: 18px; height: 4px; border-radius: 2px; margin-right: 7px; vertical-align: 3px; }
-  #legend i.lost { height: 10px; vertical-align: -1px; background: #8a929b; opacity: .5; }
-
-  #say { flex: none; margin: 0; padding: 16px 26px 22px; text-align: center; background: var(--panel);
-         border-top: 1px solid var(--line); }
-  #say strong { display: block; font-size: clamp(28px, 6vw, 60px); line-height: 1.15; letter-spacing: -.02em; }
-  #say span { display: block; max-width: 34em; margin: 6px auto 0; font-size: clamp(16px, 2vw, 23px); line-height: 1.35; }
-  #say.moved { border: 4px dashed var(--alarm); }
-  #say.moved strong { color: var(--alarm); }
-  #say.small { position: absolute; left: 50%; bottom: 18px; transform: translateX(-50%); width: max-content; max-width: 90%;
-               padding: 5px 14px 6px; border: 1px solid var(--line); border-radius: 9px; background: var(--chip);
-               pointer-events: none; }
-  #say.small strong { display: inline; font-size: 14px; letter-spacing: 0; }
-  #say.small span { display: inline; margin: 0 0 0 8px; font-size: 14px; }
-  #say.small #progress { display: none; }
-  #progress { height: 16px; max-width: 640px; margin: 14px auto 0; border: 1px solid var(--ink); border-radius: 8px; overflow: hidden; }
-  #progress i { display: block; height: 100%; width: 0; background: var(--accent); }
-  #offline { position: absolute; left: 0; right: 0; top: 0; padding: 9px; text-align: center; font-size: 15px; font-weight: 600;
-             color: var(--alarm); background: var(--alarm-back); border-bottom: 2px solid var(--alarm); z-index: 3; }
-
-  #side { width: 548px; overflow: auto; padding: 16px 18px; background: var(--panel); border-left: 1px solid var(--line); }
-  h2 { margin: 0 0 6px; font-size: 14px; font-weight: 600; }
-  table { width: 100%; border-collapse: collapse; font-size: 12px; font-variant-numeric: tabular-nums; }
-  th, td { padding: 5px 4px 5px 6px; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
-  th { color: var(--soft); font-weight: 500; vertical-align: bottom; line-height: 1.25; }
-  th small { font-size: 11px; font-weight: 400; }
-  th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left; }
-  td svg { width: 10px; height: 10px; margin-right: 5px; fill: currentColor; vertical-align: -1px; }
-  tr.lost td { color: var(--alarm); background: var(--alarm-back); }
-  tr.lost td:nth-child(2) { font-weight: 700; }
-  dl { display: grid; grid-template-columns: auto 1fr; gap: 4px 14px; margin: 16px 0; font-variant-numeric: tabular-nums; }
-  dt { color: var(--soft); }
-  dd { margin: 0; }
-  dd small { font-size: inherit; color: var(--soft); }
-  #recording b { display: inline-block; width: 10px; height: 10px; margin-right: 6px; border-radius: 5px; background: #d0341c;
-                 vertical-align: -1px; }
-  #problems { color: var(--alarm); }
-  #buttons { display: flex; flex-wrap: wrap; gap: 8px; }
-  button { font: inherit; color: inherit; background: var(--panel); border: 1px solid var(--line); border-radius: 6px;
-           height: 30px; padding: 0 11px; cursor: pointer; white-space: nowrap; }
-  button:hover { background: var(--button); }
-  button:focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
-  button[aria-pressed=false] { color: var(--soft); text-decoration: line-through; }
-  kbd { font: inherit; padding: 0 5px; border: 1px solid var(--line); border-bottom-width: 2px; border-radius: 4px; }
-  #answer { margin: 10px 0 0; min-height: 1.4em; color: var(--soft); }
-  noscript, #trouble { position: absolute; inset: 40% 10% auto; text-align: center; color: var(--soft); }
-  @media (max-width: 900px) {
-    body { flex-direction: column; }
-    #side { width: auto; max-height: 46%; border-left: 0; border-top: 1px solid var(--line); }
-  }
-  @media print {
-    html, body, main { display: block; height: auto; overflow: visible; background: #fff; }
-    #stage { height: 130mm; border: 1px solid var(--line); }
-    #say, #say.small { position: static; width: auto; max-width: none; transform: none; border: 0; }
-    #stage canvas { display: none; }
-    #printed { display: block; width: 100%; height: 100%; object-fit: cover; }
-    #side { width: auto; border: 0; padding: 6mm 0 0; overflow: visible; }
-    #buttons, #answer { display: none; }
-    #legend i, #recording b, #progress i, tr.lost td { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-  }
-</style>
-</head>
-<body>
-<main>
-  <div id="stage"><img id="printed" alt="">
-    <div id="head"><h1>@@title@@</h1><div id="legend"></div></div></div>
-  <div id="say" role="status" class="small"><strong>Connecting</strong><span></span>
-    <div id="progress"><i></i></div></div>
-  <div id="offline" role="alert" hidden></div>
-  <noscript>This page draws with JavaScript and WebGL.</noscript>
-</main>
-<aside id="side">
-  <h2>Sensors</h2>
-  <table>
-    <thead><tr>
-      <th>on</th><th>state</th><th title="samples a second over the last second">rate<br><small>Hz</small></th>
-      <th title="what the gyroscope shows at rest, about its axes x, y, z">gyro bias x y z<br><small>°/s</small></th>
-      <th title="one standard deviation of the direction about the vertical">heading<br><small>± °</small></th>
-      <th title="since the heading was set: at the start, or by a reset">set<br><small>ago</small></th>
-      <th title="samples that never came, came too late, came twice">missed<br><small>samples</small></th>
-    </tr></thead>
-    <tbody id="rows"></tbody>
-  </table>
-  <dl>
-    <dt>Latency</dt><dd id="latency">–</dd>
-    <dt>Picture</dt><dd id="picture">–</dd>
-    <dt>Time</dt><dd id="time">–</dd>
-    <dt>Recording</dt><dd id="recording">–</dd>
-    <dt id="problems-name" hidden>Problems</dt><dd id="problems" hidden></dd>
-  </dl>
-  <div id="buttons">
-    <button id="reset" title="stand in the start pose, then press: headings are set as at the start">Reset headings <kbd>R</kbd></button>
-    <button id="trails" aria-pressed="true" title="where the hands were in the last 3 s">Trails</button>
-    <button id="camera" title="the camera back to where it began">Reset view</button>
-  </div>
-  <p id="answer" role="status"></p>
-</aside>
-
-<!-- meshcat's viewer (MIT, Copyright 2018 Robin Deits) with three.js (MIT, Copyright 2010-2021 Three.js Authors) and the
-     parts that meshcat/viewer/dist/main.min.js.LICENSE.txt and main.min.js.THIRD_PARTY_LICENSES.json of the meshcat
-     package name, among them ieee754 (BSD-3-Clause, Feross Aboukhadijeh) and event-lite (MIT, Yusuke Kawasaki). -->
-<script>@@meshcat@@</script>
-<script id="wepose-data" type="application/json">@@data@@</script>
-<script>
-"use strict";
-(() => {
-@@parts@@
 const data = JSON.parse($("wepose-data").textContent);
 const TRAIL_S = 3, TRAIL_WIDTH = 0.013, TRAIL_POINTS = 240;              // [s], [m]
 const LOST = { colour: 0x8a929b, opacity: 0.4 };
@@ -142,18 +7,14 @@ const n = data.links.length;
 // ---- the scene
 const stage = $("stage");
 const viewer = openViewer(stage);
-obey(viewer, data.commands);
-const body = data.links.map((_, k) => viewer.scene_tree.find(["meshcat", "body", String(k)]).object);
+const body = buildScene(viewer, data.scene, data.links);
 const skins = body.map((link) => {
   const found = [];
   link.traverse(({ material }) => { if (material) found.push([material, material.color.getHex(), material.opacity]); });
   return found;
 });
 const darkScreen = matchMedia("(prefers-color-scheme: dark)");
-function backdrop(name) {
-  obey(viewer, data.backdrops[name]);
-  viewer.set_dirty();
-}
+const backdrop = (name) => setBackdrop(viewer, data.backdrops[name]);
 const screenBackdrop = () => backdrop(darkScreen.matches ? "dark" : "light");
 darkScreen.addEventListener("change", screenBackdrop);
 screenBackdrop();
@@ -355,7 +216,3 @@ viewer.set_3d_pane_size();
 fit();
 connect();
 requestAnimationFrame(tick);
-})();
-</script>
-</body>
-</html>

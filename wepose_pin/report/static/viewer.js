@@ -21,10 +21,57 @@ function openViewer(stage) {
   return viewer;
 }
 
-function obey(viewer, commands) {
-  commands.forEach((command) => viewer.handle_command_bytearray(bytes(command)));
-  const ground = viewer.scene_tree.find(["meshcat", "ground", "<object>"]).object;
-  ground.castShadow = false;
+const floats = (base64) => new Float32Array(bytes(base64).buffer);
+
+// Lights, camera and body; gives the group of each link, which the page moves.
+function buildScene(viewer, scene, links) {
+  viewer.set_property(["Axes"], "visible", false);
+  viewer.set_property(["Grid"], "visible", false);
+  viewer.set_property(["Cameras", "default", "rotated", "<object>"], "fov", scene.fov_deg);
+  scene.lights.forEach(({ name, intensity, position }) => {
+    viewer.set_property(["Lights", name], "visible", true);
+    viewer.set_property(["Lights", name, "<object>"], "intensity", intensity);
+    if (position) viewer.set_property(["Lights", name, "<object>"], "position", position);
+  });
+  const shapes = {
+    box: ([x, y, z]) => new THREE.BoxGeometry(x, y, z),
+    sphere: ([radius]) => new THREE.SphereGeometry(radius, 40, 28),
+    cylinder: ([radius, length]) => new THREE.CylinderGeometry(radius, radius, length, 50).rotateX(Math.PI / 2), // along z
+  };
+  const add = (link, name, geometry, [red, green, blue, opacity], more) => {
+    const clipped = [red, green, blue].map((c) => Math.round(255 * Math.min(Math.max(c, 0), 1)));
+    const color = (clipped[0] << 16) + (clipped[1] << 8) + clipped[2];
+    const material = new THREE.MeshPhongMaterial(
+      { color, opacity, transparent: opacity !== 1, specular: 0x1c1c1c, shininess: 24, ...more });
+    const mesh = new THREE.Mesh(geometry, material);
+    mesh.castShadow = mesh.receiveShadow = true;
+    viewer.set_object(["meshcat", "body", String(link), name], mesh);
+    return mesh;
+  };
+  scene.parts.forEach(({ link, kind, size, quat, position, rgba }, k) => {
+    const mesh = add(link, `part${k}`, shapes[kind](size), rgba);
+    mesh.quaternion.fromArray(quat);
+    mesh.position.fromArray(position);
+  });
+  scene.meshes.forEach(({ link, vertices, triangles, rgba }, k) => {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(floats(vertices), 3));
+    geometry.setIndex(new THREE.BufferAttribute(new Uint32Array(bytes(triangles).buffer), 1));
+    geometry.computeVertexNormals();
+    add(link, `mesh${k}`, geometry, rgba, { flatShading: true, side: THREE.DoubleSide });
+  });
+  return links.map((_, k) => viewer.scene_tree.find(["meshcat", "body", String(k)]).object);
+}
+
+// Background and ground grid, in place of those before.
+function setBackdrop(viewer, { top, bottom, points, colours }) {
+  viewer.set_property(["Background"], "top_color", top);
+  viewer.set_property(["Background"], "bottom_color", bottom);
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(floats(points), 3));
+  geometry.setAttribute("color", new THREE.BufferAttribute(floats(colours), 3));
+  viewer.set_object(["meshcat", "ground"], new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ vertexColors: true })));
+  viewer.set_dirty();
 }
 
 // A trail that faces the camera, as WebGL draws lines one pixel wide.

@@ -1,97 +1,13 @@
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<!-- The page holds all it needs: the browser refuses whatever it would load from elsewhere. -->
-<meta http-equiv="Content-Security-Policy"
-      content="default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:">
-<title>@@window_title@@</title>
-<style>
-  :root { --ink: #1d2935; --soft: #66758a; --line: #d5dbe3; --accent: #24618f; }
-  * { box-sizing: border-box; }
-  html, body { margin: 0; height: 100%; }
-  body { display: flex; flex-direction: column; overflow: hidden; color: var(--ink); background: #e3e8ee;
-         font: 13px/1.4 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-  .dg { display: none !important; }                    /* meshcat's own controls */
-  #stage { flex: 1; min-height: 0; position: relative; overflow: hidden; cursor: grab; }
-  #stage canvas { display: block; }
-  #head { position: absolute; left: 22px; top: 16px; right: 22px; pointer-events: none; }
-  h1 { margin: 0 0 4px; font-size: 19px; font-weight: 600; letter-spacing: -.01em; }
-  #legend { display: flex; flex-wrap: wrap; gap: 2px 16px; color: var(--soft); }
-  #legend i { display: inline-block; width: 18px; height: 4px; border-radius: 2px; margin-right: 7px; vertical-align: 3px; }
-  #bar { background: #fff; border-top: 1px solid var(--line); padding: 10px 18px 12px; }
-  #line { position: relative; height: 24px; }
-  #bands { position: absolute; inset: 0 3px; border-radius: 4px; overflow: hidden; background: #edf0f4; }
-  #bands span { position: absolute; top: 0; bottom: 0; padding: 0 5px; border-left: 1px solid #fff; overflow: hidden;
-                white-space: nowrap; text-overflow: ellipsis; font-size: 11px; line-height: 24px; color: #22303d; }
-  #past { position: absolute; left: 0; top: 0; bottom: 0; background: rgba(29, 41, 53, .10); z-index: 1; }
-  #slider { -webkit-appearance: none; appearance: none; position: absolute; inset: -3px 0; width: 100%; height: 30px;
-            margin: 0; background: none; cursor: pointer; z-index: 2; }
-  #slider::-webkit-slider-thumb { -webkit-appearance: none; width: 6px; height: 30px; border-radius: 3px;
-                                  background: var(--ink); border: 1px solid #fff; }
-  #slider::-moz-range-thumb { width: 6px; height: 30px; border-radius: 3px; background: var(--ink);
-                              border: 1px solid #fff; box-sizing: border-box; }
-  #slider::-moz-range-track { background: none; }
-  #controls { display: flex; align-items: center; gap: 14px; margin-top: 9px; }
-  button { font: inherit; color: var(--ink); background: #fff; border: 1px solid var(--line); border-radius: 6px;
-           height: 30px; padding: 0 11px; cursor: pointer; white-space: nowrap; }
-  button:hover { background: #f3f6f9; }
-  button:focus-visible, #slider:focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
-  button[aria-pressed=true] { background: #e6eff6; border-color: #9dbcd4; color: #174766; }
-  #play { width: 42px; padding: 0; border: 0; background: var(--ink); color: #fff; }
-  #play:hover { background: #33465a; }
-  #play svg { width: 14px; height: 14px; fill: currentColor; vertical-align: -2px; }
-  #clock { font-variant-numeric: tabular-nums; white-space: nowrap; }
-  #clock small { font-size: inherit; color: var(--soft); }
-  #speeds { display: flex; margin-left: auto; }
-  #speeds button { border-radius: 0; margin-left: -1px; padding: 0 9px; }
-  #speeds button:first-child { border-radius: 6px 0 0 6px; }
-  #speeds button:last-child { border-radius: 0 6px 6px 0; }
-  @media (max-width: 560px) { #controls { flex-wrap: wrap; gap: 8px; } #speeds { margin-left: 0; } }
-  noscript, #trouble { position: absolute; inset: 40% 10% auto; text-align: center; color: var(--soft); }
-</style>
-</head>
-<body>
-<main id="stage">
-  <div id="head"><h1>@@title@@</h1><div id="legend"></div></div>
-  <noscript>This page draws with JavaScript and WebGL.</noscript>
-</main>
-<footer id="bar">
-  <div id="line">
-    <div id="bands"><div id="past"></div></div>
-    <input id="slider" type="range" min="0" max="1" step="any" value="0" aria-label="time">
-  </div>
-  <div id="controls">
-    <button id="play" title="play, pause (space)" aria-label="play, pause"><svg viewBox="0 0 14 14"><path/></svg></button>
-    <span id="clock"><span id="now"></span> <small id="total"></small></span>
-    <div id="speeds" role="group" aria-label="speed"></div>
-    <button id="trails" aria-pressed="true" title="where the hands were in the last 3 s">Trails</button>
-    <button id="reset" title="the camera back to where it began">Reset view</button>
-  </div>
-</footer>
-
-<!-- meshcat's viewer (MIT, Copyright 2018 Robin Deits) with three.js (MIT, Copyright 2010-2021 Three.js Authors) and the
-     parts that meshcat/viewer/dist/main.min.js.LICENSE.txt and main.min.js.THIRD_PARTY_LICENSES.json of the meshcat
-     package name, among them ieee754 (BSD-3-Clause, Feross Aboukhadijeh) and event-lite (MIT, Yusuke Kawasaki). -->
-<script>@@meshcat@@</script>
-<script id="wepose-data" type="application/json">@@data@@</script>
-<script>
-"use strict";
-(() => {
-@@parts@@
 const data = JSON.parse($("wepose-data").textContent);
 const TRAIL_S = 3, TRAIL_WIDTH = 0.013;                                  // [s], [m]
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
 const BAND_COLOURS = ["#a9cbe8", "#f1cf8f", "#aed8ae", "#dbb6dc", "#efb3a4", "#a5d9d6", "#cfc9a8"];
 
-const floats = (base64) => new Float32Array(bytes(base64).buffer);
-
 // ---- the scene
 const stage = $("stage");
 const viewer = openViewer(stage);
-obey(viewer, data.commands);
-const body = data.links.map((_, k) => viewer.scene_tree.find(["meshcat", "body", String(k)]).object);
+const body = buildScene(viewer, data.scene, data.links);
+setBackdrop(viewer, data.backdrop);
 
 // ---- the motion: frame k is at times[k], a link's frame is quaternion xyzw and position
 const times = floats(data.offsets), motion = floats(data.motion), n = times.length;
@@ -260,7 +176,3 @@ fit();
 show();
 readHash();
 requestAnimationFrame(tick);
-})();
-</script>
-</body>
-</html>

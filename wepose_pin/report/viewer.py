@@ -1,30 +1,30 @@
 """The motion as one HTML page on meshcat that opens offline, from a file, without a server.
 
-meshcat's own server listens on every interface, so none is started: meshcat writes its commands into a list,
-and the page hands them to the viewer that it carries inside. The motion is not meshcat's animation but a
-table that a small player in `viewer_page.html` reads: as keyframes, minutes would be tens of megabytes.
+meshcat's own server listens on every interface, so none is started: the page carries meshcat's viewer inside, and
+static/viewer.js builds the scene in it. The motion is not meshcat's animation but a table that static/view.js plays:
+as keyframes, minutes would be tens of megabytes.
 """
 
 from __future__ import annotations
 
 import base64
-import html
-import json
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from .model import BodyModel, Visual
-from .pose import Pose, configuration, known_links, placements
+from ..model import BodyModel, Visual
+from ..pose import Pose, configuration, known_links, placements
+from .page import load_template
 
 if TYPE_CHECKING:
-    from .retargeting import Trajectory
+    from ..retargeting import Trajectory
 
 FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips
 GRID_CELL = 0.25  # [m]
@@ -62,22 +62,6 @@ class Mesh(NamedTuple):
     rgba: tuple[float, float, float, float]
 
 
-class CommandList:
-    """Stands where meshcat expects its window and keeps every command instead of sending it."""
-
-    def __init__(self) -> None:
-        self.commands: list[bytes] = []
-
-    def send(self, command: Any) -> None:
-        import umsgpack
-
-        lowered = command.lower()
-        for shape in lowered.get("object", {}).get("geometries", []):
-            if shape["type"] == "SphereGeometry":  # meshcat's 20 x 20 shows on a head
-                shape.update(widthSegments=40, heightSegments=28)
-        self.commands.append(umsgpack.packb(lowered))
-
-
 def pose_html(
     model: BodyModel,
     pose: Pose,
@@ -110,8 +94,8 @@ def pose_html(
 
 def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "", fps: float = 30.0) -> str:
     """The page on which a person and the robot that does as they do move together, on the robot's time."""
-    from .retargeting.looks import parts, stands_at
-    from .retargeting.looks import placements as robot_placements
+    from ..retargeting.looks import parts, stands_at
+    from ..retargeting.looks import placements as robot_placements
 
     frames = frame_indices(trajectory.time, fps)
     nearest = np.abs(pose.time[:, None] - trajectory.recorded[frames][None, :]).argmin(axis=0)
@@ -206,22 +190,15 @@ def view_html(
             for name, spans in (phases or {}).items()
         ],
         "view": view([*drawn, *map(_box_of, meshes)], links, motion, list(trails.values())),
-        "commands": as_base64([*scene(drawn, links, meshes), *backdrop(LIGHT, floor_z)]),
+        "scene": scene(drawn, links, meshes),
+        "backdrop": backdrop(LIGHT, floor_z),
     }
-    return filled(Path(__file__).with_name("viewer_page.html"), data, title)
+    return filled("report/templates/view.html.j2", data, title)
 
 
-def filled(template: Path, data: Mapping[str, Any], title: str) -> str:
-    """The page of a template: with the viewer, what both pages share, the data and the title."""
-    parts = {
-        "title": html.escape(title),
-        "window_title": html.escape(title or "wepose"),
-        "meshcat": _meshcat_source(),
-        "parts": Path(__file__).with_name("viewer_parts.js").read_text(encoding="utf-8"),
-        "data": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-    }
-    page = template.read_text(encoding="utf-8")
-    return re.sub(r"@@(\w+)@@", lambda found: parts[found[1]], page)  # one pass: a title cannot name a part
+def filled(template: str, data: Mapping[str, Any], title: str) -> str:
+    """A page of a template with the viewer in it, of its data and title."""
+    return load_template(template).render(title=title, data=data, meshcat=_meshcat_source())
 
 
 def visible(visuals: Iterable[Visual]) -> list[Visual]:
@@ -247,62 +224,43 @@ def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
     return np.unique(np.searchsorted(nearest_changes, clock))
 
 
-def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[Mesh] = ()) -> list[bytes]:
-    """meshcat's commands for lights, camera and body; `links` are groups that the page moves."""
-    import meshcat
-    import meshcat.geometry as g
+def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[Mesh] = ()) -> dict[str, Any]:
+    """Lights, camera and body as static/viewer.js builds them; a part's link is its place in `links`."""
+    return {
+        "fov_deg": FIELD_OF_VIEW_DEG,
+        "lights": [{"name": name, "intensity": value, "position": position} for name, value, position in LIGHTS],
+        "parts": [
+            {
+                "link": links.index(visual.link),
+                "kind": visual.kind,
+                "size": [float(length) for length in visual.size],
+                "quat": [float(value) for value in visual.quat_LV],
+                "position": [float(value) for value in visual.p_LV],
+                "rgba": [float(value) for value in visual.rgba],
+            }
+            for visual in drawn
+        ],
+        "meshes": [
+            {
+                "link": links.index(mesh.link),
+                "vertices": _base64(mesh.vertices),
+                "triangles": base64.b64encode(np.ascontiguousarray(mesh.triangles, "<u4").tobytes()).decode("ascii"),
+                "rgba": [float(value) for value in mesh.rgba],
+            }
+            for mesh in meshes
+        ],
+    }
 
-    window = CommandList()
-    root = meshcat.Visualizer(window=window)
-    root["/Axes"].set_property("visible", False)
-    root["/Grid"].set_property("visible", False)
-    root["/Cameras/default/rotated/<object>"].set_property("fov", FIELD_OF_VIEW_DEG)
-    for light, intensity, position in LIGHTS:
-        root[f"/Lights/{light}"].set_property("visible", True)
-        root[f"/Lights/{light}/<object>"].set_property("intensity", intensity)
-        if position is not None:
-            root[f"/Lights/{light}/<object>"].set_property("position", list(position))
-    for k, visual in enumerate(drawn):
-        path = f"body/{links.index(visual.link)}/{k}"  # numbers: a link's name may hold a slash
-        part = root[path]
-        part.set_object(_named(g.Mesh(_geometry(visual), _material(visual.rgba)), path))
-        part.set_transform(_transform(visual))
-    for k, mesh in enumerate(meshes):
-        path = f"body/{links.index(mesh.link)}/mesh{k}"
-        shape = g.TriangularMeshGeometry(mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32))
-        root[path].set_object(_named(g.Mesh(shape, _material(mesh.rgba, flat=True)), path))
-    return window.commands
 
-
-def backdrop(colours: Backdrop, floor_z: float = FLOOR_Z) -> list[bytes]:
-    """meshcat's commands for the background and the ground grid, in place of those before."""
-    import meshcat
-    import meshcat.geometry as g
-
-    window = CommandList()
-    root = meshcat.Visualizer(window=window)
-    root["/Background"].set_property("top_color", list(colours.top))
-    root["/Background"].set_property("bottom_color", list(colours.bottom))
+def backdrop(colours: Backdrop, floor_z: float = FLOOR_Z) -> dict[str, Any]:
+    """Background and ground grid as static/viewer.js builds them."""
     points, vertex_colours = _grid(colours, floor_z)
-    grid = g.LineSegments(g.PointsGeometry(points, vertex_colours), g.LineBasicMaterial(vertexColors=True))
-    root["ground"].set_object(_named(grid, "ground"))
-    return window.commands
-
-
-def _named(thing: Any, path: str) -> Any:
-    """Names in place of meshcat's, which hold the machine's network address and differ in every run."""
-    thing.uuid, thing.geometry.uuid, thing.material.uuid = f"{path}-mesh", f"{path}-shape", f"{path}-skin"
-    return thing
-
-
-def _geometry(visual: Visual) -> Any:
-    import meshcat.geometry as g
-
-    if visual.kind == "box":
-        return g.Box([float(x) for x in visual.size])
-    if visual.kind == "cylinder":
-        return g.Cylinder(height=float(visual.size[1]), radius=float(visual.size[0]))
-    return g.Sphere(float(visual.size[0]))
+    return {
+        "top": colours.top,
+        "bottom": colours.bottom,
+        "points": _base64(points),
+        "colours": _base64(vertex_colours),
+    }
 
 
 def _box_of(mesh: Mesh) -> Visual:
@@ -312,27 +270,8 @@ def _box_of(mesh: Mesh) -> Visual:
     return Visual(mesh.link, "box", size, np.array([0.0, 0.0, 0.0, 1.0]), 0.5 * (low + high), mesh.rgba)
 
 
-def _material(rgba: tuple[float, float, float, float], flat: bool = False) -> Any:
-    import meshcat.geometry as g
-
-    red, green, blue = (round(255 * min(max(c, 0.0), 1.0)) for c in rgba[:3])
-    colour = (red << 16) + (green << 8) + blue
-    more = {"flatShading": True, "side": 2} if flat else {"side": 0}
-    return g.MeshPhongMaterial(color=colour, opacity=float(rgba[3]), specular=0x1C1C1C, shininess=24, **more)
-
-
-def _transform(visual: Visual) -> np.ndarray:
-    """(4, 4): where the viewer's shape stands in its link. three.js lays a cylinder along y, URDF along z."""
-    T_LV = np.eye(4)
-    T_LV[:3, :3] = Rotation.from_quat(visual.quat_LV).as_matrix()
-    T_LV[:3, 3] = visual.p_LV
-    if visual.kind == "cylinder":
-        T_LV[:3, :3] = T_LV[:3, :3] @ Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
-    return T_LV
-
-
 def _grid(colours: Backdrop, floor_z: float) -> tuple[np.ndarray, np.ndarray]:
-    """The ends of the ground's line pieces and their colours, each (3, m); it fades into the background."""
+    """The ends of the ground's line pieces and their colours, each (m, 3); it fades into the background."""
     ticks = np.arange(-GRID_RADIUS, GRID_RADIUS + GRID_CELL / 2, GRID_CELL)
     x, y = np.meshgrid(ticks, ticks[:-1], indexing="ij")
     start, end = np.stack([x, y]).reshape(2, -1), np.stack([x, y + GRID_CELL]).reshape(2, -1)
@@ -341,7 +280,7 @@ def _grid(colours: Backdrop, floor_z: float) -> tuple[np.ndarray, np.ndarray]:
     points = np.vstack([xy, np.full(xy.shape[1], floor_z)])
     fade = np.clip(np.hypot(*xy) / GRID_RADIUS, 0.0, 1.0)
     near, far = np.array(colours.grid)[:, None], np.array(colours.bottom)[:, None]
-    return points.astype(np.float32), (near + fade * (far - near)).astype(np.float32)
+    return points.T, (near + fade * (far - near)).T
 
 
 def view(
@@ -391,17 +330,14 @@ def trail_colour(point: str, visuals: Sequence[Visual]) -> str:
     return OTHER_COLOUR
 
 
-def _meshcat_source() -> str:
-    """meshcat's viewer, safe inside a script element."""
-    import meshcat
-
-    source = Path(meshcat.__file__).with_name("viewer") / "dist" / "main.min.js"
-    return source.read_text(encoding="utf-8").replace("</script", "<\\/script").replace("<!--", "<\\!--")
+def _meshcat_source() -> Markup:
+    """meshcat's viewer, safe inside a script element; its Python side, which brings a server, is not loaded."""
+    found = find_spec("meshcat")
+    assert found is not None
+    assert found.origin is not None
+    source = (Path(found.origin).parent / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8")
+    return Markup(source.replace("</script", "<\\/script").replace("<!--", "<\\!--"))
 
 
 def _base64(values: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
-
-
-def as_base64(commands: Iterable[bytes]) -> list[str]:
-    return [base64.b64encode(command).decode("ascii") for command in commands]
