@@ -16,7 +16,7 @@ from wepose_pin.filters import METHODS, GdcParams, NcfParams
 from wepose_pin.noise import noise_of
 from wepose_pin.simulation import SingleSensor, paper_dynamic
 from wepose_pin.validation import gains as tuning
-from wepose_pin.validation.contenders import AS_IT_COMES, Contender, contenders
+from wepose_pin.validation.contenders import DEFAULT_GAINS, Contender, contenders
 from wepose_pin.validation.gains import STATED, gains_of, total_rmse, trials
 from wepose_pin.validation.series import aligned
 
@@ -35,7 +35,7 @@ def at_rest(sensor: SingleSensor) -> np.ndarray:
 
 
 def test_who_takes_part() -> None:
-    others = ["ncf", "gdc", "ncf as it comes", "gdc as it comes"]
+    others = ["ncf", "gdc", "ncf, default gains", "gdc, default gains"]
     ours = [method for method in METHODS if method not in others]
     assert NAMES[: len(ours) + 4] == [*ours, *others]
     assert {contender.label for contender in ALL if contender.method} == set(ours)
@@ -60,7 +60,7 @@ def test_orientations_are_xyzw_from_sensor_to_a_world_with_z_up(contender: Conte
     true = Rotation.from_quat(sensor.quat_WS)
     error = attitude_error(aligned(Rotation.from_quat(quat), true, rest), true, sensor.time)
     print(f"{contender.label}: {error.total_rmse:.2f} deg")
-    assert error.total_rmse < (8.0 if "as it comes" in contender.label else 3.0)
+    assert error.total_rmse < (8.0 if "default gains" in contender.label else 3.0)
 
 
 @pytest.mark.parametrize("contender", ALL, ids=NAMES)
@@ -73,7 +73,7 @@ def test_the_bias_is_removed_for_all_but_as_it_comes(contender: Contender, senso
         for gyro, measured in ((sensor.gyro_S, noise), (sensor.gyro_S + bias, biased))
     )
     apart = np.degrees((without * with_.inv()).magnitude().max())
-    if contender.label in [f"{name} as it comes" for name in AS_IT_COMES]:
+    if contender.label in [f"{name}, default gains" for name in DEFAULT_GAINS]:
         assert apart > 20.0
     else:
         assert apart < (0.05 if contender.label == "imufusion" else 1e-4)  # that one counts in single precision

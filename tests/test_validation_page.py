@@ -63,7 +63,7 @@ DYNAMIC = [
     for method, errors in {"smekf": (1.0, 1.52, 1.3), "ncf": (2.0, 1.2, 2.4), "gdc": (1.5, 1.6, 2.0)}.items()
 ]
 REALISTIC, ALONE = "upper body, realistic", "upper body, MTi-3 noise alone"
-WATERFALL = "where the millimetres come from"
+WATERFALL = "error budget"
 RESULTS = [
     *DYNAMIC,
     *(hand(REALISTIC, m, *e) for m, e in {"smekf": (18.04, 17.0), "ncf": (25.0, 24.0), "gdc": (24.0, 23.0)}.items()),

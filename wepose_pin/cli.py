@@ -788,7 +788,7 @@ def validate(
 
     Args:
         out: Folder for validation.json with every trial, and the page with tables and figures: validation.html,
-            validation.md with validation/*.png.
+            validation.md with validation/*.svg.
         data: Folder of the real recordings (broad/, wepose_hr/, ring/, ur5/), to measure on them too.
         quick: One trial of each experiment, and two of BROAD, instead of all; without the account of what costs how
             many millimetres and without the search for gains.
@@ -840,7 +840,7 @@ def validate(
     _validation_tables(document)
     _warn([*(each.line() for each in document.skipped), *failed])
     if out is not None and (out / "validation.html").is_file():
-        _say(f"Page: {out / 'validation.html'}  {out / 'validation.md'}  {out / 'validation'}/*.png")
+        _say(f"Page: {out / 'validation.html'}  {out / 'validation.md'}  {out / 'validation'}/*.svg")
     if out is not None and from_ is None:
         _say(f"Every trial: {out / 'validation.json'}")
 
@@ -1551,37 +1551,27 @@ def _verdict(verdict: Verdict) -> None:
 
 
 def _validation_tables(document: Document) -> None:
-    """A table an experiment, what it says beside the paper, and the targets."""
-    import textwrap
-
+    """A table an experiment, and the targets."""
     from .validation import summary
-    from .validation.findings import anywhere_lines, order, target_line, targets, worse
-    from .validation.page import experiment_table, how_many, unit_of
-
-    def say(text: str) -> None:
-        _say(textwrap.fill(text, 98, initial_indent="  ", subsequent_indent="    "))
+    from .validation.tables import experiment_table, shared_unit, targets_table
 
     rows = summary(document.results)
     for experiment in dict.fromkeys(row.experiment for row in rows):
         of = [row for row in rows if row.experiment == experiment]
         trials = len({result.trial for result in document.results if result.experiment == experiment})
-        unit = unit_of(of)
+        unit = shared_unit(of)
         header, lines = experiment_table(of, whole=False)
         # A long name in two lines: the tables stay within 100 columns.
         header = [name if len(name) < 12 else "\n".join(name.rsplit(" ", 1)) for name in header]
-        title = f"{experiment}, {how_many(experiment, trials)}" + (f" [{unit}]" if unit else "")
+        title = f"{experiment}, {trials} trial{'s' * (trials != 1)}" + (f" [{unit}]" if unit else "")
         _print_table(title + ", a quick run" * document.quick, tuple(header), [tuple(line) for line in lines])
-        said = [*order(of), *worse(of), *anywhere_lines(of)]
-        for text in said:
-            say(text)
         _say("")
-    found = targets(rows)
-    if found:
-        _say("Targets for the mean error of the hand, smekf:")
-        for target in found:
-            say(target_line(target))
-    _say("± is one standard deviation over time, averaged over the trials. The still phase's bias is removed for")
-    _say("every filter but those as they come; the heading is aligned once, where nothing is scored, and never")
+    targets = targets_table(rows)
+    if targets.rows:
+        cells = [tuple(cell.replace("**", "") for cell in row if isinstance(cell, str)) for row in targets.rows]
+        _print_table("Targets for the mean errors", tuple(targets.header), cells)
+    _say("± is one standard deviation over time, averaged over the trials. The static phase's bias is removed for")
+    _say("every filter but those with default gains; the heading is aligned once, where nothing is scored, and never")
     _say("fitted to the truth afterwards.")
 
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
 import polars as pl
-from matplotlib import rc_context
 
-from ..page import ACCENT, STYLE, Banner, Block, Facts, Heading, Picture, Sections, Table, as_html, new_figure, png_of
+from ..report.chart import Chart, Panel, Picture
+from ..report.page import Link, Page, Table
 from .plan import Plan
 
+TEMPLATE = "batch/templates/study.html.j2"
 APART = 5.0  # robust deviations: of 10 000 normal figures not one is so far off
 FEWEST = 8  # figures, of which one can stand apart
 MOST_ROWS = 2000  # of a table in the page; results.parquet has all
@@ -27,7 +27,7 @@ _WORDS = {
     "seconds": "time it took [s]",
     "gap_mm": "palm-to-palm gap [mm]",
     "memory_mb": "memory of the worker [MB]",
-    "independent": "independent looks of the calibration",
+    "independent": "effective sample size of the calibration",
     "static_share": "share of time at rest",
 }
 
@@ -49,19 +49,14 @@ def study_page(plan: Plan, table: pl.DataFrame, failures: list[str] | None = Non
     """
     failed, done = table.filter(pl.col("status") != "done"), table.filter(pl.col("status") == "done")
     columns = _figures(done)
-    sections = Sections(failures)
-    return as_html(
-        [
-            Heading(f"Study: {plan.name}", 1),
-            _verdict(done.height, failed.height),
-            *sections("Facts", lambda: [Facts(_facts(plan, table, done))]),
-            *sections("Not done, by cause", lambda: _failures(failed)),
-            *sections("Distributions", lambda: _distributions(done, columns)),
-            *sections("Outliers", lambda: _outliers(done, columns)),
-            *sections("All items", lambda: _all(table, columns)),
-        ],
-        f"{plan.name}: {table.height} items",
-    )
+    page = Page(TEMPLATE, f"Study: {plan.name}", failures)
+    page.add("verdict", lambda: {"done": done.height, "failed": failed.height}, name="The verdict")
+    page.add("summary", lambda: {"rows": _facts(plan, table, done)}, name="Facts")
+    page.add("failures", lambda: _failures(failed), "Not done, by cause")
+    page.add("distributions", lambda: _distributions(done, columns), "Distributions")
+    page.add("outliers", lambda: _outliers(done, columns), "Outliers")
+    page.add("items", lambda: _items(table, columns), "All items")
+    return page.html(f"{plan.name}: {table.height} items")
 
 
 def apart(done: pl.DataFrame, columns: Sequence[str]) -> list[Apart]:
@@ -95,13 +90,6 @@ def _figures(done: pl.DataFrame) -> list[str]:
     return [*first, *(name for name in known if name not in (*first, *timed)), *timed]
 
 
-def _verdict(done: int, failed: int) -> Banner:
-    if failed == 0:
-        return Banner("pass", f"All {done} items are done.", [])
-    kind = "poor" if done else "fail"
-    return Banner(kind, f"{done} of {done + failed} items are done; {failed} are not, see below.", [])
-
-
 def _facts(plan: Plan, table: pl.DataFrame, done: pl.DataFrame) -> list[tuple[str, str]]:
     steps = dict.fromkeys(step for item in (*plan.first, *plan.items) for step in item.steps)
     subjects = table["subject"].drop_nulls().n_unique()
@@ -118,23 +106,23 @@ def _facts(plan: Plan, table: pl.DataFrame, done: pl.DataFrame) -> list[tuple[st
     return facts
 
 
-def _failures(failed: pl.DataFrame) -> list[Block]:
+def _failures(failed: pl.DataFrame) -> dict[str, Any] | None:
     if failed.is_empty():
-        return []
+        return None
     causes = failed.group_by("error", maintain_order=True).agg(pl.len(), pl.col("message").first())
     causes = causes.sort("len", descending=True, maintain_order=True)
-    listed = failed.head(MOST_ROWS).select("item", "error", "message").iter_rows()
-    return [
-        Heading("Not done, by cause"),
-        Table(["cause", "items", "the first of them"], [[c, str(n), _cut(text)] for c, n, text in causes.iter_rows()]),
-        Table(["item", "cause", "what was wrong"], [[item, cause, _cut(text)] for item, cause, text in listed]),
-        *_more(failed.height),
-    ]
+    items = [[row["item"], row["error"], _cut(row["message"])] for row in failed.head(MOST_ROWS).iter_rows(named=True)]
+    rows = [[cause, str(count), _cut(text)] for cause, count, text in causes.iter_rows()]
+    return {
+        "causes": Table(["cause", "items", "the first of them"], rows),
+        "items": Table(["item", "cause", "what was wrong"], items),
+        "more": _more(failed.height),
+    }
 
 
-def _distributions(done: pl.DataFrame, columns: Sequence[str]) -> list[Block]:
+def _distributions(done: pl.DataFrame, columns: Sequence[str]) -> dict[str, Any] | None:
     if done.height < 2 or not columns:
-        return []
+        return None
     rows = []
     for column in columns:
         values = _values(done, column)
@@ -142,34 +130,34 @@ def _distributions(done: pl.DataFrame, columns: Sequence[str]) -> list[Block]:
         rows.append([_in_words(column), str(len(values)), *(told or [""] * 5)])
     header = ["figure", "items", "median", "5 %", "95 %", "least", "greatest"]
     pictured = [column for column in columns if len(_values(done, column)) > 1][:MOST_PICTURES]
-    return [Heading("Distributions"), _histograms(done, pictured), Table(header, rows)]
+    return {"picture": _histograms(done, pictured) if pictured else None, "figures": Table(header, rows)}
 
 
 def _histograms(done: pl.DataFrame, columns: Sequence[str]) -> Picture:
-    lines = -(-len(columns) // 3)
-    with rc_context(STYLE):
-        figure = new_figure(0.4 + 1.7 * lines)
-        for k, column in enumerate(columns):
-            axes = figure.add_subplot(lines, 3, k + 1)
-            values = _values(done, column)
-            median = float(np.median(values))
-            ends = float(values.min()), float(values.max())
-            if ends[1] - ends[0] <= 1e-9 * abs(median):  # all one value, up to rounding: no bins fit in between
-                ends = median - max(0.5, 0.5 * abs(median)), median + max(0.5, 0.5 * abs(median))
-            axes.hist(values, bins=min(40, max(5, round(2 * len(values) ** 0.5))), range=ends, color=ACCENT)
-            axes.axvline(median, color="#d9772b", linewidth=1.2)
-            axes.set_title(_in_words(column), loc="left")
-            axes.locator_params(nbins=5)
-        return Picture("distributions", "Items by figure; the line is the median.", png_of(figure))
+    panels = []
+    for column in columns:
+        values = _values(done, column)
+        median = float(np.median(values))
+        ends = float(values.min()), float(values.max())
+        if ends[1] - ends[0] <= 1e-9 * abs(median):  # all one value, up to rounding: no bins fit in between
+            ends = median - max(0.5, 0.5 * abs(median)), median + max(0.5, 0.5 * abs(median))
+        count, edges = np.histogram(values, bins=min(40, max(5, round(2 * len(values) ** 0.5))), range=ends)
+        panel = Panel(_in_words(column), x=ends, y=(0.0, 1.05 * float(count.max())), grid="y")
+        panel.boxes(np.column_stack([edges[:-1], edges[1:]]), np.column_stack([0 * count, count]), "accent")
+        panel.rule("before bold", x=median)
+        panels.append(panel)
+    rows = [panels[k : k + 3] for k in range(0, len(panels), 3)]
+    return Picture("distributions", "Items by figure; the line is the median.", Chart(rows, [90.0] * len(rows)))
 
 
-def _outliers(done: pl.DataFrame, columns: Sequence[str]) -> list[Block]:
+def _outliers(done: pl.DataFrame, columns: Sequence[str]) -> dict[str, Any] | None:
     found = apart(done, columns)
     if not found:
-        return []
+        return None
+    pages = dict(done.select("item", "page").iter_rows())
     rows = [
         [
-            _link(done, each.item),
+            _link(each.item, pages[each.item]),
             _in_words(each.column),
             f"{each.value:.4g}",
             f"{each.median:.4g}",
@@ -177,38 +165,28 @@ def _outliers(done: pl.DataFrame, columns: Sequence[str]) -> list[Block]:
         ]
         for each in found[:MOST_ROWS]
     ]
-    return [
-        Heading("Outliers"),
-        f"Figures more than {APART:g} robust standard deviations off the median.",
-        Table(["item", "figure", "value", "median", "deviations off"], rows),
-        *_more(len(found)),
-    ]
+    header = ["item", "figure", "value", "median", "deviations off"]
+    return {"deviations": APART, "outliers": Table(header, rows), "more": _more(len(found))}
 
 
-def _all(table: pl.DataFrame, columns: Sequence[str]) -> list[Block]:
+def _items(table: pl.DataFrame, columns: Sequence[str]) -> dict[str, Any]:
     shown = [*(name for name in ("grade",) if name in table.columns), *columns[:6]]
     shown += ["seconds"] if "seconds" not in shown else []
     header = ["item", *(["subject"] if table["subject"].drop_nulls().len() else []), "status"]
     rows = []
     for row in table.head(MOST_ROWS).iter_rows(named=True):
-        cells = [
-            _link(table, row["item"], row),
-            *([row["subject"] or ""] if "subject" in header else []),
-            row["status"],
-        ]
-        rows.append([*cells, *(_cell(row[name]) for name in shown)])
-    return [Heading("All items"), Table([*header, *map(_in_words, shown)], rows), *_more(table.height)]
+        cells = [*([row["subject"] or ""] if "subject" in header else []), row["status"]]
+        rows.append([_link(row["item"], row["page"]), *cells, *(_cell(row[name]) for name in shown)])
+    return {"items": Table([*header, *map(_in_words, shown)], rows), "more": _more(table.height)}
 
 
-def _more(count: int) -> list[Block]:
-    return [f"The first {MOST_ROWS} of {count}; `results.parquet` has all."] if count > MOST_ROWS else []
+def _more(count: int) -> tuple[int, int] | None:
+    return (MOST_ROWS, count) if count > MOST_ROWS else None
 
 
-def _link(table: pl.DataFrame, item: str, row: dict[str, object] | None = None) -> str:
+def _link(item: str, page: str | None) -> str | Link:
     """An item's name, which leads to its own page where it has one."""
-    row = row or table.row(by_predicate=pl.col("item") == item, named=True)
-    page = row.get("page")
-    return f"[{item}](items/{quote(item)}/{page})" if page else item
+    return Link(item, f"items/{quote(item)}/{quote(page)}") if page else item
 
 
 def _values(done: pl.DataFrame, column: str) -> np.ndarray:
@@ -221,8 +199,8 @@ def _cell(value: object) -> str:
 
 
 def _cut(text: str | None) -> str:
-    """A message as plain text: nothing in it is markup or a link of ours."""
-    return re.sub(r"[`*]", "", text or "").replace("](", "] (")[:400]
+    """A message as plain text, of bounded length: nothing in it is marked."""
+    return (text or "").replace("`", "").replace("*", "")[:400]
 
 
 def _in_words(column: str) -> str:

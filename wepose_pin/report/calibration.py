@@ -137,7 +137,7 @@ def _contact(protocol: Protocol) -> _Contact:
     return _Contact(protocol.name, hands, noun, gap, protocol.chain)
 
 
-# The sections: the values that their macros of the template take --------------------------------------------------------
+# The sections: the values that the macros of the template take --------------------------------------------------------
 
 
 def _first(

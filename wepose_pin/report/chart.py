@@ -37,6 +37,7 @@ class Key(NamedTuple):
     css: str
     shape: str = "line"
     opacity: float = 1.0
+    colour: str = ""  # where the class gives none
 
 
 class Picture(NamedTuple):
@@ -199,6 +200,7 @@ class DrawnKey(NamedTuple):
     css: str
     d: str
     opacity: float
+    colour: str
 
 
 @dataclass
@@ -221,12 +223,11 @@ class Chart:
         keys, top = self._drawn_legend()
         panels = []
         left = [max(_room_left(row[k]) for row in self.rows if k < len(row)) for k in range(max(map(len, self.rows)))]
+        width = (WIDTH - sum(left) - max(sum(panel.right for panel in row) for row in self.rows)) / len(left)
         for row, height in zip(self.rows, self.heights, strict=True):
-            lefts = left[: len(row)]
-            width = (WIDTH - sum(lefts) - sum(panel.right for panel in row)) / len(row)
             top += _LINE if any(panel.title for panel in row) else 5.0
             x = 0.0
-            for panel, room in zip(row, lefts, strict=True):
+            for panel, room in zip(row, left, strict=False):
                 panels.append(_drawn_panel(panel, x + room, top, width, height))
                 x += room + width + panel.right
             shown = [panel for panel in row if not panel.bare]
@@ -248,7 +249,7 @@ class Chart:
                 d = {"line": "M40-40H300", "box": "M60-90H280V10H60z"}.get(key.shape)
                 d = d or "M170-40" + _marker(key.shape, 4.5)
                 css = f"{_CLASSES.get(key.shape, 'marker')} {key.css}"
-                drawn.append(DrawnKey(round(x, 1), y - 14.0, key.label, css, d, key.opacity))
+                drawn.append(DrawnKey(round(x, 1), y - 14.0, key.label, css, d, key.opacity, key.colour))
                 x += width
         return drawn, (_LINE + 2.0) * len(lines) + 3.0 if self.legend else 0.0
 
@@ -393,7 +394,7 @@ def _marker(shape: str, size: float) -> str:
 
 
 def _runs(x: np.ndarray, y: np.ndarray, zero: float | None) -> list[str]:
-    """A path for each stretch without NaN, in steps of whole tenths of a pixel; closed at `zero` where that is given."""
+    """A path for each stretch without NaN, in steps of tenths of a pixel; closed at `zero` where that is given."""
     known = np.isfinite(x) & np.isfinite(y)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], known, [False]))))
     points = np.rint(_UNITS_A_PIXEL * np.column_stack([np.where(known, x, 0.0), np.where(known, y, 0.0)])).astype(int)

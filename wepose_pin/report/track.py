@@ -80,7 +80,7 @@ def track_report(
     return page.html(f"Motion of {recording.name}" if recording.name else "Motion")
 
 
-# The sections: the values that their macros of the template take --------------------------------------------------------
+# The sections: the values that the macros of the template take --------------------------------------------------------
 
 
 def _first(entries: Sequence[Concern]) -> dict[str, Any]:

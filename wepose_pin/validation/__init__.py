@@ -1,15 +1,15 @@
 """How wrong the estimates are: the paper's experiments on simulated subjects, and real recordings with a truth.
 
 Everything is seeded: two runs give the same numbers. `contenders` are the filters as they are compared, `paper` the
-simulated experiments, `real` the recordings, `tables` sums them up beside the paper's figures, `findings` says in
-sentences what the figures show, `document` is their file, `page` the pages with `figures` and `words`.
+simulated experiments, `mounting` one of ours, `real` the recordings, `tables` sums them up beside the paper's figures,
+`document` is their file, `page` the pages, with `figures` and the fixed text in templates/validation.md.j2.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from . import anywhere, gains, paper, real
+from . import gains, mounting, paper, real
 from .contenders import Contender, contenders
 from .document import Document, document_text, read_document
 from .jobs import Job, Result, Skipped, run
@@ -33,7 +33,7 @@ __all__ = [
 
 def experiments(quick: bool = False, data: Path | None = None) -> dict[str, list[Job]]:
     """Name → its trials, a job each; `data`: the folder of the real recordings."""
-    found = paper.experiments(quick) | anywhere.experiments(quick)
+    found = paper.experiments(quick) | mounting.experiments(quick)
     if data is not None:
         found |= real.experiments(data, quick)
     if not quick:

@@ -1,6 +1,6 @@
 """The filters as they are compared: ours, those of others, and how each was set.
 
-All start from the same still phase: its bias is removed (but for "as it comes"), and where a start can be given it is
+All start from the same still phase: its bias is removed (but for "default gains"), and where a start can be given it is
 the tilt measured at the beginning. The heading is aligned by the experiments, for all alike.
 """
 
@@ -26,7 +26,7 @@ Orient = Callable[[np.ndarray, np.ndarray, float, SensorNoise], np.ndarray]
 # MahonyAHRS). Mahony 2008 simulates with k_P 1, k_I 0.3, which is worse by far: 69 against 16 deg on half of BROAD,
 # since an integral this fast takes the hand's acceleration for bias. GDC: β 0.033, Madgwick's own for an IMU (2010
 # report, 2011 paper); the 0.1 of x-io's MadgwickAHRS.h is no better.
-AS_IT_COMES: dict[str, Any] = {"ncf": NcfParams(0.5, 0.0), "gdc": GdcParams(0.033)}
+DEFAULT_GAINS: dict[str, Any] = {"ncf": NcfParams(0.5, 0.0), "gdc": GdcParams(0.033)}
 
 
 class Contender(NamedTuple):
@@ -49,7 +49,7 @@ def contenders(setting: str, trial: str = "") -> list[Contender]:
     tuned = gains_of(setting, trial)._asdict()
     found = [_ours(method) for method in METHODS if method not in tuned]
     found += [_set(method, params) for method, params in tuned.items()]
-    found += [_as_it_comes(method, params) for method, params in AS_IT_COMES.items()]
+    found += [_default_gains(method, params) for method, params in DEFAULT_GAINS.items()]
     return found + [Contender(label, orient) for label, (module, orient) in _PEERS.items() if find_spec(module)]
 
 
@@ -67,14 +67,14 @@ def _set(method: str, params: Any) -> Contender:
     return Contender(method, orient)
 
 
-def _as_it_comes(method: str, params: Any) -> Contender:
+def _default_gains(method: str, params: Any) -> Contender:
     """Published gains, and nobody has looked at a still phase: the bias starts at zero."""
 
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
         unknown = replace(noise, gyro_bias=np.zeros(3))
         return run_filter(gyro_S, accel_S, rate_hz, unknown, method, params).quat_WS
 
-    return Contender(f"{method} as it comes", orient)
+    return Contender(f"{method}, default gains", orient)
 
 
 # Peers with the parameters that their authors recommend. VQF (Laidig and Seel 2023; BROAD is theirs too) is meant to be

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ..errors import BadData, MissingFile
 from ..simulation import MTI_3
-from .contenders import AS_IT_COMES
+from .contenders import DEFAULT_GAINS
 from .gains import STATED
 from .jobs import Result, Skipped
 from .paper import WORLDS
@@ -46,7 +46,7 @@ def document_text(
         "noise": asdict(MTI_3),
         "gains": {
             setting: {name: asdict(params) for name, params in of.items()}
-            for setting, of in [("as it comes", AS_IT_COMES), *((s, gains._asdict()) for s, gains in STATED.items())]
+            for setting, of in {"default gains": DEFAULT_GAINS, **{s: g._asdict() for s, g in STATED.items()}}.items()
         },
     }
     text = json.dumps(_plain(head), indent=1, ensure_ascii=False, allow_nan=False).removesuffix("\n}")

@@ -37,11 +37,11 @@ from ..tracking import track
 from .contenders import Contender, contenders
 from .jobs import Job, Result
 from .series import aligned, over_time
+from .tables import ERROR_BUDGET
 
 RATES = {"100 Hz": 100.0, "1 kHz": 1000.0}
 WORLDS = {"MTi-3 noise alone": PERFECT_WORLD, "realistic": REALISTIC}
 KNOWN_MOUNT_STD = np.deg2rad(0.5)  # what the tracker is told of mounts that are in truth exact
-MILLIMETRES = "where the millimetres come from"
 # What is switched off in turn: imperfections as in a perfect world, or a part of the chain known exactly.
 SWITCHED: dict[str, dict[str, Any]] = {
     label: {name: getattr(PERFECT_WORLD, name) for name in names.split()}
@@ -63,7 +63,7 @@ SWITCHED: dict[str, dict[str, Any]] = {
 
 
 def experiments(quick: bool = False) -> dict[str, list[Job]]:
-    """Name → jobs; `quick`: one trial of each, and no account of the millimetres."""
+    """Name → jobs; `quick`: one trial of each, and no error budget."""
     found = {}
     for rate, rate_hz in RATES.items():
         name = f"dynamic {rate}"
@@ -73,7 +73,7 @@ def experiments(quick: bool = False) -> dict[str, list[Job]]:
         name = f"upper body, {world}"
         found[name] = [Job(name, str(k), _upper_body, (k, imperfections)) for k in range(1 if quick else 10)]
     if not quick:
-        found[MILLIMETRES] = [Job(MILLIMETRES, str(k), _millimetres, (k,)) for k in range(10)]
+        found[ERROR_BUDGET] = [Job(ERROR_BUDGET, str(k), _error_budget, (k,)) for k in range(10)]
     return found
 
 
@@ -143,7 +143,7 @@ def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfect
     return results
 
 
-def _millimetres(experiment: str, trial: str, seed: int) -> list[Result]:
+def _error_budget(experiment: str, trial: str, seed: int) -> list[Result]:
     """smekf on the realistic subject, each imperfection switched off or each part known exactly, in turn."""
     results = []
     for label, off in SWITCHED.items():

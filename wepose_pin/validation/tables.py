@@ -1,13 +1,21 @@
-"""Means over trials beside the paper's figures."""
+"""Means over trials beside the paper's figures, and the tables that the pages and the command show."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..report.page import Table
+from ..simulation import GRAVITY
 from .jobs import Result
+
+OURS = "smekf"  # the paper's filter
+DEFAULTS = ", default gains"  # ends the label of a filter's second row
+ERROR_BUDGET = "error budget"
+ARBITRARY_MOUNTING = "arbitrary sensor mounting"
 
 # Lisini Baldi 2019: roll, pitch, yaw [deg] as mean ± std by rate [Hz]; right hand [mm].
 PAPER_DYNAMIC = {
@@ -28,8 +36,53 @@ SHORT = {
     f"hand_uncertainty {key}": f"hand {name}"
     for key, name in (("nees", "nees"), ("within_1", "in 1σ"), ("within_2", "in 2σ"))
 }
+FROM = {"hand": "from the root", "from shoulders": "from the middle of the shoulders"}
 DEGREES = {*AXES, *(name.replace("_", " ") for name in SPLIT)}
+ERRORS = {*DEGREES, *HAND.values(), "drift_deg_min"}  # figures of which less is better
+# What the error of the project must not exceed, from and to, by experiment, filter and figure.
+TARGETS: dict[str, tuple[str, dict[str, tuple[float, float]]]] = {
+    "upper body, MTi-3 noise alone": (OURS, {"hand": (0.0, 12.0), "from shoulders": (0.0, 12.0)}),
+    "upper body, realistic": (OURS, {"hand": (0.0, 18.0), "from shoulders": (0.0, 18.0)}),
+    ARBITRARY_MOUNTING: (
+        "amekf",
+        {
+            "lengths_rms_mm": (0.0, 8.0),
+            "headings_rms_deg": (0.0, 2.0),
+            "hand": (0.0, 18.0),
+            "errors_by_std_rms": (0.7, 1.5),
+        },
+    ),
+}
+# Field of `Imperfections` → words, factor to the unit, unit.
+_IMPERFECTIONS = {
+    "soft_tissue_deg": ("soft-tissue artefact: rotation of a sensor, rms", 1.0, "°"),
+    "palm_slip": ("slip of the palms in the clasp, rms", 1e3, " mm"),
+    "shoulder_wander": ("shoulder centres that wander, at 90° of elevation", 1e3, " mm"),
+    "start_elbow_deg": ("elbows bent in the start pose", 1.0, "°"),
+    "start_segment_deg": ("arm segments off the start pose, rms", 1.0, "°"),
+    "sway_deg_s": ("sway while standing, rms", 1.0, "°/s"),
+    "gyro_scale": ("gyroscope scale", 100.0, " %"),
+    "accel_scale": ("accelerometer scale", 100.0, " %"),
+    "misalignment_deg": ("misaligned axes", 1.0, "°"),
+    "g_sensitivity_deg_s": ("g-sensitivity", 1.0, "°/s per g"),
+    "gyro_range_deg_s": ("gyroscope range", 1.0, "°/s"),
+    "accel_range_g": ("accelerometer range", 1.0, " g"),
+    "bits": ("quantisation", 1.0, " bits"),
+    "clock_jitter": ("clock jitter", 1e3, " ms"),
+    "clock_offset": ("clocks apart", 1e3, " ms"),
+    "dropped": ("samples lost", 100.0, " %"),
+}
+# Field of `ImuNoise` → words, factor to the unit, unit.
+_NOISE = {
+    "gyro_density": ("gyroscope, noise density", math.degrees(1.0), "°/s/√Hz"),
+    "gyro_bias_std": ("gyroscope, turn-on bias", math.degrees(1.0), "°/s"),
+    "gyro_bias_instability": ("gyroscope, in-run bias", math.degrees(3600.0), "°/h"),
+    "accel_density": ("accelerometer, noise density", 1e6 / GRAVITY, " µg/√Hz"),
+    "accel_bias_std": ("accelerometer, turn-on bias", 1e3 / GRAVITY, " mg"),
+    "accel_bias_instability": ("accelerometer, in-run bias", 1e3 / GRAVITY, " mg"),
+}
 _RMS = ("_rms", "_rms_mm", "_rms_deg")
+GAINS = {"gain", "integral"}  # of the grid search: small numbers, three digits
 UNITS = {"_deg_min": "deg/min", "_deg_s": "deg/s", "_deg": "deg", "_percent": "%", "_mm": "mm", "_s": "s"}
 
 
@@ -73,8 +126,8 @@ def figures(result: Result) -> dict[str, float]:
 
 
 def paper_figures(experiment: str, method: str) -> dict[str, tuple[float, float]]:
-    """Name → the paper's mean and deviation; a filter's second row ("ncf as it comes") stands beside the same."""
-    filter_ = method.split()[0]
+    """Name → the paper's mean and deviation; a filter's second row ("ncf, default gains") stands beside the same."""
+    filter_ = method.removesuffix(DEFAULTS)
     if experiment.startswith("dynamic"):
         rate = 1000 if "1 kHz" in experiment else 100
         return dict(zip(AXES, PAPER_DYNAMIC.get((filter_, rate), ()), strict=False))
@@ -86,7 +139,7 @@ def paper_figures(experiment: str, method: str) -> dict[str, tuple[float, float]
 def paper_text(experiment: str, method: str) -> str:
     """The paper's figures in a few words; empty where it has none."""
     if experiment == "drift":
-        return PAPER_DRIFT.get(method.split()[0], "")
+        return PAPER_DRIFT.get(method.removesuffix(DEFAULTS), "")
     found = paper_figures(experiment, method).values()
     texts = list(dict.fromkeys(f"{mean:.2f} ± {std:.2f}" for mean, std in found))
     return texts[0] if len(texts) == 1 else "  ".join(text.replace(" ", "") for text in texts)
@@ -102,6 +155,192 @@ def name_and_unit(name: str) -> tuple[str, str]:
         if name.endswith(ending):
             return name.removesuffix(ending).replace("_", " "), unit
     return name.replace("_", " "), ""
+
+
+# Tables ---------------------------------------------------------------------------------------------------------------
+
+
+def experiment_table(rows: Sequence[Row], whole: bool) -> Table:
+    """An experiment's rows as text; `whole`: with the deviation between trials and all columns, the best in bold."""
+    names = list(dict.fromkeys(name for row in rows for name in row.names()))
+    if not whole:
+        names = [name for name in names if name not in SHORT.values()]
+    units = {name: name_and_unit(name) for name in names}
+    experiment = rows[0].experiment
+    papers = [paper_figures(experiment, row.method) for row in rows]
+    compared = [name for name in names if any(name in paper for paper in papers)] if whole else []
+    if len({str(paper.get(name)) for paper in papers[:1] for name in compared}) < len(compared):
+        compared = []  # one figure for all columns
+    best = {
+        name: min(round(row.figures[name], 2) for row in rows if name in row.figures)
+        for name in names
+        if whole and len(rows) > 1 and name in ERRORS and experiment != ERROR_BUDGET
+    }
+    shared = {unit for _, unit in units.values()}
+    header = ["on or off" if experiment == ERROR_BUDGET else "filter"]
+    header += [f"{text} [{unit}]" if unit and (whole or len(shared) > 1) else text for text, unit in units.values()]
+    texts = not compared and any(row.paper for row in rows)
+    header += [f"paper: {units[name][0]}" for name in compared] + (["the paper"] if texts else [])
+    cells = []
+    for row, paper in zip(rows, papers, strict=True):
+        line = [row.method]
+        for name in names:
+            text = _cell(row, name, whole)
+            line.append(f"**{text}**" if text and name in best and round(row.figures[name], 2) <= best[name] else text)
+        line += ["{:.2f} ± {:.2f}".format(*paper[name]) if name in paper else "" for name in compared]
+        cells.append(line + ([row.paper] if texts else []))
+    return Table(header, cells)
+
+
+def shared_unit(rows: Sequence[Row]) -> str:
+    """The unit that all columns of a short table share; empty where they differ."""
+    names = dict.fromkeys(name for row in rows for name in row.names() if name not in SHORT.values())
+    units = {name_and_unit(name)[1] for name in names}
+    return units.pop() if len(units) == 1 else ""
+
+
+def targets_table(rows: Sequence[Row]) -> Table:
+    """The project's targets as far as they were measured."""
+    cells = []
+    for row in rows:
+        method, limits = TARGETS.get(row.experiment, ("", {}))
+        for name, (least, most) in limits.items():
+            if row.method == method and name in row.figures:
+                value, (text, unit) = row.figures[name], name_and_unit(name)
+                target = f"at most {most:g} {unit}" if least == 0.0 else f"{least:g} to {most:g} {unit}"
+                met = "met" if least <= value <= most else "**missed**"
+                cells.append([row.experiment, method, text, f"{value:.2f} {unit}".strip(), target.strip(), met])
+    return Table(["experiment", "filter", "figure", "value", "target", ""], cells)
+
+
+def overview_table(rows: Sequence[Row]) -> Table:
+    """smekf beside the paper's smekf and beside the best of all filters; bold where ours is larger than the paper's."""
+    cells = []
+    for experiment in dict.fromkeys(row.experiment for row in rows if row.experiment != ERROR_BUDGET):
+        of = {row.method: row.figures for row in rows if row.experiment == experiment}
+        paper = paper_figures(experiment, OURS)
+        for name in (name for name in of.get(OURS, {}) if name in ERRORS and name != "mean angle"):
+            ours, (text, unit) = of[OURS][name], name_and_unit(name)
+            best = min((m for m in of if name in of[m]), key=lambda m, name=name: (round(of[m][name], 2), m != OURS))  # type: ignore[misc]
+            shown = f"{ours:.2f}"
+            if name in paper and round(ours, 2) > paper[name][0]:
+                shown = f"**{shown}**"
+            theirs = f"{paper[name][0]:.2f}" if name in paper else ""
+            cells.append([experiment, f"{text} [{unit}]", shown, theirs, f"{of[best][name]:.2f}", best])
+    return Table(["experiment", "mean error", "smekf", "the paper's smekf", "best", "by"], cells)
+
+
+def imperfections_table(worlds: Mapping[str, Mapping[str, Any]]) -> Table:
+    """What is off in each simulated world, and by how much."""
+    sizes = {world: of.get("imperfections", {}) for world, of in worlds.items()}
+    cells = [
+        [words, *(_size(of.get(name), factor, unit) for of in sizes.values())]
+        for name, (words, factor, unit) in _IMPERFECTIONS.items()
+    ]
+    return Table(["imperfection", *sizes], cells)
+
+
+def noise_table(noise: Mapping[str, float]) -> Table:
+    """The simulated sensors' noise in the units of data sheets."""
+    cells = [
+        [words, f"{factor * noise[name]:.3g}{unit}"] for name, (words, factor, unit) in _NOISE.items() if name in noise
+    ]
+    return Table(["Xsens MTi-3", "one standard deviation"], cells)
+
+
+def gains_table(gains: Mapping[str, Mapping[str, Any]]) -> Table:
+    """The gains of ncf and gdc in each setting."""
+    cells = [
+        [setting, *(", ".join(f"{k} {v:.3g}" for k, v in of.get(name, {}).items()) for name in ("ncf", "gdc"))]
+        for setting, of in gains.items()
+    ]
+    return Table(["setting", "ncf", "gdc"], cells)
+
+
+def table_note(rows: Sequence[Row]) -> str:
+    """What the signs of the table mean."""
+    keys = [key for row in rows for key in row.figures]
+    notes = []
+    if any(key.endswith(" std") for key in keys):
+        notes.append("± is one standard deviation over time, averaged over the trials, as is the mean")
+    if any(key.endswith(" between") for key in keys):
+        notes.append("in brackets one standard deviation between the trials")
+    if any(name.replace("_", " ") in keys for name in SPLIT):
+        notes.append("RMSE: root mean square error of a trial, averaged over the trials")
+    if set(SHORT.values()) & set(keys):
+        notes.append(
+            "nees: normalised squared error of the hand, right are 3; in 1σ, in 2σ: share of the hand's errors within "
+            "one and two stated standard deviations, right are 0.68 and 0.95"
+        )
+    if any(key in ERRORS for key in keys) and len(rows) > 1 and rows[0].experiment != ERROR_BUDGET:
+        notes.append("bold: the smallest of a column")
+    text = "; ".join(notes)
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
+
+
+class Part(NamedTuple):
+    """What one imperfection adds to the hand's error: all on less this one off, as root of the mean squares [mm].
+
+    Below zero: the error grows without it.
+    """
+
+    name: str
+    added: dict[str, float]  # "hand", "from shoulders"
+
+
+class ErrorBudget(NamedTuple):
+    """Root-mean-square errors of the hand [mm] with all imperfections, and what each adds."""
+
+    full: dict[str, float]
+    parts: list[Part]  # the largest first
+    more: list[Part]  # what is not in it, and what that would add
+
+
+def error_budget(results: Sequence[Result]) -> ErrorBudget | None:
+    """What each imperfection adds to the hand's error; None without a run that has all of them on."""
+    rms: dict[str, dict[str, float]] = {}
+    for method in dict.fromkeys(result.method for result in results if result.experiment == ERROR_BUDGET):
+        of = [r.figures for r in results if r.experiment == ERROR_BUDGET and r.method == method]
+        rms[method] = {
+            name: float(np.sqrt(np.mean([figure[key]["rmse"] ** 2 for figure in of])))
+            for key, name in HAND.items()
+            if all(isinstance(figure.get(key), dict) and figure[key].get("rmse") is not None for figure in of)
+        }
+    full = rms.pop("all on", None)
+    if not full:
+        return None
+    parts, more = [], []
+    for method, without in rms.items():
+        squares = {name: full[name] ** 2 - without[name] ** 2 for name in without if name in full}
+        added = {name: float(np.copysign(np.sqrt(abs(square)), square)) for name, square in squares.items()}
+        if method.endswith(" as stated"):  # known in the budget
+            more.append(Part(method, {name: -value for name, value in added.items()}))
+        elif added:
+            parts.append(Part(_part(method), added))
+    parts.sort(key=lambda part: -next(iter(part.added.values())))
+    return ErrorBudget(full, parts, more)
+
+
+def _part(method: str) -> str:
+    """What is switched off: "soft tissue off", "lengths known" → "soft tissue", "lengths"."""
+    name = method.removesuffix(" off").removesuffix(" known").removesuffix(" exact")
+    return {"orientations": "orientation filter", "clocks exact, none lost": "clocks, lost samples"}.get(name, name)
+
+
+def _cell(row: Row, name: str, whole: bool) -> str:
+    if name not in row.figures:
+        return ""
+    text = f"{row.figures[name]:.3g}" if name in GAINS else f"{row.figures[name]:.2f}"
+    text += f" ± {row.figures[f'{name} std']:.2f}" if f"{name} std" in row.figures else ""
+    return text + (f" ({row.figures[f'{name} between']:.2f})" if whole and f"{name} between" in row.figures else "")
+
+
+def _size(value: Any, factor: float, unit: str) -> str:
+    """A size in its unit; "–" for none, as of a range without end."""
+    return f"{factor * value:.4g}{unit}" if isinstance(value, int | float) and value else "–"
+
+
+# Figures of trials ----------------------------------------------------------------------------------------------------
 
 
 def _flat(found: Mapping[str, Any], above: str = "") -> dict[str, float]:
