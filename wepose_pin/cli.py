@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import logging
 import os
 import re
 import signal
@@ -718,8 +717,8 @@ def retarget(
             (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
         if view:
             step("making the page")
+            from .report.page import PageWriter
             from .report.viewer import retarget_html
-            from .writers.pages import PageWriter
 
             writer = PageWriter(out, ["view.html"])
             writer.write(
@@ -1095,8 +1094,6 @@ def main(argv: list[str] | None = None) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         signal.signal(signal.SIGINT, _stop)
         signal.signal(signal.SIGTERM, _stop)
-        # It says in several lines that it cannot keep fonts and settings, and does without.
-        logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if argv in (["--version"], ["-V"]):
         from . import __version__
 
@@ -1564,11 +1561,11 @@ def _validation_tables(document: Document) -> None:
         # A long name in two lines: the tables stay within 100 columns.
         header = [name if len(name) < 12 else "\n".join(name.rsplit(" ", 1)) for name in header]
         title = f"{experiment}, {trials} trial{'s' * (trials != 1)}" + (f" [{unit}]" if unit else "")
-        _print_table(title + ", a quick run" * document.quick, tuple(header), [tuple(line) for line in lines])
+        _print_table(title + ", a quick run" * document.quick, tuple(header), [tuple(map(str, line)) for line in lines])
         _say("")
     targets = targets_table(rows)
     if targets.rows:
-        cells = [tuple(cell.replace("**", "") for cell in row if isinstance(cell, str)) for row in targets.rows]
+        cells = [tuple(str(cell).replace("**", "") for cell in row) for row in targets.rows]
         _print_table("Targets for the mean errors", tuple(targets.header), cells)
     _say("± is one standard deviation over time, averaged over the trials. The static phase's bias is removed for")
     _say("every filter but those with default gains; the heading is aligned once, where nothing is scored, and never")

@@ -148,8 +148,8 @@ class Work:
         found = as_json(retargeting.summary(trajectory, held, touched)) | {"made_by": dict(self.given.made_by)}
         (folder / "summary.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
         if options["view"]:
+            from ..report.page import PageWriter
             from ..report.viewer import retarget_html
-            from ..writers.pages import PageWriter
 
             title = f"{self._recording(False).name} on {model.map.name}"
             writer = PageWriter(folder, ["view.html"])

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .chart import Anchor, Chart, Key, Panel, Picture, category_limits, category_ticks
+from .chart import Anchor, Chart, Key, Panel, Picture, category_rows
 from .track_figures import TIME, body_views
 from .words import capital, plus_minus, signed
 
@@ -51,10 +51,8 @@ class Hands(NamedTuple):
 
 def lengths_picture(rows: Sequence[Length]) -> Picture:
     """Each length beside the population prior, with intervals."""
-    names = [row.label for row in rows]
-    panel = Panel(x_label="longer than the population prior [mm]", y=category_limits(names), grid="x", right=110.0)
-    panel.y_ticks = category_ticks(names)
-    for (at, _), row in zip(panel.y_ticks, rows, strict=True):
+    panel = Panel(x_label="longer than the population prior [mm]", right=110.0)
+    for at, row in zip(category_rows(panel, [row.label for row in rows]), rows, strict=True):
         off, std, before = (1e3 * v for v in (row.value - row.prior, row.std, row.prior_std))
         if np.isfinite(before):
             panel.boxes((-before, before), (at - 0.31, at + 0.31), "band")
@@ -84,18 +82,17 @@ def sensors_picture(rows: Sequence[Sensor], tilt_before_deg: float, drift_before
     names = [row.label for row in rows]
     columns = [[row.tilt_std for row in rows], [row.heading_std for row in rows], [r.drift_deg_min for r in rows]]
     titles = ["tilt of the mount, ± [°]", "heading of the mount, ± [°]", "heading drift [°/min]"]
-    ticks, panels = category_ticks(names), []
+    panels: list[Panel] = []
     for k, (title, column) in enumerate(zip(titles, columns, strict=True)):
         before = (tilt_before_deg, 0.0, drift_before)[k]
         most = max([1e-3, before, *(abs(value) for value in column if np.isfinite(value))])
-        panel = Panel(title, x=(-1.35 * most if k == 2 else 0.0, 1.25 * most), y=category_limits(names), grid="x")
-        panel.y_ticks = ticks if k == 0 else [(at, "") for at, _ in ticks]
+        panel = Panel(title, x=(-1.35 * most if k == 2 else 0.0, 1.25 * most), shown_y=not panels)
         if k == 2:
             panel.spans([(-before, before)], "band")
             panel.rule("ink thin", x=0.0)
         if k == 0:
             panel.rule("soft dashed", x=before)
-        for (at, _), value in zip(ticks, column, strict=True):
+        for at, value in zip(category_rows(panel, names), column, strict=True):
             if not np.isfinite(value):
                 panel.text(0.0, at, "not known", "soft", dx=5.0)
                 continue

@@ -87,7 +87,7 @@ class Panel:
     equal : one unit is as long in x as in y; the limits give way
     flip_x : larger values to the left
     log_x, log_y : a logarithmic axis
-    shown_x : with labels at the ticks of x, and not only the grid
+    shown_x, shown_y : with labels at the ticks, and not only the grid
     bare : without axes
     right : [px] kept free to the right of it
     """
@@ -104,6 +104,7 @@ class Panel:
     log_x: bool = False
     log_y: bool = False
     shown_x: bool = True
+    shown_y: bool = True
     bare: bool = False
     right: float = 12.0
     marks: list[Mark] = field(default_factory=list)
@@ -125,7 +126,7 @@ class Panel:
         if len(x):
             self.marks.append(Mark("box", css, x, y, opacity=opacity, colour=colour, counts=counts))
 
-    def spans(self, spans: Sequence[Limits], css: str) -> None:
+    def spans(self, spans: Sequence[Limits] | np.ndarray, css: str) -> None:
         """Boxes over the whole height."""
         if len(spans):
             self.boxes(np.array(spans, float), (-np.inf, np.inf), css, counts=False)
@@ -291,21 +292,19 @@ def log_ticks(low: float, high: float) -> list[Tick]:
     return [(value, f"{value:g}") for value in values if low <= value <= high]
 
 
-def category_ticks(names: Sequence[str]) -> list[Tick]:
-    """A row a name, the first on top, at whole numbers; `category_limits` shows them."""
-    return [(float(len(names) - 1 - k), name) for k, name in enumerate(names)]
-
-
-def category_limits(names: Sequence[str]) -> Limits:
-    return -0.6, len(names) - 0.4
+def category_rows(panel: Panel, names: Sequence[str]) -> list[float]:
+    """Make the panel's y axis one of names, the first on top; gives their places."""
+    places = [float(len(names) - 1 - k) for k in range(len(names))]
+    panel.y, panel.y_ticks, panel.grid = (-0.6, len(names) - 0.4), list(zip(places, names, strict=True)), "x"
+    return places
 
 
 # From data to pixels --------------------------------------------------------------------------------------------------
 
 
 def _room_left(panel: Panel) -> float:
-    if panel.bare:
-        return 8.0
+    if panel.bare or not panel.shown_y:
+        return 12.0
     ticks = panel.y_ticks
     if ticks is None:
         ticks = _ticks(panel, "y", *panel.limits("y"), 100.0)
@@ -357,7 +356,7 @@ def _drawn_panel(panel: Panel, left: float, top: float, width: float, height: fl
         for value, label in y_ticks:
             y = round(float(at_y(value)), 1)
             if 0.0 <= y <= height:
-                texts.append(DrawnText(-7.0, y + 4.0, label, "tick", "end"))
+                texts += [DrawnText(-7.0, y + 4.0, label, "tick", "end")] if panel.shown_y else []
                 grid += f"M0 {y:g}h{width:.1f}" if "y" in panel.grid else ""
         if panel.x_label:
             below = height + 15.0 + _LINE * panel.shown_x

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..recording.gaps import runs
-from .chart import WIDTH, Chart, Key, Panel, Picture, category_limits, category_ticks, envelope
+from .chart import WIDTH, Chart, Key, Panel, Picture, category_rows, envelope
 from .measures import Hand, Signal, largest
 from .words import plain
 
@@ -53,25 +53,21 @@ def timeline_picture(time: np.ndarray, signals: Mapping[str, Signal], phases: Ma
 def noise_picture(signals: Mapping[str, Signal]) -> Picture:
     """Noise and bias of each sensor that has them."""
     rows = {plain(name): signal for name, signal in signals.items() if signal.bias is not None}
-    names = list(rows)
-    limits, ticks = category_limits(names), category_ticks(names)
-    panels = []
+    panels: list[Panel] = []
     for title, values in (
         ("gyroscope's noise [°/s]", [float(np.degrees(signal.gyro_noise)) for signal in rows.values()]),
         ("accelerometer's noise [m/s²]", [signal.accel_noise for signal in rows.values()]),
     ):
-        panel = Panel(title, x=(0.0, 1.25 * max(1e-6, *values)), y=limits, y_ticks=ticks, grid="x")
-        for (at, _), value in zip(ticks, values, strict=True):
+        panel = Panel(title, x=(0.0, 1.25 * max(1e-6, *values)), shown_y=not panels)
+        for at, value in zip(category_rows(panel, list(rows)), values, strict=True):
             panel.boxes((0.0, value), (at - 0.28, at + 0.28), "accent")
             panel.text(value, at, f"{value:.3f}", dx=5.0)
         panels.append(panel)
-        ticks = [(at, "") for at, _ in ticks]
     biases = np.array(
         [np.degrees(np.linalg.norm(signal.bias, axis=1)) for signal in rows.values() if signal.bias is not None]
     )
-    panel = Panel("gyroscope's bias [°/s]", x=(0.0, 1.12 * max(1e-6, float(biases.max()))), y=limits, y_ticks=ticks)
-    panel.grid = "x"
-    for (at, _), (begin, end) in zip(ticks, biases, strict=True):
+    panel = Panel("gyroscope's bias [°/s]", x=(0.0, 1.12 * max(1e-6, float(biases.max()))), shown_y=False)
+    for at, (begin, end) in zip(category_rows(panel, list(rows)), biases, strict=True):
         panel.line(np.array([begin, end]), np.full(2, at), "accent")
         panel.markers(begin, at, "circle", "accent hollow")
         panel.markers(end, at, "diamond", "accent")
@@ -81,7 +77,7 @@ def noise_picture(signals: Mapping[str, Signal]) -> Picture:
         "Noise of one axis in the still phase (a person's sway counts as noise there), and the size of the bias of the "
         "three axes together: as measured in the still phase, and as the filter knew it at the end."
     )
-    return Picture("noise", caption, Chart([panels], [26.0 * len(names) + 6.0], keys))
+    return Picture("noise", caption, Chart([panels], [26.0 * len(rows) + 6.0], keys))
 
 
 def headings_picture(time: np.ndarray, std_deg: Mapping[str, np.ndarray], clasps: Spans) -> Picture:
@@ -105,7 +101,7 @@ def paths_picture(hands: Mapping[str, Hand], shoulder_width: float, trunk: float
             at = 100.0 * hand.reach[:: max(1, len(hand.reach) // PATH_POINTS)][:, [across, up]]
             side = style_of(name).split()[0]
             panel.line(at[:, 0], at[:, 1], f"{side} faint")
-            panel.markers(*at[0], "circle" if side == "left" else "square", side)
+            panel.markers(at[0, 0], at[0, 1], "circle" if side == "left" else "square", side)
         panels.append(panel)
     keys = [
         Key(f"{plain(name)}, mark: beginning", style_of(name).split()[0], "square" if "right" in name else "circle")

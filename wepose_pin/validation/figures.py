@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ..errors import reason
-from ..report.chart import Chart, Key, Marker, Panel, Picture, category_limits, category_ticks
+from ..report.chart import Chart, Key, Marker, Panel, Picture, category_rows
 from ..report.words import capital, slug
 from .document import Document
 from .jobs import Result
@@ -74,13 +74,12 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Pi
     paper = {row.method: paper_figures(experiment, row.method) for row in rows if row.method in COLOURS}
     limits = TARGETS.get(experiment, ("", {}))[1]
     methods = [row.method for row in rows]
-    panels = []
+    panels: list[Panel] = []
     for name in names:
         shown, unit = name_and_unit(name)
-        panel = Panel(f"{FROM.get(name, shown)} [{unit}]", y=category_limits(methods), grid="x")
-        panel.y_ticks = category_ticks(methods) if not panels else [(at, "") for at, _ in category_ticks(methods)]
+        panel = Panel(f"{FROM.get(name, shown)} [{unit}]", shown_y=not panels)
         bars = []  # place, mean, with whisker
-        for (at, _), row in zip(category_ticks(methods), rows, strict=True):
+        for at, row in zip(category_rows(panel, methods), rows, strict=True):
             beside = paper.get(row.method, {}).get(name)
             half, up = (0.18, 0.19) if beside else (0.25, 0.0)
             both = [(at + up, row.figures[name], row.figures.get(f"{name} std", 0.0), _colour(row.method), "")]
@@ -113,14 +112,14 @@ def _trials(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> 
     trials = list(dict.fromkeys(result.trial for result in results))
     if len(trials) < 2 or not all(name in row.figures for row in rows for name in names):
         return None
-    ticks = category_ticks([trial.replace("_", " ") for trial in trials])
-    place = {trial: at for trial, (at, _) in zip(trials, ticks, strict=True)}
-    panels = []
+    panels: list[Panel] = []
     for name in names:
+        panel = Panel(f"{name} [°]", shown_y=not panels)
+        places = category_rows(panel, [trial.replace("_", " ") for trial in trials])
+        place = dict(zip(trials, places, strict=True))
         shown = [(r.method, place[r.trial], value) for r in results if (value := figures(r).get(name)) is not None]
         values = np.array([value for _, _, value in shown])
-        panel = Panel(f"{name} [°]", y=category_limits(trials))
-        panel.y_ticks = ticks if not panels else [(at, "") for at, _ in ticks]
+        panel.grid = "xy"
         panel.log_x = bool(values.min() > 0.0 and values.max() > 12.0 * values.min())
         panel.x = None if panel.log_x else (0.0, 1.05 * float(values.max()))
         for k, method in reversed(list(enumerate(row.method for row in rows))):  # ours on top
@@ -176,7 +175,7 @@ def _path(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pictu
     off = {m: [np.subtract(s[f"{axis}_mm"], s[f"true_{axis}_mm"]) for axis in "xyz"] for m, s in series.items()}
     plain: list[str] = [m for m in ("ncf", "gdc") if m in series] or [m for m in series if m != first]
     others = sorted((m for m in plain if m != first), key=lambda m: float(np.mean(np.square(off[m]))))[-1:]
-    panels = []
+    panels: list[Panel] = []
     for up, title in (("z", "from behind: z, upwards [mm]"), ("x", "from above: x, forwards [mm]")):
         panel = Panel(title, "y, to the left [mm]", equal=True, flip_x=True)
         for method in [*others, first]:
@@ -195,16 +194,15 @@ def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pic
     found = error_budget(results)
     if experiment != ERROR_BUDGET or found is None:
         return None
-    rows = [("all on", found.full, "ink"), *((part.name, part.added, "accent") for part in found.parts)]
-    rows += [(f"more: {part.name}", part.added, "before") for part in found.more]
-    names = [name for name, _, _ in rows]
-    values = [of.get(name, 0.0) for _, of, _ in rows for name in found.full]
-    panels = []
+    lines = [("all on", found.full, "ink"), *((part.name, part.added, "accent") for part in found.parts)]
+    lines += [(f"more: {part.name}", part.added, "before") for part in found.more]
+    names = [line[0] for line in lines]
+    values = [line[1].get(name, 0.0) for line in lines for name in found.full]
+    panels: list[Panel] = []
     for name in found.full:
         ends = min(0.0, 1.05 * min(values)), 1.15 * max(values)
-        panel = Panel(f"{FROM[name]} [mm]", x=ends, y=category_limits(names), grid="x")
-        panel.y_ticks = category_ticks(names) if not panels else [(at, "") for at, _ in category_ticks(names)]
-        for (at, _), (_, of, css) in zip(category_ticks(names), rows, strict=True):
+        panel = Panel(f"{FROM[name]} [mm]", x=ends, shown_y=not panels)
+        for at, (__, of, css) in zip(category_rows(panel, names), lines, strict=True):
             value = of.get(name)
             if value is not None:
                 ends = min(value, 0.0), max(value, 0.0)
@@ -220,7 +218,7 @@ def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pic
         caption += "; hatched, to the left: the error grows without it"
     if found.more:
         caption += "; orange: what would come on top"
-    return Picture("parts", f"{caption}.", Chart([panels], [28.0 * len(rows) + 6.0]))
+    return Picture("parts", f"{caption}.", Chart([panels], [28.0 * len(lines) + 6.0]))
 
 
 # How they look --------------------------------------------------------------------------------------------------------
