@@ -13,7 +13,7 @@ from .track_figures import TIME, body_views
 from .words import capital, plus_minus, signed
 
 CELL = 5.0  # [cm] of the map of the hands
-SHADES = 6  # of the map of the hands
+SHADES = 6  # of the map of the hands: classes shade1 to shade6
 SMOOTHED_S = 2.0
 EXAGGERATED_DEG = 24.0  # the largest tilt is drawn about so large
 MOST_EXAGGERATED = 6
@@ -162,14 +162,9 @@ def hands_picture(hands: Hands, noun: str) -> Picture:
         shade = np.ceil(SHADES * total / most).clip(1, SHADES)
         for k in range(1, SHADES + 1):
             at = corners[shade == k]
-            panel.boxes(
-                at[:, :1] + [0.0, CELL], at[:, 1:] + [0.0, CELL], "shade", opacity=round(0.1 + 0.9 * k / SHADES, 2)
-            )
+            panel.boxes(at[:, :1] + [0.0, CELL], at[:, 1:] + [0.0, CELL], f"shade{k}")
         panel.markers(reach[~hands.touched, x], reach[~hands.touched, y], "cross", "before crosses", size=3.0)
-    keys = [
-        Key(f"to {most * k / SHADES:.2g} %", "shade", "box", round(0.1 + 0.9 * k / SHADES, 2))
-        for k in range(1, SHADES + 1)
-    ]
+    keys = [Key(f"to {most * k / SHADES:.2g} %", f"shade{k}", "box") for k in range(1, SHADES + 1)]
     caption = f"Where {noun} went, seen from the torso; the darker, the more was learned in a cell of {CELL:g} cm."
     if not hands.touched.all():
         caption += " Crosses: apart."

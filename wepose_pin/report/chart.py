@@ -36,7 +36,6 @@ class Key(NamedTuple):
     label: str
     css: str
     shape: str = "line"
-    opacity: float = 1.0
     colour: str = ""  # where the class gives none
 
 
@@ -57,7 +56,6 @@ class Mark:
     x: np.ndarray  # (n,); of boxes (n, 2)
     y: np.ndarray
     size: float = 4.0  # [px] of a marker; a disc's radius in data units
-    opacity: float = 1.0
     colour: str = ""  # where the class gives none
     counts: bool = True  # for limits that are taken from the data
 
@@ -118,13 +116,11 @@ class Panel:
         """The area between a line and zero."""
         self.marks.append(Mark("area", css, np.asarray(x, float), np.asarray(y, float)))
 
-    def boxes(
-        self, x: object, y: object, css: str, *, opacity: float = 1.0, colour: str = "", counts: bool = True
-    ) -> None:
+    def boxes(self, x: object, y: object, css: str, *, colour: str = "", counts: bool = True) -> None:
         """Boxes from x[:, 0] to x[:, 1] and y[:, 0] to y[:, 1]."""
         x, y = np.broadcast_arrays(np.atleast_2d(np.asarray(x, float)), np.atleast_2d(np.asarray(y, float)))
         if len(x):
-            self.marks.append(Mark("box", css, x, y, opacity=opacity, colour=colour, counts=counts))
+            self.marks.append(Mark("box", css, x, y, colour=colour, counts=counts))
 
     def spans(self, spans: Sequence[Limits] | np.ndarray, css: str) -> None:
         """Boxes over the whole height."""
@@ -145,7 +141,7 @@ class Panel:
             self.marks.append(Mark(shape, css, xs, ys, size, colour=colour))
 
     def disc(self, x: float, y: float, radius: float, css: str) -> None:
-        self.marks.append(Mark("disc", css, np.array([x]), np.array([y]), radius, counts=False))
+        self.marks.append(Mark("disc", css, np.array([x]), np.array([y]), radius))
 
     def text(self, x: float, y: float, text: str, css: str = "", anchor: Anchor = "start", *,
              dx: float = 0.0, dy: float = 4.0) -> None:  # fmt: skip
@@ -156,7 +152,16 @@ class Panel:
         given = self.x if axis == "x" else self.y
         if given is not None:
             return given if given[1] > given[0] else (given[0] - 0.5, given[0] + 0.5)
-        values = np.concatenate([[np.nan], *(getattr(m, axis).ravel() for m in self.marks if m.counts)])
+        values = np.concatenate(
+            [[np.nan]]
+            + [
+                np.add.outer([-m.size, m.size], getattr(m, axis)).ravel()
+                if m.kind == "disc"
+                else getattr(m, axis).ravel()
+                for m in self.marks
+                if m.counts
+            ]
+        )
         values = values[np.isfinite(values)]
         low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
         if self.log_x if axis == "x" else self.log_y:
@@ -168,7 +173,6 @@ class Panel:
 class DrawnMark(NamedTuple):
     d: str
     css: str
-    opacity: float
     colour: str
 
 
@@ -200,7 +204,6 @@ class DrawnKey(NamedTuple):
     label: str
     css: str
     d: str
-    opacity: float
     colour: str
 
 
@@ -250,7 +253,7 @@ class Chart:
                 d = {"line": "M40-40H300", "box": "M60-90H280V10H60z"}.get(key.shape)
                 d = d or "M170-40" + _marker(key.shape, 4.5)
                 css = f"{_CLASSES.get(key.shape, 'marker')} {key.css}"
-                drawn.append(DrawnKey(round(x, 1), y - 14.0, key.label, css, d, key.opacity, key.colour))
+                drawn.append(DrawnKey(round(x, 1), y - 14.0, key.label, css, d, key.colour))
                 x += width
         return drawn, (_LINE + 2.0) * len(lines) + 3.0 if self.legend else 0.0
 
@@ -338,7 +341,7 @@ def _drawn_panel(panel: Panel, left: float, top: float, width: float, height: fl
     for mark in panel.marks:
         d = _path(mark, at_x(mark.x), at_y(mark.y), float(at_y(0.0)) if mark.kind == "area" else 0.0, width / (x1 - x0))
         if d:
-            marks.append(DrawnMark(d, f"{_CLASSES.get(mark.kind, 'marker')} {mark.css}", mark.opacity, mark.colour))
+            marks.append(DrawnMark(d, f"{_CLASSES.get(mark.kind, 'marker')} {mark.css}", mark.colour))
     texts = []
     for text in panel.texts:
         x, y = float(at_x(text.x)) + text.dx, float(at_y(text.y)) + text.dy
