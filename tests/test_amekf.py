@@ -18,10 +18,10 @@ from wepose_pin.evaluation import attitude_error, uncertainty
 from wepose_pin.filters import TYPICAL, Amekf, AmekfParams, FilterRun, Smoother, estimate_orientation, run_filter
 from wepose_pin.filters.amekf import STATES, TAPE, transition_rows
 from wepose_pin.filters.bank import LiveBank
-from wepose_pin.noise import SensorNoise, noise_of
+from wepose_pin.filters.noise import SensorNoise, noise_of
+from wepose_pin.filters.static import StaticDetector
 from wepose_pin.readers.trials import read_authors_trial, read_broad
 from wepose_pin.simulation import PERFECT_WORLD, REALISTIC, paper_dynamic
-from wepose_pin.static import StaticDetector
 
 RATE = 100.0
 GRAVITY = 9.81

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin import so3
 from wepose_pin.filters import GdcParams, Smekf, run_filter
-from wepose_pin.noise import noise_of
+from wepose_pin.filters.noise import noise_of
+from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.readers.trials import read_broad
-from wepose_pin.static import StaticDetector, StaticTest
 
 ROWS = ("smekf", "smekf, no correction in motion", "smekf, start measured", "ncf", "gdc 0.12", "gdc 0.01")
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.evaluation import attitude_error
 from wepose_pin.filters import METHODS, GdcParams, NcfParams
-from wepose_pin.noise import noise_of
+from wepose_pin.filters.noise import noise_of
 from wepose_pin.simulation import SingleSensor, paper_dynamic
 from wepose_pin.validation import gains as tuning
 from wepose_pin.validation.contenders import DEFAULT_GAINS, Contender, contenders

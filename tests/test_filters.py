@@ -25,12 +25,12 @@ from wepose_pin.filters import (
 )
 from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.base import in_parallel
+from wepose_pin.filters.noise import SensorNoise, noise_of
 from wepose_pin.filters.smekf import starting_params
-from wepose_pin.noise import SensorNoise, noise_of
+from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.readers.trials import read_authors_trial
 from wepose_pin.simulation import paper_dynamic
 from wepose_pin.so3 import tilt
-from wepose_pin.static import StaticDetector, StaticTest
 
 RATE = 100.0
 GRAVITY = 9.81

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadPhase
-from wepose_pin.noise import ACCEL_FLOOR, GYRO_FLOOR, QUIET_S, noise_of, quietest
+from wepose_pin.filters.noise import ACCEL_FLOOR, GYRO_FLOOR, QUIET_S, noise_of, quietest
 from wepose_pin.recording import Recording, Sensor
 
 RATE = 100.0

@@ -18,8 +18,8 @@ from wepose_pin.calibration import calibrate_lengths
 from wepose_pin.cli import main
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.filters import METHODS, SensorRun, piece_multiple, run_filter
+from wepose_pin.filters.noise import noise_of
 from wepose_pin.model import load_model
-from wepose_pin.noise import noise_of
 from wepose_pin.pose import pose_table
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording

@@ -13,7 +13,7 @@ import wepose_pin
 
 PACKAGE = Path(wepose_pin.__file__).parent
 ORDER = (
-    "errors arguments so3 assets recording readers subject noise static filters model alignment pose calibration "
+    "errors arguments so3 assets recording readers subject filters model alignment pose calibration "
     "tracking simulation evaluation angles writers retargeting report live validation batch bench cli"
 ).split()
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if "_assets" not in path.parts)

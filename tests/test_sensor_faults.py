@@ -14,7 +14,7 @@ from test_bad_input import refused
 from wepose_pin import load_session, so3
 from wepose_pin.alignment import START_POSE_STD, segment_orientations
 from wepose_pin.errors import BadData, BadPhase
-from wepose_pin.noise import quietest
+from wepose_pin.filters.noise import quietest
 from wepose_pin.readers import iter_session
 from wepose_pin.readers.session import SessionReader
 from wepose_pin.recording import Recording, Sensor

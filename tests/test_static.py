@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import run_filter
-from wepose_pin.noise import SensorNoise, noise_of
-from wepose_pin.static import StaticDetector, StaticTest
+from wepose_pin.filters.noise import SensorNoise, noise_of
+from wepose_pin.filters.static import StaticDetector, StaticTest
 
 RATE = 100.0
 # The paper's conditions alone, without (5)

@@ -22,7 +22,7 @@ _WHERE = {
     "Pose": "pose",
     "Recording": "recording",
     "Sensor": "recording",
-    "StaticTest": "static",
+    "StaticTest": "filters.static",
     "Subject": "subject",
     "WeposeError": "errors",
     "WeposeWarning": "errors",

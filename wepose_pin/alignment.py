@@ -20,10 +20,10 @@ from . import so3
 from .errors import BadPhase, BadSession, WeposeError
 from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
+from .filters.noise import SensorNoise, noise_of, quietest
 from .filters.start import ACCEL_BIAS_STD
-from .noise import SensorNoise, noise_of, quietest
+from .filters.static import StaticTest
 from .recording import CONFIGURATION, SEGMENTS, Recording, format_time, span_text
-from .static import StaticTest
 from .subject import Subject
 
 # The stated axes are by hand; further off than this they are no longer what was meant.
@@ -40,19 +40,6 @@ ATTITUDE_STD = np.deg2rad(1.5)
 SLIP_STD = 0.005
 # A calibrated mount that gravity contradicts by more than this many standard deviations has moved.
 MOVED_MOUNT = 3.5
-
-# Turning in the start pose: root mean square of the rate, and largest turn from its mean. A person who stands sways
-# below 3 deg/s and 3 deg; at the limits the mean pose is no longer the pose that was meant.
-MOVES_DEG_S, MOVES_DEG = 20.0, 15.0
-SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
-# Sensors that all turn about the vertical at the same rate are on a person who turns: rates [rad/s] above the first, by
-# chance once in a thousand times. Of one or two sensors, a rate above what data sheets give for a bias.
-COMMON_RATE, COMMON_RATE_CHANCE = float(np.deg2rad(0.5)), 1e-3
-LARGEST_BIAS = float(np.deg2rad(5.0))
-
-
-# Samples of a phase at rest, and the share of them that each sensor must have measured.
-FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 
 
 @dataclass(frozen=True)
@@ -82,127 +69,6 @@ class Segments:
     start: tuple[float, float]
     still: tuple[float, float]
     warnings: tuple[str, ...]
-
-
-class Filtered(NamedTuple):
-    """Every sensor in its own world, before any mount is known."""
-
-    R_VS: dict[str, Rotation]  # segment → n orientations of its sensor
-    at_start: dict[str, Rotation]  # their mean in the start pose
-    orientation: dict[str, Orientation]  # what the filter gave; none for ready orientations
-    start: tuple[float, float]  # [s]
-    still: tuple[float, float]  # [s]
-    warnings: list[str]
-
-
-class SensorFilters:
-    """The filters of a recording that comes in pieces; `filtered` is one piece.
-
-    Parameters
-    ----------
-    first : the piece that the recording begins with, and in which the phases `start` and `still` are
-    method, static_test : as `filtered`
-
-    Attributes
-    ----------
-    start, still, warnings : as in `Filtered`
-    ahead : the smoother's: `push` gives the piece before, and the last one comes from `finish`
-
-    Raises
-    ------
-    WeposeError
-        A start phase in which there are too few samples; an unknown method.
-    """
-
-    def __init__(self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> None:
-        check_method(method)
-        self.start, self.still, self.warnings = _phases(first)
-        self._held: Recording | None = None  # the piece that the smoother has not given yet
-        self._runs: dict[str, SensorRun] = {}
-        noises: dict[str, SensorNoise] = {}
-        for segment, sensor in first.sensors.items():
-            if not sensor.aligned:
-                self.warnings += _motion(first, segment, self.start, "start")
-            if self.still != self.start and not sensor.aligned:
-                self.warnings += _motion(first, segment, self.still, "still")
-            if sensor.ready:
-                continue
-            assert sensor.gyro_S is not None
-            assert sensor.accel_S is not None
-            at_rest = first.measured(segment, self.still)
-            try:
-                worn = self.still == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
-                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
-            except WeposeError as error:
-                raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
-            noises[segment] = noise
-        self.warnings += _common_rotation(first, noises, self.still)
-        for segment, noise in noises.items():
-            self._runs[segment] = SensorRun(
-                first.rate_hz,
-                noise,
-                method,
-                static_test=static_test,
-                measured_start=True,
-                start=first.span(self.start),
-                gyro_range=first.sensors[segment].gyro_range,
-            )
-        self.ahead = method in OFFLINE and bool(self._runs)
-
-    def push(self, piece: Recording) -> tuple[Recording, dict[str, Orientation]] | None:
-        """Take a piece; gives a piece and what the filters say of it: this one, or with the smoother the one before."""
-        measured = []
-        for segment in self._runs:
-            sensor = piece.sensors[segment]
-            gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
-            assert gyro_S is not None
-            assert accel_S is not None
-            if sensor.gap is not None:
-                # A long bridge is a guess that no filter may take for measured: lost, its covariance grows over it.
-                gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
-            measured.append((gyro_S, accel_S))
-        before, self._held = self._held, piece
-        done = in_parallel(lambda run, of: run.push(*of), self._runs.values(), measured)
-        found = {segment: of for segment, of in zip(self._runs, done, strict=True) if of is not None}
-        if len(found) < len(self._runs):
-            return None
-        of_piece = before if self.ahead else piece
-        assert of_piece is not None
-        return of_piece, found
-
-    def finish(self) -> tuple[Recording, dict[str, Orientation]]:
-        """The smoother's last piece."""
-        assert self._held is not None
-        found = in_parallel(SensorRun.finish, self._runs.values())
-        return self._held, dict(zip(self._runs, found, strict=True))
-
-
-def filtered(recording: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> Filtered:
-    """Filter every sensor; the start pose, and how still it was.
-
-    Raises
-    ------
-    WeposeError
-        A start phase in which there are too few samples; an unknown method.
-    """
-    filters = SensorFilters(recording, method=method, static_test=static_test)
-    _, orientation = filters.push(recording) or filters.finish()
-    return filtered_piece(filters, recording, orientation)
-
-
-def filtered_piece(filters: SensorFilters, piece: Recording, orientation: Mapping[str, Orientation]) -> Filtered:
-    """A piece that `filters` gave, if the start pose is in it."""
-    R_VS = _in_sensor_worlds(piece, orientation)
-    at_start = {segment: R[piece.measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
-    return Filtered(R_VS, at_start, dict(orientation), filters.start, filters.still, filters.warnings)
-
-
-def _in_sensor_worlds(piece: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:
-    """Segment → n orientations of its sensor, each in a world of its own."""
-    return {
-        segment: Rotation.from_quat(sensor.quat_WS if sensor.quat_WS is not None else orientation[segment].quat_WS)
-        for segment, sensor in piece.sensors.items()
-    }
 
 
 @dataclass(frozen=True)
@@ -438,100 +304,3 @@ def start_heading_var(recording: Recording, segment: str, subject: Subject | Non
 def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
     """Covariance (3, 3) [rad²] of a calibrated mount's error in L, where it holds for this strapping and is known."""
     return None if subject is None or recording.strapping == "new" else subject.mount_covariance(segment)
-
-
-def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[str]]:
-    """The start pose's interval, the interval that noise and bias come from, and what to tell the user of them."""
-    notes = list(recording.notes)
-    if recording.phases.get("start"):
-        start = recording.phases["start"][0]
-        if len(recording.phases["start"]) > 1:
-            notes.append(f"phases.start holds several intervals; the first, {span_text(start)}, is used")
-    elif recording.phases.get("still"):
-        raise BadPhase(
-            f"{recording.where()}: phases.still without phases.start; name the seconds of the start pose, "
-            f"start = [[from, to]]"
-        )
-    else:
-        start = quietest(recording)
-        notes.append(f"no phases.start: the quietest window, {span_text(start)}, is taken for the start pose")
-    still = recording.phases.get("still", ())
-    if len(still) > 1:
-        notes.append(f"phases.still holds several intervals; the first, {span_text(still[0])}, is used")
-    for name, interval in (("start", start), *(("still", span) for span in still[:1])):
-        place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
-        samples = len(recording.time[recording.span(interval)])
-        if samples < FEWEST_AT_START:
-            raise BadPhase(f"{place} holds {samples} samples; it needs at least {FEWEST_AT_START}, better two seconds")
-        for segment in recording.sensors:
-            measured = len(recording.measured(segment, interval))
-            if measured < max(FEWEST_AT_START, LEAST_SHARE_AT_START * samples):
-                raise BadPhase(
-                    f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: nothing "
-                    f"there says how it sits; name seconds in which it measures, or take [sensors.{segment}] out"
-                )
-    return start, still[0] if still else start, notes
-
-
-def _common_rotation(recording: Recording, noises: dict[str, SensorNoise], interval: tuple[float, float]) -> list[str]:
-    """A warning if the person turns in a phase, whose mean rate is the gyroscopes' bias then; an error if by much.
-
-    The biases of several sensors about the vertical are as different as sensors are; the same rate in all is the
-    person's (one-sample t-test). What it may be stays in the biases' covariance, in place.
-    """
-    up_S = {}
-    for segment in noises:
-        accel_S = recording.sensors[segment].accel_S
-        assert accel_S is not None
-        mean_S = accel_S[recording.measured(segment, interval)].mean(axis=0)
-        up_S[segment] = mean_S / np.linalg.norm(mean_S)
-    rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
-    if len(rates) == 0:
-        return []
-    mean = float(rates.mean())
-    if len(rates) >= 3:
-        spread = max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
-        turns = abs(mean) > COMMON_RATE and 2.0 * stats.t.sf(abs(mean) / spread, len(rates) - 1) < COMMON_RATE_CHANCE
-    else:
-        turns = abs(mean) > LARGEST_BIAS
-    if not turns:
-        return []
-    turn_deg = abs(np.degrees(mean)) * (interval[1] - interval[0])
-    found = f"all sensors turn about the vertical at {np.degrees(mean):.1f} deg/s, by {turn_deg:.0f} deg in all"
-    if turn_deg > MOVES_DEG:
-        raise BadPhase(
-            f"{recording.where()}: phases.start ({format_time(interval[0])} to {format_time(interval[1])} s): {found}, "
-            f"where gyroscopes have biases of their own: name seconds in which the person does not turn"
-        )
-    for segment, noise in noises.items():
-        up = up_S[segment]
-        noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + mean**2 * np.outer(up, up))
-    return [f"{found}: the biases of the gyroscopes, and so all headings, are uncertain by as much"]
-
-
-def _motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[str]:
-    """A note if the sensor sways in the phase, an error if it moves.
-
-    The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
-    """
-    sensor, measured = recording.sensors[segment], recording.measured(segment, interval)
-    if sensor.quat_WS is not None:
-        R = Rotation.from_quat(sensor.quat_WS[measured])
-        rate = (R[:-1].inv() * R[1:]).as_rotvec() * recording.rate_hz
-    else:
-        assert sensor.gyro_S is not None
-        rate = sensor.gyro_S[measured]
-        R = Rotation.from_quat(so3.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
-    rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
-    turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
-    guessed = phase not in recording.phases or not recording.phases[phase]
-    place = "the quietest window, taken for the start pose" if guessed else f"phases.{phase}"
-    found = f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} ({span_text(interval)})"
-    if rms > MOVES_DEG_S or turn > MOVES_DEG:
-        raise BadPhase(
-            f"{recording.where()}: {found}; name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "
-            f"{MOVES_DEG:g} deg"
-        )
-    if rms > SWAYS_DEG_S or turn > SWAYS_DEG:
-        return [f"{found}: mounts and headings are uncertain by as much"]
-    return []

@@ -34,10 +34,10 @@ from ..evaluation import attitude_error
 from ..filters import METHODS, OFFLINE, Smekf, run_filter
 from ..filters.bank import LiveBank
 from ..filters.base import in_parallel, processors
-from ..noise import SensorNoise, noise_of
+from ..filters.noise import SensorNoise, noise_of
+from ..filters.static import StaticDetector, StaticTest
 from ..readers.trials import read_authors_trial, read_broad
 from ..simulation import REALISTIC, paper_dynamic, simulate, simulated_person
-from ..static import StaticDetector, StaticTest
 
 FORMAT = 1
 NO_PEERS = "No ratios: VQF is not installed; pip install 'wepose-pin[peers]' brings it and imufusion."
@@ -451,8 +451,8 @@ begin = time.perf_counter()
 import numpy as np
 from wepose_pin.filters import METHODS, OFFLINE, Smekf, run_filter
 from wepose_pin.filters.bank import LiveBank
-from wepose_pin.noise import noise_of
-from wepose_pin.static import StaticDetector
+from wepose_pin.filters.noise import noise_of
+from wepose_pin.filters.static import StaticDetector
 rng = np.random.default_rng(0)
 gyro = rng.normal(scale=1e-3, size=(1000, 3))
 accel = rng.normal(scale=1e-2, size=(1000, 3)) + [0.0, 0.0, 9.81]

@@ -14,16 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from ..arguments import check_arguments
 from ..errors import BadData, BadOption, BadPhase, one_of
-from ..noise import SensorNoise, noise_of
 from ..recording.limits import STANDARD_GRAVITY
-from ..static import StaticDetector, StaticTest
 from .amekf import Amekf, AmekfParams
 from .base import FilterRun, OrientationFilter
 from .gdc import Gdc, GdcParams
 from .ncf import Ncf, NcfParams
+from .noise import SensorNoise, noise_of
 from .smekf import Smekf, SmekfParams, starting_params
 from .smoother import Smoother
 from .start import MOVING_TILT_STD, StartTilt, start_tilt
+from .static import StaticDetector, StaticTest
 
 __all__ = [
     "BEST",

@@ -27,11 +27,11 @@ import numpy as np
 
 from ..arguments import check_fields
 from ..errors import BadOption
-from ..noise import SensorNoise
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..so3 import inlined, kernel
-from ..static import static_step
 from .base import REST_TURN_NOISE, FilterRun, OneSample, samples
+from .noise import SensorNoise
+from .static import static_step
 
 # Error states
 _V, _P, _B, _M, _F, _D = 3, 5, 7, 10, 19, 22  # velocity, position, bias, matrix, accel (force) bias, bias in motion

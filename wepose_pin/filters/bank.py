@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadData, BadOption
-from ..static import StaticDetector, StaticState
 from .smekf import P_AA, P_AB, symmetric
+from .static import StaticDetector, StaticState
 
 
 class LiveBank:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from ..errors import BadData
-from ..noise import SensorNoise
+from .noise import SensorNoise
 
 T = TypeVar("T")
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..noise import SensorNoise
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..so3 import kernel, rotate_by_vector, up_in_sensor
 from .base import FilterRun, OneSample, samples
+from .noise import SensorNoise
 
 
 @dataclass(frozen=True)

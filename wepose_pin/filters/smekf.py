@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import BadOption
-from ..noise import SWAY_CORRELATION_S, SensorNoise
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..so3 import inlined, kernel, rotate_by_vector, up_in_sensor
-from ..static import static_step
 from .base import REST_TURN_NOISE, FilterRun, OneSample, samples
+from .noise import SWAY_CORRELATION_S, SensorNoise
 from .start import ACCEL_BIAS_STD
+from .static import static_step
 
 HEADING_FLOOR = 1e-5  # [rad] keeps P₀ positive definite about the vertical
 

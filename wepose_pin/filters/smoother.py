@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import BadData, BadOption
-from ..noise import SensorNoise
 from ..so3 import compiled
 from .amekf import (
     STATES,
@@ -39,6 +38,7 @@ from .amekf import (
     turn_left,
 )
 from .base import FilterRun
+from .noise import SensorNoise
 
 _V, _P, _B, _M, _F, _D, _MOVING = 3, 5, 7, 10, 19, 22, 36  # as in amekf
 _SHARED = len(TAPE_ROWS)

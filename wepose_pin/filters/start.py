@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..errors import BadData
-from ..noise import BLOCK_S, SensorNoise
+from .noise import BLOCK_S, SensorNoise
 
 ACCEL_BIAS_STD = 0.003  # [rad] tilt error that a calibrated MEMS accelerometer's bias makes (3 mg: our assumption)
 MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion

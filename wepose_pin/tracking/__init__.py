@@ -6,9 +6,9 @@ from ..alignment import segment_orientations
 from ..arguments import check_arguments
 from ..errors import BadOption
 from ..filters import BEST, check_method
+from ..filters.static import StaticTest
 from ..model import BodyModel
 from ..recording import CONFIGURATION, Recording
-from ..static import StaticTest
 from ..subject import Subject
 from .causal import causal_segments
 from .chain import TrackedChain, track_chain

@@ -27,12 +27,12 @@ from ..errors import BadOption, BadPhase
 from ..filters import BEST, OFFLINE, Orientation, check_method
 from ..filters.bank import bank_of
 from ..filters.base import in_parallel
+from ..filters.static import StaticTest
 from ..pose import spread
 from ..recording import Intervals, Recording, Sensor
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
 from ..so3 import kernel
-from ..static import StaticTest
 from ..subject import Subject
 
 HOLD_S = 3.0  # [s] of standing still for a start pose that nobody named

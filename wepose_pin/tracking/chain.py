@@ -21,10 +21,10 @@ from ..alignment import Segments, segment_orientations
 from ..arguments import check_arguments
 from ..errors import BadOption, BadSession, one_of
 from ..filters import BEST, check_method
+from ..filters.static import StaticTest
 from ..model.fit import fit, unseen
 from ..model.robot import joint_values, start_configuration
 from ..recording import CONFIGURATION, Recording
-from ..static import StaticTest
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,12 @@ from ..alignment import (
 )
 from ..errors import BadOption
 from ..filters import BEST, OFFLINE, Orientation, check_method, piece_multiple
+from ..filters.noise import BEGINNING_S
+from ..filters.static import StaticTest
 from ..model import BodyModel
-from ..noise import BEGINNING_S
 from ..pose import Poser
 from ..readers.session import SessionReader
 from ..recording import CONFIGURATION, Intervals, Recording
-from ..static import StaticTest
 from ..subject import Subject
 from .headings import HeadingHold
 from .tracked import TrackedPose, posed, who_and_body

@@ -16,8 +16,8 @@ import numpy as np
 
 from .. import so3
 from ..filters import METHODS, GdcParams, NcfParams, run_filter
-from ..noise import SensorNoise
-from ..static import StaticTest
+from ..filters.noise import SensorNoise
+from ..filters.static import StaticTest
 from .gains import gains_of
 
 Orient = Callable[[np.ndarray, np.ndarray, float, SensorNoise], np.ndarray]

@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from .. import so3
 from ..filters import Gdc, GdcParams, Ncf, NcfParams
-from ..noise import SensorNoise, noise_of
+from ..filters.noise import SensorNoise, noise_of
+from ..filters.static import StaticTest
 from ..readers.trials import read_broad
 from ..simulation import PERFECT_WORLD, REALISTIC, Imperfections, paper_dynamic, simulate, simulated_person
-from ..static import StaticTest
 from .jobs import Job, Result
 from .series import aligned
 

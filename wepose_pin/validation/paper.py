@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from .. import so3
 from ..calibration import calibrate_lengths
 from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
-from ..noise import noise_of
+from ..filters.noise import noise_of
 from ..recording import Recording, Sensor
 from ..simulation import (
     PERFECT_WORLD,

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import MissingFile
 from ..evaluation import attitude_error
-from ..noise import SensorNoise, noise_of
+from ..filters.noise import SensorNoise, noise_of
 from ..readers.trials import (
     RING_MOUNTS,
     RING_SEGMENTS,

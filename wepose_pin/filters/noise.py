@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .errors import BadPhase
-from .recording import Recording
+from ..errors import BadPhase
+from ..recording import Recording
 
 # A quantised signal can stand still to the last bit; below these standard deviations no MEMS sensor is believed, and
 # the covariances stay invertible.

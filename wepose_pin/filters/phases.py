@@ -1,0 +1,126 @@
+"""The intervals that filters and headings start from, and whether the person keeps still in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from .. import so3
+from ..errors import BadPhase
+from ..recording import Recording, format_time, span_text
+from .noise import SensorNoise, quietest
+
+# Turning in the start pose: root mean square of the rate, and largest turn from its mean. A person who stands sways
+# below 3 deg/s and 3 deg; at the limits the mean pose is no longer the pose that was meant.
+MOVES_DEG_S, MOVES_DEG = 20.0, 15.0
+SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
+# Sensors that all turn about the vertical at the same rate are on a person who turns: rates [rad/s] above the first, by
+# chance once in a thousand times. Of one or two sensors, a rate above what data sheets give for a bias.
+COMMON_RATE, COMMON_RATE_CHANCE = float(np.deg2rad(0.5)), 1e-3
+LARGEST_BIAS = float(np.deg2rad(5.0))
+
+
+# Samples of a phase at rest, and the share of them that each sensor must have measured.
+FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
+
+
+def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[str]]:
+    """The start pose's interval, the interval that noise and bias come from, and what to tell the user of them."""
+    notes = list(recording.notes)
+    if recording.phases.get("start"):
+        start = recording.phases["start"][0]
+        if len(recording.phases["start"]) > 1:
+            notes.append(f"phases.start holds several intervals; the first, {span_text(start)}, is used")
+    elif recording.phases.get("still"):
+        raise BadPhase(
+            f"{recording.where()}: phases.still without phases.start; name the seconds of the start pose, "
+            f"start = [[from, to]]"
+        )
+    else:
+        start = quietest(recording)
+        notes.append(f"no phases.start: the quietest window, {span_text(start)}, is taken for the start pose")
+    still = recording.phases.get("still", ())
+    if len(still) > 1:
+        notes.append(f"phases.still holds several intervals; the first, {span_text(still[0])}, is used")
+    for name, interval in (("start", start), *(("still", span) for span in still[:1])):
+        place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
+        samples = len(recording.time[recording.span(interval)])
+        if samples < FEWEST_AT_START:
+            raise BadPhase(f"{place} holds {samples} samples; it needs at least {FEWEST_AT_START}, better two seconds")
+        for segment in recording.sensors:
+            measured = len(recording.measured(segment, interval))
+            if measured < max(FEWEST_AT_START, LEAST_SHARE_AT_START * samples):
+                raise BadPhase(
+                    f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: nothing "
+                    f"there says how it sits; name seconds in which it measures, or take [sensors.{segment}] out"
+                )
+    return start, still[0] if still else start, notes
+
+
+def check_common_rotation(
+    recording: Recording, noises: dict[str, SensorNoise], interval: tuple[float, float]
+) -> list[str]:
+    """A warning if the person turns in a phase, whose mean rate is the gyroscopes' bias then; an error if by much.
+
+    The biases of several sensors about the vertical are as different as sensors are; the same rate in all is the
+    person's (one-sample t-test). What it may be stays in the biases' covariance, in place.
+    """
+    up_S = {}
+    for segment in noises:
+        accel_S = recording.sensors[segment].accel_S
+        assert accel_S is not None
+        mean_S = accel_S[recording.measured(segment, interval)].mean(axis=0)
+        up_S[segment] = mean_S / np.linalg.norm(mean_S)
+    rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
+    if len(rates) == 0:
+        return []
+    mean = float(rates.mean())
+    if len(rates) >= 3:
+        spread = max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
+        turns = abs(mean) > COMMON_RATE and 2.0 * stats.t.sf(abs(mean) / spread, len(rates) - 1) < COMMON_RATE_CHANCE
+    else:
+        turns = abs(mean) > LARGEST_BIAS
+    if not turns:
+        return []
+    turn_deg = abs(np.degrees(mean)) * (interval[1] - interval[0])
+    found = f"all sensors turn about the vertical at {np.degrees(mean):.1f} deg/s, by {turn_deg:.0f} deg in all"
+    if turn_deg > MOVES_DEG:
+        raise BadPhase(
+            f"{recording.where()}: phases.start ({format_time(interval[0])} to {format_time(interval[1])} s): {found}, "
+            f"where gyroscopes have biases of their own: name seconds in which the person does not turn"
+        )
+    for segment, noise in noises.items():
+        up = up_S[segment]
+        noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + mean**2 * np.outer(up, up))
+    return [f"{found}: the biases of the gyroscopes, and so all headings, are uncertain by as much"]
+
+
+def check_motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[str]:
+    """A note if the sensor sways in the phase, an error if it moves.
+
+    The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
+    """
+    sensor, measured = recording.sensors[segment], recording.measured(segment, interval)
+    if sensor.quat_WS is not None:
+        R = Rotation.from_quat(sensor.quat_WS[measured])
+        rate = (R[:-1].inv() * R[1:]).as_rotvec() * recording.rate_hz
+    else:
+        assert sensor.gyro_S is not None
+        rate = sensor.gyro_S[measured]
+        R = Rotation.from_quat(so3.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
+    rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
+    turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
+    guessed = phase not in recording.phases or not recording.phases[phase]
+    place = "the quietest window, taken for the start pose" if guessed else f"phases.{phase}"
+    found = f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} ({span_text(interval)})"
+    if rms > MOVES_DEG_S or turn > MOVES_DEG:
+        raise BadPhase(
+            f"{recording.where()}: {found}; name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "
+            f"{MOVES_DEG:g} deg"
+        )
+    if rms > SWAYS_DEG_S or turn > SWAYS_DEG:
+        return [f"{found}: mounts and headings are uncertain by as much"]
+    return []

@@ -1,0 +1,142 @@
+"""The filters of a recording's sensors: chunk by chunk, each sensor in a world of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import WeposeError
+from ..recording import CONFIGURATION, Recording
+from . import BEST, OFFLINE, Orientation, SensorRun, check_method
+from .base import in_parallel
+from .noise import SensorNoise, noise_of
+from .phases import check_common_rotation, check_motion, reference_phases
+from .static import StaticTest
+
+
+class FilteredRecording(NamedTuple):
+    """Every sensor in its own world, before any mount is known."""
+
+    R_VS: dict[str, Rotation]  # segment → n orientations of its sensor
+    at_start: dict[str, Rotation]  # their mean in the start pose
+    orientation: dict[str, Orientation]  # what the filter gave; none for ready orientations
+    start: tuple[float, float]  # [s]
+    still: tuple[float, float]  # [s]
+    warnings: list[str]
+
+
+class SensorFilters:
+    """The filters of a recording that comes in chunks; `filter_recording` is one chunk.
+
+    Parameters
+    ----------
+    first : the chunk that the recording begins with, and in which the phases `start` and `still` are
+    method, static_test : as `filter_recording`
+
+    Attributes
+    ----------
+    start, still, warnings : as in `FilteredRecording`
+    ahead : the smoother's: `push` gives the chunk before, and the last one comes from `finish`
+
+    Raises
+    ------
+    WeposeError
+        A start phase in which there are too few samples; an unknown method.
+    """
+
+    def __init__(self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> None:
+        check_method(method)
+        self.start, self.still, self.warnings = reference_phases(first)
+        self._held: Recording | None = None  # the chunk that the smoother has not given yet
+        self._runs: dict[str, SensorRun] = {}
+        noises: dict[str, SensorNoise] = {}
+        for segment, sensor in first.sensors.items():
+            if not sensor.aligned:
+                self.warnings += check_motion(first, segment, self.start, "start")
+            if self.still != self.start and not sensor.aligned:
+                self.warnings += check_motion(first, segment, self.still, "still")
+            if sensor.ready:
+                continue
+            assert sensor.gyro_S is not None
+            assert sensor.accel_S is not None
+            at_rest = first.measured(segment, self.still)
+            try:
+                worn = self.still == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
+                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
+            except WeposeError as error:
+                raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
+            noises[segment] = noise
+        self.warnings += check_common_rotation(first, noises, self.still)
+        for segment, noise in noises.items():
+            self._runs[segment] = SensorRun(
+                first.rate_hz,
+                noise,
+                method,
+                static_test=static_test,
+                measured_start=True,
+                start=first.span(self.start),
+                gyro_range=first.sensors[segment].gyro_range,
+            )
+        self.ahead = method in OFFLINE and bool(self._runs)
+
+    def push(self, chunk: Recording) -> tuple[Recording, dict[str, Orientation]] | None:
+        """Take a chunk; gives a chunk and what the filters say of it: this one, or with the smoother the one before."""
+        measured = []
+        for segment in self._runs:
+            sensor = chunk.sensors[segment]
+            gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
+            assert gyro_S is not None
+            assert accel_S is not None
+            if sensor.gap is not None:
+                # A long bridge is a guess that no filter may take for measured: lost, its covariance grows over it.
+                gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
+            measured.append((gyro_S, accel_S))
+        before, self._held = self._held, chunk
+        results = in_parallel(lambda run, of: run.push(*of), self._runs.values(), measured)
+        orientation = {segment: of for segment, of in zip(self._runs, results, strict=True) if of is not None}
+        if len(orientation) < len(self._runs):
+            return None
+        filtered = before if self.ahead else chunk
+        assert filtered is not None
+        return filtered, orientation
+
+    def finish(self) -> tuple[Recording, dict[str, Orientation]]:
+        """The smoother's last chunk."""
+        assert self._held is not None
+        orientation = in_parallel(SensorRun.finish, self._runs.values())
+        return self._held, dict(zip(self._runs, orientation, strict=True))
+
+
+def filter_recording(
+    recording: Recording, *, method: str = BEST, static_test: StaticTest | None = None
+) -> FilteredRecording:
+    """Filter every sensor; the start pose, and how still it was.
+
+    Raises
+    ------
+    WeposeError
+        A start phase in which there are too few samples; an unknown method.
+    """
+    filters = SensorFilters(recording, method=method, static_test=static_test)
+    _, orientation = filters.push(recording) or filters.finish()
+    return filtered_chunk(filters, recording, orientation)
+
+
+def filtered_chunk(
+    filters: SensorFilters, chunk: Recording, orientation: Mapping[str, Orientation]
+) -> FilteredRecording:
+    """A chunk that `filters` gave, if the start pose is in it."""
+    R_VS = sensor_rotations(chunk, orientation)
+    at_start = {segment: R[chunk.measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
+    return FilteredRecording(R_VS, at_start, dict(orientation), filters.start, filters.still, filters.warnings)
+
+
+def sensor_rotations(chunk: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:
+    """Segment → n orientations of its sensor, each in a world of its own."""
+    return {
+        segment: Rotation.from_quat(sensor.quat_WS if sensor.quat_WS is not None else orientation[segment].quat_WS)
+        for segment, sensor in chunk.sensors.items()
+    }
