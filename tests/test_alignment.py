@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import heading_to, mount_advice, need_mounts, segment_orientations
+from wepose_pin.alignment import check_mounts, heading_to, mount_advice
 from wepose_pin.calibration import load_protocol
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
 from wepose_pin.recording import SEGMENTS, Recording, Sensor, axes_from_mount, mount_from_axes
 from wepose_pin.simulation import Simulation, paper_dynamic
 from wepose_pin.subject import StartTilt, Subject, average_subject, mount_rows
+from wepose_pin.tracking.segments import estimate_segments
 
 
 @pytest.mark.parametrize(("up", "forward"), [("+x", "-z"), ("-y", "+x"), ("+z", "+x"), ("-z", "-y")])
@@ -37,7 +38,7 @@ def test_any_mount_has_two_different_nearest_axes() -> None:
 
 
 def test_a_mount_tilted_from_its_stated_axes_is_found_by_gravity(simulation: Simulation) -> None:
-    segments = segment_orientations(simulation.recording())
+    segments = estimate_segments(simulation.recording())
     for name, true in simulation.quat_LS.items():
         off = Rotation.from_quat(true).inv() * Rotation.from_quat(segments.quat_LS[name])
         # What is left is the accelerometer's bias: 3 mg on each axis.
@@ -67,7 +68,7 @@ def test_calibrated_mounts_give_headings_of_any_size() -> None:
     mounts = {name: Rotation.random(random_state=rng) for name in headings}
     recording, true = ready_recording(headings, mounts)
     subject = replace(average_subject(), mounts={name: mount.as_quat() for name, mount in mounts.items()})
-    segments = segment_orientations(recording, subject)
+    segments = estimate_segments(recording, subject)
     for name, psi in headings.items():
         assert segments.heading[name] == pytest.approx(psi, abs=1e-9)
         assert (Rotation.from_quat(segments.quat_WL[name]) * true[name].inv()).magnitude().max() < 1e-9
@@ -88,7 +89,7 @@ def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
             order=tuple(rows),
             covariance=np.deg2rad(std_deg) ** 2 * np.eye(3),
         )
-        segments = segment_orientations(recording, subject)
+        segments = estimate_segments(recording, subject)
         off = (truth.inv() * Rotation.from_quat(segments.quat_WL["left_forearm"])).magnitude()
         assert np.degrees(off.max()) == pytest.approx(5.0 * share, abs=0.05)
         assert not segments.warnings
@@ -106,7 +107,7 @@ def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
         order=tuple(mount_rows("left_forearm")),
         covariance=known,
     )
-    segments = segment_orientations(recording, subject)
+    segments = estimate_segments(recording, subject)
     moved = (Rotation.from_quat(segments.quat_LS["left_forearm"]) * mount.inv()).as_rotvec(degrees=True)
     # Half of the 5 deg is the mount's, and with it 0.9 as much of its heading.
     np.testing.assert_allclose(np.abs(moved), [0.0, 2.5, 2.25], atol=0.06)
@@ -124,7 +125,7 @@ def test_a_calibrated_mount_that_has_moved_is_said() -> None:
         order=tuple(mount_rows("torso")),
         covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
     )
-    (warning,) = segment_orientations(recording, subject).warnings
+    (warning,) = estimate_segments(recording, subject).warnings
     assert "calibrated mount is 20 deg off" in warning
     assert 'strapping = "new"' in warning
 
@@ -142,7 +143,7 @@ def test_a_person_stands_as_in_the_calibration() -> None:
     )
     for tilt, said in ((lean, []), (lean - [0.0, np.deg2rad(9.0)], ["is 9 deg off"]), (0.0 * lean, ["is 20 deg off"])):
         recording, _ = ready_recording({"torso": 0.0}, {"torso": Rotation.from_rotvec([*tilt, 0.0]) * mount})
-        warnings = segment_orientations(recording, subject).warnings
+        warnings = estimate_segments(recording, subject).warnings
         assert len(warnings) == len(said), warnings
         assert all(text in warning for text, warning in zip(said, warnings, strict=True))
 
@@ -153,7 +154,7 @@ def test_a_calibrated_mount_that_cannot_be_names_the_strapping() -> None:
     recording, _ = ready_recording({"torso": 0.0}, {"torso": over * mount})
     subject = replace(average_subject(), mounts={"torso": mount.as_quat()})
     with pytest.raises(BadSession, match=r"sensors\.torso: its calibrated mount is 180 deg off .* strapping = \"new\""):
-        segment_orientations(recording, subject)
+        estimate_segments(recording, subject)
 
 
 def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
@@ -163,8 +164,8 @@ def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
     sensors = {name: replace(s, stated_quat_LS=stated.as_quat()) for name, s in recording.sensors.items()}
     wrong = (Rotation.from_rotvec([0, 0, 1.0]) * stated).as_quat()
     subject: Subject = replace(average_subject(), mounts=dict.fromkeys(headings, wrong))
-    kept = segment_orientations(replace(recording, sensors=sensors), subject)
-    new = segment_orientations(replace(recording, sensors=sensors, strapping="new"), subject)
+    kept = estimate_segments(replace(recording, sensors=sensors), subject)
+    new = estimate_segments(replace(recording, sensors=sensors, strapping="new"), subject)
     for name in headings:
         assert new.heading[name] == pytest.approx(headings[name], abs=1e-9)
         assert kept.heading[name] == pytest.approx(headings[name] + 1.0, abs=1e-9)
@@ -173,7 +174,7 @@ def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
 def test_ready_orientations_need_no_mount() -> None:
     headings = {"torso": 0.0, "left_upper_arm": 0.0}
     recording, true = ready_recording(headings, dict.fromkeys(headings, Rotation.identity()))
-    segments = segment_orientations(recording)
+    segments = estimate_segments(recording)
     assert (Rotation.from_quat(segments.quat_WL["torso"]) * true["torso"].inv()).magnitude().max() < 1e-9
     assert not segments.orientation
 
@@ -195,18 +196,18 @@ def test_a_mount_that_contradicts_gravity_and_one_that_is_missing(simulation: Si
     recording = simulation.recording()
     wrong = replace(recording.sensors["torso"], stated_quat_LS=mount_from_axes("-x", "+z"))
     with pytest.raises(BadSession, match=r"sensors\.torso\.mount is \d+ deg off gravity"):
-        segment_orientations(replace(recording, sensors={**recording.sensors, "torso": wrong}))
+        estimate_segments(replace(recording, sensors={**recording.sensors, "torso": wrong}))
     without = replace(recording.sensors["torso"], stated_quat_LS=None)
     with pytest.raises(BadSession, match=r"sensors\.torso\.mount is not known: state it"):
-        segment_orientations(replace(recording, sensors={**recording.sensors, "torso": without}))
+        estimate_segments(replace(recording, sensors={**recording.sensors, "torso": without}))
 
 
 def test_without_phases_the_quietest_window_is_taken_and_said(simulation: Simulation) -> None:
-    segments = segment_orientations(replace(simulation.recording(), phases={}))
+    segments = estimate_segments(replace(simulation.recording(), phases={}))
     assert 0.0 <= segments.start[0] < segments.start[1] <= 5.1
     assert any("quietest window" in warning for warning in segments.warnings)
     with pytest.raises(BadPhase, match="holds 2 samples"):
-        segment_orientations(replace(simulation.recording(), phases={"start": ((1.0, 1.01),)}))
+        estimate_segments(replace(simulation.recording(), phases={"start": ((1.0, 1.01),)}))
 
 
 @pytest.mark.parametrize("method", ["amekf", "smekf"])
@@ -223,7 +224,7 @@ def test_what_is_bridged_is_uncertain(method: str) -> None:
         stated = Rotation.from_quat(sensor.quat_WS[:400]).mean().as_quat()
         one = Sensor(gyro_S=gyro, accel_S=accel, stated_quat_LS=stated, gap=lost)
         recording = Recording("gap", sensor.time, 100.0, {"torso": one}, {"start": ((0.5, 4.5),)})
-        found = segment_orientations(recording, method=method)
+        found = estimate_segments(recording, method=method)
         true = Rotation.from_quat(sensor.quat_WS) * Rotation.from_quat(stated).inv()
         error = (true * Rotation.from_quat(found.quat_WL["torso"]).inv()).as_rotvec()[2050:2600]
         nees.append(uncertainty(error, found.covariance_W["torso"][2050:2600]).nees)
@@ -254,7 +255,7 @@ def test_an_unknown_mount_beside_a_subject_that_has_none_for_it(simulation: Simu
     known = {name: quat for name, quat in simulation.quat_LS.items() if name != segment}
     subject = replace(average_subject(), name="anna", mounts=known)
     with pytest.raises(BadSession, match=rf"sensors\.{segment}\.mount is not known.*'anna' has none for it") as told:
-        need_mounts(recording, subject)
+        check_mounts(recording, subject)
     assert ("no calibration finds" in str(told.value)) == (segment in ("head", "pelvis"))
     assert "\n" not in str(told.value)
 
@@ -273,11 +274,11 @@ def test_a_person_who_turns_in_the_start_pose_is_named(simulation: Simulation, r
     turned = replace(recording, sensors=turning)
     if rate_deg_s * (end - begin) > 15.0:
         with pytest.raises(BadPhase, match="all sensors turn about the vertical"):
-            segment_orientations(turned)
+            estimate_segments(turned)
         return
-    found = segment_orientations(turned)
+    found = estimate_segments(turned)
     assert any("turn about the vertical" in warning for warning in found.warnings)
-    assert not any("turn about the vertical" in warning for warning in segment_orientations(recording).warnings)
+    assert not any("turn about the vertical" in warning for warning in estimate_segments(recording).warnings)
     for segment, orientation in found.orientation.items():
-        still = segment_orientations(recording).orientation[segment]
+        still = estimate_segments(recording).orientation[segment]
         assert np.trace(orientation.noise.gyro_bias_cov - still.noise.gyro_bias_cov) > 0.9 * np.deg2rad(rate_deg_s) ** 2

@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption, BadPhase
+from wepose_pin.pose import pose_table
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import LENGTHS, average_subject, mount_rows
-from wepose_pin.tracking import track
-from wepose_pin.tracking.causal import HOLD_S, CausalTracker, StartGuide, start_of
+from wepose_pin.subject import LENGTHS, Subject, average_subject, mount_rows
+from wepose_pin.tracking import Tracker, TrackOptions, track
+from wepose_pin.tracking.causal import SegmentFollower
+from wepose_pin.tracking.start_pose import HOLD_S, StartGuide
 
 
 @pytest.fixture(scope="module")
@@ -25,16 +28,15 @@ def recording(simulation: Simulation) -> Recording:
 
 def first(recording: Recording, n: int, begin: int = 0) -> Recording:
     """Some samples of it, with the start pose alone for a phase."""
-    sensors = {
-        name: replace(
-            of,
-            gyro_S=of.gyro_S[begin:n] if of.gyro_S is not None else None,
-            accel_S=of.accel_S[begin:n] if of.accel_S is not None else None,
-        )
-        for name, of in recording.sensors.items()
-    }
-    phases = {"start": recording.phases["start"]}
-    return replace(recording, time=recording.time[begin:n], sensors=sensors, phases=phases)
+    return replace(recording.cut(slice(begin, n)), phases={"start": recording.phases["start"]})
+
+
+def started(recording: Recording, subject: Subject | None = None, method: str = "amekf") -> tuple[SegmentFollower, int]:
+    """A causal tracker whose start pose has just ended, and the sample that comes next."""
+    begin = recording.span(recording.phases["start"][0]).stop
+    tracker = Tracker(subject, options=TrackOptions(method, causal=True))
+    assert not tracker.push(recording.cut(slice(0, begin)))
+    return tracker.follower, begin
 
 
 def columns(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -51,15 +53,14 @@ def test_sample_by_sample_gives_the_bits_of_a_run_through_resets_and_gaps(record
     sensors["left_forearm"] = replace(sensors["left_forearm"], gap=gap)
     recording = replace(recording, sensors=sensors, resets=(1500, 1520, 2900))
     pose = track(recording, method=method, causal=True)
-    until, begin = start_of(recording)
-    tracker = CausalTracker(until, method=method)
+    tracker, begin = started(recording, method=method)
     gyro, accel = columns(recording)
     column = tracker.names.index("left_forearm")
     gyro[gap, column] = np.nan
     accel[gap, column] = np.nan
     for k in range(begin, len(recording)):
         if k in recording.resets:
-            tracker.reset()
+            tracker.reset_headings()
         stepped = tracker.step(gyro[k], accel[k])
         for i, name in enumerate(tracker.names):
             assert np.array_equal(stepped[i], pose.quat_WL[name][k - begin]), (name, k)
@@ -69,20 +70,19 @@ def test_sample_by_sample_gives_the_bits_of_a_run_through_resets_and_gaps(record
 
 def test_resets_at_once_and_before_the_first_pose(recording: Recording) -> None:
     """Who presses twice between two ticks asks for one reset, and may do so as soon as the start pose is over."""
-    until, begin = start_of(recording)
+    tracker, begin = started(recording)
     pose = track(replace(recording, resets=(begin, 2000, 2000)), causal=True)
-    tracker = CausalTracker(until)
     gyro, accel = columns(recording)
     for k in range(begin, 2500):
         for _ in range({begin: 1, 2000: 2}.get(k, 0)):
-            tracker.reset()
+            tracker.reset_headings()
         stepped = tracker.step(gyro[k], accel[k])
         assert all(np.array_equal(stepped[i], pose.quat_WL[name][k - begin]) for i, name in enumerate(tracker.names))
 
 
 def test_a_gap_in_the_start_pose_is_bridged_by_what_is_left_of_it(recording: Recording) -> None:
     """Neither by what the file has there, nor by what came after."""
-    _, begin = start_of(recording)
+    begin = recording.span(recording.phases["start"][0]).stop
     gap = np.zeros(len(recording), dtype=bool)
     gap[begin - 100 : begin + 100] = True
     torso = recording.sensors["torso"]
@@ -98,11 +98,22 @@ def test_a_gap_in_the_start_pose_is_bridged_by_what_is_left_of_it(recording: Rec
         track(replace(recording, sensors={**recording.sensors, "torso": silent}), causal=True)
 
 
+def test_causal_chunks_put_together_are_the_whole(recording: Recording) -> None:
+    recording = replace(recording, resets=(1500, 2900))
+    named, unnamed = recording, replace(recording, phases={})
+    for of in (named, unnamed):
+        tracker, whole = Tracker(options=TrackOptions(causal=True)), track(of, causal=True)
+        chunks = [tracked for chunk in of.chunks(1.7) for tracked in tracker.push(chunk)] + tracker.finish()
+        assert len(chunks) > 10
+        table = pl.concat([pose_table(chunk.pose, covariance=True) for chunk in chunks])
+        assert table.equals(pose_table(whole.pose, covariance=True))
+
+
 def test_what_comes_later_changes_nothing(recording: Recording) -> None:
     whole, part = track(recording, causal=True), track(first(recording, 2500), causal=True)
     for name, quat in part.quat_WL.items():
         assert np.array_equal(quat, whole.quat_WL[name][: len(quat)])
-        assert np.array_equal(part.segment_cov[name], whole.segment_cov[name][: len(quat)])
+        assert np.array_equal(part.pose.segment_cov[name], whole.pose.segment_cov[name][: len(quat)])
 
 
 def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording) -> None:
@@ -114,7 +125,7 @@ def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording) ->
 
 def test_it_is_close_to_tracking_the_whole_recording(recording: Recording) -> None:
     """The filter begins half a second later and is else the same."""
-    causal, whole = track(recording, causal=True), track(recording, hold_headings=False)
+    causal, whole = track(recording, causal=True), track(recording, correct_headings=False)
     for name, quat in causal.quat_WL.items():
         offline = Rotation.from_quat(whole.quat_WL[name][-len(quat) :])
         assert np.degrees((offline.inv() * Rotation.from_quat(quat)).magnitude().max()) < 0.2
@@ -122,13 +133,12 @@ def test_it_is_close_to_tracking_the_whole_recording(recording: Recording) -> No
 
 def test_a_reset_turns_headings_to_where_the_person_stands(recording: Recording) -> None:
     """Standing in the start pose with headings that are off by 30 degrees: a reset brings them back."""
-    until, begin = start_of(recording)
-    tracker = CausalTracker(until)
+    tracker, begin = started(recording)
     before = tracker.heading.copy()
     tracker.heading += np.deg2rad(30.0)
     tracker._turn = Rotation.from_rotvec(tracker.heading[:, None] * [0.0, 0.0, 1.0]).as_quat()
     std = tracker.heading_std()
-    tracker.reset()
+    tracker.reset_headings()
     np.testing.assert_allclose(tracker.heading, before, atol=np.deg2rad(1.5))  # as the person sways
     assert (tracker.heading_std() > std).all()  # a person stands to some degrees, a filter drifts by tenths
     gyro, accel = columns(recording)
@@ -142,19 +152,18 @@ def test_a_heading_is_stated_as_track_states_it(recording: Recording, simulation
     average = average_subject()
     subject = replace(average, mounts=simulation.quat_LS, order=(*LENGTHS, *order),
                       covariance=block_diag(average.covariance, covariance))  # fmt: skip
-    until, begin = start_of(recording)
-    tracker = CausalTracker(until, subject)
+    tracker, begin = started(recording, subject)
     gyro, accel = columns(recording)
     for k in range(begin, begin + 3000):
         tracker.step(gyro[k], accel[k])
     tracked = track(recording, subject, causal=True)
-    stated = [np.sqrt(tracked.segment_cov[name][2999, 2, 2]) for name in tracker.names]
+    stated = [np.sqrt(tracked.pose.segment_cov[name][2999, 2, 2]) for name in tracker.names]
     np.testing.assert_allclose(tracker.heading_std(), stated, rtol=1e-9)
     moved = np.array([name != "torso" for name in tracker.names])
     assert (np.degrees(tracker.heading_std())[moved] > 1.0).all()
     var = tracker.heading_var()
     assert var is not None
-    tracker.reset()  # sets the heading of the start pose, and says nothing of how the mount turns a raised arm
+    tracker.reset_headings()  # sets the heading of the start pose, and says nothing of how the mount turns a raised arm
     after = np.degrees(tracker.heading_std())
     assert (after[moved] > np.degrees(np.sqrt(np.maximum(np.square(stated) - var, 0.0)))[moved]).all()
 
@@ -199,9 +208,9 @@ def test_what_cannot_be_causal_is_said(recording: Recording) -> None:
     ready = {**recording.sensors, "torso": replace(torso, gyro_S=None, accel_S=None, quat_WS=identity)}
     with pytest.raises(BadOption, match=r"sensors.torso comes with ready orientations"):
         track(replace(recording, sensors=ready), causal=True)
-    end = float(recording.time[-1])
+    until = recording.span(recording.phases["start"][0]).stop
     with pytest.raises(BadPhase, match="ends with the recording"):
-        track(replace(recording, phases={"start": ((end - 2.0, end),)}), causal=True)
+        track(recording.cut(slice(0, until)), causal=True)
     moving = {
         name: replace(of, gyro_S=(of.gyro_S if of.gyro_S is not None else 0.0) + 1.0)
         for name, of in recording.sensors.items()

@@ -130,7 +130,7 @@ def test_a_person_on_48_degrees_of_freedom(data: Path, body: BodyModel) -> None:
     """The arms hang in both standing phases, though the elbows have two axes and an end."""
     recording = load_session(data / "upper_body" / "session.toml")
     pose = track(recording, model=body)
-    missed = pose.summary()["not_followed_rms_deg"]
+    missed = pose.summary()["orientation_residual_rms_deg"]
     print("\nmissed, rms [deg]:", missed)
     assert set(missed) == {f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm", "hand")}
     assert max(missed.values()) < 20.0

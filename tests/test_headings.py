@@ -43,21 +43,23 @@ def test_a_forearm_that_drifts_is_brought_back(made: tuple[Simulation, Subject])
     recording = drifting(simulation, {"right_forearm": 8.0})
     errors = {}
     for hold in (False, True):
-        pose = track(recording, subject, hold_headings=hold)
+        pose = track(recording, subject, correct_headings=hold)
         errors[hold] = evaluate(pose, simulation.truth(), simulation.phases["circles"][0]).position["right_hand"].mean
     assert errors[True] < 0.7 * errors[False]
     assert pose.reset is not None
     assert pose.reset.clasp_mm is not None
     assert pose.reset.clasp_mm[1] < 0.6 * pose.reset.clasp_mm[0]
     assert pose.reset.hinge_deg["right"][1] < pose.reset.hinge_deg["right"][0]
-    summary = pose.summary()["headings_held_together"]
-    assert summary["largest_turn_deg"]["right_forearm"] > 4.0 > summary["largest_turn_deg"]["left_upper_arm"]
+    summary = pose.summary()["heading_correction"]
+    assert (
+        summary["largest_correction_deg"]["right_forearm"] > 4.0 > summary["largest_correction_deg"]["left_upper_arm"]
+    )
 
 
 def test_what_does_not_drift_stays(made: tuple[Simulation, Subject]) -> None:
     simulation, subject = made
     recording = drifting(simulation, {})
-    with_, without = (track(recording, subject, hold_headings=hold) for hold in (True, False))
+    with_, without = (track(recording, subject, correct_headings=hold) for hold in (True, False))
     for name, quat in without.quat_WL.items():
         off = Rotation.from_quat(with_.quat_WL[name]) * Rotation.from_quat(quat).inv()
         assert np.degrees(off.magnitude().max()) < 0.02
@@ -104,7 +106,7 @@ def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     loose = covariance.copy()
     loose[-1, -1] = np.deg2rad(5.0) ** 2
     held, free = (
-        [track(recording, replace(sure, covariance=C), hold_headings=hold) for C in (covariance, loose)]
+        [track(recording, replace(sure, covariance=C), correct_headings=hold) for C in (covariance, loose)]
         for hold in (True, False)
     )
     name = "right_forearm"

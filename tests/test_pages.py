@@ -20,7 +20,7 @@ from wepose_pin.recording import Recording, Sensor, check, mount_from_axes
 from wepose_pin.report import track_report, write_thinned_pages
 from wepose_pin.report.thinned import Thinner
 from wepose_pin.simulation import Simulation
-from wepose_pin.tracking import TrackedPose, track
+from wepose_pin.tracking import TrackedRecording, track
 from wepose_pin.writers import write_session
 
 RESULT = {"pose.parquet", "subject.toml", "subject.urdf", "summary.json"}
@@ -60,7 +60,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def pose() -> TrackedPose:
+def pose() -> TrackedRecording:
     return track(recorded(ARM))
 
 
@@ -112,7 +112,7 @@ def nowhere(values: np.ndarray, rows: slice) -> np.ndarray:
 
 @pytest.mark.parametrize("rows", [slice(None), slice(0, 300), slice(300, None), slice(1, None), slice(None, None, 2)])
 @pytest.mark.parametrize("segments", ["arm", "all"])
-def test_a_report_where_segments_are_not_known(pose: TrackedPose, rows: slice, segments: str) -> None:
+def test_a_report_where_segments_are_not_known(pose: TrackedRecording, rows: slice, segments: str) -> None:
     """No filter should give NaN undeclared; where one does, the report still stands."""
     lost = [name for name in pose.quat_WL if segments == "all" or name.startswith("left")]
     changed = replace(
@@ -176,7 +176,7 @@ def test_a_page_that_fails_is_a_warning(
     assert run("evaluate", tmp_path / "out", tmp_path / "out" / "pose.parquet") == 0
 
 
-def test_a_recording_in_pieces_whose_pages_cannot_be_gathered(pose: TrackedPose, tmp_path: Path) -> None:
+def test_a_recording_in_pieces_whose_pages_cannot_be_gathered(pose: TrackedRecording, tmp_path: Path) -> None:
     thinner = Thinner(len(pose.time))
     thinner.add(replace(pose, segments=None))
     (tmp_path / "summary.json").write_text('{"warnings": ["before"]}')

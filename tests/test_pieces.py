@@ -27,8 +27,7 @@ from wepose_pin.report import track_report
 from wepose_pin.report.thinned import Thinner, whole_of
 from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.subject import Subject
-from wepose_pin.tracking import TrackedPose, track, track_pieces
-from wepose_pin.tracking.tracked import Tally
+from wepose_pin.tracking import SummaryAccumulator, TrackedRecording, TrackOptions, track, track_session
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import write_subject
 
@@ -60,23 +59,23 @@ def written(folder: Path, recording: Recording) -> Path:
     return folder
 
 
-def joined(pieces: list[TrackedPose]) -> pl.DataFrame:
-    return pl.concat([pose_table(piece, covariance=True) for piece in pieces])
+def joined(pieces: list[TrackedRecording]) -> pl.DataFrame:
+    return pl.concat([pose_table(piece.pose, covariance=True) for piece in pieces])
 
 
 @pytest.mark.parametrize(("method", "seconds"), [("amekf", 7.31), ("smekf", 5.0), ("ncf", 2.0)])
 def test_pieces_put_together_are_the_whole(session: Path, subject: Subject, method: str, seconds: float) -> None:
     whole = track(load_session(session), subject, method=method)
-    pieces = list(track_pieces(session, subject, method=method, seconds=seconds))
+    pieces = list(track_session(session, subject, options=TrackOptions(method), seconds=seconds))
     assert len(pieces) > 2
-    assert joined(pieces).equals(pose_table(whole, covariance=True))
-    assert whole.reset is not None
-    assert pieces[-1].reset is not None
-    assert max(whole.reset.largest_deg.values()) > 0.01  # there was something to hold
-    tally = Tally()
+    assert joined(pieces).equals(pose_table(whole.pose, covariance=True))
+    assert whole.correction is not None
+    assert pieces[-1].correction is not None
+    assert max(whole.correction.largest_deg.values()) > 0.01  # there was something to hold
+    accumulator = SummaryAccumulator()
     for piece in pieces:
-        tally.add(piece)
-    assert tally.summary() == whole.summary()
+        accumulator.add(piece)
+    assert accumulator.summary() == whole.summary()
 
 
 def test_of_a_csv_too_and_with_lost_samples(session: Path, subject: Subject, monkeypatch) -> None:
@@ -94,8 +93,8 @@ def test_of_a_csv_too_and_with_lost_samples(session: Path, subject: Subject, mon
     text = (session / "session.toml").read_text().replace("recording.parquet", "recording.csv")
     (session / "session.toml").write_text(text)
     whole = track(load_session(session, gaps=True), subject)
-    pieces = list(track_pieces(session, subject, seconds=6.0, gaps=True))
-    ours, wanted = joined(pieces), pose_table(whole, covariance=True)
+    pieces = list(track_session(session, subject, seconds=6.0, gaps=True))
+    ours, wanted = joined(pieces), pose_table(whole.pose, covariance=True)
     assert ours.equals(wanted)
     assert wanted["left_forearm_gap"].sum() == pytest.approx(100 * (13.0 + 14.0), abs=3)
     found, of_whole = (of["sensors"]["torso"] for of in (summary_of(pieces), whole.summary()))
@@ -103,14 +102,14 @@ def test_of_a_csv_too_and_with_lost_samples(session: Path, subject: Subject, mon
         (found["gaps"], found["gap_s"]) == (of_whole["gaps"], of_whole["gap_s"]) == (2, pytest.approx(14.8, abs=0.03))
     )
     with pytest.raises(BadData, match=r"--gaps"):
-        list(track_pieces(session, subject, seconds=6.0))
+        list(track_session(session, subject, seconds=6.0))
 
 
-def summary_of(pieces: list[TrackedPose]) -> dict:
-    tally = Tally()
+def summary_of(pieces: list[TrackedRecording]) -> dict:
+    accumulator = SummaryAccumulator()
     for piece in pieces:
-        tally.add(piece)
-    return tally.summary()
+        accumulator.add(piece)
+    return accumulator.summary()
 
 
 def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation, tmp_path: Path) -> None:
@@ -119,9 +118,9 @@ def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation, tmp_pa
     late = (float(again.time[-1]) - 4.5, float(again.time[-1]) - 1.0)
     session = written(tmp_path / "late", replace(again, phases={"still": ((0.5, 4.5),), "start": (late,)}))
     whole = track(load_session(session))
-    pieces = list(track_pieces(session, seconds=3.0))
+    pieces = list(track_session(session, seconds=3.0))
     assert pieces[0].time[-1] >= late[1] > pieces[0].time[-1] - 3.0
-    assert joined(pieces).equals(pose_table(whole, covariance=True))
+    assert joined(pieces).equals(pose_table(whole.pose, covariance=True))
 
 
 def test_a_body_whose_joints_are_too_few(made: Simulation, tmp_path: Path, data: Path) -> None:
@@ -135,11 +134,11 @@ def test_a_body_whose_joints_are_too_few(made: Simulation, tmp_path: Path, data:
     recording = replace(recording, time=recording.time[:1500], sensors=first, phases={"start": ((0.5, 4.5),)})
     session, body = written(tmp_path / "short", recording), gazebo(data, 48)
     whole = track(load_session(session), model=body)
-    pieces = list(track_pieces(session, model=body, seconds=4.0))
-    assert joined(pieces).equals(pose_table(whole, covariance=True))
-    missed = whole.summary()["not_followed_rms_deg"]
+    pieces = list(track_session(session, model=body, seconds=4.0))
+    assert joined(pieces).equals(pose_table(whole.pose, covariance=True))
+    missed = whole.summary()["orientation_residual_rms_deg"]
     assert max(missed.values()) > 1.0
-    assert summary_of(pieces)["not_followed_rms_deg"] == missed
+    assert summary_of(pieces)["orientation_residual_rms_deg"] == missed
 
 
 # The smoother ---------------------------------------------------------------------------------------------------------
@@ -185,7 +184,7 @@ def test_the_smoother_looks_one_piece_ahead(session: Path) -> None:
         return float(np.degrees(np.sqrt(np.mean(np.square(angles)))))
 
     def in_pieces(seconds: float) -> dict[str, np.ndarray]:
-        pieces = list(track_pieces(session, method="smoother", seconds=seconds))
+        pieces = list(track_session(session, options=TrackOptions("smoother"), seconds=seconds))
         return {name: np.concatenate([piece.quat_WL[name] for piece in pieces]) for name in whole.quat_WL}
 
     causal = off(track(load_session(session)).quat_WL)
@@ -254,7 +253,7 @@ def test_what_has_no_pieces(session: Path, tmp_path: Path, capsys, options: list
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     with pytest.raises(BadOption, match="at least 2 s"):
-        next(track_pieces(session, seconds=0.5))
+        next(track_session(session, seconds=0.5))
 
 
 def test_a_thinned_report_keeps_extremes(session: Path, subject: Subject, monkeypatch) -> None:
@@ -262,7 +261,7 @@ def test_a_thinned_report_keeps_extremes(session: Path, subject: Subject, monkey
     monkeypatch.setattr("wepose_pin.report.thinned.MOST", 300)
     pose = track(load_session(session), subject)
     thinner = Thinner(len(pose.time))
-    for piece in track_pieces(session, subject, seconds=7.31):
+    for piece in track_session(session, subject, seconds=7.31):
         thinner.add(piece)
     assert pose.recording is not None
     thin, whole = thinner.thinned(pose.recording.phases, pose.summary()["warnings"])

@@ -251,12 +251,12 @@ def test_a_pelvis_that_cannot_move_says_by_how_much(data: Path) -> None:
 def test_the_summary_says_what_was_not_followed(data: Path, simulation: Simulation) -> None:
     recording = simulation.recording()
     summary = track(recording, model=gazebo(data, 48)).summary()
-    assert summary["not_followed_rms_deg"]["left_forearm"] > 1.0
+    assert summary["orientation_residual_rms_deg"]["left_forearm"] > 1.0
     lame = [text for text in summary["warnings"] if "joints are too few or end too soon" in text]
     assert len(lame) == 1
     assert "left_forearm" in lame[0]
-    assert track(recording, model=gazebo(data, 66)).summary()["not_followed_rms_deg"] == {}
-    assert track(recording).summary()["not_followed_rms_deg"] == {}
+    assert track(recording, model=gazebo(data, 66)).summary()["orientation_residual_rms_deg"] == {}
+    assert track(recording).summary()["orientation_residual_rms_deg"] == {}
 
 
 def arm(elbow: list[tuple[str, str]]) -> str:

@@ -17,9 +17,9 @@ from wepose_pin.recording import Recording
 from wepose_pin.report import calibration_report, unsaid
 from wepose_pin.report.figures import broken, direction, plus_minus, smoothed
 from wepose_pin.simulation import REALISTIC, simulate, simulated_person
-from wepose_pin.tracking import TrackedPose, track
+from wepose_pin.tracking import TrackedRecording, track
 
-Made = tuple[Calibration, Recording, TrackedPose]
+Made = tuple[Calibration, Recording, TrackedRecording]
 REASONS = ["the left upper arm ± 9 mm, more than 8 mm: move the joined hands up and down"]
 
 

@@ -26,7 +26,7 @@ from wepose_pin.report.measures import between, elbow_of, hands_of, heading_budg
 from wepose_pin.report.words import listed, signed, whole
 from wepose_pin.simulation import Simulation, simulate, simulated_person
 from wepose_pin.subject import Hinge, Subject, average_subject
-from wepose_pin.tracking import TrackedPose, track
+from wepose_pin.tracking import TrackedRecording, track
 from wepose_pin.writers import write_session
 
 SECTIONS = [
@@ -41,12 +41,12 @@ SECTIONS = [
 
 
 @pytest.fixture(scope="module")
-def pose(simulation: Simulation) -> TrackedPose:
+def pose(simulation: Simulation) -> TrackedRecording:
     return track(simulation.recording("anna <3"))
 
 
 @pytest.fixture(scope="module")
-def page(pose: TrackedPose) -> str:
+def page(pose: TrackedRecording) -> str:
     return track_report(pose)
 
 
@@ -73,7 +73,7 @@ def changed(recording: Recording, name: str, **signals: np.ndarray) -> Recording
     return replace(recording, sensors={**recording.sensors, name: replace(recording.sensors[name], **signals)})
 
 
-def looked_at(pose: TrackedPose) -> list[Concern]:
+def looked_at(pose: TrackedRecording) -> list[Concern]:
     assert pose.recording is not None
     signals = {name: signal_of(pose.recording, name, pose) for name in pose.recording.sensors}
     found = {side: elbow_of(pose, side, pose.subject) for side in ("left", "right")}
@@ -82,7 +82,7 @@ def looked_at(pose: TrackedPose) -> list[Concern]:
     return concerns(pose, signals, heading_budgets(pose), elbows, hands, pose.summary()["warnings"])
 
 
-def said(pose: TrackedPose, words: str) -> Concern:
+def said(pose: TrackedRecording, words: str) -> Concern:
     matching = [concern for concern in looked_at(pose) if words in concern.said]
     assert len(matching) == 1, [concern.said for concern in looked_at(pose)]
     return matching[0]
@@ -99,7 +99,7 @@ def test_it_has_its_sections_and_every_figure_a_caption(page: str) -> None:
     assert "anna &lt;3" in page
 
 
-def test_it_gives_the_sensors_in_numbers(page: str, pose: TrackedPose) -> None:
+def test_it_gives_the_sensors_in_numbers(page: str, pose: TrackedRecording) -> None:
     assert pose.recording is not None
     assert pose.segments is not None
     table = rows(page)
@@ -115,7 +115,7 @@ def test_it_gives_the_sensors_in_numbers(page: str, pose: TrackedPose) -> None:
         assert noise[3] == f"{of.noise.gravity:.3f} m/s²"
 
 
-def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedPose) -> None:
+def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedRecording) -> None:
     table = rows(page)
     std = {name: np.degrees(np.sqrt(cov[:, 2, 2])) for name, cov in pose.segment_cov.items()}
     assert pose.segments is not None
@@ -130,7 +130,7 @@ def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedPose) 
     assert ["right elbow", f"{np.median(elbow):.1f}°", f"{elbow.max():.1f}°"] in table
 
 
-def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedPose, page: str) -> None:
+def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedRecording, page: str) -> None:
     assert pose.recording is not None
     assert pose.segments is not None
     warned = replace(
@@ -144,7 +144,7 @@ def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedPose
     assert "The lengths are an average person's" in text_of(page)
 
 
-def test_a_known_person_and_nothing_to_say(pose: TrackedPose) -> None:
+def test_a_known_person_and_nothing_to_say(pose: TrackedRecording) -> None:
     assert pose.subject is not None
     quiet = replace(pose, subject=replace(pose.subject, name="anna", note=""))
     assert looked_at(quiet) == []
@@ -160,7 +160,7 @@ def test_it_opens_offline_prints_and_has_no_nan(page: str) -> None:
     assert "@media screen and (prefers-color-scheme: dark)" in page
 
 
-def test_equal_arguments_give_equal_text_and_a_ready_view_is_taken(pose: TrackedPose, page: str) -> None:
+def test_equal_arguments_give_equal_text_and_a_ready_view_is_taken(pose: TrackedRecording, page: str) -> None:
     assert track_report(pose) == page
     assert 'srcdoc="&lt;p&gt;mine&lt;/p&gt;"' in track_report(pose, view="<p>mine</p>")
 
@@ -182,7 +182,7 @@ def test_without_a_covariance_it_says_so(simulation: Simulation) -> None:
     assert "± nan" not in page
 
 
-def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedPose) -> None:
+def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedRecording) -> None:
     recording = simulation.recording("ready")
     assert pose.segments is not None
     sensors = {
@@ -260,7 +260,7 @@ def test_gravity_bias_and_stamps(simulation: Simulation) -> None:
     assert "by 0.5" in said(warm, "at the end is another").said
 
 
-def test_a_person_who_never_rests(pose: TrackedPose) -> None:
+def test_a_person_who_never_rests(pose: TrackedRecording) -> None:
     assert pose.segments is not None
     restless = {name: of._replace(static=np.zeros_like(of.static)) for name, of in pose.segments.orientation.items()}
     never = replace(pose, segments=replace(pose.segments, orientation=restless))
@@ -269,13 +269,13 @@ def test_a_person_who_never_rests(pose: TrackedPose) -> None:
     assert longest(np.array([True, False, True, True, True, False]), 2.0) == 1.5
 
 
-def test_a_late_start_pose(pose: TrackedPose) -> None:
+def test_a_late_start_pose(pose: TrackedRecording) -> None:
     assert pose.segments is not None
     late = replace(pose, segments=replace(pose.segments, start=(40.0, 44.0)))
     assert said(late, "the start pose comes 40 s into the recording").do
 
 
-def test_headings_that_may_be_far_off(pose: TrackedPose) -> None:
+def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
     wide = replace(pose, segment_cov={name: 100.0 * cov for name, cov in pose.segment_cov.items()})
     concern = said(wide, "may be off against each other")
     assert concern.grave
@@ -283,7 +283,7 @@ def test_headings_that_may_be_far_off(pose: TrackedPose) -> None:
     assert len(between(heading_budgets(wide))) == 4
 
 
-def test_headings_that_were_turned_far(pose: TrackedPose) -> None:
+def test_headings_that_were_turned_far(pose: TrackedRecording) -> None:
     from wepose_pin.tracking.headings import Reset
 
     turned = replace(pose, reset=Reset(None, {}, {"right_forearm": 23.0, "torso": 1.0}))
@@ -299,12 +299,14 @@ def bent(forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0) -> dict[s
     return {"torso": still, "left_upper_arm": still, "left_forearm": fore.as_quat(canonical=True)}
 
 
-def with_elbow(pose: TrackedPose, forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0) -> TrackedPose:
+def with_elbow(
+    pose: TrackedRecording, forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0
+) -> TrackedRecording:
     quat_WL = {**pose.quat_WL, **bent(forward_deg, aside_deg)}
     return replace(pose, quat_WL=quat_WL)
 
 
-def test_elbows_that_cannot_be(pose: TrackedPose) -> None:
+def test_elbows_that_cannot_be(pose: TrackedRecording) -> None:
     n = len(pose.time)
     assert not any("elbow" in concern.said for concern in looked_at(with_elbow(pose, np.linspace(-10.0, 140.0, n))))
     assert said(with_elbow(pose, np.full(n, -30.0)), "the left elbow bends backward, to 30°").grave
@@ -316,7 +318,7 @@ def test_elbows_that_cannot_be(pose: TrackedPose) -> None:
     assert "by 15° in the first half of the recording and 45° in the second" in drifting.said
 
 
-def test_new_strapping(simulation: Simulation, pose: TrackedPose) -> None:
+def test_new_strapping(simulation: Simulation, pose: TrackedRecording) -> None:
     assert pose.subject is not None
     known: Subject = replace(pose.subject, mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])})
     anew = track(replace(simulation.recording("new"), strapping="new"), known)
@@ -379,7 +381,7 @@ def test_the_elbows_uncertainty_against_draws() -> None:
     assert elbow.std[0] == pytest.approx(draws.bend.std(), rel=0.03)
 
 
-def test_heading_budgets_are_those_of_the_covariance(pose: TrackedPose) -> None:
+def test_heading_budgets_are_those_of_the_covariance(pose: TrackedRecording) -> None:
     assert pose.segments is not None
     assert pose.recording is not None
     for name, budget in heading_budgets(pose).items():
@@ -394,7 +396,7 @@ def test_heading_budgets_are_those_of_the_covariance(pose: TrackedPose) -> None:
         assert budget.growth * minutes == pytest.approx(std[-1] - std[0], rel=1e-6)
 
 
-def test_hands_are_seen_from_the_torso(pose: TrackedPose) -> None:
+def test_hands_are_seen_from_the_torso(pose: TrackedRecording) -> None:
     turn = Rotation.from_euler("zyx", [70.0, 10.0, -20.0], degrees=True)
     turned = Pose(
         pose.time,
@@ -496,7 +498,7 @@ def test_in_a_browser_it_has_its_sections_light_and_dark(page: str, tmp_path: Pa
     assert corner["light"] > 250
 
 
-def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: TrackedPose) -> None:
+def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: TrackedRecording) -> None:
     """A peak before the start pose: it was the largest ± of the page, beside "Nothing stands out"."""
     assert pose.segments is not None
     begin = float(pose.time[0]) + 5.0
@@ -517,7 +519,7 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
     assert "counts from the end of the start pose on, without the 7 s before" in text
 
 
-def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackedPose) -> None:
+def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackedRecording) -> None:
     cov = {name: np.broadcast_to(0.12**2 * np.eye(3), cov.shape) for name, cov in pose.point_cov.items()}
     concern = said(replace(pose, point_cov=cov), "places may be off")
     assert concern.grave

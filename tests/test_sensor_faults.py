@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from test_bad_input import refused
 
 from wepose_pin import load_session, so3
-from wepose_pin.alignment import START_POSE_STD, segment_orientations
+from wepose_pin.alignment import START_POSE_STD
 from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.filters.noise import quietest
 from wepose_pin.readers import iter_session
@@ -21,7 +21,8 @@ from wepose_pin.recording import Recording, Sensor
 from wepose_pin.recording.clocks import clock_of
 from wepose_pin.recording.plausibility import sensor_notes
 from wepose_pin.simulation import Simulation, simulate, simulated_person
-from wepose_pin.tracking import track, track_pieces
+from wepose_pin.tracking import TrackOptions, track, track_session
+from wepose_pin.tracking.segments import estimate_segments
 from wepose_pin.writers import write_session
 
 BROKEN = "left_forearm"
@@ -135,16 +136,19 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
     assert all(np.isinf(sensor.gyro_range) for name, sensor in read.sensors.items() if name != BROKEN)
 
     def worst(recording: Recording) -> float:
-        of = segment_orientations(recording, method=method).orientation[BROKEN]
+        of = estimate_segments(recording, method=method).orientation[BROKEN]
         R_VS = Rotation.from_quat(of.quat_WS)
         off = (turned[300].inv() * turned).inv() * (R_VS[300].inv() * R_VS)
         return float((off.magnitude() / np.sqrt(np.linalg.eigvalsh(of.attitude_cov)[:, -1]))[450:].max())
 
     assert worst(with_sensor(read, BROKEN, gyro_range=np.inf)) > 6.0
     assert worst(read) < 6.0
-    pieces = [piece.segments.orientation[BROKEN].quat_WS for piece in track_pieces(path, method=method, seconds=6.0)]
+    pieces = [
+        piece.segments.orientation[BROKEN].quat_WS
+        for piece in track_session(path, options=TrackOptions(method), seconds=6.0)
+    ]
     if method != "smoother":
-        of = segment_orientations(read, method=method).orientation[BROKEN]
+        of = estimate_segments(read, method=method).orientation[BROKEN]
         np.testing.assert_array_equal(np.concatenate(pieces), of.quat_WS)
 
 
@@ -178,8 +182,8 @@ def test_gravity_and_noise_are_those_of_measured_samples(made: Simulation) -> No
     gap.sensors["torso"].accel_S[100:290] *= 0.7
     for phases in (gap.phases, {}):
         assert sensor_notes(replace(gap, phases=phases)) == ()
-    torso = segment_orientations(gap).orientation["torso"].noise
-    right = segment_orientations(whole).orientation["torso"].noise
+    torso = estimate_segments(gap).orientation["torso"].noise
+    right = estimate_segments(whole).orientation["torso"].noise
     assert torso.gravity == pytest.approx(right.gravity, rel=1e-3)
     np.testing.assert_allclose(np.diag(torso.gyro_cov), np.diag(right.gyro_cov), rtol=0.3)
 
@@ -210,8 +214,8 @@ def test_a_start_pose_with_a_gap_in_it_is_that_of_what_was_measured(made: Simula
     quat_WS = Rotation.from_rotvec(raised).as_quat()
     ready = replace(whole, sensors={"torso": Sensor(quat_WS=quat_WS, gap=gap), "head": Sensor(quat_WS=quat_WS[:n])})
     with pytest.raises(BadPhase, match=r"sensors\.head turns by"):
-        segment_orientations(ready)
-    alone = segment_orientations(replace(ready, sensors={"torso": ready.sensors["torso"]}))
+        estimate_segments(ready)
+    alone = estimate_segments(replace(ready, sensors={"torso": ready.sensors["torso"]}))
     assert Rotation.from_quat(alone.quat_LS["torso"]).magnitude() < 1e-6
 
 
@@ -303,6 +307,6 @@ def test_times_on_a_clock_since_1970_can_be_found(made: Simulation, tmp_path: Pa
     notes = " ".join(read.notes)
     assert "1700000009 to 1700000025.38 s" in notes
     assert "e+09" not in notes
-    quiet = segment_orientations(replace(read, phases={})).warnings
+    quiet = estimate_segments(replace(read, phases={})).warnings
     assert any(" 17000000" in note for note in quiet)
     assert not any("e+09" in note for note in quiet)

@@ -170,7 +170,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "method": (*NAME, None),
         "model": THING,
         "static_test": THING,
-        "hold_headings": (*FLAG, None),
+        "correct_headings": (*FLAG, None),
         "causal": (*FLAG, None),
         "limits": (*FLAG, None),
     },

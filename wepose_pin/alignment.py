@@ -9,21 +9,17 @@ calibrated mount's covariance says is weighed against the few degrees by which t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from . import so3
-from .errors import BadPhase, BadSession, WeposeError
-from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
-from .filters.base import in_parallel
-from .filters.noise import SensorNoise, noise_of, quietest
+from .errors import BadSession
+from .filters import Orientation
+from .filters.sensors import FilteredRecording, sensor_rotations
 from .filters.start import ACCEL_BIAS_STD
-from .filters.static import StaticTest
-from .recording import CONFIGURATION, SEGMENTS, Recording, format_time, span_text
+from .recording import SEGMENTS, Recording, span_text
 from .subject import Subject
 
 # The stated axes are by hand; further off than this they are no longer what was meant.
@@ -92,29 +88,6 @@ class Alignment:
     warnings: tuple[str, ...]
 
 
-def segment_orientations(
-    recording: Recording,
-    subject: Subject | None = None,
-    *,
-    method: str = BEST,
-    static_test: StaticTest | None = None,
-) -> Segments:
-    """Filter every sensor, then align it with its segment by the start pose.
-
-    A calibrated mount of the subject is taken before a stated one, unless the strapping is new. Orientations that are
-    aligned already are only turned about the vertical, all by the same angle, so that the torso faces x in the start
-    pose.
-
-    Raises
-    ------
-    WeposeError
-        No mount is known for a sensor; a start phase in which there are too few samples; an unknown method.
-    """
-    need_mounts(recording, subject)
-    found = filtered(recording, method=method, static_test=static_test)
-    return oriented_segments(recording, align(recording, subject, found), found.orientation, subject)
-
-
 # Which protocols in calibration/ see a segment's sensor; a sensor that is not here none of them sees.
 _FOUND_BY = {
     "torso": "clasp, handle, poses or touch",
@@ -124,7 +97,7 @@ _FOUND_BY = {
 }
 
 
-def need_mounts(recording: Recording, subject: Subject | None) -> None:
+def check_mounts(recording: Recording, subject: Subject | None) -> None:
     """Raises `BadSession` where neither the subject nor the session knows the mount of a sensor."""
     missing = [segment for segment in recording.sensors if nominal_mount(recording, segment, subject) is None]
     if missing:
@@ -154,15 +127,15 @@ def mount_advice(segments: Sequence[str]) -> str:
     return do
 
 
-def align(recording: Recording, subject: Subject | None, found: Filtered) -> Alignment:
-    """Mounts and headings; `recording` is that which was filtered, or its piece with the start pose.
+def align(recording: Recording, subject: Subject | None, filtered: FilteredRecording) -> Alignment:
+    """Mounts and headings; `recording` is that which was filtered, or its chunk with the start pose.
 
     Raises
     ------
     BadSession
         A mount that gravity contradicts.
     """
-    start, warnings = found.start, list(found.warnings)
+    start, warnings = filtered.start, list(filtered.warnings)
     named = bool(recording.phases.get("start"))
     guessed = "" if named else ", which was only guessed: [phases] start = [[from, to]] is missing"
     mount, turn, heading = {}, {}, {}
@@ -170,8 +143,8 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
     if aligned:
         # The torso faces x; where it is not among them the most central of the others does.
         facing = min(aligned, key=SEGMENTS.index)
-        psi_aligned = heading_to(found.at_start[facing], Rotation.identity())
-    for segment, at_start in found.at_start.items():
+        psi_aligned = heading_to(filtered.at_start[facing], Rotation.identity())
+    for segment, at_start in filtered.at_start.items():
         if recording.sensors[segment].aligned:
             turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi_aligned])
             mount[segment], heading[segment] = Rotation.identity(), psi_aligned
@@ -219,25 +192,25 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
                 )
         mount[segment], heading[segment] = R_LS, psi
         turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi])
-    return Alignment(mount, turn, heading, start, found.still, tuple(warnings))
+    return Alignment(mount, turn, heading, start, filtered.still, tuple(warnings))
 
 
-def oriented_segments(
-    piece: Recording, alignment: Alignment, orientation: Mapping[str, Orientation], subject: Subject | None
+def orient_segments(
+    chunk: Recording, alignment: Alignment, orientation: Mapping[str, Orientation], subject: Subject | None
 ) -> Segments:
-    """A recording's segments, or those of a piece of it, from what its sensors' filters gave."""
+    """A recording's segments, or those of a chunk of it, from what its sensors' filters gave."""
     quat_WL, covariance_W = {}, {}
-    for segment, R_VS in _in_sensor_worlds(piece, orientation).items():
+    for segment, R_VS in sensor_rotations(chunk, orientation).items():
         turn, R_LS = alignment.turn[segment], alignment.mount[segment]
-        if piece.sensors[segment].aligned:
+        if chunk.sensors[segment].aligned:
             quat_WL[segment] = (turn * R_VS).as_quat()
             continue
         quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
         ours = orientation.get(segment)
         if ours is not None and ours.attitude_cov is not None:
-            covariance_W[segment] = covariance_of(piece, segment, subject, turn * R_VS, R_LS, ours)
+            covariance_W[segment] = covariance_of(chunk, segment, subject, turn * R_VS, R_LS, ours)
     return Segments(
-        piece.time,
+        chunk.time,
         quat_WL,
         {segment: R_LS.as_quat() for segment, R_LS in alignment.mount.items()},
         alignment.heading,

@@ -1365,7 +1365,7 @@ def _track_chain(
     _print_table(
         f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {method}, on {model.name}",
         ("link", "missed by the joints, rms [deg]"),
-        [(link, f"{angle:.2f}") for link, angle in summary["not_followed_rms_deg"].items()],
+        [(link, f"{angle:.2f}") for link, angle in summary["orientation_residual_rms_deg"].items()],
     )
     _print_table(
         "Joints [rad or m]",

@@ -19,7 +19,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from ..errors import BadData, BadModel, BadOption
 from ..model import chains
-from ..tracking import TrackedPose
+from ..tracking import TrackedRecording
 
 CUTOFF_HZ = 6.0  # usual for the motion of limbs
 _LEAST_MASS = 1e-6  # [kg]
@@ -110,16 +110,14 @@ def joint_torques(
     return Torques(time, torque, q, v, a, cutoff_hz, mass)
 
 
-def pose_torques(pose: TrackedPose, cutoff_hz: float = CUTOFF_HZ) -> Torques:
+def pose_torques(tracked: TrackedRecording, cutoff_hz: float = CUTOFF_HZ) -> Torques:
     """`joint_torques` of a person, of the joints that follow measured segments.
 
     Masses are the model's, stretched with the subject's lengths (`BodyModel.with_lengths`), not the person's.
     """
-    assert pose.model is not None
-    assert pose.q is not None
-    model = pose.model.pin
-    moved = {joint for name, chain in chains(model).items() if name in pose.quat_WL for joint in chain.joints}
-    return joint_torques(model, pose.time, pose.q, cutoff_hz, moved)
+    model = tracked.model.pin
+    moved = {joint for name, chain in chains(model).items() if name in tracked.quat_WL for joint in chain.joints}
+    return joint_torques(model, tracked.time, tracked.q, cutoff_hz, moved)
 
 
 def derivatives(model: pin.Model, q: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:

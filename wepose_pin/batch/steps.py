@@ -14,7 +14,7 @@ from ..errors import MissingFile
 from ..readers import load_session
 from ..recording import Recording
 from ..subject import Subject, average_subject, load_subject
-from ..tracking import TrackedPose, track
+from ..tracking import TrackedRecording, track
 from .plan import Body
 
 Row = dict[str, Any]
@@ -37,7 +37,7 @@ class Work:
     def __init__(self, given: Given) -> None:
         self.given = given
         self.subject: Subject | None = None
-        self.pose: TrackedPose | None = None
+        self.pose: TrackedRecording | None = None
         self._recordings: dict[bool, Recording] = {}
 
     def run(self, step: str, options: Mapping[str, Any]) -> Row:

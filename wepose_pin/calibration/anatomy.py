@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG, Filtered, heading_to, nominal_mount
+from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG, heading_to, nominal_mount
+from ..filters.sensors import FilteredRecording
 from ..recording import Recording
 from ..subject import Subject
 
@@ -152,7 +153,9 @@ def check_labels(stated: Arms, solve: Callable[[Mapping[str, str]], Arms], place
     return Labels(doubt, stated.contradiction(), moved if best < min(1.0, BETTER * doubt) else {})
 
 
-def relabelled(recording: Recording, found: Filtered, moved: Mapping[str, str]) -> tuple[Recording, Filtered]:
+def relabelled(
+    recording: Recording, found: FilteredRecording, moved: Mapping[str, str]
+) -> tuple[Recording, FilteredRecording]:
     """The same with other sensors on the segments; a stated mount goes with its sensor."""
 
     def of(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -164,7 +167,7 @@ def relabelled(recording: Recording, found: Filtered, moved: Mapping[str, str]) 
     )
 
 
-def segments_at(found: Filtered, mounts: Mapping[str, np.ndarray], at: np.ndarray) -> dict[str, np.ndarray]:
+def segments_at(found: FilteredRecording, mounts: Mapping[str, np.ndarray], at: np.ndarray) -> dict[str, np.ndarray]:
     """Segment → `quat_WL` (n, 4) xyzw at the samples `at`, of sensors with a mount `quat_LS`: as `track` would."""
     quat_WL = {}
     for name in found.R_VS.keys() & mounts.keys():
@@ -184,7 +187,7 @@ def without_mounts(recording: Recording, prior: Subject, names: Collection[str])
     return replace(recording, sensors=sensors), replace(prior, mounts=mounts)
 
 
-def against_gravity(recording: Recording, prior: Subject, found: Filtered) -> dict[str, float]:
+def against_gravity(recording: Recording, prior: Subject, found: FilteredRecording) -> dict[str, float]:
     """Segment → [deg] by which gravity in the start pose contradicts its mount, of those that cannot be meant so."""
     off = {}
     for name, at_start in found.at_start.items():

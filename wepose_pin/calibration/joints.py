@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from ..alignment import Filtered
+from ..filters.sensors import FilteredRecording
 from ..recording import Recording
 from .problem import Layout
 from .weighing import LEAST_CORRELATION_S
@@ -57,7 +57,7 @@ class Coupling(NamedTuple):
 
 
 def couplings(
-    recording: Recording, found: Filtered, names: Sequence[str], spans: Sequence[tuple[float, float]]
+    recording: Recording, found: FilteredRecording, names: Sequence[str], spans: Sequence[tuple[float, float]]
 ) -> list[Coupling]:
     """Of each joint between two raw sensors of `names`, by the motion in these spans [s]; none where that is little."""
     raw = [name for name in names if recording.sensors[name].gyro_S is not None]
@@ -102,7 +102,7 @@ def coupled(
     return center + np.linalg.solve(after, H.T @ (weight * off)), after
 
 
-def _felt(recording: Recording, found: Filtered, name: str, at: np.ndarray) -> np.ndarray:
+def _felt(recording: Recording, found: FilteredRecording, name: str, at: np.ndarray) -> np.ndarray:
     """(n, 3, 4) in V: specific force, and what a lever of 1 m along each axis of the sensor adds to the joint's."""
     sensor, rate_hz = recording.sensors[name], recording.rate_hz
     assert sensor.gyro_S is not None

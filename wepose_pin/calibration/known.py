@@ -10,8 +10,9 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import START_POSE_STD, Filtered, heading_to, mount_covariance, nominal_mount
+from ..alignment import START_POSE_STD, heading_to, mount_covariance, nominal_mount
 from ..errors import BadSubject
+from ..filters.sensors import FilteredRecording
 from ..recording import Recording
 from ..subject import LENGTHS, Subject
 from .problem import K, Layout, Looks, placed
@@ -34,7 +35,7 @@ HINGE_MIRROR_STD, HINGE_COMMON_STD, HINGE_TILT_STD = np.deg2rad([20.0, 5.0, 5.0]
 
 def known_before(
     recording: Recording,
-    found: Filtered,
+    found: FilteredRecording,
     looks: Looks,
     prior: Subject,
     gauge: Mapping[str, float],
@@ -105,7 +106,7 @@ def known_lengths(prior: Subject, gauge: Mapping[str, float], gauge_std: float) 
     return np.linalg.solve(information, target), information
 
 
-def stated_headings(recording: Recording, found: Filtered, layout: Layout, prior: Subject) -> dict[str, float]:
+def stated_headings(recording: Recording, found: FilteredRecording, layout: Layout, prior: Subject) -> dict[str, float]:
     """Sensor → ψ [rad] to its nominal mount, of those that have one."""
     mounts = {name: nominal_mount(recording, name, prior) for name in layout.sensors}
     return {

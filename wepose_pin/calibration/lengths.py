@@ -28,10 +28,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import Filtered, filtered, heading_to, nominal_mount
+from ..alignment import heading_to, nominal_mount
 from ..arguments import Positive, check_arguments
 from ..errors import BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
+from ..filters.sensors import FilteredRecording, filter_recording
 from ..recording import Recording
 from ..subject import LENGTHS, Drift, Hinge, StartTilt, Subject, average_subject
 from .alternatives import Alternative, alternatives, on_others, spread_over
@@ -182,12 +183,12 @@ def calibrate_lengths(
     before = prior or average_subject()
     for condition in protocol.conditions:
         recording.phase(condition.phase)
-    return _believed(recording, filtered(recording, method=method), protocol, before, gauge, gauge_std)
+    return _believed(recording, filter_recording(recording, method=method), protocol, before, gauge, gauge_std)
 
 
 def _believed(
     recording: Recording,
-    found: Filtered,
+    found: FilteredRecording,
     protocol: Protocol,
     prior: Subject,
     gauge: Mapping[str, float],
@@ -195,7 +196,7 @@ def _believed(
 ) -> Calibration:
     """The calibration by what the session says of its sensors, as far as gravity, motion and anatomy let it stand."""
 
-    def tried(recording: Recording, found: Filtered, prior: Subject) -> Calibration:
+    def tried(recording: Recording, found: FilteredRecording, prior: Subject) -> Calibration:
         return _solve(recording, found, protocol, prior, gauge, gauge_std, quick=True)
 
     where = "correct it in the session or leave it out"
@@ -254,7 +255,7 @@ def _nothing_learned(
 
 
 def _looks(
-    recording: Recording, found: Filtered, protocol: Protocol, rate_hz: float = LOOK_RATE_HZ
+    recording: Recording, found: FilteredRecording, protocol: Protocol, rate_hz: float = LOOK_RATE_HZ
 ) -> tuple[Looks, np.ndarray]:
     """The looks of all conditions, and their samples (n,)."""
     stride = max(1, round(recording.rate_hz / rate_hz))
@@ -284,7 +285,7 @@ def _looks(
 
 def _solve(
     recording: Recording,
-    found: Filtered,
+    found: FilteredRecording,
     protocol: Protocol,
     prior: Subject,
     gauge: Mapping[str, float],
@@ -410,7 +411,7 @@ def _solve(
     )
 
 
-def _mount(found: Filtered, x: np.ndarray, layout: Layout, name: str) -> Rotation:
+def _mount(found: FilteredRecording, x: np.ndarray, layout: Layout, name: str) -> Rotation:
     i = layout.sensors.index(name)
     tilt = np.append(x[layout.tilt][2 * i : 2 * i + 2], 0.0)
     turn = Rotation.from_rotvec([0.0, 0.0, x[layout.heading][i]])

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from scipy.optimize import least_squares
 
-from ..alignment import filtered
+from ..filters.sensors import filter_recording
 from ..recording import Recording
 from ..subject import Subject
 from . import problem
@@ -43,7 +43,7 @@ def posed(
     recording: Recording, prior: Subject, gauge: Mapping[str, float], gauge_std: float, rates_hz: tuple[float, ...]
 ) -> tuple[list[Problem], list[Callable[[], Problem]]]:
     """The last problem of a hands-together calibration at each rate of looks, and calibrations whole, filters apart."""
-    found, protocol = filtered(recording), load_protocol("clasp")
+    found, protocol = filter_recording(recording), load_protocol("clasp")
     problems: list[Problem] = []
     whole: list[Callable[[], Problem]] = []
     for rate_hz in rates_hz:

@@ -29,7 +29,9 @@ from ..recording.arrivals import (
     arrivals,
 )
 from ..subject import Subject, average_subject
-from ..tracking.causal import HOLD_S, CausalTracker, StartGuide, until_start
+from ..tracking import Tracker, TrackOptions
+from ..tracking.causal import SegmentFollower
+from ..tracking.start_pose import HOLD_S, StartGuide
 from ..writers.live_log import LiveLog
 from .sources.base import Source
 from .state import LivePose, SensorStatus, Stage, Status
@@ -136,7 +138,7 @@ class LiveLoop:
         self._before: list[Ticks] = []  # the start pose's
         self._guide: StartGuide | None = None
         self._named: tuple[float, float] | None = next(iter(wearing.phases.get("start", ())), None)
-        self._tracker: CausalTracker | None = None
+        self._tracker: SegmentFollower | None = None
         self._newest = dict.fromkeys(source.sensors, -np.inf)
         self._heading_set = 0.0
         self._std, self._std_every = np.full(len(source.sensors), np.nan), 1
@@ -282,9 +284,9 @@ class LiveLoop:
         recording = recording_of(
             self.wearing.header(self.source.sensors), self._aligner.rate_hz, self._before, (begin, end), last=end
         )
-        self._tracker = CausalTracker(
-            until_start(recording, recording.phases["start"][0]), self.wearing.subject, method=self.method
-        )
+        tracker = Tracker(self.wearing.subject, model=self.model, options=TrackOptions(self.method, causal=True))
+        tracker.push(recording)
+        self._tracker = tracker.follower
         self._before = []
         self._first_pose = self._heading_set = float(recording.time[-1])
         if self.log is not None:
@@ -302,7 +304,7 @@ class LiveLoop:
                 if key == "q":
                     return False
                 if key == "r" and self._tracker is not None and self._aligner is not None:
-                    self._tracker.reset()
+                    self._tracker.reset_headings()
                     self._heading_set = self._aligner.newest
                     if self.log is not None:
                         self.log.event("reset", tick=self._aligner.next_tick)
@@ -440,8 +442,10 @@ def warm(method: str) -> None:
         },
         {"start": ((0.0, 1.9),)},
     )
-    tracker = CausalTracker(made, method=method)
-    tracker.step(np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
-    tracker.std()
+    tracker = Tracker(options=TrackOptions(method, causal=True))
+    tracker.push(made)
+    follower = tracker.follower
+    follower.step(np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
+    follower.std()
     aligner = Aligner(sensors, 100.0, 0.0)
     aligner.push(arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))

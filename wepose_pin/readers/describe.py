@@ -109,7 +109,7 @@ def _result(path: Path) -> Description:
         *(f"note: {warning}" for warning in _texts(summary.get("warnings"))),
     ]
     if (path / "joints.parquet").is_file():
-        facts[1:1] = [f"of a chain, sensors on: {', '.join(_texts(summary.get('not_followed_rms_deg')))}"]
+        facts[1:1] = [f"of a chain, sensors on: {', '.join(_texts(summary.get('orientation_residual_rms_deg')))}"]
         return Description(f"{path}: a result of `wepose track`", (*facts, "its motion: joints.parquet"), (), None)
     facts[1:1] = [
         f"sensors: {', '.join(_texts(summary.get('sensors')))}",

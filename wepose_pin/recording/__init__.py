@@ -6,7 +6,7 @@ sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a f
 """
 
 from .intervals import Intervals, check_phases, check_time, format_time, span_text
-from .recording import CONFIGURATION, EACH_TIME, START_POSES, STRAPPINGS, Recording, check
+from .recording import CONFIGURATION, EACH_TIME, START_POSES, STRAPPINGS, Recording, check, join
 from .sensors import AXES, SEGMENTS, Sensor, axes_from_mount, mount_from_axes
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "check_phases",
     "check_time",
     "format_time",
+    "join",
     "mount_from_axes",
     "span_text",
 ]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +90,31 @@ class Recording:
         samples = np.arange(len(self))[span]
         return samples if gap is None else samples[~gap[span]]
 
+    def cut(self, span: slice) -> Recording:
+        """The samples of a span; phases as they were."""
+        first, last, _ = span.indices(len(self))
+
+        def rows(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else values[first:last]
+
+        sensors = {
+            name: replace(
+                of, gyro_S=rows(of.gyro_S), accel_S=rows(of.accel_S), quat_WS=rows(of.quat_WS), gap=rows(of.gap)
+            )
+            for name, of in self.sensors.items()
+        }
+        resets = tuple(tick - first for tick in self.resets if first <= tick < last)
+        return replace(self, time=self.time[first:last], sensors=sensors, resets=resets)
+
+    def chunks(self, seconds: float) -> Iterator[Recording]:
+        """The recording in chunks of so many seconds, one after the other; the last may be longer by a half."""
+        size = max(1, round(seconds * self.rate_hz))
+        first = 0
+        while first < len(self):
+            last = len(self) if len(self) - first < 1.5 * size else first + size
+            yield self.cut(slice(first, last))
+            first = last
+
     def phase(self, name: str) -> Intervals:
         """Intervals of a phase that must be there.
 
@@ -111,6 +136,26 @@ class Recording:
                 f"[[from, to]] in seconds; {one_of(self.phases, name)}"
             )
         return intervals
+
+
+def join(first: Recording, second: Recording) -> Recording:
+    """Two recordings of the same sensors, one after the other; all else is the first one's."""
+
+    def rows(a: np.ndarray | None, b: np.ndarray | None) -> np.ndarray | None:
+        return None if a is None or b is None else np.concatenate([a, b])
+
+    sensors = {}
+    for name, of in first.sensors.items():
+        after = second.sensors[name]
+        sensors[name] = replace(
+            of,
+            gyro_S=rows(of.gyro_S, after.gyro_S),
+            accel_S=rows(of.accel_S, after.accel_S),
+            quat_WS=rows(of.quat_WS, after.quat_WS),
+            gap=rows(of.gap, after.gap),
+        )
+    resets = (*first.resets, *(len(first) + tick for tick in second.resets))
+    return replace(first, time=np.concatenate([first.time, second.time]), sensors=sensors, resets=resets)
 
 
 def check(recording: Recording) -> Recording:

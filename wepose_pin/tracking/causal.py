@@ -1,119 +1,135 @@
-"""Tracking without a look ahead: from the end of the start pose on, sample by sample or a recording at once.
+"""Segment orientations without a look ahead: from the end of the start pose on, sample by sample or many at once.
 
-Both go through the same compiled steps, so that a live session and its recording give the same quaternions to the bit.
-The start pose is filtered when it has ended; nothing that comes later changes what was said.
+Both go through the same compiled steps, so that a live session and its recording give the same quaternions,
+bit-identical. The start pose is filtered when it has ended; nothing that comes later changes what was given.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import so3
-from ..alignment import (
-    START_POSE_STD,
-    SWAYS_DEG,
-    SWAYS_DEG_S,
-    Segments,
-    covariance_of,
-    heading_to,
-    segment_orientations,
-)
+from ..alignment import START_POSE_STD, Segments, align, check_mounts, covariance_of, heading_to, orient_segments
 from ..errors import BadOption, BadPhase
-from ..filters import BEST, OFFLINE, Orientation, check_method
-from ..filters.bank import bank_of
-from ..filters.base import in_parallel
+from ..filters import BEST, Orientation
+from ..filters.bank import LiveBank, OneByOne, bank_of
+from ..filters.sensors import SensorFilters, filtered_chunk
 from ..filters.static import StaticTest
 from ..pose import spread
-from ..recording import Intervals, Recording, Sensor
-from ..recording.clocks import Clock
-from ..recording.gaps import GOOD, LONG, bridge
+from ..recording import Recording, join
 from ..so3 import kernel
 from ..subject import Subject
+from .segments import Oriented
+from .start_pose import HOLD_S, StartGuide, until_start
 
-HOLD_S = 3.0  # [s] of standing still for a start pose that nobody named
-LOOK_S = 0.1  # [s] from look to look at whether a person moves
-QUIET_S = 0.5  # [s] over which a look goes
-RESET_S = 0.5  # [s] over which the orientation is averaged for a heading reset
+RESET_S = 0.5  # [s] over which the orientation is averaged when headings are set anew
 
 
-class StartGuide:
-    """Waits for `HOLD_S` in which no sensor moves or is lost: the start pose of a session without `phases.start`.
+class CausalEstimator:
+    """Segment orientations from the end of the start pose on, chunk by chunk (`push`) or sample by sample (`step`).
 
-    Attributes
+    Without `phases.start` the start pose is the first `HOLD_S` in which nothing moves. Headings are set anew before
+    each of `Recording.resets`. An estimator that was stepped takes no more chunks.
+
+    Parameters
     ----------
-    state : "waiting" for sensors, "hold", "moved" (in the last second, and held again since), "ready"
-    held_s : [s] of stillness so far
-    missing, moving : columns of the sensors that are lost, or that moved last
+    subject : lengths and mounts; None for the session's stated mounts
     """
 
-    def __init__(self, rate_hz: float, sensors: int, hold_s: float = HOLD_S) -> None:
-        self.state, self.missing, self.moving = "waiting", tuple(range(sensors)), tuple[int, ...]()
-        self._rate, self._hold = rate_hz, round(hold_s * rate_hz)
-        self._every, self._window = max(1, round(LOOK_S * rate_hz)), max(4, round(QUIET_S * rate_hz))
-        self._gyro = np.zeros((self._hold, sensors, 3))
-        self._held = 0
-        self._tick = 0
-        self._moved_at = -np.inf
+    def __init__(
+        self, subject: Subject | None = None, *, method: str = BEST, static_test: StaticTest | None = None
+    ) -> None:
+        self._subject, self._method, self._static_test = subject, method, static_test
+        self._until: Recording | None = None  # what came until the start pose had ended
+        self._guide: StartGuide | None = None
+        self._follower: SegmentFollower | None = None
+        self._tracked = False
 
     @property
-    def held_s(self) -> float:
-        return self._held / self._rate
+    def follower(self) -> SegmentFollower:
+        """What goes on from the start pose.
 
-    @property
-    def begin(self) -> int:
-        """Tick with which the stillness began."""
-        return self._tick - self._held
+        Raises
+        ------
+        BadPhase
+            The start pose has not ended.
+        """
+        if self._follower is None:
+            raise BadPhase("the start pose has not ended: push a recording that holds it")
+        return self._follower
 
-    @property
-    def end(self) -> int:
-        """The last tick so far."""
-        return self._tick - 1
+    def push(self, chunk: Recording) -> list[Oriented]:
+        """Take a chunk; gives what of it follows the start pose, and its segments.
 
-    def push(self, gyro_S: np.ndarray) -> str:
-        """One tick, (k, 3) [rad/s], NaN where a sensor is lost; gives the state."""
-        if self.state == "ready":
-            return self.state
-        self._tick += 1
-        self.missing = tuple(np.flatnonzero(~np.isfinite(gyro_S).all(axis=1)).tolist())
-        if self.missing:
-            self.state, self._held = "waiting", 0
-            return self.state
-        self._gyro[self._held] = gyro_S
-        self._held += 1
-        if self._held % self._every == 0 or self._held == self._hold:
-            held = self._gyro[: self._held]
-            last = held[-self._window :]
-            rate = np.sqrt(np.mean(np.sum((last - last.mean(axis=0)) ** 2, axis=2), axis=0))
-            turn = np.linalg.norm(np.cumsum(held - held.mean(axis=0), axis=0) / self._rate, axis=2).max(axis=0)
-            mean = np.linalg.norm(held.mean(axis=0), axis=1)
-            moves = (np.degrees(rate) > SWAYS_DEG_S) | (np.degrees(turn) > SWAYS_DEG) | (np.degrees(mean) > SWAYS_DEG_S)
-            if moves.any():
-                self.moving = tuple(np.flatnonzero(moves).tolist())
-                self._held, self._moved_at = 0, self._tick
-        if self._held == self._hold:
-            self.state = "ready"
+        Raises
+        ------
+        WeposeError
+            A sensor with measured orientations, or without a known mount; as `SensorFilters`.
+        """
+        if self._follower is None:
+            chunk = self._wait(chunk)
+        if self._follower is None or not len(chunk):
+            return []
+        self._tracked = True
+        return [(chunk, self._follower.run(chunk))]
+
+    def finish(self) -> list[Oriented]:
+        """Nothing is left when the last chunk has been pushed.
+
+        Raises
+        ------
+        BadPhase
+            There was no start pose, or nothing after it.
+        """
+        if self._tracked:
+            return []
+        recording = self._until
+        if self._follower is None and self._guide is not None and recording is not None:
+            raise BadPhase(
+                f"{recording.where()}: nobody stands still for {HOLD_S:g} s ({self._guide.held_s:.1f} s at its end); "
+                f"name the seconds of the start pose, [phases] start = [[from, to]]"
+            )
+        where = "" if recording is None else f"{recording.where()}: "
+        raise BadPhase(f"{where}phases.start ends with the recording; nothing is left to track")
+
+    def _wait(self, chunk: Recording) -> Recording:
+        """Look for the end of the start pose in a chunk, and begin there; gives what of the chunk follows it."""
+        for name, sensor in chunk.sensors.items():
+            if sensor.ready:
+                raise BadOption(
+                    f"{chunk.where()}: sensors.{name} comes with ready orientations: there is no filter to run "
+                    f"causally; leave the option out"
+                )
+        came = chunk if self._until is None else join(self._until, chunk)
+        self._until = came
+        if came.phases.get("start"):
+            interval = came.phases["start"][0]
+            if came.time[-1] < interval[1] - 1e-9:
+                return chunk
+            last = came.span(interval).stop
         else:
-            self.state = "moved" if self._tick - self._moved_at < self._rate else "hold"
-        return self.state
+            if self._guide is None:
+                self._guide = StartGuide(came.rate_hz, len(came.sensors))
+            rates = [of.gyro_S for of in chunk.sensors.values() if of.gyro_S is not None]
+            for tick in np.stack(rates, axis=1):
+                if self._guide.push(tick) == "ready":
+                    break
+            else:
+                return chunk
+            interval = float(came.time[self._guide.begin]), float(came.time[self._guide.end])
+            last = self._guide.end + 1
+        self._follower = SegmentFollower(
+            until_start(came, interval), self._subject, method=self._method, static_test=self._static_test
+        )
+        return came.cut(slice(last, len(came)))
 
 
-class Run(NamedTuple):
-    """A stretch of ticks through a `CausalTracker`; k sensors in the order of its `names`."""
-
-    quat_WL: np.ndarray  # (n, k, 4) xyzw
-    quat_VS: np.ndarray  # (n, k, 4) xyzw, each sensor in its own world
-    gyro_bias: np.ndarray  # (n, k, 3) [rad/s]
-    static: np.ndarray  # (n, k) bool
-    attitude_cov: np.ndarray | None  # (n, k, 3, 3) [rad²], error on the right, in S; None: the filter has none
-
-
-class CausalTracker:
-    """Segment orientations from the end of the start pose on.
+class SegmentFollower:
+    """Segment orientations after a start pose; k sensors in the order of `names`.
 
     Parameters
     ----------
@@ -122,15 +138,9 @@ class CausalTracker:
 
     Attributes
     ----------
-    names : segments, in the order of all columns
     start : `Segments` of the start pose: mounts, headings, warnings
     heading : (k,) ψ [rad] from each sensor's world to W
     quat_WL, static, gyro_bias : (k, 4) xyzw, (k,), (k, 3) [rad/s] after the last step; overwritten by the next
-
-    Raises
-    ------
-    WeposeError
-        A method that needs the whole recording, sensors with ready orientations, and as `segment_orientations`.
     """
 
     def __init__(
@@ -141,31 +151,28 @@ class CausalTracker:
         method: str = BEST,
         static_test: StaticTest | None = None,
     ) -> None:
-        check_method(method)
-        if method in OFFLINE:
-            raise BadOption(f"method '{method}' needs the whole recording; 'amekf' looks at nothing ahead")
-        for name, sensor in until.sensors.items():
-            if sensor.ready:
-                raise BadOption(
-                    f"{until.where()}: sensors.{name} comes with ready orientations: there is no filter to run "
-                    f"causally; leave the option out"
-                )
-        self.start = segment_orientations(until, subject, method=method, static_test=static_test)
+        check_mounts(until, subject)
+        self._filters = SensorFilters(until, method=method, static_test=static_test)
+        _, orientation = self._filters.push(until) or self._filters.finish()
+        alignment = align(until, subject, filtered_chunk(self._filters, until, orientation))
+        self.start = orient_segments(until, alignment, orientation, subject)
         self.names = tuple(until.sensors)
-        self.rate_hz, self.method = until.rate_hz, method
-        found = [self.start.orientation[name] for name in self.names]
-        self._filters = [of.filter for of in found if of.filter is not None]
-        self._detectors = [of.detector for of in found if of.detector is not None]
-        self._bank = bank_of(self._filters, self._detectors)
+        self.rate_hz = until.rate_hz
+        started = [orientation[name] for name in self.names]
+        self._bank: LiveBank | OneByOne = bank_of(
+            [of.filter for of in started if of.filter is not None],
+            [of.detector for of in started if of.detector is not None],
+        )
         self._until, self._subject = until, subject
         self._mount = np.array([self.start.quat_LS[name] for name in self.names])
         self.heading = np.array([self.start.heading[name] for name in self.names])
         self._turn = _about_z(self.heading)
-        self._recent = np.stack([of.quat_WS for of in found], axis=1)[-max(1, round(RESET_S * self.rate_hz)) :].copy()
-        self._at = 0  # the oldest of them
+        self._recent = np.stack([of.quat_WS for of in started], axis=1)[-max(1, round(RESET_S * self.rate_hz)) :].copy()
+        self._oldest = 0  # its place in `_recent`
         self.quat_WL = np.zeros((len(self.names), 4))
         _place(self._turn, self._recent[-1:], self._mount, self.quat_WL, self.quat_WL[None].copy())
-        self._forgiven: np.ndarray | None = None  # (k,) [rad²] of heading that a reset took away
+        self._run_var = self.heading_var()  # (k,) [rad²] of each heading by its filter alone, after the last run
+        self._var_at_reset: np.ndarray | None = None  # (k,) [rad²] of heading that a reset took away
 
     @property
     def static(self) -> np.ndarray:
@@ -176,66 +183,86 @@ class CausalTracker:
         return self._bank.gyro_bias
 
     def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """`quat_WL` (k, 4) after one tick, (k, 3) [rad/s], (k, 3) [m/s²], NaN where a sensor is lost."""
-        self._recent[self._at] = self._bank.update(gyro_S, accel_S)
-        _place(self._turn, self._recent[self._at : self._at + 1], self._mount, self.quat_WL, self.quat_WL[None])
-        self._at = (self._at + 1) % len(self._recent)
+        """`quat_WL` (k, 4) after one sample, (k, 3) [rad/s], (k, 3) [m/s²], NaN where a sensor is lost."""
+        self._recent[self._oldest] = self._bank.update(gyro_S, accel_S)
+        newest = self._recent[self._oldest : self._oldest + 1]
+        _place(self._turn, newest, self._mount, self.quat_WL, self.quat_WL[None])
+        self._oldest = (self._oldest + 1) % len(self._recent)
         return self.quat_WL
 
-    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Run:
-        """Many ticks at once, (n, k, 3) each; for a tracker that is never stepped. The same bits as steps give."""
-        n, k = gyro_S.shape[:2]
-        gyro, accel = (np.ascontiguousarray(np.moveaxis(x, 1, 0), dtype=float) for x in (gyro_S, accel_S))
-        statics = in_parallel(lambda i: self._detectors[i].run(gyro[i], accel[i]), range(k))
-        runs = in_parallel(lambda i: self._filters[i].run(gyro[i], accel[i], statics[i]), range(k))
-        quat_VS = np.stack([run.quat_WS for run in runs], axis=1)
-        quat_WL = np.empty((n, k, 4))
+    def run(self, chunk: Recording) -> Segments:
+        """The segments of many samples, bit-identical with as many steps."""
+        resets = {tick for tick in chunk.resets if 0 <= tick < len(chunk)}  # two at once are one
+        parts = []
+        for begin, end in pairwise(sorted({0, *resets, len(chunk)})):
+            if begin in resets:
+                self.reset_headings(self._run_var)
+            parts.append(self._run(chunk.cut(slice(begin, end))))
+        return parts[0] if len(parts) == 1 else _joined(chunk, parts)
+
+    def _run(self, chunk: Recording) -> Segments:
+        """As `run`, without a reset."""
+        _, orientation = self._filters.push(chunk) or self._filters.finish()
+        quat_VS = np.stack([orientation[name].quat_WS for name in self.names], axis=1)
+        quat_WL = np.empty(quat_VS.shape)
         _place(self._turn, quat_VS, self._mount, self.quat_WL, quat_WL)
         self._recent = np.concatenate([self._in_order(), quat_VS])[-len(self._recent) :].copy()
-        self._at = 0
-        covs = [run.attitude_cov for run in runs if run.attitude_cov is not None]
-        cov = np.stack(covs, axis=1) if covs else None
-        return Run(quat_WL, quat_VS, np.stack([run.gyro_bias for run in runs], axis=1), np.stack(statics, axis=1), cov)
+        self._oldest = 0
+        covariance_W = {}
+        covs = {name: of.attitude_cov for name, of in orientation.items() if of.attitude_cov is not None}
+        if covs:
+            last = np.stack([covs[name][-1] for name in self.names])
+            self._run_var = vertical_var(quat_VS[-1], last)
+            covariance_W = {name: self._covariance_W(i, quat_VS[:, i], covs[name]) for i, name in enumerate(self.names)}
+        return replace(
+            self.start,
+            time=chunk.time,
+            quat_WL={name: quat_WL[:, i] for i, name in enumerate(self.names)},
+            heading={name: float(self.heading[i]) for i, name in enumerate(self.names)},
+            orientation=orientation,
+            covariance_W=covariance_W,
+        )
 
-    def reset(self, heading_var: np.ndarray | None = None) -> None:
-        """Headings anew: the person stands in the start pose again, and has for `RESET_S`.
+    def reset_headings(self, heading_var: np.ndarray | None = None) -> None:
+        """Set headings anew: the person stands in the start pose again, and has for `RESET_S`.
 
-        `heading_var` (k,) [rad²]: what the filters' own covariance says of the heading now; it no longer counts.
+        `heading_var` (k,) [rad²]: what the filters' own covariance says of the heading now, and no longer counts; None
+        for that of the last step.
         """
         recent = self._in_order()
-        aligned = recent * np.sign(np.einsum("nki,ki->nk", recent, recent[-1]))[:, :, None]
-        mean = aligned.sum(axis=0)
+        same_sign = recent * np.sign(np.einsum("nki,ki->nk", recent, recent[-1]))[:, :, None]
+        mean = same_sign.sum(axis=0)
         mean /= np.linalg.norm(mean, axis=1)[:, None]
         for i in range(len(self.names)):
             self.heading[i] = heading_to(Rotation.from_quat(mean[i]), Rotation.from_quat(self._mount[i]))
         self._turn = _about_z(self.heading)
-        self._forgiven = heading_var if heading_var is not None else self.heading_var()
+        self._var_at_reset = heading_var if heading_var is not None else self.heading_var()
 
     def heading_var(self) -> np.ndarray | None:
-        """(k,) [rad²] variance of each heading by its filter alone, of steps; None where the filter has none."""
+        """(k,) [rad²] variance of each heading by its filter alone, after a step; None where the filter has none."""
         cov = self._bank.attitude_cov
-        return None if cov is None else vertical_var(self._recent[self._at - 1], cov)
+        return None if cov is None else vertical_var(self._recent[self._oldest - 1], cov)
 
     def heading_std(self) -> np.ndarray:
-        """(k,) [rad] one standard deviation of each segment's heading now, as `track` states it: the mounts' part too.
+        """(k,) [rad] one standard deviation of each segment's heading, as `track` states it: the mounts' part too.
 
         NaN where the filter has none.
         """
         return np.sqrt([cov[2, 2] for cov in self._covariances_W()])
 
     def std(self) -> np.ndarray:
-        """(k,) [rad] one standard deviation of an axis of each segment now; NaN where the filter has none."""
+        """(k,) [rad] one standard deviation of an axis of each segment; NaN where the filter has none."""
         return spread(self._covariances_W())
 
     def _covariances_W(self) -> np.ndarray:
-        """(k, 3, 3) [rad²] of each segment in W now; NaN where the filter has none."""
+        """(k, 3, 3) [rad²] of each segment in W after the last step; NaN where the filter has none."""
         cov = self._bank.attitude_cov
         if cov is None:
             return np.full((len(self.names), 3, 3), np.nan)
-        now = self._recent[self._at - 1]
-        return np.concatenate([self.covariance_W(i, now[i : i + 1], cov[i : i + 1]) for i in range(len(cov))])
+        now = self._recent[self._oldest - 1]
+        return np.concatenate([self._covariance_W(i, now[i : i + 1], cov[i : i + 1]) for i in range(len(cov))])
 
-    def covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
+    def _covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
         """(n, 3, 3) [rad²] of sensor i's segment in W, error on the left of `quat_WL`, since the last reset.
 
         As `alignment.covariance_of`; after a reset the heading is as good as a person stands, and grows from there.
@@ -244,9 +271,9 @@ class CausalTracker:
         of = self.start.orientation[self.names[i]]._replace(attitude_cov=attitude_cov)
         mount = Rotation.from_quat(self._mount[i])
         cov = covariance_of(self._until, self.names[i], self._subject, R_WS, mount, of)
-        if self._forgiven is not None:
+        if self._var_at_reset is not None:
             var = vertical_var(quat_VS, attitude_cov)
-            grown = np.maximum(0.0, var - self._forgiven[i])
+            grown = np.maximum(0.0, var - self._var_at_reset[i])
             # The mount's part of the heading stays: the reset has set that of the start pose alone.
             share = np.sqrt((np.maximum(cov[:, 2, 2] - var, 0.0) + grown + START_POSE_STD**2) / cov[:, 2, 2])
             cov[:, 2, :] *= share[:, None]
@@ -254,157 +281,30 @@ class CausalTracker:
         return cov
 
     def _in_order(self) -> np.ndarray:
-        return np.concatenate([self._recent[self._at :], self._recent[: self._at]])
+        return np.concatenate([self._recent[self._oldest :], self._recent[: self._oldest]])
 
 
-def causal_segments(
-    recording: Recording,
-    subject: Subject | None = None,
-    *,
-    method: str = BEST,
-    static_test: StaticTest | None = None,
-) -> tuple[Recording, Segments]:
-    """What follows the start pose: that part of the recording, and its segments by a `CausalTracker`.
+def _joined(chunk: Recording, parts: list[Segments]) -> Segments:
+    """Segments of a chunk from those of its parts; headings are the last one's."""
 
-    Without `phases.start` the start pose is the first `HOLD_S` in which nothing moves, as in a live session. Headings
-    are set anew before each of `recording.resets`.
-
-    Raises
-    ------
-    WeposeError
-        As `CausalTracker`; nobody stands still; nothing follows the start pose.
-    """
-    until, first = start_of(recording)
-    tracker = CausalTracker(until, subject, method=method, static_test=static_test)
-    names = tracker.names
-    gyro, accel = np.empty((len(recording) - first, len(names), 3)), np.empty((len(recording) - first, len(names), 3))
-    for i, name in enumerate(names):
-        sensor = recording.sensors[name]
-        assert sensor.gyro_S is not None
-        assert sensor.accel_S is not None
-        lost = np.zeros(len(gyro), dtype=bool) if sensor.gap is None else sensor.gap[first:]
-        # A long bridge was made by what came after it: it is no look ahead only as a gap.
-        gyro[:, i] = np.where(lost[:, None], np.nan, sensor.gyro_S[first:])
-        accel[:, i] = np.where(lost[:, None], np.nan, sensor.accel_S[first:])
-    resets = {tick - first for tick in recording.resets if first <= tick < len(recording)}  # two at once are one
-    if 0 in resets:
-        tracker.reset()
-    edges = sorted({0, *resets, len(gyro)})
-    runs: list[Run] = []
-    covariances: list[list[np.ndarray]] = []
-    for begin, end in pairwise(edges):
-        if runs:
-            last = runs[-1]
-            cov = last.attitude_cov
-            tracker.reset(None if cov is None else vertical_var(last.quat_VS[-1], cov[-1]))
-        run = tracker.run(gyro[begin:end], accel[begin:end])
-        runs.append(run)
-        if run.attitude_cov is not None:
-            cov = run.attitude_cov
-            covariances.append([tracker.covariance_W(i, run.quat_VS[:, i], cov[:, i]) for i in range(len(names))])
-    quat_WL, quat_VS, bias, static = (
-        np.concatenate([getattr(run, part) for run in runs]) for part in ("quat_WL", "quat_VS", "gyro_bias", "static")
-    )
-    attitude = np.concatenate([run.attitude_cov for run in runs]) if covariances else None
-    orientation = {
-        name: Orientation(
-            quat_VS[:, i],
-            bias[:, i],
-            static[:, i],
-            None if attitude is None else attitude[:, i],
-            tracker.start.orientation[name].noise,
+    def orientation(name: str) -> Orientation:
+        rows = [part.orientation[name] for part in parts]
+        covs = [of.attitude_cov for of in rows if of.attitude_cov is not None]
+        quat_WS, gyro_bias, static = (
+            np.concatenate([getattr(of, field) for of in rows]) for field in ("quat_WS", "gyro_bias", "static")
         )
-        for i, name in enumerate(names)
-    }
-    rest = _part(recording, slice(first, len(recording)))
-    return rest, replace(
-        tracker.start,
-        time=rest.time,
-        quat_WL={name: quat_WL[:, i] for i, name in enumerate(names)},
-        heading={name: float(tracker.heading[i]) for i, name in enumerate(names)},
-        orientation=orientation,
-        covariance_W={name: np.concatenate([of[i] for of in covariances]) for i, name in enumerate(names)}
-        if covariances
-        else {},
+        return rows[-1]._replace(
+            quat_WS=quat_WS, gyro_bias=gyro_bias, static=static, attitude_cov=np.concatenate(covs) if covs else None
+        )
+
+    last = parts[-1]
+    return replace(
+        last,
+        time=chunk.time,
+        quat_WL={name: np.concatenate([part.quat_WL[name] for part in parts]) for name in last.quat_WL},
+        orientation={name: orientation(name) for name in last.orientation},
+        covariance_W={name: np.concatenate([part.covariance_W[name] for part in parts]) for name in last.covariance_W},
     )
-
-
-def start_of(recording: Recording) -> tuple[Recording, int]:
-    """The recording until its start pose ends, with that as `phases.start`, and the first sample after it.
-
-    Raises
-    ------
-    BadPhase
-        No start pose; it ends with the recording.
-    """
-    if recording.phases.get("start"):
-        interval = recording.phases["start"][0]
-        last = recording.span(interval).stop
-    else:
-        guide = StartGuide(recording.rate_hz, len(recording.sensors))
-        still = np.zeros((len(recording), 3))
-        rates = [still if s.gyro_S is None else s.gyro_S for s in recording.sensors.values()]
-        for tick in np.stack(rates, axis=1):
-            if guide.push(tick) == "ready":
-                break
-        else:
-            raise BadPhase(
-                f"{recording.where()}: nobody stands still for {HOLD_S:g} s ({guide.held_s:.1f} s at its end); "
-                f"name the seconds of the start pose, [phases] start = [[from, to]]"
-            )
-        interval = float(recording.time[guide.begin]), float(recording.time[guide.end])
-        last = guide.end + 1
-    if last >= len(recording):
-        raise BadPhase(f"{recording.where()}: phases.start ends with the recording; nothing is left to track")
-    return until_start(recording, interval), last
-
-
-def until_start(recording: Recording, interval: tuple[float, float]) -> Recording:
-    """From the start pose's begin, or that of a phase `still` before its end, to its end.
-
-    What was lost in it is bridged by what is left of it: whoever reads a whole recording bridges with what came later.
-
-    Raises
-    ------
-    BadPhase
-        A sensor that sent nothing in it.
-    """
-    before: dict[str, Intervals] = {"start": (interval,)}
-    still = recording.phases.get("still", ())
-    span = recording.span(interval)
-    begin = span.start
-    if still and still[0][1] <= interval[1]:
-        before["still"] = still[:1]
-        begin = min(begin, recording.span(still[0]).start)
-    part = _part(recording, slice(begin, span.stop))
-    clock = Clock(np.arange(len(part)) / part.rate_hz, np.arange(len(part)), 1.0 / part.rate_hz)
-    sensors = {name: _bridged(part, name, clock) for name in part.sensors}
-    return replace(part, phases=before, sensors=sensors)
-
-
-def _bridged(part: Recording, name: str, clock: Clock) -> Sensor:
-    """A sensor with its gaps filled anew."""
-    sensor = part.sensors[name]
-    if sensor.gap is None or not sensor.gap.any() or sensor.gyro_S is None or sensor.accel_S is None:
-        return sensor
-    if sensor.gap.all():
-        raise BadPhase(f"{part.where()}: phases.start: sensors.{name} sent nothing in it; name seconds in which all do")
-    marks = np.where(sensor.gap, LONG, GOOD).astype(np.int8)
-    gyro_S, accel_S = bridge(sensor.gyro_S, marks, clock, rate=True), bridge(sensor.accel_S, marks, clock)
-    return replace(sensor, gyro_S=gyro_S, accel_S=accel_S)
-
-
-def _part(recording: Recording, span: slice) -> Recording:
-    """The samples of a span; phases as they were."""
-
-    def cut(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else values[span]
-
-    sensors = {
-        name: replace(of, gyro_S=cut(of.gyro_S), accel_S=cut(of.accel_S), quat_WS=cut(of.quat_WS), gap=cut(of.gap))
-        for name, of in recording.sensors.items()
-    }
-    return replace(recording, time=recording.time[span], sensors=sensors)
 
 
 def vertical_var(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from .. import so3
-from ..alignment import Segments, segment_orientations
+from ..alignment import Segments
 from ..arguments import check_arguments
 from ..errors import BadOption, BadSession, one_of
 from ..filters import BEST, check_method
@@ -25,6 +25,7 @@ from ..filters.static import StaticTest
 from ..model.fit import fit, unseen
 from ..model.robot import joint_values, start_configuration
 from ..recording import CONFIGURATION, Recording
+from .segments import estimate_segments
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class TrackedChain:
     time : (n,) [s]
     q : (n, nq) configuration of `model`
     quat_WL : link → (n, 4) xyzw as measured
-    missed : link → (n,) [rad], angle between what was measured and the model
+    residual : link → (n,) [rad], angle between what was measured and the model
     segment_cov : link → (n, 3, 3) [rad²], error of `quat_WL` on the left, in W
     open : joints that the known links leave undetermined, at least in part: they move as little as they can
     """
@@ -44,7 +45,7 @@ class TrackedChain:
     time: np.ndarray
     q: np.ndarray
     quat_WL: Mapping[str, np.ndarray]
-    missed: Mapping[str, np.ndarray]
+    residual: Mapping[str, np.ndarray]
     segment_cov: Mapping[str, np.ndarray]
     open: tuple[str, ...]
     model: pin.Model
@@ -74,8 +75,8 @@ class TrackedChain:
             "duration_s": round(float(self.time[-1] - self.time[0]), 3),
             "phases": {"start": list(self.segments.start), "still": list(self.segments.still)},
             "start": dict(self.recording.joints),
-            "not_followed_rms_deg": {
-                link: round(float(np.degrees(np.sqrt(np.mean(angle**2)))), 3) for link, angle in self.missed.items()
+            "orientation_residual_rms_deg": {
+                link: round(float(np.degrees(np.sqrt(np.mean(angle**2)))), 3) for link, angle in self.residual.items()
             },
             "joints_left_open": list(self.open),
             "warnings": [*self.segments.warnings, *([left] if self.open else [])],
@@ -101,7 +102,7 @@ def track_chain(
     Raises
     ------
     WeposeError
-        Another start pose; a link or joint that the model does not have; as `segment_orientations`.
+        Another start pose; a link or joint that the model does not have; as `estimate_segments`.
     """
     check_arguments(track_chain, locals())
     check_method(method)
@@ -115,13 +116,13 @@ def track_chain(
         if sensor.aligned:
             raise BadSession(f"{where}: sensors.{link}.aligned is for a person's segments; leave it out")
     q_start = start_configuration(model, recording.joints, where)
-    segments = segment_orientations(recording, method=method, static_test=static_test)
+    segments = estimate_segments(recording, method=method, static_test=static_test)
 
     at_start = {link: Rotation.from_quat(quat[0]) for link, quat in _orientations(model, q_start[None], links).items()}
     quat_WL = {link: (Rotation.from_quat(quat) * at_start[link]).as_quat() for link, quat in segments.quat_WL.items()}
     q = fit(model, quat_WL, range(1, model.njoints), q_start[None], limits=limits)
     stands = _orientations(model, q, list(quat_WL))
-    missed = {
+    residual = {
         link: (Rotation.from_quat(stands[link]).inv() * Rotation.from_quat(quat)).magnitude()
         for link, quat in quat_WL.items()
     }
@@ -129,7 +130,7 @@ def track_chain(
         recording.time,
         q,
         {link: so3.continuous(quat) for link, quat in quat_WL.items()},
-        missed,
+        residual,
         segments.covariance_W,
         tuple(unseen(model, list(quat_WL), q[len(q) // 2])),
         model,

@@ -1,4 +1,4 @@
-"""Headings held together: what drifts apart between sensors is seen at joined hands and at the elbows' hinges.
+"""Heading correction: what drifts apart between sensors is observed at joined hands and at the elbows' hinges.
 
 The filters' tilt is good and their headings drift. δ_i(t) is the heading error of segment i, R_WL,true = Rz(δ) R_WL, a
 random walk whose steps are what the filter's own covariance grows by. Two things measure it, both linear in δ:
@@ -20,15 +20,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import ATTITUDE_STD, SLIP_STD, START_POSE_STD, Segments, start_heading_var
-from ..recording import SEGMENTS, Intervals, Recording
+from ..recording import SEGMENTS, Recording
 from ..subject import Subject
 
 CHAIN = SEGMENTS[:5]
 HANDS = ("left_hand", "right_hand")  # each in the chain where it has a sensor, else rigid with its forearm
 KNOT_S = 2.0
-LOOK_RATE_HZ = 8.0
+SAMPLE_RATE_HZ = 8.0
 # How long errors of the residuals last that have nothing to do with headings: soft tissue and what is left of the
-# mounts' errors come back in every pose, so that a minute of joined hands is worth three looks. Found on simulated
+# mounts' errors come back in every pose, so that a minute of joined hands is worth three samples. Taken from simulated
 # people, where less takes a good filter's headings for worse than they are.
 CORRELATION_S = 20.0
 TORSO_START_STD = np.deg2rad(0.5)  # [rad] of the torso's heading when the start pose ends: it says where x points
@@ -36,73 +36,58 @@ UNKNOWN_DRIFT = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no c
 APART = 5.0  # standard deviations from which on palms are not joined, or an elbow is no hinge
 
 
-class Reset(NamedTuple):
-    """What held the headings together, before and after."""
+class HeadingCorrection(NamedTuple):
+    """What headings were corrected by: residuals before and after, and the largest correction."""
 
     clasp_mm: tuple[float, float] | None  # rms palm gap in the clasp phases
     hinge_deg: Mapping[str, tuple[float, float]]  # side → rms of the forearm against the elbow's plane
-    largest_deg: Mapping[str, float]  # segment → largest turn
+    largest_deg: Mapping[str, float]  # segment → largest rotation about the vertical
 
 
-def held_together(recording: Recording, segments: Segments, subject: Subject) -> tuple[Segments, Reset | None]:
-    """Segments with their headings corrected; as they were where neither a clasp nor a hinge is known."""
-    hold = HeadingHold(recording, segments.quat_WL, segments.start[1], subject, recording.phases.get("clasp", ()))
-    if not hold.has_chain or not hold.can_see:
-        return segments, None
-    hold.look(recording, segments)
-    if not hold.solve():
-        return segments, None
-    corrected = hold.apply(recording, segments)
-    return corrected, hold.reset()
+class HeadingCorrector:
+    """Corrects the headings of a recording whose chunks come twice: `observe` all, `solve`, then `correct` each.
 
-
-class HeadingHold:
-    """`held_together` for a recording that comes in pieces, and comes twice: `look`, then `solve`, then `apply`.
-
-    Put together, what it gives is to the bit that of the recording as a whole: what is summed is summed knot by knot.
+    Put together, the chunks are bit-identical with the recording as one chunk: sums are taken knot by knot.
 
     Parameters
     ----------
-    piece : the first
+    chunk : the first
     segments : names of those that are measured
     begin : [s] end of the start pose, from which on there is drift
-    clasp : intervals [s] of joined hands, of the whole recording
 
     Attributes
     ----------
     has_chain : whether all segments from hand to hand are measured; without it there is nothing to hold
-    can_see : whether there is a hinge, or a clasp that is not over when the start pose is
+    has_observations : whether there is a hinge, or a clasp that is not over when the start pose is
     """
 
-    def __init__(
-        self, piece: Recording, segments: Collection[str], begin: float, subject: Subject, clasp: Intervals
-    ) -> None:
+    def __init__(self, chunk: Recording, segments: Collection[str], begin: float, subject: Subject) -> None:
         self.has_chain = set(CHAIN) <= set(segments)
         self._chain = (*CHAIN, *(hand for hand in HANDS if hand in segments))
-        self._subject, self._start, self._clasp = subject, begin, clasp
+        self._subject, self._start, self._clasp = subject, begin, chunk.phases.get("clasp", ())
         # A hinge was seen through the mounts of its calibration and holds as long as they do.
-        self._hinges = subject.hinges if piece.strapping != "new" else {}
-        self.can_see = bool(self._hinges) or any(end >= begin for _, end in clasp)
-        self._stride = max(1, round(piece.rate_hz / LOOK_RATE_HZ))
-        self._share = 1.0 / max(1.0, CORRELATION_S * piece.rate_hz / self._stride)
-        self._first: float | None = None  # [s] of the first look
+        self._hinges = subject.hinges if chunk.strapping != "new" else {}
+        self.has_observations = bool(self._hinges) or any(end >= begin for _, end in self._clasp)
+        self._stride = max(1, round(chunk.rate_hz / SAMPLE_RATE_HZ))
+        self._share = 1.0 / max(1.0, CORRELATION_S * chunk.rate_hz / self._stride)
+        self._first: float | None = None  # [s] of the first sample that is used
         self._seen = [0, 0]  # samples so far, of either pass
-        self._open: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # looks of a knot that is not complete
+        self._open: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # samples of a knot that is not complete
         self._sums: list[tuple[np.ndarray, np.ndarray]] = []  # information and pull of knots that are
-        self._found = False
+        self._observed = False
         self._var: dict[str, list[np.ndarray]] = {}  # name → the filter's heading variance [rad²] at `_asked` times
         self._asked = 0
         self._last: dict[str, tuple[float, float]] = {}  # name → time and variance of the last sample
         self._gaps = {when: _Rms() for when in ("before", "after")}
-        self._bends = {when: {side: _Rms() for side in self._hinges} for when in ("before", "after")}
+        self._hinge_rms = {when: {side: _Rms() for side in self._hinges} for when in ("before", "after")}
         self._largest = dict.fromkeys(self._chain, 0.0)
 
-    def look(self, piece: Recording, segments: Segments) -> None:
-        """Take a piece in, the first time that it comes."""
-        time, quats = self._looks(piece, segments, 0)
+    def observe(self, chunk: Recording, segments: Segments) -> None:
+        """Take a chunk, the first time that it comes."""
+        time, quats = self._sampled(chunk, segments, 0)
         if len(time) and self._first is None:
             self._first = float(time[0])
-        self._ask(piece, segments)
+        self._ask(chunk, segments)
         if self._open is not None:
             time = np.concatenate([self._open[0], time])
             quats = {name: np.concatenate([self._open[1][name], quat]) for name, quat in quats.items()}
@@ -119,7 +104,7 @@ class HeadingHold:
         if self._open is None or self._first is None:
             return False
         self._take(*self._open)
-        if not self._found:
+        if not self._observed:
             return False
         information, pull = (np.concatenate(parts) for parts in zip(*self._sums, strict=True))
         middle = self._first + KNOT_S * (np.arange(len(pull)) + 0.5)
@@ -133,51 +118,51 @@ class HeadingHold:
         self._middle, self._delta = middle, delta  # constant before the first middle and after the last
         return True
 
-    def apply(self, piece: Recording, segments: Segments) -> Segments:
-        """The piece's segments corrected, the second time that it comes."""
+    def correct(self, chunk: Recording, segments: Segments) -> Segments:
+        """The chunk's segments with corrected headings, the second time that it comes."""
         corrected, covariance = dict(segments.quat_WL), dict(segments.covariance_W)
         for i, name in enumerate(self._chain):
-            turn = np.interp(piece.time, self._middle, self._delta[:, i])
-            about_z = Rotation.from_rotvec(turn[:, None] * [0.0, 0.0, 1.0])
+            psi = np.interp(chunk.time, self._middle, self._delta[:, i])
+            about_z = Rotation.from_rotvec(psi[:, None] * [0.0, 0.0, 1.0])
             corrected[name] = (about_z * Rotation.from_quat(corrected[name])).as_quat()
-            self._largest[name] = max(self._largest[name], float(np.degrees(np.abs(turn).max())))
+            self._largest[name] = max(self._largest[name], float(np.degrees(np.abs(psi).max())))
             if name in covariance:
-                variance = np.interp(piece.time, self._middle, self._cov[:, i, i])
+                variance = np.interp(chunk.time, self._middle, self._cov[:, i, i])
                 with_heading, of_filter = _of_filter(segments, name)
-                start = start_heading_var(piece, name, self._subject)
+                start = start_heading_var(chunk, name, self._subject)
                 covariance[name] = _narrowed(covariance[name], with_heading, of_filter + start, variance)
-        held = replace(segments, quat_WL=corrected, covariance_W=covariance)
-        time, quats = self._looks(piece, held, 1)
+        result = replace(segments, quat_WL=corrected, covariance_W=covariance)
+        time, quats = self._sampled(chunk, result, 1)
         self._measure("after", time, {name: Rotation.from_quat(quat) for name, quat in quats.items()})
-        return held
+        return result
 
-    def reset(self) -> Reset:
-        """What was held so far, before and after."""
-        gaps, bends = self._gaps, self._bends
-        return Reset(
+    def correction(self) -> HeadingCorrection:
+        """Residuals so far, before and after."""
+        gaps, hinge_rms = self._gaps, self._hinge_rms
+        return HeadingCorrection(
             clasp_mm=(1e3 * gaps["before"].value, 1e3 * gaps["after"].value) if gaps["before"].count else None,
             hinge_deg={
                 side: (
-                    float(np.degrees(bends["before"][side].value)),
-                    float(np.degrees(bends["after"][side].value)),
+                    float(np.degrees(hinge_rms["before"][side].value)),
+                    float(np.degrees(hinge_rms["after"][side].value)),
                 )
                 for side in self._hinges
             },
             largest_deg=dict(self._largest),
         )
 
-    def _looks(self, piece: Recording, segments: Segments, nth: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Times (m,) [s] and orientations (m, 4) at a few samples a second, the `nth` time that the piece comes."""
-        at = np.arange(-self._seen[nth] % self._stride, len(piece), self._stride)
-        self._seen[nth] += len(piece)
-        at = at[piece.time[at] >= self._start]
-        return piece.time[at], {name: segments.quat_WL[name][at] for name in self._chain}
+    def _sampled(self, chunk: Recording, segments: Segments, nth: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Times (m,) [s] and orientations (m, 4) at a few samples a second, the `nth` time that the chunk comes."""
+        at = np.arange(-self._seen[nth] % self._stride, len(chunk), self._stride)
+        self._seen[nth] += len(chunk)
+        at = at[chunk.time[at] >= self._start]
+        return chunk.time[at], {name: segments.quat_WL[name][at] for name in self._chain}
 
     def _knots(self, time: np.ndarray) -> np.ndarray:
         return np.floor((time - self._first) / KNOT_S).astype(int)
 
     def _take(self, time: np.ndarray, quats: Mapping[str, np.ndarray]) -> None:
-        """Information and pull of complete knots from their looks."""
+        """Information and pull of complete knots from their samples."""
         R = {name: Rotation.from_quat(quat) for name, quat in quats.items()}
         joined = self._measure("before", time, R)
         done = sum(len(pull) for _, pull in self._sums)
@@ -186,9 +171,9 @@ class HeadingHold:
         information, pull = np.zeros((count, size, size)), np.zeros((count, size))
         for row in (_gaps(R, self._subject, joined), *(_hinge(R, self._subject, side) for side in self._hinges)):
             weight = self._share * row.weight[:, None]
-            np.add.at(information, knot[row.look], np.einsum("na,nb->nab", weight * row.H, row.H))
-            np.add.at(pull, knot[row.look], -weight * row.H * row.r[:, None])
-            self._found |= len(row.look) > 0
+            np.add.at(information, knot[row.sample], np.einsum("na,nb->nab", weight * row.H, row.H))
+            np.add.at(pull, knot[row.sample], -weight * row.H * row.r[:, None])
+            self._observed |= len(row.sample) > 0
         self._sums.append((information, pull))
 
     def _measure(self, when: str, time: np.ndarray, R: Mapping[str, Rotation]) -> np.ndarray:
@@ -200,24 +185,24 @@ class HeadingHold:
             self._gaps[when].add(np.sum(_palms(R, self._subject)[joined] ** 2, axis=1))
         if len(time):
             for side in self._hinges:
-                self._bends[when][side].add(_elbow(R, self._subject, side) ** 2)
+                self._hinge_rms[when][side].add(_elbow(R, self._subject, side) ** 2)
         return joined
 
-    def _ask(self, piece: Recording, segments: Segments) -> None:
+    def _ask(self, chunk: Recording, segments: Segments) -> None:
         """The filters' heading variances at the end of the start pose and in the middles of the knots."""
-        # The start pose may end in a piece whose first look is in the next one.
+        # The start pose may end in a chunk whose first used sample is in the next one.
         times = np.array([self._start] if self._asked == 0 else [])
         if self._first is not None:
-            last = int(np.floor((piece.time[-1] - self._first) / KNOT_S - 0.5))
+            last = int(np.floor((chunk.time[-1] - self._first) / KNOT_S - 0.5))
             times = np.append(times, self._first + KNOT_S * (np.arange(max(0, self._asked - 1), last + 1) + 0.5))
-        times = times[times <= piece.time[-1]]
+        times = times[times <= chunk.time[-1]]
         self._asked += len(times)
         for name in self._chain:
             if name not in segments.covariance_W:
                 continue
             _, variance = _of_filter(segments, name)
-            known = piece.time
-            if name in self._last:  # what lies between two pieces
+            known = chunk.time
+            if name in self._last:  # what lies between two chunks
                 known = np.concatenate([[self._last[name][0]], known])
                 variance = np.concatenate([[self._last[name][1]], variance])
             self._var.setdefault(name, []).append(np.interp(times, known, variance))
@@ -241,7 +226,7 @@ class _Rms:
 class _Rows(NamedTuple):
     """Scalar measurements 0 = r + H δ + e."""
 
-    look: np.ndarray  # (m,) index of the look
+    sample: np.ndarray  # (m,) its index
     r: np.ndarray  # (m,)
     H: np.ndarray  # (m, k), δ of the chain in its order
     weight: np.ndarray  # (m,) 1 / variance of e
@@ -250,16 +235,16 @@ class _Rows(NamedTuple):
 def _links(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
     """(k, n, 3) [m] in W: each segment's part of the way from the right palm to the left one."""
     length = subject.lengths
-    found = [R["torso"].apply([0.0, length["shoulder_width"], 0.0])]
+    parts = [R["torso"].apply([0.0, length["shoulder_width"], 0.0])]
     for name in [name for name in R if name != "torso"]:
         side = name.split("_", 1)[0]
         along = sum(length[part] for part in _carried(name, R))
-        found.append(R[name].apply([0.0, 0.0, -along if side == "left" else along]))
-    return np.array(found)
+        parts.append(R[name].apply([0.0, 0.0, -along if side == "left" else along]))
+    return np.array(parts)
 
 
 def _carried(name: str, R: Mapping[str, Rotation]) -> tuple[str, ...]:
-    """The lengths that turn with a segment of the chain."""
+    """The lengths that rotate with a segment of the chain."""
     hand = name.replace("forearm", "hand")
     if name == "torso":
         return ("shoulder_width",)
@@ -272,7 +257,7 @@ def _palms(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
 
 
 def _gaps(R: Mapping[str, Rotation], subject: Subject, joined: np.ndarray) -> _Rows:
-    """Of each look with joined palms three whitened rows; those that lie far out are left out."""
+    """Of each sample with joined palms three whitened rows; those that lie far out are left out."""
     v = _links(R, subject)[:, joined]
     n = v.shape[1]
     eye = np.eye(3)
@@ -287,8 +272,8 @@ def _gaps(R: Mapping[str, Rotation], subject: Subject, joined: np.ndarray) -> _R
     whiten = np.linalg.inv(np.linalg.cholesky(covariance)) if n else covariance
     r, H = np.einsum("nab,nb->na", whiten, r), whiten @ H
     near = np.sum(r**2, axis=1) < APART**2 * 3.0
-    look = np.repeat(np.flatnonzero(joined)[near], 3)
-    return _Rows(look, r[near].ravel(), H[near].reshape(-1, len(v)), np.ones(len(look)))
+    sample = np.repeat(np.flatnonzero(joined)[near], 3)
+    return _Rows(sample, r[near].ravel(), H[near].reshape(-1, len(v)), np.ones(len(sample)))
 
 
 def _of_lengths(v: np.ndarray, R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
@@ -318,8 +303,8 @@ def _hinge(R: Mapping[str, Rotation], subject: Subject, side: str) -> _Rows:
     H[:, names.index(f"{side}_forearm")], H[:, names.index(f"{side}_upper_arm")] = slope, -slope
     std = subject.hinges[side].std
     near = np.abs(r) < APART * std + np.deg2rad(10.0)  # a heading that has drifted is no reason to doubt the hinge
-    look = np.flatnonzero(near)
-    return _Rows(look, r[near], H[near], np.full(len(look), std**-2))
+    sample = np.flatnonzero(near)
+    return _Rows(sample, r[near], H[near], np.full(len(sample), std**-2))
 
 
 def _of_filter(segments: Segments, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,8 @@
-"""`TrackedPose`: a pose with all that led to it, and what is to be said of it."""
+"""`TrackedRecording`: a pose with all that led to it, and what is to be said of it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,78 +10,101 @@ import numpy as np
 
 from ..alignment import Segments
 from ..model import POINTS, BodyModel, load_model
-from ..pose import Pose, Poser, deviation, point_covariance
+from ..pose import Pose, deviation
 from ..recording import SEGMENTS, Recording
 from ..subject import Subject, average_subject
-from .headings import Reset
+from .headings import HeadingCorrection
+from .options import TrackOptions
 
 _WORTH_A_WARNING_DEG = 1.0
-_MOST_NOTES = 10  # of the later pieces of a long recording
+_MOST_NOTES = 10  # of the later chunks of a long recording
 
 
 @dataclass(frozen=True)
-class TrackedPose(Pose):
-    """A `Pose` with all that led to it."""
+class TrackedRecording:
+    """A recording's pose, or that of a chunk, with all that led to it.
 
-    recording: Recording | None = None
-    subject: Subject | None = None
-    model: BodyModel | None = None
-    segments: Segments | None = None
-    method: str = ""
-    reset: Reset | None = None
-    causal: bool = False
+    Parameters
+    ----------
+    recording : what was tracked, of a causal tracker what follows the start pose
+    subject : lengths and mounts as used
+    model : the body with those lengths
+    correction : what headings were corrected by so far; None where nothing is known that could correct them
+    """
+
+    pose: Pose
+    recording: Recording
+    subject: Subject
+    model: BodyModel
+    segments: Segments
+    options: TrackOptions
+    correction: HeadingCorrection | None
+
+    @property
+    def time(self) -> np.ndarray:
+        """(n,) [s]."""
+        return self.pose.time
+
+    @property
+    def quat_WL(self) -> Mapping[str, np.ndarray]:
+        """Segment → (n, 4) xyzw."""
+        return self.pose.quat_WL
+
+    @property
+    def points(self) -> Mapping[str, np.ndarray]:
+        """Point → (n, 3) [m] in W."""
+        return self.pose.points
+
+    @property
+    def q(self) -> np.ndarray:
+        """(n, nq) configuration of `model`."""
+        assert self.pose.q is not None  # kinematics have been run
+        return self.pose.q
 
     def summary(self) -> dict[str, Any]:
         """What was run on what, in numbers and words, for ``summary.json``."""
-        tally = Tally()
-        tally.add(self)
-        return tally.summary()
+        accumulator = SummaryAccumulator()
+        accumulator.add(self)
+        return accumulator.summary()
 
-    def not_followed(self) -> dict[str, np.ndarray]:
+    def orientation_residual(self) -> dict[str, np.ndarray]:
         """Segment → angle (n,) [rad] between its measured orientation and the model's, where joints are too few."""
-        if self.model is None or self.q is None:
-            return {}
         return deviation(self.model, self.q, self.quat_WL)
 
 
-class Tally:
-    """The summary of a pose that comes in pieces, each added as it comes."""
+class SummaryAccumulator:
+    """The summary of a recording that is tracked in chunks, each added as it comes."""
 
     def __init__(self) -> None:
-        self.last: TrackedPose | None = None
+        self.last: TrackedRecording | None = None
         self._begin, self._samples = 0.0, 0
         self._still: dict[str, int] = {}
         self._lost: dict[str, tuple[int, int, bool]] = {}  # segment → gaps, lost samples, whether the last one was
-        self._missed: dict[str, float] = {}  # segment → sum of squares [rad²]
-        self._notes: list[str] = []  # what was said while reading, later than in the first piece
+        self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
+        self._notes: list[str] = []  # what was said while reading, later than in the first chunk
 
-    def add(self, pose: TrackedPose) -> None:
-        """The next piece."""
-        assert pose.recording is not None
-        assert pose.segments is not None
+    def add(self, tracked: TrackedRecording) -> None:
+        """The next chunk."""
         if self.last is None:
-            self._begin = float(pose.time[0])
+            self._begin = float(tracked.time[0])
         else:
-            known = (*self._notes, *pose.segments.warnings)
-            self._notes += [note for note in pose.recording.notes if note not in known]
-        self._samples += len(pose.time)
-        for segment, of in pose.segments.orientation.items():
+            known = (*self._notes, *tracked.segments.warnings)
+            self._notes += [note for note in tracked.recording.notes if note not in known]
+        self._samples += len(tracked.time)
+        for segment, of in tracked.segments.orientation.items():
             self._still[segment] = self._still.get(segment, 0) + int(np.count_nonzero(of.static))
-        for segment, gap in pose.gap.items():
+        for segment, gap in tracked.pose.gap.items():
             gaps, samples, before = self._lost.get(segment, (0, 0, False))
             begun = int(np.count_nonzero(np.diff(gap, prepend=before) & gap))
             self._lost[segment] = gaps + begun, samples + int(np.count_nonzero(gap)), bool(gap[-1])
-        for segment, angle in pose.not_followed().items():
-            self._missed[segment] = self._missed.get(segment, 0.0) + float(np.sum(angle**2))
-        self.last = pose
+        for segment, angle in tracked.orientation_residual().items():
+            self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
+        self.last = tracked
 
     def summary(self) -> dict[str, Any]:
-        """As `TrackedPose.summary`, of all pieces."""
+        """As `TrackedRecording.summary`, of all chunks."""
         last = self.last
         assert last is not None
-        assert last.recording is not None
-        assert last.subject is not None
-        assert last.segments is not None
         sensors: dict[str, Any] = {}
         for segment in last.recording.sensors:
             about: dict[str, Any] = {"heading_deg": round(float(np.degrees(last.segments.heading[segment])), 3)}
@@ -96,21 +120,21 @@ class Tally:
                 about["gaps"], lost, _ = self._lost[segment]
                 about["gap_s"] = round(lost / last.recording.rate_hz, 3)
             sensors[segment] = about
-        missed = {
+        residual = {
             name: round(float(np.degrees(np.sqrt(squares / self._samples))), 3)
-            for name, squares in self._missed.items()
+            for name, squares in self._residual.items()
         }
-        lame = [f"{segment} {angle:.3g}" for segment, angle in missed.items() if angle > _WORTH_A_WARNING_DEG]
-        if lame:
-            lame = [
-                f"the model's joints are too few or end too soon and miss segments by, rms [deg]: {', '.join(lame)}"
+        too_few = [f"{segment} {angle:.3g}" for segment, angle in residual.items() if angle > _WORTH_A_WARNING_DEG]
+        if too_few:
+            too_few = [
+                f"the model's joints are too few or end too soon and miss segments by, rms [deg]: {', '.join(too_few)}"
             ]
         return {
             "recording": last.recording.name,
             "session": str(last.recording.source) if last.recording.source else None,
-            "method": last.method if last.segments.orientation else "ready orientations",
-            "causal": last.causal,
-            "model": last.model.robot.name if last.model else None,
+            "method": last.options.method if last.segments.orientation else "ready orientations",
+            "causal": last.options.causal,
+            "model": last.model.robot.name,
             "subject": {"name": last.subject.name, "note": last.subject.note},
             "samples": self._samples,
             "rate_hz": round(last.recording.rate_hz, 4),
@@ -118,37 +142,37 @@ class Tally:
             "phases": {"start": list(last.segments.start), "still": list(last.segments.still)},
             "sensors": sensors,
             "points": sorted(last.points),
-            "not_followed_rms_deg": missed,
-            "headings_held_together": _held_together(last.reset),
+            "orientation_residual_rms_deg": residual,
+            "heading_correction": _correction_json(last.correction),
             "warnings": [
                 *last.segments.warnings,
                 *self._later(),
                 *_not_known(last),
-                *lame,
-                *(last.model.warnings if last.model else ()),
+                *too_few,
+                *last.model.warnings,
             ],
         }
 
     def _later(self) -> list[str]:
-        """Notes of later pieces; a day's would be too many to read."""
+        """Notes of later chunks; a day's would be too many to read."""
         more = len(self._notes) - _MOST_NOTES
         return self._notes[:_MOST_NOTES] + ([f"and {more} more notes like these"] if more > 0 else [])
 
 
-def _held_together(reset: Reset | None) -> dict[str, Any] | None:
-    """Residuals of clasp and elbows before and after, and how far each heading was turned."""
-    if reset is None:
+def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | None:
+    """Residuals of clasp and elbows before and after, and the largest correction of each heading."""
+    if correction is None:
         return None
     about: dict[str, Any] = {
-        "hinge_rms_deg": {side: [round(v, 3) for v in values] for side, values in reset.hinge_deg.items()},
-        "largest_turn_deg": {name: round(value, 3) for name, value in reset.largest_deg.items()},
+        "hinge_rms_deg": {side: [round(v, 3) for v in values] for side, values in correction.hinge_deg.items()},
+        "largest_correction_deg": {name: round(value, 3) for name, value in correction.largest_deg.items()},
     }
-    if reset.clasp_mm is not None:
-        about["clasp_gap_rms_mm"] = [round(value, 2) for value in reset.clasp_mm]
+    if correction.clasp_mm is not None:
+        about["clasp_gap_rms_mm"] = [round(value, 2) for value in correction.clasp_mm]
     return about
 
 
-def _not_known(pose: TrackedPose) -> list[str]:
+def _not_known(pose: TrackedRecording) -> list[str]:
     """A line on the points that have no place for want of a sensor."""
     missing = [point for point in POINTS if point not in pose.points]
     lacking = [name for name in SEGMENTS[:5] if name not in pose.quat_WL]
@@ -157,23 +181,7 @@ def _not_known(pose: TrackedPose) -> list[str]:
     return [f"no sensor on {', '.join(lacking)}: not known and not written: {', '.join(missing)}"]
 
 
-def tracked_pose(
-    recording: Recording,
-    segments: Segments,
-    subject: Subject | None,
-    model: BodyModel | None,
-    method: str,
-    reset: Reset | None = None,
-    causal: bool = False,
-    limits: bool = True,
-) -> TrackedPose:
-    """The pose of segments that are known: a body of the subject's lengths, and its kinematics."""
-    who, body = who_and_body(subject, model)
-    poser = Poser(body, segments.quat_WL, limits=limits)
-    return posed(poser, recording, segments, who, body, method=method, reset=reset, causal=causal)
-
-
-def who_and_body(subject: Subject | None, model: BodyModel | None) -> tuple[Subject, BodyModel]:
+def body_of(subject: Subject | None, model: BodyModel | None) -> tuple[Subject, BodyModel]:
     """The subject as used, the average one for want of another, and a body of those lengths."""
     who = subject or average_subject()
     body = model or load_model()
@@ -182,34 +190,3 @@ def who_and_body(subject: Subject | None, model: BodyModel | None) -> tuple[Subj
         # A model that somebody chose has that person's lengths; what it lacks stays the average person's.
         who = replace(who, name=body.robot.name, lengths={**who.lengths, **own}, note="lengths of the model")
     return who, body.with_lengths({name: value for name, value in who.lengths.items() if name in own})
-
-
-def posed(
-    poser: Poser,
-    recording: Recording,
-    segments: Segments,
-    who: Subject,
-    body: BodyModel,
-    *,
-    method: str,
-    reset: Reset | None = None,
-    causal: bool = False,
-) -> TrackedPose:
-    """A recording's pose, or that of the piece which follows what `poser` had last."""
-    pose = poser.pose(recording.time, segments.quat_WL)
-    return TrackedPose(
-        pose.time,
-        pose.quat_WL,
-        pose.points,
-        pose.q,
-        segment_cov=segments.covariance_W,
-        point_cov=point_covariance(pose.points, pose.quat_WL, segments.covariance_W, who.lengths_covariance()),
-        gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
-        recording=recording,
-        subject=who,
-        model=body,
-        segments=segments,
-        method=method,
-        reset=reset,
-        causal=causal,
-    )

@@ -20,12 +20,12 @@ from ..model import BodyModel, load_model
 from ..pose import Pose, pose_from_table, pose_table
 from ..readers.tables import read_table
 from ..subject import Subject, subject_toml
-from ..tracking import TrackedPose
+from ..tracking import TrackedRecording
 
 
 def write_result(
     folder: Path,
-    pose: TrackedPose,
+    tracked: TrackedRecording,
     covariance: bool = False,
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     torques: Torques | None = None,
@@ -36,25 +36,23 @@ def write_result(
     `phases` of the recording go to the summary, so that a page made from the folder shows them too. `torques` become
     ``torques.parquet``, `made_by` (see `provenance`) part of the summary.
     """
-    write_table(folder / "pose.parquet", pose_table(pose, covariance))
-    summary = pose.summary()
+    write_table(folder / "pose.parquet", pose_table(tracked.pose, covariance))
+    summary = tracked.summary()
     if torques is not None:
         write_table(folder / "torques.parquet", torque_table(torques))
         summary["torques"] = torques.summary()
-    write_about(folder, pose, summary, phases, made_by)
+    write_about(folder, tracked, summary, phases, made_by)
 
 
 def write_about(
     folder: Path,
-    pose: TrackedPose,
+    tracked: TrackedRecording,
     summary: Mapping[str, Any],
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     made_by: Mapping[str, Any] | None = None,
 ) -> None:
     """What stands in a result folder beside its tables: the subject as used, and ``summary.json``."""
-    assert pose.model is not None
-    assert pose.subject is not None
-    write_subject(folder, pose.subject, pose.model)
+    write_subject(folder, tracked.subject, tracked.model)
     spans = {name: [[float(a), float(b)] for a, b in of] for name, of in (phases or {}).items()}
     about = {**summary, "recorded_phases": spans, "versions": versions()}
     if made_by is not None:

@@ -1,4 +1,4 @@
-"""The result folder of a recording that was tracked in pieces (`tracking.track_pieces`)."""
+"""The result folder of a recording that was tracked in chunks (`tracking.track_session`)."""
 
 from __future__ import annotations
 
@@ -11,47 +11,46 @@ import polars as pl
 
 from ..errors import ExistingOutput
 from ..pose import pose_table
-from ..tracking import TrackedPose
-from ..tracking.tracked import Tally
+from ..tracking import SummaryAccumulator, TrackedRecording
 from .result import write_about, write_table
 
 ROW_GROUP = 50_000  # rows that are put together at a time
 
 
-class PieceWriter:
-    """`write_result`, a piece at a time: a part of ``pose.parquet`` each, made one table at the end.
+class ChunkWriter:
+    """`write_result`, a chunk at a time: a part of ``pose.parquet`` each, made one table at the end.
 
     Attributes
     ----------
-    tally : what the summary counts
+    accumulator : of the summary
     """
 
     def __init__(self, folder: Path, covariance: bool = False) -> None:
-        self.tally = Tally()
+        self.accumulator = SummaryAccumulator()
         self._folder, self._covariance = folder, covariance
         self._parts = folder / "parts"
         self._parts.mkdir()
         self._seen = 0
 
-    def add(self, piece: TrackedPose) -> None:
-        """The next piece.
+    def add(self, chunk: TrackedRecording) -> None:
+        """The next chunk.
 
         Raises
         ------
         ExistingOutput
             It cannot be written: a full disk, say.
         """
-        write_table(self._parts / f"{self._seen:012d}.parquet", pose_table(piece, self._covariance))
-        self._seen += len(piece.time)
-        self.tally.add(piece)
+        write_table(self._parts / f"{self._seen:012d}.parquet", pose_table(chunk.pose, self._covariance))
+        self._seen += len(chunk.time)
+        self.accumulator.add(chunk)
 
     def finish(self, phases: Mapping[str, Sequence[tuple[float, float]]], made_by: Mapping[str, Any]) -> None:
         """The other files."""
         _put_together(self._parts, self._folder / "pose.parquet")
         shutil.rmtree(self._parts)
-        last = self.tally.last
+        last = self.accumulator.last
         assert last is not None
-        write_about(self._folder, last, self.tally.summary(), phases, made_by)
+        write_about(self._folder, last, self.accumulator.summary(), phases, made_by)
 
 
 def _put_together(parts: Path, path: Path) -> None:

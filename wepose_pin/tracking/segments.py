@@ -1,0 +1,69 @@
+"""Recording → orientation of each segment, chunk by chunk: filter, then align by the start pose."""
+
+from __future__ import annotations
+
+from ..alignment import Alignment, Segments, align, check_mounts, orient_segments
+from ..filters import BEST, Orientation
+from ..filters.sensors import SensorFilters, filtered_chunk
+from ..filters.static import StaticTest
+from ..recording import Recording
+from ..subject import Subject
+
+Oriented = tuple[Recording, Segments]
+
+
+class SegmentEstimator:
+    """Orientation of each segment of a recording that comes in chunks.
+
+    Put together, the chunks of a causal filter are what one chunk gives, bit-identical; the smoother looks one chunk
+    ahead. The phases `start` and `static` are in the first chunk.
+
+    Parameters
+    ----------
+    subject : its calibrated mounts go before those that the session states; None for the stated ones
+    """
+
+    def __init__(
+        self, subject: Subject | None = None, *, method: str = BEST, static_test: StaticTest | None = None
+    ) -> None:
+        self._subject, self._method, self._static_test = subject, method, static_test
+        self._filters: SensorFilters | None = None
+        self._alignment: Alignment | None = None
+
+    def push(self, chunk: Recording) -> list[Oriented]:
+        """Take a chunk; gives it and its segments, or with the smoother those of the chunk before.
+
+        Raises
+        ------
+        WeposeError
+            No mount is known for a sensor, or gravity contradicts it; a start phase with too few samples.
+        """
+        if self._filters is None:
+            check_mounts(chunk, self._subject)
+            self._filters = SensorFilters(chunk, method=self._method, static_test=self._static_test)
+        filtered = self._filters.push(chunk)
+        return [] if filtered is None else [self._orient(self._filters, *filtered)]
+
+    def finish(self) -> list[Oriented]:
+        """What is left when the last chunk has been pushed: the smoother's last one."""
+        if self._filters is None or not self._filters.ahead:
+            return []
+        return [self._orient(self._filters, *self._filters.finish())]
+
+    def _orient(self, filters: SensorFilters, chunk: Recording, orientation: dict[str, Orientation]) -> Oriented:
+        if self._alignment is None:
+            self._alignment = align(chunk, self._subject, filtered_chunk(filters, chunk, orientation))
+        return chunk, orient_segments(chunk, self._alignment, orientation, self._subject)
+
+
+def estimate_segments(
+    recording: Recording,
+    subject: Subject | None = None,
+    *,
+    method: str = BEST,
+    static_test: StaticTest | None = None,
+) -> Segments:
+    """Segment orientations of a whole recording; parameters and errors as `SegmentEstimator`."""
+    estimator = SegmentEstimator(subject, method=method, static_test=static_test)
+    [(_, segments)] = estimator.push(recording) + estimator.finish()
+    return segments

@@ -1,0 +1,85 @@
+"""Sessions too long for memory: read, filtered and posed a chunk at a time.
+
+Put together, the chunks of a causal filter are bit-identical with what `track` gives of the whole. The smoother looks
+one chunk ahead. Corrections of headings take a pass over the recording beforehand, of which little is kept: a few
+numbers every two seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import BadOption
+from ..filters import OFFLINE, piece_multiple
+from ..filters.noise import BEGINNING_S
+from ..model import BodyModel
+from ..readers.session import SessionReader
+from ..recording import CONFIGURATION, Recording
+from ..subject import Subject
+from .options import TrackOptions
+from .tracked import TrackedRecording
+from .tracker import track_chunks
+
+CHUNK_S = 120.0
+SMOOTHER_CHUNK_S = 600.0  # how far the smoother looks ahead
+LARGE = 500_000_000  # bytes of a recording's files from which on it is better tracked in chunks
+SHORTEST_S = 2.0  # of a chunk: a filter's first window has to fit
+
+
+def track_session(
+    session: str | Path | SessionReader,
+    subject: Subject | None = None,
+    *,
+    seconds: float | None = None,
+    gaps: bool = False,
+    model: BodyModel | None = None,
+    options: TrackOptions | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Iterator[TrackedRecording]:
+    """Track a session file in chunks of `seconds`, None for `CHUNK_S`, of the smoother `SMOOTHER_CHUNK_S`.
+
+    The first is as long as it takes to have the start pose, and the static phase, in it. Of a session in CSV or Parquet
+    only the times are held as a whole. `progress` gets what is done, and which share of it, chunk by chunk. Other
+    parameters as `Tracker`, and `load_session`.
+
+    Raises
+    ------
+    WeposeError
+        As `load_session` and `Tracker`, at the chunk that it comes from.
+    """
+    options = options or TrackOptions()
+    if seconds is None:
+        seconds = SMOOTHER_CHUNK_S if options.method in OFFLINE else CHUNK_S
+    if not seconds >= SHORTEST_S:
+        raise BadOption(f"chunks of {seconds:g} s: they have at least {SHORTEST_S:g} s")
+    reader = session if isinstance(session, SessionReader) else SessionReader(session, gaps=gaps, in_memory=False)
+    if reader.start_pose == CONFIGURATION:
+        raise BadOption(f'{reader.path}: start_pose = "{CONFIGURATION}" is that of a chain, which has no chunks')
+    multiple = piece_multiple(options.method, reader.rate_hz)
+
+    def share(task: str, chunk: Recording) -> None:
+        if progress is not None:
+            progress(task, float(np.searchsorted(reader.time, chunk.time[-1], side="right")) / len(reader.time))
+
+    yield from track_chunks(
+        lambda: _chunks(reader, seconds, multiple), subject, model=model, options=options, progress=share
+    )
+
+
+def _chunks(reader: SessionReader, seconds: float, multiple: int) -> Iterator[Recording]:
+    """Chunks of a multiple of so many samples; none at the end that is too short to be one."""
+    time, rate_hz = reader.time, reader.rate_hz
+
+    def samples(duration_s: float) -> int:
+        return max(1, int(np.ceil(duration_s * rate_hz / multiple))) * multiple
+
+    ends = [spans[0][1] for name, spans in reader.phases.items() if name in ("start", "still") and spans]
+    first_s = max(seconds, max(ends or [time[0] + BEGINNING_S]) - time[0])
+    first, size = 0, samples(first_s + 2.0 / rate_hz)
+    while first < len(time):
+        last = len(time) if len(time) - first < size + samples(SHORTEST_S) else first + size
+        yield reader.recording(first, last)
+        first, size = last, samples(seconds)

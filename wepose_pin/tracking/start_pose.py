@@ -1,0 +1,113 @@
+"""The start pose of whoever is tracked without a look ahead: waited for, and cut out of what came until then."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..errors import BadPhase
+from ..filters.phases import SWAYS_DEG, SWAYS_DEG_S
+from ..recording import Intervals, Recording, Sensor
+from ..recording.clocks import Clock
+from ..recording.gaps import GOOD, LONG, bridge
+
+HOLD_S = 3.0  # [s] of standing still for a start pose that nobody named
+CHECK_S = 0.1  # [s] between two checks whether a person moves
+WINDOW_S = 0.5  # [s] over which a check goes
+
+
+class StartGuide:
+    """Waits for `HOLD_S` in which no sensor moves or is lost: the start pose of a session without `phases.start`.
+
+    Attributes
+    ----------
+    state : "waiting" for sensors, "hold", "moved" (in the last second, and held again since), "ready"
+    held_s : [s] of stillness so far
+    missing, moving : columns of the sensors that are lost, or that moved last
+    """
+
+    def __init__(self, rate_hz: float, sensors: int, hold_s: float = HOLD_S) -> None:
+        self.state, self.missing, self.moving = "waiting", tuple(range(sensors)), tuple[int, ...]()
+        self._rate, self._hold = rate_hz, round(hold_s * rate_hz)
+        self._every, self._window = max(1, round(CHECK_S * rate_hz)), max(4, round(WINDOW_S * rate_hz))
+        self._gyro = np.zeros((self._hold, sensors, 3))
+        self._held = 0
+        self._tick = 0
+        self._moved_at = -np.inf
+
+    @property
+    def held_s(self) -> float:
+        return self._held / self._rate
+
+    @property
+    def begin(self) -> int:
+        """Tick with which the stillness began."""
+        return self._tick - self._held
+
+    @property
+    def end(self) -> int:
+        """The last tick so far."""
+        return self._tick - 1
+
+    def push(self, gyro_S: np.ndarray) -> str:
+        """One tick, (k, 3) [rad/s], NaN where a sensor is lost; gives the state."""
+        if self.state == "ready":
+            return self.state
+        self._tick += 1
+        self.missing = tuple(np.flatnonzero(~np.isfinite(gyro_S).all(axis=1)).tolist())
+        if self.missing:
+            self.state, self._held = "waiting", 0
+            return self.state
+        self._gyro[self._held] = gyro_S
+        self._held += 1
+        if self._held % self._every == 0 or self._held == self._hold:
+            held = self._gyro[: self._held]
+            last = held[-self._window :]
+            rate = np.sqrt(np.mean(np.sum((last - last.mean(axis=0)) ** 2, axis=2), axis=0))
+            turn = np.linalg.norm(np.cumsum(held - held.mean(axis=0), axis=0) / self._rate, axis=2).max(axis=0)
+            mean = np.linalg.norm(held.mean(axis=0), axis=1)
+            moves = (np.degrees(rate) > SWAYS_DEG_S) | (np.degrees(turn) > SWAYS_DEG) | (np.degrees(mean) > SWAYS_DEG_S)
+            if moves.any():
+                self.moving = tuple(np.flatnonzero(moves).tolist())
+                self._held, self._moved_at = 0, self._tick
+        if self._held == self._hold:
+            self.state = "ready"
+        else:
+            self.state = "moved" if self._tick - self._moved_at < self._rate else "hold"
+        return self.state
+
+
+def until_start(recording: Recording, interval: tuple[float, float]) -> Recording:
+    """From the start pose's begin, or that of a phase `still` before its end, to its end.
+
+    What was lost in it is bridged by what is left of it: whoever reads a whole recording bridges with what came later.
+
+    Raises
+    ------
+    BadPhase
+        A sensor that sent nothing in it.
+    """
+    before: dict[str, Intervals] = {"start": (interval,)}
+    still = recording.phases.get("still", ())
+    span = recording.span(interval)
+    begin = span.start
+    if still and still[0][1] <= interval[1]:
+        before["still"] = still[:1]
+        begin = min(begin, recording.span(still[0]).start)
+    part = recording.cut(slice(begin, span.stop))
+    clock = Clock(np.arange(len(part)) / part.rate_hz, np.arange(len(part)), 1.0 / part.rate_hz)
+    sensors = {name: _bridged(part, name, clock) for name in part.sensors}
+    return replace(part, phases=before, sensors=sensors)
+
+
+def _bridged(part: Recording, name: str, clock: Clock) -> Sensor:
+    """A sensor with its gaps filled anew."""
+    sensor = part.sensors[name]
+    if sensor.gap is None or not sensor.gap.any() or sensor.gyro_S is None or sensor.accel_S is None:
+        return sensor
+    if sensor.gap.all():
+        raise BadPhase(f"{part.where()}: phases.start: sensors.{name} sent nothing in it; name seconds in which all do")
+    marks = np.where(sensor.gap, LONG, GOOD).astype(np.int8)
+    gyro_S, accel_S = bridge(sensor.gyro_S, marks, clock, rate=True), bridge(sensor.accel_S, marks, clock)
+    return replace(sensor, gyro_S=gyro_S, accel_S=accel_S)

@@ -1,0 +1,201 @@
+"""`Tracker`: recording and subject → pose, chunk by chunk: filter, align, correct headings, kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+from ..errors import BadOption
+from ..model import BodyModel
+from ..pose import Poser, point_covariance
+from ..recording import CONFIGURATION, Recording
+from ..subject import Subject
+from .causal import CausalEstimator, SegmentFollower
+from .headings import HeadingCorrector
+from .options import TrackOptions
+from .segments import Oriented, SegmentEstimator
+from .tracked import TrackedRecording, body_of
+
+Chunks = Callable[[], Iterable[Recording]]
+
+
+class Tracker:
+    """The pose of the upper body of a recording that comes in chunks; the whole recording may be one.
+
+    `push` gives what can be said so far, `finish` the rest: the smoother looks one chunk ahead, and corrections of
+    headings need the whole recording. So that it need not be kept, `observe_headings` goes over its chunks beforehand;
+    its result is `headings` here. A causal tracker takes single samples as well, as `follower.step`.
+
+    All chunks of a recording carry its phases; `start` and `static` are in the first. Put together, what causal filters
+    give is bit-identical, whatever the chunks.
+
+    Parameters
+    ----------
+    subject : lengths and mounts; None for the population's mean and the session's stated mounts
+    model : a body; None for ours. It gets the subject's lengths; without a subject its own stand
+    headings : solved beforehand; None: solved in `finish`, where `options.correct_headings` and the subject ask for it
+    """
+
+    def __init__(
+        self,
+        subject: Subject | None = None,
+        *,
+        model: BodyModel | None = None,
+        options: TrackOptions | None = None,
+        headings: HeadingCorrector | None = None,
+    ) -> None:
+        self.options = options or TrackOptions()
+        self._subject, self._model = subject, model
+        self._headings, self._solved = headings, headings is not None
+        self._estimator = _estimator(subject, self.options)
+        self._person, self._body = body_of(subject, model)
+        self._poser: Poser | None = None
+        self._waiting: list[Oriented] = []  # until the headings are solved
+
+    @property
+    def follower(self) -> SegmentFollower:
+        """Segment orientations sample by sample, of a causal tracker whose start pose has ended.
+
+        Raises
+        ------
+        BadOption, BadPhase
+            The tracker is not causal; the start pose has not ended.
+        """
+        if not isinstance(self._estimator, CausalEstimator):
+            raise BadOption("a tracker takes single samples where its options are causal")
+        return self._estimator.follower
+
+    def push(self, chunk: Recording) -> list[TrackedRecording]:
+        """Take the next chunk; gives those that are done.
+
+        Raises
+        ------
+        WeposeError
+            What the recording, the subject or the model lacks; sensors on links that are no segments.
+        """
+        _check_person(chunk)
+        return [tracked for oriented in self._estimator.push(chunk) for tracked in self._take(oriented)]
+
+    def finish(self) -> list[TrackedRecording]:
+        """The chunks that are not done when the last one has been pushed."""
+        done = [tracked for oriented in self._estimator.finish() for tracked in self._take(oriented)]
+        if self._headings is not None and not self._solved:
+            self._solved = True
+            if not self._headings.solve():
+                self._headings = None
+            waiting, self._waiting = self._waiting, []
+            done += [self._tracked(oriented) for oriented in waiting]
+        return done
+
+    def _take(self, oriented: Oriented) -> list[TrackedRecording]:
+        if self._headings is None and not self._solved:
+            self._headings = heading_corrector(oriented, self._subject, self.options)
+            self._solved = self._headings is None
+        if self._headings is not None and not self._solved:
+            self._headings.observe(*oriented)
+            self._waiting.append(oriented)
+            return []
+        return [self._tracked(oriented)]
+
+    def _tracked(self, oriented: Oriented) -> TrackedRecording:
+        recording, segments = oriented
+        if self._headings is not None:
+            segments = self._headings.correct(recording, segments)
+        if self._poser is None:
+            self._poser = Poser(self._body, segments.quat_WL, limits=self.options.limits)
+        pose = self._poser.pose(recording.time, segments.quat_WL)
+        lengths_cov = self._person.lengths_covariance()
+        pose = replace(
+            pose,
+            segment_cov=segments.covariance_W,
+            point_cov=point_covariance(pose.points, pose.quat_WL, segments.covariance_W, lengths_cov),
+            gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
+        )
+        correction = None if self._headings is None else self._headings.correction()
+        return TrackedRecording(pose, recording, self._person, self._body, segments, self.options, correction)
+
+
+def observe_headings(
+    chunks: Iterable[Recording], subject: Subject | None = None, options: TrackOptions | None = None
+) -> HeadingCorrector | None:
+    """What corrects the headings of a recording, after a pass over its chunks; None where nothing does.
+
+    Raises
+    ------
+    WeposeError
+        As `Tracker.push`.
+    """
+    options = options or TrackOptions()
+    estimator = _estimator(subject, options)
+    headings: HeadingCorrector | None = None
+
+    def estimates() -> Iterator[Oriented]:
+        for chunk in chunks:
+            yield from estimator.push(chunk)
+        yield from estimator.finish()
+
+    for oriented in estimates():
+        headings = headings or heading_corrector(oriented, subject, options)
+        if headings is None:
+            return None
+        headings.observe(*oriented)
+    return headings if headings is not None and headings.solve() else None
+
+
+def heading_corrector(oriented: Oriented, subject: Subject | None, options: TrackOptions) -> HeadingCorrector | None:
+    """What may correct the headings of a recording that begins so; None where nothing is known that could."""
+    recording, segments = oriented
+    if subject is None or not subject.mounts or options.causal or not options.correct_headings:
+        return None
+    if recording.strapping == "new" or any(sensor.aligned for sensor in recording.sensors.values()):
+        return None  # frames that no calibration knows
+    headings = HeadingCorrector(recording, segments.quat_WL, segments.start[1], subject)
+    return headings if headings.has_chain and headings.has_observations else None
+
+
+def track_chunks(
+    chunks: Chunks,
+    subject: Subject | None = None,
+    *,
+    model: BodyModel | None = None,
+    options: TrackOptions | None = None,
+    progress: Callable[[str, Recording], None] | None = None,
+) -> Iterator[TrackedRecording]:
+    """A recording too long for memory: `chunks()` gives its chunks, twice where headings are to be corrected.
+
+    `progress` gets what is done and the chunk that it was done with.
+
+    Raises
+    ------
+    WeposeError
+        As `Tracker.push`, at the chunk that it comes from.
+    """
+    options = options or TrackOptions()
+
+    def counted(task: str) -> Iterator[Recording]:
+        for chunk in chunks():
+            yield chunk
+            if progress is not None:
+                progress(task, chunk)
+
+    headings = None
+    if subject is not None and subject.mounts and options.correct_headings and not options.causal:
+        headings = observe_headings(counted("observing headings"), subject, options)
+        options = options if headings is not None else replace(options, correct_headings=False)
+    tracker = Tracker(subject, model=model, options=options, headings=headings)
+    for chunk in counted(f"tracking by {options.method}"):
+        yield from tracker.push(chunk)
+    yield from tracker.finish()
+
+
+def _estimator(subject: Subject | None, options: TrackOptions) -> SegmentEstimator | CausalEstimator:
+    kind = CausalEstimator if options.causal else SegmentEstimator
+    return kind(subject, method=options.method, static_test=options.static_test)
+
+
+def _check_person(recording: Recording) -> None:
+    if recording.start_pose == CONFIGURATION:
+        raise BadOption(
+            f'{recording.where()}: start_pose = "{CONFIGURATION}" is that of a chain: give its URDF (--model; in '
+            f"Python track_chain)"
+        )
