@@ -478,7 +478,7 @@ def test_the_axes_of_a_segment_are_right_handed() -> None:
 
 
 def test_of_a_tracked_person_the_angles_are_within_their_deviations(simulation: Simulation, person: Person) -> None:
-    pose = wp.track(simulation.recording(), replace(average_subject(), lengths=person.lengths))
+    pose = wp.track(simulation.recording(), replace(average_subject(), lengths=person.lengths)).pose
     found, true = wp.joint_angles(pose), wp.joint_angles(simulation.truth())
     for joint in ("right_elbow", "left_elbow", "thorax"):
         assert found[joint].std is not None

@@ -71,7 +71,7 @@ def test_the_whole_chain_is_honest() -> None:
         person = simulated_person(200 + seed)
         simulation = simulate(person.lengths, seed=seed, imperfections=REALISTIC)
         recording = simulation.recording()
-        pose = track(recording, calibrate(recording, gauge=person.taped, prior=person.average))
+        pose = track(recording, calibrate(recording, gauge=person.taped, prior=person.average)).pose
         during = recording.span(simulation.phases["circles"][0])
         for name in simulation.quat_WL:
             true, found = (Rotation.from_quat(p.quat_WL[name][during]) for p in (simulation.truth(), pose))

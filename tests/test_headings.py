@@ -44,12 +44,12 @@ def test_a_forearm_that_drifts_is_brought_back(made: tuple[Simulation, Subject])
     errors = {}
     for hold in (False, True):
         pose = track(recording, subject, correct_headings=hold)
-        errors[hold] = evaluate(pose, simulation.truth(), simulation.phases["circles"][0]).position["right_hand"].mean
+        errors[hold] = evaluate(pose.pose, simulation.truth(), simulation.phases["circles"][0]).position["right_hand"].mean
     assert errors[True] < 0.7 * errors[False]
-    assert pose.reset is not None
-    assert pose.reset.clasp_mm is not None
-    assert pose.reset.clasp_mm[1] < 0.6 * pose.reset.clasp_mm[0]
-    assert pose.reset.hinge_deg["right"][1] < pose.reset.hinge_deg["right"][0]
+    assert pose.correction is not None
+    assert pose.correction.clasp_mm is not None
+    assert pose.correction.clasp_mm[1] < 0.6 * pose.correction.clasp_mm[0]
+    assert pose.correction.hinge_deg["right"][1] < pose.correction.hinge_deg["right"][0]
     summary = pose.summary()["heading_correction"]
     assert (
         summary["largest_correction_deg"]["right_forearm"] > 4.0 > summary["largest_correction_deg"]["left_upper_arm"]
@@ -69,9 +69,9 @@ def test_nothing_is_corrected_without_a_clasp_and_hinges(made: tuple[Simulation,
     simulation, subject = made
     recording = drifting(simulation, {"right_forearm": 8.0})
     recording = replace(recording, phases={"start": recording.phases["start"]})
-    assert track(recording, replace(subject, hinges={})).reset is None
+    assert track(recording, replace(subject, hinges={})).correction is None
     fewer = replace(recording, sensors={n: s for n, s in recording.sensors.items() if n != "torso"})
-    assert track(fewer, subject).reset is None
+    assert track(fewer, subject).correction is None
 
 
 def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simulation, Subject]) -> None:
@@ -83,14 +83,14 @@ def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simula
         track(replace(recording, phases={"start": start, "clasp": spans}), replace(subject, hinges={}))
         for spans in (clasp, (*clasp, *circles), tuple(circles))
     )
-    assert only.reset is not None
-    assert only.reset.largest_deg["right_forearm"] > 0.5
-    assert longer.reset is not None
-    assert longer.reset.clasp_mm is not None
-    assert longer.reset.clasp_mm[0] > 300.0
+    assert only.correction is not None
+    assert only.correction.largest_deg["right_forearm"] > 0.5
+    assert longer.correction is not None
+    assert longer.correction.clasp_mm is not None
+    assert longer.correction.clasp_mm[0] > 300.0
     for name, quat in only.quat_WL.items():
         np.testing.assert_allclose(longer.quat_WL[name], quat, atol=1e-12)
-    assert alone.reset is None
+    assert alone.correction is None
 
 
 def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
@@ -110,11 +110,11 @@ def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
         for hold in (True, False)
     )
     name = "right_forearm"
-    brought = [of[1].segment_cov[name] - of[0].segment_cov[name] for of in (held, free)]
+    brought = [of[1].pose.segment_cov[name] - of[0].pose.segment_cov[name] for of in (held, free)]
     assert brought[1][:, 2, 2].max() > np.deg2rad(3.0) ** 2
     np.testing.assert_allclose(brought[0], brought[1], atol=1e-12)
-    assert np.all(np.linalg.eigvalsh(held[1].segment_cov[name]) > 0.0)
-    end = [np.degrees(np.sqrt(of[0].segment_cov[name][-1, 2, 2])) for of in (held, free)]
+    assert np.all(np.linalg.eigvalsh(held[1].pose.segment_cov[name]) > 0.0)
+    end = [np.degrees(np.sqrt(of[0].pose.segment_cov[name][-1, 2, 2])) for of in (held, free)]
     assert end[0] < 0.9 * end[1]
 
 
@@ -145,16 +145,16 @@ def test_hands_with_sensors_of_their_own_bend_at_the_wrist(made: tuple[Simulatio
         sensors[f"{side}_hand"] = Sensor(quat_WS=Rotation.from_rotvec(bent).as_quat())
         mounts[f"{side}_hand"] = np.array([0.0, 0.0, 0.0, 1.0])
     pose = track(replace(recording, sensors=sensors), replace(subject, lengths=lengths, mounts=mounts, hinges={}))
-    assert pose.reset is not None
-    assert pose.reset.clasp_mm is not None
-    assert max(pose.reset.clasp_mm) < 2.0
-    assert max(pose.reset.largest_deg.values()) < 0.05
-    assert set(pose.reset.largest_deg) == set(sensors)
+    assert pose.correction is not None
+    assert pose.correction.clasp_mm is not None
+    assert max(pose.correction.clasp_mm) < 2.0
+    assert max(pose.correction.largest_deg.values()) < 0.05
+    assert set(pose.correction.largest_deg) == set(sensors)
 
 
 def test_hinges_hold_for_the_strapping_in_which_they_were_found(made: tuple[Simulation, Subject]) -> None:
     simulation, subject = made
     recording = drifting(simulation, {"right_forearm": 8.0})
     recording = replace(recording, phases={"start": recording.phases["start"]})
-    assert track(recording, subject).reset is not None
-    assert track(replace(recording, strapping="new"), subject).reset is None
+    assert track(recording, subject).correction is not None
+    assert track(replace(recording, strapping="new"), subject).correction is None

@@ -549,8 +549,8 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("result")
     made = simulate(simulated_person(2).lengths, seed=2)
-    pose = track(made.recording("made"))
-    keep = slice(0, 600)
+    tracked = track(made.recording("made"))
+    pose, keep = tracked.pose, slice(0, 600)
     short = replace(
         pose,
         time=pose.time[keep],
@@ -559,7 +559,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
         segment_cov={name: cov[keep] for name, cov in pose.segment_cov.items()},
         point_cov={name: cov[keep] for name, cov in pose.point_cov.items()},
     )
-    write_result(folder, short)
+    write_result(folder, replace(tracked, pose=short))
     return folder
 
 

@@ -119,7 +119,7 @@ def tracked(data: Path) -> Pose:
     from wepose_pin.readers import load_session
     from wepose_pin.tracking import track
 
-    return track(load_session(data / "upper_body" / "session.toml"))
+    return track(load_session(data / "upper_body" / "session.toml")).pose
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5", "baxter", "tiago_dual"])

@@ -58,7 +58,7 @@ def written(folder: Path, recording: Recording) -> Path:
 
 def off_by(recording: Recording, made: Simulation, method: str) -> np.ndarray:
     """Angle to the truth of the broken sensor's segment over its standard deviation, for each sample."""
-    pose, truth = track(recording, method=method), made.truth()
+    pose, truth = track(recording, method=method).pose, made.truth()
     off = Rotation.from_quat(truth.quat_WL[BROKEN]).inv() * Rotation.from_quat(pose.quat_WL[BROKEN])
     # A stated mount counts as exact, and the start pose is held to some degrees.
     std = np.sqrt(np.linalg.eigvalsh(pose.segment_cov[BROKEN])[:, -1])

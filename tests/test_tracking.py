@@ -21,7 +21,7 @@ def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
     """1 kHz, no noise, the true lengths: what is left is the filter's and the alignment's own error."""
     simulation = simulate(person.lengths, seed=5, rate_hz=1000.0, noise=PERFECT, clasp_s=10.0, circles=1)
     subject = replace(average_subject(), lengths=person.lengths)
-    errors = evaluate(track(simulation.recording(), subject), simulation.truth())
+    errors = evaluate(track(simulation.recording(), subject).pose, simulation.truth())
     for name, error in errors.position.items():
         assert error.worst < 1.0, name
     for name, attitude in errors.attitude.items():
@@ -32,7 +32,7 @@ def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
 def test_a_noisy_world_is_tracked_by_every_filter(simulation: Simulation, person: Person, method: str) -> None:
     subject = replace(average_subject(), lengths=person.lengths)
     pose = track(simulation.recording(), subject, method=method)
-    errors = evaluate(pose, simulation.truth(), simulation.phases["circles"][0])
+    errors = evaluate(pose.pose, simulation.truth(), simulation.phases["circles"][0])
     assert errors.position["right_hand"].mean < 20.0
     summary = pose.summary()
     assert summary["method"] == method

@@ -113,7 +113,6 @@ def test_a_result_reads_back(simulation: Simulation, tmp_path: Path) -> None:
     again, model, summary = read_result(tmp_path)
     np.testing.assert_array_equal(again.points["right_hand"], pose.points["right_hand"])
     np.testing.assert_allclose(again.quat_WL["torso"], pose.quat_WL["torso"], atol=1e-15)
-    assert pose.subject is not None
     assert model.lengths == pytest.approx(dict(pose.subject.lengths), abs=1e-12)
     assert summary == json.loads((tmp_path / "summary.json").read_text())
     assert summary["versions"]["wepose-pin"]

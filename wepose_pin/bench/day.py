@@ -20,7 +20,7 @@ from ..calibration import calibrate_lengths
 from ..errors import NoSolution
 from ..recording import Recording, Sensor
 from ..simulation import simulate, simulated_person
-from ..tracking import AHEAD_S, PIECE_S
+from ..tracking import SMOOTHER_CHUNK_S, CHUNK_S
 from ..writers import write_session
 from ..writers.result import write_subject
 from . import Column, Table
@@ -56,14 +56,14 @@ def _day(hours: tuple[float, ...]) -> Table:
             begin = length == hours[0]
             if begin:
                 table.rows[f"{length:g} h as a whole"] = _track(folder, length, "whole", pieces=0.0)
-            of = _track(folder, length, "pieces", pieces=PIECE_S)
+            of = _track(folder, length, "pieces", pieces=CHUNK_S)
             if begin:
                 of["same"] = float(_pose(folder, "pieces").equals(_pose(folder, "whole")))
-            table.rows[f"{length:g} h in pieces of {PIECE_S:g} s"] = of
+            table.rows[f"{length:g} h in pieces of {CHUNK_S:g} s"] = of
             if begin:
                 whole = f"smoother, {length:g} h as a whole"
                 table.rows[whole] = _track(folder, length, "smooth", pieces=0.0, method="smoother")
-                for pieces in (SHORT_S, AHEAD_S):
+                for pieces in (SHORT_S, SMOOTHER_CHUNK_S):
                     row = _track(folder, length, "pieces", pieces=pieces, method="smoother")
                     row["most"], row["rms"] = _off(_pose(folder, "pieces"), _pose(folder, "smooth"))
                     table.rows[f"smoother, {length:g} h in pieces of {pieces:g} s"] = row

@@ -34,7 +34,7 @@ def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
         subject = calibrate_lengths(
             recording, gauge=person.taped, prior=person.average, method=method, gauge_std=person.taped_std
         ).subject
-        errors = evaluate(track(recording, subject, method=method), truth, simulation.phases["circles"][0])
+        errors = evaluate(track(recording, subject, method=method).pose, truth, simulation.phases["circles"][0])
         found = _found(subject, person, simulation) | {
             "hand_mm": errors.position["right_hand"]._asdict(),
             "hand_from_shoulders_mm": errors.position_from_shoulders["right_hand"]._asdict(),

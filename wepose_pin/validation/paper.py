@@ -130,7 +130,7 @@ def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfect
     for contender in contenders(experiment):
         recording, method = oriented(recorded, contender)
         subject = _calibrated(recording, person, prior, method)
-        pose = track(recording, subject, method=method)
+        pose = track(recording, subject, method=method).pose
         series = {}
         if seed == 0:
             inside = recording.span(circles)
@@ -160,7 +160,7 @@ def _error_budget(experiment: str, trial: str, seed: int) -> list[Result]:
         if label == "lengths exact":
             subject = replace(subject, lengths=person.lengths)
         errors = evaluate(
-            track(recording, subject, method="smekf"), simulation.truth(), simulation.phases["circles"][0]
+            track(recording, subject, method="smekf").pose, simulation.truth(), simulation.phases["circles"][0]
         )
         results.append(
             Result(experiment, trial, label, _hand(errors) | {"lengths_rms_mm": _lengths_rms(subject, person)})
