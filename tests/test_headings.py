@@ -44,7 +44,9 @@ def test_a_forearm_that_drifts_is_brought_back(made: tuple[Simulation, Subject])
     errors = {}
     for hold in (False, True):
         pose = track(recording, subject, correct_headings=hold)
-        errors[hold] = evaluate(pose.pose, simulation.truth(), simulation.phases["circles"][0]).position["right_hand"].mean
+        errors[hold] = (
+            evaluate(pose.pose, simulation.truth(), simulation.phases["circles"][0]).position["right_hand"].mean
+        )
     assert errors[True] < 0.7 * errors[False]
     assert pose.correction is not None
     assert pose.correction.clasp_mm is not None

@@ -125,7 +125,9 @@ def test_elbow_and_wrist_stand_to_the_shoulder_as_in_xsens(tracked, side: str, n
 def test_elbow_and_wrist_have_the_joint_angles_of_xsens(data: Path, tmp_path: Path, side: str, name: str) -> None:
     """Of MVN's three, z, x, y of a Z-X-Y sequence as the ISB has it, abduction (x) has the other sign."""
     path = data / "mvnx" / "test_mocap.mvnx"
-    angles = wp.joint_angles(wp.track(wp.load_session(session(tmp_path, path, (*OURS, "left_hand", "right_hand")))).pose)
+    angles = wp.joint_angles(
+        wp.track(wp.load_session(session(tmp_path, path, (*OURS, "left_hand", "right_hand")))).pose
+    )
     root = ElementTree.parse(path).getroot()
     xmlns = "{http://www.xsens.com/mvn/mvnx}"
     labels = [joint.get("label") for joint in root.iter(f"{xmlns}joint")]

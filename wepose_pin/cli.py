@@ -88,7 +88,6 @@ def demo(*, out: Out = Path("wepose-demo"), seed: int = 1, force: bool = False) 
             if method == BEST:
                 (folder / "subject").mkdir()
                 (folder / "result").mkdir()
-                assert pose.model is not None
                 write_subject(folder / "subject", found[method].subject, pose.model)
                 write_result(folder / "result", pose, phases=recording.phases)
                 best = pose
@@ -1307,7 +1306,7 @@ def _track_pieces(
     from .model import load_model
     from .readers.session import SessionReader
     from .report import write_thinned_pages
-    from .report.thinned import Thinner
+    from .report.thinned import Decimator
     from .report.track import MOST_FRAMES
     from .subject import load_subject
     from .tracking import track_pieces
@@ -1321,7 +1320,7 @@ def _track_pieces(
             who = load_subject(subject) if subject else None
             body = load_model(model) if model else None
             reader = SessionReader(session, gaps=gaps, in_memory=False)
-            writer, thinner = PieceWriter(folder, covariance), Thinner(len(reader.time))
+            writer, thinner = PieceWriter(folder, covariance), Decimator(len(reader.time))
             for piece in track_pieces(
                 reader, who, seconds=seconds, method=method, model=body, limits=limits, told=told
             ):

@@ -185,13 +185,12 @@ class Work:
         from ..writers.result import as_json
 
         assert self.pose is not None
-        assert self.pose.recording is not None
         truth = self.given.truth or self.pose.recording.truth
         if truth is None:
             raise MissingFile(
                 f"{self.given.session}: data.truth is missing; evaluate needs a reference, there or in a table's truth"
             )
-        errors = evaluate(self.pose, pose_from_table(read_table(truth), str(truth)), interval)
+        errors = evaluate(self.pose.pose, pose_from_table(read_table(truth), str(truth)), interval)
         text = json.dumps(as_json(asdict(errors)), indent=2)
         (folder / "errors.json").write_text(text + "\n", encoding="utf-8")
         row: Row = {f"{point}_error_mm": error.mean for point, error in errors.position.items()}

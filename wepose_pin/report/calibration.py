@@ -21,7 +21,7 @@ from ..filters import BEST
 from ..pose import Pose
 from ..recording import Recording, axes_from_mount, mount_from_axes
 from ..subject import Subject, mount_rows
-from ..tracking import TrackedPose, track
+from ..tracking import TrackedRecording, track
 from .calibration_figures import (
     Hands,
     Length,
@@ -72,7 +72,7 @@ def calibration_report(
     recording: Recording,
     *,
     verdict: Verdict | tuple[str, Sequence[str]] | None = None,
-    pose: TrackedPose | None = None,
+    pose: TrackedRecording | None = None,
     method: str = BEST,
     protocol: str | Path | Protocol = "clasp",
     gauge_std: float = GAUGE_STD,
@@ -102,7 +102,7 @@ def calibration_report(
     page.add("lengths", lambda: _lengths(calibration, contact), "Lengths")
     page.add("sensors", lambda: _sensors(calibration, recording), "Sensors")
     page.add("gap", lambda: _gap(calibration, contact), f"{capital(contact.gap)} over time")
-    page.add("hands", lambda: _hands(calibration, contact, pose), "Where the motion was informative")
+    page.add("hands", lambda: _hands(calibration, contact, None if pose is None else pose.pose), "Where the motion was informative")
     page.add("posture", lambda: _posture(calibration), "The start pose")
     page.add("elbows", lambda: _elbows(calibration), "The elbows as hinges")
     page.add("view", lambda: _view(calibration, recording, pose), "The motion in 3D")
@@ -357,7 +357,7 @@ def _elbows(calibration: Calibration) -> dict[str, Any] | None:
     return {"elbows": Table(header, lines)} if lines else None
 
 
-def _view(calibration: Calibration, recording: Recording, pose: TrackedPose | None) -> dict[str, Any] | None:
+def _view(calibration: Calibration, recording: Recording, pose: TrackedRecording | None) -> dict[str, Any] | None:
     if pose is None or pose.model is None or not len(calibration.time):
         return None
     begin, end = float(calibration.time.min()), float(calibration.time.max())

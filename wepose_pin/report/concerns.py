@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..recording.limits import STANDARD_GRAVITY
-from ..tracking import TrackedPose
+from ..tracking import TrackedRecording
 from .measures import BENT, Budget, Elbow, Hand, Signal, between, from_start, largest, longest
 from .words import capital, listed, plain
 
@@ -67,7 +67,7 @@ class Concern(NamedTuple):
 
 
 def concerns(
-    pose: TrackedPose,
+    pose: TrackedRecording,
     signals: Mapping[str, Signal],
     budgets: Mapping[str, Budget],
     elbows: Mapping[str, Elbow],
@@ -75,7 +75,6 @@ def concerns(
     warnings: list[str],
 ) -> list[Concern]:
     """The grave ones first; `warnings` are those of the pose's summary."""
-    assert pose.recording is not None
     found = [
         *(_of_warning(text) for text in warnings),
         *_of_signals(pose, signals, "\n".join(warnings)),
@@ -93,10 +92,9 @@ def _of_warning(text: str) -> Concern:
     return Concern(not re.search(HARMLESS, text), text, do)
 
 
-def _of_signals(pose: TrackedPose, signals: Mapping[str, Signal], told: str) -> Iterator[Concern]:
+def _of_signals(pose: TrackedRecording, signals: Mapping[str, Signal], told: str) -> Iterator[Concern]:
     recording = pose.recording
     assert recording is not None
-    assert pose.segments is not None
 
     def which(values: Mapping[str, str]) -> str:
         return listed([f"{plain(name)} {value}".strip() for name, value in values.items()])
@@ -168,7 +166,7 @@ def _of_signals(pose: TrackedPose, signals: Mapping[str, Signal], told: str) -> 
     }
     if restless:
         yield Concern(
-            pose.method == "smekf",
+            pose.options.method == "smekf",
             f"little rest: {which(restless)}",
             "Let the person hold still for a second or two every half minute; a rest shows the gyroscope's bias.",
         )
@@ -183,7 +181,7 @@ def _of_signals(pose: TrackedPose, signals: Mapping[str, Signal], told: str) -> 
         )
 
 
-def _of_headings(pose: TrackedPose, budgets: Mapping[str, Budget]) -> Iterator[Concern]:
+def _of_headings(pose: TrackedRecording, budgets: Mapping[str, Budget]) -> Iterator[Concern]:
     since = from_start(pose)
     wide = {joint: most for joint, std in between(budgets).items() if (most := largest(std[since])) > HEADING}
     if wide:
@@ -195,9 +193,9 @@ def _of_headings(pose: TrackedPose, budgets: Mapping[str, Budget]) -> Iterator[C
             + others * (len(wide) > 1),
             hold(pose),
         )
-    if pose.reset is None:
+    if pose.correction is None:
         return
-    turned = {name: value for name, value in pose.reset.largest_deg.items() if value > TURNED_DEG}
+    turned = {name: value for name, value in pose.correction.largest_deg.items() if value > TURNED_DEG}
     if turned:
         yield Concern(
             True,
@@ -207,7 +205,7 @@ def _of_headings(pose: TrackedPose, budgets: Mapping[str, Budget]) -> Iterator[C
         )
 
 
-def _of_hands(pose: TrackedPose, hands: Mapping[str, Hand]) -> Iterator[Concern]:
+def _of_hands(pose: TrackedRecording, hands: Mapping[str, Hand]) -> Iterator[Concern]:
     since = from_start(pose)
     wide = {name: most for name, hand in hands.items() if (most := _largest_mm(hand, since)) > 1e3 * PLACE}
     if wide:
@@ -216,11 +214,9 @@ def _of_hands(pose: TrackedPose, hands: Mapping[str, Hand]) -> Iterator[Concern]
 
 
 def _of_the_time_before(
-    pose: TrackedPose, budgets: Mapping[str, Budget], hands: Mapping[str, Hand]
+    pose: TrackedRecording, budgets: Mapping[str, Budget], hands: Mapping[str, Hand]
 ) -> Iterator[Concern]:
     """What is less certain before the start pose than ever after it, for longer than filters take to begin."""
-    assert pose.recording is not None
-    assert pose.segments is not None
     since, before = from_start(pose), pose.time < pose.segments.start[0]
     stds = [
         ("headings between neighbours", np.degrees(1.0), "°", HEADING, list(between(budgets).values())),
@@ -245,12 +241,12 @@ def _largest_mm(hand: Hand, which: np.ndarray) -> float:
     return 1e3 * largest(hand.std[which]) if hand.std is not None else float("nan")
 
 
-def hold(pose: TrackedPose) -> str:
+def hold(pose: TrackedRecording) -> str:
     """What to do about headings that drift."""
     said = "Let the person rest for a second now and then"
-    if pose.method == "smekf":
+    if pose.options.method == "smekf":
         said += ", or use the method amekf, which corrects in motion too"
-    if pose.reset is None:
+    if pose.correction is None:
         return f"{said}, and calibrate the person: then the elbows and joined hands (phase `clasp`) hold headings."
     if not pose.recording or not pose.recording.phases.get("clasp"):
         return f"{said}, or hold the hands together (phase `clasp`)."
@@ -306,10 +302,7 @@ def _halves(elbow: Elbow) -> tuple[float, float]:
     return float(np.median(parts[0])), float(np.median(parts[1]))
 
 
-def _of_subject(pose: TrackedPose) -> Iterator[Concern]:
-    assert pose.recording is not None
-    assert pose.subject is not None
-    assert pose.segments is not None
+def _of_subject(pose: TrackedRecording) -> Iterator[Concern]:
     if pose.subject.name == "average":
         yield Concern(
             False,

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..angles import JointAngles, joint_angles, summary
 from ..errors import BadData
-from ..tracking import TrackedPose
+from ..tracking import TrackedRecording
 from .measures import stated_mounts, usual
 from .page import Table
 from .track_figures import over_time_picture
@@ -17,10 +17,10 @@ from .words import plain, whole
 FULL_TURN = 2.0 * np.pi - 1e-9
 
 
-def joint_angles_section(pose: TrackedPose) -> dict[str, Any] | None:
+def joint_angles_section(pose: TrackedRecording) -> dict[str, Any] | None:
     """Charts and table; None where no joint has both of its segments."""
     try:
-        angles = joint_angles(pose)
+        angles = joint_angles(pose.pose)
     except BadData:  # no joint has both of its segments
         return None
     groups: dict[str, list[str]] = {}

@@ -14,7 +14,7 @@ from ..recording.gaps import runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
 from ..recording.plausibility import cut_off
 from ..subject import Subject
-from ..tracking import TrackedPose
+from ..tracking import TrackedRecording
 
 # Segments that meet in a joint, from the trunk outwards: their headings make an angle of that joint.
 JOINTS = (
@@ -48,7 +48,7 @@ class Signal(NamedTuple):
     bias: tuple[np.ndarray, np.ndarray] | None  # (3,) [rad/s] at the beginning and at the end
 
 
-def signal_of(recording: Recording, name: str, pose: TrackedPose) -> Signal:
+def signal_of(recording: Recording, name: str, pose: TrackedRecording) -> Signal:
     """The signal of a sensor, and what its filter found."""
     sensor: Sensor = recording.sensors[name]
     nothing = np.zeros(len(recording), dtype=bool)
@@ -58,7 +58,6 @@ def signal_of(recording: Recording, name: str, pose: TrackedPose) -> Signal:
         rate = (R[:-1].inv() * R[1:]).magnitude() * recording.rate_hz
         nan = float("nan")
         return Signal(np.concatenate([rate[:1], rate]), nan, nothing, gap, None, nan, nan, nan, None)
-    assert pose.segments is not None
     of = pose.segments.orientation[name]
     cut = cut_off(sensor.gyro_S, NARROWEST_GYRO_RANGE) | cut_off(sensor.accel_S, NARROWEST_ACCEL_RANGE)
     return Signal(
@@ -85,12 +84,11 @@ def usual(values: np.ndarray) -> float:
     return float(np.median(known)) if len(known) else float("nan")
 
 
-def from_start(pose: TrackedPose) -> np.ndarray:
+def from_start(pose: TrackedRecording) -> np.ndarray:
     """(n,) bool, the samples from the end of the start pose on: only of these the stated uncertainties are summed up.
 
     Before it the filters have only begun, and headings are followed back in time.
     """
-    assert pose.segments is not None
     since = pose.time >= pose.segments.start[1] - 1e-9
     return since if since.any() else ~since
 
@@ -100,10 +98,8 @@ def longest(which: np.ndarray, rate_hz: float) -> float:
     return max((b - a for a, b in runs(which)), default=0) / rate_hz
 
 
-def stated_mounts(pose: TrackedPose) -> bool:
+def stated_mounts(pose: TrackedRecording) -> bool:
     """The mounts are the session's and not calibrated ones."""
-    assert pose.subject is not None
-    assert pose.recording is not None
     return not pose.subject.mounts or pose.recording.strapping == "new"
 
 
@@ -118,12 +114,10 @@ class Budget(NamedTuple):
     growth: float  # of the filter's, a minute of motion; NaN where it was never in motion
 
 
-def heading_budgets(pose: TrackedPose) -> dict[str, Budget]:
+def heading_budgets(pose: TrackedRecording) -> dict[str, Budget]:
     """Segment → its budget, from the covariances; none where the filter has none."""
-    assert pose.segments is not None
-    assert pose.recording is not None
     found = {}
-    for name, cov_W in pose.segment_cov.items():
+    for name, cov_W in pose.pose.segment_cov.items():
         of = pose.segments.orientation[name]
         ends = np.array([0, -1])
         up_S = Rotation.from_quat(of.quat_WS[ends]).inv().apply([0.0, 0.0, 1.0])

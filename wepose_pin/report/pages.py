@@ -7,9 +7,9 @@ from pathlib import Path
 
 from ..errors import reason
 from ..recording import Intervals
-from ..tracking import TrackedPose
+from ..tracking import TrackedRecording
 from .page import PageWriter
-from .thinned import Thinner, Whole
+from .decimation import Decimator, Whole
 from .track import track_report
 from .viewer import pose_html
 
@@ -18,7 +18,7 @@ PAGES = ("view.html", "report.html")
 
 def write_track_pages(
     folder: Path,
-    pose: TrackedPose,
+    pose: TrackedRecording,
     *,
     view: bool = True,
     report: bool = True,
@@ -30,7 +30,7 @@ def write_track_pages(
     Parameters
     ----------
     view, report : which of them
-    whole : of a `pose` that `Thinner` thinned
+    whole : of a `pose` that `Decimator` thinned
     fps : of ``view.html``
 
     Returns
@@ -39,13 +39,11 @@ def write_track_pages(
         A line for each page, or part of one, that cannot be made; they stand in ``summary.json`` too.
     """
     model, recording = pose.model, pose.recording
-    assert model is not None
-    assert recording is not None
     writer = PageWriter(folder, [name for name, wanted in zip(PAGES, (view, report), strict=True) if wanted])
     page = None
     if view:
         page = writer.write(
-            "view.html", lambda _: pose_html(model, pose, phases=recording.phases, title=recording.name, fps=fps)
+            "view.html", lambda _: pose_html(model, pose.pose, phases=recording.phases, title=recording.name, fps=fps)
         )
     if report:
         writer.write("report.html", lambda failures: track_report(pose, view=page, whole=whole, failures=failures))
@@ -55,7 +53,7 @@ def write_track_pages(
 
 def write_thinned_pages(
     folder: Path,
-    thinner: Thinner,
+    thinner: Decimator,
     phases: Mapping[str, Intervals],
     warnings: list[str],
     *,
@@ -64,7 +62,7 @@ def write_thinned_pages(
 ) -> list[str]:
     """`write_track_pages` of a recording that came in pieces; `phases` and `warnings` of the whole recording."""
     try:
-        pose, whole = thinner.thinned(phases, warnings)
+        pose, whole = thinner.decimated(phases, warnings)
     except Exception as error:
         writer = PageWriter(folder, PAGES)
         writer.warnings.append(f"{' and '.join(PAGES)}: cannot be made: {reason(error)}")

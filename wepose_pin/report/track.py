@@ -9,7 +9,7 @@ import numpy as np
 
 from ..pose import deviation, spread
 from ..recording import Recording, Sensor
-from ..tracking import TrackedPose
+from ..tracking import TrackedRecording
 from .concerns import GRAVITY_OFF, Concern, concerns, hold
 from .joints import joint_angles_section
 from .measures import (
@@ -27,7 +27,7 @@ from .measures import (
     usual,
 )
 from .page import Page, Table
-from .thinned import Whole, whole_of
+from .decimation import Whole, whole_of
 from .track_figures import headings_picture, noise_picture, paths_picture, reach_picture, timeline_picture
 from .viewer import pose_html
 from .words import degrees, intervals, listed, plain, versions, whole
@@ -39,7 +39,7 @@ LARGEST_VIEW = 3_000_000  # of a view that comes ready, in characters
 
 
 def track_report(
-    pose: TrackedPose, *, view: str | None = None, whole: Whole | None = None, failures: list[str] | None = None
+    pose: TrackedRecording, *, view: str | None = None, whole: Whole | None = None, failures: list[str] | None = None
 ) -> str:
     """``report.html``: one page that opens offline and prints; equal arguments give equal text.
 
@@ -49,7 +49,7 @@ def track_report(
     ----------
     pose : of `track`
     view : the page of `pose_html` where it is made already, to be shown here unless it is large; None: it is made here
-    whole : of a `pose` that `Thinner` thinned
+    whole : of a `pose` that `Decimator` thinned
     failures : takes a line for each section that cannot be made; the page says so in its place
     """
     recording = pose.recording
@@ -57,11 +57,11 @@ def track_report(
     whole = whole or whole_of(pose)
     signals = whole.signals
     budgets = heading_budgets(pose)
-    found = {side: elbow_of(pose, side, pose.subject) for side in ("left", "right")}
+    found = {side: elbow_of(pose.pose, side, pose.subject) for side in ("left", "right")}
     elbows = {side: elbow for side, elbow in found.items() if elbow is not None}
     hands = {
         name: hand._replace(peak_speed=whole.peak_speed[name])
-        for name, hand in hands_of(pose, recording.rate_hz).items()
+        for name, hand in hands_of(pose.pose, recording.rate_hz).items()
     }
     page = Page(TEMPLATE, f"Motion of {recording.name or 'a recording'}", failures)
     page.add(
@@ -89,13 +89,12 @@ def _first(entries: Sequence[Concern]) -> dict[str, Any]:
     return {"kind": kind, "entries": [("warning" if each.grave else "info", each.line()) for each in entries]}
 
 
-def _short(pose: TrackedPose, whole: Whole, budgets: Mapping[str, Budget]) -> dict[str, Any]:
+def _short(pose: TrackedRecording, whole: Whole, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = pose.recording
     assert recording is not None
-    assert pose.subject is not None
     since = from_start(pose)
     headings = {joint: float(np.degrees(largest(std[since]))) for joint, std in between(budgets).items()}
-    stds = {name: spread(cov[since]) for name, cov in pose.point_cov.items()}
+    stds = {name: spread(cov[since]) for name, cov in pose.pose.point_cov.items()}
     return {
         "duration": _duration(float(recording.time[-1] - recording.time[0])),
         "rate_hz": whole.rate_hz,
@@ -147,19 +146,19 @@ def _noise(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
     return {"percent": 100 * GRAVITY_OFF, "picture": noise_picture(signals), "sensors": Table(header, rows)}
 
 
-def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> dict[str, Any]:
+def _drift(pose: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = pose.recording
     assert recording is not None
     if not budgets:
         ready = all(sensor.ready for sensor in recording.sensors.values())
-        return {"method": None if ready else pose.method, "known": False}
+        return {"method": None if ready else pose.options.method, "known": False}
     since = from_start(pose)
     stds = {name: np.nan_to_num(np.where(since, budget.std, 0.0)) for name, budget in budgets.items()}
     worst = max(stds, key=lambda name: float(stds[name].max()))
     at = int(np.argmax(stds[worst]))
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     fastest = max(growth, key=growth.__getitem__) if growth else None
-    clasped = pose.reset is not None and pose.reset.clasp_mm is not None
+    clasped = pose.correction is not None and pose.correction.clasp_mm is not None
     segments = [
         [
             plain(name),
@@ -176,12 +175,12 @@ def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     ]
     header = ["segment, ±", "largest", "at the end", "at the end, filter alone", "filter's growth, a minute of motion"]
     return {
-        "method": pose.method,
+        "method": pose.options.method,
         "known": True,
         "worst": (worst, float(np.degrees(stds[worst][at])), _duration(float(pose.time[at] - pose.time[0]))),
         "fastest": (fastest, float(np.degrees(growth[fastest]))) if fastest else None,
         "advice": hold(pose),
-        "corrected": max(pose.reset.largest_deg.values(), default=0.0) if pose.reset is not None else None,
+        "corrected": max(pose.correction.largest_deg.values(), default=0.0) if pose.correction is not None else None,
         "clasped": clasped,
         "without": [plain(name) for name in recording.sensors if name not in budgets],
         "before": _before(pose),
@@ -196,10 +195,9 @@ def _drift(pose: TrackedPose, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     }
 
 
-def _hands(pose: TrackedPose, hands: Mapping[str, Hand]) -> dict[str, Any] | None:
+def _hands(pose: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, Any] | None:
     if not hands:
         return None
-    assert pose.subject is not None
     since = from_start(pose)
     rows = []
     for name, hand in hands.items():
@@ -220,26 +218,22 @@ def _hands(pose: TrackedPose, hands: Mapping[str, Hand]) -> dict[str, Any] | Non
     }
 
 
-def _view(pose: TrackedPose, view: str | None) -> dict[str, Any]:
-    assert pose.model is not None
-    assert pose.recording is not None
+def _view(pose: TrackedRecording, view: str | None) -> dict[str, Any]:
     if view is not None and len(view) <= LARGEST_VIEW:
         return {"page": view, "fps": None}
     fps = min(FRAMES_A_SECOND, MOST_FRAMES / max(float(pose.time[-1] - pose.time[0]), 1e-3))
-    page = pose_html(pose.model, pose, phases=pose.recording.phases, title=pose.recording.name, fps=fps)
+    page = pose_html(pose.model, pose.pose, phases=pose.recording.phases, title=pose.recording.name, fps=fps)
     return {"page": page, "fps": fps if fps < FRAMES_A_SECOND else None}
 
 
-def _run(pose: TrackedPose) -> dict[str, Any]:
+def _run(pose: TrackedRecording) -> dict[str, Any]:
     recording, subject = pose.recording, pose.subject
     assert recording is not None
     assert subject is not None
-    assert pose.segments is not None
-    assert pose.model is not None
     lengths = ", ".join(f"{plain(name)} {1e3 * value:.0f} mm" for name, value in subject.lengths.items())
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
-        ("filter", pose.method if pose.segments.orientation else "none: ready orientations"),
+        ("filter", pose.options.method if pose.segments.orientation else "none: ready orientations"),
         ("start pose", f"{recording.start_pose.replace('_', '-')}, {intervals([pose.segments.start])}"),
         ("still phase", intervals([pose.segments.still])),
         ("person", f"{subject.name}; {subject.note}" if subject.note else subject.name),
@@ -283,7 +277,7 @@ def _three(values: np.ndarray) -> str:
     return " / ".join(f"{value:+.2f}".replace("-", "−") if abs(value) >= 0.005 else "0.00" for value in values)
 
 
-def _before(pose: TrackedPose) -> str | None:
+def _before(pose: TrackedRecording) -> str | None:
     """The time before the end of the start pose, over which uncertainties are not summed up; None where it is short."""
     seconds = float(pose.time[np.argmax(from_start(pose))] - pose.time[0])
     return _duration(seconds) if seconds >= 1.0 else None

@@ -1,0 +1,197 @@
+"""A recording tracked in chunks, decimated to what a page can show; extremes and what lasts are of all samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from ..pose import Pose
+from ..recording import Intervals, join
+from ..tracking import TrackedRecording
+from .measures import Signal, hands_of, signal_of
+
+MOST = 20_000  # samples that are kept
+_OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov")  # in `Orientation`
+
+
+@dataclass(frozen=True)
+class Whole:
+    """What a decimated pose no longer tells of the recording."""
+
+    samples: int
+    rate_hz: float
+    steps_ms: tuple[float, float]  # shortest and longest step between samples
+    signals: Mapping[str, Signal]  # a row for each kept sample, of all from it to the next
+    peak_speed: Mapping[str, float]  # hand → [m/s]
+    warnings: list[str]
+
+
+def whole_of(pose: TrackedRecording) -> Whole:
+    """That of a pose which has all its samples."""
+    recording = pose.recording
+    steps = 1e3 * np.diff(recording.time)
+    hands = hands_of(pose.pose, recording.rate_hz)
+    return Whole(
+        len(recording),
+        recording.rate_hz,
+        (float(steps.min()), float(steps.max())),
+        {name: signal_of(recording, name, pose) for name in recording.sensors},
+        {name: hand.peak_speed for name, hand in hands.items()},
+        pose.summary()["warnings"],
+    )
+
+
+class Decimator:
+    """Takes the chunks of `tracking.track_session`; `decimated` is for `track_report` and the page.
+
+    Parameters
+    ----------
+    samples : of the whole recording
+    """
+
+    def __init__(self, samples: int) -> None:
+        self._every = max(1, samples // MOST)
+        self._seen = 0
+        self._kept: list[TrackedRecording] = []
+        self._signals: dict[str, list[Signal]] = {}
+        self._peak_speed: dict[str, float] = {}
+        self._steps = (np.inf, 0.0)
+        self._last = np.nan  # [s]
+        self._error: Exception | None = None
+
+    def add(self, chunk: TrackedRecording) -> None:
+        """The next chunk. What fails here is kept for `decimated`: it must not stop what the chunks are for."""
+        try:
+            self._add(chunk)
+        except Exception as error:
+            self._error = self._error or error
+
+    def _add(self, chunk: TrackedRecording) -> None:
+        recording = chunk.recording
+        at = np.arange(-self._seen % self._every, len(recording), self._every)
+        for name in recording.sensors:
+            self._take_signal(name, signal_of(recording, name, chunk), at)
+        for name, hand in hands_of(chunk.pose, recording.rate_hz).items():
+            self._peak_speed[name] = max(self._peak_speed.get(name, 0.0), hand.peak_speed)
+        steps = 1e3 * np.diff(recording.time, prepend=self._last)
+        self._steps = min(self._steps[0], float(np.nanmin(steps))), max(self._steps[1], float(np.nanmax(steps)))
+        self._seen, self._last = self._seen + len(recording), float(recording.time[-1])
+        if len(at):
+            self._kept.append(_decimated(chunk, at, recording.rate_hz / self._every))
+
+    def decimated(self, phases: Mapping[str, Intervals], warnings: list[str]) -> tuple[TrackedRecording, Whole]:
+        """The pose, and what it no longer tells; `phases` and `warnings` of the whole recording.
+
+        Raises the first error of `add`, of any kind.
+        """
+        if self._error is not None:
+            raise self._error
+        last = self._kept[-1]
+        pose = _joined(self._kept, phases)
+        signals = {name: _joined_signal(parts) for name, parts in self._signals.items()}
+        rate_hz = last.recording.rate_hz * self._every
+        return pose, Whole(self._seen, rate_hz, self._steps, signals, self._peak_speed, warnings)
+
+    def _take_signal(self, name: str, signal: Signal, at: np.ndarray) -> None:
+        """Bins that begin at the kept samples; what comes before the first belongs to the last bin so far."""
+        parts = self._signals.setdefault(name, [])
+        edges = at if len(at) and at[0] == 0 else np.concatenate([[0], at]).astype(int)
+        of = signal._replace(
+            rate=np.maximum.reduceat(signal.rate, edges),
+            cut=np.logical_or.reduceat(signal.cut, edges),
+            gap=np.logical_or.reduceat(signal.gap, edges),
+            rest=None if signal.rest is None else np.logical_and.reduceat(signal.rest, edges),
+        )
+        if len(edges) > len(at):
+            before = parts[-1]
+            before.rate[-1] = max(before.rate[-1], of.rate[0])
+            before.cut[-1] |= of.cut[0]
+            before.gap[-1] |= of.gap[0]
+            if before.rest is not None and of.rest is not None:
+                before.rest[-1] &= of.rest[0]
+            of = of._replace(
+                rate=of.rate[1:], cut=of.cut[1:], gap=of.gap[1:], rest=None if of.rest is None else of.rest[1:]
+            )
+        if len(at):
+            parts.append(of)
+        else:  # a chunk shorter than a bin: its bias is the last one, its peak may be the largest
+            parts[-1] = parts[-1]._replace(bias=of.bias, peak_accel=max(parts[-1].peak_accel, of.peak_accel))
+
+
+def _joined_signal(parts: list[Signal]) -> Signal:
+    rest = [part.rest for part in parts if part.rest is not None]
+    last = parts[-1]
+    return last._replace(
+        rate=np.concatenate([part.rate for part in parts]),
+        cut=np.concatenate([part.cut for part in parts]),
+        gap=np.concatenate([part.gap for part in parts]),
+        rest=np.concatenate(rest) if rest else None,
+        peak_accel=max(part.peak_accel for part in parts),
+    )
+
+
+def _decimated(tracked: TrackedRecording, at: np.ndarray, rate_hz: float) -> TrackedRecording:
+    """The samples `at` of a recording, as if it had been recorded so slowly."""
+    pose, recording, segments = tracked.pose, tracked.recording, tracked.segments
+    sensors = {}
+    for name, sensor in recording.sensors.items():
+        signals = {key: getattr(sensor, key) for key in ("gyro_S", "accel_S", "quat_WS", "gap")}
+        sensors[name] = replace(sensor, **{key: v[at] for key, v in signals.items() if v is not None})
+    orientation = {
+        name: of._replace(**{field: _rows(getattr(of, field), at) for field in _OF_EACH_SAMPLE})
+        for name, of in segments.orientation.items()
+    }
+    return replace(
+        tracked,
+        pose=Pose(*(_rows(getattr(pose, of.name), at) for of in fields(Pose))),
+        recording=replace(recording, time=recording.time[at], rate_hz=rate_hz, sensors=sensors),
+        segments=replace(
+            segments,
+            time=segments.time[at],
+            quat_WL=_rows(segments.quat_WL, at),
+            covariance_W=_rows(segments.covariance_W, at),
+            orientation=orientation,
+        ),
+    )
+
+
+def _rows(values: Any, at: np.ndarray) -> Any:
+    """Rows of an array, or of each array of a mapping."""
+    if isinstance(values, Mapping):
+        return {name: array[at] for name, array in values.items()}
+    return None if values is None else values[at]
+
+
+def _joined(parts: list[TrackedRecording], phases: Mapping[str, Intervals]) -> TrackedRecording:
+    """One of many; what is one number comes from the last."""
+    last = parts[-1]
+    segments = [part.segments for part in parts]
+    orientation = {
+        name: of._replace(
+            **{field: _concatenated([getattr(s.orientation[name], field) for s in segments]) for field in _OF_EACH_SAMPLE}
+        )
+        for name, of in segments[-1].orientation.items()
+    }
+    return replace(
+        last,
+        pose=Pose(*(_concatenated([getattr(part.pose, of.name) for part in parts]) for of in fields(Pose))),
+        recording=replace(reduce(join, [part.recording for part in parts]), phases=phases),
+        segments=replace(
+            segments[-1],
+            time=np.concatenate([of.time for of in segments]),
+            quat_WL=_concatenated([of.quat_WL for of in segments]),
+            covariance_W=_concatenated([of.covariance_W for of in segments]),
+            orientation=orientation,
+        ),
+    )
+
+
+def _concatenated(values: list[Any]) -> Any:
+    """Arrays put together, or each array of mappings; None where one is missing."""
+    if isinstance(values[0], Mapping):
+        return {name: np.concatenate([arrays[name] for arrays in values]) for name in values[0]}
+    return None if any(value is None for value in values) else np.concatenate(values)
