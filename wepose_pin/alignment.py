@@ -16,7 +16,7 @@ import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from . import so3
+from . import rotations
 from .errors import BadPhase, BadSession, WeposeError
 from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
@@ -385,7 +385,7 @@ def oriented_segments(
 
 def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
     """ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
-    return float(so3.heading((R_WS * R_VS.inv()).as_quat()))
+    return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
 
 
 def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
@@ -521,7 +521,7 @@ def _motion(recording: Recording, segment: str, interval: tuple[float, float], p
     else:
         assert sensor.gyro_S is not None
         rate = sensor.gyro_S[measured]
-        R = Rotation.from_quat(so3.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
+        R = Rotation.from_quat(rotations.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
     turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
     guessed = phase not in recording.phases or not recording.phases[phase]

@@ -14,9 +14,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from .arguments import NonNegative, Positive, Range, check_fields
+from .compilation import inlined, kernel
 from .errors import BadData, BadOption
 from .noise import BLOCK_S, SensorNoise
-from .so3 import inlined, kernel
 
 # A sample is gyro (3), accel/g (3) and the norm of accel/g. The sums are of its differences from an anchor: those
 # themselves, their products gyro xx xy xz yy yz zz, the same of accel, and the norm's square.
