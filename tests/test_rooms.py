@@ -14,7 +14,7 @@ import wepose_pin
 PACKAGE = Path(wepose_pin.__file__).parent
 ORDER = (
     "errors arguments so3 assets recording readers subject noise static filters model alignment pose calibration "
-    "tracking simulation evaluation page validation angles writers retargeting viewer report live batch bench cli"
+    "tracking simulation evaluation page validation angles writers retargeting viewer report live jobs batch bench cli"
 ).split()
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if "_assets" not in path.parts)
 
