@@ -246,7 +246,7 @@ def test_what_is_wrong_late_leaves_nothing(session: Path, tmp_path: Path, capsys
         (["--causal"], "--causal is tracked as a whole"),
         (["--torques"], "--torques is tracked as a whole"),
         (["--chunk-seconds", "-1"], "at least 2 s"),
-        (["--chunk-seconds", "nan"], "at least 2 s"),
+        (["--chunk-seconds", "nan"], "'nan' is not a number"),
     ],
 )
 def test_what_has_no_pieces(session: Path, tmp_path: Path, capsys, options: list[str], said: str) -> None:
