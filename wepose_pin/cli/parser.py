@@ -59,7 +59,7 @@ def parse(name: str, command: Command, argv: Sequence[str]) -> Any:
         switch = word.partition("=")[0]
         if switch.startswith("--") and switch not in known:
             raise BadOption(f"{switch} is not an option of wepose {name}; {one_of(known, switch)}; {see}")
-    parser = _parser(name, command, options.values())
+    parser = _parser(name, command, list(options.values()))
     try:
         found, more = parser.parse_known_args(argv)
     except argparse.ArgumentError as error:
@@ -70,59 +70,79 @@ def parse(name: str, command: Command, argv: Sequence[str]) -> Any:
     missing = [options[field].shown for field in options if options[field].required and field not in given]
     if missing:
         raise BadOption(f"wepose {name} needs {' and '.join(missing)}; {see}")
-    return command.job(**{field: options[field].collected(value) for field, value in given.items()})
+    return command.job(**{field: options[field].collect(value) for field, value in given.items()})
 
 
 class _Option:
-    """One field as argparse has it."""
+    """One field as argparse has it.
+
+    Attributes
+    ----------
+    switch : ``--name``, or ``--no-name`` of what is true by default; empty for an argument by position
+    shown : as an error names it
+    """
 
     def __init__(self, command: Command, field: str, hint: Any) -> None:
-        self.default = field_defaults(command.job)[field]
+        self.field, self.kinds, self.default = field, choices_of(hint), field_defaults(command.job)[field]
         self.required = self.default is REQUIRED
-        self.field, (self.kind, *_) = field, choices_of(hint)
-        kinds = choices_of(hint)
-        self.metavar, text = _help_of(command.job)[field]
-        positional = field in command.arguments
-        words = field.rstrip("_").replace("_", "-")
-        negative = self.kind is bool and self.default is True
-        self.switch = "" if positional else f"--no-{words}" if negative else f"--{words}"
-        short = ["-o"] if field == "out" else []
-        self.names = [field] if positional else [*short, self.switch]
-        self.shown = self.metavar if positional else f"{self.names[0]} {self.metavar}"
-        self.settings: dict[str, Any] = {"default": None} | ({"nargs": "?"} if positional else {"dest": field})
-        if self.kind is bool:
-            self.settings["action"] = "store_false" if negative else "store_true"
-            text = f"Do not {text[0].lower()}{text[1:]}" if negative else text
-        else:
-            self.settings |= {"type": _converter(kinds), "metavar": self.metavar}
-        origin, parts = get_origin(self.kind), get_args(self.kind)
-        if origin is Literal:
-            self.settings["metavar"] = self.metavar = "|".join(parts)
-        elif origin is tuple:
-            self.settings |= {"nargs": len(parts), "type": _number, "metavar": tuple(self.metavar.split())}
-        elif origin is not None and issubclass(origin, Mapping):
-            self.settings |= {"action": "append", "type": _entry(choices_of(parts[1]), self.metavar)}
-        if isinstance(self.default, str | float | int | Path) and not isinstance(self.default, bool):
-            shown = f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
-            text += f" (default: {shown})"
-        self.settings["help"] = text.replace("%", "%%")
+        self.metavar, self.help = _help_of(command.job)[field]
+        if get_origin(self.kinds[0]) is Literal:
+            self.metavar = "|".join(get_args(self.kinds[0]))
+        name = field.rstrip("_").replace("_", "-")
+        self.switch = "" if field in command.arguments else f"--no-{name}" if self.default is True else f"--{name}"
+        self.shown = f"{self._names()[0]} {self.metavar}" if self.switch else self.metavar
 
-    def collected(self, value: Any) -> Any:
-        """The field's value from what argparse collected."""
-        origin = get_origin(self.kind)
-        if origin is tuple:
+    def add_to(self, group: argparse._ArgumentGroup) -> None:
+        """Add it to a group of argparse's; where it is not given its value is None."""
+        if not self.switch:
+            group.add_argument(self.field, nargs="?", help=self._help(), **self._value())
+            return
+        value = self._value() if bool not in self.kinds else {}
+        action = "store_false" if self.default is True else "store_true" if self.default is False else None
+        value |= {"action": action} if action else {}
+        group.add_argument(*self._names(), dest=self.field, default=None, help=self._help(), **value)
+
+    def collect(self, value: Any) -> Any:
+        """The field's value from what argparse collected.
+
+        Raises
+        ------
+        BadOption
+            A name is given twice.
+        """
+        if get_origin(self.kinds[0]) is tuple:
             return tuple(value)
         if not isinstance(value, list):
             return value
         entries: dict[str, Any] = {}
-        for key, entry in value:
-            if key in entries:
-                raise BadOption(f"{self.switch} {key}={entry}: '{key}' is given twice")
-            entries[key] = entry
+        for name, entry in value:
+            if name in entries:
+                raise BadOption(f"{self.switch} {name}={entry}: '{name}' is given twice")
+            entries[name] = entry
         return entries
 
+    def _names(self) -> list[str]:
+        return ["-o", self.switch] if self.field == "out" else [self.switch]
 
-def _parser(name: str, command: Command, options: Sequence[_Option] | Any) -> argparse.ArgumentParser:
+    def _help(self) -> str:
+        text = self.help
+        if self.default is True:
+            text = f"Do not {text[0].lower()}{text[1:]}"
+        elif isinstance(self.default, str | float | int | Path) and self.default is not False:
+            text += f" (default: {f'{self.default:g}' if isinstance(self.default, float) else self.default})"
+        return text.replace("%", "%%")
+
+    def _value(self) -> dict[str, Any]:
+        """How argparse reads the value."""
+        kind, parts = get_origin(self.kinds[0]), get_args(self.kinds[0])
+        if kind is tuple:
+            return {"type": _number, "nargs": len(parts), "metavar": tuple(self.metavar.split())}
+        if kind is Mapping:
+            return {"type": _entry(choices_of(parts[1]), self.metavar), "action": "append", "metavar": self.metavar}
+        return {"type": _one_of(parts) if kind is Literal else _CONVERTERS[self.kinds[0]], "metavar": self.metavar}
+
+
+def _parser(name: str, command: Command, options: Sequence[_Option]) -> argparse.ArgumentParser:
     required = " ".join(option.shown for option in options if option.required)
     texts = [_description(command.job), command.exit_codes and f"Exit code: {command.exit_codes}"]
     parser = argparse.ArgumentParser(
@@ -137,7 +157,7 @@ def _parser(name: str, command: Command, options: Sequence[_Option] | Any) -> ar
     )
     arguments, others = parser.add_argument_group("arguments"), parser.add_argument_group("options")
     for option in options:
-        (others if option.switch else arguments).add_argument(*option.names, **option.settings)
+        option.add_to(others if option.switch else arguments)
     others.add_argument("-h", "--help", action="help", help="Show this text and exit.")
     return parser
 
@@ -181,14 +201,6 @@ def _help_of(job: type) -> dict[str, tuple[str, str]]:
 # Values ------------------------------------------------------------------------------------------------------------
 
 
-def _converter(kinds: tuple[Any, ...]) -> Callable[[str], Any]:
-    """What makes a value of a word."""
-    if get_origin(kinds[0]) is Literal:
-        return _one_of(get_args(kinds[0]))
-    converters: dict[Any, Callable[[str], Any]] = {Path: Path, int: _whole_number, float: _number}
-    return converters.get(kinds[0], str)
-
-
 def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
     def chosen(word: str) -> str:
         if word not in choices:
@@ -230,3 +242,6 @@ def _entry(kinds: tuple[Any, ...], metavar: str) -> Callable[[str], tuple[str, A
             raise argparse.ArgumentTypeError(f"{word}: {error}; {metavar} is needed") from None
 
     return entry
+
+
+_CONVERTERS: dict[Any, Callable[[str], Any]] = {str: str, Path: Path, int: _whole_number, float: _number}

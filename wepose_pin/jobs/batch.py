@@ -10,7 +10,7 @@ from ..errors import BadOption
 
 @dataclass(frozen=True)
 class BatchJob:
-    """Work through many recordings: a plan of sessions, subjects and steps, on all processors or on a Dask cluster.
+    """Work through many recordings by a plan, on all processors or on a Dask cluster.
 
     Each item is made by itself: one that fails leaves its error in the table, the others go on. The same command goes
     on where it was stopped and repeats nothing that is done. Sessions and DIR may lie on s3:// (docs/batch.md).
@@ -18,13 +18,13 @@ class BatchJob:
     Parameters
     ----------
     plan : PLAN.toml
-        Which sessions, whose, and the steps calibrate, track, retarget, export, evaluate with their options.
+        The plan: which sessions, whose, and the steps calibrate, track, retarget, export, evaluate with their options.
     out : DIR|URL
-        Write items/, a folder an item, results.parquet and report.html to this folder or below this URL.
+        Write items/, one folder per item, results.parquet and report.html to this folder or below this URL.
     scheduler : ADDRESS
         Use the workers of a running Dask scheduler, tcp://HOST:8786. Without it workers are started here.
     workers : NUMBER
-        Start so many workers here. Without it one a processor.
+        Start this number of workers here. Without it one per processor.
     force
         Make those items again whose inputs, options or version have changed since they were made.
     """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CalibrateJob:
-    """Calibrate a subject with joined hands: arm lengths and sensor mounts, their standard deviations and a quality.
+    """Calibrate arm lengths and sensor mounts from a recording with joined hands.
 
     Joined hands fix the proportions of the arms and not their scale. Measure one length, such as the shoulder width,
     and give it by --measured; without one the scale is that of the population prior, and the output says how uncertain
@@ -32,7 +32,7 @@ class CalibrateJob:
     out : DIR
         Write subject.toml, subject.urdf, calibration.json (the quality and all figures) and report.html to this folder.
     protocol : NAME|FILE.toml
-        What the person did: clasp (hands together), clasp_taped (the same, with a length that must be measured),
+        Calibrate by this protocol: clasp (hands together), clasp_taped (the same, with a length that must be measured),
         handle (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), poses (T-pose
         and bow: headings only), or a file of your own made like those in calibration/.
     measured : NAME=METRES

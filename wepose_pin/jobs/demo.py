@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DemoJob:
-    """Show the whole chain on a recording that it makes itself: simulate, calibrate, track, evaluate, view.
+    """Run the whole chain on a simulated recording: simulate, calibrate, track, evaluate, view.
 
     A person of random size stands in the N-pose, moves the joined hands for a minute, then draws six circles in the air
     with rests on a table, with five Xsens MTi-3 on. All of it is simulated, so that the truth is known.
@@ -29,7 +29,7 @@ class DemoJob:
     out : DIR
         Write session, subject, result, its page and the figures to this folder.
     seed : NUMBER
-        Draw another person and another motion by another number.
+        Draw the person and the motion from this seed.
     force
         Replace the files of an earlier run.
     """

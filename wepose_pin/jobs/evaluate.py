@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EvaluateJob:
-    """Compare a result with a reference: attitude, drift, positions, and how far the stated uncertainty is right.
+    """Compare a result with a reference: attitude, drift, positions, stated uncertainty.
 
     Parameters
     ----------

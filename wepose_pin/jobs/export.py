@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportJob:
-    """Write the motion of a result for other programs: CSV, Parquet, OpenSim, BVH, C3D, URDF (docs/formats/export.md).
+    """Write the motion of a result for other programs: CSV, Parquet, OpenSim, BVH, C3D, URDF.
+
+    What each file holds: docs/formats/export.md.
 
     Parameters
     ----------
@@ -25,7 +27,7 @@ class ExportJob:
     out : FILE
         Write this file.
     format : FORMAT
-        Write this format, in place of that of the file's suffix: csv, parquet (pose and joint angles), mot (joint
+        Write this format instead of that of the file's suffix: csv, parquet (pose and joint angles), mot (joint
         angles for OpenSim), sto (orientations for OpenSense), placement (the sample for its IMU Placer), trc, c3d
         (points), bvh (skeleton and motion), urdf (the subject).
     names

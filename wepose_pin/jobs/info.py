@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class InfoJob:
-    """Say what a file is: its sensors, rates and gaps, with a session file that is ready for it.
+    """Describe a file, its sensors, rates and gaps, and propose a session file for it.
 
     Known are Xsens MVNX, MT Manager's text, Movella DOT, x-IMU3, APDM, OpenSim .sto of orientations, CSV, Parquet,
     HDF5, MATLAB (docs/formats/), recordings of `wepose live`, and sessions, subjects and results. What is marked CHECK

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LiveJob:
-    """Track while it happens: from a stream to a page in the browser, the terminal, other programs and a file.
+    """Track a stream live: to a page in the browser, the terminal, other programs and a file.
 
-    Stand still in the start pose until you are told that it is ready. Then r sets the headings anew while you stand so
-    again, and q ends (Ctrl-C too). What --record wrote up to any end is whole but for its last second.
+    Stand still in the start pose until you are told that it is ready. After that r resets the headings, while you stand
+    in the start pose again, and q or Ctrl-C ends. Whatever ends it, the file of --record lacks its last second at most.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class LiveJob:
     speed : FACTOR
         Replay at this speed: 1 its own, 4 four times that, max as fast as it is read.
     page
-        Serve a page with the pose, to this machine only.
+        Serve the page that shows the pose, to this machine only.
     open
         Open the page in the browser.
     port : PORT
@@ -53,17 +53,17 @@ class LiveJob:
     robot : NAME|FILE.urdf
         Send commands by which this robot (as of `wepose retarget`) follows the person (docs/live-robot.md).
     arm
-        Move this arm of the robot or both. Without it all that it has.
+        Move only this arm of the robot, or both. Without it all arms that it has.
     map : TOML
         Use this map of the URDF in --robot, where none lies beside it.
     to : [HOST:]PORT
-        Send the robot's commands there, as JSON. Without it to port 9002 of this machine.
+        Send the robot's commands to this port, as JSON. Without it to port 9002 of this machine.
     robot_hz : HZ
-        Send so many commands a second.
+        Send commands at this rate.
     hold_after : SECONDS
-        Brake the robot when there was no pose for so long.
+        Brake the robot after this time without a pose.
     stop_after : SECONDS
-        Stop the robot, until r is pressed, when there was no pose for so long.
+        Stop the robot, until r is pressed, after this time without a pose.
     force
         Replace the file of --record.
     """

@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ReproduceJob:
-    """Make a result again from its provenance and say whether it is the same: tables exactly, bit-identical.
+    """Make a result again from its provenance and compare: tables must be bit-identical.
 
     Nothing is changed: the result is made again in a folder that is removed afterwards.
 

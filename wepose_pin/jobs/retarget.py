@@ -14,7 +14,7 @@ from .fields import field_values
 
 @dataclass(frozen=True)
 class RetargetJob:
-    """Make a person's arms a robot's: a joint trajectory within its limits that does not collide with itself.
+    """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
     Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (of example-robot-data). Any other by its URDF with a map
     beside it that says which links are shoulder, elbow and hand (docs/retargeting.md).
@@ -28,17 +28,17 @@ class RetargetJob:
     out : DIR
         Write trajectory.parquet and .csv, joint_trajectory.json and .yaml, summary.json and view.html to this folder.
     arm
-        Move this arm or both. Without it all that the robot has.
+        Move only this arm, or both. Without it all arms that the robot has.
     rate_hz : HZ
-        Sample the trajectory so often a second, as the controller needs it.
+        Sample the trajectory at the rate that the controller needs.
     task
         Follow the position of the person's hands, their orientation, or both.
     scale : FACTOR
-        Make one metre of the person so many of the robot. Without it a straight arm becomes a straight arm.
+        Scale the person's distances by this factor. Without it a straight arm becomes a straight arm of the robot.
     smoothing_hz : HZ
-        Cut the measured motion off above this frequency; 0 does not smooth it.
+        Low-pass filter the measured motion at this frequency; 0 does not filter it.
     strict
-        Refuse a motion that is too fast for the robot, in place of slowing it.
+        Refuse a motion that is too fast for the robot, instead of slowing it down.
     episode
         Write episode/ too: a data set of one episode as LeRobot reads it.
     view

@@ -19,7 +19,7 @@ CIRCLES = 6  # drawn by the right hand after the protocol
 
 @dataclass(frozen=True)
 class SimulateJob:
-    """Simulate a person with five sensors and a known truth: session file, recording, and the truth as pose.parquet.
+    """Simulate a person with five sensors and a known truth.
 
     The sensors have the noise and bias of an Xsens MTi-3 in either preset. `wepose calibrate DIR --measured ...` and
     `wepose track DIR` go on from there.
@@ -27,20 +27,20 @@ class SimulateJob:
     Parameters
     ----------
     out : DIR
-        Write session.toml, recording.parquet, truth.parquet and subject.toml (the true lengths and mounts) to this
-        folder.
+        Write session.toml, recording.parquet, truth.parquet (columns as in pose.parquet) and subject.toml (the true
+        lengths and mounts) to this folder.
     seed : NUMBER
-        Draw another person and another motion by another number.
+        Draw the person and the motion from this seed.
     rate_hz : HZ
-        Sample so often a second.
+        Sample at this rate.
     protocol
-        What the person does to be calibrated, as of `wepose calibrate --protocol`. After it the right hand draws
-        circles, but not after poses.
+        Simulate this calibration protocol, as of `wepose calibrate --protocol`. The right hand then draws circles,
+        except after poses.
     preset
-        ideal: nothing is wrong but the sensors' noise. mild: soft tissue, slip, sway and sensor errors of a usual size,
-        as stated with their sources in wepose_pin/simulation/imperfections.py.
+        Simulate no imperfection but the sensors' noise and bias (ideal), or soft tissue, slip, sway and sensor errors
+        of a usual size too (mild), as stated with their sources in wepose_pin/simulation/imperfections.py.
     imperfection : NAME=VALUE
-        Give one imperfection another size; may be given several times. mount=any: sensors in any rotation, nothing
+        Simulate one imperfection at this size; may be given several times. mount=any: sensors in any rotation, nothing
         stated. The others are numbers, 0 for off: soft_tissue_deg, palm_slip [m], shoulder_wander [m], start_elbow_deg,
         start_segment_deg, sway_deg_s, gyro_scale, accel_scale, misalignment_deg, g_sensitivity_deg_s,
         gyro_range_deg_s, accel_range_g, bits, clock_jitter [s], clock_offset [s], dropped.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrackJob:
-    """Estimate the pose of a recording: segment orientations and joint centres, with a page to look at and a report.
+    """Estimate the pose of a recording: segment orientations and joint centres.
 
     A recording of `wepose live` gives the poses that were shown, bit-identical: it is tracked with its own subject and
     method, and causally, unless one of these is given here.
@@ -53,7 +53,8 @@ class TrackJob:
         Write report.html: warnings and what to do, noise, drift, hands, joint angles.
     chunk_seconds : SECONDS
         Track in chunks of this length, in a memory that does not grow with the recording (docs/long-recordings.md).
-        Recordings of 500 MB and more always are, in chunks of 120 s (smoother: 600 s); 0 tracks them as a whole.
+        Recordings of 500 MB and more are always tracked so, in chunks of 120 s (smoother: 600 s); 0 tracks them as a
+        whole.
     force
         Replace the files of an earlier run.
     """

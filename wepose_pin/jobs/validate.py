@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ValidateJob:
-    """Run the paper's experiments on simulated subjects, and real recordings, beside the paper's own figures.
+    """Run the paper's experiments on simulated subjects and compare with the paper's figures.
 
-    On two cores a quick run takes under a minute, a full one some ten.
+    On two cores a quick run takes under a minute, a full one about ten.
 
     Parameters
     ----------
@@ -26,9 +26,9 @@ class ValidateJob:
         Write validation.json with every trial, and the page with tables and figures to this folder: validation.html,
         validation.md with validation/*.png.
     data : DIR
-        Measure on the real recordings in this folder too (broad/, wepose_hr/, ring/, ur5/).
+        Run on the real recordings in this folder too (broad/, wepose_hr/, ring/, ur5/).
     quick
-        Run one trial of each experiment, and two of BROAD, in place of all; without the error budget and without the
+        Run one trial of each experiment, and two of BROAD, instead of all; without the error budget and without the
         search for gains.
     from_ : FILE
         Make tables and pages anew from the validation.json of an earlier run, and run nothing.
