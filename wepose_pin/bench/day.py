@@ -134,7 +134,15 @@ def _track(folder: Path, hours: float, out: str, *, pieces: float, method: str =
     """
     session = folder / f"{hours:g}"
     words = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(folder / out), "--force"]
-    words += ["--subject", str(session / "subject"), "--method", method, "--pieces", f"{pieces:g}", "--no-report"]
+    words += [
+        "--subject",
+        str(session / "subject"),
+        "--method",
+        method,
+        "--chunk-seconds",
+        f"{pieces:g}",
+        "--no-report",
+    ]
     begun = time.perf_counter()
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     assert process.stderr is not None

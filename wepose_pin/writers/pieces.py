@@ -45,13 +45,13 @@ class PieceWriter:
         self._seen += len(piece.time)
         self.tally.add(piece)
 
-    def finish(self, phases: Mapping[str, Sequence[tuple[float, float]]], made_by: Mapping[str, Any]) -> None:
+    def finish(self, phases: Mapping[str, Sequence[tuple[float, float]]], provenance: Mapping[str, Any]) -> None:
         """The other files."""
         _put_together(self._parts, self._folder / "pose.parquet")
         shutil.rmtree(self._parts)
         last = self.tally.last
         assert last is not None
-        write_about(self._folder, last, self.tally.summary(), phases, made_by)
+        write_about(self._folder, last, self.tally.summary(), phases, provenance)
 
 
 def _put_together(parts: Path, path: Path) -> None:
