@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from wepose_pin.batch import Item
-from wepose_pin.batch.plan import STEPS
+from wepose_pin.batch.plan import step_options
 from wepose_pin.simulation import simulate, simulated_person
 from wepose_pin.writers import write_session
 
-QUICK = {"track": {**STEPS["track"], "view": False, "report": False}, "evaluate": {"interval": None}}
+QUICK = {"track": {**step_options("track"), "view": False, "report": False}, "evaluate": {"interval": None}}
 PLAN = """
 [sessions]
 files = ["data/*/session.toml"]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin import so3
+from wepose_pin import rotations
 from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import attitude_error, uncertainty
 from wepose_pin.filters import TYPICAL, Amekf, AmekfParams, FilterRun, Smoother, estimate_orientation, run_filter
@@ -50,7 +50,7 @@ def case(seed: int, realistic: bool = False) -> Case:
 def as_case(gyro: np.ndarray, accel: np.ndarray, true: np.ndarray, moving: np.ndarray) -> Case:
     noise = noise_of(gyro[50:450], accel[50:450], RATE)
     static = StaticDetector(noise, RATE).run(gyro, accel)
-    return Case(gyro, accel, static, true, noise, so3.tilt(accel[:50].mean(axis=0)), moving)
+    return Case(gyro, accel, static, true, noise, rotations.quat_from_gravity(accel[:50].mean(axis=0)), moving)
 
 
 @lru_cache
@@ -83,7 +83,7 @@ def cov(found: FilterRun) -> np.ndarray:
 def errors(of: Case, quat_VS: np.ndarray) -> Rotation:
     """Error on the left, in W; heading aligned at rest as `wepose validate` does."""
     R_VS, true = Rotation.from_quat(quat_VS), Rotation.from_quat(of.true)
-    psi = so3.heading((true[50:450] * R_VS[50:450].inv()).mean().as_quat())
+    psi = rotations.heading((true[50:450] * R_VS[50:450].inv()).mean().as_quat())
     return Rotation.from_rotvec([0.0, 0.0, float(psi)]) * R_VS * true.inv()
 
 
@@ -104,7 +104,7 @@ def columns(of: Case, quat_VS: np.ndarray) -> np.ndarray:
 def nees(of: Case, found: FilterRun) -> float:
     """Mean normalised squared error of the attitude in the motion; the heading is exact at the first sample."""
     true, R_VS = Rotation.from_quat(of.true), Rotation.from_quat(found.quat_WS)
-    psi = so3.heading((true[0] * R_VS[0].inv()).as_quat())
+    psi = rotations.heading((true[0] * R_VS[0].inv()).as_quat())
     k = np.flatnonzero(of.moving)[300::25]
     error = ((Rotation.from_rotvec([0, 0, float(psi)]) * R_VS[k]).inv() * true[k]).as_rotvec()
     return uncertainty(error, cov(found)[k]).nees
@@ -321,7 +321,9 @@ def test_the_gyroscope_s_scale_is_learned_in_motion() -> None:
         fixed = errors(of, run(wrong, AmekfParams(gyro_matrix_std=0.0)).quat_WS)
         np.testing.assert_allclose(filter_.state.x[[M, M + 4, M + 8]], scale, atol=0.0035)
         end = of.moving.nonzero()[0][-1000:]
-        headings.append([float(np.abs(np.degrees(so3.heading(e[end].as_quat()))).mean()) for e in (learned, fixed)])
+        headings.append(
+            [float(np.abs(np.degrees(rotations.heading(e[end].as_quat()))).mean()) for e in (learned, fixed)]
+        )
     learned_deg, fixed_deg = np.mean(headings, axis=0)
     print(f"heading in the last 10 s: scale learned {learned_deg:.2f} deg, not learned {fixed_deg:.2f} deg")
     assert learned_deg < 0.6 * fixed_deg
@@ -474,7 +476,7 @@ def test_broad_against_vqf(data: Path) -> None:
         for method in table:
             out = run_filter(trial.gyro_S, trial.accel_S, trial.rate_hz, noise, method)
             R_VS = Rotation.from_quat(out.quat_WS)
-            psi = float(so3.heading((true[rest] * R_VS[rest].inv()).mean().as_quat()))
+            psi = float(rotations.heading((true[rest] * R_VS[rest].inv()).mean().as_quat()))
             error = (Rotation.from_rotvec([0, 0, psi]) * R_VS[scored]) * true[scored].inv()
             of = attitude_error(error * true[scored], true[scored], scored / trial.rate_hz)
             table[method].append((of.inclination_rmse, of.heading_rmse, of.total_rmse))

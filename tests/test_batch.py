@@ -13,14 +13,15 @@ import polars as pl
 import pytest
 from studies import PLAN, QUICK, files, item, sessions_and_plan, three_sessions  # noqa: F401
 
-from wepose_pin.batch import Item, items, read_plan, run_study
+from wepose_pin.batch import Item, items, read_plan, run_batch
 from wepose_pin.batch.compare import differences
 from wepose_pin.batch.items import make_items
 from wepose_pin.batch.page import apart, study_page
-from wepose_pin.batch.plan import STEPS
+from wepose_pin.batch.plan import step_options
 from wepose_pin.batch.storage import DONE, new_folder, only_one
 from wepose_pin.batch.study import STUDY, _claim, table_of
 from wepose_pin.errors import BadData, ExistingOutput
+from wepose_pin.jobs.batch import BatchJob
 
 
 @pytest.fixture(autouse=True)
@@ -128,7 +129,7 @@ def test_one_that_fails_is_named_and_the_others_go_on(study: Path, monkeypatch: 
     def wrong(*_: object, **__: object) -> None:
         raise ZeroDivisionError("of ours\nand more")
 
-    monkeypatch.setattr("wepose_pin.batch.steps.track", wrong)
+    monkeypatch.setattr("wepose_pin.batch.steps.run_track", wrong)
     (row,) = make_items([item(study, session=str(study / "data" / "three"))], str(study / "items"))
     assert row["error"] == "ZeroDivisionError"
     assert row["message"].startswith("of ours and more (test_batch.py:")
@@ -156,7 +157,11 @@ def test_steps_give_what_the_commands_give(study: Path) -> None:
     """The same bits, where the same BLAS threads are used: here one process."""
     from wepose_pin.cli import main
 
-    steps = {"calibrate": STEPS["calibrate"], **QUICK, "export": {"formats": ("trc",), "names": None, "rate_hz": None}}
+    steps = {
+        "calibrate": step_options("calibrate"),
+        **QUICK,
+        "export": {"formats": ("trc",), "names": None, "rate_hz": None},
+    }
     session = study / "data" / "one"
     (row,) = make_items([item(study, steps=steps)], str(study / "items"))
     for words in (
@@ -185,9 +190,9 @@ def test_a_pipe_in_place_of_a_session_holds_nobody_up(study: Path) -> None:
 
 def test_where_a_study_may_not_go(study: Path) -> None:
     with pytest.raises(ExistingOutput, match="no study of wepose batch"):
-        run_study(study / "plan.toml", str(study / "data"))
+        run_batch(BatchJob(study / "plan.toml", str(study / "data")))
     with pytest.raises(ExistingOutput, match="is there and no study"):
-        run_study(study / "plan.toml", str(study / "plan.toml"))
+        run_batch(BatchJob(study / "plan.toml", str(study / "plan.toml")))
     _claim(str(study / "killed"), study / "plan.toml")
     (study / "killed" / STUDY).rename(study / "killed" / f".{STUDY}.partial")  # by a kill at its very beginning
     _claim(str(study / "killed"), study / "plan.toml")
@@ -253,7 +258,7 @@ def bucket(recorded: Path) -> Iterator[str]:
 
 def test_a_study_on_s3(bucket: str, tmp_path: Path, recorded: Path) -> None:
     (tmp_path / "plan.toml").write_text(PLAN.replace("data/*", f"{bucket}/data/*"))
-    done = run_study(tmp_path / "plan.toml", f"{bucket}/out", workers=2)
+    done = run_batch(BatchJob(tmp_path / "plan.toml", f"{bucket}/out", workers=2))
     assert done.table["item"].to_list() == ["data-one", "data-three", "data-two"]
     assert done.table["status"].to_list() == ["done"] * 3, done.table["message"].to_list()
     import s3fs
@@ -269,11 +274,11 @@ def test_a_study_on_s3(bucket: str, tmp_path: Path, recorded: Path) -> None:
     system.get_file("lab/out/items/data-one/track/pose.parquet", str(tmp_path / "pose.parquet"))
     local = pl.read_parquet(tmp_path / "items" / "one" / "track" / "pose.parquet")
     assert pl.read_parquet(tmp_path / "pose.parquet").equals(local)
-    assert run_study(tmp_path / "plan.toml", f"{bucket}/out", workers=1).kept == 3
+    assert run_batch(BatchJob(tmp_path / "plan.toml", f"{bucket}/out", workers=1)).kept == 3
     # Without its done.json an item is not whole, and a changed recording is another one.
     system.rm_file("lab/out/items/data-one/done.json")
     system.pipe_file("lab/data/two/recording.parquet", b"nothing")
-    table = run_study(tmp_path / "plan.toml", f"{bucket}/out", workers=1).table
+    table = run_batch(BatchJob(tmp_path / "plan.toml", f"{bucket}/out", workers=1)).table
     assert table["status"].to_list() == ["done", "done", "changed"]
     assert "another session" in table["message"][2]
 
@@ -285,8 +290,8 @@ def test_a_study_on_s3_is_that_of_a_local_folder(bucket: str, study: Path) -> No
     system.mkdir("other")
     system.put(str(study / "data"), "other/data", recursive=True)
     (study / "there.toml").write_text(PLAN.replace("data/*", f"{bucket.replace('lab', 'other')}/data/*"))
-    here = run_study(study / "plan.toml", str(study / "out"), workers=1).table
-    there = run_study(study / "there.toml", f"{bucket}/same", workers=1).table
+    here = run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1)).table
+    there = run_batch(BatchJob(study / "there.toml", f"{bucket}/same", workers=1)).table
     differ = {name for name in here.columns if not here[name].equals(there[name])}
     assert differ <= {"session", "seconds", "memory_mb", "track_s", "evaluate_s"}
     system.get("lab/same/items", str(study / "fetched"), recursive=True)

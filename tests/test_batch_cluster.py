@@ -21,13 +21,14 @@ import polars as pl
 import pytest
 from studies import PLAN, files, item, sessions_and_plan, three_sessions  # noqa: F401
 
-from wepose_pin.batch import cluster, run_study
+from wepose_pin.batch import cluster, run_batch
 from wepose_pin.batch.apart import make_apart
 from wepose_pin.batch.cluster import connected, made
 from wepose_pin.batch.compare import differences
 from wepose_pin.batch.storage import DONE
 from wepose_pin.bench.study import _apart_from_us
 from wepose_pin.errors import BadData, BadOption, LostWorker
+from wepose_pin.jobs.batch import BatchJob
 
 WEPOSE = [sys.executable, "-m", "wepose_pin.cli"]
 APART = ("seconds", "memory_mb", "track_s", "evaluate_s")  # columns that are not the same twice
@@ -43,7 +44,8 @@ def test_a_study_on_this_machine(study: Path) -> None:
         )
     )
     told = []
-    done = run_study(study / "plan.toml", str(study / "out"), workers=2, progress=lambda *of: told.append(of))
+    job = BatchJob(study / "plan.toml", str(study / "out"), workers=2)
+    done = run_batch(job, lambda *counts: told.append(counts))
     assert told[0] == (0, 0, 5)
     assert told[-1] == (5, 1, 5)
     table = pl.read_parquet(study / "out" / "results.parquet")
@@ -56,12 +58,12 @@ def test_a_study_on_this_machine(study: Path) -> None:
         assert word in page
     assert (study / "out" / "items" / "data-one" / "track" / "report.html").is_file()
     before = files(study / "out" / "items")
-    assert run_study(study / "plan.toml", str(study / "out"), workers=1).kept == 4
+    assert run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1)).kept == 4
     assert files(study / "out" / "items") == before
 
     (study / "data" / "three" / "session.toml").write_text("")
     shutil.rmtree(study / "out" / "items" / "subject-x")
-    table = run_study(study / "plan.toml", str(study / "out"), workers=1).table
+    table = run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1)).table
     assert table["status"].to_list() == ["failed"] * 5
     assert "its subject 'x' has no calibration, see item subject-x" in table["message"][2]
 
@@ -142,7 +144,7 @@ def test_an_item_that_is_too_much_for_a_worker_is_given_up_by_name(
     columns = {name: np.resize(table[name].to_numpy(), rows) for name in table.columns}
     pl.DataFrame(columns | {"time": 0.01 * np.arange(rows)}).write_parquet(file, compression="snappy")
     monkeypatch.setattr(distributed, "LocalCluster", partial(distributed.LocalCluster, memory_limit="600MB"))
-    told = run_study(study / "plan.toml", str(study / "out"), workers=1).table
+    told = run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1)).table
     assert told["item"].to_list() == ["data-one", "data-three", "data-two"]
     assert told["status"].to_list() == ["done", "done", "failed"], told["message"].to_list()
     assert told["error"][2] == "LostWorker"
@@ -265,7 +267,7 @@ def test_stopped_by_ctrl_c_it_ends_at_once_and_goes_on_later(study: Path) -> Non
 
 
 def test_a_cluster_of_ones_own_one_of_whose_workers_is_killed(study: Path) -> None:
-    alone = run_study(study / "plan.toml", str(study / "alone"), workers=1).table.drop(*APART)
+    alone = run_batch(BatchJob(study / "plan.toml", str(study / "alone"), workers=1)).table.drop(*APART)
     killed: list[int] = []
 
     def progress(done: int, _failed: int, _total: int) -> None:
@@ -274,11 +276,11 @@ def test_a_cluster_of_ones_own_one_of_whose_workers_is_killed(study: Path) -> No
             killed.append(done)
 
     with _apart_from_us(study) as (address, kill):
-        found = run_study(study / "plan.toml", str(study / "out"), scheduler=address, progress=progress)
+        found = run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler=address), progress)
         assert killed
         assert found.table.drop(*APART).equals(alone)
         assert found.table["item"].n_unique() == 3
-        assert run_study(study / "plan.toml", str(study / "out"), scheduler=address).kept == 3
+        assert run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler=address)).kept == 3
 
 
 @pytest.mark.parametrize("when", ["before", "meanwhile"])

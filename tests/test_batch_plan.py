@@ -32,7 +32,7 @@ def test_globs_give_items_named_by_their_folders(folder: Path) -> None:
     assert [item.name for item in plan.items] == ["anna-one", "ben-one", "anna-two"]
     assert [Path(item.session).is_absolute() for item in plan.items] == [True] * 3
     assert list(plan.items[0].steps) == ["calibrate", "track"]
-    assert plan.items[0].steps["track"]["method"] == "amekf"
+    assert plan.items[0].steps["calibrate"]["method"] == "amekf"
     assert plan.name == "plan"
     assert plan.first == ()
 
@@ -62,7 +62,7 @@ def test_a_subject_calibrated_once_goes_first_and_its_sessions_are_not_calibrate
         [subjects.anna]
         calibration = "anna/one"
         stature = 1.7
-        gauge = {{ shoulder_width = 0.36 }}
+        measured = {{ shoulder_width = 0.36 }}
         [subjects.ben]
         sex = "m"
         {STEPS}""",
@@ -82,7 +82,7 @@ def test_a_subject_calibrated_once_goes_first_and_its_sessions_are_not_calibrate
 
 def test_a_table_ties_sessions_to_subjects_and_lengths(folder: Path) -> None:
     table = {"session": ["anna/one", "ben/one"], "name": ["a", None], "truth": [None, "t.parquet"]}
-    table |= {"stature": [1.7, None], "sex": ["f", None], "gauge.trunk": [0.5, None]}
+    table |= {"stature": [1.7, None], "sex": ["f", None], "measured.trunk": [0.5, None]}
     pl.DataFrame(table).write_csv(folder / "sessions.csv")
     plan = planned(folder, f'[sessions]\ntable = "sessions.csv"\n{STEPS}')
     assert [item.name for item in plan.items] == ["a", "ben-one"]
@@ -108,14 +108,20 @@ def test_items_keep_their_names_when_others_join(folder: Path) -> None:
         ('[sessions]\nfiles = ["anna/*"]\n[steps]\n', "no step"),
         ('[sessions]\nfiles = ["anna/*"]\n[steps.trak]\n', "did you mean 'track'?"),
         ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\nmethod = "amek"\n', "did you mean 'amekf'?"),
-        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\ngaps = 1\n', "gaps = 1 is neither true nor false"),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\ngaps = 1\n', "gaps = 1: True or False is needed"),
         ('[sessions]\nfiles = ["anna/*"]\n[steps.evaluate]\n', "needs the step [steps.track]"),
         ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\n[steps.export]\n', "steps.export.formats is missing"),
         ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.export]\nformats = ["trx"]', "'trx' is no format"),
-        ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.evaluate]\ninterval = [2, 1]', "is not two times"),
+        (
+            '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.evaluate]\ninterval = [2, 1]',
+            "interval = 2 1: two times in seconds are needed",
+        ),
         ('[sessions]\nfiles = "anna/*"\nsubject = "ben"\n[subjects.anna]\n[steps.track]', "subject 'ben' is not in"),
         ('[sessions]\nfiles = "anna/*"\n[subjects.anna]\nfile = "a"\ncalibration = "b"\n[steps.track]', "not both"),
-        ('[sessions]\nfiles = "anna/*"\n[subjects.a]\ngauge = { arm = 1 }\n[steps.track]', "gauge.arm is not a known"),
+        (
+            '[sessions]\nfiles = "anna/*"\n[subjects.a]\nmeasured = { arm = 1 }\n[steps.track]',
+            "measured.arm is not a known",
+        ),
         (
             '[sessions]\nfiles = "anna/*"\nsubject = "a"\n[subjects.a]\ncalibration = "ben/one"\n[steps.track]',
             "needs the step [steps.calibrate]",
@@ -123,14 +129,17 @@ def test_items_keep_their_names_when_others_join(folder: Path) -> None:
         ('[sessions]\nfiles = "anna/*"\n[subjects.a]\nfile = "nobody"\n[steps.track]', "file = 'nobody': no such file"),
         ('[sessions]\nfiles = "anna/*"\n[subjects]\na = 3\n[steps.track]', "subjects.a = 3 is not a table"),
         ('[sessions]\nfiles = "anna/*"\n[subjects.a]\nstature = 170\n[steps.track]', "170 is not a body height"),
-        ('[sessions]\nfiles = "anna/*"\n[subjects.a]\ngauge = { handle = 0.4 }\n[steps.calibrate]', "gauge.handle"),
+        (
+            '[sessions]\nfiles = "anna/*"\n[subjects.a]\nmeasured = { handle = 0.4 }\n[steps.calibrate]',
+            "measured.handle",
+        ),
         ('[sessions]\nfiles = "anna/*"\n[steps.calibrate]\nprotocol = "clsp"', "did you mean 'clasp'?"),
-        ('[sessions]\nfiles = "anna/*"\n[steps.track]\nmodel = "nobody.urdf"', "'nobody.urdf': no such file"),
+        ('[sessions]\nfiles = "anna/*"\n[steps.track]\nmodel = "nobody.urdf"', "model = nobody.urdf: no such file"),
         ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "pandda"', "did you mean 'panda'?"),
         ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "panda"\narm = "up"', "arm = 'up'"),
         (
             '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "panda"\nrate_hz = -3',
-            "rate_hz = -3 must be greater than 0",
+            "rate_hz = -3: from 10 to 2000",
         ),
         (
             '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.export]\nformats = ["mot"]\nnames = "isp"',
@@ -146,10 +155,10 @@ def test_a_mistake_gets_one_line_that_names_it(folder: Path, text: str, said: st
     assert "\n" not in str(error.value)
 
 
-def test_the_distance_that_a_protocol_needs_may_be_taped(folder: Path) -> None:
-    subject = '[subjects.a]\ngauge = { handle = 0.42 }\n[steps.calibrate]\nprotocol = "handle"\n'
+def test_the_distance_that_a_protocol_needs_may_be_measured(folder: Path) -> None:
+    subject = '[subjects.a]\nmeasured = { handle = 0.42 }\n[steps.calibrate]\nprotocol = "handle"\n'
     plan = planned(folder, f'[sessions]\nfiles = "ben/one"\nsubject = "a"\n{subject}')
-    assert plan.items[0].body.gauge == {"handle": 0.42}
+    assert plan.items[0].body.measured == {"handle": 0.42}
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin import so3
+from wepose_pin import rotations
 from wepose_pin.filters import GdcParams, Smekf, run_filter
 from wepose_pin.filters.noise import noise_of
 from wepose_pin.filters.static import StaticDetector, StaticTest
@@ -34,9 +34,13 @@ def errors_deg(path: Path) -> dict[str, tuple[float, float, float]]:
 
     def rmse(quat_VS: np.ndarray) -> tuple[float, float, float]:
         R_VS = Rotation.from_quat(quat_VS)
-        psi = so3.heading((true[resting] * R_VS[resting].inv()).mean().as_quat())
+        psi = rotations.heading((true[resting] * R_VS[resting].inv()).mean().as_quat())
         error = (Rotation.from_rotvec([0, 0, psi]) * R_VS[trial.scored]) * true[trial.scored].inv()
-        parts = np.arccos(np.clip(error.as_matrix()[:, 2, 2], -1, 1)), so3.heading(error.as_quat()), error.magnitude()
+        parts = (
+            np.arccos(np.clip(error.as_matrix()[:, 2, 2], -1, 1)),
+            rotations.heading(error.as_quat()),
+            error.magnitude(),
+        )
         inclination, heading, total = (float(np.degrees(np.sqrt(np.mean(part**2)))) for part in parts)
         return inclination, heading, total
 
@@ -46,7 +50,7 @@ def errors_deg(path: Path) -> dict[str, tuple[float, float, float]]:
     # Correction only up to the motion: what the corrections in the trial are worth.
     early = StaticDetector(noise, rate_hz).run(gyro, accel)
     early[trial.still.stop + round(rate_hz) :] = False  # the motion begins a second after what counts as still
-    start = so3.tilt(accel[: StaticTest().samples(rate_hz)].mean(axis=0))
+    start = rotations.quat_from_gravity(accel[: StaticTest().samples(rate_hz)].mean(axis=0))
     return {
         ROWS[0]: rmse(run("smekf")),
         ROWS[1]: rmse(Smekf(noise, rate_hz, start).run(gyro, accel, early).quat_WS),

@@ -188,7 +188,7 @@ def test_the_command_writes_joints_orientations_and_torques(
         "pose.parquet",
         "torques.parquet",
         "summary.json",
-        "made_by.json",
+        "provenance.json",
     }
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert summary["torques"]["mass_kg"] == 6.0

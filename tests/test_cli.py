@@ -15,7 +15,8 @@ import polars as pl
 import pytest
 
 from wepose_pin import __version__
-from wepose_pin.cli import COMMANDS, main
+from wepose_pin.cli import COMMANDS, find_command, main
+from wepose_pin.jobs.fields import field_types
 from wepose_pin.simulation import Imperfections, Simulation
 from wepose_pin.writers import write_session
 
@@ -43,6 +44,23 @@ def test_help_of_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert __version__ in capsys.readouterr().out
 
 
+def test_help_reads_like_a_manual(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each option says what happens when it is given; values have names, and what is off or on is no default."""
+    monkeypatch.setenv("COLUMNS", "300")
+    for name in COMMANDS:
+        job = find_command(name).job
+        assert run(name, "--help") == 0
+        text = capsys.readouterr().out
+        for wrong in ("None", "True", "False", "{", "Path"):
+            assert wrong not in text, (name, wrong)
+        for field, kind in field_types(job).items():
+            words = field.rstrip("_").replace("_", "-")
+            switch = f"--no-{words}" if kind is bool and getattr(job, field) is True else f"--{words}"
+            assert switch in text or field in find_command(name).arguments, (name, switch)
+            if switch.startswith("--no-"):
+                assert f"{switch} Do not " in " ".join(text.split()), (name, switch)
+
+
 def test_help_names_each_imperfection(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("simulate", "--help") == 0
     text = capsys.readouterr().out
@@ -53,7 +71,7 @@ def test_help_names_each_imperfection(capsys: pytest.CaptureFixture[str]) -> Non
 def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("demo", "-o", tmp_path / "demo", "--seed", 2) == 0
     text = capsys.readouterr().out
-    for word in ("left_forearm", "smekf", "ncf", "gdc", "taped", "view.html"):
+    for word in ("left_forearm", "smekf", "ncf", "gdc", "measured", "view.html"):
         assert word in text
     for name in (
         "session/session.toml",
@@ -72,13 +90,14 @@ def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (
-        run("calibrate", session, "--gauge", "shoulder_width=0.35", "--stature", 1.67, "-o", tmp_path / "subject") == 0
+        run("calibrate", session, "--measured", "shoulder_width=0.35", "--stature", 1.67, "-o", tmp_path / "subject")
+        == 0
     )
     said = capsys.readouterr().out
     assert "Palm-to-palm gap" in said
-    assert "Verdict: pass" in said
+    assert "Quality: pass" in said
     assert run("track", session, "--subject", tmp_path / "subject", "-o", tmp_path / "result") == 0
-    assert "at rest" in capsys.readouterr().out
+    assert "static" in capsys.readouterr().out
     assert run("evaluate", tmp_path / "result", tmp_path / "truth.parquet", "--interval", 72, 100) == 0
     assert "right_forearm" in capsys.readouterr().out
     assert run("view", tmp_path / "result", "-o", tmp_path / "page.html", "--no-open") == 0
@@ -94,7 +113,7 @@ def test_without_a_gauge_it_says_whose_scale_it_is(
     assert run("calibrate", session, "-o", tmp_path / "subject") == 3
     said = capsys.readouterr()
     assert "note: no gauge" in said.err
-    assert "Verdict: poor" in said.out
+    assert "Quality: poor" in said.out
 
 
 def test_simulate_is_seeded(tmp_path: Path) -> None:
@@ -107,7 +126,10 @@ def test_simulate_is_seeded(tmp_path: Path) -> None:
 
 def test_simulate_with_mounts_anywhere_is_tracked_with_its_subject(tmp_path: Path) -> None:
     made = tmp_path / "made"
-    assert run("simulate", "-o", made, "--world", "realistic", "--set", "mount=any", "--set", "dropped=0") == 0
+    assert (
+        run("simulate", "-o", made, "--preset", "mild", "--imperfection", "mount=any", "--imperfection", "dropped=0")
+        == 0
+    )
     assert "mount =" not in (made / "session.toml").read_text()
     track_it = ("track", made / "session.toml", "-o", tmp_path / "result")
     assert run(*track_it) == 2
@@ -132,12 +154,12 @@ def test_nothing_is_overwritten_without_force(
 def test_gauges_add_up_and_none_is_given_twice(
     session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    two = ["--gauge", "shoulder_width=0.39", "--gauge", "trunk=0.51"]
+    two = ["--measured", "shoulder_width=0.39", "--measured", "trunk=0.51"]
     assert run("calibrate", session, *two, "-o", tmp_path / "subject") == 0
     subject = (tmp_path / "subject" / "subject.toml").read_text()
     assert "taped: shoulder_width" in subject
     assert "trunk = 0.510" in subject  # the prior gives way to the tape
-    assert run("calibrate", session, *two, "--gauge", "trunk=0.6", "-o", tmp_path / "again") == 2
+    assert run("calibrate", session, *two, "--measured", "trunk=0.6", "-o", tmp_path / "again") == 2
     assert "'trunk' is given twice" in capsys.readouterr().err
 
 
@@ -185,24 +207,31 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
     ("words", "says"),
     [
         (["trak"], "did you mean 'track'?"),
-        (["track"], "Missing from wepose track: SESSION, -o DIR; see: wepose track --help"),
-        (["simulate", "-o", "OUT", "--rate-hz", "fast"], "'fast'; see wepose"),
-        (["simulate", "-o", "OUT", "--wrld", "perfect"], "Perhaps you meant: --world; see wepose"),
-        (["calibrate", "s.toml", "-o", "OUT", "--gauge", "handle=0.4"], "the bar of --protocol handle"),
-        (["track", "s.toml"], "-o"),
-        (["track", "s.toml", "-o", "OUT", "--method", "ekf"], "'smekf'"),
+        (["track"], "wepose track needs SESSION and -o DIR; see wepose track --help"),
+        (["track", "s.toml", "-o"], "-o/--out: expected one argument; see wepose track --help"),
+        (["track", "s.toml", "t.toml", "-o", "OUT"], "'t.toml' is one word too many for wepose track"),
+        (["evaluate", "a", "b", "--interval", "3"], "--interval: expected 2 arguments"),
+        (["simulate", "-o", "OUT", "--rate-hz", "fast"], "--rate-hz: 'fast' is not a number; see wepose simulate"),
+        (["simulate", "-o", "OUT", "--prset", "ideal"], "not an option of wepose simulate; did you mean '--preset'?"),
+        (["calibrate", "s.toml", "-o", "OUT", "--measured", "handle=0.4"], "the bar of --protocol handle"),
+        (["track", "s.toml"], "wepose track needs -o DIR"),
+        (["track", "s.toml", "-o", "OUT", "--method", "ekf"], "--method: 'ekf' is not known; did you mean 'smekf'?"),
         (["track", "nowhere.toml", "-o", "OUT"], "nowhere.toml: no such file"),
-        (["calibrate", "s.toml", "-o", "OUT", "--gauge", "shoulder=0.4"], "did you mean 'shoulder_width'"),
-        (["calibrate", "s.toml", "-o", "OUT", "--gauge", "shoulder_width=wide"], "'wide' is not a number of metres"),
+        (["calibrate", "s.toml", "-o", "OUT", "--measured", "shoulder=0.4"], "did you mean 'shoulder_width'"),
+        (
+            ["calibrate", "s.toml", "-o", "OUT", "--measured", "shoulder_width=wide"],
+            "'wide' is not a number; NAME=METRES",
+        ),
+        (["calibrate", "s.toml", "-o", "OUT", "--measured", "0.4"], "--measured: '0.4': NAME=METRES is needed"),
         (["calibrate", "s.toml", "-o", "OUT", "--stature", "175"], "stature 175 is not a body height"),
         (["evaluate", "nowhere", "truth.csv"], "no pose.parquet in it"),
         (["view", "nowhere"], "no pose.parquet in it"),
         (["simulate", "-o", "OUT", "--rate-hz", "5"], "between 20 and 2000"),
-        (["simulate", "-o", "OUT", "--set", "palm_slide=0"], "palm_slip"),
-        (["simulate", "-o", "OUT", "--set", "palm_slip=much"], "'much' is not a number, as in palm_slip=0"),
-        (["simulate", "-o", "OUT", "--set", "bits=1.5"], "'1.5' is not a whole number"),
-        (["simulate", "-o", "OUT", "--set", "nothing=1"], ", mount"),
-        (["simulate", "-o", "OUT", "--set", "mount=taped"], "there is: stated, any"),
+        (["simulate", "-o", "OUT", "--imperfection", "palm_slide=0"], "palm_slip"),
+        (["simulate", "-o", "OUT", "--imperfection", "palm_slip=much"], "'much' is not a number, as in palm_slip=0"),
+        (["simulate", "-o", "OUT", "--imperfection", "bits=1.5"], "'1.5' is not a whole number"),
+        (["simulate", "-o", "OUT", "--imperfection", "nothing=1"], ", mount"),
+        (["simulate", "-o", "OUT", "--imperfection", "mount=taped"], "there is: stated, any"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(

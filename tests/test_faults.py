@@ -107,10 +107,10 @@ def test_an_export_that_has_no_room_for_its_record_is_none(result: Path, tmp_pat
     from wepose_pin.writers.export import export
 
     with pytest.raises(ExistingOutput), files_of_at_most(40_000):
-        export(result, tmp_path / "a.urdf", made_by={"format": 1, "long": "x" * 50_000})
+        export(result, tmp_path / "a.urdf", provenance={"format": 1, "long": "x" * 50_000})
     assert list(tmp_path.iterdir()) == []
-    export(result, tmp_path / "a.urdf", made_by={"format": 1})
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.urdf", "a.urdf.made_by.json"]
+    export(result, tmp_path / "a.urdf", provenance={"format": 1})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.urdf", "a.urdf.provenance.json"]
 
 
 # Places that cannot be written -------------------------------------------------------------------------------------
@@ -158,8 +158,8 @@ READS = [
     *("track ODD.toml -o OUT", "track ODD.wepose -o OUT", "track SESSION --subject ODD.toml -o OUT"),
     *("track SESSION --model ODD.urdf -o OUT", "track SESSION --model ODD.toml -o OUT", "evaluate ODD SESSION"),
     *("calibrate SESSION --protocol ODD.toml -o OUT", "evaluate RESULT ODD.parquet", "evaluate RESULT ODD.csv"),
-    *("evaluate RESULT ODD.toml", "export ODD -o OUT.csv", "view ODD --no-open", "rerun ODD", "batch ODD.toml -o OUT"),
-    *("validate --from ODD.json", "bench --compare ODD.json", "live --no-page --source replay:ODD.toml"),
+    *("evaluate RESULT ODD.toml", "export ODD -o OUT.csv", "view ODD --no-open", "reproduce ODD"),
+    *("batch ODD.toml -o OUT", "validate --from ODD.json", "live --no-page --source replay:ODD.toml"),
     *("live --no-page --source udp:9 --session ODD.toml", "info ODD.csv", "info ODD.parquet", "info ODD.h5"),
     *("info ODD.mat", "info ODD.mvnx", "info ODD.sto", "info ODD.toml", "info ODD"),
 ]

@@ -29,8 +29,8 @@ from wepose_pin.filters.noise import SensorNoise, noise_of
 from wepose_pin.filters.smekf import starting_params
 from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.readers.trials import read_authors_trial
+from wepose_pin.rotations import quat_from_gravity
 from wepose_pin.simulation import paper_dynamic
-from wepose_pin.so3 import tilt
 
 RATE = 100.0
 GRAVITY = 9.81
@@ -527,7 +527,7 @@ def sensors(
     found = [measured(np.random.default_rng(seed), seconds, bias=(0.01, -0.02, 0.005)) for seed in range(count)]
     gyro, accel, true = (np.stack([sensor[i] for sensor in found], axis=1) for i in range(3))
     noises = [noise_of(gyro[:180, i], accel[:180, i], RATE) for i in range(count)]
-    return gyro, accel, true, noises, [tilt(accel[:50, i].mean(axis=0)) for i in range(count)]
+    return gyro, accel, true, noises, [quat_from_gravity(accel[:50, i].mean(axis=0)) for i in range(count)]
 
 
 def test_a_bank_of_sensors_gives_the_bits_of_each_alone() -> None:
@@ -598,7 +598,7 @@ def test_a_sample_that_is_no_number_does_not_stay(method: str, wrong: float) -> 
     """One in motion, three at rest, one at the very start; batch and sample by sample alike."""
     gyro, accel, _, rest = measured(np.random.default_rng(9), 20.0)
     noise = noise_of(gyro[:180], accel[:180], RATE)
-    start = tilt(accel[:50].mean(axis=0))
+    start = quat_from_gravity(accel[:50].mean(axis=0))
     clean = METHODS[method](noise, RATE, start).run(gyro, accel, rest)
     gyro[[0, 500, 1050, 1051, 1052], [0, 1, 2, 0, 1]] = wrong
     accel[[0, 500, 1100, 1200, 1201], [0, 1, 2, 0, 1]] = wrong
@@ -622,10 +622,10 @@ def test_what_is_unseen_is_in_the_covariance(gap: int) -> None:
         gyro, accel, _, rest = measured(np.random.default_rng(100 + seed), 10.0)
         noise = noise_of(gyro[:180], accel[:180], RATE)
         params = SmekfParams(1e-8, 1e-10)
-        clean = Smekf(noise, RATE, tilt(accel[:50].mean(axis=0)), params).run(gyro, accel, rest)
+        clean = Smekf(noise, RATE, quat_from_gravity(accel[:50].mean(axis=0)), params).run(gyro, accel, rest)
         first = 350 + 5 * seed
         gyro[first : first + gap] = np.nan
-        run = Smekf(noise, RATE, tilt(accel[:50].mean(axis=0)), params).run(gyro, accel, rest)
+        run = Smekf(noise, RATE, quat_from_gravity(accel[:50].mean(axis=0)), params).run(gyro, accel, rest)
         last = first + gap - 1
         error = (Rotation.from_quat(run.quat_WS[last]).inv() * Rotation.from_quat(clean.quat_WS[last])).as_rotvec()
         assert run.attitude_cov is not None

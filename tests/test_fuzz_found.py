@@ -429,7 +429,7 @@ def test_a_byte_order_mark_and_dos_lines(name: str, tmp_path: Path) -> None:
 
 
 def test_a_record_of_what_made_a_result_without_end(tmp_path: Path) -> None:
-    assert "damaged, no JSON" in told("made_by", tmp_path, b"[" * 100_000, BadData)
+    assert "damaged, no JSON" in told("provenance", tmp_path, b"[" * 100_000, BadData)
 
 
 @pytest.mark.parametrize("command", ["batch", "live", "info"])
@@ -441,7 +441,7 @@ def test_a_record_has_no_other_command_run_than_those_that_write_records(command
         "info": {"file": "a.csv", "write": True},
     }[command]
     record = {"format": 1, "command": command, "options": options, "inputs": {}}
-    assert "cannot be made again" in told("made_by", tmp_path, json.dumps(record).encode(), BadData)
+    assert "cannot be made again" in told("provenance", tmp_path, json.dumps(record).encode(), BadData)
 
 
 @pytest.mark.parametrize("name", ["..", ".", "..."])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from wepose_pin import so3
+from wepose_pin import rotations
 from wepose_pin.alignment import Filtered, filtered, heading_to
 from wepose_pin.calibration import calibrate_lengths, lengths
 from wepose_pin.calibration.joints import SYSTEMATIC_STD, Coupling, _felt, _turn, coupled, couplings
@@ -130,7 +130,7 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
             seen = np.isfinite(sensor.quat_VB).all(axis=1) & (time >= 0.0) & (time < min(60.0, clock[-1]))
             R_WS = Rotation.from_quat(found.quat_WV) * Rotation.from_quat(sensor.quat_VB[seen])
             R_WS *= Rotation.from_quat(found.quat_BS)
-            headings = so3.heading((R_WS * Slerp(clock, R_VS[segment])(time[seen]).inv()).as_quat())
+            headings = rotations.heading((R_WS * Slerp(clock, R_VS[segment])(time[seen]).inv()).as_quat())
             psi[segment] = float(np.angle(np.mean(np.exp(1j * headings))))
         sensors = {
             name: Sensor(gyro_S=chain.sensors[mount, name].gyro_S, accel_S=chain.sensors[mount, name].accel_S)

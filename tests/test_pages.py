@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.batch.items import make_items
 from wepose_pin.batch.page import study_page
-from wepose_pin.batch.plan import STEPS, Item, Plan
+from wepose_pin.batch.plan import Item, Plan, step_options
 from wepose_pin.cli import main
 from wepose_pin.recording import Recording, Sensor, check, mount_from_axes
-from wepose_pin.report import track_report, write_thinned_pages
-from wepose_pin.report.thinned import Thinner
+from wepose_pin.report import track_report, write_decimated_pages
+from wepose_pin.report.decimation import Decimator
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import TrackedRecording, track
 from wepose_pin.writers import write_session
@@ -81,7 +81,7 @@ def fails(*_: Any, **__: Any) -> Any:
 # The causes -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [[], ["--pieces", "3"], ["--causal"]])
+@pytest.mark.parametrize("options", [[], ["--chunk-seconds", "3"], ["--causal"]])
 def test_an_arm_that_hangs_throughout_is_tracked(
     session: Path, tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -147,7 +147,7 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("options", [[], ["--pieces", "3"]])
+@pytest.mark.parametrize("options", [[], ["--chunk-seconds", "3"]])
 @pytest.mark.parametrize("broken", BROKEN)
 def test_a_page_that_fails_is_a_warning(
     broken: str,
@@ -177,10 +177,10 @@ def test_a_page_that_fails_is_a_warning(
 
 
 def test_a_recording_in_pieces_whose_pages_cannot_be_gathered(pose: TrackedRecording, tmp_path: Path) -> None:
-    thinner = Thinner(len(pose.time))
-    thinner.add(replace(pose, segments=None))
+    decimator = Decimator(len(pose.time))
+    decimator.add(replace(pose, segments=None))
     (tmp_path / "summary.json").write_text('{"warnings": ["before"]}')
-    (warning,) = write_thinned_pages(tmp_path, thinner, {}, [])
+    (warning,) = write_decimated_pages(tmp_path, decimator, {}, [])
     assert "view.html" in warning
     assert json.loads((tmp_path / "summary.json").read_text())["warnings"] == ["before", warning]
     assert names(tmp_path) == {"summary.json"}
@@ -225,7 +225,7 @@ def test_a_calibration_outlasts_its_report(
 
 def test_an_item_of_a_batch_outlasts_its_pages(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wepose_pin.report.pages.pose_html", fails)
-    steps = {"track": {**STEPS["track"], "method": "ncf"}}
+    steps = {"track": {**step_options("track"), "method": "ncf"}}
     (row,) = make_items([Item(name="one", session=str(session), steps=steps)], str(tmp_path))
     assert row["status"] == "done", row
     assert names(tmp_path / "one" / "track") == RESULT | {"report.html"}

@@ -331,7 +331,7 @@ def test_a_longer_phase_makes_no_better_pose() -> None:
 def test_clasp_with_a_taped_length_is_clasp_with_a_gauge() -> None:
     person, simulation = made("clasp", 4, real=False)
     recording = simulation.recording()
-    with pytest.raises(BadOption, match=r"needs 1 taped length of its chain, as in --gauge shoulder_width=0\.385"):
+    with pytest.raises(BadOption, match=r"needs 1 taped length of its chain, as in --measured shoulder_width=0\.385"):
         calibrate_lengths(recording, protocol="clasp_taped")
     with pytest.raises(BadOption, match="needs 1 taped length"):
         calibrate_lengths(recording, protocol="clasp_taped", gauge={"trunk": 0.5})
@@ -434,9 +434,9 @@ def test_a_protocol_is_simulated_and_calibrated(tmp_path: Path, capsys: pytest.C
 def test_the_command_takes_protocols(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_session(tmp_path, made("handle", 1, real=False)[1].recording())
     asked = ["calibrate", str(tmp_path / "session.toml"), "--protocol", "handle", "-o", str(tmp_path / "out")]
-    assert command(*asked, "--gauge", "handle=0.4") in (0, 3)  # pass or poor
+    assert command(*asked, "--measured", "handle=0.4") in (0, 3)  # pass or poor
     assert "scale taped: handle" in (tmp_path / "out" / "subject.toml").read_text()
-    assert command(*asked, "--force", "--gauge", "bar=0.4") == 2
+    assert command(*asked, "--force", "--measured", "bar=0.4") == 2
     assert "'bar' is not a length" in capsys.readouterr().err
     asked[3] = "hande"
     assert command(*asked, "--force") == 2

@@ -13,7 +13,7 @@ import pytest
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
-from wepose_pin import load_session, so3
+from wepose_pin import load_session, rotations
 from wepose_pin.cli import main
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.readers import iter_session
@@ -76,7 +76,7 @@ def write(
 def rotation_error_deg(sensor: Sensor, time: np.ndarray) -> np.ndarray:
     """Angle between the integrated gyroscope and the truth, at each time."""
     assert sensor.gyro_S is not None
-    turned = Rotation.from_quat(so3.integrate(sensor.gyro_S[1:] * np.diff(time)[:, None]))
+    turned = Rotation.from_quat(rotations.integrate(sensor.gyro_S[1:] * np.diff(time)[:, None]))
     truth = true_orientation(time)
     return np.degrees(((truth[0] * turned).inv() * truth).magnitude())
 
@@ -230,7 +230,7 @@ def test_gaps_at_both_ends_keep_the_nearest_value() -> None:
     marks = lost_samples(clock, good)
     assert marks.tolist() == [BRIDGED] * 2 + [0] * 7 + [BRIDGED]
     assert bridge(values, marks, clock)[:, 0].tolist() == [2.0, 2.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 8.0]
-    quat = so3.exp(values * [0.0, 0.0, 0.1])
+    quat = rotations.exp(values * [0.0, 0.0, 0.1])
     np.testing.assert_array_equal(bridge_quat(quat, marks, clock)[[0, 1, 9]], quat[[2, 2, 8]])
 
 
@@ -316,7 +316,7 @@ def test_resampling_beats_taking_the_rate_for_even(tmp_path: Path) -> None:
     assert "the rate changes by up to" in recording.notes[0]
     assert rotation_error_deg(recording.sensors["torso"], recording.time).max() < 0.1
     even = Sensor(gyro_S=table[SIGNALS["gyro"]].to_numpy(), accel_S=table[SIGNALS["accel"]].to_numpy())
-    taken = Rotation.from_quat(so3.integrate(even.gyro_S[1:] * np.diff(time).mean()))
+    taken = Rotation.from_quat(rotations.integrate(even.gyro_S[1:] * np.diff(time).mean()))
     assert np.degrees((taken.inv() * true_orientation(time)).magnitude()).max() > 10.0
 
 
@@ -475,7 +475,7 @@ def test_a_slow_peak_of_a_coarse_sensor_is_no_saturation() -> None:
     time = np.arange(8000) / 1000.0
     gyro_S = np.zeros((8000, 3))
     gyro_S[:, 1] = np.round(3.0 * np.sin(2.0 * time), 3)
-    quat = so3.integrate(gyro_S[1:] / 1000.0)
+    quat = rotations.integrate(gyro_S[1:] / 1000.0)
     sensor = Sensor(gyro_S=gyro_S, accel_S=Rotation.from_quat(quat).inv().apply([0.0, 0.0, 9.81]))
     assert sensor_notes(Recording("r", time, 1000.0, {"torso": sensor})) == ()
 

@@ -13,8 +13,8 @@ import wepose_pin
 
 PACKAGE = Path(wepose_pin.__file__).parent
 ORDER = (
-    "errors arguments so3 assets recording readers subject filters model alignment pose calibration "
-    "tracking simulation evaluation angles writers retargeting report live validation batch bench cli"
+    "errors arguments compilation rotations assets recording readers subject filters model alignment pose "
+    "calibration tracking simulation evaluation angles writers retargeting report live validation jobs batch bench cli"
 ).split()
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if "_assets" not in path.parts)
 
@@ -51,7 +51,7 @@ def test_a_room_imports_only_from_above(path: Path) -> None:
 def test_the_walk_sees_lazy_and_relative_imports() -> None:
     source = "def f():\n    from ..report import x\n    import wepose_pin.cli\n    from .. import batch\n"
     assert imported_rooms(source, ["filters"]) == {"report", "cli", "batch"}
-    assert imported_rooms("from .static import X\nfrom . import so3", []) == {"static", "so3"}
+    assert imported_rooms("from .subject import X\nfrom . import rotations", []) == {"subject", "rotations"}
 
 
 def test_the_facade_knows_where_everything_is() -> None:

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_bad_input import refused
 
-from wepose_pin import load_session, so3
+from wepose_pin import load_session, rotations
 from wepose_pin.alignment import START_POSE_STD
 from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.filters.noise import quietest
@@ -121,7 +121,7 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
     whole, level = made.recording("cut"), np.deg2rad(120.0)
     gyro_S = whole.sensors[BROKEN].gyro_S
     fast = 4.0 * (gyro_S - gyro_S[50:450].mean(axis=0))
-    turned = Rotation.from_quat(so3.integrate(fast[1:] / RATE))
+    turned = Rotation.from_quat(rotations.integrate(fast[1:] / RATE))
     accel = turned.inv().apply(whole.sensors[BROKEN].accel_S[0])
     accel += 0.01 * np.random.default_rng(0).standard_normal(accel.shape)
     path = written(tmp_path / "in", with_sensor(whole, BROKEN, gyro_S=np.clip(fast, -level, level), accel_S=accel))

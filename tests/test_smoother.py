@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_amekf import RATE, Case, case, cov, errors, run, tilt_deg
 
-from wepose_pin import so3
+from wepose_pin import rotations
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import METHODS, OFFLINE, Amekf, AmekfParams, Smoother
 from wepose_pin.filters.amekf import STATES, TAPE, TAPE_FIRST, TAPE_LENGTH, TAPE_MEASURED, TAPE_STEP, transition_rows
@@ -72,7 +72,7 @@ def test_a_rest_at_the_end_tells_the_bias_of_the_beginning() -> None:
         unknown = replace(
             of.noise, gyro_bias=true_bias + np.array([0.01, -0.01, 0.005]), gyro_bias_cov=1e-4 * np.eye(3)
         )
-        of = of._replace(noise=unknown, start=so3.tilt(of.accel[:50].mean(axis=0)))
+        of = of._replace(noise=unknown, start=rotations.quat_from_gravity(of.accel[:50].mean(axis=0)))
         forward, smoothed = run(of), run(of, kind=Smoother)
         wrong = [np.abs(found.gyro_bias[100] - true_bias).max() for found in (forward, smoothed)]
         assert wrong[1] < 3e-4

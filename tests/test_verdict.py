@@ -146,7 +146,7 @@ def test_without_a_gauge_the_scale_is_the_average_persons(anywhere: Simulation, 
     assert verdict.grade == "poor"
     assert [f.name for f in verdict.reasons] == ["scale"]
     assert "nothing was taped" in verdict.reasons[0].said
-    assert "--gauge shoulder_width" in verdict.reasons[0].do
+    assert "--measured shoulder_width" in verdict.reasons[0].do
 
 
 def test_a_tape_that_contradicts_all_else_is_named_once(anywhere: Simulation, person: Person) -> None:
@@ -287,7 +287,7 @@ def test_exit_code_and_file_carry_the_verdict(
     write_session(tmp_path, anywhere.recording("made"))
     taped = f"shoulder_width={person.taped['shoulder_width']:.4f}"
     words = ["--stature", f"{person.stature:.3f}", "--sex", person.sex]
-    for options, grade, code in ((["--gauge", taped], "pass", 0), ([], "poor", 3)):
+    for options, grade, code in ((["--measured", taped], "pass", 0), ([], "poor", 3)):
         with pytest.raises(SystemExit) as stop:
             main(["calibrate", "session.toml", "-o", grade, *words, *options])
         assert int(stop.value.code or 0) == code

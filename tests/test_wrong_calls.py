@@ -206,7 +206,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "names": NAME,
         "rate_hz": POSITIVE,
         "force": (*FLAG, None),
-        "made_by": ("x", 3, []),
+        "provenance": ("x", 3, []),
     },
     "retarget": {
         "pose": (*THING, None),

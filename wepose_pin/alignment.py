@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from . import so3
+from . import rotations
 from .errors import BadSession
 from .filters import Orientation
 from .filters.sensors import FilteredRecording, sensor_rotations
@@ -224,7 +224,7 @@ def orient_segments(
 
 def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
     """ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
-    return float(so3.heading((R_WS * R_VS.inv()).as_quat()))
+    return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
 
 
 def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:

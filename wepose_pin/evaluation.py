@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from . import so3
+from . import rotations
 from .arguments import check_arguments
 from .errors import BadData, BadOption
 from .pose import Pose
@@ -161,7 +161,7 @@ def attitude_error(estimated: Rotation, true: Rotation, time: np.ndarray) -> Att
     """Attitude error of n orientations in W at `time` (n,) [s]."""
     error = estimated * true.inv()
     yaw, pitch, roll = np.abs(error.as_euler("ZYX", degrees=True)).T
-    heading = np.degrees(np.unwrap(so3.heading(error.as_quat())))
+    heading = np.degrees(np.unwrap(rotations.heading(error.as_quat())))
     inclination = np.degrees(np.arccos(np.clip(error.as_matrix()[:, 2, 2], -1.0, 1.0)))
     slope = np.polyfit(time - time[0], heading, 1)[0] if np.ptp(time) > 0.0 else 0.0
     return AttitudeError(

@@ -10,13 +10,14 @@ import pinocchio as pin
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from . import so3
+from . import rotations
 from .arguments import check_array, check_covariance, check_fields, check_finite, check_names, check_unit
+from .compilation import kernel
 from .errors import BadData, BadModel, one_of
 from .model import POINTS, BodyModel, chains
 from .model.follow import Follower, groups
 from .recording import EACH_TIME, SEGMENTS, check_time
-from .so3 import kernel
+from .rotations import product
 from .subject import LENGTHS
 
 _WILD = 1e12  # beyond this a number in a table is no time [s] and no place [m]
@@ -110,7 +111,7 @@ class Poser:
         q = self._follower.run(quat_WL, go_on=True)
         _, p_W = forward_kinematics(self._model, q, [POINTS[point] for point in self._points], rotations=False)
         points = {point: p_W[:, k] for k, point in enumerate(self._points)}
-        quats = {name: so3.continuous(quat, self._last.get(name)) for name, quat in quat_WL.items()}
+        quats = {name: rotations.unwrap_signs(quat, self._last.get(name)) for name, quat in quat_WL.items()}
         self._last = {name: quat[-1].copy() for name, quat in quats.items()}
         return Pose(time, quats, points, q)
 
@@ -290,10 +291,7 @@ def relative(quat, row, above, q, at):  # type: ignore[no-untyped-def]
     ax, ay, az, aw = 0.0, 0.0, 0.0, 1.0
     if above >= 0:
         ax, ay, az, aw = -quat[above, 0], -quat[above, 1], -quat[above, 2], quat[above, 3]
-    x = aw * bx + ax * bw + ay * bz - az * by
-    y = aw * by - ax * bz + ay * bw + az * bx
-    z = aw * bz + ax * by - ay * bx + az * bw
-    w = aw * bw - ax * bx - ay * by - az * bz
+    x, y, z, w = product(ax, ay, az, aw, bx, by, bz, bw)
     scale = 1.0 / np.sqrt(x * x + y * y + z * z + w * w)
     q[at], q[at + 1], q[at + 2], q[at + 3] = x * scale, y * scale, z * scale, w * scale
 
@@ -303,7 +301,7 @@ def placements(model: BodyModel, q: np.ndarray, links: Iterable[str]) -> dict[st
     links = list(links)
     R, p = forward_kinematics(model, q, links)
     quat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat().reshape(len(q), len(links), 4)
-    return {link: (so3.continuous(quat[:, k]), p[:, k]) for k, link in enumerate(links)}
+    return {link: (rotations.unwrap_signs(quat[:, k]), p[:, k]) for k, link in enumerate(links)}
 
 
 # Confidence --------------------------------------------------------------------------------------------------------

@@ -39,9 +39,9 @@ EXPORTS: tuple[tuple[str, tuple[str, ...]], ...] = (
 ACCEPTED = {"calibrate": (0, 3, 4), "retarget": (0, 3)}  # exit codes beside 0 with which files are written
 
 # Files of a result whose numbers are not compared: pages, and what tells where, when and by what it was made.
-NOT_COMPARED = ("*.html", "*.md", "*.png", "made_by.json", "*.made_by.json")
+NOT_COMPARED = ("*.html", "*.md", "*.png", "provenance.json", "*.provenance.json")
 # Keys, of JSON or of ours, whose numbers differ from run to run: times, versions, dates.
-VOLATILE = r"(^|/)(made_by|versions|packages|machine|date|solve_ms)(/|$)"
+VOLATILE = r"(^|/)(provenance|versions|packages|machine|date|solve_ms)(/|$)"
 MAIN_TABLES = ("pose",)  # files whose columns stand under the result's own key
 
 # Where the inputs of an older version are read: what has another name now. Pattern → replacement, line by line of its
@@ -220,7 +220,7 @@ def run(argv: list[str]) -> Outcome:
 
 def calibrate(session: Path, out: Path, *, method: str, protocol: str, known: Mapping[str, Any]) -> list[str]:
     argv = ["calibrate", str(session), "-o", str(out), "--method", method, "--protocol", protocol]
-    argv += [part for name, value in known.get("measured", {}).items() for part in ("--gauge", f"{name}={value!r}")]
+    argv += [part for name, value in known.get("measured", {}).items() for part in ("--measured", f"{name}={value!r}")]
     argv += ["--stature", str(known["stature"]), "--sex", known["sex"]] if "stature" in known else []
     return argv
 
@@ -238,7 +238,8 @@ def track(
     argv = ["track", str(session), "-o", str(out), "--method", method, "--no-report"]
     argv += ["--subject", str(subject)] if subject else []
     argv += ["--model", str(model)] if model else []
-    return argv + [part for name in options for part in (["--pieces", "10"] if name == "chunks" else [f"--{name}"])]
+    words = {"chunks": ["--chunk-seconds", "10"]}
+    return argv + [word for name in options for word in words.get(name, [f"--{name}"])]
 
 
 def track_live_recording(file: Path, out: Path) -> list[str]:
@@ -260,9 +261,8 @@ def retarget(result: Path, out: Path, *, robot: str, options: Iterable[str] = ()
 
 
 def simulate(out: Path, *, seed: int, preset: str, protocol: str, changes: Iterable[str] = ()) -> list[str]:
-    world = {"ideal": "perfect", "mild": "realistic"}[preset]
-    argv = ["simulate", "-o", str(out), "--seed", str(seed), "--world", world, "--protocol", protocol]
-    return argv + [part for change in changes for part in ("--set", change)]
+    argv = ["simulate", "-o", str(out), "--seed", str(seed), "--preset", preset, "--protocol", protocol]
+    return argv + [part for change in changes for part in ("--imperfection", change)]
 
 
 def info(file: Path, session: Path) -> list[str]:

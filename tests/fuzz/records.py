@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import inspect
 import io
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from unittest import mock
 
 from . import seeds
 from .target import file
 
-RERUN = ("track", "calibrate", "simulate", "retarget", "demo", "export")
+REPRODUCED = ("track", "calibrate", "simulate", "retarget", "demo", "export")
 
 
 def plan(folder: Path, data: bytes) -> object:
@@ -61,11 +60,11 @@ def _silently(do: Callable[[], object]) -> None:
 
 
 def _validation(path: Path) -> object:
-    from wepose_pin.cli import _validation_tables
+    from wepose_pin.cli.validate import print_experiments
     from wepose_pin.validation import read_document
 
     found = read_document(path)
-    _silently(lambda: _validation_tables(found))
+    _silently(lambda: print_experiments(found))
     return found
 
 
@@ -80,28 +79,10 @@ validation = file("validation.json", _validation)
 bench = file("before.json", _bench)
 
 
-@functools.cache
-def _commands(made: Path) -> dict[str, Callable[..., None]]:
-    """The commands as `wepose rerun` sees them, of their own signatures; each takes a second file for what it made."""
-    from wepose_pin.cli import COMMANDS
-
-    def stub(name: str) -> Callable[..., None]:
-        def run(*first: Any, out: Any = None, **options: Any) -> None:
-            signature.bind(*first, out=out, **options)
-            if name not in RERUN:
-                raise AssertionError(f"a result's record had `wepose {name}` run")
-            shutil.copytree(made, out)
-
-        signature = inspect.signature(COMMANDS[name])
-        run.__signature__ = signature  # type: ignore[attr-defined]
-        return run
-
-    return {name: stub(name) for name in COMMANDS}
-
-
-def made_by(folder: Path, data: bytes) -> object:
-    """The input is what a result says made it; made again it is another."""
-    from wepose_pin.batch.rerun import rerun
+def provenance(folder: Path, data: bytes) -> object:
+    """The input is what a result says made it; what would make it again copies another."""
+    from wepose_pin.batch import reproduce
+    from wepose_pin.jobs.reproduce import ReproduceJob
 
     result, made = folder / "result", folder / "made"
     for place in (result, made):
@@ -109,20 +90,29 @@ def made_by(folder: Path, data: bytes) -> object:
             place.mkdir()
             (place / "pose.parquet").write_bytes(seeds.pose())
     (folder / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
-    (result / "made_by.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
-    return rerun(result, _commands(made))
+    (result / "provenance.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
+    copies = {name: (kind, lambda job: shutil.copytree(made, job.out)) for name, (kind, _) in _reproducible().items()}
+    with mock.patch.dict(reproduce.REPRODUCIBLE, copies):
+        return reproduce.run_reproduce(ReproduceJob(result))
+
+
+def _reproducible() -> dict[str, tuple[type, Callable[..., object]]]:
+    from wepose_pin.batch.reproduce import REPRODUCIBLE
+
+    assert set(REPRODUCIBLE) == set(REPRODUCED), "a stranger's record runs only what makes a result"
+    return REPRODUCIBLE
 
 
 def done(folder: Path, data: bytes) -> object:
     """The input is what an item of a batch says made it; read as batch does before it makes it again."""
     from wepose_pin.batch.items import _changed, _done, item_of
-    from wepose_pin.batch.rerun import _of_item
+    from wepose_pin.batch.reproduce import _item_provenance
 
     (folder / "item").mkdir(exist_ok=True)
     (folder / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
     (folder / "item" / "done.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
     found = _done(str(folder / "item"))
-    item = item_of(_of_item(folder / "item"))
+    item = item_of(_item_provenance(folder / "item"))
     return None if found is None else _changed(item, "", found)
 
 

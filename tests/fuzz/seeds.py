@@ -297,7 +297,7 @@ files = ["*/session.toml"]
 file = "anna.toml"
 stature = 1.7
 sex = "f"
-gauge = { shoulder_width = 0.385 }
+measured = { shoulder_width = 0.385 }
 [steps.calibrate]
 protocol = "clasp"
 method = "amekf"
@@ -312,13 +312,13 @@ formats = ["trc", "mot"]
 [steps.evaluate]
 interval = [1.0, 2.0]
 """
-PLAN_TABLE = b"""session,name,subject,truth,stature,sex,gauge.shoulder_width
+PLAN_TABLE = b"""session,name,subject,truth,stature,sex,measured.shoulder_width
 one,first,anna,truth.parquet,1.7,f,0.385
 two,second,,,,,
 """
 
 
-def made_by() -> bytes:
+def provenance() -> bytes:
     block = {
         **{"format": 1, "command": "track", "version": "0.1.0", "commit": None, "code": "0", "machine": "a"},
         "options": {"method": None, "causal": False, "subject": None, "limits": True},
@@ -329,11 +329,11 @@ def made_by() -> bytes:
 
 
 def done() -> bytes:
-    body = {"stature": 1.7, "sex": "f", "gauge": {"shoulder_width": 0.385}}
+    body = {"stature": 1.7, "sex": "f", "measured": {"shoulder_width": 0.385}}
     options = {"name": "item", "subject": None, "body": body, "steps": {"track": {"method": "amekf"}}}
     files = {"path": "FOLDER/session.toml", "files": {"session.toml": session_hash()}}
     block = {"format": 1, "command": "batch item", "options": options, "inputs": {"session": files}}
-    return json.dumps({"key": "", "made_by": block, "stamps": {"session": {}}, "row": {"item": "item"}}).encode()
+    return json.dumps({"key": "", "provenance": block, "stamps": {"session": {}}, "row": {"item": "item"}}).encode()
 
 
 def session_hash() -> str:

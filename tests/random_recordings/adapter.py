@@ -30,7 +30,7 @@ from .sensors import DEG, GRAVITY
 CODES = {"calibrate": {0, 2, 3, 4}, "batch": {0, 2, 3}, "reproduce": {0, 2, 3}}
 USUAL_CODES = {0, 2}
 ACCEPTED = {"calibrate": {0, 3, 4}}
-COMMANDS = {"reproduce": "rerun"}  # ours → the project's, where they differ
+COMMANDS: dict[str, str] = {}  # ours → the project's, where they differ
 NO_COVARIANCE = ("ncf", "gdc")  # methods that state no uncertainty
 EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet", "out.urdf")
 HAND_POINTS = {"left_palm": "left_hand", "right_palm": "right_hand"}  # our point → the project's
@@ -159,7 +159,8 @@ def rounded(values: np.ndarray, digits: int) -> np.ndarray:
 
 
 def calibrate(session: Path, out: Path, case: Case) -> list[str]:
-    taped = [part for name, value in case.taped.items() if name != "stature" for part in ("--gauge", f"{name}={value}")]
+    lengths = {name: value for name, value in case.taped.items() if name != "stature"}
+    taped = [part for name, value in lengths.items() for part in ("--measured", f"{name}={value}")]
     if "stature" in case.taped:
         taped += ["--stature", str(case.taped["stature"]), "--sex", case.person.sex]
     method = [] if case.method == "amekf" else ["--method", case.method]
@@ -180,7 +181,7 @@ def track(
     argv += [f"--{name}" for name in ("covariance", "causal", "torques", "no-limits") if name in options]
     argv += [] if "report" in options else ["--no-report"]
     argv += ["--subject", str(subject)] if subject else []
-    return argv + (["--pieces", f"{chunk:g}"] if chunk else [])
+    return argv + (["--chunk-seconds", f"{chunk:g}"] if chunk else [])
 
 
 def _gaps(options: Iterable[str]) -> list[str]:
@@ -204,7 +205,7 @@ def info(file: Path, session: Path | None = None) -> list[str]:
 
 
 def reproduce(result: Path) -> list[str]:
-    return ["rerun", str(result)]
+    return ["reproduce", str(result)]
 
 
 def retarget(result: Path, out: Path) -> list[str]:

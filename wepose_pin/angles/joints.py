@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..arguments import check_arguments
 from ..errors import BadData, BadOption, one_of
-from ..model.chains import conjugate, multiply
 from ..pose import Pose
 from ..recording import AXES
+from ..rotations import conjugate, multiply
 from . import euler
 
 # Where the ISB's axes X, Y, Z of a segment point in our frame of it. X is forward (of a forearm and a hand: to the side
@@ -172,7 +172,7 @@ def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngl
         gimbal < near_lock,
         gap,
         None if std is None else _at(known, std, n),
-        _at(known, so3.continuous(quat), n),
+        _at(known, rotations.unwrap_signs(quat), n),
     )
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from ..model.chains import conjugate, multiply
+from ..rotations import conjugate, multiply
 from .joints import Angles, JointAngles
 
 # Rates are means over this time [s], to the nearest whole number of samples: noise of the orientation is divided by it,

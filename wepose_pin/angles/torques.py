@@ -19,6 +19,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from ..errors import BadData, BadModel, BadOption
 from ..model import chains
+from ..rotations import unwrap_signs
 from ..tracking import TrackedRecording
 
 CUTOFF_HZ = 6.0  # usual for the motion of limbs
@@ -136,9 +137,7 @@ def _continuous(model: pin.Model, q: np.ndarray) -> np.ndarray:
     for joint in range(1, model.njoints):
         first, n = model.idx_qs[joint], model.nqs[joint]
         if n == 4:
-            quat = q[:, first : first + 4]
-            flip = np.cumprod(np.where(np.einsum("ni,ni->n", quat[1:], quat[:-1]) < 0.0, -1.0, 1.0))
-            q[1:, first : first + 4] *= flip[:, None]
+            q[:, first : first + 4] = unwrap_signs(q[:, first : first + 4])
         elif n == 1 and "Prismatic" not in model.joints[joint].shortname():
             q[:, first] = np.unwrap(q[:, first])
     return q

@@ -13,9 +13,9 @@ import polars as pl
 from ..readers.tables import read_table
 from .storage import DONE
 
-# Pages are made from the tables beside them; blocks of provenance hold where inputs lie.
+# Pages are made from the tables beside them; provenance holds where inputs lie.
 _PAGES = (".html", ".png")
-_APART = ("made_by", "versions", "session", "solve_ms")  # keys of records that say where, by what, and how fast
+_APART = ("provenance", "versions", "session", "solve_ms")  # keys of records that say where, by what, and how fast
 _MOST = 5  # differences told of a file
 
 
@@ -39,7 +39,7 @@ def _files(folder: Path) -> Iterator[Path]:
             path.is_file()
             and not hidden
             and path.suffix not in _PAGES
-            and not path.name.endswith(("made_by.json", DONE))
+            and not path.name.endswith(("provenance.json", DONE))
         ):
             yield path
 

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import BadData, ExistingOutput, WeposeError
-from ..writers.provenance import code, file_hashes, made_by
+from ..writers.provenance import code, collect_provenance, file_hashes
 from .plan import Item
-from .steps import Given, Work
+from .steps import ItemFiles, ItemSteps
 from .storage import DONE, fetch, is_remote, new_folder, read_bytes, stamps
 
 COMMAND = "batch item"
@@ -105,15 +105,15 @@ def make_item(item: Item, place: str, force: bool = False) -> Row:
     begun = time.perf_counter()
     with new_folder(target) as folder:
         stamped = _stamps(item)  # before anything is read: what changes meanwhile is seen the next time
-        row, block = make_into(folder, item)
+        row, provenance = make_into(folder, item)
         row |= {"seconds": time.perf_counter() - begun, "memory_mb": _most_memory()}
-        content = {"key": key, "made_by": block, "stamps": stamped, "row": row}
+        content = {"key": key, "provenance": provenance, "stamps": stamped, "row": row}
         (folder / DONE).write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
     return row | {"status": MADE, "kept": False}
 
 
 def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
-    """The item's steps into an existing folder: its columns of the table, and the block that says what made it.
+    """The item's steps into an existing folder: its columns of the table, and its provenance.
 
     Raises
     ------
@@ -125,15 +125,15 @@ def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
             name: fetch(url, Path(fetched), name == "session" and "evaluate" in item.steps)
             for name, url in _inputs(item).items()
         }
-        block = _block(item, local)
-        given = Given(folder, local["session"], local.get("subject_file"), local.get("truth"), item.body, block)
-        work, row, took = Work(given), Row(), Row()
+        provenance = _provenance(item, local)
+        files = ItemFiles(folder, local["session"], local.get("subject_file"), local.get("truth"))
+        steps, row, took = ItemSteps(files, item.body, provenance), Row(), Row()
         for step, options in item.steps.items():
             begun = time.perf_counter()
-            row |= work.run(step, options)
+            row |= steps.run(step, options)
             took[f"{step}_s"] = time.perf_counter() - begun
     pages = [f"{step}/{page}" for step in reversed(list(item.steps)) for page in PAGES]
-    return row | {"page": next((page for page in pages if (folder / page).is_file()), None)} | took, block
+    return row | {"page": next((page for page in pages if (folder / page).is_file()), None)} | took, provenance
 
 
 def _most_memory() -> float:
@@ -153,18 +153,19 @@ def key_of(item: Item) -> str:
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 
-def item_of(block: Mapping[str, Any]) -> Item:
-    """The item that a block of provenance tells of.
+def item_of(provenance: Mapping[str, Any]) -> Item:
+    """The item that a provenance tells of.
 
     Raises
     ------
     BadData
-        The block is of something else, or damaged.
+        It is of something else, or damaged.
     """
     from .plan import Body
 
     try:
-        about, paths = block["options"], {name: entry["path"] for name, entry in block["inputs"].items()}
+        about = provenance["options"]
+        paths = {name: entry["path"] for name, entry in provenance["inputs"].items()}
         steps = {
             step: {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
             for step, options in about["steps"].items()
@@ -172,7 +173,7 @@ def item_of(block: Mapping[str, Any]) -> Item:
         known = {name: paths.get(name) for name in ("subject_file", "truth")}
         return Item(about["name"], paths["session"], steps, about["subject"], **known, body=Body(**about["body"]))
     except (KeyError, TypeError, AttributeError) as error:
-        raise BadData(f"made_by: not that of a batch's item: {type(error).__name__} {error}") from None
+        raise BadData(f"provenance: not that of a batch's item: {type(error).__name__} {error}") from None
 
 
 def _inputs(item: Item) -> dict[str, str]:
@@ -186,19 +187,19 @@ def _inputs(item: Item) -> dict[str, str]:
     return {name: url for name, url in named.items() if url is not None}
 
 
-def _block(item: Item, local: Mapping[str, Path]) -> dict[str, Any]:
-    """Provenance; inputs by where they lie, not by where they were fetched to."""
+def _provenance(item: Item, local: Mapping[str, Path]) -> dict[str, Any]:
+    """Inputs are named by where they lie, not by where they were fetched to."""
     truth = "evaluate" in item.steps
     options = {"name": item.name, "subject": item.subject, "body": asdict(item.body), "steps": dict(item.steps)}
-    block = made_by(COMMAND, options)
-    block["inputs"] = {
+    provenance = collect_provenance(COMMAND, options)
+    provenance["inputs"] = {
         name: {
             "path": url if is_remote(url) else str(Path(url).absolute()),
             "files": file_hashes(local[name], truth and name == "session"),
         }
         for name, url in _inputs(item).items()
     }
-    return block
+    return provenance
 
 
 def _stamps(item: Item) -> dict[str, Any]:
@@ -215,13 +216,13 @@ def _done(target: str) -> dict[str, Any] | None:
         done = json.loads(content)
     except ValueError:
         return None
-    whole = isinstance(done, dict) and all(isinstance(done.get(key), dict) for key in ("made_by", "stamps", "row"))
+    whole = isinstance(done, dict) and all(isinstance(done.get(key), dict) for key in ("provenance", "stamps", "row"))
     return done if whole else None
 
 
 def _changed(item: Item, key: str, done: Mapping[str, Any]) -> str | None:
     """What has changed since an item was done; None: nothing."""
-    was, now = done["made_by"], code()
+    was, now = done["provenance"], code()
     if was.get("code") != now["code"]:
         return f"other code, version {was.get('version')}" + (f" ({was['commit']})" if was.get("commit") else "")
     if done.get("key") != key:

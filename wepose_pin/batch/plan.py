@@ -10,34 +10,35 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ..errors import BadData, BadPlan, BadSession, MissingFile, WeposeError, one_of
-from ..filters import BEST, METHODS
-from ..readers.keys import Keys, is_number, read_toml
+from ..arguments import check_value
+from ..errors import BadData, BadOption, BadPlan, BadSession, WeposeError, one_of
+from ..jobs.calibrate import CalibrateJob
+from ..jobs.evaluate import EvaluateJob
+from ..jobs.export import ExportJob
+from ..jobs.fields import REQUIRED, build_job, convert_value, field_defaults, field_types
+from ..jobs.retarget import RetargetJob
+from ..jobs.track import TrackJob
+from ..readers.keys import Keys, read_toml
 from ..readers.tables import read_table
 from ..subject import LENGTHS, average_subject
 from .storage import find, is_remote
 
 SESSION = "session.toml"
-REQUIRED = object()
-# Step → option → its default, in the order in which they run. Those of the commands of the same name.
-STEPS: dict[str, dict[str, Any]] = {
-    "calibrate": {"protocol": "clasp", "method": BEST, "gaps": False, "report": True},
-    "track": {
-        **{"method": BEST, "causal": False, "gaps": False, "covariance": False, "limits": True, "torques": False},
-        **{"model": None, "view": True, "report": True},
-    },
-    "retarget": {
-        **{"robot": REQUIRED, "arm": None, "rate_hz": 100.0, "task": "both", "scale": None, "smoothing_hz": 6.0},
-        **{"strict": False, "view": True},
-    },
-    "export": {"formats": REQUIRED, "names": None, "rate_hz": None},
-    "evaluate": {"interval": None},
+# Step → the job of the command of the same name, whose options it takes; in the order in which they run.
+STEPS: dict[str, type] = {
+    "calibrate": CalibrateJob,
+    "track": TrackJob,
+    "retarget": RetargetJob,
+    "export": ExportJob,
+    "evaluate": EvaluateJob,
 }
-_FILES = ("model", "protocol", "robot")  # options that may name a file beside the plan
-_NUMBERS = ("scale", "rate_hz")  # of those without a default
-_CHOICES = {"method": METHODS, "arm": ("left", "right", "both"), "task": ("both", "position", "orientation")}
+# What an item's session and subject fill in.
+_PATHS = ("session", "out", "result", "truth")
+_FILLED = (*_PATHS, "subject", "measured", "stature", "sex", "force")
+_MAY_BE_FILES = ("protocol", "robot")  # a name, or a file beside the plan
+_FORMATS = "formats"  # of export: a list in place of --format
 _COLUMNS = ("session", "name", "subject", "truth", "stature", "sex")
-_GAUGE = "gauge."
+_MEASURED = "measured."
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Body:
 
     stature: float | None = None
     sex: str | None = None
-    gauge: Mapping[str, float] = field(default_factory=dict)
+    measured: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -104,12 +105,12 @@ def _plan(path: Path, items_at: str) -> Plan:
     top = Keys(read_toml(path, "a plan"), str(path))
     top.allow("name", "sessions", "subjects", "steps")
     steps = _steps(top, path.parent)
-    gauges = (*LENGTHS, *_distances(steps))
-    subjects = {name: _subject(keys, path, gauges) for name, keys in _named(top)}
+    lengths = (*LENGTHS, *_distances(steps))
+    subjects = {name: _subject(keys, path, lengths) for name, keys in _named(top)}
     found = [
         _tied(path, entry, steps, subjects, items_at)
         for at, keys in _entries(top, path)
-        for entry in _sessions(at, keys, path, gauges)
+        for entry in _sessions(at, keys, path, lengths)
     ]
     if not found:
         raise BadPlan(f"{path}: sessions: no session at all; files or table are needed")
@@ -132,18 +133,25 @@ def _plan(path: Path, items_at: str) -> Plan:
 # Steps ---------------------------------------------------------------------------------------------------------------
 
 
+def step_options(step: str) -> dict[str, Any]:
+    """Option → default of a step, as a plan's table may have it; `REQUIRED` where it needs one."""
+    defaults = field_defaults(STEPS[step])
+    named = {_FORMATS: REQUIRED} if "format" in defaults else {}
+    return named | {name: value for name, value in defaults.items() if name not in (*_FILLED, "format")}
+
+
 def _steps(top: Keys, folder: Path) -> dict[str, dict[str, Any]]:
     table = top.table("steps")
     table.allow(*STEPS)
     if not table.values:
         raise BadPlan(f"{top.at('steps')}: no step; {one_of(STEPS)}")
     steps: dict[str, dict[str, Any]] = {}
-    for step, known in STEPS.items():  # in the order in which they run, however they are written
+    for step in STEPS:  # in the order in which they run, however they are written
         if step not in table:
             continue
-        keys = table.table(step)
-        keys.allow(*known)
-        steps[step] = {name: _option(keys, name, default, folder) for name, default in known.items()}
+        keys, options = table.table(step), step_options(step)
+        keys.allow(*options)
+        steps[step] = {name: _option(keys, step, name, default, folder) for name, default in options.items()}
         _check(step, steps[step], keys)
     for step in ("retarget", "export", "evaluate"):
         if step in steps and "track" not in steps:
@@ -151,68 +159,54 @@ def _steps(top: Keys, folder: Path) -> dict[str, dict[str, Any]]:
     return steps
 
 
-def _option(keys: Keys, name: str, default: Any, folder: Path) -> Any:
+def _option(keys: Keys, step: str, name: str, default: Any, folder: Path) -> Any:
+    """The value of an option as JSON holds it."""
     if name not in keys:
         if default is REQUIRED:
             raise BadPlan(f"{keys.at(name)} is missing")
         return default
     value = keys.values[name]
-    if name == "formats":
-        from ..writers.export import FORMATS
+    if name == _FORMATS:
+        return _export_formats(keys, value)
+    hint = field_types(STEPS[step])[name]
+    try:
+        value = convert_value(value, hint)
+        check_value(keys.at(name), value, hint)
+    except BadOption as error:
+        raise BadPlan(str(error)) from None
+    if isinstance(value, Path) or name in _MAY_BE_FILES:
+        beside = folder / value
+        return str(beside.absolute()) if beside.is_file() else str(value)
+    return value
 
-        if not isinstance(value, list) or not value:
-            raise BadPlan(f'{keys.at(name)} = {value!r} is not a list of formats, such as ["trc", "mot"]')
-        for each in value:
-            if each not in FORMATS:
-                raise BadPlan(f"{keys.at(name)}: '{each}' is no format; {one_of(FORMATS, str(each))}")
-        return tuple(dict.fromkeys(value))
-    if name == "interval":
-        if not isinstance(value, list) or len(value) != 2 or not all(map(is_number, value)) or value[0] >= value[1]:
-            raise BadPlan(f"{keys.at(name)} = {value!r} is not two times in seconds, such as [10.0, 70.0]")
-        return (float(value[0]), float(value[1]))
-    if name in _CHOICES:
-        return keys.choice(name, _CHOICES[name])
-    if isinstance(default, bool):
-        if not isinstance(value, bool):
-            raise BadPlan(f"{keys.at(name)} = {value!r} is neither true nor false")
-        return value
-    if isinstance(default, float) or name in _NUMBERS:
-        number = keys.number(name, None, positive=name != "smoothing_hz")
-        if number is not None and number < 0.0:
-            raise BadPlan(f"{keys.at(name)} = {value!r}: 0, which is none, or more")
-        return number
-    text = keys.text(name, None)
-    assert text is not None
-    beside = folder / text
-    return str(beside.absolute()) if name in _FILES and beside.is_file() else text
+
+def _export_formats(keys: Keys, value: Any) -> tuple[str, ...]:
+    from ..writers.export import FORMATS
+
+    if not isinstance(value, list) or not value:
+        raise BadPlan(f'{keys.at(_FORMATS)} = {value!r} is not a list of formats, such as ["trc", "mot"]')
+    for each in value:
+        if each not in FORMATS:
+            raise BadPlan(f"{keys.at(_FORMATS)}: '{each}' is no format; {one_of(FORMATS, str(each))}")
+    return tuple(dict.fromkeys(value))
 
 
 def _check(step: str, options: Mapping[str, Any], keys: Keys) -> None:
     """What would fail at every item, said once and before any work."""
+    values = {name: value for name, value in options.items() if name != _FORMATS}
+    values |= {name: Path(name) for name in _PATHS if name in field_types(STEPS[step])}
+    job: Any = build_job(STEPS[step], values)
     try:
-        if step == "calibrate":
-            from ..calibration.protocols import load_protocol
-
-            load_protocol(options["protocol"])
-        elif step == "retarget":
-            from ..retargeting.maps import find_map
-
-            find_map(options["robot"])
-        elif step == "track" and options["model"] is not None and not Path(options["model"]).is_file():
-            raise MissingFile(f"model = '{options['model']}': no such file; a URDF, or a table that names one")
-        elif step == "export" and options["names"] is not None:
-            from ..writers.export import NAMES
-
-            keys.choice("names", NAMES)
+        job.check()
     except BadSession:
         raise
     except WeposeError as error:
-        said = str(error).replace("--robot ", "robot ")
-        raise BadPlan(f"{keys.file}: {keys.place.rstrip('.')}: {said}") from None
+        text = re.sub(r"^--([\w-]+) ", lambda match: match[1].replace("-", "_") + " = ", str(error))
+        raise BadPlan(f"{keys.file}: {keys.place.rstrip('.')}: {text}") from None
 
 
 def _distances(steps: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
-    """What can be taped besides the body, by the protocol: the bar between the palms, say."""
+    """What can be measured besides the body, by the protocol: the bar between the palms, say."""
     if "calibrate" not in steps:
         return ()
     from ..calibration.protocols import load_protocol
@@ -229,8 +223,8 @@ def _named(top: Keys) -> Iterator[tuple[str, Keys]]:
         yield name, table.table(name)
 
 
-def _subject(keys: Keys, path: Path, gauges: Sequence[str]) -> _Subject:
-    keys.allow("calibration", "file", "stature", "sex", "gauge")
+def _subject(keys: Keys, path: Path, lengths: Sequence[str]) -> _Subject:
+    keys.allow("calibration", "file", "stature", "sex", "measured")
     calibration, file = keys.text("calibration", None), keys.text("file", None)
     if calibration is not None and file is not None:
         raise BadPlan(f"{keys.at('file')}: a subject has a file or a calibration, not both")
@@ -238,11 +232,11 @@ def _subject(keys: Keys, path: Path, gauges: Sequence[str]) -> _Subject:
         place = _resolved(keys.text(key, None), path)
         if place is not None and not is_remote(place) and not Path(place).exists():
             raise BadPlan(f"{keys.at(key)} = '{keys.values[key]}': no such file; a path from the plan's folder, or URL")
-    gauge = keys.table("gauge", {})
-    gauge.allow(*gauges)
-    taped = {name: gauge.number(name, None, positive=True) for name in gauge.values}
+    table = keys.table("measured", {})
+    table.allow(*lengths)
+    measured = {name: table.number(name, None, positive=True) for name in table.values}
     sex = keys.choice("sex", ("f", "m")) if "sex" in keys else None
-    body = Body(keys.number("stature", None, True), sex, {name: v for name, v in taped.items() if v is not None})
+    body = Body(keys.number("stature", None, True), sex, {name: v for name, v in measured.items() if v is not None})
     _check_stature(body.stature, keys.at("stature"))
     return _Subject(_resolved(calibration, path), _resolved(file, path), body)
 
@@ -275,7 +269,7 @@ def _entries(top: Keys, path: Path) -> list[tuple[str, Keys]]:
     return [(place, Keys(entry, str(path), f"{place}.")) for place, entry in zip(places, value, strict=True)]
 
 
-def _sessions(place: str, keys: Keys, path: Path, gauges: Sequence[str]) -> list[_Entry]:
+def _sessions(place: str, keys: Keys, path: Path, lengths: Sequence[str]) -> list[_Entry]:
     keys.allow("files", "table", "subject")
     if ("files" in keys) == ("table" in keys):
         raise BadPlan(f"{path}: {place}: either files (globs) or table is needed")
@@ -283,7 +277,7 @@ def _sessions(place: str, keys: Keys, path: Path, gauges: Sequence[str]) -> list
     if "table" in keys:
         if subject is not None:
             raise BadPlan(f"{keys.at('subject')}: a table has a column for it")
-        return _table(str(keys.text("table", None)), path, gauges)
+        return _table(str(keys.text("table", None)), path, lengths)
     patterns = keys.values["files"]
     patterns = [patterns] if isinstance(patterns, str) else patterns
     if not isinstance(patterns, list) or not all(isinstance(pattern, str) and pattern for pattern in patterns):
@@ -297,14 +291,14 @@ def _sessions(place: str, keys: Keys, path: Path, gauges: Sequence[str]) -> list
     return [_Entry(url, f"{path}: {place}: {url}", subject=subject) for url in found]
 
 
-def _table(name: str, path: Path, gauges: Sequence[str]) -> list[_Entry]:
+def _table(name: str, path: Path, lengths: Sequence[str]) -> list[_Entry]:
     file = path.parent / name
     table = read_table(file)
     if "session" not in table.columns:
         raise BadPlan(f"{file}: no column 'session'; {one_of(table.columns, 'session')}")
     for column in table.columns:
-        if column not in _COLUMNS and not (column.startswith(_GAUGE) and column.removeprefix(_GAUGE) in gauges):
-            known = (*_COLUMNS, *(f"{_GAUGE}{length}" for length in gauges))
+        if column not in _COLUMNS and not (column.startswith(_MEASURED) and column.removeprefix(_MEASURED) in lengths):
+            known = (*_COLUMNS, *(f"{_MEASURED}{length}" for length in lengths))
             raise BadPlan(f"{file}: column '{column}' is not known; {one_of(known, column, len(known))}")
     entries = []
     for k, row in enumerate(table.iter_rows(named=True), 1):
@@ -312,12 +306,12 @@ def _table(name: str, path: Path, gauges: Sequence[str]) -> list[_Entry]:
         said = {column: value for column, value in row.items() if value is not None and value != ""}
         if "session" not in said:
             raise BadPlan(f"{where}: session is empty")
-        metres = {c: _metres(where, c, v) for c, v in said.items() if c == "stature" or c.startswith(_GAUGE)}
+        metres = {c: _metres(where, c, v) for c, v in said.items() if c == "stature" or c.startswith(_MEASURED)}
         sex = said.get("sex")
         if sex not in (None, "f", "m"):
             raise BadPlan(f"{where}: sex = '{sex}'; f, m or nothing")
-        gauge = {c.removeprefix(_GAUGE): value for c, value in metres.items() if c != "stature"}
-        body = Body(metres.get("stature"), sex, gauge) if metres or sex else None
+        measured = {c.removeprefix(_MEASURED): value for c, value in metres.items() if c != "stature"}
+        body = Body(metres.get("stature"), sex, measured) if metres or sex else None
         _check_stature(metres.get("stature"), where)
         text = {key: str(said[key]) for key in ("name", "subject") if key in said}
         session, truth = (_resolved(str(said[key]), file) if key in said else None for key in ("session", "truth"))

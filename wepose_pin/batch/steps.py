@@ -1,4 +1,4 @@
-"""The steps of an item: each does what the command of its name does, into a folder of its name, and gives figures."""
+"""The steps of an item: each builds the job of the command of its name, runs it, and gives figures for the table."""
 
 from __future__ import annotations
 
@@ -10,189 +10,112 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import MissingFile
-from ..readers import load_session
-from ..recording import Recording
-from ..subject import Subject, average_subject, load_subject
-from ..tracking import TrackedRecording, track
+from ..jobs.calibrate import CalibrateJob, run_calibrate
+from ..jobs.evaluate import EvaluateJob, run_evaluate
+from ..jobs.export import ExportJob, run_export
+from ..jobs.fields import build_job
+from ..jobs.retarget import RetargetJob, run_retarget
+from ..jobs.track import TrackJob, run_track
+from ..tracking import TrackedRecording
+from ..writers.result import as_json
 from .plan import Body
 
 Row = dict[str, Any]
 
 
-class Given(NamedTuple):
-    """What an item's steps work on, as local files, and where they write."""
+class ItemFiles(NamedTuple):
+    """What an item's steps read, as local files, and where they write."""
 
     folder: Path
     session: Path
-    subject_file: Path | None
+    subject: Path | None
     truth: Path | None
-    body: Body
-    made_by: Mapping[str, Any]
 
 
-class Work:
-    """The steps of one item, in order; what one finds the next ones use."""
+class ItemSteps:
+    """The steps of one item, in order; what one finds the next ones use.
 
-    def __init__(self, given: Given) -> None:
-        self.given = given
-        self.subject: Subject | None = None
-        self.pose: TrackedRecording | None = None
-        self._recordings: dict[bool, Recording] = {}
+    Parameters
+    ----------
+    provenance : what its results say made them
+    """
+
+    def __init__(self, files: ItemFiles, body: Body, provenance: Mapping[str, Any]) -> None:
+        self._files, self._body, self._provenance = files, body, provenance
+        self._subject = files.subject
+        self._tracked: TrackedRecording | None = None
 
     def run(self, step: str, options: Mapping[str, Any]) -> Row:
-        """The step's figures, by column of the study's table.
+        """Run a step into the folder of its name; its figures, by column of the study's table.
 
         Raises
         ------
         WeposeError
             What the recording, the subject or an option lacks.
         """
-        folder = self.given.folder / step
-        folder.mkdir()
-        row: Row = getattr(self, f"_{step}")(folder, **options)
+        row: Row = getattr(self, f"_{step}")(self._files.folder / step, dict(options))
         return row
 
-    def _recording(self, gaps: bool) -> Recording:
-        if gaps not in self._recordings:
-            self._recordings[gaps] = load_session(self.given.session, gaps=gaps)
-        return self._recordings[gaps]
-
-    def _calibrate(self, folder: Path, *, protocol: str, method: str, gaps: bool, report: bool) -> Row:
-        from ..calibration import calibrate_lengths, judge, load_protocol
-        from ..model import load_model
-        from ..writers.calibration import write_calibration
-        from ..writers.result import write_subject
-
-        body, what, recording = self.given.body, load_protocol(protocol), self._recording(gaps)
-        average = average_subject(body.stature, body.sex)
-        found = calibrate_lengths(recording, gauge=dict(body.gauge), prior=average, protocol=what, method=method)
-        verdict = judge(found)
-        write_subject(folder, found.subject, load_model(lengths=found.subject.lengths))
-        self.subject = load_subject(folder)  # as it stands there: the same as for the commands one by one
-        write_calibration(folder, found, verdict, self.given.made_by)
-        if report:
-            from ..report import write_calibration_page
-
-            write_calibration_page(folder, found, recording, method=method, protocol=what, verdict=verdict)
-        row: Row = {"grade": verdict.grade, "gap_mm": _finite(1e3 * found.rms_gap), "independent": found.independent}
-        for name, value in found.subject.lengths.items():
-            row |= {f"{name}_mm": 1e3 * value, f"{name}_std_mm": _finite(1e3 * found.subject.std(name))}
+    def _calibrate(self, out: Path, options: Row) -> Row:
+        person = {"measured": dict(self._body.measured), "stature": self._body.stature, "sex": self._body.sex}
+        job = build_job(CalibrateJob, options | person | {"session": self._files.session, "out": out})
+        outcome = run_calibrate(job, provenance=self._provenance)
+        self._subject = out
+        calibration = outcome.calibration
+        row = {
+            "grade": outcome.quality.grade,
+            "gap_mm": _finite(1e3 * calibration.rms_gap),
+            "independent": calibration.independent,
+        }
+        for name, value in calibration.subject.lengths.items():
+            row |= {f"{name}_mm": 1e3 * value, f"{name}_std_mm": _finite(1e3 * calibration.subject.std(name))}
         return row
 
-    def _track(
-        self,
-        folder: Path,
-        *,
-        method: str,
-        causal: bool,
-        gaps: bool,
-        covariance: bool,
-        limits: bool,
-        torques: bool,
-        model: str | None,
-        view: bool,
-        report: bool,
-    ) -> Row:
-        from ..model import load_model
-        from ..writers.result import write_result
-
-        recording = self._recording(gaps)
-        if self.subject is None and self.given.subject_file is not None:
-            self.subject = load_subject(self.given.subject_file)
-        body = load_model(model) if model else None
-        pose = track(recording, self.subject, method=method, model=body, causal=causal, limits=limits)
-        found = None
-        if torques:
-            from ..angles.torques import pose_torques
-
-            found = pose_torques(pose)
-        write_result(folder, pose, covariance, recording.phases, found, self.given.made_by)
-        self.pose = pose
-        failed: list[str] = []
-        if view or report:
-            from ..report import write_track_pages
-
-            failed = write_track_pages(folder, pose, view=view, report=report)
-        about = pose.summary()
-        still = [of["static_share"] for of in about["sensors"].values() if "static_share" in of]
+    def _track(self, out: Path, options: Row) -> Row:
+        job = build_job(TrackJob, options | {"session": self._files.session, "out": out, "subject": self._subject})
+        outcome = run_track(job, provenance=self._provenance)
+        self._tracked, summary = outcome.tracked, outcome.summary
+        static = [of["static_share"] for of in summary.get("sensors", {}).values() if "static_share" in of]
         return {
-            "samples": len(pose.time),
-            "rate_hz": about["rate_hz"],
-            "duration_s": about["duration_s"],
-            "sensors": len(about["sensors"]),
-            "static_share": float(np.mean(still)) if still else None,
-            "warnings": len(about["warnings"]) + len(failed),
+            "samples": summary["samples"],
+            "rate_hz": summary["rate_hz"],
+            "duration_s": summary["duration_s"],
+            "sensors": len(summary.get("sensors", ())),
+            "static_share": float(np.mean(static)) if static else None,
+            "warnings": len(summary["warnings"]) + len(outcome.page_failures),
         }
 
-    def _retarget(self, folder: Path, **options: Any) -> Row:
-        from dataclasses import replace
-
-        from .. import retargeting
-        from ..writers.result import as_json, read_result
-
-        robot, arm, task = options["robot"], options["arm"], options["task"]
-        sides = None if arm is None else ("left", "right") if arm == "both" else (arm,)
-        off = {name: 0.0 for name in ("position", "orientation") if task not in ("both", name)}
-        pose, body, _ = read_result(self.given.folder / "track")
-        model = retargeting.load(retargeting.find_map(robot), sides)
-        trajectory = retargeting.retarget(
-            pose,
-            model,
-            tasks=replace(retargeting.Tasks(), **off),
-            **{name: options[name] for name in ("rate_hz", "scale", "smoothing_hz", "strict")},
-        )
-        held = retargeting.kept(retargeting.table(trajectory), model.map.urdf, model.map.acceleration, model.map.jerk)
-        touched = retargeting.touching(model, trajectory.time, trajectory.u)
-        retargeting.write_trajectory(folder, trajectory)
-        found = as_json(retargeting.summary(trajectory, held, touched)) | {"made_by": dict(self.given.made_by)}
-        (folder / "summary.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
-        if options["view"]:
-            from ..report.page import PageWriter
-            from ..report.viewer import retarget_html
-
-            title = f"{self._recording(False).name} on {model.map.name}"
-            writer = PageWriter(folder, ["view.html"])
-            writer.write("view.html", lambda _: retarget_html(body, pose, trajectory, title=title))
-            writer.add_warnings("summary.json")
+    def _retarget(self, out: Path, options: Row) -> Row:
+        job = build_job(RetargetJob, options | {"result": self._files.folder / "track", "out": out})
+        outcome = run_retarget(job, provenance=self._provenance)
         return {
-            "trajectory_s": float(trajectory.time[-1]),
-            "trajectory_limits_kept": held.all,
-            "trajectory_touching": touched.samples,
+            "trajectory_s": outcome.duration_s,
+            "trajectory_limits_kept": outcome.summary["limits_kept"],
+            "trajectory_touching": outcome.summary["self_collision"]["samples_touching"],
         }
 
-    def _export(self, folder: Path, *, formats: tuple[str, ...], names: str | None, rate_hz: float | None) -> Row:
-        from ..writers.export import SUFFIXES, export
+    def _export(self, out: Path, options: Row) -> Row:
+        from ..writers.export import SUFFIXES
 
-        notes = []
+        out.mkdir()
+        formats, notes = options.pop("formats"), 0
         for format in formats:
-            file = folder / (f"placement{SUFFIXES[format]}" if format in SUFFIXES else f"motion.{format}")
-            motion = format not in ("urdf", "placement")
-            written = export(
-                self.given.folder / "track",
-                file,
-                format,
-                names=names if format == "mot" else None,
-                rate_hz=rate_hz if motion else None,
-            )
-            notes += written.notes
-        return {"export_notes": len(notes)}
+            file = out / (f"placement{SUFFIXES[format]}" if format in SUFFIXES else f"motion.{format}")
+            without = {} if format == "mot" else {"names": None}
+            without |= {"rate_hz": None} if format in ("urdf", "placement") else {}
+            result = {"result": self._files.folder / "track", "out": file, "format": format}
+            notes += len(run_export(build_job(ExportJob, options | without | result), provenance={}).notes)
+        return {"export_notes": notes}
 
-    def _evaluate(self, folder: Path, *, interval: tuple[float, float] | None) -> Row:
-        from ..evaluation import evaluate
-        from ..pose import pose_from_table
-        from ..readers.tables import read_table
-        from ..writers.result import as_json
-
-        assert self.pose is not None
-        truth = self.given.truth or self.pose.recording.truth
-        if truth is None:
-            raise MissingFile(
-                f"{self.given.session}: data.truth is missing; evaluate needs a reference, there or in a table's truth"
-            )
-        errors = evaluate(self.pose.pose, pose_from_table(read_table(truth), str(truth)), interval)
+    def _evaluate(self, out: Path, options: Row) -> Row:
+        recording = None if self._tracked is None else self._tracked.recording
+        stated = recording.truth if recording is not None else None
+        truth = self._files.truth or stated or self._files.session
+        job = build_job(EvaluateJob, options | {"result": self._files.folder / "track", "truth": truth})
+        errors = run_evaluate(job, pose=None if self._tracked is None else self._tracked.pose)
+        out.mkdir()
         text = json.dumps(as_json(asdict(errors)), indent=2)
-        (folder / "errors.json").write_text(text + "\n", encoding="utf-8")
+        (out / "errors.json").write_text(text + "\n", encoding="utf-8")
         row: Row = {f"{point}_error_mm": error.mean for point, error in errors.position.items()}
         row |= {f"{point}_arm_error_mm": error.mean for point, error in errors.position_from_shoulders.items()}
         row |= {f"{segment}_error_deg": error.total_rmse for segment, error in errors.attitude.items()}

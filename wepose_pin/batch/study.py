@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import polars as pl
 
 from ..errors import ExistingOutput, reason
-from ..writers.provenance import code, made_by
+from ..jobs.batch import BatchJob
+from ..writers.provenance import code, collect_provenance
 from .cluster import connected, made
 from .items import FAILED, MADE, Row, failed
 from .page import study_page
@@ -26,6 +27,10 @@ _FIRST = {
 }
 
 
+# Told how many items there are rows of, how many of these are not done, and how many items there are.
+ItemProgress = Callable[[int, int, int], None]
+
+
 class Study(NamedTuple):
     """What came of a plan."""
 
@@ -35,30 +40,18 @@ class Study(NamedTuple):
     warnings: list[str]  # of the page, where it or a part of it cannot be made
 
 
-def run_study(
-    path: Path,
-    out: str,
-    *,
-    scheduler: str | None = None,
-    workers: int | None = None,
-    force: bool = False,
-    progress: Callable[[int, int, int], None] = lambda *_: None,
-) -> Study:
+def run_batch(job: BatchJob, progress: ItemProgress = lambda *_: None) -> Study:
     """Make all items of a plan, and ``results.parquet`` and ``report.html`` over them, in a folder or below a URL.
 
     What was done before, by the same plan or another, is left as it is where nothing that makes it has changed.
-
-    Parameters
-    ----------
-    force : make items again whose inputs, options or version have changed; without it they are left, and say so
-    progress : told how many items there are rows of, how many of these are not done, and how many items there are
 
     Raises
     ------
     WeposeError
         Of the plan or the place. What is wrong with an item stands in its row.
     """
-    out = out.rstrip("/")
+    job.check()
+    path, out = job.plan, job.out.rstrip("/")
     place = f"{out}/{ITEMS}" if is_remote(out) else str(Path(out).absolute() / ITEMS)
     plan = read_plan(path, place)
     _claim(out, path)
@@ -66,7 +59,7 @@ def run_study(
         everything = (*plan.first, *plan.items)
         names = [item.name for item in everything]
         sweep(place, names)
-        rows = _rows(plan, place, scheduler, workers, force, progress)
+        rows = _rows(plan, place, job, progress)
         sweep(place, names)
         table = table_of([rows[item.name] for item in everything])
         content = io.BytesIO()
@@ -89,25 +82,18 @@ def _claim(out: str, path: Path) -> None:
         if not is_remote(out) and here.exists() and (not here.is_dir() or {p.name for p in here.iterdir()} - {*ours}):
             raise ExistingOutput(f"{out}: is there and no study of wepose batch; name another folder")
     try:
-        text = json.dumps(made_by("batch", {"plan": path}), indent=1, ensure_ascii=False)
+        text = json.dumps(collect_provenance("batch", {"plan": path}), indent=1, ensure_ascii=False)
         write_bytes(f"{out}/{STUDY}", text.encode())
     except OSError as error:
         raise ExistingOutput(f"{out}: cannot be written: {error.strerror}") from error
 
 
-def _rows(
-    plan: Plan,
-    place: str,
-    scheduler: str | None,
-    workers: int | None,
-    force: bool,
-    progress: Callable[[int, int, int], None],
-) -> dict[str, Row]:
+def _rows(plan: Plan, place: str, job: BatchJob, progress: ItemProgress) -> dict[str, Row]:
     """Item → its row; subjects first, since sessions wait for them."""
     total = len(plan.first) + len(plan.items)
     rows: dict[str, Row] = {}
     progress(0, 0, total)
-    with connected(scheduler, workers) as client:
+    with connected(job.scheduler, job.workers) as client:
         for items in (plan.first, plan.items):
             ready = []
             for item in items:
@@ -116,7 +102,7 @@ def _rows(
                     ready.append(item)
                 else:
                     rows[item.name] = cause
-            for some in made(client, ready, place, force=force, code=code()["code"]):
+            for some in made(client, ready, place, force=job.force, code=code()["code"]):
                 rows |= {row["item"]: row for row in some}
                 progress(len(rows), sum(row["status"] != MADE for row in rows.values()), total)
     return rows

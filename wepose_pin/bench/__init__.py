@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..calibration.lengths import LOOK_RATE_HZ
 from ..errors import BadData, MissingFile
 from ..evaluation import attitude_error
@@ -214,7 +214,7 @@ def _peers(of: Sample) -> dict[str, Callable[[], Any]]:
 def _live_filters(of: Sample) -> dict[str, Callable[[], Any]]:
     """Loops over the samples, ours with its static detector; a Python call each, arrays made beforehand."""
     rows = list(zip(of.gyro_S, of.accel_S, strict=True))
-    start = so3.tilt(of.accel_S[: StaticTest().samples(of.rate_hz)].mean(axis=0))
+    start = rotations.quat_from_gravity(of.accel_S[: StaticTest().samples(of.rate_hz)].mean(axis=0))
 
     def ours(make: Any) -> Callable[[], Any]:
         def loop() -> None:
@@ -319,7 +319,7 @@ def live(effort: Effort) -> Table:
         rows = np.arange(count)[None, :] * 100 + np.arange(len(data.gyro_S) - 100 * count)[:, None]
         gyro, accel = list(data.gyro_S[rows]), list(data.accel_S[rows])
         bank = LiveBank(
-            [Smekf(data.noise, data.rate_hz, so3.tilt(accel[0][i])) for i in range(count)],
+            [Smekf(data.noise, data.rate_hz, rotations.quat_from_gravity(accel[0][i])) for i in range(count)],
             [StaticDetector(data.noise, data.rate_hz) for _ in range(count)],
         )
         ours = _each(bank.update, gyro, accel)
@@ -576,15 +576,15 @@ def _orientations(data: Sample) -> dict[str, np.ndarray]:
     if have("vqf"):
         import vqf
 
-        found["VQF"] = so3.xyzw_from_wxyz(vqf.VQF(1.0 / rate_hz).updateBatch(unbiased, accel)["quat6D"])
+        found["VQF"] = rotations.xyzw_from_wxyz(vqf.VQF(1.0 / rate_hz).updateBatch(unbiased, accel)["quat6D"])
         offline = vqf.offlineVQF(unbiased, accel, None, 1.0 / rate_hz)
-        found["offline VQF"] = so3.xyzw_from_wxyz(offline["quat6D"])
+        found["offline VQF"] = rotations.xyzw_from_wxyz(offline["quat6D"])
     if have("imufusion"):
         filter_, quat = fusion(rate_hz), np.empty((len(gyro), 4))
         for k, (rate, force) in enumerate(zip(np.degrees(unbiased), accel / _G, strict=True)):
             filter_.update_no_magnetometer(rate, force)
             quat[k] = filter_.get_quaternion()
-        found["imufusion"] = so3.xyzw_from_wxyz(quat)
+        found["imufusion"] = rotations.xyzw_from_wxyz(quat)
     return found
 
 
@@ -594,7 +594,7 @@ def _errors(quat: np.ndarray, truth: Truth) -> list[float]:
     true = Rotation.from_quat(np.where(known[:, None], truth.quat_true, [0.0, 0.0, 0.0, 1.0]))
     estimated = Rotation.from_quat(quat)
     where = truth.at_rest & known
-    psi = float(so3.heading((true[where] * estimated[where].inv()).mean().as_quat()))
+    psi = float(rotations.heading((true[where] * estimated[where].inv()).mean().as_quat()))
     aligned = Rotation.from_rotvec([0.0, 0.0, psi]) * estimated
     time_ = np.arange(len(quat)) / truth.data.rate_hz
     error = attitude_error(aligned[truth.scored], true[truth.scored], time_[truth.scored])

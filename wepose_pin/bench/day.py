@@ -20,7 +20,7 @@ from ..calibration import calibrate_lengths
 from ..errors import NoSolution
 from ..recording import Recording, Sensor
 from ..simulation import simulate, simulated_person
-from ..tracking import SMOOTHER_CHUNK_S, CHUNK_S
+from ..tracking import CHUNK_S, SMOOTHER_CHUNK_S
 from ..writers import write_session
 from ..writers.result import write_subject
 from . import Column, Table
@@ -134,7 +134,15 @@ def _track(folder: Path, hours: float, out: str, *, pieces: float, method: str =
     """
     session = folder / f"{hours:g}"
     words = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(folder / out), "--force"]
-    words += ["--subject", str(session / "subject"), "--method", method, "--pieces", f"{pieces:g}", "--no-report"]
+    words += [
+        "--subject",
+        str(session / "subject"),
+        "--method",
+        method,
+        "--chunk-seconds",
+        f"{pieces:g}",
+        "--no-report",
+    ]
     begun = time.perf_counter()
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     assert process.stderr is not None

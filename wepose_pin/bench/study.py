@@ -20,10 +20,11 @@ from typing import NamedTuple
 
 import polars as pl
 
-from ..batch import run_study
+from ..batch import run_batch
 from ..batch.cluster import TASK_S, connected
 from ..batch.storage import only_one, write_bytes
 from ..errors import ExistingOutput, NoSolution
+from ..jobs.batch import BatchJob
 from ..simulation import simulate, simulated_person
 from ..writers import write_session
 from ..writers.provenance import code
@@ -191,7 +192,7 @@ def _run(
             waiting = None
 
     begun = time.perf_counter()
-    study = run_study(folder / "plan.toml", str(out), workers=workers, scheduler=scheduler, progress=progress)
+    study = run_batch(BatchJob(folder / "plan.toml", str(out), scheduler, workers), progress)
     (last, total), (first, before) = told[-1], next((entry for entry in told if entry[1]), told[-1])
     return _Run(study.table, study.kept, last - begun, (total - before) / max(last - first, 1e-9))
 

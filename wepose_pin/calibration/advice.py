@@ -69,7 +69,7 @@ POINT = Advice(
     closer="keep the middle of the palm on its point and the hips in place, wrist straight; tighten the straps",
     apart="the palm was off its point for {:.0f} % of the phase; that was left out",
     together="keep the palm on its point, or name only the seconds in which it is there",
-    width="one arm hardly tells it: tape it and give it, as in --gauge shoulder_width=0.385",
+    width="one arm hardly tells it: tape it and give it, as in --measured shoulder_width=0.385",
 )
 ADVICE = {"coincide": JOINED, "distance": BAR, "fixed_point": POINT}
 POSED = "hold each pose more exactly, and for longer; or hold the hands together"  # where nothing was closed

@@ -171,7 +171,7 @@ def calibrate_lengths(
             raise BadOption(f"gauge {name}={value:g}: a length in metres is needed, between 0.02 and 1.0")
     if len(set(gauge) & set(protocol.chain)) < protocol.taped:
         raise BadOption(
-            f"protocol '{protocol.name}' needs {protocol.taped} taped length of its chain, as in --gauge "
+            f"protocol '{protocol.name}' needs {protocol.taped} taped length of its chain, as in --measured "
             f"{protocol.tape}; {one_of(protocol.chain)}"
         )
     for segment in protocol.needs:

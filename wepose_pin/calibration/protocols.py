@@ -40,7 +40,7 @@ class Closure:
     kind : one of `KINDS`
     points : of the body
     slip : [m] one standard deviation, each axis, of what holds only nearly; sets the weights' shape, not their size
-    gauge : name of the distance, as in ``--gauge handle=0.4``; empty where none is kept
+    gauge : name of the distance, as in ``--measured handle=0.4``; empty where none is kept
     metres, metres_std : the distance where the user gives none, and one standard deviation [m]
     """
 

@@ -44,7 +44,7 @@ def on_lengths(
         lines.append(
             f"no gauge in the chain: what was done ({protocol.title}) fixes the proportions, not the scale, which is "
             f"the prior's ({prior.note or prior.name}): all lengths may be off together by "
-            f"{100 * free_scale_std:.1f} %; tape one, as in --gauge {protocol.tape}"
+            f"{100 * free_scale_std:.1f} %; tape one, as in --measured {protocol.tape}"
         )
     arms = [LENGTHS.index(name) for name in protocol.chain if name.endswith(("upper_arm", "forearm"))]
     share = np.zeros(K)
@@ -53,7 +53,7 @@ def on_lengths(
     if free_scale_std is None and scale_std > max(LOOSE_SCALE * before, LEAST_LOOSE_SCALE):
         lines.append(
             f"the gauge hardly tells the scale of the arms, which may be off together by {100 * scale_std:.1f} %: "
-            f"tape another length, as in --gauge {protocol.tape}"
+            f"tape another length, as in --measured {protocol.tape}"
         )
     contradicted = [tape.said(name) for name, tape in tapes.items() if tape.off > CONTRADICTED]
     lines += contradicted
@@ -91,7 +91,7 @@ def on_headings(protocol: Protocol, layout: Layout, covariance: np.ndarray, gaug
         )
         lines.append(f"headings that the motion hardly told: {said}; move through more of the reach, trunk as well")
     lines += [
-        f"{closure.gauge} = {closure.metres:g} m is the protocol's, not measured: give yours, as in --gauge "
+        f"{closure.gauge} = {closure.metres:g} m is the protocol's, not measured: give yours, as in --measured "
         f"{closure.gauge}={closure.metres:g}"
         for closure in protocol.closures
         if closure.gauge and closure.gauge not in gauge

@@ -254,7 +254,7 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
             SCALE,
             "relative",
             f"all lengths together ± {100 * calibration.scale_std:.1f} %{whose}",
-            f"tape one length and give it, as in --gauge {calibration.tape}",
+            f"tape one length and give it, as in --measured {calibration.tape}",
         )
     )
     return found

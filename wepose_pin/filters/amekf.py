@@ -26,9 +26,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..arguments import check_fields
+from ..compilation import inlined, kernel
 from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
-from ..so3 import inlined, kernel
+from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
 from .base import REST_TURN_NOISE, FilterRun, OneSample, samples
 from .noise import SensorNoise
 from .static import static_step
@@ -210,31 +211,6 @@ class Amekf:
         return one.quat_WS[0].copy()
 
 
-@inlined
-def _series(h2):  # type: ignore[no-untyped-def]
-    """sin(h)/h and cos(h) of h² = `h2`; below 0.02 (0.28 rad a sample) by series, to the last bit or two."""
-    if h2 < 0.02:
-        s = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * (1.0 - h2 / 42.0 * (1.0 - h2 / 72.0)))
-        c = 1.0 - h2 / 2.0 * (1.0 - h2 / 12.0 * (1.0 - h2 / 30.0 * (1.0 - h2 / 56.0 * (1.0 - h2 / 90.0))))
-        return s, c
-    h = np.sqrt(h2)
-    return np.sin(h) / h, np.cos(h)
-
-
-@inlined
-def turn_left(quat, x, y, z):  # type: ignore[no-untyped-def]
-    """In place: ``quat ← exp([x, y, z]) ⊗ quat``, the vector in W [rad]."""
-    s, ew = _series(0.25 * (x * x + y * y + z * z))
-    ex, ey, ez = 0.5 * s * x, 0.5 * s * y, 0.5 * s * z
-    qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]
-    rx = ew * qx + ex * qw + ey * qz - ez * qy
-    ry = ew * qy - ex * qz + ey * qw + ez * qx
-    rz = ew * qz + ex * qy - ey * qx + ez * qw
-    rw = ew * qw - ex * qx - ey * qy - ez * qz
-    norm = 1.0 / np.sqrt(rx * rx + ry * ry + rz * rz + rw * rw)
-    quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
-
-
 @kernel
 def transition_rows(sums, length, gravity, P, out):  # type: ignore[no-untyped-def]
     """Rows of ``F P`` that differ from P's, those of θ, velocity and position, to `out` (7, m); `P` is (25, m).
@@ -392,7 +368,7 @@ def _close(state, quat, x, P, sums, dt, numbers, tape, row):  # type: ignore[no-
                 tape[row, to + 3 + j] = scaled[j]
     for i in range(3, STATES):
         x[i] += d[i]
-    turn_left(quat, d[0], d[1], d[2])
+    rotate_by_world_vector(quat, d[0], d[1], d[2])
     if taped:
         tape[row, TAPE_MEASURED] = n
         for n in range(len(TAPE_ROWS)):
@@ -429,16 +405,6 @@ def fill_symmetric(upper, out):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def matrix_of(quat, R):  # type: ignore[no-untyped-def]
-    """`R` (9,) rows first, of `quat` (4,) xyzw."""
-    x, y, z, w = quat[0], quat[1], quat[2], quat[3]
-    x2, y2, z2 = 2.0 * x, 2.0 * y, 2.0 * z
-    R[0], R[1], R[2] = 1.0 - y * y2 - z * z2, x * y2 - w * z2, x * z2 + w * y2
-    R[3], R[4], R[5] = x * y2 + w * z2, 1.0 - x * x2 - z * z2, y * z2 - w * x2
-    R[6], R[7], R[8] = x * z2 - w * y2, y * z2 + w * x2, 1.0 - x * x2 - y * y2
-
-
-@inlined
 def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: ignore[no-untyped-def]
     """One sample of one sensor: `state` (1180,), `model` (30,), gyro [rad/s], accel [m/s²]; whether a block ended."""
     quat, x, sums, kept, R = state[:4], state[_X:_COV], state[_SUM:_KEEP], state[_KEEP:_COUNT], state[_ROOM : _ROOM + 9]
@@ -471,17 +437,8 @@ def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: igno
     wy = uy - (x[_M + 3] * ux + x[_M + 4] * uy + x[_M + 5] * uz)
     wz = uz - (x[_M + 6] * ux + x[_M + 7] * uy + x[_M + 8] * uz)
     sums[_RATE2] += wx * wx + wy * wy + wz * wz
-    s, ew = _series(0.25 * dt * dt * (wx * wx + wy * wy + wz * wz))
-    s *= 0.5 * dt
-    ex, ey, ez = s * wx, s * wy, s * wz
-    qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]
-    rx = qw * ex + qx * ew + qy * ez - qz * ey
-    ry = qw * ey - qx * ez + qy * ew + qz * ex
-    rz = qw * ez + qx * ey - qy * ex + qz * ew
-    rw = qw * ew - qx * ex - qy * ey - qz * ez
-    norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)  # 1/√, to first order: it is 1 but for rounding
-    quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
-    matrix_of(quat, R)
+    rotate_unit_by_rate(quat, wx, wy, wz, dt)
+    fill_matrix(quat, R)
     for i in range(9):
         sums[i] += R[i]
         sums[9 + i] += R[i] * ux
@@ -515,7 +472,7 @@ def step(state, model, gx, gy, gz, ax, ay, az, static, tape, row):  # type: igno
     if full:
         _close(state, quat, x, P, sums, dt, model, tape, row)
         state[_COUNT] = 0.0
-        matrix_of(quat, R)
+        fill_matrix(quat, R)
     state[4], state[5], state[6] = bx, by, bz
     into_sensor(R, P, sums[_LOST_TURN], state[7:13])
     return full

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
-from ..so3 import inlined, kernel
+from ..rotations import derivative, up_in_sensor
 from .base import FilterRun, OneSample, samples
 from .noise import SensorNoise
 
@@ -67,15 +68,11 @@ def _run(quat, bias, gyro_S, accel_S, dt, gain, out_quat):  # type: ignore[no-un
 @inlined
 def _step(quat, wx, wy, wz, ax, ay, az, dt, gain):  # type: ignore[no-untyped-def]
     x, y, z, w = quat[0], quat[1], quat[2], quat[3]
-    dx = 0.5 * (w * wx + y * wz - z * wy)
-    dy = 0.5 * (w * wy - x * wz + z * wx)
-    dz = 0.5 * (w * wz + x * wy - y * wx)
-    dw = 0.5 * (-x * wx - y * wy - z * wz)
+    dx, dy, dz, dw = derivative(x, y, z, w, wx, wy, wz)
     norm = np.sqrt(ax * ax + ay * ay + az * az)
     if 0.0 < norm < np.inf:  # in free fall there is no direction to descend
-        f1 = 2.0 * (x * z - w * y) - ax / norm
-        f2 = 2.0 * (w * x + y * z) - ay / norm
-        f3 = 1.0 - 2.0 * (x * x + y * y) - az / norm
+        ux, uy, uz = up_in_sensor(quat)
+        f1, f2, f3 = ux - ax / norm, uy - ay / norm, uz - az / norm
         gw = -2.0 * y * f1 + 2.0 * x * f2  # ∇f = Jᵀ f
         gx = 2.0 * z * f1 + 2.0 * w * f2 - 4.0 * x * f3
         gy = -2.0 * w * f1 + 2.0 * z * f2 - 4.0 * y * f3

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..compilation import kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
-from ..so3 import kernel, rotate_by_vector, up_in_sensor
+from ..rotations import rotate_by_vector, up_in_sensor
 from .base import FilterRun, OneSample, samples
 from .noise import SensorNoise
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..errors import BadPhase
 from ..recording import Recording, format_time, span_text
 from .noise import SensorNoise, quietest
@@ -110,7 +110,7 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
     else:
         assert sensor.gyro_S is not None
         rate = sensor.gyro_S[measured]
-        R = Rotation.from_quat(so3.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
+        R = Rotation.from_quat(rotations.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
     turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
     guessed = phase not in recording.phases or not recording.phases[phase]

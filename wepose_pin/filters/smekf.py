@@ -16,9 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..compilation import inlined, kernel
 from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
-from ..so3 import inlined, kernel, rotate_by_vector, up_in_sensor
+from ..rotations import rotate_by_vector, rotation_terms, up_in_sensor
 from .base import REST_TURN_NOISE, FilterRun, OneSample, samples
 from .noise import SWAY_CORRELATION_S, SensorNoise
 from .start import ACCEL_BIAS_STD
@@ -195,19 +196,6 @@ def step(x, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-d
 
 
 @inlined
-def transition_series(t):  # type: ignore[no-untyped-def]
-    """cos θ, sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ of θ² = `t`; below 0.02 by series, to the last bit or two."""
-    if t < 0.02:
-        s = 1.0 - t / 6.0 * (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0)))
-        c = 0.5 * (1.0 - t / 12.0 * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0))))
-        d = (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0 * (1.0 - t / 110.0)))) / 6.0
-        return 1.0 - t * c, s, c, d
-    angle = np.sqrt(t)
-    cosine, s = np.cos(angle), np.sin(angle) / angle
-    return cosine, s, (1.0 - cosine) / t, (1.0 - s) / t
-
-
-@inlined
 def predict(x, model, wx, wy, wz, unseen_cov):  # type: ignore[no-untyped-def]
     """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w), P ← F P Fᵀ + G Q Gᵀ.
 
@@ -239,7 +227,7 @@ def carry(x, wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
     cosine, s, c, d = 1.0, 1.0, 0.0, 0.0
     e = 1.0  # B's share of I, s where A's is cos θ
     if not first_order:
-        cosine, s, c, d = transition_series(wx * wx + wy * wy + wz * wz)
+        cosine, s, c, d = rotation_terms(wx * wx + wy * wy + wz * wz)
         e = s
     # A = cos θ I − s [w]× + c w wᵀ
     xy, xz, yz = c * wx * wy, c * wx * wz, c * wy * wz

@@ -17,8 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..compilation import compiled
 from ..errors import BadData, BadOption
-from ..so3 import compiled
+from ..rotations import fill_matrix, rotate_by_world_vector
 from .amekf import (
     STATES,
     TAPE,
@@ -34,8 +35,6 @@ from .amekf import (
     AmekfParams,
     fill_symmetric,
     into_sensor,
-    matrix_of,
-    turn_left,
 )
 from .base import FilterRun
 from .noise import SensorNoise
@@ -257,10 +256,10 @@ def _between(tape, deviation, cov, start_trace, block, static, quat, bias, attit
             for i in range(3):
                 for j in range(3):
                     P[i, j] = (1.0 - share) * cov[row, i, j] + share * cov[row + 1, i, j]
-        turn_left(quat[k], e[0], e[1], e[2])
+        rotate_by_world_vector(quat[k], e[0], e[1], e[2])
         moving = 0.0 if static[k] else 1.0
         for c in range(3):
             bias[k, c] += e[3 + c] + moving * e[6 + c]
-        matrix_of(quat[k], R)
+        fill_matrix(quat[k], R)
         into_sensor(R, P, bridge, upper)
         fill_symmetric(upper, attitude_cov[k])

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..errors import BadData
 from .noise import BLOCK_S, SensorNoise
 
@@ -38,7 +38,7 @@ def start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise, rate
         No gravity in them.
     """
     rate = np.where(np.isfinite(gyro_S), gyro_S - noise.gyro_bias, 0.0)
-    force = Rotation.from_quat(so3.integrate(rate / rate_hz)[1:]).apply(np.nan_to_num(accel_S))
+    force = Rotation.from_quat(rotations.integrate(rate / rate_hz)[1:]).apply(np.nan_to_num(accel_S))
     force = force[np.isfinite(accel_S).all(axis=1)]
     mean = force.mean(axis=0) if len(force) else np.zeros(3)
     norm = float(np.linalg.norm(mean))
@@ -52,4 +52,4 @@ def start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise, rate
         variance = float(means.var(axis=0, ddof=1).sum()) / 2.0 / blocks
     else:  # too short to see how sway averages out: as if it did not
         variance = float(across.var(axis=0).sum()) / 2.0
-    return StartTilt(so3.tilt(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm)))
+    return StartTilt(rotations.quat_from_gravity(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm)))

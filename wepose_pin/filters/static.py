@@ -14,8 +14,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ..arguments import NonNegative, Positive, Range, check_fields
+from ..compilation import inlined, kernel
 from ..errors import BadData, BadOption
-from ..so3 import inlined, kernel
 from .noise import BLOCK_S, SensorNoise
 
 # A sample is gyro (3), accel/g (3) and the norm of accel/g. The sums are of its differences from an anchor: those

@@ -21,9 +21,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from .. import so3
 from ..errors import BadModel
 from ..recording import SEGMENTS
+from ..rotations import conjugate, exp, log, multiply, rotation_about
 
 AXIAL = ("torso", "pelvis", "head")
 _MEET_TOLERANCE = 1e-6  # [m]
@@ -99,28 +99,6 @@ def solve(chain: Chain, quat: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products of quaternions (…, 4) xyzw; on 60 000 ten times as fast as SciPy's."""
-    ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
-    bx, by, bz, bw = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
-    out = np.empty((*np.broadcast(ax, bx).shape, 4))
-    out[..., 0] = aw * bx + ax * bw + ay * bz - az * by
-    out[..., 1] = aw * by - ax * bz + ay * bw + az * bx
-    out[..., 2] = aw * bz + ax * by - ay * bx + az * bw
-    out[..., 3] = aw * bw - ax * bx - ay * by - az * bz
-    return out
-
-
-def conjugate(quat: np.ndarray) -> np.ndarray:
-    return quat * np.array([-1.0, -1.0, -1.0, 1.0])
-
-
-def about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Rotations (n, 4) xyzw about one axis (3,) by angles (n,) [rad]."""
-    half = np.asarray(angle)[..., None] / 2.0
-    return np.concatenate([np.sin(half) * axis, np.cos(half)], axis=-1)
-
-
 # Which joints -----------------------------------------------------------------------------------------------------
 
 
@@ -189,7 +167,7 @@ def _shared(chain: Chain, target: np.ndarray) -> list[np.ndarray]:
     """
     free = max(k for k, axis in enumerate(chain.axes) if axis is None)
     places = chain.place[-1] + 1
-    share = so3.exp(so3.log(_tilt(target, chain.quat_AL)) / places) if len(chain.axes) > 1 else target
+    share = exp(log(_tilt(target, chain.quat_AL)) / places) if len(chain.axes) > 1 else target
     found = [np.zeros(len(target)) for _ in chain.axes]
     for place in set(chain.place) - {chain.place[free]}:
         here = [k for k, at in enumerate(chain.place) if at == place]
@@ -203,7 +181,7 @@ def _shared(chain: Chain, target: np.ndarray) -> list[np.ndarray]:
     before = after = np.array([0.0, 0.0, 0.0, 1.0])
     for k, (axis, value) in enumerate(zip(chain.axes, found, strict=True)):
         if k != free:
-            turn = value if axis is None else about(axis, value)
+            turn = value if axis is None else rotation_about(axis, value)
             before, after = (multiply(before, turn), after) if k < free else (before, multiply(after, turn))
     found[free] = multiply(multiply(conjugate(before), target), conjugate(after))
     return found

@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from .. import so3
+from .. import rotations
+from ..rotations import conjugate, multiply, rotation_about
 from .body import BodyModel
-from .chains import AXIAL, Chain, about, axis_in_joint, conjugate, multiply, solve
+from .chains import AXIAL, Chain, axis_in_joint, solve
 from .fit import Fit, Limits, limits_of
 
 _MISSED = 1e-9  # [rad] that is nothing
@@ -94,7 +95,7 @@ class Follower:
             for joint in group.joints:
                 if self.model.nqs[joint] == 4:
                     first = self.model.idx_qs[joint]
-                    q[:, first : first + 4] = so3.continuous(q[:, first : first + 4])
+                    q[:, first : first + 4] = rotations.unwrap_signs(q[:, first : first + 4])
             if group.segments[0] in AXIAL:  # what hangs on it stands elsewhere now
                 kept |= {joint: _value(self.model, q, joint) for joint in group.joints}
                 q, quat_WJ = self.stepwise(quat_WL, kept)
@@ -144,7 +145,7 @@ class Follower:
         """Write a joint's value into `q`: an angle (n,) [rad] or a rotation (n, 4); gives its rotation."""
         first = self.model.idx_qs[joint]
         if value.ndim == 2:
-            value = so3.continuous(value / np.linalg.norm(value, axis=1)[:, None])
+            value = rotations.unwrap_signs(value / np.linalg.norm(value, axis=1)[:, None])
             q[:, first : first + 4] = value
             return value
         if self.model.nqs[joint] == 1:
@@ -155,7 +156,7 @@ class Follower:
             axis = axis_in_joint(self.model, joint)
             assert axis is not None
             self._axes[joint] = axis
-        return about(self._axes[joint], value)
+        return rotation_about(self._axes[joint], value)
 
 
 def _value(model: pin.Model, q: np.ndarray, joint: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..errors import BadData, MissingFile
 from .device import Device, must_be_measured, table_of
 
@@ -119,7 +119,7 @@ def _reference_pose(path: Path, frames: Frames) -> str | None:
     for label, end in ARM.items():
         if label not in at or end not in at:
             continue
-        quat = so3.xyzw_from_wxyz(frames.values["orientation"][:, at[label]])
+        quat = rotations.xyzw_from_wxyz(frames.values["orientation"][:, at[label]])
         along_W = frames.values["position"][:, at[end]] - frames.values["position"][:, at[label]]
         good = np.isfinite(quat).all(axis=1) & (np.linalg.norm(np.nan_to_num(quat), axis=1) > 0.5)
         good &= np.linalg.norm(np.nan_to_num(along_W), axis=1) > 1e-3
@@ -148,7 +148,7 @@ def _segment_quat(label: str, quat_WB: np.ndarray, pose: str) -> np.ndarray:
 
     Rows of zeros or NaN become NaN.
     """
-    quat = so3.xyzw_from_wxyz(quat_WB)
+    quat = rotations.xyzw_from_wxyz(quat_WB)
     good = np.isfinite(quat).all(axis=1) & (np.linalg.norm(np.nan_to_num(quat), axis=1) > 0.5)
     turned = np.full(quat.shape, np.nan)
     side = SEGMENT_OF[label].partition("_")[0]

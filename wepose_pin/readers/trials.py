@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..errors import BadData, MissingFile
 from .mat5 import read_mat5
 from .tables import columns, most_bytes, read_table
@@ -62,7 +62,7 @@ def read_broad(path: Path) -> Trial:
             f"{shapes[2]}, movement {moving.shape}, sampling_rate {rate_hz:g}; (n, 3), (n, 3), (n, 4), (n,) and a rate "
             f"are needed"
         )
-    true = so3.xyzw_from_wxyz(true)
+    true = rotations.xyzw_from_wxyz(true)
     begin, second = int(np.argmax(moving)), round(rate_hz)
     seen = np.isfinite(true).all(axis=1)
     return Trial(path.stem, rate_hz, gyro, accel, true, slice(second, begin - second), moving & seen)
@@ -214,7 +214,7 @@ def read_ring(files: RingFiles) -> Chain:
     table, rate_hz = read_table(omc), _stated_rate(omc)
     for segment, marker in zip(RING_SEGMENTS, (2, 2, 1, 2, 4), strict=True):  # the origins of arm.xml
         names = [f"{segment}_quat_{axis}" for axis in "wxyz"], [f"{segment}_marker{marker}_{axis}" for axis in "xyz"]
-        quat_VB[segment] = so3.xyzw_from_wxyz(columns(table, names[0], str(omc), segment))
+        quat_VB[segment] = rotations.xyzw_from_wxyz(columns(table, names[0], str(omc), segment))
         origin_V[segment] = columns(table, names[1], str(omc), segment)
     seen: np.ndarray = np.isfinite(np.stack([quat_VB[segment] for segment in RING_SEGMENTS])).all(axis=(0, 2))
     if seen.sum() < 2:
@@ -274,7 +274,7 @@ def read_ur5(files: Ur5Files) -> Referenced:
         for kind in ("gyr", "acc")
     )
     time = 1e-6 * columns(true, ["TIME"], str(encoder), sensor)[:, 0]
-    quat_VB = so3.xyzw_from_wxyz(columns(true, [f"QUATERNION_{k}" for k in range(4)], str(encoder), sensor))
+    quat_VB = rotations.xyzw_from_wxyz(columns(true, [f"QUATERNION_{k}" for k in range(4)], str(encoder), sensor))
     steps = np.diff(time)
     if len(gyro) != len(time):
         raise BadData(f"{encoder}: {len(time)} lines, but {len(gyro)} in {imu}; as many are needed")

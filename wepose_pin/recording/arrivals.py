@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..so3 import kernel
+from ..compilation import kernel
 from .clocks import LONGEST_GAP_S
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 

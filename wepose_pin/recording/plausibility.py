@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..errors import BadData
 from .gaps import runs
 from .intervals import format_time
@@ -171,7 +171,7 @@ def _coherence(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float
     In the sensor the specific force of an arm that swings is several times gravity, and points along the arm all the
     time; of its mean in the world gravity alone is left.
     """
-    turned = Rotation.from_quat(so3.integrate(gyro_S[1:] / rate_hz)).apply(accel_S)
+    turned = Rotation.from_quat(rotations.integrate(gyro_S[1:] / rate_hz)).apply(accel_S)
     return max(0.0, 1.0 - abs(float(np.linalg.norm(turned.mean(axis=0))) / STANDARD_GRAVITY - 1.0))
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from .. import so3
+from .. import rotations
 from .clocks import UNEVEN
 from .sensors import Sensor
 
@@ -28,7 +28,7 @@ def on_time(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
         return replace(sensor, quat_WS=Slerp(clock, Rotation.from_quat(sensor.quat_WS))(within).as_quat(), gap=gap)
     assert sensor.gyro_S is not None
     assert sensor.accel_S is not None
-    turned = so3.integrate(sensor.gyro_S[1:] * np.diff(clock)[:, None])
+    turned = rotations.integrate(sensor.gyro_S[1:] * np.diff(clock)[:, None])
     at = Slerp(clock, Rotation.from_quat(turned))(within)
     rate = (at[:-1].inv() * at[1:]).as_rotvec() / np.diff(time)[:, None]
     dt = float(time[1] - time[0])

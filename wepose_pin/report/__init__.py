@@ -11,7 +11,7 @@ _WHERE = {
     "track_report": "track",
     "unsaid": "calibration",
     "write_calibration_page": "calibration",
-    "write_thinned_pages": "pages",
+    "write_decimated_pages": "pages",
     "write_track_pages": "pages",
 }
 __all__ = [
@@ -19,7 +19,7 @@ __all__ = [
     "track_report",
     "unsaid",
     "write_calibration_page",
-    "write_thinned_pages",
+    "write_decimated_pages",
     "write_track_pages",
 ]
 

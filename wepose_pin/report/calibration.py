@@ -102,7 +102,11 @@ def calibration_report(
     page.add("lengths", lambda: _lengths(calibration, contact), "Lengths")
     page.add("sensors", lambda: _sensors(calibration, recording), "Sensors")
     page.add("gap", lambda: _gap(calibration, contact), f"{capital(contact.gap)} over time")
-    page.add("hands", lambda: _hands(calibration, contact, None if pose is None else pose.pose), "Where the motion was informative")
+    page.add(
+        "hands",
+        lambda: _hands(calibration, contact, None if pose is None else pose.pose),
+        "Where the motion was informative",
+    )
     page.add("posture", lambda: _posture(calibration), "The start pose")
     page.add("elbows", lambda: _elbows(calibration), "The elbows as hinges")
     page.add("view", lambda: _view(calibration, recording, pose), "The motion in 3D")

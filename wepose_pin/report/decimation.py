@@ -172,7 +172,10 @@ def _joined(parts: list[TrackedRecording], phases: Mapping[str, Intervals]) -> T
     segments = [part.segments for part in parts]
     orientation = {
         name: of._replace(
-            **{field: _concatenated([getattr(s.orientation[name], field) for s in segments]) for field in _OF_EACH_SAMPLE}
+            **{
+                field: _concatenated([getattr(s.orientation[name], field) for s in segments])
+                for field in _OF_EACH_SAMPLE
+            }
         )
         for name, of in segments[-1].orientation.items()
     }

@@ -8,8 +8,8 @@ from pathlib import Path
 from ..errors import reason
 from ..recording import Intervals
 from ..tracking import TrackedRecording
-from .page import PageWriter
 from .decimation import Decimator, Whole
+from .page import PageWriter
 from .track import track_report
 from .viewer import pose_html
 
@@ -30,7 +30,7 @@ def write_track_pages(
     Parameters
     ----------
     view, report : which of them
-    whole : of a `pose` that `Decimator` thinned
+    whole : of a `pose` that `Decimator` made
     fps : of ``view.html``
 
     Returns
@@ -51,9 +51,9 @@ def write_track_pages(
     return writer.warnings
 
 
-def write_thinned_pages(
+def write_decimated_pages(
     folder: Path,
-    thinner: Decimator,
+    decimator: Decimator,
     phases: Mapping[str, Intervals],
     warnings: list[str],
     *,
@@ -62,7 +62,7 @@ def write_thinned_pages(
 ) -> list[str]:
     """`write_track_pages` of a recording that came in pieces; `phases` and `warnings` of the whole recording."""
     try:
-        pose, whole = thinner.decimated(phases, warnings)
+        pose, whole = decimator.decimated(phases, warnings)
     except Exception as error:
         writer = PageWriter(folder, PAGES)
         writer.warnings.append(f"{' and '.join(PAGES)}: cannot be made: {reason(error)}")

@@ -11,6 +11,7 @@ from ..pose import deviation, spread
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
 from .concerns import GRAVITY_OFF, Concern, concerns, hold
+from .decimation import Whole, whole_of
 from .joints import joint_angles_section
 from .measures import (
     Budget,
@@ -27,7 +28,6 @@ from .measures import (
     usual,
 )
 from .page import Page, Table
-from .decimation import Whole, whole_of
 from .track_figures import headings_picture, noise_picture, paths_picture, reach_picture, timeline_picture
 from .viewer import pose_html
 from .words import degrees, intervals, listed, plain, versions, whole
@@ -49,7 +49,7 @@ def track_report(
     ----------
     pose : of `track`
     view : the page of `pose_html` where it is made already, to be shown here unless it is large; None: it is made here
-    whole : of a `pose` that `Decimator` thinned
+    whole : of a `pose` that `Decimator` made
     failures : takes a line for each section that cannot be made; the page says so in its place
     """
     recording = pose.recording

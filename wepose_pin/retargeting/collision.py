@@ -11,8 +11,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from ..compilation import compiled
 from ..errors import BadModel
-from ..so3 import compiled
 from .robot import Robot
 
 CLEARANCE = 0.02  # [m] that the solver keeps between hulls

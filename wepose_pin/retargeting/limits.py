@@ -21,8 +21,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ..compilation import compiled, inlined, kernel
 from ..errors import BadModel, MissingFile
-from ..so3 import compiled, inlined, kernel
 
 
 class JointLimit(NamedTuple):

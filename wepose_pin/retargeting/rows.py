@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..so3 import compiled, inlined
+from ..compilation import compiled, inlined
 
 # Where each number of the tasks stands in `numbers`.
 POSITION, ORIENTATION, SWIVEL, GAIN, BRAKE, STRAIGHT, DAMPING, CURVED = range(8)

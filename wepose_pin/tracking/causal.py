@@ -12,8 +12,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..alignment import START_POSE_STD, Segments, align, check_mounts, covariance_of, heading_to, orient_segments
+from ..compilation import kernel
 from ..errors import BadOption, BadPhase
 from ..filters import BEST, Orientation
 from ..filters.bank import LiveBank, OneByOne, bank_of
@@ -21,7 +22,7 @@ from ..filters.sensors import SensorFilters, filtered_chunk
 from ..filters.static import StaticTest
 from ..pose import spread
 from ..recording import Recording, join
-from ..so3 import kernel
+from ..rotations import product
 from ..subject import Subject
 from .segments import Oriented
 from .start_pose import HOLD_S, StartGuide, until_start
@@ -314,7 +315,7 @@ def vertical_var(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
 
 
 def _about_z(angle: np.ndarray) -> np.ndarray:
-    return so3.exp(angle[:, None] * [0.0, 0.0, 1.0])
+    return rotations.exp(angle[:, None] * [0.0, 0.0, 1.0])
 
 
 @kernel
@@ -324,15 +325,8 @@ def _place(turn, quat_VS, mount, last, out):  # type: ignore[no-untyped-def]
         for k in range(len(turn)):
             ax, ay, az, aw = turn[k, 0], turn[k, 1], turn[k, 2], turn[k, 3]
             bx, by, bz, bw = quat_VS[n, k, 0], quat_VS[n, k, 1], quat_VS[n, k, 2], quat_VS[n, k, 3]
-            x = aw * bx + ax * bw + ay * bz - az * by
-            y = aw * by - ax * bz + ay * bw + az * bx
-            z = aw * bz + ax * by - ay * bx + az * bw
-            w = aw * bw - ax * bx - ay * by - az * bz
-            bx, by, bz, bw = -mount[k, 0], -mount[k, 1], -mount[k, 2], mount[k, 3]
-            rx = w * bx + x * bw + y * bz - z * by
-            ry = w * by - x * bz + y * bw + z * bx
-            rz = w * bz + x * by - y * bx + z * bw
-            rw = w * bw - x * bx - y * by - z * bz
+            x, y, z, w = product(ax, ay, az, aw, bx, by, bz, bw)
+            rx, ry, rz, rw = product(x, y, z, w, -mount[k, 0], -mount[k, 1], -mount[k, 2], mount[k, 3])
             sign = 1.0
             if rx * last[k, 0] + ry * last[k, 1] + rz * last[k, 2] + rw * last[k, 3] < 0.0:
                 sign = -1.0

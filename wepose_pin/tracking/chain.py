@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..alignment import Segments
 from ..arguments import check_arguments
 from ..errors import BadOption, BadSession, one_of
@@ -129,7 +129,7 @@ def track_chain(
     return TrackedChain(
         recording.time,
         q,
-        {link: so3.continuous(quat) for link, quat in quat_WL.items()},
+        {link: rotations.unwrap_signs(quat) for link, quat in quat_WL.items()},
         residual,
         segments.covariance_W,
         tuple(unseen(model, list(quat_WL), q[len(q) // 2])),
@@ -148,4 +148,4 @@ def _orientations(model: pin.Model, q: np.ndarray, links: list[str]) -> dict[str
         pin.framesForwardKinematics(model, data, row)
         for i, frame in enumerate(frames):
             R[k, i] = data.oMf[frame].rotation
-    return {link: so3.continuous(Rotation.from_matrix(R[:, i]).as_quat()) for i, link in enumerate(links)}
+    return {link: rotations.unwrap_signs(Rotation.from_matrix(R[:, i]).as_quat()) for i, link in enumerate(links)}

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .. import so3
+from .. import rotations
 from ..filters import METHODS, GdcParams, NcfParams, run_filter
 from ..filters.noise import SensorNoise
 from ..filters.static import StaticTest
@@ -82,13 +82,13 @@ def _default_gains(method: str, params: Any) -> Contender:
 # others: that never costs it more than 0.002 deg, and in a minute at 100 Hz it helps.
 def _vqf(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
     gyro, accel = np.ascontiguousarray(gyro_S - noise.gyro_bias), np.ascontiguousarray(accel_S, dtype=float)
-    return so3.xyzw_from_wxyz(import_module("vqf").VQF(1.0 / rate_hz).updateBatch(gyro, accel)["quat6D"])
+    return rotations.xyzw_from_wxyz(import_module("vqf").VQF(1.0 / rate_hz).updateBatch(gyro, accel)["quat6D"])
 
 
 def _offline_vqf(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
     """Forward and backward over the whole recording: it knows the future, as a smoother does."""
     gyro, accel = np.ascontiguousarray(gyro_S - noise.gyro_bias), np.ascontiguousarray(accel_S, dtype=float)
-    return so3.xyzw_from_wxyz(import_module("vqf").offlineVQF(gyro, accel, None, 1.0 / rate_hz)["quat6D"])
+    return rotations.xyzw_from_wxyz(import_module("vqf").offlineVQF(gyro, accel, None, 1.0 / rate_hz)["quat6D"])
 
 
 # x-io's Fusion (chapter 7 of Madgwick's thesis) as its README and examples have it: gain 0.5, accelerations beyond
@@ -104,14 +104,14 @@ def _imufusion(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: S
         )
     )
     # The start that the others have; its own would hold the heading for three seconds.
-    quat_start = so3.tilt(accel_S[: StaticTest().samples(rate_hz)].mean(axis=0))
-    ahrs.set_quaternion(so3.wxyz_from_xyzw(quat_start)).skip_startup()
+    quat_start = rotations.quat_from_gravity(accel_S[: StaticTest().samples(rate_hz)].mean(axis=0))
+    ahrs.set_quaternion(rotations.wxyz_from_xyzw(quat_start)).skip_startup()
     gyro, accel = np.degrees(gyro_S), accel_S / noise.gravity  # [deg/s], [g]
     quat_wxyz = np.empty((len(gyro), 4))
     for k in range(len(gyro)):
         quat_wxyz[k] = ahrs.update_no_magnetometer(bias.update(gyro[k]), accel[k]).get_quaternion()
     # It counts in single precision: the norm is off by 1e-7.
-    return so3.xyzw_from_wxyz(quat_wxyz / np.linalg.norm(quat_wxyz, axis=1, keepdims=True))
+    return rotations.xyzw_from_wxyz(quat_wxyz / np.linalg.norm(quat_wxyz, axis=1, keepdims=True))
 
 
 _PEERS: dict[str, tuple[str, Orient]] = {  # label → the package it needs, and how it is run

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..filters import Gdc, GdcParams, Ncf, NcfParams
 from ..filters.noise import SensorNoise, noise_of
 from ..filters.static import StaticTest
@@ -120,7 +120,7 @@ def best(scores: Sequence[Score]) -> Score:
 
 def total_rmse(trial: TuningTrial, params: NcfParams | GdcParams) -> float:
     """[deg] over what of a trial is scored."""
-    quat_start = so3.tilt(trial.accel_S[: StaticTest().samples(trial.rate_hz)].mean(axis=0))
+    quat_start = rotations.quat_from_gravity(trial.accel_S[: StaticTest().samples(trial.rate_hz)].mean(axis=0))
     filter_ = (Ncf if isinstance(params, NcfParams) else Gdc)(trial.noise, trial.rate_hz, quat_start, params)  # type: ignore[arg-type]
     quat = filter_.run(trial.gyro_S, trial.accel_S, np.zeros(len(trial.gyro_S), dtype=bool)).quat_WS
     R_VS = aligned(Rotation.from_quat(quat[trial.at]), trial.R_WS, trial.rest)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 from ..calibration import calibrate_lengths
 from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
 from ..filters.noise import noise_of
@@ -94,7 +94,7 @@ def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
     results = []
     for method, _, error in _single(sensor, "simulated 1 kHz"):
         yaw, pitch, roll = np.abs(error.as_euler("ZYX", degrees=True)[after]).T
-        heading = np.degrees(np.unwrap(so3.heading(error.as_quat())))
+        heading = np.degrees(np.unwrap(rotations.heading(error.as_quat())))
         slope = np.polyfit(sensor.time[after], heading[after], 1)[0]
         figures = {"roll": roll.mean(), "pitch": pitch.mean(), "yaw": yaw.mean(), "drift_deg_min": 60.0 * abs(slope)}
         series = over_time(sensor.time, heading_deg=heading) if seed == 0 else {}

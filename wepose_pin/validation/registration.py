@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
-from .. import so3
+from .. import rotations
 from ..errors import BadData
 from ..readers.trials import Referenced
 
@@ -76,7 +76,7 @@ def register(sensors: Sequence[Referenced], stretch: tuple[float, float]) -> lis
         raise BadData(f"{sensors[0].name}: no offset of the clocks within {LARGEST_OFFSET_S:g} s fits the reference")
     fits = [span.fit(offset) for span in spans]
     up_V = np.array([span.up(offset, fit) for span, fit in zip(spans, fits, strict=True)])
-    quat_WV = so3.tilt(np.array([fit.rms for fit in fits]) ** -2.0 @ up_V)
+    quat_WV = rotations.quat_from_gravity(np.array([fit.rms for fit in fits]) ** -2.0 @ up_V)
     return [
         Registration(offset, fit.R_BS.as_quat(), quat_WV, fit.bias, float(row[best]), float(np.degrees(fit.rms)))
         for fit, row in zip(fits, correlations, strict=True)
@@ -130,7 +130,7 @@ class _Span:
     def integrated(self, bias: np.ndarray) -> Rotation:
         """R_IS of all samples, I the sensor's frame at the beginning."""
         rate = self.sensor.gyro_S[self.samples] - bias
-        return Rotation.from_quat(so3.integrate(np.ascontiguousarray(rate / self.sensor.rate_hz))[1:])
+        return Rotation.from_quat(rotations.integrate(np.ascontiguousarray(rate / self.sensor.rate_hz))[1:])
 
     def mount(self, offset: float) -> Rotation:
         """R_BS from turns over `TURN_S`."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import so3
+from .. import rotations
 
 POINTS_DRAWN = 600
 
 
 def aligned(R_VS: Rotation, R_WS: Rotation, where: np.ndarray) -> Rotation:
     """R_VS turned about the vertical such that its heading is that of R_WS where `where`."""
-    psi = so3.heading((R_WS[where] * R_VS[where].inv()).mean().as_quat())
+    psi = rotations.heading((R_WS[where] * R_VS[where].inv()).mean().as_quat())
     return Rotation.from_rotvec([0.0, 0.0, float(psi)]) * R_VS
 
 

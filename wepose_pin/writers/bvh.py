@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..errors import BadData
-from ..model.chains import conjugate, multiply
 from ..pose import configuration, forward_kinematics, pose_of
+from ..rotations import conjugate, multiply
 from .motion import Motion, bridged, even, whole
 
 _ROTATIONS = "Zrotation Xrotation Yrotation"

@@ -12,11 +12,11 @@ from .result import as_json, versions
 
 
 def write_calibration(
-    folder: Path, calibration: Calibration, verdict: Verdict, made_by: Mapping[str, Any] | None = None
+    folder: Path, calibration: Calibration, verdict: Verdict, provenance: Mapping[str, Any] | None = None
 ) -> None:
-    """Write ``calibration.json`` into an existing folder; `made_by` (see `provenance`) becomes part of it."""
+    """Write ``calibration.json`` into an existing folder; `provenance` becomes part of it."""
     content = as_json(document(calibration, verdict)) | {"versions": versions()}
-    if made_by is not None:
-        content["made_by"] = dict(made_by)
+    if provenance is not None:
+        content["provenance"] = dict(provenance)
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")

@@ -44,13 +44,13 @@ class ChunkWriter:
         self._seen += len(chunk.time)
         self.accumulator.add(chunk)
 
-    def finish(self, phases: Mapping[str, Sequence[tuple[float, float]]], made_by: Mapping[str, Any]) -> None:
+    def finish(self, phases: Mapping[str, Sequence[tuple[float, float]]], provenance: Mapping[str, Any]) -> None:
         """The other files."""
         _put_together(self._parts, self._folder / "pose.parquet")
         shutil.rmtree(self._parts)
         last = self.accumulator.last
         assert last is not None
-        write_about(self._folder, last, self.accumulator.summary(), phases, made_by)
+        write_about(self._folder, last, self.accumulator.summary(), phases, provenance)
 
 
 def _put_together(parts: Path, path: Path) -> None:

@@ -16,7 +16,7 @@ from .c3d import write_c3d
 from .folder import whole_file
 from .motion import Motion, check_rate, resampled
 from .opensim import write_mot, write_placement, write_sto, write_trc
-from .provenance import beside, block_text
+from .provenance import provenance_file, provenance_text
 from .result import read_result
 from .tables import write_csv, write_parquet
 
@@ -52,7 +52,7 @@ def export(
     names: str | None = None,
     rate_hz: float | None = None,
     force: bool = False,
-    made_by: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
     """Write the motion of a result folder, or its subject, to a file, which appears whole or not at all.
 
@@ -61,7 +61,7 @@ def export(
     format : one of `FORMATS`; None: that of the file's suffix, which otherwise has to be the format's own
     names : of a .mot's columns, one of `NAMES`; None: "opensim"
     rate_hz : resample the motion first
-    made_by : (see `provenance`) written beside the file, before it
+    provenance : written beside the file, before it
 
     Raises
     ------
@@ -85,8 +85,9 @@ def export(
         raise BadOption(f"--rate-hz {rate_hz:g}: there is no motion in a file of format {format}")
     with contextlib.ExitStack() as files:
         partial = files.enter_context(whole_file(file, force))
-        if made_by is not None:
-            files.enter_context(whole_file(beside(file), True)).write_text(block_text(made_by), encoding="utf-8")
+        if provenance is not None:
+            beside = files.enter_context(whole_file(provenance_file(file), True))
+            beside.write_text(provenance_text(provenance), encoding="utf-8")
         if format == "urdf":
             if not (result / "subject.urdf").is_file():
                 raise MissingFile(f"{result}: no subject.urdf in it; a folder that `wepose track` wrote is wanted here")

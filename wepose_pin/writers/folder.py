@@ -65,10 +65,7 @@ def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
     ExistingOutput
         `file` is there and `force` is not given, or it cannot be written.
     """
-    if file.exists() and not force:
-        raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
-    if file.is_dir() or not file.absolute().parent.is_dir():
-        raise ExistingOutput(f"{file}: not a file that can be written; -o names a file in an existing folder")
+    check_file(file, force)
     partial = file.with_name(f".{file.name}.partial")
     try:
         with _full_told(file):
@@ -76,6 +73,14 @@ def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
         partial.replace(file)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def check_file(file: Path, force: bool = False) -> None:
+    """Raise `ExistingOutput` where `file` is there and `force` is not given, or it cannot be a file."""
+    if file.exists() and not force:
+        raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
+    if file.is_dir() or not file.absolute().parent.is_dir():
+        raise ExistingOutput(f"{file}: not a file that can be written; -o names a file in an existing folder")
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What made a result: version, commit, options, inputs with their hashes; the block `made_by` beside what was made."""
+"""The provenance of a result: the job that made it as data, hashes of its inputs, code, packages and machine."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..errors import BadData, MissingFile
 from .result import versions
 
 FORMAT = 1
-ALONE = "made_by.json"  # beside results that have no JSON of their own
+ALONE = "provenance.json"  # beside results that have no JSON of their own
 INSIDE = ("summary.json", "calibration.json")
 # Of a result folder, what others are made from; pages and what was exported into it are not.
 _RESULT = ("pose.parquet", "joints.parquet", "subject.toml", "subject.urdf")
@@ -64,40 +64,33 @@ def _commit() -> str | None:
     return described.stdout.strip()
 
 
-def made_by(
-    command: str, given: Mapping[str, Any], *, truth: bool = False, inputs: Mapping[str, Path] | None = None
-) -> dict[str, Any]:
-    """The block of a result.
+def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The provenance of what a command makes.
 
     Parameters
     ----------
     command : as on the command line
-    given : its arguments and options by name; those that name existing files are inputs, the rest options (seeds too)
-    truth : the reference that a session names was used as well
-    inputs : more of them, where `given` does not name the files
+    values : the fields of its job; those that name existing files are inputs, the others options, seeds among them
 
     Raises
     ------
     MissingFile
         An input cannot be read.
     """
-    named = {name: path for name, value in given.items() if (path := _as_input(name, value)) is not None}
-    options = {name: value for name, value in given.items() if name not in (*named, *_NOT_OPTIONS)}
+    inputs = {name: path for name, value in values.items() if (path := _input_path(name, value)) is not None}
+    options = {name: value for name, value in values.items() if name not in (*inputs, *_NOT_OPTIONS)}
     return {
         "format": FORMAT,
         "command": command,
         **code(),
         "options": json.loads(json.dumps(options, default=str)),
-        "inputs": {
-            name: {"path": str(path.absolute()), "files": file_hashes(path, truth)}
-            for name, path in {**named, **(inputs or {})}.items()
-        },
+        "inputs": {name: {"path": str(path.absolute()), "files": file_hashes(path)} for name, path in inputs.items()},
         "packages": versions(),
         "machine": machine(),
     }
 
 
-def _as_input(name: str, value: Any) -> Path | None:
+def _input_path(name: str, value: Any) -> Path | None:
     """The path that an option names, if it is that of something read."""
     if name in _NOT_OPTIONS or not isinstance(value, str | Path):
         return None
@@ -187,23 +180,23 @@ def _name(file: Path, top: Path) -> str:
 # Where it is kept ----------------------------------------------------------------------------------------------------
 
 
-def beside(file: Path) -> Path:
-    """``FILE.made_by.json``, where the block of a file stands."""
+def provenance_file(file: Path) -> Path:
+    """``FILE.provenance.json``, where the provenance of a file stands."""
     return file.with_name(f"{file.name}.{ALONE}")
 
 
-def write_made_by(folder: Path, block: Mapping[str, Any]) -> None:
-    """``made_by.json`` in a folder."""
-    (folder / ALONE).write_text(block_text(block), encoding="utf-8")
+def write_provenance(folder: Path, provenance: Mapping[str, Any]) -> None:
+    """``provenance.json`` in a folder."""
+    (folder / ALONE).write_text(provenance_text(provenance), encoding="utf-8")
 
 
-def block_text(block: Mapping[str, Any]) -> str:
-    """A block as a file of its own holds it."""
-    return json.dumps(block, indent=1, ensure_ascii=False) + "\n"
+def provenance_text(provenance: Mapping[str, Any]) -> str:
+    """A provenance as a file of its own holds it."""
+    return json.dumps(provenance, indent=1, ensure_ascii=False) + "\n"
 
 
-def read_made_by(result: Path) -> dict[str, Any]:
-    """The block of a result folder, or of an exported file.
+def read_provenance(result: Path) -> dict[str, Any]:
+    """The provenance of a result folder, or of an exported file.
 
     Raises
     ------
@@ -214,19 +207,20 @@ def read_made_by(result: Path) -> dict[str, Any]:
     """
     if not result.exists():
         raise MissingFile(f"{result}: no such result; a folder, or an exported file, is wanted here")
-    alone = result / ALONE if result.is_dir() else beside(result)
+    alone = result / ALONE if result.is_dir() else provenance_file(result)
     places = [alone, *(result / name for name in INSIDE if result.is_dir())]
     for place in (place for place in places if place.is_file()):
         try:
             content = json.loads(place.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:
             raise BadData(f"{place}: is damaged, no JSON: {error}") from error
-        block = content if place.name.endswith(ALONE) else content.get("made_by") if isinstance(content, dict) else None
-        if block is None:
+        if place != alone:
+            content = content.get("provenance") if isinstance(content, dict) else None
+        if content is None:
             continue
-        if not isinstance(block, dict) or block.get("format") != FORMAT:
-            raise BadData(f"{place}: made_by is not of format {FORMAT}; made by another version")
-        if not all(isinstance(block.get(key), dict) for key in ("options", "inputs")):
-            raise BadData(f"{place}: made_by is damaged: options and inputs, tables both, are needed")
-        return block
-    raise BadData(f"{result}: does not say what made it ({alone.name}, or made_by in {' or '.join(INSIDE)})")
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise BadData(f"{place}: provenance is not of format {FORMAT}; made by another version")
+        if not all(isinstance(content.get(key), dict) for key in ("options", "inputs")):
+            raise BadData(f"{place}: provenance is damaged: options and inputs, tables both, are needed")
+        return content
+    raise BadData(f"{result}: does not say what made it ({alone.name}, or provenance in {' or '.join(INSIDE)})")

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
-from ..model.chains import Chain, about, conjugate, multiply, solve
+from ..model.chains import Chain, solve
 from ..readers.opensim import PRONATION, R_GW, in_n_pose
+from ..rotations import conjugate, multiply, rotation_about
 
 # Segment → body. The model has no head of its own.
 BODIES = {
@@ -141,7 +142,7 @@ def _errors(
     columns = np.tile(np.eye(3), (n, 1, 1))  # what moves the body, in its own axes: (n, 3, …)
     for m, measured in enumerate(quat):
         for k in (2 * m - 2, 2 * m - 1) if m else ():
-            turn = about(axes[k], angles[:, k])
+            turn = rotation_about(axes[k], angles[:, k])
             body = multiply(body, turn)
             back = Rotation.from_quat(conjugate(turn)).as_matrix()
             columns = np.concatenate([back @ columns, np.tile(axes[k][:, None], (n, 1, 1))], axis=2)

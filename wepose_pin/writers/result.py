@@ -29,19 +29,19 @@ def write_result(
     covariance: bool = False,
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     torques: Torques | None = None,
-    made_by: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
 ) -> None:
     """Write what `track` gave into an existing folder; with `covariance` its entries as well, not only deviations.
 
     `phases` of the recording go to the summary, so that a page made from the folder shows them too. `torques` become
-    ``torques.parquet``, `made_by` (see `provenance`) part of the summary.
+    ``torques.parquet``, `provenance` part of the summary.
     """
     write_table(folder / "pose.parquet", pose_table(tracked.pose, covariance))
     summary = tracked.summary()
     if torques is not None:
         write_table(folder / "torques.parquet", torque_table(torques))
         summary["torques"] = torques.summary()
-    write_about(folder, tracked, summary, phases, made_by)
+    write_about(folder, tracked, summary, phases, provenance)
 
 
 def write_about(
@@ -49,14 +49,14 @@ def write_about(
     tracked: TrackedRecording,
     summary: Mapping[str, Any],
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
-    made_by: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
 ) -> None:
     """What stands in a result folder beside its tables: the subject as used, and ``summary.json``."""
     write_subject(folder, tracked.subject, tracked.model)
     spans = {name: [[float(a), float(b)] for a, b in of] for name, of in (phases or {}).items()}
     about = {**summary, "recorded_phases": spans, "versions": versions()}
-    if made_by is not None:
-        about["made_by"] = dict(made_by)
+    if provenance is not None:
+        about["provenance"] = dict(provenance)
     (folder / "summary.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
 
 

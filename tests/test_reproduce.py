@@ -1,4 +1,4 @@
-"""`wepose rerun`: results say what made them, are made again to the bit, and what has changed is named."""
+"""`wepose reproduce`: results say what made them, are made again to the bit, and what has changed is named."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from arms import write_arm
 from wepose_pin import __version__
 from wepose_pin.batch.compare import differences
 from wepose_pin.batch.items import make_items
-from wepose_pin.batch.plan import STEPS, Item
+from wepose_pin.batch.plan import Item, step_options
 from wepose_pin.cli import main
 from wepose_pin.simulation import simulate, simulated_person
 from wepose_pin.writers import write_session
-from wepose_pin.writers.provenance import code, file_hash, made_by, read_made_by
+from wepose_pin.writers.provenance import code, collect_provenance, file_hash, read_provenance
 
 
 def run(*words: object) -> int:
@@ -51,8 +51,8 @@ def result(session: Path) -> Path:
 
 
 def test_a_result_says_what_made_it(result: Path, session: Path) -> None:
-    block = read_made_by(result)
-    assert json.loads((result / "summary.json").read_text())["made_by"] == block
+    block = read_provenance(result)
+    assert json.loads((result / "summary.json").read_text())["provenance"] == block
     assert (block["command"], block["version"], block["code"]) == ("track", __version__, code()["code"])
     assert block["options"]["method"] == "ncf"
     assert {"out", "force", "session"}.isdisjoint(block["options"])
@@ -80,32 +80,35 @@ def test_the_commit_is_that_of_the_checkout() -> None:
 def test_track_again_is_the_same(result: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path: path.read_bytes() for path in result.rglob("*")}
     capsys.readouterr()
-    assert run("rerun", result) == 0
+    assert run("reproduce", result) == 0
     said = capsys.readouterr()
     assert said.out == f"{result}: the same, made again by wepose track\n"
     assert {path: path.read_bytes() for path in result.rglob("*")} == before
 
 
 def test_what_is_made_by_other_commands(session: Path, result: Path, tmp_path: Path) -> None:
-    assert run("calibrate", session, "--gauge", "shoulder_width=0.36", "-o", tmp_path / "anna") in (0, 3, 4)
-    assert run("rerun", tmp_path / "anna") == 0
+    assert run("calibrate", session, "--measured", "shoulder_width=0.36", "-o", tmp_path / "anna") in (0, 3, 4)
+    assert run("reproduce", tmp_path / "anna") == 0
     assert run("export", result, "--rate-hz", 50, "-o", tmp_path / "motion.trc") == 0
-    assert run("rerun", tmp_path / "motion.trc") == 0
+    assert run("reproduce", tmp_path / "motion.trc") == 0
     text = (tmp_path / "motion.trc").read_text()
     (tmp_path / "motion.trc").write_text(text + "1\n")
-    assert run("rerun", tmp_path / "motion.trc") == 3
-    assert run("simulate", "--seed", 4, "--protocol", "poses", "--set", "palm_slip=0", "-o", tmp_path / "made") == 0
-    assert read_made_by(tmp_path / "made")["options"]["seed"] == 4
-    assert run("rerun", tmp_path / "made") == 0
+    assert run("reproduce", tmp_path / "motion.trc") == 3
+    assert (
+        run("simulate", "--seed", 4, "--protocol", "poses", "--imperfection", "palm_slip=0", "-o", tmp_path / "made")
+        == 0
+    )
+    assert read_provenance(tmp_path / "made")["options"]["seed"] == 4
+    assert run("reproduce", tmp_path / "made") == 0
 
 
 def test_what_another_version_has_made_is_made_again_and_said(result: Path, capsys: pytest.CaptureFixture[str]) -> None:
     summary = json.loads((result / "summary.json").read_text())
-    summary["made_by"] |= {"version": "0.0.9", "commit": "abc", "code": "0" * 64}
-    summary["made_by"]["packages"]["numpy"] = "1.0"
+    summary["provenance"] |= {"version": "0.0.9", "commit": "abc", "code": "0" * 64}
+    summary["provenance"]["packages"]["numpy"] = "1.0"
     (result / "summary.json").write_text(json.dumps(summary))
     capsys.readouterr()
-    assert run("rerun", result) == 0
+    assert run("reproduce", result) == 0
     said = capsys.readouterr()
     assert "note: made by wepose-pin 0.0.9 (abc); this is " in said.err
     assert "note: other versions now: numpy " in said.err
@@ -118,15 +121,15 @@ def test_retarget_again(result: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     robot.mkdir()
     write_arm(robot)
     assert run("retarget", result, "--robot", robot / "arm.urdf", "--no-view", "-o", tmp_path / "moved") == 0
-    assert run("rerun", tmp_path / "moved") == 0
+    assert run("reproduce", tmp_path / "moved") == 0
     text = (robot / "arm.toml").read_text()
     (robot / "arm.toml").write_text(text + "\n")
     capsys.readouterr()
-    assert run("rerun", tmp_path / "moved") == 2
+    assert run("reproduce", tmp_path / "moved") == 2
     assert f"of its robot, {robot / 'arm.toml'} has changed" in capsys.readouterr().err
     (robot / "arm.toml").write_text(text)
     (result / "pose.parquet").unlink()
-    assert run("rerun", tmp_path / "moved") == 2
+    assert run("reproduce", tmp_path / "moved") == 2
     assert "of its result, pose.parquet is gone" in capsys.readouterr().err
 
 
@@ -138,20 +141,20 @@ def test_a_whole_study_again(session: Path, tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "plan.toml").write_text(f'[sessions]\nfiles = ["session", "other", "bad"]\n{steps}')
     assert run("batch", tmp_path / "plan.toml", "--workers", 1, "-o", tmp_path / "study") == 3
     capsys.readouterr()
-    assert run("rerun", tmp_path / "study") == 0
+    assert run("reproduce", tmp_path / "study") == 0
     said = capsys.readouterr()
     assert said.out == f"{tmp_path / 'study'}: the same, made again by wepose batch\n"
     assert "1 items had failed" in said.err
     pose = tmp_path / "study" / "items" / "other" / "track" / "pose.parquet"
     pl.read_parquet(pose).head(3).write_parquet(pose)
     (session / "recording.parquet").unlink()
-    assert run("rerun", tmp_path / "study") == 3
+    assert run("reproduce", tmp_path / "study") == 3
     said = capsys.readouterr()
     assert "other: track/pose.parquet: " in said.out
     assert "session: cannot be made again: " in said.out
     assert "recording.parquet is gone" in said.out
     (tmp_path / "study" / "results.parquet").unlink()
-    assert run("rerun", tmp_path / "study") == 2
+    assert run("reproduce", tmp_path / "study") == 2
 
 
 def test_differences_are_named(result: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -162,7 +165,7 @@ def test_differences_are_named(result: Path, capsys: pytest.CaptureFixture[str])
     (result / "summary.json").write_text(json.dumps(summary | {"rate_hz": 99.0}))
     (result / "subject.urdf").unlink()
     capsys.readouterr()
-    assert run("rerun", result) == 3
+    assert run("reproduce", result) == 3
     said = capsys.readouterr().out
     assert f"pose.parquet: column left_hand_x differs in 1 of {table.height} rows, by 0.25 at most" in said
     assert "summary.json: rate_hz was 99.0, is 100.0" in said
@@ -172,8 +175,8 @@ def test_differences_are_named(result: Path, capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize("wrong", ["gone", "changed", "data", "none", "damaged", "format", "unknown", "nothing"])
 def test_what_cannot_be_made_again(wrong: str, result: Path, session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     summary = json.loads((result / "summary.json").read_text())
-    block: dict[str, Any] = summary["made_by"]
-    said = "made_by"
+    block: dict[str, Any] = summary["provenance"]
+    said = "provenance"
     if wrong == "gone":
         (session / "session.toml").unlink()
         said = f"of its session, session.toml is gone: {session / 'session.toml'}"
@@ -184,22 +187,22 @@ def test_what_cannot_be_made_again(wrong: str, result: Path, session: Path, caps
         (session / "recording.parquet").unlink()
         said = "recording.parquet is gone"
     elif wrong == "none":
-        summary.pop("made_by")
+        summary.pop("provenance")
         said = "does not say what made it"
     elif wrong == "damaged":
         block["inputs"] = []
-        said = "made_by is damaged"
+        said = "provenance is damaged"
     elif wrong == "format":
         block["format"] = 2
-        said = "made_by is not of format 1"
+        said = "provenance is not of format 1"
     elif wrong == "unknown":
         block["options"]["speed"] = 3
-        said = "wepose track of this version has no option speed"
+        said = "wepose track of this version: speed is not an option"
     (result / "summary.json").write_text(json.dumps(summary))
     if wrong == "nothing":
         result, said = result / "nothing", "no such result"
     capsys.readouterr()
-    assert run("rerun", result) == 2
+    assert run("reproduce", result) == 2
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
@@ -207,7 +210,10 @@ def test_what_cannot_be_made_again(wrong: str, result: Path, session: Path, caps
 
 def test_an_item_of_a_batch_and_its_parts(session: Path, tmp_path: Path) -> None:
     """Each as a user types it, in a process of its own: the number of BLAS threads is then that of the workers."""
-    steps = {"calibrate": STEPS["calibrate"] | {"report": False}, "track": STEPS["track"] | {"report": False}}
+    steps = {
+        "calibrate": step_options("calibrate") | {"report": False},
+        "track": step_options("track") | {"report": False},
+    }
     steps |= {"evaluate": {"interval": None}}
     script = (
         "import sys; from wepose_pin.batch.items import make_items; from wepose_pin.batch.plan import Item\n"
@@ -220,7 +226,7 @@ def test_an_item_of_a_batch_and_its_parts(session: Path, tmp_path: Path) -> None
     )  # fmt: skip
     assert made.stdout == "done\n"
     for part in ("one", "one/track"):
-        command = [sys.executable, "-m", "wepose_pin.cli", "rerun", tmp_path / "items" / part]
+        command = [sys.executable, "-m", "wepose_pin.cli", "reproduce", tmp_path / "items" / part]
         again = subprocess.run(command, capture_output=True, text=True, check=False)
         assert (again.returncode, again.stdout, again.stderr) == (
             0,
@@ -230,10 +236,10 @@ def test_an_item_of_a_batch_and_its_parts(session: Path, tmp_path: Path) -> None
 
 
 def test_an_item_whose_truth_has_changed(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    steps = {"track": STEPS["track"] | {"report": False, "view": False}, "evaluate": {"interval": None}}
+    steps = {"track": step_options("track") | {"report": False, "view": False}, "evaluate": {"interval": None}}
     make_items([Item("one", str(session), steps)], str(tmp_path / "items"))
     (session / "truth.parquet").unlink()
-    assert run("rerun", tmp_path / "items" / "one") == 2
+    assert run("reproduce", tmp_path / "items" / "one") == 2
     assert "of its session, truth.parquet is gone" in capsys.readouterr().err
 
 
@@ -242,7 +248,7 @@ def test_what_counts_as_a_difference(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         pl.DataFrame({"x": [1.0, float("nan"), None]}).write_parquet(tmp_path / name / "t.parquet", compression="lz4")
         (tmp_path / name / "view.html").write_text(name)
-        (tmp_path / name / "s.json").write_text(json.dumps({"v": 1, "made_by": name}))
+        (tmp_path / name / "s.json").write_text(json.dumps({"v": 1, "provenance": name}))
     assert differences(tmp_path / "a", tmp_path / "b") == []
     pl.DataFrame({"x": [1.0, None, None]}).write_parquet(tmp_path / "b" / "t.parquet")
     assert differences(tmp_path / "a", tmp_path / "b")[0].startswith("t.parquet: column x differs in 1 of 3 rows")
@@ -253,8 +259,7 @@ def test_what_counts_as_a_difference(tmp_path: Path) -> None:
 def test_files_that_options_name_are_inputs(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text('urdf = "body.urdf"\n')
     (tmp_path / "body.urdf").write_text("<robot/>")
-    block = made_by(
-        "x", {"protocol": str(tmp_path / "own.toml"), "method": "amekf", "out": tmp_path, "gauge": ("a=1",)}
-    )
+    values = {"protocol": str(tmp_path / "own.toml"), "method": "amekf", "out": tmp_path, "measured": {"a": 1.0}}
+    block = collect_provenance("x", values)
     assert list(block["inputs"]["protocol"]["files"]) == ["own.toml", "body.urdf"]
-    assert block["options"] == {"method": "amekf", "gauge": ["a=1"]}
+    assert block["options"] == {"method": "amekf", "measured": {"a": 1.0}}

@@ -1,0 +1,56 @@
+"""Kernels are compiled once and kept, and a place to keep them is not needed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numba import njit
+
+from wepose_pin import compilation
+
+_FIRST_USE = """
+import numpy as np
+from wepose_pin import rotations
+print(rotations.integrate(np.zeros((3, 3)))[-1].tolist())
+"""
+_FULL_DISK = """
+import resource, signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+"""
+
+
+def _fresh(code: str, **environment: str) -> str:
+    run = subprocess.run(
+        [sys.executable, "-B", "-c", code], env=os.environ | environment, capture_output=True, text=True, check=True
+    )
+    assert run.stderr == ""
+    return run.stdout
+
+
+def test_compiled_once_and_kept(tmp_path: Path) -> None:
+    assert _fresh(_FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "[0.0, 0.0, 0.0, 1.0]\n"
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb*")}
+    assert kept
+    assert _fresh(_FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "[0.0, 0.0, 0.0, 1.0]\n"
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb*")} == kept
+
+
+def test_a_full_disk_is_no_error(tmp_path: Path) -> None:
+    assert _fresh(_FULL_DISK + _FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "[0.0, 0.0, 0.0, 1.0]\n"
+
+
+def test_nowhere_to_keep_what_is_compiled_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def without_a_folder(**options: Any) -> Any:
+        if options.pop("cache", False):
+            raise RuntimeError("cannot cache function: no locator available")
+        return njit(**options)
+
+    monkeypatch.setattr(compilation, "njit", without_a_folder)
+    for decorator in (compilation.compiled, compilation.kernel):
+        assert decorator(lambda x: x + 1.0)(1.0) == 2.0

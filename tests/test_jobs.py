@@ -1,0 +1,132 @@
+"""Jobs: the command line, batch and `wepose reproduce` build the same dataclass and call the same function."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import FrozenInstanceError, fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from wepose_pin.batch.plan import STEPS, step_options
+from wepose_pin.batch.reproduce import REPRODUCIBLE
+from wepose_pin.cli import COMMANDS, find_command
+from wepose_pin.cli.parser import parse
+from wepose_pin.errors import BadOption
+from wepose_pin.jobs.calibrate import CalibrateJob
+from wepose_pin.jobs.demo import DemoJob
+from wepose_pin.jobs.evaluate import EvaluateJob
+from wepose_pin.jobs.export import ExportJob
+from wepose_pin.jobs.fields import REQUIRED, build_job, field_values
+from wepose_pin.jobs.retarget import RetargetJob
+from wepose_pin.jobs.simulate import SimulateJob, run_simulate
+from wepose_pin.jobs.track import TrackJob, run_track
+from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.writers import write_session
+from wepose_pin.writers.provenance import collect_provenance
+
+JOBS = {
+    "track": TrackJob(Path("s.toml"), Path("out"), Path("anna"), method="smekf", limits=False, chunk_seconds=20.0),
+    "calibrate": CalibrateJob(Path("s.toml"), Path("out"), "handle", {"handle": 0.4, "trunk": 0.5}, 1.7, "f"),
+    "simulate": SimulateJob(Path("out"), 3, 50.0, preset="mild", imperfection={"bits": 12.0, "mount": "any"}),
+    "retarget": RetargetJob(Path("result"), "panda", Path("out"), "both", scale=0.8, episode=True),
+    "demo": DemoJob(Path("out"), 4),
+    "export": ExportJob(Path("result"), Path("a.mot"), names="isb", rate_hz=50.0),
+}
+
+
+@pytest.mark.parametrize("command", REPRODUCIBLE)
+def test_a_job_is_built_again_from_its_provenance(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Options and the paths of inputs, as JSON holds them, are the whole job but where it writes."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("s.toml", "anna", "result"):
+        Path(name).touch()
+    job = JOBS[command]
+    provenance = json.loads(json.dumps(collect_provenance(command, field_values(job))))
+    paths = {name: about["path"] for name, about in provenance["inputs"].items()}
+    assert set(paths) <= {"session", "subject", "result"}
+    assert {"out", "force"}.isdisjoint(provenance["options"])
+    kind, _ = REPRODUCIBLE[command]
+    again = build_job(kind, {**provenance["options"], **paths, "out": str(job.out)})
+    assert again == replace(job, **{name: tmp_path / getattr(job, name) for name in paths})
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"session": "s.toml", "out": "o", "speed": 3}, "speed is not an option; there is: "),
+        ({"session": "s.toml"}, "out is missing"),
+        ({"session": 3, "out": "o"}, "session = 3: a path is needed"),
+        ({"session": "s.toml", "out": "o", "causal": 1}, "causal = 1: True or False is needed"),
+        ({"session": "s.toml", "out": "o", "method": "ekf"}, "method = 'ekf' is not known; did you mean 'smekf'"),
+        ({"session": "s.toml", "out": "o", "chunk_seconds": "a"}, "chunk_seconds = 'a': a number"),
+        ({"session": "s.toml", "out": "o", "chunk_seconds": float("nan")}, "chunk_seconds = nan: a number"),
+    ],
+)
+def test_a_job_of_wrong_values_is_refused_by_name(values: dict[str, Any], said: str) -> None:
+    with pytest.raises(BadOption) as error:
+        build_job(TrackJob, values)
+    assert said in str(error.value)
+
+
+def test_values_of_json_and_toml_become_those_of_the_fields() -> None:
+    job = build_job(EvaluateJob, {"result": "r", "truth": "t.csv", "interval": [1, 2]})
+    assert job == EvaluateJob(Path("r"), Path("t.csv"), (1.0, 2.0))
+    assert build_job(SimulateJob, {"out": "o", "rate_hz": 10**400}).rate_hz == float("inf")
+    with pytest.raises(BadOption, match="between 20 and 2000"):
+        build_job(SimulateJob, {"out": "o", "rate_hz": 10**400}).check()
+    with pytest.raises(FrozenInstanceError):
+        job.truth = Path("other")  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_example_of_a_command_is_a_job(name: str) -> None:
+    command = find_command(name)
+    first, *words = shlex.split(command.example)
+    assert first == name
+    assert isinstance(parse(name, command, words), command.job)
+
+
+def test_words_and_defaults_become_the_fields() -> None:
+    words = "s.toml --measured handle=0.4 --protocol handle --measured trunk=0.5 --stature 1.7 --sex f -o out"
+    assert parse("calibrate", find_command("calibrate"), words.split()) == JOBS["calibrate"]
+    words = "--out=out s.toml --subject anna --method smekf --no-limits --chunk-seconds 20"
+    assert parse("track", find_command("track"), words.split()) == JOBS["track"]
+    words = "-o out --seed 3 --rate-hz 50 --preset mild --imperfection bits=12 --imperfection mount=any"
+    assert parse("simulate", find_command("simulate"), words.split()) == JOBS["simulate"]
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_a_step_of_a_plan_has_the_options_of_its_command(step: str) -> None:
+    """What a plan may say of a step, and what its item fills in, are all fields of the job."""
+    options = step_options(step)
+    formats = {"format"} if "formats" in options else set()
+    filled = {"session", "out", "subject", "result", "truth", "measured", "stature", "sex", "force"}
+    assert {field.name for field in fields(STEPS[step])} == (set(options) - {"formats"}) | formats | (
+        filled & {field.name for field in fields(STEPS[step])}
+    )
+    assert [name for name, default in options.items() if default is REQUIRED] == {
+        "retarget": ["robot"],
+        "export": ["formats"],
+    }.get(step, [])
+
+
+def test_jobs_print_nothing_and_tell_a_growing_share(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    told: list[tuple[str, float]] = []
+    made = simulate(simulated_person(1).lengths, seed=1, clasp_s=8.0, circles=0)
+    (tmp_path / "session").mkdir()
+    write_session(tmp_path / "session", made.recording("made"), made.truth())
+    outcome = run_track(TrackJob(tmp_path / "session", tmp_path / "result"), lambda *of: told.append(of))
+    assert outcome.pose is not None
+    assert outcome.page_failures == []
+    assert outcome.summary["method"] == "amekf"
+    assert [text for text, _ in told] == ["reading", "tracking by amekf", "making the pages"]
+    assert told[0][1] == 0.0
+    assert sorted(share for _, share in told) == [share for _, share in told]
+    assert all(0.0 <= share < 1.0 for _, share in told)
+    run_simulate(SimulateJob(tmp_path / "made", protocol="poses"))
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,163 @@
+"""Rotations: group axioms, small angles, the compiled step against SciPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba import njit
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from wepose_pin import rotations
+
+SWITCH = 2.0 * rotations.SERIES_HALF_ANGLE
+ANGLES = np.concatenate([[0.0], np.logspace(-16, 0, 33), [0.999 * SWITCH, 1.001 * SWITCH, 3.0, np.pi - 1e-9]])
+
+
+def cross_matrix(v: np.ndarray) -> np.ndarray:
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exp_is_the_matrix_exponential(angle: float) -> None:
+    axis = np.array([0.36, -0.48, 0.8])
+    matrix = expm(cross_matrix(angle * axis))
+    np.testing.assert_allclose(Rotation.from_quat(rotations.exp(angle * axis)).as_matrix(), matrix, atol=1e-14)
+    quat = np.array([0.0, 0.0, 0.0, 1.0])
+    rotations.rotate_by_vector(quat, *(angle * axis))
+    np.testing.assert_allclose(Rotation.from_quat(quat).as_matrix(), matrix, atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_log_undoes_exp(angle: float) -> None:
+    vector = angle * np.array([0.6, 0.0, -0.8])
+    np.testing.assert_allclose(rotations.log(rotations.exp(vector)), vector, atol=1e-12)
+
+
+def test_the_compiled_step_keeps_relative_precision_on_both_sides_of_its_switch() -> None:
+    for half in rotations.SERIES_HALF_ANGLE * np.array(
+        [1e-15, 1e-8, 1e-4, 0.1, 0.5, 0.99, 0.999999, 1.000001, 1.01, 3.0]
+    ):
+        quat = np.array([0.0, 0.0, 0.0, 1.0])
+        rotations.rotate_by_vector(quat, 2.0 * half, 0.0, 0.0)
+        assert quat[0] == pytest.approx(np.sin(half), rel=1e-15, abs=0.0)
+        assert quat[3] == pytest.approx(np.cos(half), rel=1e-15, abs=1e-16)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.9, 1 - 1e-8, 1 - 1e-9, 1 + 1e-9, 1 + 1e-8, 1.1, 1e3])
+def test_the_compiled_step_renormalises_on_both_sides_of_its_switch(scale: float) -> None:
+    start = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_quat()
+    quat, unit = scale * start, start.copy()
+    rotations.rotate_by_vector(quat, 0.1, 0.2, -0.3)
+    rotations.rotate_by_vector(unit, 0.1, 0.2, -0.3)
+    assert np.linalg.norm(quat) == pytest.approx(1.0, rel=1e-15, abs=0.0)
+    np.testing.assert_allclose(quat, unit, rtol=1e-15)
+
+
+def test_a_million_steps_stay_on_the_sphere() -> None:
+    steps = np.random.default_rng(3).normal(scale=0.05, size=(1_000_000, 3))
+    assert np.abs(np.linalg.norm(rotations.integrate(steps), axis=1) - 1.0).max() < 1e-15
+
+
+def test_the_compiled_step_multiplies_on_the_right() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        start, turn = Rotation.random(random_state=rng), rng.normal(size=3)
+        quat = start.as_quat()
+        rotations.rotate_by_vector(quat, *turn)
+        expected = start * Rotation.from_rotvec(turn)
+        assert (expected.inv() * Rotation.from_quat(quat)).magnitude() < 1e-14
+        np.testing.assert_allclose(rotations.up_in_sensor(quat), expected.as_matrix()[2], atol=1e-14)
+
+
+def test_orders_of_the_quaternion() -> None:
+    xyzw = np.array([[0.1, 0.2, 0.3, 0.9], [0.0, 0.0, 0.0, 1.0]])
+    np.testing.assert_array_equal(rotations.wxyz_from_xyzw(xyzw)[0], [0.9, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(rotations.xyzw_from_wxyz(rotations.wxyz_from_xyzw(xyzw)), xyzw)
+
+
+@pytest.mark.parametrize(
+    "up_S", [[0, 0, 1], [1, 0, 0], [0, -1, 0], [0, 0, -1], [1e-9, 0, -1], [0.3, -0.5, -0.9], [0, 1e-17, 1]]
+)
+def test_tilt_takes_accel_to_the_vertical_without_heading(up_S: list[float]) -> None:
+    accel = 9.81 * np.array(up_S, dtype=float)
+    quat = rotations.quat_from_gravity(accel)
+    up_W = Rotation.from_quat(quat).apply(accel / np.linalg.norm(accel))
+    np.testing.assert_allclose(up_W, [0, 0, 1], atol=1e-7)
+    assert np.linalg.norm(quat) == pytest.approx(1.0)
+    assert quat[2] == 0.0
+
+
+def test_tilt_of_nothing_is_an_error() -> None:
+    with pytest.raises(ValueError, match="zero acceleration"):
+        rotations.quat_from_gravity([0.0, 0.0, 0.0])
+
+
+def test_heading_is_the_twist_about_the_vertical() -> None:
+    for psi in np.linspace(-3.1, 3.1, 13):
+        for tilt in ([0, 0, 0], [0.4, 0, 0], [0.3, -1.2, 0]):
+            rotation = Rotation.from_rotvec([0, 0, psi]) * Rotation.from_rotvec(tilt)
+            assert rotations.heading(rotation.as_quat()) == pytest.approx(psi)
+            assert rotations.heading(-rotation.as_quat()) == pytest.approx(psi)
+
+
+def test_continuous_changes_signs_and_nothing_else() -> None:
+    quat = Rotation.from_rotvec(np.linspace([0, 0, 0], [0, 0, 12.0], 500)).as_quat()
+    flipped = quat * np.where(np.random.default_rng(1).random(500) < 0.5, -1.0, 1.0)[:, None]
+    smooth = rotations.unwrap_signs(flipped)
+    np.testing.assert_array_equal(np.abs(smooth), np.abs(flipped))
+    assert np.abs(np.diff(smooth, axis=0)).max() < 0.02
+
+
+def test_products_of_arrays_are_scipys() -> None:
+    rng = np.random.default_rng(4)
+    a, b = Rotation.random(20, random_state=rng), Rotation.random(20, random_state=rng)
+    found = rotations.multiply(a.as_quat(), b.as_quat())
+    assert ((a * b).inv() * Rotation.from_quat(found)).magnitude().max() < 1e-14
+    np.testing.assert_array_equal(rotations.multiply(a.as_quat(), b.as_quat()[0])[0], found[0])
+    back = rotations.multiply(rotations.conjugate(a.as_quat()), a.as_quat())
+    np.testing.assert_allclose(back, np.tile([0.0, 0.0, 0.0, 1.0], (20, 1)), atol=1e-15)
+    axis, angle = np.array([0.36, -0.48, 0.8]), np.array([-7.0, 0.0, 1e-12, 2.0])
+    turned = rotations.rotation_about(axis, angle)
+    np.testing.assert_allclose(
+        Rotation.from_quat(turned).as_matrix(), Rotation.from_rotvec(angle[:, None] * axis).as_matrix(), atol=1e-14
+    )
+
+
+@njit
+def _kernels(quat, rate, dt, by_rate, in_world, R):  # type: ignore[no-untyped-def]
+    """What the kernels that are parts of others make of a rotation; they cannot be called from here."""
+    by_rate[:], in_world[:] = quat, quat
+    rotations.rotate_unit_by_rate(by_rate, rate[0], rate[1], rate[2], dt)
+    rotations.rotate_by_world_vector(in_world, rate[0] * dt, rate[1] * dt, rate[2] * dt)
+    rotations.fill_matrix(quat, R)
+    terms = rotations.rotation_terms(dt * dt * (rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2))
+    return terms, rotations.derivative(quat[0], quat[1], quat[2], quat[3], rate[0], rate[1], rate[2])
+
+
+# The half angle's series ends at 0.02 = 0.1414², that of the whole angle at the same.
+@pytest.mark.parametrize("angle", [*ANGLES, 0.1414, 0.1415, 0.2828, 0.2829])
+def test_kernels_on_both_sides_of_their_switches(angle: float) -> None:
+    dt, axis, start = 0.01, np.array([0.36, -0.48, 0.8]), Rotation.from_rotvec([0.3, -0.5, 0.9])
+    by_rate, in_world, R = np.empty(4), np.empty(4), np.empty(9)
+    terms, derivative = _kernels(start.as_quat(), angle / dt * axis, dt, by_rate, in_world, R)
+    turn = Rotation.from_rotvec(angle * axis)
+    np.testing.assert_allclose(Rotation.from_quat(by_rate).as_matrix(), (start * turn).as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(Rotation.from_quat(in_world).as_matrix(), (turn * start).as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(R.reshape(3, 3), start.as_matrix(), atol=1e-15)
+    cosine, s, c, d = terms
+    W = cross_matrix(angle * axis)
+    outer = np.outer(axis, axis) * angle**2
+    np.testing.assert_allclose(cosine * np.eye(3) + s * W + c * outer, expm(W), atol=1e-14)
+    block = expm(np.block([[W, np.eye(3)], [np.zeros((3, 6))]]))  # its corner is the integral
+    np.testing.assert_allclose(s * np.eye(3) + c * W + d * outer, block[:3, 3:], atol=1e-14)
+    pure = np.append(angle / dt * axis, 0.0)
+    np.testing.assert_allclose(derivative, 0.5 * rotations.multiply(start.as_quat(), pure), rtol=1e-13, atol=1e-300)
+
+
+def test_integrate_turns_step_by_step() -> None:
+    steps = np.random.default_rng(2).normal(scale=0.1, size=(50, 3))
+    total = Rotation.identity()
+    for step in steps:
+        total = total * Rotation.from_rotvec(step)
+    assert (total.inv() * Rotation.from_quat(rotations.integrate(steps)[-1])).magnitude() < 1e-13

@@ -1,0 +1,172 @@
+"""A result made again from its provenance, and compared with what it was."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import polars as pl
+
+from ..errors import BadData, BadOption, MissingFile, WeposeError
+from ..jobs import Progress, no_progress
+from ..jobs.calibrate import CalibrateJob, run_calibrate
+from ..jobs.demo import DemoJob, run_demo
+from ..jobs.export import ExportJob, run_export
+from ..jobs.fields import build_job, field_types
+from ..jobs.reproduce import ReproduceJob
+from ..jobs.retarget import RetargetJob, run_retarget
+from ..jobs.simulate import SimulateJob, run_simulate
+from ..jobs.track import TrackJob, run_track
+from ..readers.tables import read_table
+from ..writers.provenance import code, file_hash, machine, read_provenance
+from ..writers.result import versions
+from .compare import differences
+from .items import COMMAND, FAILED, item_of, make_into
+from .storage import DONE, fetch
+from .study import ITEMS, RESULTS, STUDY
+
+# What is run because a provenance says so: commands that make a result and talk to nobody. It may be a stranger's.
+REPRODUCIBLE: dict[str, tuple[type, Callable[[Any], Any]]] = {
+    "track": (TrackJob, run_track),
+    "calibrate": (CalibrateJob, run_calibrate),
+    "simulate": (SimulateJob, run_simulate),
+    "retarget": (RetargetJob, run_retarget),
+    "demo": (DemoJob, run_demo),
+    "export": (ExportJob, run_export),
+}
+_PAGES = ("report", "view")  # fields that ask for pages, which are not compared
+
+
+class Reproduction(NamedTuple):
+    """What came of making a result again."""
+
+    command: str
+    differences: list[str]  # a line each; empty: the same
+    notes: list[str]  # what else is not as it was: code, packages, machine
+
+
+def run_reproduce(job: ReproduceJob, progress: Progress = no_progress) -> Reproduction:
+    """Make a result, or each item of a study, again in a place that is removed afterwards, and compare.
+
+    Raises
+    ------
+    MissingFile
+        The result, or an input, is not there.
+    BadData
+        It does not say what made it, or an input has changed; or the command now refuses.
+    """
+    if (job.result / STUDY).is_file():
+        return _reproduce_study(job.result, progress)
+    progress(f"making {job.result.name} again", 0.0)
+    return _reproduce(job.result)
+
+
+def _reproduce(result: Path) -> Reproduction:
+    item = next((folder for folder in (result, *result.parents[:2]) if (folder / DONE).is_file()), None)
+    provenance = _item_provenance(item) if item is not None else read_provenance(result)
+    command = str(provenance.get("command"))
+    with tempfile.TemporaryDirectory(prefix="wepose-") as place:
+        out = Path(place) / "made" / result.name
+        out.parent.mkdir()
+        if command == COMMAND:
+            if item is None:
+                raise BadData(f"{result}: is of an item of wepose batch, whose {DONE} is missing; name its folder")
+            _check_inputs(item, provenance, Path(place))
+            out = Path(place) / "item"
+            out.mkdir()
+            make_into(out, item_of(provenance))
+            out /= result.relative_to(item)
+        elif command in REPRODUCIBLE:
+            _check_inputs(result, provenance, Path(place))
+            kind, run = REPRODUCIBLE[command]
+            run(_job_of(result, kind, provenance, out))
+        else:
+            raise BadData(f"{result}: made by '{command}', which cannot be made again one by one")
+        return Reproduction(command, differences(result, out), _notes(provenance))
+
+
+def _job_of(result: Path, kind: type, provenance: Mapping[str, Any], out: Path) -> Any:
+    """The job that made a result, to be done into `out`, without pages."""
+    inputs = {name: about["path"] for name, about in provenance["inputs"].items()}
+    values = {**provenance["options"], **inputs, "out": out}
+    values |= {name: False for name in _PAGES if name in field_types(kind)}
+    try:
+        return build_job(kind, values)
+    except BadOption as error:
+        raise BadData(f"{result}: provenance: wepose {provenance['command']} of this version: {error}") from None
+
+
+def _reproduce_study(study: Path, progress: Progress) -> Reproduction:
+    """All items of a study that were done, one by one; one that cannot be made again is a difference."""
+    names, failed = _done_items(study)
+    lines, notes = list[str](), dict[str, None]()
+    for k, name in enumerate(names):
+        progress(f"making {name} again", k / len(names))
+        try:
+            again = _reproduce(study / ITEMS / name)
+        except WeposeError as error:
+            again = Reproduction(COMMAND, [f"cannot be made again: {error}"], [])
+        lines += [f"{name}: {line}" for line in again.differences]
+        notes |= dict.fromkeys(again.notes)
+    if failed:
+        notes[f"{failed} items had failed and are not made again"] = None
+    return Reproduction("batch", lines, list(notes))
+
+
+def _done_items(study: Path) -> tuple[list[str], int]:
+    """Names of a study's items that are there, and how many are not."""
+    try:
+        table = read_table(study / RESULTS).select("item", "status")
+    except (WeposeError, pl.exceptions.PolarsError):
+        raise MissingFile(f"{study}: no {RESULTS} in it to go by; wepose batch goes on where it was stopped") from None
+    names = table.filter(pl.col("status") != FAILED)["item"].to_list()
+    return names, table.height - len(names)
+
+
+def _item_provenance(folder: Path) -> dict[str, Any]:
+    try:
+        provenance = json.loads((folder / DONE).read_text(encoding="utf-8"))["provenance"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise BadData(f"{folder / DONE}: is damaged: {error}") from None
+    if not isinstance(provenance, dict) or not isinstance(provenance.get("inputs"), dict):
+        raise BadData(f"{folder / DONE}: provenance is damaged: a table with inputs is needed")
+    return provenance
+
+
+def _check_inputs(result: Path, provenance: Mapping[str, Any], place: Path) -> None:
+    """Raise `WeposeError` where inputs are gone or not what they were."""
+    for name, about in provenance["inputs"].items():
+        try:
+            url, before = str(about["path"]), dict(about["files"])
+        except (KeyError, TypeError, ValueError):
+            raise BadData(f"{result}: provenance is damaged: inputs.{name} needs path and files") from None
+        truth = name == "session" and "evaluate" in provenance["options"].get("steps", ())
+        path = fetch(url, place, truth)
+        if not path.exists():
+            raise MissingFile(f"{result}: its {name} is gone: {url}")
+        top = path if path.is_dir() else path.parent
+        for file, digest in before.items():
+            if not (top / file).exists():
+                raise MissingFile(f"{result}: of its {name}, {file} is gone: {top / file}")
+            now = file_hash(top / file)
+            if now != digest:
+                raise BadData(
+                    f"{result}: of its {name}, {top / file} has changed: SHA-256 was {digest[:12]}…, is {now[:12]}…"
+                )
+
+
+def _notes(provenance: Mapping[str, Any]) -> list[str]:
+    now, notes = code(), []
+    if provenance.get("code") != now["code"]:
+        was = f"{provenance.get('version')} ({provenance.get('commit') or 'commit not known'})"
+        notes.append(f"made by wepose-pin {was}; this is {now['version']} ({now['commit'] or 'commit not known'})")
+    if provenance.get("machine") not in (None, machine()):
+        notes.append(f"made on {provenance['machine']}; this is {machine()}, which may round the last bits otherwise")
+    packages = provenance.get("packages")
+    changed = {name: of for name, of in versions().items() if isinstance(packages, dict) and packages.get(name) != of}
+    if changed:
+        notes.append(f"other versions now: {', '.join(f'{name} {of}' for name, of in changed.items())}")
+    return notes

@@ -1,0 +1,76 @@
+"""``wepose calibrate``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..jobs.calibrate import CalibrateJob, run_calibrate
+from .output import note, print_table, progress_bar, say, say_indented, say_pages
+from .parser import Command
+from .tables import print_lengths
+
+if TYPE_CHECKING:
+    from ..calibration import Calibration, Verdict
+
+EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
+COLOURS = {"pass": "green", "poor": "yellow", "fail": "red"}
+GAPS = {"coincide": "Palm-to-palm gap", "distance": "Palms off their distance"}
+
+
+def run(job: CalibrateJob) -> int:
+    """Calibrate; say lengths, mounts, the gap between the palms and the quality."""
+    with progress_bar() as progress:
+        outcome = run_calibrate(job, progress)
+    from ..report import unsaid
+
+    calibration, quality, protocol = outcome.calibration, outcome.quality, outcome.protocol
+    note([*unsaid(calibration.warnings, quality), *outcome.page_failures])
+    print_lengths(f"Lengths, by {protocol.title}", calibration.subject, outcome.prior, job.measured)
+    _print_mounts(calibration)
+    if protocol.closures:
+        gap = GAPS.get(calibration.closure, "Gap from palm to its point")
+        prior_mm = f"{1e3 * calibration.prior_rms_gap:.1f} mm with the lengths of the population prior"
+        say(f"{gap}: {1e3 * calibration.rms_gap:.1f} mm rms, {prior_mm}")
+        say(f"Effective sample size of the motion: {calibration.independent:.0f}")
+    if job.report:
+        say_pages(job.out, {"Report to look at": "report.html"})
+    say(f"Subject: {job.out / 'subject.toml'}  {job.out / 'subject.urdf'}  {job.out / 'calibration.json'}")
+    _print_quality(quality)
+    return EXIT_CODES[quality.grade]
+
+
+def _print_mounts(calibration: Calibration) -> None:
+    import numpy as np
+
+    from ..recording import axes_from_mount
+    from ..subject import mount_rows
+
+    rows: list[tuple[str, ...]] = []
+    for segment, tilt in calibration.start_tilt.items():
+        x, y, z = (np.degrees(calibration.subject.std(row)) for row in mount_rows(segment))
+        up, forward = axes_from_mount(calibration.subject.mounts[segment])
+        off_start, drift = np.degrees(np.linalg.norm(tilt)), 60.0 * np.degrees(calibration.drift[segment])
+        cells = f"± {z:.1f}", f"± {np.hypot(x, y) / 2**0.5:.1f}", f"{off_start:.1f}", f"{drift:+.1f}"
+        rows.append((segment, f"{up} up, {forward} ahead", *cells))
+    header = ("sensor", "nearest axes", "heading", "tilt", "off the start pose", "heading drift [1/min]")
+    print_table("Mounts, in deg: ± is one standard deviation", header, rows)
+
+
+def _print_quality(quality: Verdict) -> None:
+    from rich.console import Console
+
+    colour = COLOURS[quality.grade]
+    determined = f"the motion determines {quality.determined} of {quality.unknowns} unknowns better than the prior"
+    Console(width=160).print(f"Quality: [bold {colour}]{quality.grade}[/] ({determined})", highlight=False)
+    for text in quality.in_words():
+        say_indented(text)
+
+
+COMMAND = Command(
+    CalibrateJob,
+    run,
+    example="calibrate session.toml --measured shoulder_width=0.385 --stature 1.78 --sex f -o anna",
+    arguments=("session",),
+    exit_codes="0 the quality is pass, 3 poor, 4 fail; the files are written in each case and carry the quality. "
+    "2: the input is wrong, and nothing is written.",
+)

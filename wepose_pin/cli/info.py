@@ -1,0 +1,29 @@
+"""``wepose info``."""
+
+from __future__ import annotations
+
+from ..jobs.info import InfoJob, run_info
+from .output import print_table, progress_bar, say
+from .parser import Command
+
+
+def run(job: InfoJob) -> int:
+    """Say what the file is; print a session for it, or say where it was written."""
+    with progress_bar() as progress:
+        description, written = run_info(job, progress)
+    say(description.what)
+    for fact in description.facts:
+        say(f"  {fact}")
+    if description.sensors:
+        header = ("sensor", "in the file", "holds", "fastest turn", "median force", "gaps over 50 ms")
+        print_table("Sensors", header, description.sensors)
+    if written is not None:
+        then = description.then.replace("SESSION", str(written))
+        say(f"Session: {written}  (check the lines marked CHECK, then: {then})")
+    elif description.session is not None:
+        say(f"# A session for it; --write writes it to {job.session_file}")
+        print(description.session, end="")
+    return 0
+
+
+COMMAND = Command(InfoJob, run, example="info trial.mvnx --write", arguments=("file",))

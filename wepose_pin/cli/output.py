@@ -1,0 +1,82 @@
+"""What the user sees: lines, notes, tables and a progress bar, without the control characters that a file may hold."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from ..errors import printable
+from ..jobs import Progress
+from .stopping import check_stopped
+
+WIDTH = 98  # columns of running text
+TABLE_WIDTH = 160  # rich would cut numbers off to fit a narrow terminal, which wraps by itself
+
+
+def say(text: str) -> None:
+    """A line on standard output."""
+    print(_shown(text))
+
+
+def say_indented(text: str) -> None:
+    """A paragraph, two columns in."""
+    say(textwrap.fill(text, WIDTH, initial_indent="  ", subsequent_indent="    "))
+
+
+def note(warnings: Iterable[str]) -> None:
+    """A line each on standard error."""
+    for warning in warnings:
+        print(f"note: {_shown(str(warning))}", file=sys.stderr)
+
+
+def say_pages(folder: Path, pages: Mapping[str, str]) -> None:
+    """What each page is and where it lies; nothing of those that could not be made."""
+    for title, name in pages.items():
+        if (folder / name).is_file():
+            say(f"{title}:  {folder / name}")
+
+
+def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """A table; the first column is text, the others numbers."""
+    from rich import box
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for k, name in enumerate(header):
+        table.add_column(escape(name), justify="left" if k == 0 else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(_shown, row))
+    console = Console(width=TABLE_WIDTH)
+    console.print(escape(_shown(title)), style="bold", highlight=False)
+    console.print(table)
+
+
+@contextlib.contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """A bar that shows what is being done and how much of it; none when not on a terminal. A signal ends the job."""
+    if not sys.stderr.isatty():
+        yield lambda _text, _share: check_stopped()
+        check_stopped()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+
+        def show(text: str, share: float) -> None:
+            check_stopped()
+            bar.update(task, description=text, completed=share)
+
+        yield show
+        check_stopped()
+
+
+def _shown(text: str) -> str:
+    return "\n".join(map(printable, text.split("\n")))

@@ -1,0 +1,92 @@
+"""``wepose retarget``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..jobs.retarget import RetargetJob, run_retarget
+from .output import note, print_table, progress_bar, say, say_pages
+from .parser import Command
+
+MOST_MOMENTS = 6  # of those at which the motion was slowed
+
+
+def run(job: RetargetJob) -> int:
+    """Compute the trajectory; say how well the hands follow and what it keeps."""
+    with progress_bar() as progress:
+        outcome = run_retarget(job, progress)
+    note(outcome.page_failures)
+    _print_arms(outcome.summary)
+    _print_checks(outcome.summary)
+    out = job.out
+    say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
+    if job.view:
+        say_pages(out, {"Motion to look at": "view.html"})
+    return 0 if outcome.runnable else 3
+
+
+def _print_arms(summary: Mapping[str, Any]) -> None:
+    """How well the hands follow, and why they do not."""
+    rows, reasons = [], []
+    for side, of in summary["arms"].items():
+        inside, turn, swivel, possible = (
+            of[key] for key in ("hand_error_mm", "hand_error_deg", "swivel_error_deg", "possible")
+        )
+        near = possible["hand_error_where_reachable_mm"]
+        rows.append(
+            (
+                side,
+                f"{of['scale']:.2f}",
+                *((f"{error[key]:.1f}" if error else "") for error in (inside, near) for key in ("median", "p90")),
+                f"{turn['median']:.1f}",
+                f"{swivel['median']:.0f}" if swivel else "",
+                f"{100 * possible['reachable_share']:.0f}",
+            )
+        )
+        reasons.append((side, *(f"{100 * share:.1f}" for share in of["causes"].values())))
+    hand = ("hand [mm] median", "90 %", "where it can: median", "90 %")
+    print_table(
+        f"{summary['robot']}: {summary['duration_s']:.1f} s for {summary['recorded_s']:.1f} s recorded",
+        ("arm", "scale", *hand, "turn [deg]", "elbow swivel [deg]", "can reach [%]"),
+        rows,
+    )
+    print_table("Hand more than 20 mm off [% of the time], for", ("arm", *of["causes"]), reasons)
+
+
+def _print_checks(summary: Mapping[str, Any]) -> None:
+    """What the trajectory keeps, where it was slowed, and how long a step took."""
+    margins, touched = summary["limit_margins"], summary["self_collision"]
+    say(
+        f"Limits {'kept' if summary['limits_kept'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "
+        f"velocity {100 * margins['velocity_share']:.1f} %, "
+        f"acceleration {100 * margins['acceleration_share']:.1f} %, jerk {100 * margins['jerk_share']:.1f} % to spare"
+    )
+    slow = summary["slowest"]
+    if slow is not None:
+        say(f"Slowed most for {slow['joint']} at {slow['time']:.1f} s of the recording ({slow['what']})")
+    if summary["slowed_for_contact_s"]:
+        moments = ", ".join(f"{moment:.1f}" for moment in summary["slowed_for_contact_s"][:MOST_MOMENTS])
+        say(f"Slowed so that it can stop before it touches itself, about {moments} s of the recording")
+    if touched["samples_touching"]:
+        note(
+            [
+                f"the robot touches itself in {touched['samples_touching']} samples, first {touched['first']}: do not "
+                f"run this trajectory; a smaller --scale keeps the hands apart"
+            ]
+        )
+    else:
+        closest = touched["closest_hulls_mm"]
+        say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
+    say(f"Solved in {summary['solve_ms']['p50']:.2f} ms (p50), {summary['solve_ms']['p99']:.2f} ms (p99) a step")
+
+
+COMMAND = Command(
+    RetargetJob,
+    run,
+    example="retarget result --robot panda -o panda",
+    arguments=("result",),
+    exit_codes="0 the trajectory keeps the robot's limits and does not touch itself, as the check of what was written "
+    "says; 3 it does not: the files are there to be looked at, no robot should run them. 2: the input is wrong, and "
+    "nothing is written.",
+)

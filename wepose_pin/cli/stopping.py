@@ -1,0 +1,70 @@
+"""Ctrl-C and SIGTERM: a command ends with what it has written whole, or nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+_stopped: list[int] = []
+
+
+def catch_signals() -> None:
+    """From here on both raise `KeyboardInterrupt`, and are remembered: a library may swallow that."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _stop)
+
+
+def ignore_signals() -> None:
+    """While Python itself ends, a signal would take the exit code's place."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def is_stopped() -> bool:
+    """Whether a signal came."""
+    return bool(_stopped)
+
+
+def check_stopped() -> None:
+    """Raise `KeyboardInterrupt` where a signal came and a library has swallowed what it raised."""
+    if _stopped:
+        raise KeyboardInterrupt
+
+
+def whats_written() -> str:
+    """What a command that ends early has written all the same, whole."""
+    written = getattr(sys.modules.get("wepose_pin.writers.folder"), "written", ())
+    folders = [folder for folder in written if folder.exists()]
+    return f"{', '.join(map(str, folders))} was written before" if folders else "nothing was written"
+
+
+@contextlib.contextmanager
+def stop_requests() -> Iterator[Callable[[], bool]]:
+    """Whether a signal asked to stop. It interrupts nothing, unless nobody has looked yet or it comes twice."""
+    asked: list[int] = []
+    looked = False
+
+    def ask(number: int, frame: Any) -> None:
+        if asked or not looked:
+            _stop(number, frame)
+        asked.append(number)
+
+    def is_asked() -> bool:
+        nonlocal looked
+        looked = True
+        return bool(asked or _stopped)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield is_asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stop(number: int, _frame: Any) -> None:
+    _stopped.append(number)
+    raise KeyboardInterrupt

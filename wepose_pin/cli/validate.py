@@ -1,0 +1,54 @@
+"""``wepose validate``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..jobs.validate import ValidateJob, run_validate
+from .output import note, print_table, progress_bar, say
+from .parser import Command
+
+if TYPE_CHECKING:
+    from ..validation import Document
+
+LONGEST_HEADER = 12  # letters; a longer one goes in two lines, so that tables stay within 100 columns
+
+
+def run(job: ValidateJob) -> int:
+    """Run the experiments; print a table each."""
+    with progress_bar() as progress:
+        document, failures = run_validate(job, progress)
+    print_experiments(document)
+    note([*(each.line() for each in document.skipped), *failures])
+    if job.out is not None and (job.out / "validation.html").is_file():
+        say(f"Page: {job.out / 'validation.html'}  {job.out / 'validation.md'}  {job.out / 'validation'}/*.svg")
+    if job.out is not None and job.from_ is None:
+        say(f"Every trial: {job.out / 'validation.json'}")
+    return 0
+
+
+def print_experiments(document: Document) -> None:
+    """A table an experiment, and the targets."""
+    from ..validation import summary
+    from ..validation.tables import experiment_table, shared_unit, targets_table
+
+    rows = summary(document.results)
+    for experiment in dict.fromkeys(row.experiment for row in rows):
+        of = [row for row in rows if row.experiment == experiment]
+        trials = len({result.trial for result in document.results if result.experiment == experiment})
+        unit = shared_unit(of)
+        header, lines = experiment_table(of, whole=False)
+        header = [name if len(name) < LONGEST_HEADER else "\n".join(name.rsplit(" ", 1)) for name in header]
+        title = f"{experiment}, {trials} trial{'s' * (trials != 1)}" + (f" [{unit}]" if unit else "")
+        print_table(title + ", a quick run" * document.quick, header, [[str(cell) for cell in line] for line in lines])
+        say("")
+    targets = targets_table(rows)
+    if targets.rows:
+        cells = [[str(cell).replace("**", "") for cell in row] for row in targets.rows]
+        print_table("Targets for the mean errors", list(targets.header), cells)
+    say("± is one standard deviation over time, averaged over the trials. The bias of the static phase is removed for")
+    say("every filter but those with default gains; the heading is aligned once, where nothing is scored, and never")
+    say("fitted to the truth afterwards.")
+
+
+COMMAND = Command(ValidateJob, run, example="validate --quick")

@@ -1,0 +1,27 @@
+"""One function a command does the whole job: a frozen dataclass of its options in, an outcome out, nothing printed.
+
+The command line, batch and `wepose reproduce` build the same dataclass and call the same function. A docstring's
+``Parameters`` are the help of the options: of ``name : METAVAR`` the second word is what the value is called there. An
+option that is true by default is described as what happens by default; its switch is ``--no-NAME``.
+
+Heavy rooms load inside the functions, so that help and mistakes in options are answered at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+Method = Literal["amekf", "smoother", "smekf", "ncf", "gdc"]
+LiveMethod = Literal["amekf", "smekf", "ncf", "gdc"]
+Arms = Literal["left", "right", "both"]
+Progress = Callable[[str, float], None]  # what is being done, and the share of the whole job that is done; may raise
+
+
+def no_progress(_text: str, _share: float) -> None:
+    """Progress that nobody looks at."""
+
+
+def arm_sides(arms: Arms | None) -> tuple[str, ...] | None:
+    """The sides of `arms`; None where all arms of a robot are meant."""
+    return None if arms is None else ("left", "right") if arms == "both" else (arms,)

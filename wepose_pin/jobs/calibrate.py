@@ -1,0 +1,134 @@
+"""``wepose calibrate``: a recording of a protocol → the subject's lengths and mounts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from ..errors import BadOption, one_of
+from . import Method, Progress, no_progress
+from .fields import field_values
+
+if TYPE_CHECKING:
+    from ..calibration import Calibration, Protocol, Verdict
+    from ..subject import Subject
+
+
+@dataclass(frozen=True)
+class CalibrateJob:
+    """Calibrate arm lengths and sensor mounts from a recording with joined hands.
+
+    Joined hands fix the proportions of the arms and not their scale. Measure one length, such as the shoulder width,
+    and give it by --measured; without one the scale is that of the population prior, and the output says how uncertain
+    it is.
+
+    Parameters
+    ----------
+    session : SESSION
+        The recording: session.toml with the phases of the protocol, such as clasp, in which the palms are held
+        together; or the folder that holds it.
+    out : DIR
+        Write subject.toml, subject.urdf, calibration.json (the quality and all figures) and report.html to this folder.
+    protocol : NAME|FILE.toml
+        Calibrate by this protocol: clasp (hands together), clasp_taped (the same, with a length that must be measured),
+        handle (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), poses (T-pose
+        and bow: headings only), or a file of your own made like those in calibration/.
+    measured : NAME=METRES
+        Take this length as measured, such as shoulder_width=0.385; may be given several times. With the protocol
+        handle also handle=0.42, the bar between the palms.
+    stature : METRES
+        Narrow the population prior to people of this body height.
+    sex
+        Narrow the population prior to women or men.
+    method
+        Filter the sensors by this method.
+    gaps
+        Accept lost samples for longer than 50 ms and bridge them.
+    report
+        Write report.html: the quality with what to do, lengths, mounts, the gap between the palms.
+    force
+        Replace the files of an earlier run.
+    """
+
+    session: Path
+    out: Path
+    protocol: str = "clasp"
+    measured: Mapping[str, float] = field(default_factory=dict)
+    stature: float | None = None
+    sex: Literal["f", "m"] | None = None
+    method: Method = "amekf"
+    gaps: bool = False
+    report: bool = True
+    force: bool = False
+
+    def check(self) -> None:
+        """Raise `WeposeError` where the protocol is none, or a length is measured that it does not know."""
+        from ..calibration import load_protocol
+        from ..subject import LENGTHS
+
+        known = (*LENGTHS, *load_protocol(self.protocol).gauges)
+        for name, metres in self.measured.items():
+            if name == "handle" and name not in known:
+                raise BadOption(f"--measured {name}={metres:g}: the bar of --protocol handle, which is not given")
+            if name not in known:
+                raise BadOption(f"--measured {name}={metres:g}: '{name}' is not a length; {one_of(known, name)}")
+
+
+class CalibrateOutcome(NamedTuple):
+    """What came of a `CalibrateJob`."""
+
+    calibration: Calibration
+    quality: Verdict
+    protocol: Protocol
+    prior: Subject
+    page_failures: list[str]  # a line for each page, or part of one, that could not be made
+
+
+def run_calibrate(
+    job: CalibrateJob, progress: Progress = no_progress, provenance: Mapping[str, Any] | None = None
+) -> CalibrateOutcome:
+    """Calibrate a subject and write its folder, whole or not at all; its page follows.
+
+    Parameters
+    ----------
+    provenance : what the result says made it; None: this job
+
+    Raises
+    ------
+    WeposeError
+        What the session, the protocol or an option lacks.
+    """
+    from ..calibration import calibrate_lengths, judge, load_protocol
+    from ..model import load_model
+    from ..readers import load_session
+    from ..report import write_calibration_page
+    from ..subject import average_subject
+    from ..writers import whole_folder
+    from ..writers.calibration import write_calibration
+    from ..writers.provenance import collect_provenance
+    from ..writers.result import write_subject
+
+    job.check()
+    protocol = load_protocol(job.protocol)
+    with whole_folder(job.out, job.force) as folder:
+        progress("reading", 0.0)
+        prior = average_subject(job.stature, job.sex)
+        recording = load_session(job.session, gaps=job.gaps)
+        progress("calibrating", 1 / 3)
+        calibration = calibrate_lengths(
+            recording, gauge=dict(job.measured), prior=prior, protocol=protocol, method=job.method
+        )
+        quality = judge(calibration)
+        write_subject(folder, calibration.subject, load_model(lengths=calibration.subject.lengths))
+        if provenance is None:
+            provenance = collect_provenance("calibrate", field_values(job))
+        write_calibration(folder, calibration, quality, provenance)
+    failures = []
+    if job.report:
+        progress("writing the report", 2 / 3)
+        failures = write_calibration_page(
+            job.out, calibration, recording, method=job.method, protocol=protocol, verdict=quality
+        )
+    return CalibrateOutcome(calibration, quality, protocol, prior, failures)

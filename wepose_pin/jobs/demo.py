@@ -1,0 +1,115 @@
+"""``wepose demo``: the whole chain on a recording that it makes itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from . import Progress, no_progress
+from .fields import field_values
+from .simulate import check_seed
+
+if TYPE_CHECKING:
+    from ..calibration import Calibration
+    from ..evaluation import Evaluation
+    from ..simulation import Person
+
+
+@dataclass(frozen=True)
+class DemoJob:
+    """Run the whole chain on a simulated recording: simulate, calibrate, track, evaluate, view.
+
+    A person of random size stands in the N-pose, moves the joined hands for a minute, then draws six circles in the air
+    with rests on a table, with five Xsens MTi-3 on. All of it is simulated, so that the truth is known.
+
+    Parameters
+    ----------
+    out : DIR
+        Write session, subject, result, its page and the figures to this folder.
+    seed : NUMBER
+        Draw the person and the motion from this seed.
+    force
+        Replace the files of an earlier run.
+    """
+
+    out: Path = Path("wepose-demo")
+    seed: int = 1
+    force: bool = False
+
+    def check(self) -> None:
+        """Raise `BadOption` where the seed is negative."""
+        check_seed(self.seed)
+
+
+class DemoOutcome(NamedTuple):
+    """What came of a `DemoJob`."""
+
+    person: Person
+    best: Calibration  # by the default method
+    errors: Mapping[str, Evaluation]  # by method, while the circles are drawn
+    page_failures: list[str]
+
+
+def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
+    """Simulate, calibrate and track by each method, evaluate, and write the folder, whole or not at all.
+
+    Raises
+    ------
+    WeposeError
+        A place that cannot be written.
+    """
+    import json
+    from dataclasses import asdict
+
+    from ..calibration import calibrate_lengths
+    from ..evaluation import evaluate
+    from ..filters import BEST, METHODS
+    from ..report import write_track_pages
+    from ..simulation import simulate, simulated_person
+    from ..tracking import track
+    from ..writers import whole_folder, write_result, write_session
+    from ..writers.provenance import collect_provenance, write_provenance
+    from ..writers.result import as_json, write_subject
+
+    job.check()
+    steps = 2 + 2 * len(METHODS)
+    with whole_folder(job.out, job.force) as folder:
+        progress("simulating a person", 0.0)
+        person = simulated_person(job.seed)
+        simulation = simulate(person.lengths, seed=job.seed)
+        recording, truth = simulation.recording(f"demo-{job.seed}"), simulation.truth()
+        for name in ("session", "subject", "result"):
+            (folder / name).mkdir()
+        write_session(folder / "session", recording, truth)
+        circles = simulation.phases["circles"][0]
+
+        calibrations, errors = {}, {}
+        for k, method in enumerate(METHODS):
+            progress(f"calibrating by {method}", (1 + 2 * k) / steps)
+            calibrations[method] = calibrate_lengths(
+                recording, gauge=person.taped, prior=person.average, method=method, gauge_std=person.taped_std
+            )
+            progress(f"tracking by {method}", (2 + 2 * k) / steps)
+            tracked = track(recording, calibrations[method].subject, method=method)
+            errors[method] = evaluate(tracked.pose, truth, circles)
+            if method == BEST:
+                shown = tracked
+        best = calibrations[BEST]
+        write_subject(folder / "subject", best.subject, shown.model)
+        write_result(folder / "result", shown, phases=recording.phases)
+        progress("making the page", (steps - 1) / steps)
+        failures = write_track_pages(folder / "result", shown, report=False)
+        lengths = {
+            name: {"true": value, "estimated": best.subject.lengths[name], "std": best.subject.std(name)}
+            for name, value in person.lengths.items()
+        }
+        figures = {
+            "seed": job.seed,
+            "lengths": lengths,
+            "errors": {method: asdict(error) for method, error in errors.items()},
+        }
+        (folder / "demo.json").write_text(json.dumps(as_json(figures), indent=2) + "\n", encoding="utf-8")
+        write_provenance(folder, collect_provenance("demo", field_values(job)))
+    return DemoOutcome(person, best, errors, failures)

@@ -1,0 +1,71 @@
+"""``wepose evaluate``: a result against a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import BadOption
+from . import Progress, no_progress
+
+if TYPE_CHECKING:
+    from ..evaluation import Evaluation
+    from ..pose import Pose
+
+
+@dataclass(frozen=True)
+class EvaluateJob:
+    """Compare a result with a reference: attitude, drift, positions, stated uncertainty.
+
+    Parameters
+    ----------
+    result : RESULT
+        Folder that `wepose track` wrote.
+    truth : TRUTH
+        Table (.parquet or .csv) with columns as in pose.parquet, or a session file that names one.
+    interval : FROM TO
+        Compare only from this to this time, in seconds.
+    """
+
+    result: Path
+    truth: Path
+    interval: tuple[float, float] | None = None
+
+    def check(self) -> None:
+        """Raise `BadOption` where the interval is none."""
+        if self.interval is not None and not self.interval[0] < self.interval[1]:
+            begin, end = self.interval
+            raise BadOption(f"--interval {begin:g} {end:g}: two times in seconds are needed, the earlier one first")
+
+
+def run_evaluate(job: EvaluateJob, progress: Progress = no_progress, pose: Pose | None = None) -> Evaluation:
+    """The errors of a result; nothing is written.
+
+    Parameters
+    ----------
+    pose : that of the result with its covariances, where it is at hand; None: as the folder holds it
+
+    Raises
+    ------
+    WeposeError
+        No result, no reference, or nothing that both have.
+    """
+    from ..evaluation import evaluate
+    from ..pose import pose_from_table
+    from ..readers import load_session
+    from ..readers.tables import read_table
+    from ..writers import read_result
+
+    job.check()
+    progress("reading", 0.0)
+    if pose is None:
+        pose, _, _ = read_result(job.result)
+    truth: Path | None = job.truth
+    if job.truth.suffix == ".toml" or job.truth.is_dir():
+        truth = load_session(job.truth, gaps=True).truth
+    if truth is None:
+        raise BadOption(f"{job.truth}: data.truth is missing; the session names no reference to compare with")
+    reference = pose_from_table(read_table(truth), str(truth))
+    progress("comparing", 0.5)
+    return evaluate(pose, reference, job.interval)

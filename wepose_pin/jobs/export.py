@@ -1,0 +1,86 @@
+"""``wepose export``: a result's motion for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from . import Progress, no_progress
+from .fields import field_values
+
+if TYPE_CHECKING:
+    from ..writers.export import Exported
+
+
+@dataclass(frozen=True)
+class ExportJob:
+    """Write the motion of a result for other programs: CSV, Parquet, OpenSim, BVH, C3D, URDF.
+
+    What each file holds: docs/formats/export.md.
+
+    Parameters
+    ----------
+    result : RESULT
+        Folder that `wepose track` wrote.
+    out : FILE
+        Write this file.
+    format : FORMAT
+        Write this format instead of that of the file's suffix: csv, parquet (pose and joint angles), mot (joint
+        angles for OpenSim), sto (orientations for OpenSense), placement (the sample for its IMU Placer), trc, c3d
+        (points), bvh (skeleton and motion), urdf (the subject).
+    names
+        Name the columns of a .mot by the coordinates of OpenSim's Rajagopal model, or by the angles of the ISB.
+        Without it opensim.
+    rate_hz : HZ
+        Resample the motion to this many samples a second.
+    force
+        Replace an existing file.
+    """
+
+    result: Path
+    out: Path
+    format: str | None = None
+    names: Literal["opensim", "isb"] | None = None
+    rate_hz: float | None = None
+    force: bool = False
+
+    def check(self) -> None:
+        """Raise `BadOption` where the rate is none."""
+        from ..writers.motion import check_rate
+
+        if self.rate_hz is not None:
+            check_rate(self.rate_hz)
+
+
+def run_export(
+    job: ExportJob, progress: Progress = no_progress, provenance: Mapping[str, Any] | None = None
+) -> Exported:
+    """Write a file, whole or not at all, and its provenance beside it.
+
+    Parameters
+    ----------
+    provenance : what the file says made it; None: this job; empty: it says nothing
+
+    Raises
+    ------
+    WeposeError
+        No result, or an option that the format does not have.
+    """
+    from ..writers.export import export
+    from ..writers.provenance import collect_provenance
+
+    job.check()
+    progress("writing", 0.0)
+    if provenance is None:
+        provenance = collect_provenance("export", field_values(job))
+    return export(
+        job.result,
+        job.out,
+        job.format,
+        names=job.names,
+        rate_hz=job.rate_hz,
+        force=job.force,
+        provenance=provenance or None,
+    )

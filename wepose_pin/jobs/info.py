@@ -1,0 +1,74 @@
+"""``wepose info``: what a file is, and a session for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from ..errors import BadOption
+from . import Progress, no_progress
+
+if TYPE_CHECKING:
+    from ..readers.describe import Description
+
+
+@dataclass(frozen=True)
+class InfoJob:
+    """Describe a file, its sensors, rates and gaps, and propose a session file for it.
+
+    Known are Xsens MVNX, MT Manager's text, Movella DOT, x-IMU3, APDM, OpenSim .sto of orientations, CSV, Parquet,
+    HDF5, MATLAB (docs/formats/), recordings of `wepose live`, and sessions, subjects and results. What is marked CHECK
+    in the session is guessed.
+
+    Parameters
+    ----------
+    file : FILE
+        A file or folder.
+    write
+        Write the session to session.toml beside the file.
+    out : FILE
+        Write the session to this file.
+    force
+        Replace an existing session.
+    """
+
+    file: Path
+    write: bool = False
+    out: Path | None = None
+    force: bool = False
+
+    @property
+    def session_file(self) -> Path:
+        """Where the session is written, or would be."""
+        return self.out or self.file.absolute().parent / "session.toml"
+
+
+class InfoOutcome(NamedTuple):
+    """What came of an `InfoJob`."""
+
+    description: Description
+    written: Path | None  # the session
+
+
+def run_info(job: InfoJob, progress: Progress = no_progress) -> InfoOutcome:
+    """Describe a file and, where it is asked for, write a session for it, whole or not at all.
+
+    Raises
+    ------
+    WeposeError
+        No such file, or of no kind that is known; a session that exists or cannot be written, or that there is none of.
+    """
+    from ..readers.describe import describe
+    from ..writers.folder import check_file, whole_file
+
+    progress("reading", 0.0)
+    if not (job.write or job.out):
+        return InfoOutcome(describe(job.file, job.file.absolute().parent), None)
+    check_file(job.session_file, job.force)
+    description = describe(job.file, job.session_file.absolute().parent)
+    if description.session is None:
+        raise BadOption(f"--write: there is no session to write for {description.what}")
+    with whole_file(job.session_file, job.force) as partial:
+        partial.write_text(description.session, encoding="utf-8")
+    return InfoOutcome(description, job.session_file)

@@ -1,0 +1,208 @@
+"""``wepose live``: the pose while it happens."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from ..errors import BadOption
+from . import Arms, LiveMethod, arm_sides
+
+if TYPE_CHECKING:
+    from ..live import Ended, Output
+    from ..live.robot import Driven, RobotOut
+
+
+@dataclass(frozen=True)
+class LiveJob:
+    """Track a stream live: to a page in the browser, the terminal, other programs and a file.
+
+    Stand still in the start pose until you are told that it is ready. After that r resets the headings, while you stand
+    in the start pose again, and q or Ctrl-C ends. Whatever ends it, the file of --record lacks its last second at most.
+
+    Parameters
+    ----------
+    source : SOURCE
+        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME or mti:DEVICE=SEGMENT,... (docs/live-sources.md).
+    subject : SUBJECT
+        Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
+        Without it lengths are those of the population prior, and mounts those that --session states.
+    session : SESSION
+        Take the sensors' mounts from this session file; what it says of data is not read.
+    record : FILE
+        Write all that is received and the poses to this file; `wepose track FILE` gives the same poses again.
+    method
+        Filter the sensors by this method.
+    model : URDF|TOML
+        Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md).
+    speed : FACTOR
+        Replay at this speed: 1 its own, 4 four times that, max as fast as it is read.
+    page
+        Serve the page that shows the pose, to this machine only.
+    open
+        Open the page in the browser.
+    port : PORT
+        Serve the page at this port; 0: at any that is free.
+    udp : [HOST:]PORT
+        Send each pose as JSON to this port, of this machine where no host is named (docs/live-page.md).
+    lsl : NAME
+        Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
+    robot : NAME|FILE.urdf
+        Send commands by which this robot (as of `wepose retarget`) follows the person (docs/live-robot.md).
+    arm
+        Move only this arm of the robot, or both. Without it all arms that it has.
+    map : TOML
+        Use this map of the URDF in --robot, where none lies beside it.
+    to : [HOST:]PORT
+        Send the robot's commands to this port, as JSON. Without it to port 9002 of this machine.
+    robot_hz : HZ
+        Send commands at this rate.
+    hold_after : SECONDS
+        Brake the robot after this time without a pose.
+    stop_after : SECONDS
+        Stop the robot, until r is pressed, after this time without a pose.
+    force
+        Replace the file of --record.
+    """
+
+    source: str
+    subject: Path | None = None
+    session: Path | None = None
+    record: Path | None = None
+    method: LiveMethod = "amekf"
+    model: Path | None = None
+    speed: str = "1"
+    page: bool = True
+    open: bool = True
+    port: int = 0
+    udp: str | None = None
+    lsl: str | None = None
+    robot: str | None = None
+    arm: Arms | None = None
+    map: Path | None = None
+    to: str | None = None
+    robot_hz: float = 100.0
+    hold_after: float = 0.1
+    stop_after: float = 1.0
+    force: bool = False
+
+    def check(self) -> None:
+        """Raise `BadOption` where an option of the robot is given without one."""
+        for option, value in (("arm", self.arm), ("map", self.map), ("to", self.to)):
+            if value is not None and self.robot is None:
+                raise BadOption(f"--{option} {value}: goes with --robot, which is not given")
+
+    @property
+    def replays(self) -> bool:
+        """Whether the source is a recording."""
+        return self.source.startswith("replay:")
+
+
+class LiveOutcome(NamedTuple):
+    """What came of a `LiveJob`."""
+
+    session: Ended
+    robot: Driven | None
+
+
+def run_live(
+    job: LiveJob,
+    *,
+    views: Sequence[Output] = (),
+    stop: contextlib.AbstractContextManager[Callable[[], bool]] | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    note: Callable[[Sequence[str]], None] = lambda _: None,
+) -> LiveOutcome:
+    """Follow a stream to its end.
+
+    Parameters
+    ----------
+    views : outputs that show the person to the user, and the robot's state beside it
+    stop : gives what is asked again and again whether to stop, while the stream is followed
+    say, note : told where the page is, and what the user should know, before the stream begins
+
+    Raises
+    ------
+    WeposeError
+        What the source, the subject, the robot or an option lacks.
+    """
+    from ..live import open_source, run_session, wearing_of
+    from ..live.loop import warm, wearer_model
+    from ..model import load_model
+
+    job.check()
+    stated = None if job.session is None else wearing_of(None, job.subject, job.session)
+    named = None if stated is None or job.replays else list(stated.mounts)
+    source = open_source(job.source, sensors=named or None, speed=job.speed)
+    wearing = stated or wearing_of(source, job.subject, None)
+    model = wearer_model(wearing.subject, load_model(job.model) if job.model else None)
+    note(model.warnings)
+    outputs: list[Output] = []
+    robot: RobotOut | None = None
+    try:
+        if job.robot is not None:
+            from ..live.robot import follower_of
+
+            robot, source = follower_of(
+                job.robot,
+                source,
+                wearing,
+                arms=arm_sides(job.arm),
+                map_file=job.map,
+                to=job.to,
+                speed=float(job.speed.replace("max", "inf")) if job.replays else 1.0,
+                rate_hz=job.robot_hz,
+                hold_after=job.hold_after,
+                stop_after=job.stop_after,
+            )
+            outputs.append(robot)
+        if job.udp is not None:
+            from ..live.out import udp_out
+
+            outputs.append(udp_out(job.udp))
+        if job.lsl is not None:
+            from ..live.out import LslOut
+
+            outputs.append(LslOut(job.lsl))
+        if job.page:
+            from ..live.page import LivePage
+
+            page = LivePage(model, port=job.port, title=wearing.name)
+            page.open()
+            outputs.append(_with_robot(page, robot))
+            say(f"Page: {page.url}  (this machine only)")
+            if job.open:
+                import webbrowser
+
+                if not webbrowser.open(page.url):
+                    note(["no browser could be started; open the page yourself"])
+        outputs += [_with_robot(view, robot) for view in views]
+        if robot is not None:
+            warm(job.method)  # what is compiled then does not hold up commands
+            robot.open()
+        with stop or contextlib.nullcontext(lambda: False) as until:
+            ended = run_session(
+                source,
+                wearing,
+                method=job.method,
+                model=model,
+                record=job.record,
+                force=job.force,
+                outputs=outputs,
+                until=until,
+            )
+    finally:
+        for output in outputs:
+            output.close()
+    return LiveOutcome(ended, None if robot is None else robot.summary())
+
+
+def _with_robot(view: Output, robot: RobotOut | None) -> Output:
+    if robot is None:
+        return view
+    from ..live.robot import Watched
+
+    return Watched(view, robot)

@@ -1,0 +1,150 @@
+"""``wepose retarget``: a person's arms → a robot's joint trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from ..errors import BadOption
+from . import Arms, Progress, arm_sides, no_progress
+from .fields import field_values
+
+
+@dataclass(frozen=True)
+class RetargetJob:
+    """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
+
+    Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (of example-robot-data). Any other by its URDF with a map
+    beside it that says which links are shoulder, elbow and hand (docs/retargeting.md).
+
+    Parameters
+    ----------
+    result : RESULT
+        Folder that `wepose track` wrote.
+    robot : NAME|FILE
+        Move this robot: one of the names above, a URDF with a map beside it (ARM.urdf, ARM.toml), or the map.
+    out : DIR
+        Write trajectory.parquet and .csv, joint_trajectory.json and .yaml, summary.json and view.html to this folder.
+    arm
+        Move only this arm, or both. Without it all arms that the robot has.
+    rate_hz : HZ
+        Sample the trajectory at the rate that the controller needs.
+    task
+        Follow the position of the person's hands, their orientation, or both.
+    scale : FACTOR
+        Scale the person's distances by this factor. Without it a straight arm becomes a straight arm of the robot.
+    smoothing_hz : HZ
+        Low-pass filter the measured motion at this frequency; 0 does not filter it.
+    strict
+        Refuse a motion that is too fast for the robot, instead of slowing it down.
+    episode
+        Write episode/ too: a data set of one episode as LeRobot reads it.
+    view
+        Write view.html, the robot beside the person.
+    force
+        Replace the files of an earlier run.
+    """
+
+    result: Path
+    robot: str
+    out: Path
+    arm: Arms | None = None
+    rate_hz: float = 100.0
+    task: Literal["both", "position", "orientation"] = "both"
+    scale: float | None = None
+    smoothing_hz: float = 6.0
+    strict: bool = False
+    episode: bool = False
+    view: bool = True
+    force: bool = False
+
+    def check(self) -> None:
+        """Raise `WeposeError` where there is no such robot, or a number is out of its range."""
+        from ..retargeting import find_map
+
+        find_map(self.robot)
+        if not 10.0 <= self.rate_hz <= 2000.0:
+            raise BadOption(f"--rate-hz {self.rate_hz:g}: from 10 to 2000 samples a second")
+        if self.scale is not None and not 0.0 < self.scale < float("inf"):
+            raise BadOption(f"--scale {self.scale:g}: a number above 0 is needed")
+        if not 0.0 <= self.smoothing_hz < float("inf"):
+            raise BadOption(f"--smoothing-hz {self.smoothing_hz:g}: 0, which does not smooth, or more is needed")
+
+
+class RetargetOutcome(NamedTuple):
+    """What came of a `RetargetJob`."""
+
+    summary: Mapping[str, Any]  # as in summary.json, page failures apart
+    page_failures: list[str]
+    duration_s: float
+
+    @property
+    def runnable(self) -> bool:
+        """Whether a robot can run it: within its limits, and it does not touch itself."""
+        return bool(self.summary["limits_kept"]) and not self.summary["self_collision"]["samples_touching"]
+
+
+def run_retarget(
+    job: RetargetJob, progress: Progress = no_progress, provenance: Mapping[str, Any] | None = None
+) -> RetargetOutcome:
+    """Compute a trajectory, check it and write its folder, whole or not at all; its page follows.
+
+    Parameters
+    ----------
+    provenance : what the result says made it; None: this job
+
+    Raises
+    ------
+    WeposeError
+        No result, no such robot, an arm without sensors; with `strict` a motion that is too fast.
+    """
+    import json
+    from dataclasses import replace
+
+    from .. import retargeting
+    from ..report.page import PageWriter
+    from ..report.viewer import retarget_html
+    from ..writers import read_result, whole_folder
+    from ..writers.provenance import collect_provenance
+    from ..writers.result import as_json
+
+    job.check()
+    without = [task for task in ("position", "orientation") if job.task not in ("both", task)]
+    tasks = replace(retargeting.Tasks(), **dict.fromkeys(without, 0.0))
+    with whole_folder(job.out, job.force) as folder:
+        progress("reading", 0.0)
+        pose, body, about = read_result(job.result)
+        robot = retargeting.load(retargeting.find_map(job.robot), arm_sides(job.arm))
+        trajectory = retargeting.retarget(
+            pose,
+            robot,
+            rate_hz=job.rate_hz,
+            tasks=tasks,
+            scale=job.scale,
+            smoothing_hz=job.smoothing_hz,
+            strict=job.strict,
+            progress=lambda text, share: progress(text, 0.48 * share + (0.48 if text == "solving" else 0.0)),
+        )
+        progress("checking", 0.96)
+        limits = retargeting.kept(retargeting.table(trajectory), robot.map.urdf, robot.map.acceleration, robot.map.jerk)
+        touching = retargeting.touching(robot, trajectory.time, trajectory.u)
+        progress("writing", 0.98)
+        retargeting.write_trajectory(folder, trajectory)
+        if job.episode:
+            retargeting.write_episode(folder / "episode", trajectory, f"follow the arms of {job.result.name}")
+        summary = as_json(retargeting.summary(trajectory, limits, touching))
+        if provenance is None:
+            provenance = collect_provenance("retarget", field_values(job))
+        text = json.dumps({**summary, "provenance": provenance}, indent=2)
+        (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+    failures = []
+    if job.view:
+        progress("making the page", 0.99)
+        title = f"{about.get('recording') or job.result.name} on {robot.map.name}"
+        writer = PageWriter(job.out, ["view.html"])
+        writer.write("view.html", lambda _: retarget_html(body, pose, trajectory, title=title))
+        writer.add_warnings("summary.json")
+        failures = writer.warnings
+    return RetargetOutcome(summary, failures, float(trajectory.time[-1]))

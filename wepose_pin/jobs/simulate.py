@@ -1,0 +1,143 @@
+"""``wepose simulate``: a session whose truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from ..errors import BadOption, one_of
+from . import Progress, no_progress
+from .fields import field_values
+
+if TYPE_CHECKING:
+    from ..simulation import Imperfections, Person
+
+CIRCLES = 6  # drawn by the right hand after the protocol
+
+
+@dataclass(frozen=True)
+class SimulateJob:
+    """Simulate a person with five sensors and a known truth.
+
+    The sensors have the noise and bias of an Xsens MTi-3 in either preset. `wepose calibrate DIR --measured ...` and
+    `wepose track DIR` go on from there.
+
+    Parameters
+    ----------
+    out : DIR
+        Write session.toml, recording.parquet, truth.parquet (columns as in pose.parquet) and subject.toml (the true
+        lengths and mounts) to this folder.
+    seed : NUMBER
+        Draw the person and the motion from this seed.
+    rate_hz : HZ
+        Sample at this rate.
+    protocol
+        Simulate this calibration protocol, as of `wepose calibrate --protocol`. The right hand then draws circles,
+        except after poses.
+    preset
+        Simulate no imperfection but the sensors' noise and bias (ideal), or soft tissue, slip, sway and sensor errors
+        of a usual size too (mild), as stated with their sources in wepose_pin/simulation/imperfections.py.
+    imperfection : NAME=VALUE
+        Simulate one imperfection at this size; may be given several times. mount=any: sensors in any rotation, nothing
+        stated. The others are numbers, 0 for off: soft_tissue_deg, palm_slip [m], shoulder_wander [m], start_elbow_deg,
+        start_segment_deg, sway_deg_s, gyro_scale, accel_scale, misalignment_deg, g_sensitivity_deg_s,
+        gyro_range_deg_s, accel_range_g, bits, clock_jitter [s], clock_offset [s], dropped.
+    force
+        Replace the files of an earlier run.
+    """
+
+    out: Path
+    seed: int = 1
+    rate_hz: float = 100.0
+    protocol: Literal["clasp", "handle", "touch_left", "touch_right", "poses"] = "clasp"
+    preset: Literal["ideal", "mild"] = "ideal"
+    imperfection: Mapping[str, float | str] = field(default_factory=dict)
+    force: bool = False
+
+    def check(self) -> None:
+        """Raise `BadOption` where a number is out of its range, or an imperfection is none."""
+        check_seed(self.seed)
+        if not 20.0 <= self.rate_hz <= 2000.0:
+            raise BadOption(f"--rate-hz {self.rate_hz:g}: between 20 and 2000 samples a second")
+        self.imperfections()
+
+    def imperfections(self) -> Imperfections:
+        """Those of the preset, with the sizes that were given."""
+        from dataclasses import fields, replace
+
+        from ..simulation import PERFECT_WORLD, REALISTIC
+
+        sizes = REALISTIC if self.preset == "mild" else PERFECT_WORLD
+        names = [each.name for each in fields(sizes)]
+        for name, value in self.imperfection.items():
+            given = f"--imperfection {name}={value}"
+            if name not in names:
+                raise BadOption(f"{given}: '{name}' is not an imperfection; {one_of(names, name, len(names))}")
+            if name != "mount" and not isinstance(value, int | float):
+                raise BadOption(f"{given}: '{value}' is not a number, as in {name}=0")
+            if name == "bits" and not float(value).is_integer():
+                raise BadOption(f"{given}: '{value}' is not a whole number, as in {name}=0")
+            try:
+                sizes = replace(sizes, **dict[str, Any]({name: int(value) if name == "bits" else value}))
+            except BadOption as error:
+                raise BadOption(f"{given}: {error}") from None
+        return sizes
+
+
+class SimulateOutcome(NamedTuple):
+    """What came of a `SimulateJob`."""
+
+    person: Person
+
+
+def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> SimulateOutcome:
+    """Simulate a recording and write its folder, whole or not at all.
+
+    Raises
+    ------
+    WeposeError
+        What an option lacks, or a place that cannot be written.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from ..simulation import simulate, simulated_person
+    from ..subject import LENGTHS, mount_rows, subject_toml
+    from ..writers import whole_folder, write_session
+    from ..writers.provenance import collect_provenance, write_provenance
+
+    job.check()
+    with whole_folder(job.out, job.force) as folder:
+        progress("simulating a person", 0.0)
+        person = simulated_person(job.seed)
+        simulation = simulate(
+            person.lengths,
+            seed=job.seed,
+            rate_hz=job.rate_hz,
+            imperfections=job.imperfections(),
+            protocol=job.protocol,
+            circles=0 if job.protocol == "poses" else CIRCLES,
+        )
+        write_session(folder, simulation.recording(f"simulated-{job.seed}"), simulation.truth())
+        order = (*LENGTHS, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
+        true = replace(
+            person.average,
+            name="truth",
+            lengths=person.lengths,
+            mounts=simulation.quat_LS,
+            order=order,
+            covariance=np.zeros((len(order), len(order))),
+            note="simulated: the true lengths and mounts",
+        )
+        (folder / "subject.toml").write_text(subject_toml(true), encoding="utf-8")
+        write_provenance(folder, collect_provenance("simulate", field_values(job)))
+    return SimulateOutcome(person)
+
+
+def check_seed(seed: int) -> None:
+    """Raise `BadOption` where a seed is negative."""
+    if seed < 0:
+        raise BadOption(f"--seed {seed}: a whole number from 0 on")

@@ -1,0 +1,225 @@
+"""``wepose track``: a recording → its pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ..errors import BadOption
+from . import Method, Progress, no_progress
+from .fields import field_values
+
+if TYPE_CHECKING:
+    from ..recording import Recording
+    from ..tracking import TrackedChain, TrackedRecording
+
+
+@dataclass(frozen=True)
+class TrackJob:
+    """Estimate the pose of a recording: segment orientations and joint centres.
+
+    A recording of `wepose live` gives the poses that were shown, bit-identical: it is tracked with its own subject and
+    method, and causally, unless one of these is given here.
+
+    Parameters
+    ----------
+    session : SESSION
+        The recording: session.toml, the folder that holds it, or a file that `wepose live --record` wrote.
+    out : DIR
+        Write pose.parquet, subject.toml, subject.urdf, summary.json, view.html and report.html to this folder.
+    subject : SUBJECT
+        Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
+        Without it lengths are those of the population prior, and mounts those that the session states.
+    model : URDF|TOML
+        Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md). Where the sensors are on the
+        links of another chain (start_pose = "configuration"), the URDF of that chain.
+    method : METHOD
+        Filter the sensors by this method. Without it amekf, or the method of the live session.
+    causal
+        Begin at the end of the start pose and use no later sample, as `wepose live` does.
+    gaps
+        Accept lost samples for longer than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap).
+    covariance
+        Write the covariances of orientations and points too, not only their standard deviations.
+    limits
+        Keep elbows and wrists of one or two axes within the limits of the model's joints.
+    torques
+        Write torques.parquet too: joint torques estimated from the model's inertias and the smoothed motion.
+    view
+        Write view.html, the motion to look at.
+    report
+        Write report.html: warnings and what to do, noise, drift, hands, joint angles.
+    chunk_seconds : SECONDS
+        Track in chunks of this length, in a memory that does not grow with the recording (docs/long-recordings.md).
+        Recordings of 500 MB and more are always tracked so, in chunks of 120 s (smoother: 600 s); 0 tracks them as a
+        whole.
+    force
+        Replace the files of an earlier run.
+    """
+
+    session: Path
+    out: Path
+    subject: Path | None = None
+    model: Path | None = None
+    method: Method | None = None
+    causal: bool = False
+    gaps: bool = False
+    covariance: bool = False
+    limits: bool = True
+    torques: bool = False
+    view: bool = True
+    report: bool = True
+    chunk_seconds: float | None = None
+    force: bool = False
+
+    def check(self) -> None:
+        """Raise `BadOption` where options contradict each other or name what is not there."""
+        if self.model is not None and not self.model.is_file():
+            raise BadOption(f"--model {self.model}: no such file; a URDF, or a TOML that names one, is needed")
+
+
+class TrackOutcome(NamedTuple):
+    """What came of a `TrackJob`."""
+
+    summary: Mapping[str, Any]  # as in summary.json, page failures apart
+    page_failures: list[str]  # a line for each page, or part of one, that could not be made
+    view_rate_hz: float | None = None  # of view.html, where it shows fewer samples than there are
+    tracked: TrackedRecording | None = None  # where a person was tracked as a whole
+    chain: TrackedChain | None = None  # where another chain was
+
+
+def run_track(
+    job: TrackJob, progress: Progress = no_progress, provenance: Mapping[str, Any] | None = None
+) -> TrackOutcome:
+    """Track a recording and write its result folder, whole or not at all; its pages follow.
+
+    Parameters
+    ----------
+    provenance : what the result says made it; None: this job
+
+    Raises
+    ------
+    WeposeError
+        What the session, the subject, the model or an option lacks.
+    """
+    from ..readers import data_bytes, is_live_log
+    from ..tracking import LARGE
+    from ..writers.provenance import collect_provenance
+
+    job.check()
+    as_whole = (
+        "--torques" if job.torques
+        else f"{job.session}, a recording of wepose live," if is_live_log(job.session)
+        else ""
+    )  # fmt: skip
+    if job.chunk_seconds and as_whole:
+        raise BadOption(f"--chunk-seconds {job.chunk_seconds:g}: {as_whole} is tracked as a whole; leave it out")
+    if provenance is None:
+        provenance = collect_provenance("track", field_values(job))
+    if job.chunk_seconds or (job.chunk_seconds is None and not as_whole and data_bytes(job.session) >= LARGE):
+        return _track_in_chunks(job, progress, provenance)
+    return _track_as_whole(job, progress, provenance)
+
+
+def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, Any]) -> TrackOutcome:
+    from ..filters import BEST
+    from ..model import load_model
+    from ..readers import is_live_log, load_session, read_live_log
+    from ..recording import CONFIGURATION
+    from ..report import write_track_pages
+    from ..subject import load_subject, subject_of
+    from ..tracking import track
+    from ..writers import whole_folder, write_result
+
+    method, causal = job.method or BEST, job.causal
+    with whole_folder(job.out, job.force) as folder:
+        progress("reading", 0.0)
+        subject = load_subject(job.subject) if job.subject else None
+        if is_live_log(job.session):
+            log = read_live_log(job.session)
+            recording, causal = log.recording, causal or (job.method is None and subject is None)
+            method = job.method or log.header["method"]
+            if subject is None and log.header["subject"]:
+                subject = subject_of(log.header["subject"], job.session)
+        else:
+            recording = load_session(job.session, gaps=job.gaps)
+        if job.model is not None and recording.start_pose == CONFIGURATION:
+            return _track_chain(job, recording, folder, progress, provenance)
+        model = load_model(job.model) if job.model else None
+        progress(f"tracking by {method}", 1 / 3)
+        tracked = track(recording, subject, method=method, model=model, causal=causal, limits=job.limits)
+        torques = None
+        if job.torques:
+            from ..angles.torques import pose_torques
+
+            torques = pose_torques(tracked)
+        write_result(folder, tracked, job.covariance, recording.phases, torques, provenance)
+    failures = []
+    if job.view or job.report:
+        progress("making the pages", 2 / 3)
+        failures = write_track_pages(job.out, tracked, view=job.view, report=job.report)
+    return TrackOutcome(tracked.summary(), failures, tracked=tracked)
+
+
+def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str, Any]) -> TrackOutcome:
+    """In a memory that does not grow with the recording."""
+    from ..filters import BEST
+    from ..model import load_model
+    from ..readers.session import SessionReader
+    from ..report import write_decimated_pages
+    from ..report.decimation import Decimator
+    from ..report.track import MOST_FRAMES
+    from ..subject import load_subject
+    from ..tracking import TrackOptions, track_session
+    from ..writers import whole_folder
+    from ..writers.chunks import ChunkWriter
+
+    with whole_folder(job.out, job.force) as folder:
+        progress("reading the times", 0.0)
+        subject = load_subject(job.subject) if job.subject else None
+        model = load_model(job.model) if job.model else None
+        reader = SessionReader(job.session, gaps=job.gaps, in_memory=False)
+        writer, decimator = ChunkWriter(folder, job.covariance), Decimator(len(reader.time))
+        options = TrackOptions(job.method or BEST, causal=job.causal, limits=job.limits)
+        for chunk in track_session(
+            reader, subject, seconds=job.chunk_seconds, model=model, options=options, progress=progress
+        ):
+            writer.add(chunk)
+            decimator.add(chunk)
+        progress("writing the result", 1.0)
+        writer.finish(reader.phases, provenance)
+        summary = writer.accumulator.summary()
+    view_rate_hz, failures = min(30.0, MOST_FRAMES / max(summary["duration_s"], 1e-3)), []
+    if job.view or job.report:
+        progress("making the pages", 1.0)
+        failures = write_decimated_pages(
+            job.out, decimator, reader.phases, summary["warnings"], report=job.report, fps=view_rate_hz
+        )
+    if not job.view:
+        (job.out / "view.html").unlink(missing_ok=True)
+    return TrackOutcome(summary, failures, view_rate_hz)
+
+
+def _track_chain(
+    job: TrackJob, recording: Recording, folder: Path, progress: Progress, provenance: Mapping[str, Any]
+) -> TrackOutcome:
+    """Where the sensors are on the links of a chain that is no person's arms."""
+    from ..angles.torques import joint_torques
+    from ..filters import BEST
+    from ..model.robot import load_robot
+    from ..tracking import track_chain
+    from ..writers.chain import write_chain
+    from ..writers.provenance import write_provenance
+
+    if job.subject is not None or job.causal:
+        wrong = "subject" if job.subject else "causal"
+        raise BadOption(f"--{wrong}: for a person; {job.session} is of another chain")
+    assert job.model is not None
+    model, method = load_robot(job.model), job.method or BEST
+    progress(f"tracking by {method}", 1 / 3)
+    chain = track_chain(recording, model, method=method, limits=job.limits)
+    write_chain(folder, chain, joint_torques(model, chain.time, chain.q) if job.torques else None)
+    write_provenance(folder, provenance)
+    return TrackOutcome(chain.summary(), [], chain=chain)

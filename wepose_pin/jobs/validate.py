@@ -1,0 +1,107 @@
+"""``wepose validate``: the paper's experiments beside its own figures."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from ..errors import BadData, BadOption
+from . import Progress, no_progress
+
+if TYPE_CHECKING:
+    from ..validation import Document
+
+
+@dataclass(frozen=True)
+class ValidateJob:
+    """Run the paper's experiments on simulated subjects and compare with the paper's figures.
+
+    On two cores a quick run takes under a minute, a full one about ten.
+
+    Parameters
+    ----------
+    out : DIR
+        Write validation.json with every trial, and the page with tables and figures to this folder: validation.html,
+        validation.md with validation/*.svg.
+    data : DIR
+        Run on the real recordings in this folder too (broad/, wepose_hr/, ring/, ur5/).
+    quick
+        Run one trial of each experiment, and two of BROAD, instead of all; without the error budget and without the
+        search for gains.
+    from_ : FILE
+        Make tables and pages anew from the validation.json of an earlier run, and run nothing.
+    force
+        Replace the files of an earlier run.
+    """
+
+    out: Path | None = None
+    data: Path | None = None
+    quick: bool = False
+    from_: Path | None = None
+    force: bool = False
+
+    def check(self) -> None:
+        """Raise `BadOption` where options contradict each other."""
+        if self.from_ is not None and (self.quick or self.data is not None):
+            raise BadOption(f"--from {self.from_}: runs nothing, so that --quick and --data mean nothing beside it")
+
+
+class ValidateOutcome(NamedTuple):
+    """What came of a `ValidateJob`."""
+
+    document: Document
+    page_failures: list[str]
+
+
+def run_validate(job: ValidateJob, progress: Progress = no_progress) -> ValidateOutcome:
+    """Run the experiments, or read those of an earlier run, and write the folder, whole or not at all; pages follow.
+
+    Raises
+    ------
+    WeposeError
+        No data, a place that cannot be written, or nothing that could be scored.
+    """
+    import json
+
+    from ..errors import reason
+    from ..validation import Skipped, document_text, experiments, read_document, run
+    from ..validation.document import as_document
+    from ..validation.page import write_pages
+    from ..writers import whole_folder
+    from ..writers.result import versions
+
+    job.check()
+    if job.from_ is not None:
+        document, failures = read_document(job.from_), list[str]()
+        if job.out is not None:
+            with whole_folder(job.out, job.force) as folder:
+                progress("drawing the figures", 0.0)
+                failures = write_pages(folder, document)
+        return ValidateOutcome(document, failures)
+    trials = [trial for of in experiments(job.quick, job.data).values() for trial in of]
+    steps = len(trials) + (job.out is not None)
+    with contextlib.ExitStack() as place:
+        folder_or_none = place.enter_context(whole_folder(job.out, job.force)) if job.out is not None else None
+        results, skipped = [], []
+        for k, (trial, outcome) in enumerate(zip(trials, run(trials), strict=True), 1):
+            progress(trial.experiment, k / steps)
+            if isinstance(outcome, Skipped):
+                skipped.append(outcome)
+            else:
+                results += outcome
+        if not results:
+            raise BadData(f"nothing could be scored; {skipped[0].line()}")
+        text = document_text(results, job.quick, versions(), skipped)
+        if folder_or_none is not None:
+            (folder_or_none / "validation.json").write_text(text, encoding="utf-8")
+    document, failures = as_document(json.loads(text), "this run"), []
+    if job.out is not None:
+        progress("drawing the figures", 1.0)
+        try:
+            with whole_folder(job.out, force=True) as folder:
+                failures = write_pages(folder, document)
+        except Exception as error:
+            failures = [f"validation.html and validation.md: cannot be made: {reason(error)}"]
+    return ValidateOutcome(document, failures)

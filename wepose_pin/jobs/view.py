@@ -1,0 +1,68 @@
+"""``wepose view``: the motion of a result as a page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from ..errors import MissingFile
+from . import Progress, no_progress
+
+
+@dataclass(frozen=True)
+class ViewJob:
+    """Show the motion of a result as one HTML page that opens offline.
+
+    Parameters
+    ----------
+    result : RESULT
+        Folder that `wepose track` wrote.
+    out : FILE
+        Write the page to this file. Without it view.html in the folder of the result is opened, and made if it is
+        missing.
+    open
+        Open the page in the browser.
+    force
+        Replace an existing page.
+    """
+
+    result: Path
+    out: Path | None = None
+    open: bool = True
+    force: bool = False
+
+
+class ViewOutcome(NamedTuple):
+    """What came of a `ViewJob`."""
+
+    page: Path
+    opened: bool  # in a browser
+
+
+def run_view(job: ViewJob, progress: Progress = no_progress) -> ViewOutcome:
+    """Make the page where it is asked for or missing, whole or not at all, and open it.
+
+    Raises
+    ------
+    WeposeError
+        No result; a page that exists or cannot be written.
+    """
+    import webbrowser
+
+    from ..report.viewer import pose_html
+    from ..writers import read_result
+    from ..writers.folder import check_file, whole_file
+
+    page = job.out or job.result / "view.html"
+    if not (job.result / "pose.parquet").is_file():
+        raise MissingFile(f"{job.result}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
+    check_file(page, force=job.force or job.out is None)
+    if job.out is not None or job.force or not page.is_file():
+        progress("making the page", 0.0)
+        pose, model, summary = read_result(job.result)
+        phases = {name: [(a, b) for a, b in spans] for name, spans in summary.get("recorded_phases", {}).items()}
+        text = pose_html(model, pose, phases=phases, title=summary.get("recording", job.result.name))
+        with whole_file(page, force=True) as partial:
+            partial.write_text(text, encoding="utf-8")
+    return ViewOutcome(page, job.open and webbrowser.open(page.absolute().as_uri()))

@@ -1,0 +1,223 @@
+"""Quaternion algebra: the only place that has it, for arrays and for compiled kernels.
+
+Quaternions are xyzw, unit norm, as in Pinocchio and SciPy. Functions on arrays come first. The kernels below them are
+the per-sample steps of filters and of live tracking: they work on numbers and on the first four entries of a row, and
+keep their order of operations, so that results stay bit-identical.
+"""
+
+from __future__ import annotations
+
+from math import factorial
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from .compilation import compiled, inlined, kernel
+
+
+def xyzw_from_wxyz(quat_wxyz: ArrayLike) -> np.ndarray:
+    """Reorder quaternions (..., 4) from scalar first to scalar last."""
+    return np.roll(np.asarray(quat_wxyz, dtype=float), -1, axis=-1)
+
+
+def wxyz_from_xyzw(quat_xyzw: ArrayLike) -> np.ndarray:
+    """Reorder quaternions (..., 4) from scalar last to scalar first."""
+    return np.roll(np.asarray(quat_xyzw, dtype=float), 1, axis=-1)
+
+
+def _product(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped-def]
+    """``a ⊗ b`` of the components of two quaternions, numbers or arrays, as four."""
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+product = inlined(_product)
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Products of quaternions (..., 4) xyzw; on 60 000 ten times as fast as SciPy's."""
+    return np.stack(_product(*np.moveaxis(a, -1, 0), *np.moveaxis(b, -1, 0)), axis=-1)  # type: ignore[no-untyped-call]
+
+
+def conjugate(quat: np.ndarray) -> np.ndarray:
+    """Inverse rotations (..., 4) xyzw."""
+    return quat * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def rotation_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Rotations (n, 4) xyzw about one axis (3,) by angles (n,) [rad]."""
+    half = np.asarray(angle)[..., None] / 2.0
+    return np.concatenate([np.sin(half) * axis, np.cos(half)], axis=-1)
+
+
+def exp(rotvec: ArrayLike) -> np.ndarray:
+    """Quaternion (..., 4) xyzw of the rotation vector (..., 3) [rad]."""
+    return Rotation.from_rotvec(np.asarray(rotvec, dtype=float)).as_quat()
+
+
+def log(quat: ArrayLike) -> np.ndarray:
+    """Rotation vector (..., 3) [rad], at most pi long, of the quaternion (..., 4) xyzw."""
+    return Rotation.from_quat(np.asarray(quat, dtype=float)).as_rotvec()
+
+
+def quat_from_gravity(accel_S: ArrayLike) -> np.ndarray:
+    """Orientation `quat_WS` (4,) of a sensor at rest with zero heading: the shortest rotation of accel onto +z of W.
+
+    Zero heading means no twist about the vertical; that is defined for every mount but the one exactly upside down,
+    where the half turn about x is taken.
+
+    Raises
+    ------
+    ValueError
+        `accel_S` is zero.
+    """
+    accel = np.asarray(accel_S, dtype=float)
+    norm = np.linalg.norm(accel)
+    if not norm > 0.0:
+        raise ValueError("tilt of a zero acceleration is undefined")
+    up_S = accel / norm
+    quat = np.array([up_S[1], -up_S[0], 0.0, 1.0 + up_S[2]])
+    if np.linalg.norm(quat) < 1e-8:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+    return quat / np.linalg.norm(quat)
+
+
+def heading(quat_WV: ArrayLike) -> np.ndarray:
+    """Twist [rad] of rotations (..., 4) about the vertical, in [−pi, pi]: what is left when the tilt is taken off."""
+    quat = np.asarray(quat_WV, dtype=float)
+    return np.angle(np.exp(2j * np.arctan2(quat[..., 2], quat[..., 3])))
+
+
+def unwrap_signs(quat: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+    """The same rotations (n, 4) with signs chosen such that neighbours lie on one side (for files and plots).
+
+    The first keeps its sign, or takes that of `before` (4,).
+    """
+    jumps = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))
+    first = 1.0 if before is None else np.sign(quat[0] @ before)
+    signs = np.concatenate([[first], jumps])
+    signs[signs == 0.0] = 1.0
+    return quat * np.cumprod(signs)[:, None]
+
+
+# Below this half angle [rad] polynomials replace sine and cosine; the first terms left out are under 1e-18 there.
+SERIES_HALF_ANGLE = 0.5
+S0, S1, S2, S3, S4, S5, S6, S7 = (0.5 * (-1) ** k / factorial(2 * k + 1) for k in range(8))  # ½ sin(h)/h in h²
+C0, C1, C2, C3, C4, C5, C6, C7 = ((-1) ** k / factorial(2 * k) for k in range(8))  # cos(h) in h²
+
+
+@kernel
+def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
+    """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised. `quat` (4,) or more, its first four xyzw; vector [rad].
+
+    Sine and cosine of a sample's turn are power series in the square of the half angle: no call, no square root.
+    """
+    h1 = 0.25 * (x * x + y * y + z * z)
+    if h1 < SERIES_HALF_ANGLE * SERIES_HALF_ANGLE:
+        h2 = h1 * h1
+        h4 = h2 * h2
+        s = (S0 + S1 * h1 + h2 * (S2 + S3 * h1)) + h4 * (S4 + S5 * h1 + h2 * (S6 + S7 * h1))
+        c = (C0 + C1 * h1 + h2 * (C2 + C3 * h1)) + h4 * (C4 + C5 * h1 + h2 * (C6 + C7 * h1))
+    else:
+        half = np.sqrt(h1)
+        s = 0.5 * np.sin(half) / half
+        c = np.cos(half)
+    ex, ey, ez = s * x, s * y, s * z
+    qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]
+    rx, ry, rz, rw = product(qx, qy, qz, qw, ex, ey, ez, c)
+    square = rx * rx + ry * ry + rz * rz + rw * rw
+    # Of an almost unit quaternion 1/norm is 1 − (square − 1)/2, to 3/8 (square − 1)².
+    scale = 1.5 - 0.5 * square if abs(square - 1.0) < 1e-8 else 1.0 / np.sqrt(square)
+    quat[0], quat[1], quat[2], quat[3] = rx * scale, ry * scale, rz * scale, rw * scale
+
+
+@inlined
+def half_angle_terms(h2):  # type: ignore[no-untyped-def]
+    """sin(h)/h and cos(h) of h² = `h2`; below 0.02 (0.28 rad a sample) by series, to the last bit or two."""
+    if h2 < 0.02:
+        s = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * (1.0 - h2 / 42.0 * (1.0 - h2 / 72.0)))
+        c = 1.0 - h2 / 2.0 * (1.0 - h2 / 12.0 * (1.0 - h2 / 30.0 * (1.0 - h2 / 56.0 * (1.0 - h2 / 90.0))))
+        return s, c
+    h = np.sqrt(h2)
+    return np.sin(h) / h, np.cos(h)
+
+
+@inlined
+def rotate_unit_by_rate(quat, wx, wy, wz, dt):  # type: ignore[no-untyped-def]
+    """In place: ``quat ← quat ⊗ exp([wx, wy, wz] dt)``, renormalised to first order: but for rounding it is unit."""
+    s, ew = half_angle_terms(0.25 * dt * dt * (wx * wx + wy * wy + wz * wz))
+    s *= 0.5 * dt
+    rx, ry, rz, rw = product(quat[0], quat[1], quat[2], quat[3], s * wx, s * wy, s * wz, ew)
+    norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)  # 1/√, to first order
+    quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
+
+
+@inlined
+def rotate_by_world_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
+    """In place: ``quat ← exp([x, y, z]) ⊗ quat``, renormalised; the vector is in W [rad]."""
+    s, ew = half_angle_terms(0.25 * (x * x + y * y + z * z))
+    rx, ry, rz, rw = product(0.5 * s * x, 0.5 * s * y, 0.5 * s * z, ew, quat[0], quat[1], quat[2], quat[3])
+    norm = 1.0 / np.sqrt(rx * rx + ry * ry + rz * rz + rw * rw)
+    quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
+
+
+@inlined
+def rotation_terms(t):  # type: ignore[no-untyped-def]
+    """cos θ, sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ of θ² = `t`; below 0.02 by series, to the last bit or two.
+
+    With θ = ‖w‖, exp([w]×) = cos θ I + sin θ/θ [w]× + (1 − cos θ)/θ² w wᵀ. The integral of exp([w]× u) over u from 0 to
+    1 has the second to fourth term in their place.
+    """
+    if t < 0.02:
+        s = 1.0 - t / 6.0 * (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0)))
+        c = 0.5 * (1.0 - t / 12.0 * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0))))
+        d = (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0 * (1.0 - t / 110.0)))) / 6.0
+        return 1.0 - t * c, s, c, d
+    angle = np.sqrt(t)
+    cosine, s = np.cos(angle), np.sin(angle) / angle
+    return cosine, s, (1.0 - cosine) / t, (1.0 - s) / t
+
+
+@inlined
+def derivative(x, y, z, w, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """``½ quat ⊗ [wx, wy, wz, 0]``: by how much a quaternion changes in a second at a rate [rad/s], as four floats."""
+    return (
+        0.5 * (w * wx + y * wz - z * wy),
+        0.5 * (w * wy - x * wz + z * wx),
+        0.5 * (w * wz + x * wy - y * wx),
+        0.5 * (-x * wx - y * wy - z * wz),
+    )
+
+
+@inlined
+def fill_matrix(quat, R):  # type: ignore[no-untyped-def]
+    """`R` (9,) rows first, of `quat` (4,) xyzw."""
+    x, y, z, w = quat[0], quat[1], quat[2], quat[3]
+    x2, y2, z2 = 2.0 * x, 2.0 * y, 2.0 * z
+    R[0], R[1], R[2] = 1.0 - y * y2 - z * z2, x * y2 - w * z2, x * z2 + w * y2
+    R[3], R[4], R[5] = x * y2 + w * z2, 1.0 - x * x2 - z * z2, y * z2 - w * x2
+    R[6], R[7], R[8] = x * z2 - w * y2, y * z2 + w * x2, 1.0 - x * x2 - y * y2
+
+
+@kernel
+def up_in_sensor(quat):  # type: ignore[no-untyped-def]
+    """``R_WSᵀ e_z``: the vertical in sensor coordinates, as three floats. `quat` (4,) or more: its first four, xyzw."""
+    x, y, z, w = quat[0], quat[1], quat[2], quat[3]
+    return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+
+
+@compiled
+def integrate(rotvec):  # type: ignore[no-untyped-def]
+    """Orientations (n + 1, 4) xyzw from the identity on, each turned by the next of `rotvec` (n, 3) [rad]."""
+    quat = np.array([0.0, 0.0, 0.0, 1.0])
+    out = np.empty((len(rotvec) + 1, 4))
+    out[0] = quat
+    for k in range(len(rotvec)):
+        rotate_by_vector(quat, rotvec[k, 0], rotvec[k, 1], rotvec[k, 2])
+        out[k + 1] = quat
+    return out
