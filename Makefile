@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test check lint types wheel fuzz recordings clean
+.PHONY: demo test check lint types wheel fuzz recordings bench clean
 
 demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 	$(BIN)/wepose demo -o demo --force
@@ -27,6 +27,10 @@ fuzz: $(READY)            ## fuzz all that is parsed, SECONDS=60 a target; TARGE
 SEEDS ?= 0:1000
 recordings: $(READY)      ## random recordings of ordinary behaviour, SEEDS=0:1000; goes on where it was stopped
 	$(BIN)/python tests/random_recordings/run.py --seeds $(SEEDS) --jobs 2
+
+BENCH ?= filters calibration
+bench: $(READY)           ## speed and accuracy on this machine; BENCH="live" and others: python -m benchmarks --help
+	$(BIN)/python -m benchmarks $(BENCH)
 
 wheel: $(READY)
 	$(BIN)/python -m build --wheel --outdir dist .

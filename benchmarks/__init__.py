@@ -1,1 +1,2 @@
-"""Measurements of this code base that do not belong to the package: whether results have changed, and speed."""
+"""Measurements for developers, not in the wheel: speed and accuracy (`python -m benchmarks --help`), and whether two
+versions give bit-identical results (`python -m benchmarks.results --help`)."""

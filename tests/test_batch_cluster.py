@@ -21,12 +21,12 @@ import polars as pl
 import pytest
 from studies import PLAN, files, item, sessions_and_plan, three_sessions  # noqa: F401
 
+from benchmarks.batch import separate_cluster
 from wepose_pin.batch import cluster, run_batch
 from wepose_pin.batch.apart import make_apart
 from wepose_pin.batch.cluster import connected, made
 from wepose_pin.batch.compare import differences
 from wepose_pin.batch.storage import DONE
-from wepose_pin.bench.study import _apart_from_us
 from wepose_pin.errors import BadData, BadOption, LostWorker
 from wepose_pin.jobs.batch import BatchJob
 
@@ -275,7 +275,7 @@ def test_a_cluster_of_ones_own_one_of_whose_workers_is_killed(study: Path) -> No
             kill()
             killed.append(done)
 
-    with _apart_from_us(study) as (address, kill):
+    with separate_cluster(study) as (address, kill):
         found = run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler=address), progress)
         assert killed
         assert found.table.drop(*APART).equals(alone)
@@ -286,7 +286,7 @@ def test_a_cluster_of_ones_own_one_of_whose_workers_is_killed(study: Path) -> No
 @pytest.mark.parametrize("when", ["before", "meanwhile"])
 def test_a_scheduler_that_goes_ends_the_run_by_name(study: Path, when: str) -> None:
     with contextlib.ExitStack() as stack:
-        address, _ = stack.enter_context(_apart_from_us(study))
+        address, _ = stack.enter_context(separate_cluster(study))
         with connected(address) as client:
             rows = made(client, [item(study, name) for name in ("one", "two", "three")], str(study / "items"))
             if when == "meanwhile":

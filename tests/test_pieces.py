@@ -13,7 +13,7 @@ import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.bench.day import there_and_back
+from benchmarks.long_recordings import there_and_back
 from wepose_pin.calibration import calibrate_lengths
 from wepose_pin.cli import main
 from wepose_pin.errors import BadData, BadOption

@@ -39,9 +39,9 @@ EXPORTS: tuple[tuple[str, tuple[str, ...]], ...] = (
 ACCEPTED = {"calibrate": (0, 3, 4), "retarget": (0, 3)}  # exit codes beside 0 with which files are written
 
 # Files of a result whose numbers are not compared: pages, and what tells where, when and by what it was made.
-NOT_COMPARED = ("*.html", "*.md", "*.png", "provenance.json", "*.provenance.json")
+NOT_COMPARED = ("*.html", "*.md", "*.png", "provenance.json", "*.provenance.json", "done.json", "study.json")
 # Keys, of JSON or of ours, whose numbers differ from run to run: times, versions, dates.
-VOLATILE = r"(^|/)(provenance|versions|packages|machine|date|solve_ms)(/|$)"
+VOLATILE = r"(^|/)(provenance|versions|packages|machine|date|solve_ms)(/|$)|/results/(seconds|memory_mb|\w+_s)$"
 MAIN_TABLES = ("pose",)  # files whose columns stand under the result's own key
 
 # Where the inputs of an older version are read: what has another name now. Pattern → replacement, line by line of its
@@ -275,6 +275,40 @@ def name_sensors(session: Path, segments: Iterable[str]) -> None:
     for segment in segments:
         text = text.replace("# [sensors.SEGMENT]\n# file", f"[sensors.{segment}]\nfile", 1)
     session.write_text(text, encoding="utf-8")
+
+
+def demo(out: Path) -> list[str]:
+    return ["demo", "-o", str(out)]
+
+
+def batch(plan: Path, out: Path) -> list[str]:
+    return ["batch", str(plan), "-o", str(out), "--workers", "1"]
+
+
+def write_plan(file: Path, recording: Path, known: Mapping[str, Any]) -> None:
+    """A plan of `batch`: a subject calibrated by a recording, which is tracked, exported and evaluated with it."""
+    measured = ", ".join(f"{name} = {value!r}" for name, value in known["measured"].items())
+    person = f'stature = {known["stature"]}\nsex = "{known["sex"]}"'
+    file.write_text(
+        f"""name = "study"
+[sessions]
+files = ["{recording}/session.toml"]
+subject = "person"
+[subjects.person]
+calibration = "{recording}/session.toml"
+measured = {{ {measured} }}
+{person}
+[steps.calibrate]
+report = false
+[steps.track]
+view = false
+report = false
+[steps.export]
+formats = ["trc"]
+[steps.evaluate]
+""",
+        encoding="utf-8",
+    )
 
 
 def validate(out: Path, data: Path | None) -> list[str]:

@@ -70,7 +70,7 @@ def _array(value: Any) -> np.ndarray | None:
 def folder_values(folder: Path, key: str) -> Arrays:
     """The numbers of all files of a result that are compared."""
     found: Arrays = {}
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+    for path in sorted(path for path in folder.rglob("[!.]*") if path.is_file()):
         if any(fnmatch.fnmatch(path.name, pattern) for pattern in adapter.NOT_COMPARED):
             continue
         name = path.relative_to(folder).with_suffix("").as_posix()

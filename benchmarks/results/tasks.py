@@ -14,6 +14,11 @@ from . import adapter
 from .arrays import Arrays, file_values, folder_values, values_of
 from .inputs import REAL, makers, read_known
 
+BROAD = (
+    "01_undisturbed_slow_rotation_A.mat",
+    "16_undisturbed_fast_translation_B.mat",
+    "25_disturbed_tapping_B.mat",
+)
 DEVICE_FILES = (
     ("mvnx", "test_mocap.mvnx"),
     ("mvnx", "Meri-020.mvnx"),
@@ -134,7 +139,7 @@ def _methods(recording: str, exported_methods: Iterable[str] = ()) -> list[Task]
     """A person tracked by each method in each way."""
     found = []
     for method in adapter.METHODS:
-        variants: Mapping[str, tuple[str, ...]] = {"whole": ("covariance",), "chunks": ("chunks",)}
+        variants: dict[str, tuple[str, ...]] = {"whole": ("covariance",), "chunks": ("chunks",)}
         if method not in adapter.OFFLINE:
             variants["causal"] = ("causal",)
         exports = ("whole",) if method in exported_methods else ()
@@ -186,6 +191,19 @@ def _retarget(robot: str, *options: str) -> Callable[[Places], Arrays]:
         return _under(key, code) | folder_values(out, key)
 
     return run
+
+
+def _demo(places: Places) -> Arrays:
+    command(adapter.demo(places.work / "out"))
+    return folder_values(places.work / "out", "demo")
+
+
+def _batch(places: Places) -> Arrays:
+    """What a study of one session makes; each step as the command of its name."""
+    session, plan, out = places.session("mild"), places.work / "plan.toml", places.work / "out"
+    adapter.write_plan(plan, session, read_known(session))
+    command(adapter.batch(plan, out))
+    return folder_values(out, "batch")
 
 
 def _live(method: str) -> Callable[[Places], Arrays]:
@@ -275,6 +293,8 @@ def tasks() -> list[Task]:
         Task("simulate/mild", _simulate(12, "mild", "clasp"), 15.0),
         Task("simulate/handle", _simulate(13, "mild", "handle"), 15.0),
         Task("simulate/poses", _simulate(14, "mild", "poses")),
+        Task("demo", _demo, 40.0),
+        Task("batch", _batch, 20.0),
         Task("retarget/panda", _retarget("panda"), 20.0),
         Task("retarget/panda_position", _retarget("panda", "--task=position"), 20.0),
         Task("retarget/ur5", _retarget("ur5"), 20.0),
@@ -282,7 +302,7 @@ def tasks() -> list[Task]:
         Task("live/amekf", _live("amekf")),
         Task("live/smekf", _live("smekf")),
         Task("orientation/authors_trial", _authors_trial),
-        *(Task(f"orientation/{file[:2]}", _broad(file)) for file in ("07_undisturbed_fast_rotation_B.mat",)),
+        *(Task(f"orientation/{file[:2]}", _broad(file)) for file in BROAD),
         Task("read/files", _files, 3.0),
         Task("read/sessions", _sessions, 3.0),
     ]

@@ -68,15 +68,7 @@ def _validation(path: Path) -> object:
     return found
 
 
-def _bench(path: Path) -> object:
-    from wepose_pin.bench import read_document, then_by_now
-
-    found = read_document(path)
-    return then_by_now(found, "speed", "amekf", "us", 2.0)
-
-
 validation = file("validation.json", _validation)
-bench = file("before.json", _bench)
 
 
 def provenance(folder: Path, data: bytes) -> object:

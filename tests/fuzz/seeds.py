@@ -353,12 +353,6 @@ def validation() -> bytes:
     return document_text(results, True, {"wepose-pin": "0.1.0"}).encode()
 
 
-def bench() -> bytes:
-    rows = {"amekf": {"us": 1.5, "by": 2}, "vqf": {"us": 1.0}}
-    sections = {"speed": {"title": "a", "rows": rows}}
-    return json.dumps({"format": 1, "date": "2024-01-01", "sections": sections}).encode()
-
-
 def broad(compressed: bool) -> bytes:
     n = 12
     out = io.BytesIO()

@@ -312,7 +312,6 @@ TARGETS = (
     Target("provenance", lambda: [seeds.provenance()], records.provenance, JSON, "batch.reproduce"),
     Target("done", lambda: [seeds.done()], records.done, JSON, "batch.items"),
     Target("validation", lambda: [seeds.validation()], records.validation, JSON, "validation.document"),
-    Target("bench", lambda: [seeds.bench()], records.bench, JSON, "bench"),
     Target("broad", lambda: [seeds.broad(False), seeds.broad(True)], records.broad, (), "readers.trials"),
     Target("authors", lambda: [seeds.authors()], records.authors, LINES, "readers.trials"),
     Target("ring", lambda: [seeds.ring()], records.ring, LINES, "readers.trials"),

@@ -17,8 +17,8 @@ from .apart import make_apart
 from .items import Row, failed, make_items
 from .plan import Item
 
-# A task costs Dask some milliseconds (`wepose bench --batch` measures it): one that takes half a second keeps that
-# under a hundredth. Items that take less go together.
+# A task costs Dask some milliseconds (`python -m benchmarks batch` measures it): one that takes half a second keeps
+# that under a hundredth. Items that take less go together.
 TASK_S = 0.5
 MOST = 500  # items a task
 AHEAD = 2  # tasks a worker: one runs, one waits

@@ -1,4 +1,4 @@
-"""What a recording of a day costs: `wepose track` in pieces, its memory, and whether it gives what the whole gives."""
+"""What a recording of a day costs: `wepose track` in chunks, its memory, and whether it is bit-identical."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,26 +15,28 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..calibration import calibrate_lengths
-from ..errors import NoSolution
-from ..recording import Recording, Sensor
-from ..simulation import simulate, simulated_person
-from ..tracking import CHUNK_S, SMOOTHER_CHUNK_S
-from ..writers import write_session
-from ..writers.result import write_subject
-from . import Column, Table
+from wepose_pin.calibration import calibrate_lengths
+from wepose_pin.errors import NoSolution
+from wepose_pin.model import load_model
+from wepose_pin.recording import Recording, Sensor
+from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.tracking import CHUNK_S, SMOOTHER_CHUNK_S
+from wepose_pin.writers import write_session
+from wepose_pin.writers.result import write_subject
+
+from .tables import Column, Section, Table
 
 HOURS, FEW_HOURS = (1.0, 6.0, 24.0), (0.5, 1.0)
-SHORT_S = 120.0  # pieces of the smoother whose error is told too
+SHORT_S = 120.0  # [s] chunks of the smoother whose error is measured too
 
 
-def day_sections(quick: bool) -> dict[str, Callable[[], Table]]:
+def sections(quick: bool) -> dict[str, Section]:
     """Name → a function that measures it."""
-    return {"a day": partial(_day, FEW_HOURS if quick else HOURS)}
+    return {"long recordings": partial(long_recordings, FEW_HOURS if quick else HOURS)}
 
 
-def _day(hours: tuple[float, ...]) -> Table:
-    """Recordings of so many hours; the first is tracked as a whole too."""
+def long_recordings(hours: tuple[float, ...]) -> Table:
+    """Recordings of these lengths [h]; the first is tracked as a whole too."""
     table = Table(
         "Long recordings: five sensors at 100 Hz, wepose track",
         (
@@ -44,8 +45,8 @@ def _day(hours: tuple[float, ...]) -> Table:
             Column("seconds", "time [s]", 0),
             Column("faster", "times real time", 0),
             Column("memory", "memory [MB]", 0),
-            Column("same", "same bits", 0),
-            Column("most", "off, most [deg]", 4),
+            Column("same", "bit-identical", 0),
+            Column("largest", "largest deviation [deg]", 4),
             Column("rms", "rms [deg]", 4),
         ),
     )
@@ -55,22 +56,22 @@ def _day(hours: tuple[float, ...]) -> Table:
             _write(folder / f"{length:g}", length)
             begin = length == hours[0]
             if begin:
-                table.rows[f"{length:g} h as a whole"] = _track(folder, length, "whole", pieces=0.0)
-            of = _track(folder, length, "pieces", pieces=CHUNK_S)
+                table.rows[f"{length:g} h as a whole"] = _track(folder, length, "whole", chunk_s=0.0)
+            row = _track(folder, length, "chunks", chunk_s=CHUNK_S)
             if begin:
-                of["same"] = float(_pose(folder, "pieces").equals(_pose(folder, "whole")))
-            table.rows[f"{length:g} h in pieces of {CHUNK_S:g} s"] = of
+                row["same"] = float(_pose(folder, "chunks").equals(_pose(folder, "whole")))
+            table.rows[f"{length:g} h in chunks of {CHUNK_S:g} s"] = row
             if begin:
                 whole = f"smoother, {length:g} h as a whole"
-                table.rows[whole] = _track(folder, length, "smooth", pieces=0.0, method="smoother")
-                for pieces in (SHORT_S, SMOOTHER_CHUNK_S):
-                    row = _track(folder, length, "pieces", pieces=pieces, method="smoother")
-                    row["most"], row["rms"] = _off(_pose(folder, "pieces"), _pose(folder, "smooth"))
-                    table.rows[f"smoother, {length:g} h in pieces of {pieces:g} s"] = row
-    table.notes.append("Same bits: 1 where every number of pose.parquet is that of the recording as a whole.")
+                table.rows[whole] = _track(folder, length, "smooth", chunk_s=0.0, method="smoother")
+                for chunk_s in (SHORT_S, SMOOTHER_CHUNK_S):
+                    row = _track(folder, length, "chunks", chunk_s=chunk_s, method="smoother")
+                    row["largest"], row["rms"] = _deviation_deg(_pose(folder, "chunks"), _pose(folder, "smooth"))
+                    table.rows[f"smoother, {length:g} h in chunks of {chunk_s:g} s"] = row
+    table.notes.append("Bit-identical: 1 where every number of pose.parquet is that of the recording as a whole.")
     table.notes.append(
-        "Off: segments of the smoother in pieces, which looks ahead by one of them, from those of the smoother as a "
-        "whole, about whose own errors docs/validation.md tells."
+        "Deviation: segments of the smoother in chunks, which looks one chunk ahead, from those of the smoother of the "
+        "whole, whose own errors are in docs/validation.md."
     )
     table.notes.append("Memory is that of the whole process, Python and all libraries in it, at its highest.")
     return table
@@ -84,21 +85,19 @@ def _write(folder: Path, hours: float) -> None:
     found = calibrate_lengths(recording, gauge=person.taped, prior=person.average, gauge_std=person.taped_std)
     folder.mkdir()
     write_session(folder, there_and_back(recording, recording.span(recording.phases["start"][0])))
-    piece = pl.read_parquet(folder / "recording.parquet").drop("time")
+    repeated = pl.read_parquet(folder / "recording.parquet").drop("time")
     parts = folder / "parts"
     parts.mkdir()
     count, first = round(hours * 3600.0 * recording.rate_hz), 0
     while first < count:
-        rows = piece.head(min(piece.height, count - first))
+        rows = repeated.head(min(repeated.height, count - first))
         stamps = np.arange(first, first + rows.height) / recording.rate_hz
-        part = rows.with_columns(pl.Series("time", stamps)).select("time", *piece.columns)
+        part = rows.with_columns(pl.Series("time", stamps)).select("time", *repeated.columns)
         part.write_parquet(parts / f"{first:012d}.parquet")
         first += rows.height
     pl.scan_parquet(sorted(parts.glob("*.parquet"))).sink_parquet(folder / "recording.parquet")
     for path in parts.iterdir():
         path.unlink()
-    from ..model import load_model
-
     (folder / "subject").mkdir()
     write_subject(folder / "subject", found.subject, load_model().with_lengths(dict(found.subject.lengths)))
 
@@ -124,7 +123,7 @@ def there_and_back(recording: Recording, rest: slice) -> Recording:
     return replace(recording, time=np.arange(n) / recording.rate_hz, sensors=sensors)
 
 
-def _track(folder: Path, hours: float, out: str, *, pieces: float, method: str = "amekf") -> dict[str, float]:
+def _track(folder: Path, hours: float, out: str, *, chunk_s: float, method: str = "amekf") -> dict[str, float]:
     """What it costs in a process of its own.
 
     Raises
@@ -133,24 +132,19 @@ def _track(folder: Path, hours: float, out: str, *, pieces: float, method: str =
         It fails.
     """
     session = folder / f"{hours:g}"
-    words = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(folder / out), "--force"]
-    words += [
-        "--subject",
-        str(session / "subject"),
-        "--method",
-        method,
-        "--chunk-seconds",
-        f"{pieces:g}",
-        "--no-report",
-    ]
+    argv = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(folder / out), "--force"]
+    argv += ["--subject", str(session / "subject"), "--method", method, "--no-report"]
+    argv += ["--chunk-seconds", f"{chunk_s:g}"]
     begun = time.perf_counter()
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    process = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     assert process.stderr is not None
-    said = process.stderr.read()
+    complaint = process.stderr.read()
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
-        raise NoSolution(f"wepose track of {hours:g} h ended with {process.returncode}: {said.decode().strip()[-300:]}")
+        raise NoSolution(
+            f"wepose track of {hours:g} h ended with {process.returncode}: {complaint.decode().strip()[-300:]}"
+        )
     seconds = time.perf_counter() - begun
     return {
         "read": (session / "recording.parquet").stat().st_size / 1e6,
@@ -165,7 +159,7 @@ def _pose(folder: Path, out: str) -> pl.DataFrame:
     return pl.read_parquet(folder / out / "pose.parquet")
 
 
-def _off(ours: pl.DataFrame, whole: pl.DataFrame) -> tuple[float, float]:
+def _deviation_deg(ours: pl.DataFrame, whole: pl.DataFrame) -> tuple[float, float]:
     """Largest and rms angle [deg] between the segments of two poses."""
     names = [name.removesuffix("_qw") for name in whole.columns if name.endswith("_qw")]
     angles = []
@@ -173,5 +167,5 @@ def _off(ours: pl.DataFrame, whole: pl.DataFrame) -> tuple[float, float]:
         columns = [f"{name}_q{c}" for c in "xyzw"]
         a, b = (Rotation.from_quat(table.select(columns).to_numpy()) for table in (ours, whole))
         angles.append(np.degrees((a.inv() * b).magnitude()))
-    found = np.concatenate(angles)
-    return float(found.max()), float(np.sqrt(np.mean(found**2)))
+    every = np.concatenate(angles)
+    return float(every.max()), float(np.sqrt(np.mean(every**2)))

@@ -20,20 +20,21 @@ from typing import NamedTuple
 
 import polars as pl
 
-from ..batch import run_batch
-from ..batch.cluster import TASK_S, connected
-from ..batch.storage import only_one, write_bytes
-from ..errors import ExistingOutput, NoSolution
-from ..jobs.batch import BatchJob
-from ..simulation import simulate, simulated_person
-from ..writers import write_session
-from ..writers.provenance import code
-from . import Column, Table
+from wepose_pin.batch import run_batch
+from wepose_pin.batch.cluster import TASK_S, connected
+from wepose_pin.batch.storage import only_one, write_bytes
+from wepose_pin.errors import ExistingOutput, NoSolution
+from wepose_pin.jobs.batch import BatchJob
+from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.writers import write_session
+from wepose_pin.writers.provenance import code
+
+from .tables import Column, Section, Table
 
 SESSIONS, FEW = 500, 12
 TASKS, FEW_TASKS = 5000, 500
 CLASP_S, CIRCLES = 20.0, 2
-EFFICIENCY = 0.85  # of two workers, wanted
+EFFICIENCY = 0.85  # of two workers, least
 _TIMES = ("seconds", "memory_mb")  # columns that are not the same twice, with those of each step's seconds
 _PLAN = """
 name = "simulated"
@@ -48,8 +49,8 @@ report = false
 """
 
 
-def study_sections(quick: bool, sessions: int | None = None) -> dict[str, Callable[[], Table]]:
-    """Name → a function that measures it; `sessions` in place of `SESSIONS`, or of `FEW` where it is to be quick."""
+def sections(quick: bool, sessions: int | None = None) -> dict[str, Section]:
+    """Name → a function that measures it; `sessions`: their number in the study, in place of `SESSIONS` or `FEW`."""
     return {
         "scheduler": partial(_scheduler, FEW_TASKS if quick else TASKS),
         "study": partial(_study, sessions or (FEW if quick else SESSIONS)),
@@ -103,23 +104,23 @@ def _study(sessions: int) -> Table:
             "rate": 60.0 * again.rate,
         }
     table.notes += [
-        f"Wanted: an efficiency of {EFFICIENCY:g}; every row as with one worker, none twice.",
-        "A rate is from the first item to the last, without the start of the workers. It tells something where nothing "
-        "else runs on the machine.",
+        f"Limits: an efficiency of at least {EFFICIENCY:g}; every row as with one worker, none twice.",
+        "A rate is from the first item to the last, without the start of the workers. It means something where "
+        "nothing else runs on the machine.",
     ]
     return table
 
 
 @contextmanager
 def _folder(sessions: int) -> Iterator[Path]:
-    """Where the bench works: kept when it is stopped, so that it goes on there, and removed at its end.
+    """Where the benchmark works: kept when it is stopped, so that it goes on there, and removed at its end.
 
     Raises
     ------
     ExistingOutput
-        Another bench works there, or it is somebody else's.
+        Another benchmark works there, or it is somebody else's.
     """
-    folder = Path(tempfile.gettempdir()) / f"wepose-bench-{os.getuid()}-{sessions}-{str(code()['code'])[:12]}"
+    folder = Path(tempfile.gettempdir()) / f"wepose-benchmark-{os.getuid()}-{sessions}-{str(code()['code'])[:12]}"
     folder.mkdir(mode=0o700, exist_ok=True)
     if folder.is_symlink() or folder.stat().st_uid != os.getuid():
         raise ExistingOutput(f"{folder}: is somebody else's; TMPDIR names another place for it")
@@ -162,7 +163,7 @@ def _once(folder: Path, name: str, run: Callable[[Path], _Run]) -> _Run:
     kept, place = folder / f"{name}.json", folder / name
     if not kept.exists():
         if name != "again":
-            shutil.rmtree(place, ignore_errors=True)  # of a bench that was stopped: a time is that of a whole run
+            shutil.rmtree(place, ignore_errors=True)  # of a benchmark that was stopped: a time is that of a whole run
         found = run(place)
         table = io.BytesIO()
         found.table.write_parquet(table)
@@ -203,7 +204,7 @@ def _again(folder: Path, _: Path) -> _Run:
 
 
 def _killed(folder: Path, out: Path) -> _Run:
-    with _apart_from_us(folder) as (address, kill):
+    with separate_cluster(folder) as (address, kill):
         return _run(folder, out, scheduler=address, half=kill)
 
 
@@ -224,7 +225,7 @@ def _figures(run: _Run, reference: _Run, workers: int) -> dict[str, float]:
 
 
 @contextmanager
-def _apart_from_us(folder: Path) -> Iterator[tuple[str, Callable[[], None]]]:
+def separate_cluster(folder: Path) -> Iterator[tuple[str, Callable[[], None]]]:
     """A scheduler and two workers, started by themselves: its address, and what kills one of the workers.
 
     Raises

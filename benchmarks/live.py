@@ -11,22 +11,23 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from ..live import LivePose, Output, Stage, Status, Wearing, run_session
-from ..live.sources.replay import ReplaySource
-from ..recording import Recording
-from ..simulation import simulate, simulated_person
-from . import Column, Table
+from wepose_pin.live import LivePose, Output, Stage, Status, Wearing, run_session
+from wepose_pin.live.sources.replay import ReplaySource
+from wepose_pin.recording import Recording
+from wepose_pin.simulation import simulate, simulated_person
+
+from .tables import Column, Section, Table
 
 RATE_HZ = 1000.0
-PIECE_S = 60.0  # [s] of motion that is repeated
-LATENCY_MS, LATENCY_99_MS, SHARE = 1.0, 5.0, 50.0  # what is wanted: [ms], [ms], [%] of one core
+MOTION_S = 60.0  # [s] of motion that is repeated
+LATENCY_MS, LATENCY_99_MS, SHARE = 1.0, 5.0, 50.0  # limits: [ms], [ms], [%] of one core
 
-
-# A browser by what it takes: in a process of its own, as browsers are.
+# Reads the page's stream as a browser does, in a process of its own.
 _READER = """
 import asyncio, sys
 from tornado.websocket import websocket_connect
@@ -76,6 +77,11 @@ class _Meter:
         pass
 
 
+def sections(quick: bool) -> dict[str, Section]:
+    """Name → a function that measures it."""
+    return {"live session": partial(live_session, 30.0 if quick else 300.0)}
+
+
 def live_session(seconds: float) -> Table:
     """Loop, file and page for `seconds` each."""
     recording = _recording(seconds)
@@ -91,16 +97,16 @@ def live_session(seconds: float) -> Table:
         ),
     )
     with tempfile.TemporaryDirectory() as folder:
-        table.rows["poses and file"] = _measured(recording, Path(folder) / "a.wepose", [])
-        from ..live.page import LivePage
-        from ..model import load_model
+        table.rows["poses and file"] = _measure(recording, Path(folder) / "a.wepose", [])
+        from wepose_pin.live.page import LivePage
+        from wepose_pin.model import load_model
 
         page = LivePage(load_model())
         page.open()
         with _reader(page.url):
-            table.rows["and page, with a browser"] = _measured(recording, Path(folder) / "b.wepose", [page])
+            table.rows["and page, with a browser"] = _measure(recording, Path(folder) / "b.wepose", [page])
     table.notes.append(
-        "Latency is from the moment at which the newest sample was due to its pose. Wanted: p50 under "
+        "Latency is from the moment at which the newest sample was due to its pose. Limits: p50 under "
         f"{LATENCY_MS:g} ms, p99 {LATENCY_99_MS:g} ms, under {SHARE:g} % of one core, no sample lost, memory flat."
     )
     table.notes.append("Other work on the machine shows in the 99th percentile first.")
@@ -108,9 +114,9 @@ def live_session(seconds: float) -> Table:
 
 
 def _recording(seconds: float) -> Recording:
-    """A person who stands, then moves, the motion repeated as often as it takes."""
+    """A person who stands, then moves; the motion is repeated until it is `seconds` long."""
     person = simulated_person(1)
-    made = simulate(person.lengths, seed=1, rate_hz=RATE_HZ, clasp_s=PIECE_S, circles=0).recording("live")
+    made = simulate(person.lengths, seed=1, rate_hz=RATE_HZ, clasp_s=MOTION_S, circles=0).recording("live")
     start, n = made.span(made.phases["start"][0]).stop, round(seconds * RATE_HZ)
     rows = np.concatenate([np.arange(start), start + np.arange(n) % (len(made) - start)])
     sensors = {}
@@ -122,25 +128,25 @@ def _recording(seconds: float) -> Recording:
     return replace(made, time=time_s, rate_hz=RATE_HZ, sensors=sensors, phases={"start": made.phases["start"]})
 
 
-def _measured(recording: Recording, file: Path, outputs: Sequence[Output]) -> dict[str, float]:
+def _measure(recording: Recording, file: Path, outputs: Sequence[Output]) -> dict[str, float]:
     meter = _Meter()
-    ended = run_session(ReplaySource(recording), Wearing.of(recording), record=file, outputs=[*outputs, meter])
+    summary = run_session(ReplaySource(recording), Wearing.of(recording), record=file, outputs=[*outputs, meter])
     assert meter.before is not None
     assert meter.after is not None
     wall, busy, grown = (after - before for before, after in zip(meter.before, meter.after, strict=True))
-    lost = sum(of["missing"] + of["late"] + of["bad"] + len(recording) - of["taken"] for of in ended.counts.values())
+    lost = sum(of["missing"] + of["late"] + of["bad"] + len(recording) - of["taken"] for of in summary.counts.values())
     return {
-        "ticks": float(ended.poses),
+        "ticks": float(summary.poses),
         "lost": float(lost),
-        "p50": 1e3 * ended.latency.quantile(0.5),
-        "p99": 1e3 * ended.latency.quantile(0.99),
+        "p50": 1e3 * summary.latency.quantile(0.5),
+        "p99": 1e3 * summary.latency.quantile(0.99),
         "share": 100.0 * busy / wall,
         "grown": grown / 1e6,
     }
 
 
 def _resident() -> float:
-    """Memory [bytes] of this process; NaN where the system does not tell as Linux does."""
+    """Memory [bytes] of this process; NaN but on Linux."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except (OSError, ValueError, IndexError):

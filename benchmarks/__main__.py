@@ -1,0 +1,104 @@
+"""`python -m benchmarks`: speed and accuracy on this machine, as tables."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+
+from wepose_pin.errors import BadOption, ExistingOutput, WeposeError
+
+from .tables import Section, document, print_table, read_document
+
+KINDS = ("filters", "calibration", "live", "batch", "long")
+DEFAULT = ("filters", "calibration")
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    """The options."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description="Times belong to the machine and the moment; what counts are the ratios to VQF, timed in turn in "
+        "the same run.",
+        epilog="example: python -m benchmarks filters --quick --save before.json",
+    )
+    add = parser.add_argument
+    add(
+        "kinds",
+        nargs="*",
+        metavar="KIND",
+        help="filters: speed and accuracy beside VQF and imufusion, two minutes; calibration: its solve beside "
+        "SciPy's; live: five sensors at 1 kHz for five minutes, and again with the page; batch: a study of 500 "
+        "sessions on one worker, two, and two of which one is killed (stopped, the same command goes on from there); "
+        f"long: recordings of up to 24 hours in chunks. Without any: {' and '.join(DEFAULT)}",
+    )
+    add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 12 sessions, up to one hour")
+    add("--sessions", type=int, metavar="N", help="number of sessions of batch")
+    add("--data", type=Path, help="real recordings (broad/, wepose_hr/) on which filters are measured; or WEPOSE_DATA")
+    add("--save", type=Path, metavar="FILE", help="write the figures there with versions, machine and date, as JSON")
+    add("--compare", type=Path, metavar="FILE", help="show each ratio of a file that --save wrote by that of this run")
+    options = parser.parse_args(argv)
+    options.kinds = options.kinds or list(DEFAULT)
+    for kind in options.kinds:
+        if kind not in KINDS:
+            parser.error(f"'{kind}' is not measured; choose from {', '.join(KINDS)}")
+    return options
+
+
+def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
+    """Name → a function that measures it."""
+    if options.sessions is not None and ("batch" not in options.kinds or options.sessions < 2):
+        raise BadOption(f"--sessions {options.sessions}: a number of sessions of batch, at least 2")
+    named = options.data or os.environ.get("WEPOSE_DATA")
+    chosen: dict[str, Section] = {}
+    for kind in options.kinds:
+        if kind == "filters":
+            from .filters import FULL, QUICK, sections
+
+            chosen |= sections(QUICK if options.quick else FULL, Path(named) if named else None)
+        elif kind == "calibration":
+            from . import calibration
+
+            chosen |= calibration.sections(options.quick)
+        elif kind == "live":
+            from . import live
+
+            chosen |= live.sections(options.quick)
+        elif kind == "batch":
+            from . import batch
+
+            chosen |= batch.sections(options.quick, options.sessions)
+        else:
+            from . import long_recordings
+
+            chosen |= long_recordings.sections(options.quick)
+    return chosen
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The exit code: 0, or 2 after one line on what was wrong."""
+    options = parse(argv)
+    try:
+        before = None if options.compare is None else read_document(options.compare)
+        if options.save is not None and (options.save.exists() or not options.save.absolute().parent.is_dir()):
+            raise ExistingOutput(f"--save {options.save}: exists, or has no folder; name a new file in one")
+        tables = {}
+        for name, measure in chosen_sections(options).items():
+            tables[name] = measure()
+            print_table(name, tables[name], before)
+    except WeposeError as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        return 2
+    if before is not None:
+        print(f"before: {options.compare}, {before.get('date', 'undated')}; over 1: it was slower beside VQF then")
+    if options.save is not None:
+        text = json.dumps(document(tables, options.quick), indent=1, allow_nan=False) + "\n"
+        options.save.write_text(text, encoding="utf-8")
+        print(f"Figures: {options.save}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

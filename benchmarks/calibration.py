@@ -1,0 +1,177 @@
+"""The least squares of a calibration beside SciPy's: the same residuals, weights, prior and start."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from scipy.optimize import least_squares
+
+from wepose_pin.calibration import problem
+from wepose_pin.calibration.known import known_before
+from wepose_pin.calibration.lengths import LOOK_RATE_HZ, _looks
+from wepose_pin.calibration.problem import Looks, filled, residuals, solve
+from wepose_pin.calibration.protocols import load_protocol
+from wepose_pin.calibration.touching import touching_start
+from wepose_pin.calibration.weighing import weighed
+from wepose_pin.filters.sensors import filter_recording
+from wepose_pin.recording import Recording
+from wepose_pin.simulation import REALISTIC, Person, simulate, simulated_person
+
+from .tables import Column, Section, Table, time_in_turn
+
+OURS = "Gauss-Newton, ours"
+_STATUS = Path("/proc/self/status")
+
+
+class Problem(NamedTuple):
+    """Σ w r² + (x − c)ᵀ Λ (x − c), to be made least from a start."""
+
+    looks: Looks
+    center: np.ndarray  # c (m,)
+    prior: np.ndarray  # Λ (m, m)
+    weights: np.ndarray  # (n, 5)
+    start: np.ndarray  # (m,)
+
+
+def sections(quick: bool) -> dict[str, Section]:
+    """Name → a function that measures it; a full run solves at 100 samples a second too."""
+    rates_hz = (LOOK_RATE_HZ,) if quick else (LOOK_RATE_HZ, 100.0)
+    return {"calibration": partial(calibration, 60.0, rates_hz, 3)}
+
+
+def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Table:
+    """The solve of a hands-together calibration beside SciPy's, at each rate of samples."""
+    person = simulated_person(3)
+    made = simulate(person.lengths, seed=3, imperfections=REALISTIC, clasp_s=clasp_s, circles=0)
+    table = Table(
+        f"Calibration: {clasp_s:g} s of joined hands, one least squares from one start",
+        (
+            Column("seconds", "solve [s]", 3),
+            Column("spread_s", "± [s]", 3),
+            Column("ratio", "ratio to ours", 2, True),
+            Column("cost", "cost to ours", 4),
+            Column("megabytes", "memory [MB]"),
+        ),
+        notes=[
+            "Processor time of all threads, medians; no compiler. Memory: by how much a new process grows at most.",
+            "least_squares: trf, scaled by the Jacobian, default tolerances. Whole: search for a start, all rounds of",
+            "weights, the last solve, without the filters. Building: CasADi's functions, once for a number of samples.",
+        ],
+    )
+    for posed, calibrate in pose_problems(made.recording(), person, rates_hz):
+        samples = f"{len(posed.weights)} samples"
+        table.rows[f"{samples}: building"] = {"seconds": building(posed)}
+        costs: dict[str, float] = {}
+
+        def keep_cost(name: str, run: Callable[[], float], costs: dict[str, float] = costs) -> None:
+            costs[name] = run()
+
+        cases: dict[str, Callable[[], Any]] = {n: partial(keep_cost, n, run) for n, run in solvers(posed).items()}
+        timings = time_in_turn(cases | {"whole": calibrate}, rounds, OURS, time.process_time)
+        for name, timing in timings.items():
+            row = {"seconds": timing.median, "spread_s": timing.spread, "ratio": timing.ratio}
+            if name in cases:
+                row |= {"cost": costs[name] / costs[OURS], "megabytes": 1e-6 * peak_memory(posed, name)}
+            table.rows[f"{samples}: {name}"] = row
+    table.rows = table.known_rows()
+    return table
+
+
+def pose_problems(
+    recording: Recording, person: Person, rates_hz: tuple[float, ...]
+) -> list[tuple[Problem, Callable[[], Problem]]]:
+    """The last problem of a hands-together calibration at each rate of samples, and the calibration without filters."""
+    found, protocol = filter_recording(recording), load_protocol("clasp")
+    known = person.average, person.taped, person.taped_std
+    posed: list[tuple[Problem, Callable[[], Problem]]] = []
+    for rate_hz in rates_hz:
+        looks, _ = _looks(recording, found, protocol, rate_hz)
+
+        def calibrate(looks: Looks = looks) -> Problem:
+            def place(some: Looks) -> np.ndarray:
+                return known_before(recording, found, some, *known)[0]
+
+            center, information = known_before(recording, found, looks, *known)
+            start, touching = touching_start(looks, place)
+            _, weights, _, _ = weighed(looks, center, information, start, touching, quick=False)
+            weights = np.broadcast_to(weights, (looks.data.shape[1], 5)).copy()
+            return Problem(looks, center, information, weights, start)
+
+        posed.append((calibrate(), calibrate))
+    return posed
+
+
+def building(posed: Problem) -> float:
+    """Seconds that CasADi's functions take to build, once for a number of samples."""
+    problem._look.cache_clear()
+    problem._mapped.cache_clear()
+    begin = time.perf_counter()
+    problem._mapped(posed.looks.layout, posed.looks.conditions[0], 0, posed.looks.data.shape[1])
+    return time.perf_counter() - begin
+
+
+def solvers(posed: Problem) -> dict[str, Callable[[], float]]:
+    """Name → a function that solves it and gives the cost."""
+    looks, center, prior, weights, start = posed
+    root_w, root_prior = np.sqrt(weights), np.linalg.cholesky(prior).T
+    n, m = len(weights), len(center)
+    look = problem._look(looks.layout, looks.conditions[0], 0)
+    one = [ca.SX.sym("x", m), ca.SX.sym("data", looks.data.shape[0])]
+    alone = ca.Function("alone", one, look(*one)[:1])  # without the Jacobian that `residuals` gives as well
+    x, data = ca.MX.sym("x", m), ca.MX.sym("data", *looks.data.shape)
+    every = ca.Function("all", [x, data], [alone.map(n)(ca.repmat(x, 1, n), data)])
+    columns, r = np.ascontiguousarray(looks.data.T), np.empty((n, 5))
+
+    def value(x: np.ndarray) -> np.ndarray:
+        filled(every, (np.ascontiguousarray(x), columns), (r,))
+        return np.concatenate(((root_w * r).ravel(), root_prior @ (x - center)))
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        J = root_w[:, :, None] * residuals(x, looks)[1]
+        return np.concatenate((J.reshape(-1, m), root_prior))
+
+    def by_scipy(jacobian: Callable[[np.ndarray], np.ndarray] | str) -> float:
+        return 2.0 * float(least_squares(value, start, jacobian, method="trf", x_scale="jac").cost)
+
+    return {
+        OURS: lambda: solve(looks, center, prior, weights, start).cost,
+        "least_squares, our Jacobian": lambda: by_scipy(slope),
+        "least_squares, 2-point": lambda: by_scipy("2-point"),
+    }
+
+
+def peak_memory(posed: Problem, name: str) -> float:
+    """By how much solving it raises a new process's resident memory at its highest [bytes]; NaN but on Linux."""
+    if not _STATUS.exists():
+        return float("nan")
+    root = Path(__file__).resolve().parents[1]  # where `benchmarks` is found
+    code = f"import sys; from {__name__} import _peak; _peak(sys.stdin.buffer, {name!r})"
+    run = subprocess.run(
+        [sys.executable, "-c", code], input=pickle.dumps(posed), cwd=root, capture_output=True, check=True
+    )
+    return float(run.stdout)
+
+
+def _peak(file: object, name: str) -> None:
+    posed = pickle.load(file)  # type: ignore[arg-type]
+    run = solvers(posed)[name]
+    residuals(posed.start, posed.looks.take(np.arange(10)))  # libraries have loaded what they load
+    before = _resident("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the highest so far is forgotten
+    run()
+    print(1024.0 * (_resident("VmHWM") - before))
+
+
+def _resident(key: str) -> float:
+    """[kB]"""
+    lines = _STATUS.read_text(encoding="ascii").splitlines()
+    return float(next(line.split()[1] for line in lines if line.startswith(key)))

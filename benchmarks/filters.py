@@ -1,0 +1,365 @@
+"""Speed of the filters beside VQF and imufusion, as ratios within one run.
+
+A section is a function that gives a `Table`; `sections` lists them. Absolute times belong to the machine and to what
+else it does: everything is timed in turn with VQF's C++ (``pip install wepose-pin[peers]``) and its ratio is the median
+of the ratios of each round.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from wepose_pin import rotations
+from wepose_pin.filters import METHODS, OFFLINE, Smekf, run_filter
+from wepose_pin.filters.bank import LiveBank
+from wepose_pin.filters.base import in_parallel, processors
+from wepose_pin.filters.noise import SensorNoise, noise_of
+from wepose_pin.filters.static import StaticDetector, StaticTest
+from wepose_pin.simulation import paper_dynamic
+
+from .tables import Column, Section, Table, is_installed, time_in_turn
+
+NO_PEERS = "No ratios: VQF is not installed; pip install 'wepose-pin[peers]' brings it and imufusion."
+STANDARD_GRAVITY = 9.80665  # [m/s²] in which imufusion wants its accelerations
+
+
+class Sample(NamedTuple):
+    """One sensor's data to run on."""
+
+    gyro_S: np.ndarray  # (n, 3) [rad/s]
+    accel_S: np.ndarray  # (n, 3) [m/s²]
+    rate_hz: float
+    noise: SensorNoise
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is measured."""
+
+    rounds: int = 15
+    seconds: float = 1200.0  # [s] of data at 100 Hz, batch
+    live_seconds: float = 60.0  # [s] of data at 100 Hz, sample by sample
+    lengths: tuple[int, ...] = (10_000, 100_000, 1_000_000, 10_000_000)  # of a recording, samples
+    counts: tuple[int, ...] = (1, 2, 4, 5, 8, 16)  # of sensors
+    trials: int = 12  # simulated
+    recordings: int = 1000  # of BROAD
+    compiling: bool = True  # what the first use costs: a quarter of a minute by itself
+
+
+FULL = Effort()
+QUICK = Effort(7, 300.0, 20.0, (10_000, 100_000, 1_000_000), (1, 2, 5, 16), 3, 2, False)
+
+
+def sections(effort: Effort = FULL, data: Path | None = None) -> dict[str, Section]:
+    """Name → a function that measures it. `data`: the folder of the real recordings, or None.
+
+    Raises
+    ------
+    MissingFile
+        There are no recordings in `data`.
+    """
+    from . import accuracy
+
+    found: dict[str, Section] = {
+        "filters": partial(filters, effort),
+        "bank": partial(bank, effort),
+        "samples": partial(samples, effort),
+        "sensors": partial(sensors, effort),
+        "accuracy": partial(accuracy.simulated_accuracy, effort.trials),
+    }
+    if data is not None:
+        paths = accuracy.recordings(data, effort.recordings)
+        found["recordings"] = partial(accuracy.recorded_accuracy, paths)
+    if effort.compiling:
+        found["first_use"] = first_use
+    return found
+
+
+simulated_trial = lru_cache(paper_dynamic)
+
+
+def repeated_trial(seconds: float, rate_hz: float = 100.0, seed: int = 1) -> Sample:
+    """Data of one trial as in the paper (5 s static, 50 s motion, 5 s static), repeated until it is `seconds` long."""
+    trial = simulated_trial(seed, rate_hz)
+    n = round(seconds * rate_hz)
+    rest = slice(round(0.5 * rate_hz), round(4.5 * rate_hz))
+    noise = noise_of(trial.gyro_S[rest], trial.accel_S[rest], rate_hz)
+    gyro, accel = (np.resize(signal, (n, 3)) for signal in (trial.gyro_S, trial.accel_S))
+    return Sample(gyro, accel, rate_hz, noise)
+
+
+def _batch_filters(data: Sample) -> dict[str, Callable[[], Any]]:
+    """Batch runs of our methods, each with its static detector."""
+    return {name: partial(run_filter, *data, name) for name in METHODS}
+
+
+def _batch_peers(data: Sample) -> dict[str, Callable[[], Any]]:
+    """Batch runs of the peers that have one."""
+    if not is_installed("vqf"):
+        return {}
+    import vqf
+
+    dt = 1.0 / data.rate_hz
+    return {
+        "VQF": lambda: vqf.VQF(dt).updateBatch(data.gyro_S, data.accel_S),
+        "offline VQF": lambda: vqf.offlineVQF(data.gyro_S, data.accel_S, None, dt),
+    }
+
+
+def _live_filters(data: Sample) -> dict[str, Callable[[], Any]]:
+    """Loops over the samples, ours with its static detector; a Python call each, arrays made beforehand."""
+    rows = list(zip(data.gyro_S, data.accel_S, strict=True))
+    start = rotations.quat_from_gravity(data.accel_S[: StaticTest().samples(data.rate_hz)].mean(axis=0))
+
+    def ours(make: Any) -> Callable[[], Any]:
+        def loop() -> None:
+            filter_, detector = make(data.noise, data.rate_hz, start), StaticDetector(data.noise, data.rate_hz)
+            for gyro, accel in rows:
+                filter_.update(gyro, accel, detector.update(gyro, accel))
+
+        return loop
+
+    cases = {name: ours(make) for name, make in METHODS.items() if name not in OFFLINE}
+    return cases | _live_peers(data, rows)
+
+
+def _live_peers(data: Sample, rows: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Callable[[], Any]]:
+    cases: dict[str, Callable[[], Any]] = {}
+    if is_installed("vqf"):
+        import vqf
+
+        def run_vqf() -> None:
+            filter_ = vqf.VQF(1.0 / data.rate_hz)
+            for gyro, accel in rows:
+                filter_.update(gyro, accel)
+                filter_.getQuat6D()
+
+        cases["VQF"] = run_vqf
+    if is_installed("imufusion"):
+
+        def run_imufusion() -> None:
+            filter_ = imufusion_filter(data.rate_hz)
+            for gyro, accel in zip(gyro_deg, accel_g, strict=True):
+                filter_.update_no_magnetometer(gyro, accel)
+                filter_.get_quaternion()
+
+        gyro_deg, accel_g = list(np.degrees(data.gyro_S)), list(data.accel_S / STANDARD_GRAVITY)
+        cases["imufusion"] = run_imufusion
+    return cases
+
+
+def imufusion_filter(rate_hz: float) -> Any:
+    """imufusion's filter with default gains at this rate."""
+    import imufusion
+
+    settings = imufusion.AhrsSettings()
+    settings.sample_rate = rate_hz
+    filter_ = imufusion.Ahrs()
+    filter_.set_settings(settings)
+    return filter_
+
+
+def filters(effort: Effort) -> Table:
+    """Batch and sample by sample, one sensor."""
+    data, rounds = repeated_trial(effort.seconds), effort.rounds
+    n = len(data.gyro_S)
+    detector = {"static detector": lambda: StaticDetector(data.noise, data.rate_hz).run(data.gyro_S, data.accel_S)}
+    batch = time_in_turn(_batch_peers(data) | _batch_filters(data) | detector, rounds, "VQF")
+    short = repeated_trial(effort.live_seconds)
+    lives = time_in_turn(_live_filters(short), rounds, "VQF")
+    static = StaticDetector(data.noise, data.rate_hz).run(data.gyro_S, data.accel_S).mean()
+    table = Table(
+        f"One sensor, one thread: {n} samples at 100 Hz, {100 * static:.0f} % static; medians of {rounds} rounds",
+        (
+            Column("batch_ns", "batch [ns]"),
+            Column("batch_spread_ns", "± [ns]"),
+            Column("batch_ratio", "ratio to VQF", 2, True),
+            Column("live_ns", "live [ns]", 0),
+            Column("live_spread_ns", "± [ns]", 0),
+            Column("live_ratio", "ratio to VQF", 2, True),
+        ),
+        notes=[
+            "Processor time of one sample, ours with the static detector; ± between the quartiles. Live: a Python call",
+            "a sample for the filter and one for its detector; LiveBank, below, makes one call for all sensors.",
+        ],
+    )
+    for name in [*METHODS, "static detector", "VQF", "offline VQF", "imufusion"]:
+        row: dict[str, float] = {}
+        for kind, timing, count in (("batch", batch.get(name), n), ("live", lives.get(name), len(short.gyro_S))):
+            if timing is not None:
+                row |= {f"{kind}_ns": 1e9 * timing.median / count, f"{kind}_spread_ns": 1e9 * timing.spread / count}
+                row |= {f"{kind}_ratio": timing.ratio}
+        if row:
+            table.rows[name] = row
+    return _noted(table)
+
+
+def bank(effort: Effort) -> Table:
+    """One live update of several sensors in one call."""
+    table = Table(
+        "Live: one update of all sensors, detector and smekf in one call (LiveBank)",
+        (
+            Column("median_us", "median [µs]", 2),
+            Column("worst_us", "99.9 % within [µs]", 2),
+            Column("ratio", "ratio to as many of VQF", 2, True),
+        ),
+        notes=["Each call timed by itself, the clock's own time left in. VQF: update and getQuat6D of each sensor."],
+    )
+    for count in effort.counts:
+        # Each sensor elsewhere in the trial
+        data = repeated_trial(5.0 * effort.live_seconds + count)
+        rows = np.arange(count)[None, :] * 100 + np.arange(len(data.gyro_S) - 100 * count)[:, None]
+        gyro, accel = list(data.gyro_S[rows]), list(data.accel_S[rows])
+        bank = LiveBank(
+            [Smekf(data.noise, data.rate_hz, rotations.quat_from_gravity(accel[0][i])) for i in range(count)],
+            [StaticDetector(data.noise, data.rate_hz) for _ in range(count)],
+        )
+        ours = _each(bank.update, gyro, accel)
+        row = {"median_us": float(np.median(ours)), "worst_us": float(np.percentile(ours, 99.9))}
+        if is_installed("vqf"):
+            import vqf
+
+            peers = [vqf.VQF(1.0 / data.rate_hz) for _ in range(count)]
+
+            def update(gyro: np.ndarray, accel: np.ndarray, peers: list[Any] = peers) -> None:
+                for peer, rate, force in zip(peers, gyro, accel, strict=True):
+                    peer.update(rate, force)
+                    peer.getQuat6D()
+
+            row["ratio"] = row["median_us"] / float(np.median(_each(update, gyro, accel)))
+        table.rows[f"{count} sensor{'s' * (count > 1)}"] = row
+    return _noted(table)
+
+
+def _each(update: Callable[..., Any], gyro: list[np.ndarray], accel: list[np.ndarray]) -> np.ndarray:
+    """Time of each call [µs]."""
+    times = np.empty(len(gyro))
+    for k, (rate, force) in enumerate(zip(gyro, accel, strict=True)):
+        begin = time.perf_counter_ns()
+        update(rate, force)
+        times[k] = 1e-3 * (time.perf_counter_ns() - begin)
+    return times
+
+
+def samples(effort: Effort) -> Table:
+    """How the time grows with the length of the recording."""
+    table = Table(
+        "Length of a recording: smekf with the static detector, one sensor, one call",
+        (
+            Column("ns", "a sample [ns]"),
+            Column("spread_ns", "± [ns]"),
+            Column("ratio", "ratio to VQF", 2, True),
+            Column("seconds", "in all [s]", 3),
+        ),
+    )
+    for n in effort.lengths:
+        if n * 400 > _free_memory():  # bytes a sample of input and output
+            table.notes.append(f"{n:.0e} samples: left out, not enough free memory.")
+            continue
+        data = repeated_trial(n / 100.0)
+        every = _batch_peers(data) | _batch_filters(data)
+        cases = {name: run for name, run in every.items() if name in ("VQF", "smekf")}
+        timing = time_in_turn(cases, int(np.clip(3e6 / n, min(effort.rounds, 3), effort.rounds)), "VQF")["smekf"]
+        row = {"ns": 1e9 * timing.median / n, "spread_ns": 1e9 * timing.spread / n, "seconds": timing.median}
+        table.rows[f"{n:.0e} samples".replace("e+0", "e")] = row | {"ratio": timing.ratio}
+    return _noted(table)
+
+
+def _free_memory() -> float:
+    """[bytes], or infinite where it is not known."""
+    try:
+        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (ValueError, OSError):
+        return float("inf")
+
+
+def sensors(effort: Effort) -> Table:
+    """Several sensors at a time in threads."""
+    data = repeated_trial(effort.seconds)
+    n = len(data.gyro_S)
+    table = Table(
+        f"Sensors in parallel: {n} samples each, smekf with the static detector, a thread a processor",
+        (
+            Column("seconds", "in all [s]", 4),
+            Column("ns", "a sample [ns]"),
+            Column("speedup", "× one thread", 2),
+        ),
+        notes=[f"{processors()} processors."],
+    )
+    for count in effort.counts:
+        columns = list(zip(*[(*data, "smekf")] * count, strict=True))
+        cases = {
+            "one": partial(in_parallel, run_filter, *columns, threads=1),
+            "all": partial(in_parallel, run_filter, *columns),
+        }
+        timing = time_in_turn(cases, effort.rounds, "one", time.perf_counter)["all"]
+        row = {"seconds": timing.median, "ns": 1e9 * timing.median / n / count, "speedup": 1.0 / timing.ratio}
+        table.rows[f"{count} sensor{'s' * (count > 1)}"] = row
+    return table
+
+
+_FIRST_USE = """
+import sys, time
+begin = time.perf_counter()
+import numpy as np
+from wepose_pin.filters import METHODS, OFFLINE, Smekf, run_filter
+from wepose_pin.filters.bank import LiveBank
+from wepose_pin.filters.noise import noise_of
+from wepose_pin.filters.static import StaticDetector
+rng = np.random.default_rng(0)
+gyro = rng.normal(scale=1e-3, size=(1000, 3))
+accel = rng.normal(scale=1e-2, size=(1000, 3)) + [0.0, 0.0, 9.81]
+noise = noise_of(gyro, accel, 100.0)
+print("imports", time.perf_counter() - begin)
+for name in METHODS:
+    begin = time.perf_counter()
+    run_filter(gyro, accel, 100.0, noise, name)
+    print(name, time.perf_counter() - begin)
+begin = time.perf_counter()
+bank = LiveBank([Smekf(noise, 100.0, np.array([0.0, 0.0, 0.0, 1.0]))], [StaticDetector(noise, 100.0)])
+bank.update(gyro[:1], accel[:1])
+print("LiveBank", time.perf_counter() - begin)
+"""
+
+
+def first_use() -> Table:
+    """What compiling costs: a new process with an empty cache, and the next one."""
+    table = Table(
+        "First use: seconds that the first run of each takes in a new process, in this order",
+        (Column("first_s", "nothing compiled [s]", 2), Column("next_s", "next start [s]", 3)),
+        notes=["What several filters share is compiled with the first of them."],
+    )
+    with tempfile.TemporaryDirectory(prefix="wepose-benchmark-") as cache:
+        for key in ("first_s", "next_s"):
+            run = subprocess.run(
+                [sys.executable, "-c", _FIRST_USE],
+                env=os.environ | {"NUMBA_CACHE_DIR": cache},
+                capture_output=True,
+                text=True,
+                check=True,
+            )
+            for line in run.stdout.splitlines():
+                name, _, seconds = line.rpartition(" ")
+                table.rows.setdefault(name, {})[key] = float(seconds)
+    kernels = [row for name, row in table.rows.items() if name != "imports"]
+    table.rows["all but the imports"] = {key: sum(row[key] for row in kernels) for key in ("first_s", "next_s")}
+    return table
+
+
+def _noted(table: Table) -> Table:
+    """The table without the ratios that are NaN, and a note on why."""
+    if not is_installed("vqf"):
+        table.notes.append(NO_PEERS)
+    table.rows = table.known_rows()
+    return table

@@ -1,0 +1,161 @@
+"""`python -m benchmarks`: tables have the rows they should, saved figures are read again; no test looks at a time."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import accuracy, batch, calibration, filters, tables
+from benchmarks.__main__ import main
+from wepose_pin.filters import METHODS
+
+TINY = filters.Effort(2, 8.0, 1.0, (200, 400), (1, 3), 1, 1, False)
+
+
+def run(*words: object) -> int:
+    return main([str(word) for word in words])
+
+
+@pytest.fixture
+def without_peers(monkeypatch: pytest.MonkeyPatch) -> None:
+    def is_installed(name: str) -> bool:
+        return name == "numba" and importlib.util.find_spec(name) is not None
+
+    for module in (filters, accuracy, tables):
+        monkeypatch.setattr(module, "is_installed", is_installed)
+
+
+@pytest.fixture
+def fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command with little to measure."""
+    monkeypatch.setattr(filters, "QUICK", TINY)
+    monkeypatch.delenv("WEPOSE_DATA", raising=False)
+
+
+@pytest.mark.usefixtures("without_peers")
+def test_every_method_is_measured() -> None:
+    measured = {name: measure() for name, measure in filters.sections(TINY).items()}
+    assert "first_use" in filters.sections(filters.FULL)
+    assert set(measured["filters"].rows) == {*METHODS, "static detector"}
+    assert set(measured["accuracy"].rows) == set(METHODS)
+    assert set(measured["samples"].rows) == {"2e2 samples", "4e2 samples"}
+    assert set(measured["sensors"].rows) == set(measured["bank"].rows) == {"1 sensor", "3 sensors"}
+    for table in measured.values():
+        for row in table.rows.values():
+            assert set(row) <= {column.key for column in table.columns}
+            assert all(value >= 0.0 for value in row.values())
+            assert not any("ratio" in key for key in row)
+    assert any("pip install 'wepose-pin[peers]'" in note for note in measured["filters"].notes)
+    for causal in ("smekf", "ncf", "gdc"):
+        assert measured["filters"].rows[causal]["live_ns"] > 0.0
+    assert 0.0 < measured["accuracy"].rows["smekf"]["total_rmse"] < 1.0
+
+
+def test_scipy_solves_the_same_calibration() -> None:
+    rows = calibration.calibration(10.0, (10.0,), 1).rows
+    names = [name.partition(": ")[2] for name in rows]
+    solvers = ["Gauss-Newton, ours", "least_squares, our Jacobian", "least_squares, 2-point"]
+    assert names == ["building", *solvers, "whole"]
+    for name, row in rows.items():
+        assert "cost" not in row or row["cost"] == pytest.approx(1.0, abs=1e-3), name
+    assert len({name.partition(":")[0] for name in rows}) == 1
+
+
+@pytest.mark.skipif(not (tables.is_installed("vqf") and tables.is_installed("imufusion")), reason="no peers installed")
+def test_the_peers_get_the_units_and_orders_they_want() -> None:
+    """Wrong ones would not leave them near the truth."""
+    found = accuracy.simulated_accuracy(1)
+    for peer, limit in (("VQF", 1.0), ("offline VQF", 1.0), ("imufusion", 8.0)):
+        assert found.rows[peer]["total_rmse"] < limit
+    table = filters.filters(TINY)
+    assert table.rows["VQF"]["batch_ratio"] == table.rows["VQF"]["live_ratio"] == 1.0
+    assert not table.notes[-1].startswith("No ratios")
+
+
+def test_cases_take_turns_and_the_first_round_is_left_out() -> None:
+    order: list[str] = []
+    now = 0.0
+
+    def case(name: str, cost: Callable[[], float]) -> Callable[[], None]:
+        def spend() -> None:
+            nonlocal now
+            order.append(name)
+            now += cost()
+
+        return spend
+
+    slow = iter([100.0, 4.0, 8.0, 6.0])  # the first is the warm-up
+    found = tables.time_in_turn({"a": case("a", lambda: next(slow)), "b": case("b", lambda: 2.0)}, 3, "b", lambda: now)
+    assert order == ["a", "b"] * 4
+    assert found["a"] == (6.0, 2.0, 3.0)
+    assert found["b"].ratio == 1.0
+    assert np.isnan(tables.time_in_turn({"a": lambda: None}, 2, "b")["a"].ratio)
+
+
+@pytest.mark.usefixtures("fast")
+def test_save_and_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    every = filters.sections
+    monkeypatch.setattr(filters, "sections", lambda *effort: {"filters": every(*effort)["filters"]})
+    before = tmp_path / "before.json"
+    assert run("filters", "--quick", "--save", before) == 0
+    assert str(before) in capsys.readouterr().out
+    saved = json.loads(before.read_text())
+    assert {"date", "machine", "versions", "sections", "quick"} == set(saved)
+    assert {"wepose-pin", "pin", "numba"} <= set(saved["versions"])
+    assert set(saved["sections"]["filters"]["rows"]) >= set(METHODS)
+    assert run("filters", "--quick", "--save", before) == 2
+    assert "name a new file" in capsys.readouterr().err
+    assert run("filters", "--quick", "--compare", before) == 0
+    text = capsys.readouterr().out
+    assert "before/now" in text
+    assert saved["date"] in text
+
+
+def test_a_ratio_of_an_earlier_run() -> None:
+    before: dict[str, Any] = {"sections": {"filters": {"rows": {"smekf": {"batch_ratio": 2.0}}}}}
+    assert tables.ratio_before(before, "filters", "smekf", "batch_ratio") == 2.0
+    for place in (("bank", "smekf", "ratio"), ("filters", "amekf", "x"), ("filters", "smekf", "live_ratio")):
+        assert np.isnan(tables.ratio_before(before, *place))
+
+
+def test_what_cannot_be_measured_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "wrong.json").write_text('{"sections": 3}')
+    for words in (
+        ("--compare", tmp_path / "wrong.json"),
+        ("--compare", tmp_path / "none.json"),
+        ("filters", "--data", tmp_path / "nowhere"),
+        ("--save", tmp_path / "no" / "such.json"),
+        ("live", "--sessions", 5),
+    ):
+        assert run(*words) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert str(words[-1]) in error
+    with pytest.raises(SystemExit) as stop:
+        run("thoughts")
+    assert stop.value.code == 2
+
+
+def test_every_kind_names_its_sections() -> None:
+    assert list(batch.sections(True, 3)) == ["scheduler", "study"]
+    assert "calibration" in calibration.sections(True)
+
+
+@pytest.mark.usefixtures("without_peers")
+def test_real_recordings_when_at_hand(data: Path) -> None:
+    table = filters.sections(TINY, data)["recordings"]()
+    assert "1 of BROAD and the authors' trial" in table.title
+    assert 0.5 < table.rows["smekf"]["total_rmse"] < 10.0
+
+
+def test_nan_is_left_out_of_the_file() -> None:
+    columns = (tables.Column("a", "a"), tables.Column("b", "b"))
+    table = tables.Table("title", columns, {"row": {"a": 1.5, "b": float("nan")}})
+    text = json.dumps(tables.document({"of": table}, False), allow_nan=False)
+    assert json.loads(text)["sections"]["of"]["rows"] == {"row": {"a": 1.5}}
