@@ -99,7 +99,7 @@ def test_sensors_on_all_links_give_all_joints(urdf: Path) -> None:
     assert list(chain.joints) == list(UR5)
     for k, value in enumerate(chain.joints.values()):
         assert np.abs(value - q[:, k]).max() < np.deg2rad(1.0)
-    assert max(rms_deg(angle) for angle in chain.missed.values()) < 0.5
+    assert max(rms_deg(angle) for angle in chain.residual.values()) < 0.5
 
 
 def test_what_the_links_leave_open_is_named_and_the_rest_is_right(urdf: Path) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
 
 from .. import rotations
 from ..errors import BadPhase
@@ -80,7 +80,7 @@ def check_common_rotation(
     mean = float(rates.mean())
     if len(rates) >= 3:
         spread = max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
-        turns = abs(mean) > COMMON_RATE and 2.0 * stats.t.sf(abs(mean) / spread, len(rates) - 1) < COMMON_RATE_CHANCE
+        turns = abs(mean) > COMMON_RATE and 2.0 * stdtr(len(rates) - 1, -abs(mean) / spread) < COMMON_RATE_CHANCE
     else:
         turns = abs(mean) > LARGEST_BIAS
     if not turns:
