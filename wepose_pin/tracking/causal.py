@@ -22,6 +22,7 @@ from ..alignment import (
     covariance_of,
     heading_to,
     segment_orientations,
+    vertical_var,
 )
 from ..compilation import kernel
 from ..errors import BadOption, BadPhase
@@ -406,12 +407,6 @@ def _part(recording: Recording, span: slice) -> Recording:
         for name, of in recording.sensors.items()
     }
     return replace(recording, time=recording.time[span], sensors=sensors)
-
-
-def vertical_var(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
-    """(n,) [rad²]: variance about the vertical of errors on the right (n, 3, 3), in S."""
-    up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
-    return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
 
 
 def _about_z(angle: np.ndarray) -> np.ndarray:
