@@ -11,11 +11,12 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from wepose_pin import rotations
-from wepose_pin.alignment import Filtered, filtered, heading_to
+from wepose_pin.alignment import heading_to
 from wepose_pin.calibration import calibrate_lengths, lengths
 from wepose_pin.calibration.joints import SYSTEMATIC_STD, Coupling, _felt, _turn, coupled, couplings
 from wepose_pin.calibration.problem import Layout
 from wepose_pin.filters import run_filter
+from wepose_pin.filters.sensors import FilteredRecording, filter_recording
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.simulation import PERFECT, REALISTIC, Simulation, simulate, simulated_person
 from wepose_pin.validation.real import RING_SEGMENTS, _registered_ring, assumed_noise
@@ -24,18 +25,18 @@ NAMES = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_fo
 
 
 @pytest.fixture(scope="module")
-def exact() -> tuple[Simulation, Recording, Filtered]:
+def exact() -> tuple[Simulation, Recording, FilteredRecording]:
     simulation = simulate(simulated_person(2).lengths, seed=2, noise=PERFECT, clasp_s=40.0, circles=0)
     recording = simulation.recording()
-    return simulation, recording, filtered(recording)
+    return simulation, recording, filter_recording(recording)
 
 
-def true_turn(simulation: Simulation, found: Filtered, near: str, far: str) -> float:
+def true_turn(simulation: Simulation, found: FilteredRecording, near: str, far: str) -> float:
     psi = [heading_to(found.at_start[name], Rotation.from_quat(simulation.quat_LS[name])) for name in (near, far)]
     return psi[0] - psi[1]
 
 
-def test_exact_motion_gives_the_turn_between_the_worlds(exact: tuple[Simulation, Recording, Filtered]) -> None:
+def test_exact_motion_gives_the_turn_between_the_worlds(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
     simulation, recording, found = exact
     told = couplings(recording, found, NAMES, recording.phases["clasp"])
     assert [(c.near, c.far) for c in told] == [
@@ -51,7 +52,7 @@ def test_exact_motion_gives_the_turn_between_the_worlds(exact: tuple[Simulation,
         assert coupling.since == pytest.approx(np.mean(recording.phases["clasp"][0]) - found.start[1], abs=0.1)
 
 
-def test_too_little_motion_rate_or_time_tells_nothing(exact: tuple[Simulation, Recording, Filtered]) -> None:
+def test_too_little_motion_rate_or_time_tells_nothing(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
     _, recording, found = exact
     clasp = recording.phases["clasp"]
     assert couplings(recording, found, NAMES, ((clasp[0][0], clasp[0][0] + 10.0),)) == []
@@ -66,7 +67,7 @@ def test_too_little_motion_rate_or_time_tells_nothing(exact: tuple[Simulation, R
     assert couplings(replace(recording, sensors=still), found._replace(R_VS=R_VS), NAMES, clasp) == []
 
 
-def test_samples_that_are_missing_are_bridged(exact: tuple[Simulation, Recording, Filtered]) -> None:
+def test_samples_that_are_missing_are_bridged(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
     _, recording, found = exact
     clasp, sensors = recording.phases["clasp"], dict(recording.sensors)
     gyro_S = np.array(sensors["torso"].gyro_S)
@@ -137,7 +138,7 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
             for name in RING_SEGMENTS
         }
         recording = Recording("ring", clock, sensor.rate_hz, sensors)
-        filtered = Filtered(R_VS, {}, {}, (0.0, 0.0), (0.0, 0.0), [])
+        filtered = FilteredRecording(R_VS, {}, {}, (0.0, 0.0), (0.0, 0.0), [])
         at = np.arange(0, round(60.0 * sensor.rate_hz), 4)
         felt = {name: _felt(recording, filtered, name, at) for name in RING_SEGMENTS}
         for near, far in pairwise(RING_SEGMENTS):

@@ -237,6 +237,12 @@ def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -
     return stated
 
 
+def vertical_var(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
+    """(n,) [rad²]: variance about the vertical of errors on the right (n, 3, 3), in S."""
+    up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
+    return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
+
+
 def covariance_of(
     recording: Recording,
     segment: str,

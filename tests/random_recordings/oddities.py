@@ -71,6 +71,13 @@ def _gap(case: Case, rng: np.random.Generator) -> None:
             case.options.add("gaps")
             if at < case.stood[1] and at + lasts > case.stood[0]:
                 case.refusal = case.refusal or "may: samples are lost in the start pose"
+            elif (
+                case.clasp
+                and case.stood[1] <= at < case.clasp[1]
+                and (case.method == "smekf" or any(sensor.axes is None for sensor in case.worn.values()))
+            ):
+                # An orientation is lost with the samples, and what joins it to the start pose tells how a sensor sits.
+                case.refusal = case.refusal or "may: samples are lost between the start pose and joined hands"
         else:
             case.refusal = "must: samples are lost" if lasts > LONG_GAP_S + 3.0 * step else "may: samples are lost"
 

@@ -64,7 +64,7 @@ def alternatives(
     best = solved(fit.x[rows])
     std = np.sqrt(np.diag(np.linalg.inv(fit.information))[rows])
     found: list[Alternative] = []
-    for psi in distinct_headings(looks.take(looks.closed), fit.x[:K], fit.x[layout.distances], told):
+    for psi in distinct_headings(looks.take(looks.closed).stepped(fit.x), fit.x[:K], fit.x[layout.distances], told):
         other = solved(psi)
         off = other.x - best.x
         off[rows] = (off[rows] + np.pi) % (2.0 * np.pi) - np.pi

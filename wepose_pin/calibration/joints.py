@@ -20,6 +20,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from ..filters.sensors import FilteredRecording
 from ..recording import Recording
+from .losses import connected, losses_of
 from .problem import Layout
 from .weighing import LEAST_CORRELATION_S
 
@@ -72,6 +73,7 @@ def couplings(
         if gap is not None:
             inside &= ~gap
     at = np.flatnonzero(inside)
+    at = at[connected(losses_of(recording, found.start, raw), at)]  # beyond a loss headings are others
     if len(at) < LEAST_S * recording.rate_hz:
         return []
     at = at[:: max(1, round(recording.rate_hz / LOOKS_HZ))]

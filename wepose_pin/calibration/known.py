@@ -15,6 +15,7 @@ from ..errors import BadSubject
 from ..filters.sensors import FilteredRecording
 from ..recording import Recording
 from ..subject import LENGTHS, Subject
+from .losses import FREE_STD, HEADING_STD
 from .problem import K, Layout, Looks, placed
 from .protocols import Closure
 from .start import headings
@@ -23,7 +24,6 @@ from .start import headings
 STATED_STD = np.deg2rad(10.0)  # [rad] of a stated mount's heading
 READY_STD = np.deg2rad(2.0)  # [rad] about each axis, of segments that a device aligned itself
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
-HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of a heading that nothing tells: the whole circle
 POINT_STD = 3.0  # [m] of a point of W that nothing tells
 # [rad] by which soft tissue turns a sensor as its segment turns by a radian, each axis against each. It moves as much
 # on a trunk, which leans by a fifth of what arms turn.
@@ -52,6 +52,9 @@ def known_before(
     information[layout.points, layout.points] = np.eye(3 * layout.fixed) / POINT_STD**2
 
     guess = headings(looks, center[:K], center[layout.distances], stated_headings(recording, found, layout, prior))
+    free = looks.step_std > FREE_STD
+    center[layout.step] = np.where(free, guess[len(layout.sensors) :], 0.0)
+    information[layout.step, layout.step] = np.diag(np.where(free, HEADING_STD, looks.step_std) ** -2.0)
     for i, name in enumerate(layout.sensors):
         # What is known of this sensor's (ε_x, ε_y, ψ): the person stands nearly so, and of a mount R_LS = exp(m) R_0
         # that m = μ − ε + ψ' e_z is small, with μ the misfit of the start pose at the heading nearest to R_0.

@@ -51,9 +51,11 @@ from .anatomy import (
 from .chain import CHAIN, SIDES
 from .joints import coupled, couplings
 from .known import known_before, known_lengths, stated_headings
+from .losses import connected, losses_of, need_start_pose, steps_of, tilted
 from .problem import HINGE_STD, K, Layout, Looks, carrier, placed, residuals
 from .protocols import Closure, Protocol, load_protocol
 from .remarks import on_headings, on_lengths, on_looks, on_unseen
+from .start import is_linear
 from .touching import touching_start
 from .weighing import TOUCHED, Tape, covariance_of, handed_on, learned_of, taped, weighed
 
@@ -205,6 +207,7 @@ def _believed(
     for name, off in wrong.items():
         notes.append(f"sensors.{name}.mount is {off:.0f} deg off gravity in the start pose and was not used; {where}")
     recording, prior = without_mounts(recording, prior, wrong)
+    _need_start_pose(recording, found, protocol, prior)
     stated = tried(recording, found, prior)
     doubt = stated.arms().doubt()
     if doubt > 1.0 or against_motion(recording, prior, stated.subject.mounts):
@@ -259,28 +262,48 @@ def _looks(
 ) -> tuple[Looks, np.ndarray]:
     """The looks of all conditions, and their samples (n,)."""
     stride = max(1, round(recording.rate_hz / rate_hz))
+    seen = {carrier(segment, found.R_VS) for segment in protocol.segments}
+    fixed = sum(closure.kind == "fixed_point" for closure in protocol.closures)
+    layout = Layout(tuple(name for name in CHAIN if name in seen), fixed, protocol.gauges)
+    losses = losses_of(recording, found.start, layout.sensors)
+    # Where headings are searched, or poses tell them, those beyond a long loss are not to be found.
+    apart = [] if is_linear(protocol.conditions) else [loss for loss in losses if loss.free]
     samples = []
     gaps = {name: of.gap for name, of in recording.sensors.items() if of.gap is not None}
     for condition in protocol.conditions:
         spans = [recording.span(interval) for interval in recording.phase(condition.phase)]
         # Each look once, however the intervals overlap.
         phase = np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride]
-        lost = [name for name, gap in gaps.items() if gap[phase].any()]
-        samples.append(phase[~np.any([gaps[name][phase] for name in lost], axis=0)] if lost else phase)
+        unseen = {name: gap[phase] for name, gap in gaps.items()}
+        for name in {loss.sensor for loss in losses}:
+            unseen[name] = unseen[name] | tilted(found.orientation[name], phase)
+        lost = [name for name, of in unseen.items() if of.any()]
+        measured = phase[~np.any([unseen[name] for name in lost], axis=0)] if lost else phase
+        samples.append(measured[connected(apart, measured)])
+        lost = [*dict.fromkeys([*lost, *(loss.sensor for loss in apart if loss.beyond(measured).any())])]
         if len(samples[-1]) < LEAST_LOOKS * rate_hz / LOOK_RATE_HZ:
             raise BadPhase(
                 f"{recording.where()}: phases.{condition.phase} holds {len(samples[-1])} looks at {LOOK_RATE_HZ:g} a "
                 f"second; at least {LEAST_LOOKS} are needed"
                 + (", better a minute" if isinstance(condition, Closure) else ", better five seconds")
                 + (f"; in the others {', '.join(f'sensors.{name}' for name in lost)} is lost" if lost else "")
+                + (", or its orientation since it was" if losses else "")
             )
     at = np.concatenate(samples)
-    seen = {carrier(segment, found.R_VS) for segment in protocol.segments}
-    fixed = sum(closure.kind == "fixed_point" for closure in protocol.closures)
-    layout = Layout(tuple(name for name in CHAIN if name in seen), fixed, protocol.gauges)
+    steps, step_std, beyond = steps_of(losses, at)
+    layout = layout._replace(steps=steps)
     turned = [(found.R_VS[name][at] * found.at_start[name].inv()).as_quat().T for name in layout.sensors]
     of = np.repeat(np.arange(len(samples)), [len(part) for part in samples])
-    return Looks(layout, np.vstack([*turned, recording.time[at] - found.start[1]]), protocol.conditions, of), at
+    data = np.vstack([*turned, beyond, recording.time[at] - found.start[1]])
+    return Looks(layout, data, protocol.conditions, of, step_std), at
+
+
+def _need_start_pose(recording: Recording, found: FilteredRecording, protocol: Protocol, prior: Subject) -> None:
+    """Raises `BadPhase` where lost samples keep the motion from telling a mount that is not known."""
+    looks, at = _looks(recording, found, protocol)
+    unknown = [name for name in looks.layout.sensors if nominal_mount(recording, name, prior) is None]
+    losses = losses_of(recording, found.start, looks.layout.sensors)
+    need_start_pose(recording, losses, at, unknown, LEAST_LOOKS)
 
 
 def _solve(

@@ -3,12 +3,12 @@
 Of each sensor i the filter gives R_VS(t) in a world V of its own heading, and Q(t) = R_VS(t) R_VS(start)ᵀ. With a start
 pose that is held ε off the N-pose, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
 
-    R_WL(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
+    R_WL(t) = Rz(ψ + d τ + s) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
 
-with ψ the heading, d its drift since the start, and A the sensor's sag on its segment: soft tissue turns a sensor as
-gravity turns in the segment. The line between the shoulders is the torso's y but for what collarbones and shoulder
-blades make of it while the arms are raised. Neither that nor d, A and the hinges are handed on, but the covariance of
-lengths and mounts holds what they cost.
+with ψ the heading, d its drift since the start, s its steps where samples were lost since (`losses`), and A the
+sensor's sag on its segment: soft tissue turns a sensor as gravity turns in the segment. The line between the shoulders
+is the torso's y but for what collarbones and shoulder blades make of it while the arms are raised. Neither that nor d,
+s, A and the hinges are handed on, but the covariance of lengths and mounts holds what they cost.
 
 What a look sees is the condition of its protocol that holds then. Of a closure it is the gap, whitened by the
 covariance that errors of the orientations and slipping palms give it, which makes it as homogeneous in the lengths as
@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..alignment import ATTITUDE_STD
 from ..errors import NoSolution
@@ -37,11 +38,15 @@ K = len(LENGTHS)
 
 
 class Layout(NamedTuple):
-    """Where in x what stands: `sensors` of the chain in its order, how many unknown points, how many distances."""
+    """Where in x what stands: `sensors` of the chain in its order, how many unknown points, how many distances.
+
+    `steps`: the sensor of each step of a heading.
+    """
 
     sensors: tuple[str, ...]
     fixed: int = 0
     gauges: tuple[str, ...] = ()
+    steps: tuple[str, ...] = ()
 
     @property
     def heading(self) -> slice:
@@ -84,8 +89,18 @@ class Layout(NamedTuple):
         return slice(self.points.stop, self.points.stop + len(self.gauges))
 
     @property
+    def step(self) -> slice:
+        """Steps of headings [rad]."""
+        return slice(self.distances.stop, self.distances.stop + len(self.steps))
+
+    @property
     def size(self) -> int:
-        return self.distances.stop
+        return self.step.stop
+
+    @property
+    def rows(self) -> int:
+        """Of a look's data."""
+        return 4 * len(self.sensors) + len(self.steps) + 1
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -109,13 +124,29 @@ class Looks(NamedTuple):
     """What the residuals see: n looks, each at what one condition says."""
 
     layout: Layout
-    data: np.ndarray  # (4 sensors + 1, n): Q of each sensor xyzw, seconds since the start pose
+    data: np.ndarray  # (rows, n): Q of each sensor xyzw, whether it is beyond each step, seconds since the start pose
     conditions: tuple[Condition, ...]
     of: np.ndarray  # (n,) which condition holds at each look, never falling
+    step_std: np.ndarray = np.empty(0)  # [rad] of each step, before the motion
 
     def take(self, columns: np.ndarray) -> Looks:
         """Some of the looks: indices that grow, or bool (n,)."""
         return self._replace(data=self.data[:, columns], of=self.of[columns])
+
+    @property
+    def beyond(self) -> np.ndarray:
+        """(steps, n) bool: which looks are beyond each step of a heading."""
+        return self.data[4 * len(self.layout.sensors) : -1] > 0.5
+
+    def stepped(self, x: np.ndarray) -> Looks:
+        """The same looks with the steps of `x` taken into Q."""
+        data = self.data.copy()
+        for name, step, beyond in zip(self.layout.steps, x[self.layout.step], self.beyond, strict=True):
+            i = 4 * self.layout.sensors.index(name)
+            Q = Rotation.from_quat(data[i : i + 4, beyond].T)
+            data[i : i + 4, beyond] = (Rotation.from_rotvec([0.0, 0.0, step]) * Q).as_quat().T
+        data = np.delete(data, np.arange(4 * len(self.layout.sensors), len(data) - 1), axis=0)
+        return self._replace(layout=self.layout._replace(steps=()), data=data, step_std=np.empty(0))
 
     def spans(self) -> list[tuple[Condition, slice]]:
         """Which looks belong to each condition; none of them may be empty."""
@@ -170,7 +201,7 @@ def placed(x: np.ndarray, looks: Looks) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _mapped(layout: Layout, condition: Condition, point: int, n: int) -> Any:
-    x, data = ca.MX.sym("x", layout.size), ca.MX.sym("data", 4 * len(layout.sensors) + 1, n)
+    x, data = ca.MX.sym("x", layout.size), ca.MX.sym("data", layout.rows, n)
     r, J, gap = _look(layout, condition, point).map(n)(ca.repmat(x, 1, n), data)
     return ca.Function("looks", [x, data], [r, J, gap])
 
@@ -179,11 +210,15 @@ def _mapped(layout: Layout, condition: Condition, point: int, n: int) -> Any:
 def _look(layout: Layout, condition: Condition, point: int) -> Any:
     """One look: (x, data) → residuals (5), Jacobian (5, len(x)), gap (3)."""
     sensors = layout.sensors
-    x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", 4 * len(sensors) + 1)
+    x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", layout.rows)
     heading, tilt, drift, sag = x[layout.heading], x[layout.tilt], x[layout.drift], x[layout.sag]
     quat_WL = {}
     for i, name in enumerate(sensors):
-        turned = product(about_z(heading[i] + drift[i] * data[-1]), data[4 * i : 4 * i + 4])
+        now = heading[i] + drift[i] * data[-1]
+        for k, of in enumerate(layout.steps):
+            if of == name:
+                now += x[layout.step.start + k] * data[4 * len(sensors) + k]
+        turned = product(about_z(now), data[4 * i : 4 * i + 4])
         turned = product(turned, about_z(-heading[i]))
         quat = product(turned, small_turn(ca.vertcat(tilt[2 * i], tilt[2 * i + 1], 0.0)))
         A = ca.reshape(sag[9 * i : 9 * i + 9], 3, 3)

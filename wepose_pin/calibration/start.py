@@ -5,7 +5,8 @@ Poses tell them directly: the azimuth at which an arm was raised, the axis about
 Where points coincide, the closure is linear in lengths times headings. A hanging segment's direction in its sensor's
 start world is v(t) = Q(t)(−e_z), and L Rz(ψ) v is linear in (L cos ψ, L sin ψ, L). So R_torso(t) s + Σ ± L_i Rz(ψ_i)
 v_i(t) = 0, with s the line between the shoulders at the start, has its least-squares solution in the smallest singular
-vector.
+vector. Beyond a step of a sensor's heading (or the torso's, that all others are seen from) it has another ψ there and
+the same L.
 
 A fixed point is nearly the same, but a torso that hardly turns solves it by itself (s = c, no arms); a distance is not
 linear at all. There the headings are searched: Gauss-Newton from many starts at once, over headings and the size of
@@ -14,14 +15,14 @@ each sensor's part of the way, which the prior knows to some per cent.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from .problem import Looks, carrier
-from .protocols import Axis, Closure, Direction, coefficients
+from .protocols import Axis, Closure, Condition, Direction, coefficients
 
 STARTS, NEARER = 256, 24  # how many there are, and how many of the best go on after some rounds
 MINIMA, MOST_DISTINCT = 64, 12  # as `NEARER` where all minima are wanted, and how many of these at most
@@ -34,7 +35,8 @@ TOLD_STD = np.deg2rad(10.0)  # [rad] of a heading that a mount or a pose tells
 
 
 def headings(looks: Looks, lengths: np.ndarray, distances: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
-    """ψ [rad] of each sensor of the chain, from its world to W, whose y is the line of the shoulders at the start.
+    """ψ [rad] of each sensor of the chain, from its world to W, whose y is the line of the shoulders at the start, and
+    each step of a heading [rad]: zero where the closure is not linear.
 
     Parameters
     ----------
@@ -42,13 +44,18 @@ def headings(looks: Looks, lengths: np.ndarray, distances: np.ndarray, stated: M
     stated : sensor → ψ [rad] where it is known before
     """
     sensors = looks.layout.sensors
-    closures = [c for c in looks.conditions if isinstance(c, Closure)]
-    if len(closures) == 1 and closures[0].kind == "coincide" and closures[0].points == ("left_hand", "right_hand"):
-        return _linear(looks.take(looks.closed))
-    told = {**_posed(looks, stated), **stated}
-    if closures and not set(sensors) <= set(told):
-        return _searched(looks, lengths, distances, told)
-    return np.array([told.get(name, 0.0) for name in sensors])
+    if is_linear(looks.conditions):
+        return _linear(looks.take(looks.closed), stated)
+    told, none = {**_posed(looks, stated), **stated}, np.zeros(len(looks.layout.steps))
+    if looks.closed.any() and not set(sensors) <= set(told):
+        return np.append(_searched(looks, lengths, distances, told), none)
+    return np.append([told.get(name, 0.0) for name in sensors], none)
+
+
+def is_linear(conditions: Sequence[Condition]) -> bool:
+    """Whether headings come from joined hands."""
+    closures = [c for c in conditions if isinstance(c, Closure)]
+    return len(closures) == 1 and closures[0].kind == "coincide" and closures[0].points == ("left_hand", "right_hand")
 
 
 def _turns(looks: Looks) -> dict[str, Rotation]:
@@ -78,30 +85,65 @@ def _posed(looks: Looks, stated: Mapping[str, float]) -> dict[str, float]:
     return told
 
 
-def _linear(looks: Looks) -> np.ndarray:
-    columns = []
+def _linear(looks: Looks, stated: Mapping[str, float]) -> np.ndarray:
+    columns, parts = [], []
     for i, (name, R) in enumerate(_turns(looks).items()):
         if i == 0:
             columns.append(R.as_matrix())
             continue
         v = R.apply([0.0, 0.0, -1.0 if name.startswith("left") else 1.0])
         zero = np.zeros(len(v))
-        columns.append(
-            np.stack(
-                (
-                    np.column_stack((v[:, 0], v[:, 1], zero)),
-                    np.column_stack((-v[:, 1], v[:, 0], zero)),
-                    np.column_stack((zero, zero, v[:, 2])),
-                ),
-                axis=2,
-            )
-        )
-    A = np.concatenate(columns, axis=2).reshape(-1, 3 * len(columns))
-    z = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(-1, 3)
-    if z[1:, 2].sum() < 0.0:  # lengths are positive; their mirror image solves it as well
+        part = _parts(looks, name)
+        parts.append(part)
+        across = np.stack((np.column_stack((v[:, 0], v[:, 1], zero)), np.column_stack((-v[:, 1], v[:, 0], zero))), 2)
+        columns += [across * (part == k)[:, None, None] for k in range(part.max() + 1)]
+        columns.append(np.column_stack((zero, zero, v[:, 2]))[:, :, None])
+    A = np.concatenate(columns, axis=2).reshape(3 * looks.data.shape[1], -1)
+    z = np.linalg.svd(A, full_matrices=False)[2][-1]
+    sizes = [2 * (int(part.max()) + 1) for part in parts]
+    ends = 3 + np.cumsum([size + 1 for size in sizes])
+    if z[ends - 1].sum() < 0.0:  # lengths are positive; their mirror image solves it as well
         z = -z
-    torso = -np.arctan2(-z[0, 0], z[0, 1])  # turns s to y
-    return np.array([torso, *(np.arctan2(z[1:, 1], z[1:, 0]) + torso)])
+    torso = -np.arctan2(-z[0], z[1])  # turns s to y
+    turned = [z[end - 1 - size : end - 1].reshape(-1, 2) for end, size in zip(ends, sizes, strict=True)]
+    seen = np.array(
+        [(np.arctan2(of[:, 1], of[:, 0]) + torso)[part] for of, part in zip(turned, parts, strict=True)]
+    )  # (m − 1, n) ψ and steps of each sensor at each look, less the torso's steps
+    return _with_steps(looks, np.vstack([np.full(seen.shape[1], torso), seen]), stated)
+
+
+def _parts(looks: Looks, name: str) -> np.ndarray:
+    """(n,) which looks have one heading of a sensor seen from the torso, numbered from 0 on."""
+    between = [row for of, row in zip(looks.layout.steps, looks.beyond, strict=True) if of in (name, "torso")]
+    if not between:
+        return np.zeros(looks.data.shape[1], dtype=int)
+    return np.unique(np.array(between), axis=1, return_inverse=True)[1].ravel()
+
+
+def _with_steps(looks: Looks, seen: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
+    """ψ of each of the m sensors and each step [rad], of the headings `seen` (m, n) from the torso at each look.
+
+    The steps are made out from the start pose outwards: ψ is that before any of them, or the `stated` one.
+    """
+    layout, beyond = looks.layout, looks.beyond
+    of = np.array([layout.sensors.index(name) for name in layout.steps], dtype=int)
+    steps, known = np.zeros(len(of)), np.zeros(len(of), dtype=bool)
+    psi = np.array([stated.get(name, np.nan) for name in layout.sensors])
+    psi[0] = seen[0, 0]
+    for k in np.argsort(beyond.sum(axis=0), kind="stable") if len(of) else [0]:
+        here = beyond[:, k]
+        psi = np.where(np.isnan(psi), seen[:, k], psi)
+        if known[here].all():
+            continue
+        passed = np.bincount(of[here], steps[here], len(psi))
+        off = _within_half_turn(seen[:, k] - psi - passed + passed[0])
+        new = here & ~known
+        old = np.setdiff1d(np.arange(1, len(psi)), of[new])
+        turn = float(np.angle(np.exp(1j * off[old]).sum())) if 0 in of[new] and len(old) else 0.0  # the torso's, back
+        for step in np.flatnonzero(new):
+            steps[step] = -turn if of[step] == 0 else _within_half_turn(off[of[step]] - turn)
+        known |= here
+    return np.append(psi, steps)
 
 
 def distinct_headings(

@@ -13,7 +13,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..alignment import START_POSE_STD, Segments, align, check_mounts, covariance_of, heading_to, orient_segments
+from ..alignment import (
+    START_POSE_STD,
+    Segments,
+    align,
+    check_mounts,
+    covariance_of,
+    heading_to,
+    orient_segments,
+    vertical_var,
+)
 from ..compilation import kernel
 from ..errors import BadOption, BadPhase
 from ..filters import BEST, Orientation
@@ -306,12 +315,6 @@ def _joined(chunk: Recording, parts: list[Segments]) -> Segments:
         orientation={name: orientation(name) for name in last.orientation},
         covariance_W={name: np.concatenate([part.covariance_W[name] for part in parts]) for name in last.covariance_W},
     )
-
-
-def vertical_var(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
-    """(n,) [rad²]: variance about the vertical of errors on the right (n, 3, 3), in S."""
-    up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
-    return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
 
 
 def _about_z(angle: np.ndarray) -> np.ndarray:

@@ -1,0 +1,104 @@
+"""Calibration of sensors that lost samples between the start pose and the motion: their headings step there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.calibration import calibrate_lengths
+from wepose_pin.calibration.lengths import Calibration
+from wepose_pin.calibration.losses import Loss, connected, losses_of, steps_of
+from wepose_pin.errors import BadPhase
+from wepose_pin.recording import Recording, Sensor
+from wepose_pin.simulation import PERFECT, Simulation, simulate, simulated_person
+
+ALL = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    return simulate(simulated_person(3).lengths, seed=3, noise=PERFECT, clasp_s=24.0, circles=0)
+
+
+def lossy(simulation: Simulation, lost: tuple[float, float], names: tuple[str, ...], stated: bool = False) -> Recording:
+    """The recording with these sensors lost from, to [s] after joining the hands; mounts stated or none."""
+    recording = simulation.recording()
+    first = recording.phases["clasp"][0][0]
+    gap = (recording.time > first + lost[0]) & (recording.time < first + lost[1])
+
+    def of(name: str, sensor: Sensor) -> Sensor:
+        assert sensor.gyro_S is not None
+        mount = sensor.stated_quat_LS if stated else None
+        if name not in names:
+            return replace(sensor, stated_quat_LS=mount)
+        gyro_S = np.where(gap[:, None], 0.0, sensor.gyro_S)
+        return replace(sensor, stated_quat_LS=mount, gyro_S=gyro_S, gap=gap)
+
+    return replace(recording, sensors={name: of(name, sensor) for name, sensor in recording.sensors.items()})
+
+
+def worst_mount(found: Calibration, simulation: Simulation) -> float:
+    """[deg]"""
+    return max(
+        float(np.degrees((Rotation.from_quat(quat) * Rotation.from_quat(simulation.quat_LS[name]).inv()).magnitude()))
+        for name, quat in found.subject.mounts.items()
+    )
+
+
+@pytest.mark.parametrize("names", [("left_upper_arm",), ("torso",), ALL], ids=["upper arm", "torso", "all"])
+def test_headings_step_where_samples_were_lost(simulation: Simulation, names: tuple[str, ...]) -> None:
+    found = calibrate_lengths(lossy(simulation, (11.0, 13.0), names))
+    assert found.rms_gap < 0.003
+    assert worst_mount(found, simulation) < 4.0
+
+
+def test_a_loss_before_the_hands_are_joined_needs_the_mount(simulation: Simulation) -> None:
+    with pytest.raises(BadPhase, match=r"left_upper_arm is lost from .* and its heading with it: .* state its mount"):
+        calibrate_lengths(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",)))
+    found = calibrate_lengths(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",), stated=True))
+    assert found.rms_gap < 0.003
+    assert worst_mount(found, simulation) < 4.0
+
+
+def test_a_tilt_that_was_not_found_again_is_no_look(simulation: Simulation) -> None:
+    """The smekf corrects at rest alone, and joined hands never rest."""
+    with pytest.raises(BadPhase, match=r"phases\.clasp holds 0 looks .*sensors\.left_upper_arm is lost, or its orient"):
+        calibrate_lengths(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",), stated=True), method="smekf")
+
+
+def test_what_lies_beyond_a_loss() -> None:
+    simulation = simulate(simulated_person(3).lengths, seed=3, noise=PERFECT, clasp_s=10.0, circles=0)
+    recording = simulation.recording()
+    start = recording.span(recording.phases["start"][0])
+    sensor = recording.sensors["torso"]
+    gap = np.zeros(len(recording), dtype=bool)
+    for first, last in ((2, 9), (start.stop + 100, start.stop + 399), (start.stop + 420, start.stop + 425)):
+        gap[first : last + 1] = True
+    sensors = {**recording.sensors, "torso": replace(sensor, gap=gap)}
+    early, long, short = losses = losses_of(
+        replace(recording, sensors=sensors), recording.phases["start"][0], ("torso", "left_forearm")
+    )
+    assert [loss.after for loss in losses] == [False, True, True]
+    assert [loss.free for loss in losses] == [False, True, False]
+    samples = np.array([0, start.start, start.stop + 90, start.stop + 410, start.stop + 500])
+    assert connected([long], samples).tolist() == [True, True, True, False, False]
+    assert connected([early], samples).tolist() == [False, True, True, True, True]
+    names, std, beyond = steps_of(losses, samples)
+    assert names == ("torso",) * 3
+    assert beyond.astype(int).tolist() == [[1, 0, 0, 0, 0], [0, 0, 0, 1, 1], [0, 0, 0, 0, 1]]
+    assert std.tolist() == [early.std, long.std, short.std]
+    # Between two losses that no sample tells apart lies one step.
+    names, std, beyond = steps_of(losses, samples[[1, 2, 4]])
+    assert (names, len(beyond)) == (("torso",), 1)
+    assert std[0] == pytest.approx(min(np.hypot(long.std, short.std), np.pi / np.sqrt(3.0)))
+
+
+def test_nothing_lost_is_no_step() -> None:
+    assert losses_of(Recording("none", np.arange(3.0), 1.0, {"torso": Sensor()}), (0.0, 1.0), ("torso",)) == []
+    names, std, beyond = steps_of([], np.arange(4))
+    assert (names, len(std), beyond.shape) == ((), 0, (0, 4))
+    assert connected([], np.arange(2)).all()
+    assert not connected([Loss("torso", 1, 2, True, 1.0)], np.array([3])).any()
