@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption, BadPhase
-from wepose_pin.recording import Recording
+from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import LENGTHS, average_subject, mount_rows
 from wepose_pin.tracking import track
@@ -25,22 +25,14 @@ def recording(simulation: Simulation) -> Recording:
 
 def first(recording: Recording, n: int, begin: int = 0) -> Recording:
     """Some samples of it, with the start pose alone for a phase."""
-    sensors = {
-        name: replace(
-            of,
-            gyro_S=of.gyro_S[begin:n] if of.gyro_S is not None else None,
-            accel_S=of.accel_S[begin:n] if of.accel_S is not None else None,
-        )
-        for name, of in recording.sensors.items()
-    }
+    sensors = {name: of.part(slice(begin, n)) for name, of in recording.sensors.items()}
     phases = {"start": recording.phases["start"]}
     return replace(recording, time=recording.time[begin:n], sensors=sensors, phases=phases)
 
 
 def columns(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    gyro = [sensor.gyro_S for sensor in recording.sensors.values()]
-    accel = [sensor.accel_S for sensor in recording.sensors.values()]
-    return np.stack([g for g in gyro if g is not None], axis=1), np.stack([a for a in accel if a is not None], axis=1)
+    sensors = recording.imus.values()
+    return np.stack([s.gyro_S for s in sensors], axis=1), np.stack([s.accel_S for s in sensors], axis=1)
 
 
 @pytest.mark.parametrize("method", ["amekf", "smekf", "ncf", "gdc"])
@@ -86,7 +78,6 @@ def test_a_gap_in_the_start_pose_is_bridged_by_what_is_left_of_it(recording: Rec
     gap = np.zeros(len(recording), dtype=bool)
     gap[begin - 100 : begin + 100] = True
     torso = recording.sensors["torso"]
-    assert torso.gyro_S is not None
     poses = []
     for value in (0.0, 0.3):
         gyro_S = np.where(gap[:, None], value, torso.gyro_S)
@@ -194,17 +185,13 @@ def test_without_a_named_start_pose_it_is_found(recording: Recording) -> None:
 def test_what_cannot_be_causal_is_said(recording: Recording) -> None:
     with pytest.raises(BadOption, match=r"'smoother' needs the whole recording"):
         track(recording, method="smoother", causal=True)
-    torso = recording.sensors["torso"]
     identity = np.tile([0.0, 0.0, 0.0, 1.0], (len(recording), 1))
-    ready = {**recording.sensors, "torso": replace(torso, gyro_S=None, accel_S=None, quat_WS=identity)}
-    with pytest.raises(BadOption, match=r"sensors.torso comes with ready orientations"):
+    ready = {**recording.sensors, "torso": OrientationSensor(identity)}
+    with pytest.raises(BadOption, match=r"sensors.torso comes with measured orientations"):
         track(replace(recording, sensors=ready), causal=True)
     end = float(recording.time[-1])
     with pytest.raises(BadPhase, match="ends with the recording"):
         track(replace(recording, phases={"start": ((end - 2.0, end),)}), causal=True)
-    moving = {
-        name: replace(of, gyro_S=(of.gyro_S if of.gyro_S is not None else 0.0) + 1.0)
-        for name, of in recording.sensors.items()
-    }
+    moving = {name: replace(of, gyro_S=of.gyro_S + 1.0) for name, of in recording.imus.items()}
     with pytest.raises(BadPhase, match="nobody stands still for 3 s"):
         track(replace(recording, sensors=moving, phases={}), causal=True)

@@ -18,7 +18,7 @@ from wepose_pin.model.robot import joint_values, load_robot, start_configuration
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe
 from wepose_pin.readers.trials import find_ur5, read_ur5
-from wepose_pin.recording import CONFIGURATION, Recording, Sensor, mount_from_axes
+from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, mount_from_axes
 from wepose_pin.tracking import track, track_chain
 from wepose_pin.validation.real import UNSCORED_S, UR5_OFF
 from wepose_pin.writers import write_session
@@ -82,7 +82,7 @@ def made(model: pin.Model, links: list[str], seconds: float = 30.0) -> tuple[Rec
         R_WS = R_WL * R_WL[0].inv() * Rotation.from_quat(mount)
         gyro = np.zeros((len(t), 3))
         gyro[1:] = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * RATE
-        sensors[link] = Sensor(gyro_S=gyro, accel_S=R_WS.inv().apply([0.0, 0.0, 9.81]), stated_quat_LS=mount)
+        sensors[link] = ImuSensor(gyro_S=gyro, accel_S=R_WS.inv().apply([0.0, 0.0, 9.81]), stated_quat_LS=mount)
     phases = {"start": ((0.5, 3.5),)}
     return Recording("made", t, RATE, sensors, phases=phases, start_pose=CONFIGURATION, joints=HOME), q
 

@@ -95,8 +95,6 @@ class Chaos:
 
 def single(recording: Recording, name: str, k: int) -> Samples:
     sensor = recording.sensors[name]
-    assert sensor.gyro_S is not None
-    assert sensor.accel_S is not None
     return Samples(name, recording.time[k : k + 1], sensor.gyro_S[k : k + 1], sensor.accel_S[k : k + 1])
 
 

@@ -19,9 +19,10 @@ from typing import Any
 # Loaded on first use, so that the command line answers at once.
 _WHERE = {
     "CalibrationFailed": "errors",
+    "ImuSensor": "recording",
+    "OrientationSensor": "recording",
     "Pose": "pose",
     "Recording": "recording",
-    "Sensor": "recording",
     "StaticTest": "static",
     "Subject": "subject",
     "WeposeError": "errors",

@@ -22,7 +22,7 @@ from .filters import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .filters.base import in_parallel
 from .filters.start import ACCEL_BIAS_STD
 from .noise import SensorNoise, noise_of, quietest
-from .recording import CONFIGURATION, SEGMENTS, Recording, format_time, span_text
+from .recording import CONFIGURATION, SEGMENTS, OrientationSensor, Recording, format_time, span_text
 from .static import StaticTest
 from .subject import Subject
 
@@ -65,7 +65,7 @@ class Segments:
     quat_WL : segment → (n, 4) xyzw
     quat_LS : segment → (4,) xyzw, the mount used
     heading : segment → ψ [rad], from the sensor's world to W
-    orientation : segment → what the filter gave; none for ready orientations
+    orientation : segment → what the filter gave; none for measured orientations
     covariance_W : segment → (n, 3, 3) [rad²], of the error on the left of `quat_WL`, in W: the filter's, the
         accelerometer's bias, and the heading of a calibrated mount. A stated mount counts as
         exact. Only where the filter has a covariance
@@ -89,7 +89,7 @@ class Filtered(NamedTuple):
 
     R_VS: dict[str, Rotation]  # segment → n orientations of its sensor
     at_start: dict[str, Rotation]  # their mean in the start pose
-    orientation: dict[str, Orientation]  # what the filter gave; none for ready orientations
+    orientation: dict[str, Orientation]  # what the filter gave; none for measured orientations
     start: tuple[float, float]  # [s]
     still: tuple[float, float]  # [s]
     warnings: list[str]
@@ -125,10 +125,8 @@ class SensorFilters:
                 self.warnings += _motion(first, segment, self.start, "start")
             if self.still != self.start and not sensor.aligned:
                 self.warnings += _motion(first, segment, self.still, "still")
-            if sensor.ready:
+            if isinstance(sensor, OrientationSensor):
                 continue
-            assert sensor.gyro_S is not None
-            assert sensor.accel_S is not None
             at_rest = first.measured(segment, self.still)
             try:
                 worn = self.still == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
@@ -145,7 +143,7 @@ class SensorFilters:
                 static_test=static_test,
                 measured_start=True,
                 start=first.span(self.start),
-                gyro_range=first.sensors[segment].gyro_range,
+                gyro_range=first.imus[segment].gyro_range,
             )
         self.ahead = method in OFFLINE and bool(self._runs)
 
@@ -153,10 +151,8 @@ class SensorFilters:
         """Take a piece; gives a piece and what the filters say of it: this one, or with the smoother the one before."""
         measured = []
         for segment in self._runs:
-            sensor = piece.sensors[segment]
+            sensor = piece.imus[segment]
             gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
-            assert gyro_S is not None
-            assert accel_S is not None
             if sensor.gap is not None:
                 # A long bridge is a guess that no filter may take for measured: lost, its covariance grows over it.
                 gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
@@ -200,7 +196,7 @@ def filtered_piece(filters: SensorFilters, piece: Recording, orientation: Mappin
 def _in_sensor_worlds(piece: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:
     """Segment → n orientations of its sensor, each in a world of its own."""
     return {
-        segment: Rotation.from_quat(sensor.quat_WS if sensor.quat_WS is not None else orientation[segment].quat_WS)
+        segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_WS)
         for segment, sensor in piece.sensors.items()
     }
 
@@ -389,11 +385,11 @@ def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
 
 
 def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
-    """The mount `quat_LS` (4,) xyzw as calibrated, else as stated, else of a ready segment; None where unknown."""
+    """The mount `quat_LS` (4,) xyzw as calibrated, else as stated, else that of a measured segment; None: unknown."""
     if subject is not None and segment in subject.mounts and recording.strapping != "new":
         return subject.mounts[segment]
     stated = recording.sensors[segment].stated_quat_LS
-    if stated is None and recording.sensors[segment].ready:
+    if stated is None and segment not in recording.imus:
         return np.array([0.0, 0.0, 0.0, 1.0])  # orientations of segments, from a device that aligned them itself
     return stated
 
@@ -481,8 +477,7 @@ def _common_rotation(recording: Recording, noises: dict[str, SensorNoise], inter
     """
     up_S = {}
     for segment in noises:
-        accel_S = recording.sensors[segment].accel_S
-        assert accel_S is not None
+        accel_S = recording.imus[segment].accel_S
         mean_S = accel_S[recording.measured(segment, interval)].mean(axis=0)
         up_S[segment] = mean_S / np.linalg.norm(mean_S)
     rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
@@ -515,11 +510,10 @@ def _motion(recording: Recording, segment: str, interval: tuple[float, float], p
     The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
     """
     sensor, measured = recording.sensors[segment], recording.measured(segment, interval)
-    if sensor.quat_WS is not None:
+    if isinstance(sensor, OrientationSensor):
         R = Rotation.from_quat(sensor.quat_WS[measured])
         rate = (R[:-1].inv() * R[1:]).as_rotvec() * recording.rate_hz
     else:
-        assert sensor.gyro_S is not None
         rate = sensor.gyro_S[measured]
         R = Rotation.from_quat(rotations.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))

@@ -114,9 +114,7 @@ def _recording(seconds: float) -> Recording:
     start, n = made.span(made.phases["start"][0]).stop, round(seconds * RATE_HZ)
     rows = np.concatenate([np.arange(start), start + np.arange(n) % (len(made) - start)])
     sensors = {}
-    for name, sensor in made.sensors.items():
-        assert sensor.gyro_S is not None
-        assert sensor.accel_S is not None
+    for name, sensor in made.imus.items():
         sensors[name] = replace(sensor, gyro_S=sensor.gyro_S[rows], accel_S=sensor.accel_S[rows])
     time_s = np.arange(len(rows)) / RATE_HZ
     return replace(made, time=time_s, rate_hz=RATE_HZ, sensors=sensors, phases={"start": made.phases["start"]})

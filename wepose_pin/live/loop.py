@@ -14,7 +14,7 @@ from ..filters import BEST
 from ..model import BodyModel, load_model
 from ..pose import LiveKinematics
 from ..readers.live_log import recording_of
-from ..recording import SEGMENTS, Recording, Sensor
+from ..recording import SEGMENTS, ImuSensor, Recording
 from ..recording.arrivals import (
     DUPLICATE,
     JUMP_S,
@@ -431,7 +431,7 @@ def warm(method: str) -> None:
         np.arange(n) / 100.0,
         100.0,
         {
-            name: Sensor(
+            name: ImuSensor(
                 gyro_S=1e-3 * rng.standard_normal((n, 3)),
                 accel_S=[0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3)),
                 stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]),

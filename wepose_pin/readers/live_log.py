@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import BadData, MissingFile
-from ..recording import SEGMENTS, Recording, Sensor, check
+from ..recording import SEGMENTS, ImuSensor, Recording, check
 from ..recording.arrivals import Aligner, Arrivals, Ticks
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
@@ -131,9 +131,7 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
         raise BadData(f"{path}: {what}: a live recording holds raw data with times of their own; leave it out")
     log = read_live_log(path)
     values = {}
-    for label, sensor in log.recording.sensors.items():
-        assert sensor.gyro_S is not None
-        assert sensor.accel_S is not None
+    for label, sensor in log.recording.imus.items():
         lost = np.zeros((len(log.recording), 1), dtype=bool) if sensor.gap is None else sensor.gap[:, None]
         values[label] = {
             "gyro": np.where(lost, np.nan, sensor.gyro_S),
@@ -276,7 +274,7 @@ def recording_of(
             raise BadData(f"{source or header['name']}: sensors.{name} never sent a sample")
         marks = np.where(lost, LONG, GOOD).astype(np.int8)  # short holes were bridged when they were live
         stated = header["mounts"].get(name)
-        sensors[name] = Sensor(
+        sensors[name] = ImuSensor(
             gyro_S=bridge(np.ascontiguousarray(gyro[:, i]), marks, clock, rate=True),
             accel_S=bridge(np.ascontiguousarray(accel[:, i]), marks, clock),
             stated_quat_LS=None if stated is None else np.array(stated),

@@ -381,9 +381,8 @@ def _run(
     calibration: Calibration, recording: Recording, contact: _Contact, method: str, gauge_std: float
 ) -> dict[str, Any]:
     gauge = [f"{plain(name)} {1e3 * v:.0f} ± {1e3 * gauge_std:.0f} mm" for name, v in calibration.gauge.items()]
-    raw = sorted(
-        {"ready orientations" if s.ready else "gyroscope and accelerometer" for s in recording.sensors.values()}
-    )
+    imu, fused = len(recording.imus), len(recording.sensors) - len(recording.imus)
+    raw = ["gyroscope and accelerometer"] * (imu > 0) + ["measured orientations"] * (fused > 0)
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
         ("sensors", f"{', '.join(map(plain, recording.sensors))} ({', '.join(raw)})"),

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..recording import OrientationSensor
 from ..recording.limits import STANDARD_GRAVITY
 from ..tracking import TrackedPose
 from .measures import BENT, Budget, Elbow, Hand, Signal, between, from_start, largest, longest
@@ -317,11 +318,11 @@ def _of_subject(pose: TrackedPose) -> Iterator[Concern]:
             "Positions are off by centimetres where this person differs. Let the person hold the hands together for a "
             "minute, `wepose calibrate` it with one taped length, and track with `--subject`.",
         )
-    ready = [plain(name) for name, sensor in pose.recording.sensors.items() if sensor.ready]
-    if ready:
+    fused = [plain(name) for name, sensor in pose.recording.sensors.items() if isinstance(sensor, OrientationSensor)]
+    if fused:
         yield Concern(
             False,
-            f"ready orientations of the device: {listed(ready)}",
+            f"measured orientations of the device: {listed(fused)}",
             "They are taken as they come: their noise, bias, rest and uncertainty are the device's, not known here.",
         )
     if pose.recording.strapping == "new" and pose.subject.mounts:

@@ -11,6 +11,7 @@ import numpy as np
 from ..alignment import Segments
 from ..filters import Orientation
 from ..recording import Intervals, Recording
+from ..recording.sensors import join_parts
 from ..tracking import TrackedPose
 from .measures import Signal, hands_of, signal_of
 
@@ -190,16 +191,9 @@ def _joined(poses: list[TrackedPose], phases: Mapping[str, Intervals]) -> Tracke
     def optional(values: list[Any]) -> np.ndarray | None:
         return None if any(value is None for value in values) else np.concatenate(values)
 
-    sensors = {}
-    for name, sensor in recordings[-1].sensors.items():
-        all_of = [recording.sensors[name] for recording in recordings]
-        sensors[name] = replace(
-            sensor,
-            gyro_S=optional([of.gyro_S for of in all_of]),
-            accel_S=optional([of.accel_S for of in all_of]),
-            quat_WS=optional([of.quat_WS for of in all_of]),
-            gap=optional([of.gap for of in all_of]),
-        )
+    sensors = {
+        name: join_parts([recording.sensors[name] for recording in recordings]) for name in recordings[-1].sensors
+    }
     orientation = {}
     for name, last_of in segments[-1].orientation.items():
         runs = [s.orientation[name] for s in segments]

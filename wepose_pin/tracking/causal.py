@@ -29,7 +29,7 @@ from ..filters import BEST, OFFLINE, Orientation, check_method
 from ..filters.bank import bank_of
 from ..filters.base import in_parallel
 from ..pose import spread
-from ..recording import Intervals, Recording, Sensor
+from ..recording import ImuSensor, Intervals, OrientationSensor, Recording, Sensor
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
 from ..rotations import product
@@ -131,7 +131,7 @@ class CausalTracker:
     Raises
     ------
     WeposeError
-        A method that needs the whole recording, sensors with ready orientations, and as `segment_orientations`.
+        A method that needs the whole recording, sensors with measured orientations, and as `segment_orientations`.
     """
 
     def __init__(
@@ -146,9 +146,9 @@ class CausalTracker:
         if method in OFFLINE:
             raise BadOption(f"method '{method}' needs the whole recording; 'amekf' looks at nothing ahead")
         for name, sensor in until.sensors.items():
-            if sensor.ready:
+            if isinstance(sensor, OrientationSensor):
                 raise BadOption(
-                    f"{until.where()}: sensors.{name} comes with ready orientations: there is no filter to run "
+                    f"{until.where()}: sensors.{name} comes with measured orientations: there is no filter to run "
                     f"causally; leave the option out"
                 )
         self.start = segment_orientations(until, subject, method=method, static_test=static_test)
@@ -280,9 +280,7 @@ def causal_segments(
     names = tracker.names
     gyro, accel = np.empty((len(recording) - first, len(names), 3)), np.empty((len(recording) - first, len(names), 3))
     for i, name in enumerate(names):
-        sensor = recording.sensors[name]
-        assert sensor.gyro_S is not None
-        assert sensor.accel_S is not None
+        sensor = recording.imus[name]
         lost = np.zeros(len(gyro), dtype=bool) if sensor.gap is None else sensor.gap[first:]
         # A long bridge was made by what came after it: it is no look ahead only as a gap.
         gyro[:, i] = np.where(lost[:, None], np.nan, sensor.gyro_S[first:])
@@ -344,7 +342,7 @@ def start_of(recording: Recording) -> tuple[Recording, int]:
     else:
         guide = StartGuide(recording.rate_hz, len(recording.sensors))
         still = np.zeros((len(recording), 3))
-        rates = [still if s.gyro_S is None else s.gyro_S for s in recording.sensors.values()]
+        rates = [s.gyro_S if isinstance(s, ImuSensor) else still for s in recording.sensors.values()]
         for tick in np.stack(rates, axis=1):
             if guide.push(tick) == "ready":
                 break
@@ -386,7 +384,7 @@ def until_start(recording: Recording, interval: tuple[float, float]) -> Recordin
 def _bridged(part: Recording, name: str, clock: Clock) -> Sensor:
     """A sensor with its gaps filled anew."""
     sensor = part.sensors[name]
-    if sensor.gap is None or not sensor.gap.any() or sensor.gyro_S is None or sensor.accel_S is None:
+    if isinstance(sensor, OrientationSensor) or sensor.gap is None or not sensor.gap.any():
         return sensor
     if sensor.gap.all():
         raise BadPhase(f"{part.where()}: phases.start: sensors.{name} sent nothing in it; name seconds in which all do")
@@ -397,14 +395,7 @@ def _bridged(part: Recording, name: str, clock: Clock) -> Sensor:
 
 def _part(recording: Recording, span: slice) -> Recording:
     """The samples of a span; phases as they were."""
-
-    def cut(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else values[span]
-
-    sensors = {
-        name: replace(of, gyro_S=cut(of.gyro_S), accel_S=cut(of.accel_S), quat_WS=cut(of.quat_WS), gap=cut(of.gap))
-        for name, of in recording.sensors.items()
-    }
+    sensors = {name: sensor.part(span) for name, sensor in recording.sensors.items()}
     return replace(recording, time=recording.time[span], sensors=sensors)
 
 

@@ -67,7 +67,7 @@ class TrackedChain:
         return {
             "recording": self.recording.name,
             "session": str(self.recording.source) if self.recording.source else None,
-            "method": self.method if self.segments.orientation else "ready orientations",
+            "method": self.method if self.segments.orientation else "measured orientations",
             "model": self.model.name,
             "samples": len(self.time),
             "rate_hz": round(self.recording.rate_hz, 4),

@@ -108,7 +108,7 @@ class Tally:
         return {
             "recording": last.recording.name,
             "session": str(last.recording.source) if last.recording.source else None,
-            "method": last.method if last.segments.orientation else "ready orientations",
+            "method": last.method if last.segments.orientation else "measured orientations",
             "causal": last.causal,
             "model": last.model.robot.name if last.model else None,
             "subject": {"name": last.subject.name, "note": last.subject.note},
