@@ -133,7 +133,7 @@ def test_a_calibrated_mount_that_has_moved_is_said() -> None:
     )
     (warning,) = segment_orientations(recording, subject).warnings
     assert "calibrated mount is 20 deg off" in warning
-    assert 'strapping = "new"' in warning
+    assert "remounted = true" in warning
 
 
 def test_a_person_stands_as_in_the_calibration() -> None:
@@ -159,7 +159,7 @@ def test_a_calibrated_mount_that_cannot_be_names_the_strapping() -> None:
     over = Rotation.from_rotvec([0.0, np.pi, 0.0])
     recording, _ = ready_recording({"torso": 0.0}, {"torso": over * mount})
     subject = replace(average_subject(), mounts={"torso": mount.as_quat()})
-    with pytest.raises(BadSession, match=r"sensors\.torso: its calibrated mount is 180 deg off .* strapping = \"new\""):
+    with pytest.raises(BadSession, match=r"sensors\.torso: its calibrated mount is 180 deg off .* remounted = true"):
         segment_orientations(recording, subject)
 
 
@@ -171,7 +171,7 @@ def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
     wrong = (Rotation.from_rotvec([0, 0, 1.0]) * stated).as_quat()
     subject: Subject = replace(average_subject(), mounts=dict.fromkeys(headings, wrong))
     kept = segment_orientations(replace(recording, sensors=sensors), subject)
-    new = segment_orientations(replace(recording, sensors=sensors, strapping="new"), subject)
+    new = segment_orientations(replace(recording, sensors=sensors, remounted=True), subject)
     for name in headings:
         assert new.heading[name] == pytest.approx(headings[name], abs=1e-9)
         assert kept.heading[name] == pytest.approx(headings[name] + 1.0, abs=1e-9)

@@ -69,7 +69,7 @@ def test_a_known_mount_is_known_better_after_and_a_new_strapping_not(exact: tupl
     after = calibrate_lengths(recording, prior=prior).subject.mount_covariance("torso")
     assert after is not None
     assert np.linalg.eigvalsh(before - after)[0] > -1e-12
-    again = calibrate_lengths(replace(recording, strapping="new"), prior=prior).subject.mount_covariance("torso")
+    again = calibrate_lengths(replace(recording, remounted=True), prior=prior).subject.mount_covariance("torso")
     assert again is not None
     assert again[1, 1] > before[1, 1]
 

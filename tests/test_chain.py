@@ -211,10 +211,10 @@ def test_the_command_writes_joints_orientations_and_torques(
 def test_a_session_that_is_written_gives_the_recording_back(urdf: Path, tmp_path: Path) -> None:
     recording, _ = made(load_robot(urdf), ["forearm_link", "wrist_1_link"], 6.0)
     odd = {"forearm.link": recording.sensors["forearm_link"], "wrist 1": recording.sensors["wrist_1_link"]}
-    recording = replace(recording, sensors=odd, joints={**HOME, "elbow/1": 0.1}, strapping="new")
+    recording = replace(recording, sensors=odd, joints={**HOME, "elbow/1": 0.1}, remounted=True)
     write_session(tmp_path, recording)
     again = load_session(tmp_path)
-    assert (again.start_pose, again.joints, again.strapping) == (CONFIGURATION, recording.joints, "new")
+    assert (again.start_pose, again.joints, again.remounted) == (CONFIGURATION, recording.joints, True)
     assert list(again.sensors) == list(odd)
     for link, sensor in odd.items():
         np.testing.assert_array_equal(again.sensors[link].gyro_S, sensor.gyro_S)

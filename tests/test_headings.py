@@ -155,4 +155,4 @@ def test_hinges_hold_for_the_strapping_in_which_they_were_found(made: tuple[Simu
     recording = drifting(simulation, {"right_forearm": 8.0})
     recording = replace(recording, phases={"start": recording.phases["start"]})
     assert track(recording, subject).reset is not None
-    assert track(replace(recording, strapping="new"), subject).reset is None
+    assert track(replace(recording, remounted=True), subject).reset is None

@@ -316,7 +316,7 @@ def test_elbows_that_cannot_be(pose: TrackedPose) -> None:
 def test_new_strapping(simulation: Simulation, pose: TrackedPose) -> None:
     assert pose.subject is not None
     known: Subject = replace(pose.subject, mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])})
-    anew = track(replace(simulation.recording("new"), strapping="new"), known)
+    anew = track(replace(simulation.recording("new"), remounted=True), known)
     assert said(anew, "strapped on anew").do
 
 

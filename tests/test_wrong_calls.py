@@ -320,7 +320,8 @@ def wrong_recordings(recording: wp.Recording) -> Iterator[tuple[str, wp.Recordin
         yield "phases", replace(recording, phases=phases)
     for name in NAME:
         yield "start_pose", replace(recording, start_pose=name)
-        yield "strapping", replace(recording, strapping=name)
+    for remounted in (None, "new", 1):
+        yield "remounted", replace(recording, remounted=remounted)
     for resets in ("x", (-1,), (n + 5,), (1.5,), (True,), 3):
         yield "resets", replace(recording, resets=resets)
     for joints in ("x", {"elbow": "0"}, {"elbow": NAN}, None):

@@ -231,9 +231,9 @@ def segment_orientations(
 ) -> Segments:
     """Filter every sensor, then align it with its segment by the start pose.
 
-    A calibrated mount of the subject is taken before a stated one, unless the strapping is new. Orientations that are
-    aligned already are only turned about the vertical, all by the same angle, so that the torso faces x in the start
-    pose.
+    A calibrated mount of the subject is taken before a stated one, unless the sensors were remounted. Orientations that
+    are aligned already are only turned about the vertical, all by the same angle, so that the torso faces x in the
+    start pose.
 
     Raises
     ------
@@ -261,8 +261,8 @@ def need_mounts(recording: Recording, subject: Subject | None) -> None:
         of = f"sensors.{missing[0]}.mount is not known"
         if len(missing) > 1:
             of += f", nor that of {', '.join(missing[1:])}"
-        if subject is not None and recording.strapping == "new" and set(missing) & set(subject.mounts):
-            of += ' (strapping = "new": the subject\'s are of another strapping)'
+        if subject is not None and recording.remounted and set(missing) & set(subject.mounts):
+            of += " (remounted = true: the subject's are of another strapping)"
         elif subject is not None and subject.mounts:
             of += f"; the subject '{subject.name}' has none for it"
         raise BadSession(f"{recording.where()}: {of}: {mount_advice(missing)}")
@@ -313,12 +313,12 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
         R_LS = Rotation.from_rotvec([0.0, 0.0, psi]) * at_start
         off = np.degrees((R_LS * R_stated.inv()).magnitude())
         if off > STATED_LIMIT_DEG:
-            calibrated = subject is not None and segment in subject.mounts and recording.strapping != "new"
+            calibrated = subject is not None and segment in subject.mounts and not recording.remounted
             of, do = ".mount", "check which sensor axis points up and which forward"
             if guessed:
                 do = f"name its seconds, or {do}"
             if calibrated:
-                of, do = ": its calibrated mount", 'strapped on anew? then state strapping = "new" and the mounts'
+                of, do = ": its calibrated mount", "strapped on anew? then state remounted = true and the mounts"
                 if guessed:
                     do = f"name its seconds; {do}"
             raise BadSession(
@@ -345,7 +345,7 @@ def align(recording: Recording, subject: Subject | None, found: Filtered) -> Ali
                 off = np.degrees(np.linalg.norm(misfit))
                 warnings.append(
                     f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "
-                    f'pose{guessed}; strapped on anew? then state strapping = "new"'
+                    f"pose{guessed}; strapped on anew? then state remounted = true"
                 )
         mount[segment], heading[segment] = R_LS, psi
         turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi])
@@ -386,7 +386,7 @@ def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
 
 def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
     """The mount `quat_LS` (4,) xyzw as calibrated, else as stated, else that of a measured segment; None: unknown."""
-    if subject is not None and segment in subject.mounts and recording.strapping != "new":
+    if subject is not None and segment in subject.mounts and not recording.remounted:
         return subject.mounts[segment]
     stated = recording.sensors[segment].stated_quat_LS
     if stated is None and segment not in recording.imus:
@@ -433,7 +433,7 @@ def start_heading_var(recording: Recording, segment: str, subject: Subject | Non
 
 def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
     """Covariance (3, 3) [rad²] of a calibrated mount's error in L, where it holds for this strapping and is known."""
-    return None if subject is None or recording.strapping == "new" else subject.mount_covariance(segment)
+    return None if subject is None or recording.remounted else subject.mount_covariance(segment)
 
 
 def _phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[str]]:

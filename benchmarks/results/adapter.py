@@ -137,7 +137,7 @@ def write_session(folder: Path, session: Session) -> None:
     """The session file with its tables beside it."""
     folder.mkdir(parents=True)
     lines = [f'name = "{session.name}"', f'start_pose = "{session.start_pose}"']
-    lines += ['strapping = "new"'] * session.remounted
+    lines += ["remounted = true"] * session.remounted
     first = session.tables[0]
     lines += ["[data]", f'gyro_unit = "{"deg/s" if first.in_degrees else "rad/s"}"']
     lines += [f'accel_unit = "{"g" if first.in_degrees else "m/s^2"}"']

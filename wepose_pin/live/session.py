@@ -85,7 +85,7 @@ def _begin(recording: Recording) -> float:
 
 def _check_mounts(sensors: Sequence[str], wearing: Wearing) -> None:
     """Before anybody stands still: each sensor's mount is known."""
-    calibrated = wearing.subject.mounts if wearing.subject is not None and wearing.strapping != "new" else {}
+    calibrated = wearing.subject.mounts if wearing.subject is not None and not wearing.remounted else {}
     unknown = [name for name in sensors if name not in calibrated and name not in wearing.mounts]
     if unknown:
         raise BadSession(

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadSession, one_of
-from ..readers.keys import Keys, read_toml
-from ..readers.stated import phases_stated, sensor_stated
+from ..readers.keys import read_toml
+from ..readers.stated import joints_stated, phases_stated, sensor_stated, session_keys
 from ..recording import SEGMENTS, START_POSES, Intervals, Recording
 from ..subject import Subject, subject_of, subject_toml
 
@@ -34,7 +34,7 @@ class Wearing:
     mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, Intervals] = field(default_factory=dict)
     start_pose: str = "n_pose"
-    strapping: str = "as_calibrated"
+    remounted: bool = False
 
     @classmethod
     def of(cls, recording: Recording, subject: Subject | None = None, subject_text: str = "") -> Wearing:
@@ -46,7 +46,7 @@ class Wearing:
             {n: s.stated_quat_LS for n, s in recording.sensors.items() if s.stated_quat_LS is not None},
             recording.phases,
             recording.start_pose,
-            recording.strapping,
+            recording.remounted,
         )
 
     def as_recorded(self) -> Wearing:
@@ -64,7 +64,7 @@ class Wearing:
             "mounts": {name: np.asarray(quat).tolist() for name, quat in self.mounts.items() if name in sensors},
             "phases": {name: [list(span) for span in spans] for name, spans in self.phases.items()},
             "start_pose": self.start_pose,
-            "strapping": self.strapping,
+            "remounted": self.remounted,
             "subject": self.subject_text or None,
         }
 
@@ -78,8 +78,7 @@ def read_wearing(path: Path, subject: Subject | None = None, subject_text: str =
         Not there, or a key in it that no session has.
     """
     path = path / "session.toml" if path.is_dir() else path
-    top = Keys(read_toml(path, "a session file"), str(path))
-    top.allow("name", "start_pose", "strapping", "data", "phases", "sensors")
+    top = session_keys(read_toml(path, "a session file"), path)
     phases_stated(top.table("phases", {}))
     tables = top.table("sensors")
     mounts = {}
@@ -89,11 +88,13 @@ def read_wearing(path: Path, subject: Subject | None = None, subject_text: str =
         mount = sensor_stated(tables.table(segment)).mount
         if mount is not None:
             mounts[segment] = mount
+    start_pose = top.choice("start_pose", START_POSES, "n_pose")
+    joints_stated(top, start_pose)
     return Wearing(
         top.text("name", None) or path.absolute().parent.name,
         subject,
         subject_text,
         mounts,
-        start_pose=top.choice("start_pose", START_POSES, "n_pose"),
-        strapping=top.choice("strapping", ("as_calibrated", "new"), "as_calibrated"),
+        start_pose=start_pose,
+        remounted=top.flag("remounted"),
     )

@@ -34,7 +34,16 @@ from .arrays import ArrayFile, is_array_file
 from .device import Device
 from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
-from .stated import WIDTHS, Stated, joints_stated, label_stated, phases_stated, sensor_stated, truth_stated
+from .stated import (
+    WIDTHS,
+    Stated,
+    joints_stated,
+    label_stated,
+    phases_stated,
+    sensor_stated,
+    session_keys,
+    truth_stated,
+)
 from .tables import FORMATS as TABLES
 from .tables import Rows, columns, one_column, read_table
 
@@ -130,7 +139,7 @@ class SessionReader:
     Attributes
     ----------
     time, rate_hz : the common time base (n,) [s], and its rate
-    phases, start_pose, strapping : as of the `Recording`, whole
+    phases, start_pose, remounted : as of the `Recording`, whole
     any_aligned : whether a sensor's orientations are its segment's own
     """
 
@@ -145,8 +154,7 @@ class SessionReader:
         path = Path(path)
         self.path = path / "session.toml" if path.is_dir() else path
         self.gaps = gaps
-        top = Keys(read_toml(self.path, "a session file") if values is None else values, str(self.path))
-        top.allow("name", "start_pose", "strapping", "data", "phases", "sensors", "joints")
+        top = session_keys(read_toml(self.path, "a session file") if values is None else values, self.path)
         data, sensors = top.table("data"), top.table("sensors", {})
         data.allow(*_FOR_SENSORS, "truth")
         self._used: set[str] = set()  # which of `_FOR_SENSORS` some sensor had a use for
@@ -166,7 +174,7 @@ class SessionReader:
             phases=phases_stated(top.table("phases", {})),
             start_pose=start_pose,
             joints=joints_stated(top, start_pose),
-            strapping=top.choice("strapping", ("as_calibrated", "new"), "as_calibrated"),
+            remounted=top.flag("remounted"),
             source=self.path,
             truth=truth_stated(self.path, data),
         )
@@ -204,7 +212,7 @@ class SessionReader:
         )
         self.rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
         check_phases(str(self.path), self.time, self._head.phases)
-        self.phases, self.start_pose, self.strapping = self._head.phases, start_pose, self._head.strapping
+        self.phases, self.start_pose, self.remounted = self._head.phases, start_pose, self._head.remounted
         self.any_aligned = any(plan.aligned for plan in self._plans.values())
         self._refuse_shared_columns()
         self._scanned: Scan | None = None

@@ -6,7 +6,7 @@ sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a f
 """
 
 from .intervals import Intervals, check_phases, check_time, format_time, span_text
-from .recording import CONFIGURATION, EACH_TIME, START_POSES, STRAPPINGS, Recording, check
+from .recording import CONFIGURATION, EACH_TIME, START_POSES, Recording, check
 from .sensors import AXES, SEGMENTS, ImuSensor, OrientationSensor, Sensor, axes_from_mount, mount_from_axes
 
 __all__ = [
@@ -15,7 +15,6 @@ __all__ = [
     "EACH_TIME",
     "SEGMENTS",
     "START_POSES",
-    "STRAPPINGS",
     "ImuSensor",
     "Intervals",
     "OrientationSensor",

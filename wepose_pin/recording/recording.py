@@ -15,7 +15,6 @@ from .limits import MEDIAN_FORCE
 from .sensors import SEGMENTS, ImuSensor, OrientationSensor, Sensor
 
 START_POSES = ("n_pose",)
-STRAPPINGS = ("as_calibrated", "new")
 CONFIGURATION = "configuration"  # the start pose of any other chain: values of its joints; sensors are named by links
 
 RATE_OFF = 0.01  # share by which the stated rate may be off that of the times: its error is one of all angles
@@ -33,7 +32,7 @@ class Recording:
     time : (n,) [s], uniform at `rate_hz` to within the clock's jitter
     sensors : one a segment
     phases : name → intervals [s] on `time`; `start` is the start pose, `still` sensors at rest
-    strapping : "as_calibrated" or "new": whether a subject's calibrated mounts hold here
+    remounted : the sensors were strapped on anew since the subject's calibration: its mounts do not hold here
     source : the file it was read from, for messages
     truth : file with the reference, where there is one
     resets : samples before which headings were set anew, live: the person stood in the start pose
@@ -47,7 +46,7 @@ class Recording:
     sensors: Mapping[str, Sensor]
     phases: Mapping[str, Intervals] = field(default_factory=dict)
     start_pose: str = "n_pose"
-    strapping: str = "as_calibrated"
+    remounted: bool = False
     source: Path | None = None
     truth: Path | None = None
     resets: tuple[int, ...] = ()
@@ -133,9 +132,9 @@ def check(recording: Recording) -> Recording:
     """
     where, time = recording.where(), recording.time
     check_fields(recording, f"{where}: ")
-    for name, choices in (("start_pose", (*START_POSES, CONFIGURATION)), ("strapping", STRAPPINGS)):
-        if getattr(recording, name) not in choices:
-            raise BadOption(f"{where}: {name} = '{getattr(recording, name)}' is not known; {one_of(choices)}")
+    start_poses = (*START_POSES, CONFIGURATION)
+    if recording.start_pose not in start_poses:
+        raise BadOption(f"{where}: start_pose = '{recording.start_pose}' is not known; {one_of(start_poses)}")
     if recording.start_pose != CONFIGURATION:  # else they are links
         links = f'; a chain\'s links need start_pose = "{CONFIGURATION}"'
         check_names(f"{where}: sensors", recording.sensors, SEGMENTS, links)

@@ -392,7 +392,7 @@ def _run(
         ("filter", method),
         ("measured lengths", ", ".join(gauge) or "none"),
         ("population prior", calibration.prior.note or calibration.prior.name),
-        ("strapping", recording.strapping.replace("_", " ")),
+        ("sensors strapped on anew", "yes" if recording.remounted else "no"),
         *(("while reading", note) for note in recording.notes),
         ("made with", versions()),
     ]

@@ -325,7 +325,7 @@ def _of_subject(pose: TrackedPose) -> Iterator[Concern]:
             f"measured orientations of the device: {listed(fused)}",
             "They are taken as they come: their noise, bias, rest and uncertainty are the device's, not known here.",
         )
-    if pose.recording.strapping == "new" and pose.subject.mounts:
+    if pose.recording.remounted and pose.subject.mounts:
         yield Concern(
             False,
             "the sensors were strapped on anew: of the subject only the lengths are used",

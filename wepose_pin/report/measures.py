@@ -104,7 +104,7 @@ def stated_mounts(pose: TrackedPose) -> bool:
     """The mounts are the session's and not calibrated ones."""
     assert pose.subject is not None
     assert pose.recording is not None
-    return not pose.subject.mounts or pose.recording.strapping == "new"
+    return not pose.subject.mounts or pose.recording.remounted
 
 
 # Headings -------------------------------------------------------------------------------------------------------------

@@ -68,6 +68,6 @@ def track(
     segments = segment_orientations(recording, subject, method=method, static_test=static_test)
     reset = None
     own = any(sensor.aligned for sensor in recording.sensors.values())  # frames that no calibration of ours knows
-    if hold_headings and subject is not None and subject.mounts and recording.strapping != "new" and not own:
+    if hold_headings and subject is not None and subject.mounts and not recording.remounted and not own:
         segments, reset = held_together(recording, segments, subject)
     return tracked_pose(recording, segments, subject, model, method, reset, limits=limits)

@@ -81,7 +81,7 @@ class HeadingHold:
         self._chain = (*CHAIN, *(hand for hand in HANDS if hand in segments))
         self._subject, self._start, self._clasp = subject, begin, clasp
         # A hinge was seen through the mounts of its calibration and holds as long as they do.
-        self._hinges = subject.hinges if piece.strapping != "new" else {}
+        self._hinges = subject.hinges if not piece.remounted else {}
         self.can_see = bool(self._hinges) or any(end >= begin for _, end in clasp)
         self._stride = max(1, round(piece.rate_hz / LOOK_RATE_HZ))
         self._share = 1.0 / max(1.0, CORRELATION_S * piece.rate_hz / self._stride)

@@ -107,7 +107,7 @@ class _Pieces:
 
     def new_mounts(self) -> bool:
         """Whether sensors sit otherwise than a calibration found them."""
-        return self.reader.strapping == "new" or self.reader.any_aligned
+        return self.reader.remounted or self.reader.any_aligned
 
     def of(self, multiple: int) -> Iterator[Recording]:
         """Pieces of a multiple of so many samples; none at the end that is too short to be one."""

@@ -19,7 +19,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     lines = [
         f"name = {json.dumps(recording.name, ensure_ascii=False)}",
         f'start_pose = "{recording.start_pose}"',
-        *([f'strapping = "{recording.strapping}"'] if recording.strapping == "new" else []),
+        *(["remounted = true"] if recording.remounted else []),
         "",
         "[data]",
         'file = "recording.parquet"',
