@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..live import LivePose, Output, Stage, Status, Wearing, run_session
+from ..live import LivePose, Output, SensorSetup, Stage, Status, run_session
 from ..live.sources.replay import ReplaySource
 from ..recording import Recording
 from ..simulation import simulate, simulated_person
@@ -122,7 +122,9 @@ def _recording(seconds: float) -> Recording:
 
 def _measured(recording: Recording, file: Path, outputs: Sequence[Output]) -> dict[str, float]:
     meter = _Meter()
-    ended = run_session(ReplaySource(recording), Wearing.of(recording), record=file, outputs=[*outputs, meter])
+    ended = run_session(
+        ReplaySource(recording), SensorSetup.from_recording(recording), record=file, outputs=[*outputs, meter]
+    )
     assert meter.before is not None
     assert meter.after is not None
     wall, busy, grown = (after - before for before, after in zip(meter.before, meter.after, strict=True))

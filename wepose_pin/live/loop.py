@@ -31,9 +31,9 @@ from ..recording.arrivals import (
 from ..subject import Subject, average_subject
 from ..tracking.causal import HOLD_S, CausalTracker, StartGuide, until_start
 from ..writers.live_log import LiveLog
+from .setup import SensorSetup
 from .sources.base import Source
 from .state import LivePose, SensorStatus, Stage, Status
-from .wearing import Wearing
 
 STATUS_S = 0.2  # [s] from status to status
 READ_S = 0.05  # [s] that a read waits at most, so that keys and status are not held up
@@ -117,7 +117,7 @@ class LiveLoop:
     def __init__(
         self,
         source: Source,
-        wearing: Wearing,
+        setup: SensorSetup,
         *,
         method: str = BEST,
         model: BodyModel | None = None,
@@ -127,15 +127,15 @@ class LiveLoop:
         wait_s: float = WAIT_S,
     ) -> None:
         self.source, self.method, self.log, self.outputs = source, method, log, tuple(outputs)
-        self.wearing = wearing.as_recorded()
-        self.model = wearer_model(wearing.subject, model)
+        self.setup = setup.as_recorded()
+        self.model = wearer_model(setup.subject, model)
         self.kinematics = LiveKinematics(self.model, source.sensors)
         self._begin, self._wait = begin, wait_s
         self._aligner: Aligner | None = None
         self._waiting: list[Arrivals] = []
         self._before: list[Ticks] = []  # the start pose's
         self._guide: StartGuide | None = None
-        self._named: tuple[float, float] | None = next(iter(wearing.phases.get("start", ())), None)
+        self._named: tuple[float, float] | None = next(iter(setup.phases.get("start", ())), None)
         self._tracker: CausalTracker | None = None
         self._newest = dict.fromkeys(source.sensors, -np.inf)
         self._heading_set = 0.0
@@ -280,10 +280,10 @@ class LiveLoop:
     def _begin_tracking(self, begin: int, end: int) -> None:
         assert self._aligner is not None
         recording = recording_of(
-            self.wearing.header(self.source.sensors), self._aligner.rate_hz, self._before, (begin, end), last=end
+            self.setup.header(self.source.sensors), self._aligner.rate_hz, self._before, (begin, end), last=end
         )
         self._tracker = CausalTracker(
-            until_start(recording, recording.phases["start"][0]), self.wearing.subject, method=self.method
+            until_start(recording, recording.phases["start"][0]), self.setup.subject, method=self.method
         )
         self._before = []
         self._first_pose = self._heading_set = float(recording.time[-1])

@@ -1,4 +1,4 @@
-"""Who wears the sensors, and how: all that is known before the first sample."""
+"""`SensorSetup`: the subject and how the sensors sit on it, as far as it is known before the first sample."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from ..subject import Subject, subject_of, subject_toml
 
 
 @dataclass(frozen=True)
-class Wearing:
-    """A person with sensors on.
+class SensorSetup:
+    """A subject and how the sensors sit on it.
 
     Parameters
     ----------
@@ -37,8 +37,10 @@ class Wearing:
     remounted: bool = False
 
     @classmethod
-    def of(cls, recording: Recording, subject: Subject | None = None, subject_text: str = "") -> Wearing:
-        """As a recording has it that is replayed."""
+    def from_recording(
+        cls, recording: Recording, subject: Subject | None = None, subject_text: str = ""
+    ) -> SensorSetup:
+        """The setup of a recording that is replayed."""
         return cls(
             recording.name,
             subject,
@@ -49,7 +51,7 @@ class Wearing:
             recording.remounted,
         )
 
-    def as_recorded(self) -> Wearing:
+    def as_recorded(self) -> SensorSetup:
         """With the subject as who reads the session's recording will have it: decimals of a text are not all."""
         if self.subject is None or self.subject_text:
             return self
@@ -69,7 +71,7 @@ class Wearing:
         }
 
 
-def read_wearing(path: Path, subject: Subject | None = None, subject_text: str = "") -> Wearing:
+def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "") -> SensorSetup:
     """What a session file says of the sensors' mounts; what it says of data and phases is of another recording.
 
     Raises
@@ -90,7 +92,7 @@ def read_wearing(path: Path, subject: Subject | None = None, subject_text: str =
             mounts[segment] = mount
     start_pose = top.choice("start_pose", START_POSES, "n_pose")
     joints_stated(top, start_pose)
-    return Wearing(
+    return SensorSetup(
         top.text("name", None) or path.absolute().parent.name,
         subject,
         subject_text,
