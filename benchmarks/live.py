@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wepose_pin.live import LivePose, Output, Stage, Status, Wearing, run_session
+from wepose_pin.live import LivePose, Output, SensorSetup, Stage, Status, run_session
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import simulate, simulated_person
@@ -120,9 +120,7 @@ def _recording(seconds: float) -> Recording:
     start, n = made.span(made.phases["start"][0]).stop, round(seconds * RATE_HZ)
     rows = np.concatenate([np.arange(start), start + np.arange(n) % (len(made) - start)])
     sensors = {}
-    for name, sensor in made.sensors.items():
-        assert sensor.gyro_S is not None
-        assert sensor.accel_S is not None
+    for name, sensor in made.imus.items():
         sensors[name] = replace(sensor, gyro_S=sensor.gyro_S[rows], accel_S=sensor.accel_S[rows])
     time_s = np.arange(len(rows)) / RATE_HZ
     return replace(made, time=time_s, rate_hz=RATE_HZ, sensors=sensors, phases={"start": made.phases["start"]})
@@ -130,7 +128,9 @@ def _recording(seconds: float) -> Recording:
 
 def _measure(recording: Recording, file: Path, outputs: Sequence[Output]) -> dict[str, float]:
     meter = _Meter()
-    summary = run_session(ReplaySource(recording), Wearing.of(recording), record=file, outputs=[*outputs, meter])
+    summary = run_session(
+        ReplaySource(recording), SensorSetup.from_recording(recording), record=file, outputs=[*outputs, meter]
+    )
     assert meter.before is not None
     assert meter.after is not None
     wall, busy, grown = (after - before for before, after in zip(meter.before, meter.after, strict=True))

@@ -108,9 +108,7 @@ def there_and_back(recording: Recording, rest: slice) -> Recording:
     Backwards a rate is negative and a specific force the same; a gyroscope's bias is no rate and stays.
     """
     sensors: dict[str, Sensor] = {}
-    for name, sensor in recording.sensors.items():
-        assert sensor.gyro_S is not None
-        assert sensor.accel_S is not None
+    for name, sensor in recording.imus.items():
         bias = sensor.gyro_S[rest].mean(axis=0)
         # The rate at a sample is that of the interval which ends there; backwards it is the one that begins there.
         back = np.roll(2.0 * bias - sensor.gyro_S[::-1], 1, axis=0)

@@ -99,6 +99,14 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     "broken TOML": (lambda f: f.say("[phases]", "[phases"), "session.toml: not valid TOML: Expected"),
     "a table without an ending": (lambda f: f.say("arm.csv", "x"), "x: '' is not a known format; there is: .csv"),
     "unknown key at the top": (lambda f: f.say("\n[data]", "\nnme = 'x'\n[data]"), "session.toml: nme is not a known"),
+    "a key of an earlier version": (
+        lambda f: f.say("\n[data]", "\nstrapping = 'new'\n[data]"),
+        "session.toml: strapping is called remounted now: write remounted = true where it was",
+    ),
+    "remounted in words": (
+        lambda f: f.say("\n[data]", "\nremounted = 'yes'\n[data]"),
+        "session.toml: remounted = 'yes' is neither true nor false",
+    ),
     "unknown key in data": (
         lambda f: f.say("gyro_unit", "gyr_unit"),
         "session.toml: data.gyr_unit is not a known key; did you mean 'gyro_unit'?",

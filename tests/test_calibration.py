@@ -15,7 +15,7 @@ from wepose_pin.calibration.verdict import judge
 from wepose_pin.errors import BadOption, BadPhase, BadSession
 from wepose_pin.model import load_model
 from wepose_pin.pose import pose_of
-from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import PERFECT, PERFECT_WORLD, Person, Simulation, simulate, simulated_person
 from wepose_pin.simulation.motion import Motion, Wander
 from wepose_pin.subject import LENGTHS, average_subject, mount_rows
@@ -23,7 +23,7 @@ from wepose_pin.subject import LENGTHS, average_subject, mount_rows
 
 def ready(simulation: Simulation) -> Recording:
     """The simulated person with exact orientations in place of sensors: what is left is the calibration alone."""
-    sensors = {segment: Sensor(quat_WS=quat) for segment, quat in simulation.quat_WL.items()}
+    sensors = {segment: OrientationSensor(quat_WS=quat) for segment, quat in simulation.quat_WL.items()}
     return replace(simulation.recording("exact"), sensors=sensors)
 
 
@@ -69,7 +69,7 @@ def test_a_known_mount_is_known_better_after_and_a_new_strapping_not(exact: tupl
     after = calibrate_lengths(recording, prior=prior).subject.mount_covariance("torso")
     assert after is not None
     assert np.linalg.eigvalsh(before - after)[0] > -1e-12
-    again = calibrate_lengths(replace(recording, strapping="new"), prior=prior).subject.mount_covariance("torso")
+    again = calibrate_lengths(replace(recording, remounted=True), prior=prior).subject.mount_covariance("torso")
     assert again is not None
     assert again[1, 1] > before[1, 1]
 
@@ -130,7 +130,7 @@ def test_noise_in_the_orientations_does_not_shrink_the_person(exact: tuple[Perso
     rng = np.random.default_rng(2)
     moving = (recording.time > 6.0)[:, None]  # the start pose is still
     noisy = {
-        name: Sensor(
+        name: OrientationSensor(
             quat_WS=(
                 Rotation.from_quat(s.quat_WS)
                 * Rotation.from_rotvec(rng.normal(scale=0.06, size=(len(recording), 3)) * moving)
@@ -163,8 +163,8 @@ def test_a_hand_with_a_sensor_is_seen_by_itself(exact: tuple[Person, Recording])
             *(Rotation.align_vectors(t[None], b[None]) for t, b in zip(together, bent, strict=True)), strict=True
         )
         turned = Rotation.concatenate(list(turn))
-        sensors[f"{side}_forearm"] = Sensor(quat_WS=turned.as_quat())
-        sensors[f"{side}_hand"] = Sensor(quat_WS=(turned * bend).as_quat())
+        sensors[f"{side}_forearm"] = OrientationSensor(quat_WS=turned.as_quat())
+        sensors[f"{side}_hand"] = OrientationSensor(quat_WS=(turned * bend).as_quat())
     clasp = [recording.phases["clasp"][0]]
     bent_recording = replace(
         recording, sensors=sensors, phases={"start": recording.phases["start"], "clasp": tuple(clasp)}
@@ -201,10 +201,9 @@ def test_hands_that_do_not_move_say_so(exact: tuple[Person, Recording]) -> None:
     held = recording.span(recording.phases["clasp"][0]).start + 300
     frozen = {}
     for name, sensor in recording.sensors.items():
-        assert sensor.quat_WS is not None
         quat = sensor.quat_WS.copy()
         quat[held:] = quat[held]
-        frozen[name] = Sensor(quat_WS=quat)
+        frozen[name] = OrientationSensor(quat_WS=quat)
     clasp = ((float(recording.time[held]), recording.phases["clasp"][0][1]),)
     still = replace(recording, sensors=frozen, phases={**recording.phases, "clasp": clasp})
     gauge = {"shoulder_width": 0.38}

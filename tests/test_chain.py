@@ -18,7 +18,7 @@ from wepose_pin.model.robot import joint_values, load_robot, start_configuration
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe
 from wepose_pin.readers.trials import find_ur5, read_ur5
-from wepose_pin.recording import CONFIGURATION, Recording, Sensor, mount_from_axes
+from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, mount_from_axes
 from wepose_pin.tracking import track, track_chain
 from wepose_pin.validation.real import UNSCORED_S, UR5_OFF
 from wepose_pin.writers import write_session
@@ -82,7 +82,7 @@ def made(model: pin.Model, links: list[str], seconds: float = 30.0) -> tuple[Rec
         R_WS = R_WL * R_WL[0].inv() * Rotation.from_quat(mount)
         gyro = np.zeros((len(t), 3))
         gyro[1:] = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * RATE
-        sensors[link] = Sensor(gyro_S=gyro, accel_S=R_WS.inv().apply([0.0, 0.0, 9.81]), stated_quat_LS=mount)
+        sensors[link] = ImuSensor(gyro_S=gyro, accel_S=R_WS.inv().apply([0.0, 0.0, 9.81]), stated_quat_LS=mount)
     phases = {"start": ((0.5, 3.5),)}
     return Recording("made", t, RATE, sensors, phases=phases, start_pose=CONFIGURATION, joints=HOME), q
 
@@ -211,10 +211,10 @@ def test_the_command_writes_joints_orientations_and_torques(
 def test_a_session_that_is_written_gives_the_recording_back(urdf: Path, tmp_path: Path) -> None:
     recording, _ = made(load_robot(urdf), ["forearm_link", "wrist_1_link"], 6.0)
     odd = {"forearm.link": recording.sensors["forearm_link"], "wrist 1": recording.sensors["wrist_1_link"]}
-    recording = replace(recording, sensors=odd, joints={**HOME, "elbow/1": 0.1}, strapping="new")
+    recording = replace(recording, sensors=odd, joints={**HOME, "elbow/1": 0.1}, remounted=True)
     write_session(tmp_path, recording)
     again = load_session(tmp_path)
-    assert (again.start_pose, again.joints, again.strapping) == (CONFIGURATION, recording.joints, "new")
+    assert (again.start_pose, again.joints, again.remounted) == (CONFIGURATION, recording.joints, True)
     assert list(again.sensors) == list(odd)
     for link, sensor in odd.items():
         np.testing.assert_array_equal(again.sensors[link].gyro_S, sensor.gyro_S)

@@ -18,7 +18,7 @@ from wepose_pin.errors import BadData, BadSession, MissingFile, UnknownColumn, W
 from wepose_pin.readers.device import segment_of, unwrapped
 from wepose_pin.readers.formats import format_of, read_device
 from wepose_pin.readers.guess import guess_columns
-from wepose_pin.recording import Recording
+from wepose_pin.recording import OrientationSensor, Recording
 
 N, RATE = 400, 100.0
 TIME = np.arange(N) / RATE
@@ -52,7 +52,7 @@ def own(values: np.ndarray, path: Path) -> np.ndarray:
 
 def check_orientation(recording: Recording, segment: str = "torso") -> None:
     sensor = recording.sensors[segment]
-    assert sensor.gyro_S is None
+    assert isinstance(sensor, OrientationSensor)
     assert (Rotation.from_quat(sensor.quat_WS).inv() * R_WS).magnitude().max() < 1e-6
     assert not sensor.aligned
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate
-from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import MTI_3, PERFECT, Simulation, simulate, simulated_person
 from wepose_pin.subject import LENGTHS, Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.tracking import track
@@ -34,7 +34,7 @@ def drifting(simulation: Simulation, deg_min: dict[str, float]) -> Recording:
     sensors = {}
     for name, quat in simulation.quat_WL.items():
         turn = np.deg2rad(deg_min.get(name, 0.0)) / 60.0 * since[:, None] * [0.0, 0.0, 1.0]
-        sensors[name] = Sensor(quat_WS=(Rotation.from_rotvec(turn) * Rotation.from_quat(quat)).as_quat())
+        sensors[name] = OrientationSensor(quat_WS=(Rotation.from_rotvec(turn) * Rotation.from_quat(quat)).as_quat())
     return replace(recording, sensors=sensors)
 
 
@@ -144,7 +144,7 @@ def test_hands_with_sensors_of_their_own_bend_at_the_wrist(made: tuple[Simulatio
     lengths, sensors, mounts = dict(subject.lengths), dict(recording.sensors), dict(subject.mounts)
     for side in ("left", "right"):
         lengths[f"{side}_forearm"] += lengths[f"{side}_hand"]
-        sensors[f"{side}_hand"] = Sensor(quat_WS=Rotation.from_rotvec(bent).as_quat())
+        sensors[f"{side}_hand"] = OrientationSensor(quat_WS=Rotation.from_rotvec(bent).as_quat())
         mounts[f"{side}_hand"] = np.array([0.0, 0.0, 0.0, 1.0])
     pose = track(replace(recording, sensors=sensors), replace(subject, lengths=lengths, mounts=mounts, hinges={}))
     assert pose.correction is not None
@@ -159,4 +159,4 @@ def test_hinges_hold_for_the_strapping_in_which_they_were_found(made: tuple[Simu
     recording = drifting(simulation, {"right_forearm": 8.0})
     recording = replace(recording, phases={"start": recording.phases["start"]})
     assert track(recording, subject).correction is not None
-    assert track(replace(recording, strapping="new"), subject).correction is None
+    assert track(replace(recording, remounted=True), subject).correction is None

@@ -17,7 +17,7 @@ from wepose_pin.calibration.joints import SYSTEMATIC_STD, Coupling, _felt, _turn
 from wepose_pin.calibration.problem import Layout
 from wepose_pin.filters import run_filter
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
-from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import PERFECT, REALISTIC, Simulation, simulate, simulated_person
 from wepose_pin.validation.real import RING_SEGMENTS, _registered_ring, assumed_noise
 
@@ -60,8 +60,7 @@ def test_too_little_motion_rate_or_time_tells_nothing(exact: tuple[Simulation, R
     assert couplings(recording, found, ("torso", "left_forearm"), clasp) == []
     still = {
         name: replace(s, gyro_S=0.0 * s.gyro_S, accel_S=s.accel_S[:1] + 0.0 * s.accel_S)
-        for name, s in recording.sensors.items()
-        if s.gyro_S is not None and s.accel_S is not None
+        for name, s in recording.imus.items()
     }
     R_VS = {name: Rotation.concatenate([R[0]] * len(recording)) for name, R in found.R_VS.items()}
     assert couplings(replace(recording, sensors=still), found._replace(R_VS=R_VS), NAMES, clasp) == []
@@ -134,7 +133,7 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
             headings = rotations.heading((R_WS * Slerp(clock, R_VS[segment])(time[seen]).inv()).as_quat())
             psi[segment] = float(np.angle(np.mean(np.exp(1j * headings))))
         sensors = {
-            name: Sensor(gyro_S=chain.sensors[mount, name].gyro_S, accel_S=chain.sensors[mount, name].accel_S)
+            name: ImuSensor(gyro_S=chain.sensors[mount, name].gyro_S, accel_S=chain.sensors[mount, name].accel_S)
             for name in RING_SEGMENTS
         }
         recording = Recording("ring", clock, sensor.rate_hz, sensors)

@@ -15,10 +15,10 @@ from test_causal import first
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
 from wepose_pin.live.loop import Ended, Latencies, LiveLoop
 from wepose_pin.live.session import run_session
+from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, Stage, Status
-from wepose_pin.live.wearing import Wearing
 from wepose_pin.readers.live_log import SAMPLES, blocks, read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
@@ -95,8 +95,6 @@ class Chaos:
 
 def single(recording: Recording, name: str, k: int) -> Samples:
     sensor = recording.sensors[name]
-    assert sensor.gyro_S is not None
-    assert sensor.accel_S is not None
     return Samples(name, recording.time[k : k + 1], sensor.gyro_S[k : k + 1], sensor.accel_S[k : k + 1])
 
 
@@ -107,13 +105,13 @@ def live(
     watcher: Watcher | None = None,
     method: str = "amekf",
 ) -> Ended:
-    wearing = Wearing.of(recording)
-    log = LiveLog(file, wearing.header(tuple(recording.sensors)) | {"method": method})
+    setup = SensorSetup.from_recording(recording)
+    log = LiveLog(file, setup.header(tuple(recording.sensors)) | {"method": method})
     source = source or ReplaySource(recording, math.inf)
     source.open()
     loop = LiveLoop(
         source,
-        wearing,
+        setup,
         method=method,
         log=log,
         begin=float(recording.time[0]),
@@ -149,7 +147,7 @@ def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: S
         covariance=np.diag([1e-4 / 3.0] * len(LENGTHS) + [np.deg2rad(1.0 / 3.0) ** 2] * len(order)),
     )
     source = ReplaySource(recording, math.inf)
-    run_session(source, Wearing.of(recording, subject), record=tmp_path / "a.wepose")
+    run_session(source, SensorSetup.from_recording(recording, subject), record=tmp_path / "a.wepose")
     found = read_live_log(tmp_path / "a.wepose")
     again = track(found.recording, subject_of(found.header["subject"], tmp_path), causal=True)
     assert all(np.array_equal(found.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
@@ -337,11 +335,11 @@ def test_the_person_is_told_what_to_do(recording: Recording, tmp_path: Path) -> 
 def test_a_full_disk_ends_the_recording_and_not_the_session(recording: Recording) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full on this system")
-    wearing = Wearing.of(recording)
-    log = LiveLog(Path("/dev/full"), wearing.header(tuple(recording.sensors)) | {"method": "amekf"}, force=True)
+    setup = SensorSetup.from_recording(recording)
+    log = LiveLog(Path("/dev/full"), setup.header(tuple(recording.sensors)) | {"method": "amekf"}, force=True)
     source = ReplaySource(recording, math.inf)
     source.open()
-    ended = LiveLoop(source, wearing, log=log, begin=float(recording.time[0])).run()
+    ended = LiveLoop(source, setup, log=log, begin=float(recording.time[0])).run()
     assert ended.poses > 2000
     assert "the recording ended: No space left" in ended.problem
 

@@ -28,8 +28,8 @@ from wepose_pin import cli
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.live.robot import LAST, RobotOut, TickReplay, Watched, command_json
 from wepose_pin.live.session import run_session
+from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.state import LivePose, Stage, Status
-from wepose_pin.live.wearing import Wearing
 from wepose_pin.pose import Pose, point_covariance, spread
 from wepose_pin.readers import load_session
 from wepose_pin.retargeting import Robot, find_map, load, wish
@@ -616,7 +616,7 @@ def test_the_same_recording_gives_the_same_commands(
         sent.clear()
         out = RobotOut(CommandStream(arm), speed=math.inf)
         source = TickReplay(recording, math.inf)
-        run_session(source, Wearing.of(recording), method=METHOD, record=record, outputs=[out])
+        run_session(source, SensorSetup.from_recording(recording), method=METHOD, record=record, outputs=[out])
         return list(sent)
 
     once = commands(recording, tmp_path / "a.wepose")

@@ -12,7 +12,7 @@ from wepose_pin.calibration import calibrate_lengths
 from wepose_pin.calibration.lengths import Calibration
 from wepose_pin.calibration.losses import Loss, connected, losses_of, steps_of
 from wepose_pin.errors import BadPhase
-from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import PERFECT, Simulation, simulate, simulated_person
 
 ALL = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
@@ -97,7 +97,7 @@ def test_what_lies_beyond_a_loss() -> None:
 
 
 def test_nothing_lost_is_no_step() -> None:
-    assert losses_of(Recording("none", np.arange(3.0), 1.0, {"torso": Sensor()}), (0.0, 1.0), ("torso",)) == []
+    assert losses_of(Recording("none", np.arange(3.0), 1.0, {"torso": ImuSensor(np.zeros((3, 3)), np.zeros((3, 3)))}), (0.0, 1.0), ("torso",)) == []
     names, std, beyond = steps_of([], np.arange(4))
     assert (names, len(std), beyond.shape) == ((), 0, (0, 4))
     assert connected([], np.arange(2)).all()

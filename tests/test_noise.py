@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadPhase
 from wepose_pin.filters.noise import ACCEL_FLOOR, GYRO_FLOOR, QUIET_S, noise_of, quietest
-from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 
 RATE = 100.0
 
@@ -77,7 +77,7 @@ def test_a_steady_turn_is_not_the_quietest_window() -> None:
         gyro = rng.normal(scale=2e-3, size=(n, 3)) + np.deg2rad([0.3, -0.2, 0.4]) * (k + 1)
         gyro[:1000, 2] += np.deg2rad(20.0)  # a chair, very evenly
         gyro[1000:] += np.deg2rad(0.5) * np.sin(2.0 * time[1000:, None] + [0.0, 1.0, 2.0])  # standing, with sway
-        sensors[segment] = Sensor(gyro_S=gyro, accel_S=rng.normal(scale=0.02, size=(n, 3)) + [0.0, 0.0, 9.8])
+        sensors[segment] = ImuSensor(gyro_S=gyro, accel_S=rng.normal(scale=0.02, size=(n, 3)) + [0.0, 0.0, 9.8])
     first, _ = quietest(Recording("chair", time, RATE, sensors, {}))
     assert first >= 9.9
 
@@ -107,9 +107,9 @@ def test_the_quietest_window_is_found(ready: bool) -> None:
         rotation = [Rotation.identity()]
         for quat in turned:
             rotation.append(rotation[-1] * Rotation.from_quat(quat))
-        sensor = Sensor(quat_WS=Rotation.concatenate(rotation[1:]).as_quat())
+        sensor = OrientationSensor(quat_WS=Rotation.concatenate(rotation[1:]).as_quat())
     else:
-        sensor = Sensor(gyro_S=gyro, accel_S=np.tile([0, 0, 9.8], (3000, 1)))
+        sensor = ImuSensor(gyro_S=gyro, accel_S=np.tile([0, 0, 9.8], (3000, 1)))
     first, last = quietest(Recording("r", time, RATE, {"torso": sensor}))
     assert first >= 106.95
     assert last <= 109.55

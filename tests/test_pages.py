@@ -16,7 +16,7 @@ from wepose_pin.batch.items import make_items
 from wepose_pin.batch.page import study_page
 from wepose_pin.batch.plan import Item, Plan, step_options
 from wepose_pin.cli import main
-from wepose_pin.recording import Recording, Sensor, check, mount_from_axes
+from wepose_pin.recording import ImuSensor, Recording, check, mount_from_axes
 from wepose_pin.report import track_report, write_decimated_pages
 from wepose_pin.report.decimation import Decimator
 from wepose_pin.simulation import Simulation
@@ -43,7 +43,7 @@ def recorded(moved: dict[str, float], *, seconds: float = 6.0, noise: float = 1e
         angle = moved.get(segment, 0.0) * np.sin(2.0 * later) * (1.0 - np.exp(-later))
         R_WS = Rotation.from_rotvec(np.outer(angle, [0.0, 1.0, 0.0])) * R_LS
         rate = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * rate_hz
-        made[segment] = Sensor(
+        made[segment] = ImuSensor(
             gyro_S=np.vstack([np.zeros(3), rate]) + noise * rng.standard_normal((len(time), 3)),
             accel_S=R_WS.inv().apply([0.0, 0.0, 9.81]) + 10.0 * noise * rng.standard_normal((len(time), 3)),
             stated_quat_LS=R_LS.as_quat(),

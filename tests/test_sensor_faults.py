@@ -17,7 +17,7 @@ from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.filters.noise import quietest
 from wepose_pin.readers import iter_session
 from wepose_pin.readers.session import SessionReader
-from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.recording.clocks import clock_of
 from wepose_pin.recording.plausibility import sensor_notes
 from wepose_pin.simulation import Simulation, simulate, simulated_person
@@ -212,7 +212,10 @@ def test_a_start_pose_with_a_gap_in_it_is_that_of_what_was_measured(made: Simula
     gap = (whole.time > 2.7) & (whole.time < 5.5)
     raised = np.clip((whole.time - 2.7) / 2.8, 0.0, 1.0)[:, None] * [0.0, -1.5, 0.0]
     quat_WS = Rotation.from_rotvec(raised).as_quat()
-    ready = replace(whole, sensors={"torso": Sensor(quat_WS=quat_WS, gap=gap), "head": Sensor(quat_WS=quat_WS[:n])})
+    ready = replace(
+        whole,
+        sensors={"torso": OrientationSensor(quat_WS, gap=gap), "head": OrientationSensor(quat_WS[:n])},
+    )
     with pytest.raises(BadPhase, match=r"sensors\.head turns by"):
         estimate_segments(ready)
     alone = estimate_segments(replace(ready, sensors={"torso": ready.sensors["torso"]}))
@@ -241,7 +244,7 @@ def test_arms_that_swing_fast_are_measured_in_the_unit_that_is_stated(hertz: flo
 
     def notes(scale: float) -> tuple[str, ...]:
         phases = {"start": ((0.5, 4.5),)}
-        sensor = Sensor(gyro_S=scale * gyro, accel_S=accel)
+        sensor = ImuSensor(gyro_S=scale * gyro, accel_S=accel)
         return sensor_notes(Recording("swing", time, RATE, {"torso": sensor}, phases))
 
     assert notes(1.0) == ()

@@ -13,13 +13,13 @@ from wepose_pin.errors import BadOption, WeposeError
 from wepose_pin.live.sources import open_source
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
-from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 
 
 def recording(n: int = 300, rate_hz: float = 100.0) -> Recording:
     rng = np.random.default_rng(5)
     sensors = {
-        name: Sensor(gyro_S=rng.normal(size=(n, 3)), accel_S=rng.normal(size=(n, 3)))
+        name: ImuSensor(gyro_S=rng.normal(size=(n, 3)), accel_S=rng.normal(size=(n, 3)))
         for name in ("torso", "left_upper_arm")
     }
     return Recording("r", 20.0 + np.arange(n) / rate_hz, rate_hz, sensors)
@@ -75,8 +75,8 @@ def test_nothing_due_is_nothing() -> None:
 
 def test_ready_orientations_are_refused() -> None:
     r = recording()
-    ready = Sensor(quat_WS=np.tile([0.0, 0.0, 0.0, 1.0], (len(r), 1)))
-    with pytest.raises(BadOption, match=r"sensors\.torso gives ready orientations"):
+    ready = OrientationSensor(quat_WS=np.tile([0.0, 0.0, 0.0, 1.0], (len(r), 1)))
+    with pytest.raises(BadOption, match=r"sensors\.torso gives measured orientations"):
         ReplaySource(replace(r, sensors={"torso": ready}))
 
 

@@ -23,7 +23,7 @@ from wepose_pin.calibration.known import (
 )
 from wepose_pin.calibration.lengths import Calibration, _solve
 from wepose_pin.calibration.weighing import LEAST_CORRELATION_S
-from wepose_pin.recording import Recording, Sensor
+from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import PERFECT, Person, simulate, simulated_person
 from wepose_pin.subject import LENGTHS, mount_rows
 
@@ -85,7 +85,7 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
         name="drawn",
         time=np.concatenate((start_time, time)),
         rate_hz=RATE_HZ,
-        sensors={s: Sensor(gyro_S=_none(start_time, time), accel_S=_none(start_time, time)) for s in SENSORS},
+        sensors={s: ImuSensor(gyro_S=_none(start_time, time), accel_S=_none(start_time, time)) for s in SENSORS},
         phases={"start": (START,), "clasp": ((time[0] - 1e-3, time[-1] + 1e-3),)},
     )
     blocks = ((time - time[0]) / LEAST_CORRELATION_S).astype(int)

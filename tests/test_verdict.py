@@ -79,8 +79,6 @@ def exchanged(recording: Recording, *pairs: tuple[str, str]) -> Recording:
 def turned(recording: Recording, segment: str, turn: Rotation) -> Recording:
     """The sensor strapped on otherwise than its mount says."""
     sensor = recording.sensors[segment]
-    assert sensor.gyro_S is not None
-    assert sensor.accel_S is not None
     other = replace(sensor, gyro_S=turn.apply(sensor.gyro_S), accel_S=turn.apply(sensor.accel_S))
     return replace(recording, sensors={**recording.sensors, segment: other})
 

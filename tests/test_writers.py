@@ -92,9 +92,9 @@ def test_a_session_reads_back_to_the_bit(simulation: Simulation, tmp_path: Path)
 def test_ready_orientations_are_written_too(simulation: Simulation, tmp_path: Path) -> None:
     from dataclasses import replace
 
-    from wepose_pin.recording import Sensor
+    from wepose_pin.recording import OrientationSensor
 
-    ready = {name: Sensor(quat_WS=quat) for name, quat in simulation.quat_WL.items()}
+    ready = {name: OrientationSensor(quat_WS=quat) for name, quat in simulation.quat_WL.items()}
     write_session(tmp_path, replace(simulation.recording(), sensors=ready))
     again = load_session(tmp_path)
     np.testing.assert_allclose(again.sensors["torso"].quat_WS, simulation.quat_WL["torso"], atol=1e-15)

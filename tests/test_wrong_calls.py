@@ -287,16 +287,15 @@ def wrong_recordings(recording: wp.Recording) -> Iterator[tuple[str, wp.Recordin
     for unit in (1.0 / 9.81, 1e3 / 9.81):
         yield "torso.accel_S", sensor(accel_S=unit * torso.accel_S)
     quat = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
-    fused = {"gyro_S": None, "accel_S": None}
-    for quats in (2.0 * quat, np.zeros((n, 4)), quat[:, :3], quat[:-1], at(quat, 5, NAN), quat.tolist(), "x"):
-        yield "torso", sensor(quat_WS=quats, **fused)
-    yield "torso", sensor(quat_WS=quat)
+    for quats in (2.0 * quat, np.zeros((n, 4)), quat[:, :3], quat[:-1], at(quat, 5, NAN), quat.tolist(), "x", None):
+        yield "torso", replace(recording, sensors={**recording.sensors, "torso": wp.OrientationSensor(quats)})
     for mount in ("+x", [0.0, 0.0, 0.0, 1.0], np.zeros(4), np.array([0.0, 0.0, 0.0, 2.0]), np.eye(3), np.full(4, NAN)):
         yield "stated_quat_LS", sensor(stated_quat_LS=mount)
     for gap in ("x", np.zeros(n), np.zeros(n - 1, dtype=bool), [False] * n):
         yield "gap", sensor(gap=gap)
     for aligned in ("no", None, 2):
-        yield "aligned", sensor(aligned=aligned)
+        fused = wp.OrientationSensor(quat, aligned=aligned)
+        yield "aligned", replace(recording, sensors={**recording.sensors, "torso": fused})
     for sensors in (None, {}, [torso], "x", {"torso": None}, {"torso": "x"}, {3: torso}):
         yield "sensors", replace(recording, sensors=sensors)
     for name in ("trunk", "left_arm", "Torso", ""):
@@ -321,7 +320,8 @@ def wrong_recordings(recording: wp.Recording) -> Iterator[tuple[str, wp.Recordin
         yield "phases", replace(recording, phases=phases)
     for name in NAME:
         yield "start_pose", replace(recording, start_pose=name)
-        yield "strapping", replace(recording, strapping=name)
+    for remounted in (None, "new", 1):
+        yield "remounted", replace(recording, remounted=remounted)
     for resets in ("x", (-1,), (n + 5,), (1.5,), (True,), 3):
         yield "resets", replace(recording, resets=resets)
     for joints in ("x", {"elbow": "0"}, {"elbow": NAN}, None):

@@ -48,7 +48,7 @@ class Segments:
     quat_WL : segment → (n, 4) xyzw
     quat_LS : segment → (4,) xyzw, the mount used
     heading : segment → ψ [rad], from the sensor's world to W
-    orientation : segment → what the filter gave; none for ready orientations
+    orientation : segment → what the filter gave; none for measured orientations
     covariance_W : segment → (n, 3, 3) [rad²], of the error on the left of `quat_WL`, in W: the filter's, the
         accelerometer's bias, and the heading of a calibrated mount. A stated mount counts as
         exact. Only where the filter has a covariance
@@ -104,8 +104,8 @@ def check_mounts(recording: Recording, subject: Subject | None) -> None:
         of = f"sensors.{missing[0]}.mount is not known"
         if len(missing) > 1:
             of += f", nor that of {', '.join(missing[1:])}"
-        if subject is not None and recording.strapping == "new" and set(missing) & set(subject.mounts):
-            of += ' (strapping = "new": the subject\'s are of another strapping)'
+        if subject is not None and recording.remounted and set(missing) & set(subject.mounts):
+            of += " (remounted = true: the subject's are of another strapping)"
         elif subject is not None and subject.mounts:
             of += f"; the subject '{subject.name}' has none for it"
         raise BadSession(f"{recording.where()}: {of}: {mount_advice(missing)}")
@@ -156,12 +156,12 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
         R_LS = Rotation.from_rotvec([0.0, 0.0, psi]) * at_start
         off = np.degrees((R_LS * R_stated.inv()).magnitude())
         if off > STATED_LIMIT_DEG:
-            calibrated = subject is not None and segment in subject.mounts and recording.strapping != "new"
+            calibrated = subject is not None and segment in subject.mounts and not recording.remounted
             of, do = ".mount", "check which sensor axis points up and which forward"
             if guessed:
                 do = f"name its seconds, or {do}"
             if calibrated:
-                of, do = ": its calibrated mount", 'strapped on anew? then state strapping = "new" and the mounts'
+                of, do = ": its calibrated mount", "strapped on anew? then state remounted = true and the mounts"
                 if guessed:
                     do = f"name its seconds; {do}"
             raise BadSession(
@@ -188,7 +188,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
                 off = np.degrees(np.linalg.norm(misfit))
                 warnings.append(
                     f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "
-                    f'pose{guessed}; strapped on anew? then state strapping = "new"'
+                    f"pose{guessed}; strapped on anew? then state remounted = true"
                 )
         mount[segment], heading[segment] = R_LS, psi
         turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi])
@@ -228,11 +228,11 @@ def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
 
 
 def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
-    """The mount `quat_LS` (4,) xyzw as calibrated, else as stated, else of a ready segment; None where unknown."""
-    if subject is not None and segment in subject.mounts and recording.strapping != "new":
+    """The mount `quat_LS` (4,) xyzw as calibrated, else as stated, else that of a measured segment; None: unknown."""
+    if subject is not None and segment in subject.mounts and not recording.remounted:
         return subject.mounts[segment]
     stated = recording.sensors[segment].stated_quat_LS
-    if stated is None and recording.sensors[segment].ready:
+    if stated is None and segment not in recording.imus:
         return np.array([0.0, 0.0, 0.0, 1.0])  # orientations of segments, from a device that aligned them itself
     return stated
 
@@ -282,4 +282,4 @@ def start_heading_var(recording: Recording, segment: str, subject: Subject | Non
 
 def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
     """Covariance (3, 3) [rad²] of a calibrated mount's error in L, where it holds for this strapping and is known."""
-    return None if subject is None or recording.strapping == "new" else subject.mount_covariance(segment)
+    return None if subject is None or recording.remounted else subject.mount_covariance(segment)

@@ -46,10 +46,10 @@ MAIN_TABLES = ("pose",)  # files whose columns stand under the result's own key
 
 # Where the inputs of an older version are read: what has another name now. Pattern → replacement, line by line of its
 # TOML files, and by columns of its truth tables.
-SESSION_KEYS: dict[str, str] = {}
+SESSION_KEYS: dict[str, str] = {r"^still = ": "static = ", "^strapping = .new.": "remounted = true"}
 TRUTH_COLUMNS: dict[str, str] = {}
 
-_PHASES = {"static": "still"}  # our phase → the project's, where they differ
+_PHASES: dict[str, str] = {}  # our phase → the project's, where they differ
 
 
 # Sessions ----------------------------------------------------------------------------------------------------------
@@ -137,7 +137,7 @@ def write_session(folder: Path, session: Session) -> None:
     """The session file with its tables beside it."""
     folder.mkdir(parents=True)
     lines = [f'name = "{session.name}"', f'start_pose = "{session.start_pose}"']
-    lines += ['strapping = "new"'] * session.remounted
+    lines += ["remounted = true"] * session.remounted
     first = session.tables[0]
     lines += ["[data]", f'gyro_unit = "{"deg/s" if first.in_degrees else "rad/s"}"']
     lines += [f'accel_unit = "{"g" if first.in_degrees else "m/s^2"}"']

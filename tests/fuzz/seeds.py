@@ -226,8 +226,8 @@ def live_log() -> bytes:
 
     n = 100
     header = {
-        **{"format": 1, "name": "live", "sensors": ["torso"], "mounts": {"torso": [0.0, 0.0, 0.0, 1.0]}, "phases": {}},
-        **{"start_pose": "n_pose", "strapping": "as_calibrated", "subject": None, "method": "amekf"},
+        **{"format": 2, "name": "live", "sensors": ["torso"], "mounts": {"torso": [0.0, 0.0, 0.0, 1.0]}, "phases": {}},
+        **{"start_pose": "n_pose", "remounted": False, "subject": None, "method": "amekf"},
     }
     time, gyro, accel = np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.8], (n, 1))
     samples = struct.pack("<I", n) + bytes(n) + time.tobytes() + gyro.tobytes() + accel.tobytes()

@@ -196,17 +196,17 @@ class _Wild:
 def loop(folder: Path, data: bytes) -> object:
     """A live session with its recording; the recording then reads as what was shown."""
     from wepose_pin.live.loop import LiveLoop
-    from wepose_pin.live.wearing import Wearing
+    from wepose_pin.live.setup import SensorSetup
     from wepose_pin.readers import read_live_log
     from wepose_pin.writers.live_log import LiveLog
 
     file = folder / "a.wepose"
     file.unlink(missing_ok=True)
     upright = np.array([0.0, 0.0, 0.0, 1.0])
-    wearing = Wearing(mounts=dict.fromkeys(TORSO_HEAD, upright), phases={"start": ((0.1, 1.2),)})
-    log = LiveLog(file, wearing.header(TORSO_HEAD) | {"method": "ncf"})
+    setup = SensorSetup(mounts=dict.fromkeys(TORSO_HEAD, upright), phases={"start": ((0.1, 1.2),)})
+    log = LiveLog(file, setup.header(TORSO_HEAD) | {"method": "ncf"})
     with np.errstate(all="ignore"):
-        ended = LiveLoop(_Wild(data[:8192]), wearing, method="ncf", log=log, begin=STEP).run()
+        ended = LiveLoop(_Wild(data[:8192]), setup, method="ncf", log=log, begin=STEP).run()
         again = read_live_log(file)
     assert not ended.problem
     assert len(again.quat_WL) == ended.poses

@@ -107,10 +107,10 @@ def _robot_map(path: Path) -> object:
     return read_map(path)
 
 
-def _wearing(path: Path) -> object:
-    from wepose_pin.live.wearing import read_wearing
+def _setup(path: Path) -> object:
+    from wepose_pin.live.setup import read_setup
 
-    return read_wearing(path)
+    return read_setup(path)
 
 
 def _retargeted(path: Path) -> object:
@@ -286,7 +286,7 @@ TARGETS = (
     Target("opensim", lambda: [seeds.opensim()], _device("a.sto", "opensim"), LINES, "readers.opensim"),
     Target("info", _described_seeds, _described, LINES, "readers.describe"),
     Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML, "readers.session"),
-    Target("wearing", lambda: [seeds.SESSION.encode()], file("session.toml", _wearing), TOML, "live.wearing"),
+    Target("setup", lambda: [seeds.SESSION.encode()], file("session.toml", _setup), TOML, "live.setup"),
     Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML, "subject"),
     Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML, "model.table"),
     Target("robot_map", lambda: [seeds.ARM_MAP], file("map.toml", _robot_map), TOML, "retargeting.maps"),

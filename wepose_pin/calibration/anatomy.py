@@ -192,7 +192,7 @@ def against_gravity(recording: Recording, prior: Subject, found: FilteredRecordi
     off = {}
     for name, at_start in found.at_start.items():
         mount = nominal_mount(recording, name, prior)
-        if mount is not None and not recording.sensors[name].ready:
+        if mount is not None and name in recording.imus:
             up_V = (at_start * Rotation.from_quat(mount).inv()).apply(E_Z)
             off[name] = float(np.degrees(np.arccos(np.clip(up_V[2], -1.0, 1.0))))
     return {name: angle for name, angle in off.items() if angle > STATED_LIMIT_DEG}
@@ -203,6 +203,6 @@ def against_motion(recording: Recording, prior: Subject, mounts: Mapping[str, np
     off = {}
     for name, quat_LS in mounts.items():
         mount = nominal_mount(recording, name, prior)
-        if mount is not None and not recording.sensors[name].ready:
+        if mount is not None and name in recording.imus:
             off[name] = float(np.degrees((Rotation.from_quat(quat_LS) * Rotation.from_quat(mount).inv()).magnitude()))
     return {name: angle for name, angle in off.items() if angle > STATED_WARNING_DEG}

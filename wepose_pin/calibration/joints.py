@@ -61,7 +61,7 @@ def couplings(
     recording: Recording, found: FilteredRecording, names: Sequence[str], spans: Sequence[tuple[float, float]]
 ) -> list[Coupling]:
     """Of each joint between two raw sensors of `names`, by the motion in these spans [s]; none where that is little."""
-    raw = [name for name in names if recording.sensors[name].gyro_S is not None]
+    raw = [name for name in names if name in recording.imus]
     pairs = [pair for pair in JOINTS if set(pair) <= set(raw)]
     if recording.rate_hz < LEAST_RATE_HZ or not pairs:
         return []
@@ -106,9 +106,7 @@ def coupled(
 
 def _felt(recording: Recording, found: FilteredRecording, name: str, at: np.ndarray) -> np.ndarray:
     """(n, 3, 4) in V: specific force, and what a lever of 1 m along each axis of the sensor adds to the joint's."""
-    sensor, rate_hz = recording.sensors[name], recording.rate_hz
-    assert sensor.gyro_S is not None
-    assert sensor.accel_S is not None
+    sensor, rate_hz = recording.imus[name], recording.rate_hz
     smooth = butter(2, min(RATE_HZ, 0.4 * rate_hz), fs=rate_hz, output="sos")
     gyro_S = sosfiltfilt(smooth, _whole(sensor.gyro_S), axis=0)
     turning_S = np.gradient(gyro_S, 1.0 / rate_hz, axis=0)

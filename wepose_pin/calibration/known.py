@@ -124,7 +124,7 @@ def _mount_information(recording: Recording, segment: str, prior: Subject) -> np
     covariance = mount_covariance(recording, segment, prior)
     if covariance is not None:
         return np.linalg.inv(covariance + 1e-12 * np.eye(3))
-    calibrated = segment in prior.mounts and recording.strapping != "new"
-    if calibrated or recording.sensors[segment].ready:
+    calibrated = segment in prior.mounts and not recording.remounted
+    if calibrated or segment not in recording.imus:
         return np.eye(3) / READY_STD**2
     return np.diag([0.0, 0.0, STATED_STD**-2])

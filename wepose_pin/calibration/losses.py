@@ -16,7 +16,7 @@ from ..alignment import vertical_var
 from ..errors import BadPhase
 from ..filters import Orientation
 from ..filters.smekf import HOLD_S, UNSEEN_RATE_STD
-from ..recording import Recording, span_text
+from ..recording import OrientationSensor, Recording, span_text
 from ..recording.gaps import runs
 
 HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of a heading that nothing tells: the whole circle
@@ -48,7 +48,7 @@ def losses_of(recording: Recording, start: tuple[float, float], sensors: Collect
     begin, losses = recording.span(start).start, []
     for name in sensors:
         sensor = recording.sensors[name]
-        if sensor.gap is None or sensor.ready:
+        if sensor.gap is None or isinstance(sensor, OrientationSensor):
             continue
         for first, end in runs(sensor.gap):
             seconds = (end - first + 1) / recording.rate_hz

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import BadPhase
-from ..recording import Recording
+from ..recording import ImuSensor, Recording
 
 # A quantised signal can stand still to the last bit; below these standard deviations no MEMS sensor is believed, and
 # the covariances stay invertible.
@@ -157,17 +157,16 @@ def quietest(recording: Recording) -> tuple[float, float]:
     motion = np.zeros(len(range(0, n - window + 1, stride)))
     vertical_rate = np.zeros((0, len(motion)))
     for sensor in recording.sensors.values():
-        if sensor.gyro_S is not None:
+        if isinstance(sensor, ImuSensor):
             signal = sensor.gyro_S[:n]
         else:
-            assert sensor.quat_WS is not None
             # 2 (q[k] − q[k−1]) is the rotation between samples, with the signs made to agree.
             quat = sensor.quat_WS[:n]
             flips = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))[:, None]
             signal = 2.0 * rate_hz * np.concatenate([np.zeros((1, 4)), quat[1:] - flips * quat[:-1]])
         windows = np.lib.stride_tricks.sliding_window_view(signal, window, axis=0)[::stride]
         motion += windows.var(axis=-1).sum(axis=-1)
-        if sensor.accel_S is not None:
+        if isinstance(sensor, ImuSensor):
             up = np.lib.stride_tricks.sliding_window_view(sensor.accel_S[:n], window, axis=0)[::stride].mean(axis=-1)
             rate = np.einsum("ni,ni->n", windows.mean(axis=-1), up) / np.linalg.norm(up, axis=1)
             vertical_rate = np.vstack([vertical_rate, rate])

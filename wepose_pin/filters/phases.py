@@ -10,7 +10,7 @@ from scipy.special import stdtr  # of Student; scipy.stats takes half a second t
 
 from .. import rotations
 from ..errors import BadPhase
-from ..recording import Recording, format_time, span_text
+from ..recording import OrientationSensor, Recording, format_time, span_text
 from .noise import SensorNoise, quietest
 
 # Turning in the start pose: root mean square of the rate, and largest turn from its mean. A person who stands sways
@@ -34,18 +34,18 @@ def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[f
         start = recording.phases["start"][0]
         if len(recording.phases["start"]) > 1:
             notes.append(f"phases.start holds several intervals; the first, {span_text(start)}, is used")
-    elif recording.phases.get("still"):
+    elif recording.phases.get("static"):
         raise BadPhase(
-            f"{recording.where()}: phases.still without phases.start; name the seconds of the start pose, "
+            f"{recording.where()}: phases.static without phases.start; name the seconds of the start pose, "
             f"start = [[from, to]]"
         )
     else:
         start = quietest(recording)
         notes.append(f"no phases.start: the quietest window, {span_text(start)}, is taken for the start pose")
-    still = recording.phases.get("still", ())
+    still = recording.phases.get("static", ())
     if len(still) > 1:
-        notes.append(f"phases.still holds several intervals; the first, {span_text(still[0])}, is used")
-    for name, interval in (("start", start), *(("still", span) for span in still[:1])):
+        notes.append(f"phases.static holds several intervals; the first, {span_text(still[0])}, is used")
+    for name, interval in (("start", start), *(("static", span) for span in still[:1])):
         place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
         if samples < FEWEST_AT_START:
@@ -70,8 +70,7 @@ def check_common_rotation(
     """
     up_S = {}
     for segment in noises:
-        accel_S = recording.sensors[segment].accel_S
-        assert accel_S is not None
+        accel_S = recording.imus[segment].accel_S
         mean_S = accel_S[recording.measured(segment, interval)].mean(axis=0)
         up_S[segment] = mean_S / np.linalg.norm(mean_S)
     rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
@@ -104,11 +103,10 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
     The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
     """
     sensor, measured = recording.sensors[segment], recording.measured(segment, interval)
-    if sensor.quat_WS is not None:
+    if isinstance(sensor, OrientationSensor):
         R = Rotation.from_quat(sensor.quat_WS[measured])
         rate = (R[:-1].inv() * R[1:]).as_rotvec() * recording.rate_hz
     else:
-        assert sensor.gyro_S is not None
         rate = sensor.gyro_S[measured]
         R = Rotation.from_quat(rotations.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import WeposeError
-from ..recording import CONFIGURATION, Recording
+from ..recording import CONFIGURATION, OrientationSensor, Recording
 from . import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .base import in_parallel
 from .noise import SensorNoise, noise_of
@@ -22,7 +22,7 @@ class FilteredRecording(NamedTuple):
 
     R_VS: dict[str, Rotation]  # segment → n orientations of its sensor
     at_start: dict[str, Rotation]  # their mean in the start pose
-    orientation: dict[str, Orientation]  # what the filter gave; none for ready orientations
+    orientation: dict[str, Orientation]  # what the filter gave; none for measured orientations
     start: tuple[float, float]  # [s]
     still: tuple[float, float]  # [s]
     warnings: list[str]
@@ -33,7 +33,7 @@ class SensorFilters:
 
     Parameters
     ----------
-    first : the chunk that the recording begins with, and in which the phases `start` and `still` are
+    first : the chunk that the recording begins with, and in which the phases `start` and `static` are
     method, static_test : as `filter_recording`
 
     Attributes
@@ -57,11 +57,9 @@ class SensorFilters:
             if not sensor.aligned:
                 self.warnings += check_motion(first, segment, self.start, "start")
             if self.still != self.start and not sensor.aligned:
-                self.warnings += check_motion(first, segment, self.still, "still")
-            if sensor.ready:
+                self.warnings += check_motion(first, segment, self.still, "static")
+            if isinstance(sensor, OrientationSensor):
                 continue
-            assert sensor.gyro_S is not None
-            assert sensor.accel_S is not None
             at_rest = first.measured(segment, self.still)
             try:
                 worn = self.still == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
@@ -78,7 +76,7 @@ class SensorFilters:
                 static_test=static_test,
                 measured_start=True,
                 start=first.span(self.start),
-                gyro_range=first.sensors[segment].gyro_range,
+                gyro_range=first.imus[segment].gyro_range,
             )
         self.ahead = method in OFFLINE and bool(self._runs)
 
@@ -86,10 +84,8 @@ class SensorFilters:
         """Take a chunk; gives a chunk and what the filters say of it: this one, or with the smoother the one before."""
         measured = []
         for segment in self._runs:
-            sensor = chunk.sensors[segment]
+            sensor = chunk.imus[segment]
             gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
-            assert gyro_S is not None
-            assert accel_S is not None
             if sensor.gap is not None:
                 # A long bridge is a guess that no filter may take for measured: lost, its covariance grows over it.
                 gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
@@ -137,6 +133,6 @@ def filtered_chunk(
 def sensor_rotations(chunk: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:
     """Segment → n orientations of its sensor, each in a world of its own."""
     return {
-        segment: Rotation.from_quat(sensor.quat_WS if sensor.quat_WS is not None else orientation[segment].quat_WS)
+        segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_WS)
         for segment, sensor in chunk.sensors.items()
     }

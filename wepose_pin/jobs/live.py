@@ -129,16 +129,16 @@ def run_live(
     WeposeError
         What the source, the subject, the robot or an option lacks.
     """
-    from ..live import open_source, run_session, wearing_of
+    from ..live import find_setup, open_source, run_session
     from ..live.loop import warm, wearer_model
     from ..model import load_model
 
     job.check()
-    stated = None if job.session is None else wearing_of(None, job.subject, job.session)
+    stated = None if job.session is None else find_setup(None, job.subject, job.session)
     named = None if stated is None or job.replays else list(stated.mounts)
     source = open_source(job.source, sensors=named or None, speed=job.speed)
-    wearing = stated or wearing_of(source, job.subject, None)
-    model = wearer_model(wearing.subject, load_model(job.model) if job.model else None)
+    setup = stated or find_setup(source, job.subject, None)
+    model = wearer_model(setup.subject, load_model(job.model) if job.model else None)
     note(model.warnings)
     outputs: list[Output] = []
     robot: RobotOut | None = None
@@ -149,7 +149,7 @@ def run_live(
             robot, source = follower_of(
                 job.robot,
                 source,
-                wearing,
+                setup,
                 arms=arm_sides(job.arm),
                 map_file=job.map,
                 to=job.to,
@@ -170,7 +170,7 @@ def run_live(
         if job.page:
             from ..live.page import LivePage
 
-            page = LivePage(model, port=job.port, title=wearing.name)
+            page = LivePage(model, port=job.port, title=setup.name)
             page.open()
             outputs.append(_with_robot(page, robot))
             say(f"Page: {page.url}  (this machine only)")
@@ -186,7 +186,7 @@ def run_live(
         with stop or contextlib.nullcontext(lambda: False) as until:
             ended = run_session(
                 source,
-                wearing,
+                setup,
                 method=job.method,
                 model=model,
                 record=job.record,

@@ -6,22 +6,22 @@ Only what is asked for is loaded: `sources` one file a kind, `page` the browser,
 from __future__ import annotations
 
 from .loop import Ended, LiveLoop, Output
-from .session import run_session, wearing_of
+from .session import find_setup, run_session
+from .setup import SensorSetup, read_setup
 from .sources import open_source
 from .state import LivePose, SensorStatus, Stage, Status
-from .wearing import Wearing, read_wearing
 
 __all__ = [
     "Ended",
     "LiveLoop",
     "LivePose",
     "Output",
+    "SensorSetup",
     "SensorStatus",
     "Stage",
     "Status",
-    "Wearing",
+    "find_setup",
     "open_source",
-    "read_wearing",
+    "read_setup",
     "run_session",
-    "wearing_of",
 ]

@@ -14,7 +14,7 @@ from ..filters import BEST
 from ..model import BodyModel, load_model
 from ..pose import LiveKinematics
 from ..readers.live_log import recording_of
-from ..recording import SEGMENTS, Recording, Sensor
+from ..recording import SEGMENTS, ImuSensor, Recording
 from ..recording.arrivals import (
     DUPLICATE,
     JUMP_S,
@@ -33,9 +33,9 @@ from ..tracking import Tracker, TrackOptions
 from ..tracking.causal import SegmentFollower
 from ..tracking.start_pose import HOLD_S, StartGuide
 from ..writers.live_log import LiveLog
+from .setup import SensorSetup
 from .sources.base import Source
 from .state import LivePose, SensorStatus, Stage, Status
-from .wearing import Wearing
 
 STATUS_S = 0.2  # [s] from status to status
 READ_S = 0.05  # [s] that a read waits at most, so that keys and status are not held up
@@ -119,7 +119,7 @@ class LiveLoop:
     def __init__(
         self,
         source: Source,
-        wearing: Wearing,
+        setup: SensorSetup,
         *,
         method: str = BEST,
         model: BodyModel | None = None,
@@ -129,15 +129,15 @@ class LiveLoop:
         wait_s: float = WAIT_S,
     ) -> None:
         self.source, self.method, self.log, self.outputs = source, method, log, tuple(outputs)
-        self.wearing = wearing.as_recorded()
-        self.model = wearer_model(wearing.subject, model)
+        self.setup = setup.as_recorded()
+        self.model = wearer_model(setup.subject, model)
         self.kinematics = LiveKinematics(self.model, source.sensors)
         self._begin, self._wait = begin, wait_s
         self._aligner: Aligner | None = None
         self._waiting: list[Arrivals] = []
         self._before: list[Ticks] = []  # the start pose's
         self._guide: StartGuide | None = None
-        self._named: tuple[float, float] | None = next(iter(wearing.phases.get("start", ())), None)
+        self._named: tuple[float, float] | None = next(iter(setup.phases.get("start", ())), None)
         self._tracker: SegmentFollower | None = None
         self._newest = dict.fromkeys(source.sensors, -np.inf)
         self._heading_set = 0.0
@@ -282,9 +282,9 @@ class LiveLoop:
     def _begin_tracking(self, begin: int, end: int) -> None:
         assert self._aligner is not None
         recording = recording_of(
-            self.wearing.header(self.source.sensors), self._aligner.rate_hz, self._before, (begin, end), last=end
+            self.setup.header(self.source.sensors), self._aligner.rate_hz, self._before, (begin, end), last=end
         )
-        tracker = Tracker(self.wearing.subject, model=self.model, options=TrackOptions(self.method, causal=True))
+        tracker = Tracker(self.setup.subject, model=self.model, options=TrackOptions(self.method, causal=True))
         tracker.push(recording)
         self._tracker = tracker.follower
         self._before = []
@@ -433,7 +433,7 @@ def warm(method: str) -> None:
         np.arange(n) / 100.0,
         100.0,
         {
-            name: Sensor(
+            name: ImuSensor(
                 gyro_S=1e-3 * rng.standard_normal((n, 3)),
                 accel_S=[0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3)),
                 stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]),

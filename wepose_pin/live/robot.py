@@ -20,10 +20,10 @@ from ..retargeting.stream import HOLD_AFTER_S, STOP_AFTER_S, Command, CommandStr
 from ..subject import average_subject
 from .loop import Latencies, Output
 from .out import LOOPBACK
+from .setup import SensorSetup
 from .sources.base import Source
 from .sources.replay import ReplaySource
 from .state import LivePose, Stage, Status
-from .wearing import Wearing
 
 FORMAT = 1
 PORT = 9002
@@ -269,7 +269,7 @@ class TickReplay(ReplaySource):
 def follower_of(
     robot: str,
     source: Source,
-    wearing: Wearing,
+    setup: SensorSetup,
     *,
     arms: tuple[str, ...] | None = None,
     map_file: Path | None = None,
@@ -300,7 +300,7 @@ def follower_of(
         needed(loaded, source.sensors)
     if isinstance(source, ReplaySource) and math.isinf(speed):
         source = TickReplay(source.recording, speed)
-    lengths_cov = (wearing.subject or average_subject()).lengths_covariance()
+    lengths_cov = (setup.subject or average_subject()).lengths_covariance()
     stream = CommandStream(loaded, rate_hz=rate_hz, hold_after=hold_after, stop_after=stop_after)
     return RobotOut(stream, to or str(PORT), lengths_cov=lengths_cov, speed=speed), source
 

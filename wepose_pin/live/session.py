@@ -13,12 +13,12 @@ from ..subject import Subject, load_subject
 from ..writers.live_log import LiveLog
 from ..writers.result import versions
 from .loop import Ended, LiveLoop, Output, warm
+from .setup import SensorSetup, read_setup
 from .sources.base import Source
 from .sources.replay import ReplaySource
-from .wearing import Wearing, read_wearing
 
 
-def wearing_of(source: Source | None, subject: str | Path | None, session: str | Path | None) -> Wearing:
+def find_setup(source: Source | None, subject: str | Path | None, session: str | Path | None) -> SensorSetup:
     """Who wears the sensors: of a replay as its session has it, else as `session` states.
 
     Raises
@@ -33,15 +33,15 @@ def wearing_of(source: Source | None, subject: str | Path | None, session: str |
         path = Path(subject)
         text = (path / "subject.toml" if path.is_dir() else path).read_text(encoding="utf-8")
     if session is not None:
-        return read_wearing(Path(session), who, text)
+        return read_setup(Path(session), who, text)
     if isinstance(source, ReplaySource):
-        return Wearing.of(source.recording, who, text)
-    return Wearing(subject=who, subject_text=text)
+        return SensorSetup.from_recording(source.recording, who, text)
+    return SensorSetup(subject=who, subject_text=text)
 
 
 def run_session(
     source: Source,
-    wearing: Wearing,
+    setup: SensorSetup,
     *,
     method: str = BEST,
     model: BodyModel | None = None,
@@ -57,20 +57,20 @@ def run_session(
     WeposeError
         No such source; a sensor whose mount nobody knows; a file that is there.
     """
-    wearing, record = wearing.as_recorded(), None if record is None else Path(record)
+    setup, record = setup.as_recorded(), None if record is None else Path(record)
     if record is not None and record.exists() and not force:
         raise ExistingOutput(f"{record}: exists; --force replaces it, --record names another file")
-    _check_mounts(source.sensors, wearing)
+    _check_mounts(source.sensors, setup)
     warm(method)  # while nothing is lost by it
     source.open()
     log = None
     try:
-        _check_mounts(source.sensors, wearing)
+        _check_mounts(source.sensors, setup)
         if record is not None:
-            header = wearing.header(source.sensors) | {"method": method, "versions": versions()}
+            header = setup.header(source.sensors) | {"method": method, "versions": versions()}
             log = LiveLog(record, header, force)
         begin = _begin(source.recording) if isinstance(source, ReplaySource) else None
-        loop = LiveLoop(source, wearing, method=method, model=model, log=log, outputs=outputs, begin=begin)
+        loop = LiveLoop(source, setup, method=method, model=model, log=log, outputs=outputs, begin=begin)
     except BaseException:
         source.close()
         if log is not None:
@@ -83,12 +83,12 @@ def _begin(recording: Recording) -> float:
     return float(recording.time[0])
 
 
-def _check_mounts(sensors: Sequence[str], wearing: Wearing) -> None:
+def _check_mounts(sensors: Sequence[str], setup: SensorSetup) -> None:
     """Before anybody stands still: each sensor's mount is known."""
-    calibrated = wearing.subject.mounts if wearing.subject is not None and wearing.strapping != "new" else {}
-    unknown = [name for name in sensors if name not in calibrated and name not in wearing.mounts]
+    calibrated = setup.subject.mounts if setup.subject is not None and not setup.remounted else {}
+    unknown = [name for name in sensors if name not in calibrated and name not in setup.mounts]
     if unknown:
         raise BadSession(
-            f"{wearing.name}: how the sensor of {unknown[0]} is mounted is not known: give --subject with calibrated "
+            f"{setup.name}: how the sensor of {unknown[0]} is mounted is not known: give --subject with calibrated "
             f'mounts, or --session with [sensors.{unknown[0]}] mount = {{ up = "+x", forward = "-z" }}'
         )

@@ -19,8 +19,8 @@ def load_session(path: str | Path, gaps: bool = False) -> Recording:
     Parameters
     ----------
     path : the session file, or its folder; a file of `wepose live --record`
-    gaps : accept lost samples for longer than 50 ms: they are bridged, and marked in `Sensor.gap`. Of a live recording
-        they always are
+    gaps : accept lost samples for longer than 50 ms: they are bridged, and marked in the sensor's `gap`. Of a live
+        recording they always are
 
     Raises
     ------

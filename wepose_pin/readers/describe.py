@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, MissingFile, WeposeError, one_of
-from ..recording import AXES, CONFIGURATION, SEGMENTS, Recording, Sensor, format_time, span_text
+from ..recording import AXES, CONFIGURATION, SEGMENTS, ImuSensor, OrientationSensor, Recording, format_time, span_text
 from ..recording.clocks import TIME_UNITS, time_unit_of
 from ..recording.gaps import runs
 from ..recording.limits import LONGEST_STEP_S
+from ..recording.sensors import angular_rate
 from .arrays import ArrayFile, is_array_file
 from .device import Device
 from .formats import TITLES, format_of, read_device
@@ -391,25 +391,19 @@ def rests(recording: Recording) -> list[tuple[float, float]]:
     blocks = len(recording) // size
     still = np.ones(blocks, dtype=bool)
     for sensor in recording.sensors.values():
-        rate, force = _rate(sensor, recording.rate_hz)[: blocks * size].reshape(blocks, size, 3), sensor.accel_S
-        about = rate if sensor.ready else rate - rate.mean(axis=1, keepdims=True)
+        rate = angular_rate(sensor, recording.rate_hz)[: blocks * size].reshape(blocks, size, 3)
+        about = rate - rate.mean(axis=1, keepdims=True) if isinstance(sensor, ImuSensor) else rate
         still &= np.sqrt((about**2).sum(axis=2).mean(axis=1)) < REST_GYRO
         # A bias is below the rate of whoever turns evenly.
         still &= np.linalg.norm(rate.mean(axis=1), axis=1) < 3.0 * REST_GYRO
-        if force is not None:
-            still &= np.sqrt(force[: blocks * size].reshape(blocks, size, 3).var(axis=1).sum(axis=1)) < REST_ACCEL
+        if isinstance(sensor, ImuSensor):
+            still &= (
+                np.sqrt(sensor.accel_S[: blocks * size].reshape(blocks, size, 3).var(axis=1).sum(axis=1)) < REST_ACCEL
+            )
         if sensor.gap is not None:
             still &= ~sensor.gap[: blocks * size].reshape(blocks, size).any(axis=1)
     spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in runs(still)]
     return [(first, last) for first, last in spans if last - first >= SHORTEST_REST_S - BLOCK_S]
-
-
-def _rate(sensor: Sensor, rate_hz: float) -> np.ndarray:
-    if sensor.gyro_S is not None:
-        return sensor.gyro_S
-    R = Rotation.from_quat(sensor.quat_WS)
-    turned = (R[:-1].inv() * R[1:]).as_rotvec() * rate_hz
-    return np.concatenate([turned[:1], turned])
 
 
 def _mount_comment(recording: Recording, segment: str, still: list[tuple[float, float]]) -> list[str]:
@@ -418,12 +412,12 @@ def _mount_comment(recording: Recording, segment: str, still: list[tuple[float, 
     if sensor is None or sensor.aligned:
         return []
     up = "+x"
-    if sensor.accel_S is not None:
+    if isinstance(sensor, ImuSensor):
         rest = sensor.accel_S[recording.span(still[0])] if still else sensor.accel_S[: max(1, round(recording.rate_hz))]
         up = max(AXES, key=lambda axis: float(AXES[axis] @ rest.mean(axis=0)))
     forward = "-z" if up[1] != "z" else "+x"
     said = f"up as gravity says {'at rest' if still else 'in the first second'}; which axis is forward?"
-    if sensor.accel_S is None:
+    if isinstance(sensor, OrientationSensor):
         said = "which sensor axis is up, which forward, in the start pose? none: the segment's own orientation"
     return [f'# mount = {{ up = "{up}", forward = "{forward}" }}   # {said}']
 
@@ -444,13 +438,12 @@ def _facts(recording: Recording) -> tuple[str, ...]:
 def _rows(recording: Recording, labels: Mapping[str, str]) -> tuple[tuple[str, ...], ...]:
     rows = []
     for segment, sensor in recording.sensors.items():
-        if sensor.accel_S is not None:
-            assert sensor.gyro_S is not None
+        if isinstance(sensor, ImuSensor):
             fast = f"{np.degrees(np.linalg.norm(sensor.gyro_S, axis=1).max()):.0f} deg/s"
             gravity = f"{np.median(np.linalg.norm(sensor.accel_S, axis=1)):.2f} m/s²"
             holds = "gyro, accel"
         else:
-            fast = f"{np.degrees(np.linalg.norm(_rate(sensor, recording.rate_hz), axis=1).max()):.0f} deg/s"
+            fast = f"{np.degrees(np.linalg.norm(angular_rate(sensor, recording.rate_hz), axis=1).max()):.0f} deg/s"
             holds, gravity = "segment's orientation" if sensor.aligned else "orientation", ""
         lost = runs(sensor.gap) if sensor.gap is not None else []
         longest = max((b - a for a, b in lost), default=0) / recording.rate_hz

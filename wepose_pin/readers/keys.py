@@ -65,8 +65,11 @@ class Keys:
     def at(self, key: str) -> str:
         return f"{self.file}: {self.place}{key}"
 
-    def allow(self, *known: str) -> None:
+    def allow(self, *known: str, renamed: Mapping[str, str] | None = None) -> None:
+        """Refuse keys that are not known; `renamed` says what to write in place of those of an earlier version."""
         for key in self.values:
+            if renamed and key in renamed:
+                raise BadSession(f"{self.at(key)} {renamed[key]}")
             if key not in known:
                 raise BadSession(f"{self.at(key)} is not a known key; {one_of(known, key)}")
 
@@ -91,6 +94,12 @@ class Keys:
             raise BadSession(f"{self.at(key)} is missing; {one_of(choices)}")
         if value not in choices:
             raise BadSession(f"{self.at(key)} = '{value}' is not known; {one_of(choices, value)}")
+        return value
+
+    def flag(self, key: str) -> bool:
+        value = self.values.get(key, False)
+        if not isinstance(value, bool):
+            raise BadSession(f"{self.at(key)} = {value!r} is neither true nor false")
         return value
 
     def number(self, key: str, default: float | None, positive: bool = False) -> float | None:

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import BadData, MissingFile
-from ..recording import SEGMENTS, Recording, Sensor, check
+from ..recording import SEGMENTS, ImuSensor, Recording, check
 from ..recording.arrivals import Aligner, Arrivals, Ticks
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
@@ -32,6 +32,7 @@ from .stated import phases_stated
 
 MAGIC = b"WEPOSE-LIVE-1\n"
 SUFFIX = ".wepose"
+FORMAT = 2  # of the header
 BLOCK = struct.Struct("<4sII")
 HEAD, SAMPLES, EVENT, POSES = b"HEAD", b"SMPL", b"EVNT", b"POSE"
 _NUMBERS = ((1, 1), (3, 9), (3, 33))  # of a block of samples: numbers a sample, bytes a sample before them
@@ -131,9 +132,7 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
         raise BadData(f"{path}: {what}: a live recording holds raw data with times of their own; leave it out")
     log = read_live_log(path)
     values = {}
-    for label, sensor in log.recording.sensors.items():
-        assert sensor.gyro_S is not None
-        assert sensor.accel_S is not None
+    for label, sensor in log.recording.imus.items():
         lost = np.zeros((len(log.recording), 1), dtype=bool) if sensor.gap is None else sensor.gap[:, None]
         values[label] = {
             "gyro": np.where(lost, np.nan, sensor.gyro_S),
@@ -178,12 +177,15 @@ def _header(path: Path, payload: bytes) -> dict[str, Any]:
     header = _json(path, payload)
     sensors = header.get("sensors")
     named = isinstance(sensors, list) and sensors and all(name in SEGMENTS for name in sensors)
-    if header.get("format") != 1 or not named or len(set(sensors or ())) < len(sensors or ()):
-        raise BadData(f"{path}: format {header.get('format')!r} with sensors {sensors!r}; this version reads format 1")
-    texts = [header.get(key) for key in ("name", "start_pose", "strapping", "method")]
+    if header.get("format") != FORMAT or not named or len(set(sensors or ())) < len(sensors or ()):
+        raise BadData(
+            f"{path}: format {header.get('format')!r} with sensors {sensors!r}; this version reads format {FORMAT}"
+        )
+    texts = [header.get(key) for key in ("name", "start_pose", "method")]
     mounts, phases = header.get("mounts"), header.get("phases")
-    if not (all(isinstance(text, str) for text in texts) and isinstance(header.get("subject") or "", str)):
-        raise BadData(f"{path}: its header lacks name, start_pose, strapping or method; the file is damaged")
+    well = isinstance(header.get("subject") or "", str) and isinstance(header.get("remounted"), bool)
+    if not (well and all(isinstance(text, str) for text in texts)):
+        raise BadData(f"{path}: its header lacks name, start_pose, remounted or method; the file is damaged")
     if not (isinstance(mounts, dict) and all(_is_quat(mount) for mount in mounts.values())):
         raise BadData(f"{path}: mounts = {mounts!r} in its header; a unit quaternion x, y, z, w each is needed")
     phases_stated(Keys(phases if isinstance(phases, dict) else {"phases": phases}, str(path), "phases."))
@@ -254,7 +256,7 @@ def recording_of(
 
     Parameters
     ----------
-    header : name, sensors, mounts, phases, start_pose, strapping, as in `HEAD`
+    header : name, sensors, mounts, phases, start_pose, remounted, as in `HEAD`
     start : first and last tick of the start pose
     resets : ticks before which headings were set anew
 
@@ -276,7 +278,7 @@ def recording_of(
             raise BadData(f"{source or header['name']}: sensors.{name} never sent a sample")
         marks = np.where(lost, LONG, GOOD).astype(np.int8)  # short holes were bridged when they were live
         stated = header["mounts"].get(name)
-        sensors[name] = Sensor(
+        sensors[name] = ImuSensor(
             gyro_S=bridge(np.ascontiguousarray(gyro[:, i]), marks, clock, rate=True),
             accel_S=bridge(np.ascontiguousarray(accel[:, i]), marks, clock),
             stated_quat_LS=None if stated is None else np.array(stated),
@@ -294,7 +296,7 @@ def recording_of(
         sensors,
         phases,
         header["start_pose"],
-        header["strapping"],
+        header["remounted"],
         source,
         resets=tuple(tick - first for tick in resets),
     )

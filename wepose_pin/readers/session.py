@@ -15,7 +15,9 @@ from ..recording import (
     CONFIGURATION,
     SEGMENTS,
     START_POSES,
+    ImuSensor,
     Intervals,
+    OrientationSensor,
     Recording,
     Sensor,
     check,
@@ -32,7 +34,16 @@ from .arrays import ArrayFile, is_array_file
 from .device import Device
 from .formats import FORMATS, USES, format_of, read_device
 from .keys import Keys, is_number, read_toml
-from .stated import WIDTHS, Stated, joints_stated, label_stated, phases_stated, sensor_stated, truth_stated
+from .stated import (
+    WIDTHS,
+    Stated,
+    joints_stated,
+    label_stated,
+    phases_stated,
+    sensor_stated,
+    session_keys,
+    truth_stated,
+)
 from .tables import FORMATS as TABLES
 from .tables import Rows, columns, one_column, read_table
 
@@ -54,7 +65,7 @@ def load_session(path: str | Path, gaps: bool = False) -> Recording:
     Parameters
     ----------
     path : the session file, or its folder
-    gaps : accept lost samples for longer than 50 ms: they are bridged, and marked in `Sensor.gap`
+    gaps : accept lost samples for longer than 50 ms: they are bridged, and marked in the sensor's `gap`
 
     Raises
     ------
@@ -128,7 +139,7 @@ class SessionReader:
     Attributes
     ----------
     time, rate_hz : the common time base (n,) [s], and its rate
-    phases, start_pose, strapping : as of the `Recording`, whole
+    phases, start_pose, remounted : as of the `Recording`, whole
     any_aligned : whether a sensor's orientations are its segment's own
     """
 
@@ -143,8 +154,7 @@ class SessionReader:
         path = Path(path)
         self.path = path / "session.toml" if path.is_dir() else path
         self.gaps = gaps
-        top = Keys(read_toml(self.path, "a session file") if values is None else values, str(self.path))
-        top.allow("name", "start_pose", "strapping", "data", "phases", "sensors", "joints")
+        top = session_keys(read_toml(self.path, "a session file") if values is None else values, self.path)
         data, sensors = top.table("data"), top.table("sensors", {})
         data.allow(*_FOR_SENSORS, "truth")
         self._used: set[str] = set()  # which of `_FOR_SENSORS` some sensor had a use for
@@ -164,7 +174,7 @@ class SessionReader:
             phases=phases_stated(top.table("phases", {})),
             start_pose=start_pose,
             joints=joints_stated(top, start_pose),
-            strapping=top.choice("strapping", ("as_calibrated", "new"), "as_calibrated"),
+            remounted=top.flag("remounted"),
             source=self.path,
             truth=truth_stated(self.path, data),
         )
@@ -202,7 +212,7 @@ class SessionReader:
         )
         self.rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
         check_phases(str(self.path), self.time, self._head.phases)
-        self.phases, self.start_pose, self.strapping = self._head.phases, start_pose, self._head.strapping
+        self.phases, self.start_pose, self.remounted = self._head.phases, start_pose, self._head.remounted
         self.any_aligned = any(plan.aligned for plan in self._plans.values())
         self._refuse_shared_columns()
         self._scanned: Scan | None = None
@@ -406,12 +416,12 @@ class SessionReader:
             clock = replace(plan.clock, time=plan.clock.time[low:high], row=plan.clock.row[low:high])
             sensor, marks = self._sensor(plan, clock, tables[plan.table], rows[plan.table].start)
             if not self._resampled:
-                sensors[segment] = _cut(sensor, first - low, last - low)
+                sensors[segment] = sensor.part(slice(first - low, last - low))
                 marks = marks[first - low : last - low]
             else:
                 before = 1 if first else 0  # a rate needs the sample before it
                 sensor = on_time(sensor, clock.time, self.time[first - before : last])
-                sensors[segment] = _cut(sensor, before, last - first + before)
+                sensors[segment] = sensor.part(slice(before, last - first + before))
             for text in _gap_notes(marks, clock.step):
                 bridged.setdefault(text, []).append(segment)
         gap_notes = [f"sensors.{', '.join(names)}: {text}" for text, names in bridged.items()]
@@ -472,12 +482,12 @@ class SessionReader:
         if "orientation" in found:
             edges = self._scan().orientations[segment].around(clock, marks["orientation"])
             quat = bridge_quat(found["orientation"][0], marks["orientation"], clock, *edges)
-            return Sensor(quat_WS=quat, stated_quat_LS=plan.mount, gap=gap, aligned=plan.aligned), every
+            return OrientationSensor(quat, plan.mount, gap, plan.aligned), every
         gyro_S = bridge(found["gyro"][0], marks["gyro"], clock, rate=True)
         accel_S = bridge(found["accel"][0], marks["accel"], clock)
         marked = np.where(frozen, GOOD, every)  # what the notes call gaps
         gyro_range = self._scan().sensors[segment].gyro_range
-        return Sensor(gyro_S=gyro_S, accel_S=accel_S, stated_quat_LS=plan.mount, gap=gap, gyro_range=gyro_range), marked
+        return ImuSensor(gyro_S, accel_S, plan.mount, gap, gyro_range), marked
 
     def _signal(
         self, plan: _Plan, name: str, clock: Clock, table: pl.DataFrame, first_row: int
@@ -530,11 +540,6 @@ def _within(phases: Mapping[str, Intervals], time: np.ndarray) -> dict[str, Inte
     low, high = float(time[0]), float(time[-1])
     cut = {name: tuple((max(a, low), min(b, high)) for a, b in spans) for name, spans in phases.items()}
     return {name: kept for name, spans in cut.items() if (kept := tuple(s for s in spans if s[0] < s[1]))}
-
-
-def _cut(sensor: Sensor, first: int, last: int) -> Sensor:
-    signals = {name: getattr(sensor, name) for name in ("gyro_S", "accel_S", "quat_WS", "gap")}
-    return replace(sensor, **{name: v[first:last] for name, v in signals.items() if v is not None})
 
 
 def _too_long(clock: Clock) -> str:

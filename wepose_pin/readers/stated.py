@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from ..recording import AXES, CONFIGURATION, Intervals, mount_from_axes
 from .device import Device
 from .keys import Keys, is_number
 
+SESSION_KEYS = ("name", "start_pose", "remounted", "data", "phases", "sensors", "joints")
+# Of earlier versions: what to write in their place.
+_RENAMED = {"strapping": 'is called remounted now: write remounted = true where it was "new", else leave it out'}
 WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
 
 
@@ -24,6 +27,13 @@ class Stated(NamedTuple):
     aligned: bool | None
 
 
+def session_keys(values: Mapping[str, Any], path: Path) -> Keys:
+    """The keys of a session file, all of which are known."""
+    keys = Keys(values, str(path))
+    keys.allow(*SESSION_KEYS, renamed=_RENAMED)
+    return keys
+
+
 def sensor_stated(keys: Keys) -> Stated:
     """Columns by signal, the mount, and whether the orientations are the segment's own."""
     keys.allow(
@@ -31,9 +41,7 @@ def sensor_stated(keys: Keys) -> Stated:
         *("format", "label", "aligned"),
     )
     mount = _mount(keys.table("mount")) if "mount" in keys else None
-    aligned = keys.values.get("aligned")
-    if aligned is not None and not isinstance(aligned, bool):
-        raise BadSession(f"{keys.at('aligned')} = {aligned!r} is neither true nor false")
+    aligned = keys.flag("aligned") if "aligned" in keys else None
     named = [key for key in WIDTHS if key in keys]
     if not named:
         return Stated(None, mount, aligned)

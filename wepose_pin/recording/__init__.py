@@ -6,8 +6,8 @@ sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a f
 """
 
 from .intervals import Intervals, check_phases, check_time, format_time, span_text
-from .recording import CONFIGURATION, EACH_TIME, START_POSES, STRAPPINGS, Recording, check, join
-from .sensors import AXES, SEGMENTS, Sensor, axes_from_mount, mount_from_axes
+from .recording import CONFIGURATION, EACH_TIME, START_POSES, Recording, check, join
+from .sensors import AXES, SEGMENTS, ImuSensor, OrientationSensor, Sensor, axes_from_mount, mount_from_axes
 
 __all__ = [
     "AXES",
@@ -15,8 +15,9 @@ __all__ = [
     "EACH_TIME",
     "SEGMENTS",
     "START_POSES",
-    "STRAPPINGS",
+    "ImuSensor",
     "Intervals",
+    "OrientationSensor",
     "Recording",
     "Sensor",
     "axes_from_mount",

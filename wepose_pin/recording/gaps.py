@@ -1,8 +1,8 @@
 """Lost samples: which are bridged in silence, which are marked, and what stands in their place.
 
 A sample is lost where its row is not there (a step in time) or its cells are empty. Up to `clocks.LONGEST_GAP_S` of
-lost samples are bridged: the rate and the specific force linearly, ready orientations along the shortest rotation. What
-is longer is an error, or is bridged and marked where the user allows it.
+lost samples are bridged: the rate and the specific force linearly, measured orientations along the shortest rotation.
+What is longer is an error, or is bridged and marked where the user allows it.
 """
 
 from __future__ import annotations

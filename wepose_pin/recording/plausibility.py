@@ -26,7 +26,7 @@ from .limits import (
     STANDARD_GRAVITY,
 )
 from .recording import Recording
-from .sensors import Sensor
+from .sensors import ImuSensor
 
 WINDOW_S = 2.0  # over which specific force averages to gravity
 WINDOWS = 40  # those with most motion
@@ -54,11 +54,9 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
         Values that cannot be: of another unit, or out of every sensor's range.
     """
     notes: list[str] = []
-    for segment, sensor in recording.sensors.items():
-        if sensor.gyro_S is None or sensor.accel_S is None:
-            continue
+    for segment, sensor in recording.imus.items():
         place = f"{recording.where()}: sensors.{segment}"
-        notes += _gravity(recording, segment, place, whole)
+        notes += _gravity(recording, segment, sensor, place, whole)
         if units:
             _gyro_unit(sensor, recording.rate_hz, place)
         _range(recording.time, sensor.gyro_S, HIGHEST_RATE, "rad/s", f"{place}.gyro")
@@ -71,10 +69,8 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
     return tuple(notes)
 
 
-def _gravity(recording: Recording, segment: str, place: str, whole: bool) -> list[str]:
-    sensor = recording.sensors[segment]
-    assert sensor.accel_S is not None
-    name = next((name for name in ("still", "start") if recording.phases.get(name)), "")
+def _gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, whole: bool) -> list[str]:
+    name = next((name for name in ("static", "start") if recording.phases.get(name)), "")
     if name:
         at_rest, when = recording.measured(segment, recording.phases[name][0]), f"in phases.{name}"
     elif whole:
@@ -105,9 +101,8 @@ def _accel_unit(norm: float) -> str:
     return "check data.accel_unit and the sensor's calibration, and that it rests there"
 
 
-def _quiet_second(recording: Recording, sensor: Sensor) -> np.ndarray:
+def _quiet_second(recording: Recording, sensor: ImuSensor) -> np.ndarray:
     """Samples of the second, measured as a whole, in which the rate varies least; empty where there is none."""
-    assert sensor.gyro_S is not None
     n = len(recording)
     size = min(n, max(2, round(recording.rate_hz)))
     count = n // size
@@ -118,9 +113,7 @@ def _quiet_second(recording: Recording, sensor: Sensor) -> np.ndarray:
     return np.arange(first * size, (first + 1) * size) if np.isfinite(motion[first]) else np.empty(0, dtype=int)
 
 
-def _gyro_unit(sensor: Sensor, rate_hz: float, place: str) -> None:
-    assert sensor.gyro_S is not None
-    assert sensor.accel_S is not None
+def _gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
     gyro_S = sensor.gyro_S
     size = round(WINDOW_S * rate_hz)
     count = len(gyro_S) // size

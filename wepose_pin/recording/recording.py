@@ -12,10 +12,9 @@ from ..arguments import Positive, check_array, check_fields, check_finite, check
 from ..errors import BadData, BadOption, BadPhase, one_of
 from .intervals import Intervals, check_phases, check_time
 from .limits import MEDIAN_FORCE
-from .sensors import SEGMENTS, Sensor
+from .sensors import SEGMENTS, ImuSensor, OrientationSensor, Sensor, join_parts
 
 START_POSES = ("n_pose",)
-STRAPPINGS = ("as_calibrated", "new")
 CONFIGURATION = "configuration"  # the start pose of any other chain: values of its joints; sensors are named by links
 
 RATE_OFF = 0.01  # share by which the stated rate may be off that of the times: its error is one of all angles
@@ -33,7 +32,7 @@ class Recording:
     time : (n,) [s], uniform at `rate_hz` to within the clock's jitter
     sensors : one a segment
     phases : name → intervals [s] on `time`; `start` is the start pose, `still` sensors at rest
-    strapping : "as_calibrated" or "new": whether a subject's calibrated mounts hold here
+    remounted : the sensors were strapped on anew since the subject's calibration: its mounts do not hold here
     source : the file it was read from, for messages
     truth : file with the reference, where there is one
     resets : samples before which headings were set anew, live: the person stood in the start pose
@@ -47,7 +46,7 @@ class Recording:
     sensors: Mapping[str, Sensor]
     phases: Mapping[str, Intervals] = field(default_factory=dict)
     start_pose: str = "n_pose"
-    strapping: str = "as_calibrated"
+    remounted: bool = False
     source: Path | None = None
     truth: Path | None = None
     resets: tuple[int, ...] = ()
@@ -66,14 +65,19 @@ class Recording:
             As `check`; specific forces in another unit, which reading a file would have found.
         """
         check(self)
-        for segment, sensor in self.sensors.items():
-            force = 0.0 if sensor.accel_S is None else float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
+        for segment, sensor in self.imus.items():
+            force = float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
             if force and not MEDIAN_FORCE[0] < force < MEDIAN_FORCE[1]:
                 raise BadData(
                     f"{self.where()}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed, 9.8 "
                     f"where nothing moves"
                 )
         return self
+
+    @property
+    def imus(self) -> dict[str, ImuSensor]:
+        """The sensors that have a gyroscope and an accelerometer."""
+        return {segment: sensor for segment, sensor in self.sensors.items() if isinstance(sensor, ImuSensor)}
 
     def where(self) -> str:
         """Beginning of an error's text: the file, or the recording's name."""
@@ -93,16 +97,7 @@ class Recording:
     def cut(self, span: slice) -> Recording:
         """The samples of a span; phases as they were."""
         first, last, _ = span.indices(len(self))
-
-        def rows(values: np.ndarray | None) -> np.ndarray | None:
-            return None if values is None else values[first:last]
-
-        sensors = {
-            name: replace(
-                of, gyro_S=rows(of.gyro_S), accel_S=rows(of.accel_S), quat_WS=rows(of.quat_WS), gap=rows(of.gap)
-            )
-            for name, of in self.sensors.items()
-        }
+        sensors = {name: sensor.part(slice(first, last)) for name, sensor in self.sensors.items()}
         resets = tuple(tick - first for tick in self.resets if first <= tick < last)
         return replace(self, time=self.time[first:last], sensors=sensors, resets=resets)
 
@@ -141,19 +136,7 @@ class Recording:
 def join(first: Recording, second: Recording) -> Recording:
     """Two recordings of the same sensors, one after the other; all else is the first one's."""
 
-    def rows(a: np.ndarray | None, b: np.ndarray | None) -> np.ndarray | None:
-        return None if a is None or b is None else np.concatenate([a, b])
-
-    sensors = {}
-    for name, of in first.sensors.items():
-        after = second.sensors[name]
-        sensors[name] = replace(
-            of,
-            gyro_S=rows(of.gyro_S, after.gyro_S),
-            accel_S=rows(of.accel_S, after.accel_S),
-            quat_WS=rows(of.quat_WS, after.quat_WS),
-            gap=rows(of.gap, after.gap),
-        )
+    sensors = {name: join_parts([sensor, second.sensors[name]]) for name, sensor in first.sensors.items()}
     resets = (*first.resets, *(len(first) + tick for tick in second.resets))
     return replace(first, time=np.concatenate([first.time, second.time]), sensors=sensors, resets=resets)
 
@@ -173,9 +156,9 @@ def check(recording: Recording) -> Recording:
     """
     where, time = recording.where(), recording.time
     check_fields(recording, f"{where}: ")
-    for name, choices in (("start_pose", (*START_POSES, CONFIGURATION)), ("strapping", STRAPPINGS)):
-        if getattr(recording, name) not in choices:
-            raise BadOption(f"{where}: {name} = '{getattr(recording, name)}' is not known; {one_of(choices)}")
+    start_poses = (*START_POSES, CONFIGURATION)
+    if recording.start_pose not in start_poses:
+        raise BadOption(f"{where}: start_pose = '{recording.start_pose}' is not known; {one_of(start_poses)}")
     if recording.start_pose != CONFIGURATION:  # else they are links
         links = f'; a chain\'s links need start_pose = "{CONFIGURATION}"'
         check_names(f"{where}: sensors", recording.sensors, SEGMENTS, links)
@@ -189,35 +172,36 @@ def check(recording: Recording) -> Recording:
     if not all(0 <= tick < len(time) for tick in recording.resets):
         raise BadOption(f"{where}: resets = {recording.resets}: samples from 0 to {len(time) - 1} are needed")
     for segment, sensor in recording.sensors.items():
-        for name, values, width in (
-            ("gyro", sensor.gyro_S, 3),
-            ("accel", sensor.accel_S, 3),
-            ("orientation", sensor.quat_WS, 4),
-        ):
-            if values is None:
-                continue
-            place = f"{where}: sensors.{segment}.{name}"
-            check_array(place, values, (len(time), width), rows=EACH_TIME)
-            bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-            if bad.size:
-                raise BadData(
-                    f"{place}: not a finite number at {time[bad[0]]:.3f} s (sample {bad[0] + 1}, {bad.size} in all); "
-                    f"fill or cut the gap first"
-                )
-            if name == "orientation" and np.any(np.abs(np.linalg.norm(values, axis=1) - 1.0) > 1e-6):
-                k = int(np.argmax(np.abs(np.linalg.norm(values, axis=1) - 1.0)))
-                raise BadData(f"{place}: no unit quaternion at {time[k]:.3f} s: length {np.linalg.norm(values[k]):.6g}")
-        place = f"{where}: sensors.{segment}"
-        if sensor.stated_quat_LS is not None:
-            check_array(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,))
-            check_finite(f"{place}.stated_quat_LS", sensor.stated_quat_LS)
-            check_unit(f"{place}.stated_quat_LS", sensor.stated_quat_LS, 1e-6)
-        if sensor.gap is not None:
-            check_array(f"{place}.gap", sensor.gap, (len(time),), "b", EACH_TIME)
-        if (sensor.gyro_S is None) != (sensor.accel_S is None) or (sensor.gyro_S is None) == (sensor.quat_WS is None):
-            raise BadData(f"{where}: sensors.{segment} has neither gyro and accel nor orientation")
+        _check_sensor(f"{where}: sensors.{segment}", time, sensor)
     check_phases(where, time, recording.phases)
     return recording
+
+
+def _check_sensor(place: str, time: np.ndarray, sensor: Sensor) -> None:
+    """Each array has a finite row for each time (n,) [s], and quaternions are unit ones."""
+    if isinstance(sensor, ImuSensor):
+        arrays = {"gyro": (sensor.gyro_S, 3), "accel": (sensor.accel_S, 3)}
+    else:
+        arrays = {"orientation": (sensor.quat_WS, 4)}
+    for name, (values, width) in arrays.items():
+        check_array(f"{place}.{name}", values, (len(time), width), rows=EACH_TIME)
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if bad.size:
+            raise BadData(
+                f"{place}.{name}: not a finite number at {time[bad[0]]:.3f} s (sample {bad[0] + 1}, {bad.size} in "
+                f"all); fill or cut the gap first"
+            )
+    if isinstance(sensor, OrientationSensor):
+        length = np.linalg.norm(sensor.quat_WS, axis=1)
+        k = int(np.argmax(np.abs(length - 1.0)))
+        if abs(length[k] - 1.0) > 1e-6:
+            raise BadData(f"{place}.orientation: no unit quaternion at {time[k]:.3f} s: length {length[k]:.6g}")
+    if sensor.stated_quat_LS is not None:
+        check_array(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,))
+        check_finite(f"{place}.stated_quat_LS", sensor.stated_quat_LS)
+        check_unit(f"{place}.stated_quat_LS", sensor.stated_quat_LS, 1e-6)
+    if sensor.gap is not None:
+        check_array(f"{place}.gap", sensor.gap, (len(time),), "b", EACH_TIME)
 
 
 def _check_rate(where: str, time: np.ndarray, rate_hz: float) -> None:

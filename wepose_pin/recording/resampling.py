@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from .. import rotations
 from .clocks import UNEVEN
-from .sensors import Sensor
+from .sensors import OrientationSensor, Sensor
 
 
 def on_time(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
@@ -24,10 +24,8 @@ def on_time(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
         after = np.clip(np.searchsorted(clock, time - 1e-9), 0, len(clock) - 1)
         gap = sensor.gap[after] | (sensor.gap[np.maximum(after - 1, 0)] & (clock[after] > time + 1e-9))
     within = np.clip(time, clock[0], clock[-1])
-    if sensor.quat_WS is not None:
+    if isinstance(sensor, OrientationSensor):
         return replace(sensor, quat_WS=Slerp(clock, Rotation.from_quat(sensor.quat_WS))(within).as_quat(), gap=gap)
-    assert sensor.gyro_S is not None
-    assert sensor.accel_S is not None
     turned = rotations.integrate(sensor.gyro_S[1:] * np.diff(clock)[:, None])
     at = Slerp(clock, Rotation.from_quat(turned))(within)
     rate = (at[:-1].inv() * at[1:]).as_rotvec() / np.diff(time)[:, None]

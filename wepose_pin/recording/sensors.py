@@ -1,8 +1,9 @@
-"""`Sensor`: what one sensor measured, and which way it is mounted on its segment."""
+"""What one sensor measured, as `ImuSensor` or `OrientationSensor`, and how it is mounted on its segment."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -40,31 +41,77 @@ def axes_from_mount(quat_LS: np.ndarray) -> tuple[str, str]:
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """One sensor: either `gyro_S` and `accel_S`, or `quat_WS` from a device that fuses by itself.
+class ImuSensor:
+    """A gyroscope and an accelerometer.
 
     Parameters
     ----------
-    gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample; None for ready orientations
-    accel_S : (n, 3) [m/s²], specific force, +g up at rest; None for ready orientations
-    quat_WS : (n, 4) xyzw, sensor to a world of its own whose z points up; None for raw sensors
+    gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample
+    accel_S : (n, 3) [m/s²], specific force, +g up at rest
     stated_quat_LS : (4,) xyzw, the mount as the session states it, sensor to segment; None where it says nothing
     gap : (n,) bool, true where samples were lost for longer than is bridged in silence, or the sensor was frozen; None
         where neither can be
     gyro_range : [rad/s] from which on an axis of gyro is cut off; infinite where that is not known
+    """
+
+    gyro_S: np.ndarray
+    accel_S: np.ndarray
+    stated_quat_LS: np.ndarray | None = None
+    gap: np.ndarray | None = None
+    gyro_range: float = np.inf
+
+    @property
+    def aligned(self) -> bool:
+        """Not its segment's own orientation: it has none."""
+        return False
+
+    def part(self, samples: slice | np.ndarray) -> ImuSensor:
+        """The sensor at these samples."""
+        gap = None if self.gap is None else self.gap[samples]
+        return replace(self, gyro_S=self.gyro_S[samples], accel_S=self.accel_S[samples], gap=gap)
+
+
+@dataclass(frozen=True)
+class OrientationSensor:
+    """A device that gives measured orientations: it fuses by itself, and the filters are passed over.
+
+    Parameters
+    ----------
+    quat_WS : (n, 4) xyzw, sensor to a world of its own whose z points up
+    stated_quat_LS, gap : as of `ImuSensor`
     aligned : `quat_WS` is the segment's own orientation, in a world that is common to all that are aligned: only where
         that world's x points is taken from the start pose
     """
 
-    gyro_S: np.ndarray | None = None
-    accel_S: np.ndarray | None = None
-    quat_WS: np.ndarray | None = None
+    quat_WS: np.ndarray
     stated_quat_LS: np.ndarray | None = None
     gap: np.ndarray | None = None
     aligned: bool = False
-    gyro_range: float = np.inf
 
-    @property
-    def ready(self) -> bool:
-        """The sensor came with orientations."""
-        return self.quat_WS is not None
+    def part(self, samples: slice | np.ndarray) -> OrientationSensor:
+        """The sensor at these samples."""
+        return replace(self, quat_WS=self.quat_WS[samples], gap=None if self.gap is None else self.gap[samples])
+
+
+Sensor = ImuSensor | OrientationSensor
+
+
+def join_parts(parts: Sequence[Sensor]) -> Sensor:
+    """One sensor of its consecutive parts; mount and range are the last one's."""
+    gaps = [part.gap for part in parts if part.gap is not None]
+    gap = np.concatenate(gaps) if len(gaps) == len(parts) else None
+    if isinstance(parts[-1], ImuSensor):
+        imus = [part for part in parts if isinstance(part, ImuSensor)]
+        gyro_S, accel_S = np.concatenate([s.gyro_S for s in imus]), np.concatenate([s.accel_S for s in imus])
+        return replace(imus[-1], gyro_S=gyro_S, accel_S=accel_S, gap=gap)
+    fused = [part for part in parts if isinstance(part, OrientationSensor)]
+    return replace(fused[-1], quat_WS=np.concatenate([s.quat_WS for s in fused]), gap=gap)
+
+
+def angular_rate(sensor: Sensor, rate_hz: float) -> np.ndarray:
+    """(n, 3) [rad/s] in S, the rate over the interval that ends at the sample; of orientations the first repeats."""
+    if isinstance(sensor, ImuSensor):
+        return sensor.gyro_S
+    R = Rotation.from_quat(sensor.quat_WS)
+    rate = (R[:-1].inv() * R[1:]).as_rotvec() * rate_hz
+    return np.concatenate([rate[:1], rate])

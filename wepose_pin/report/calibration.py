@@ -385,9 +385,8 @@ def _run(
     calibration: Calibration, recording: Recording, contact: _Contact, method: str, gauge_std: float
 ) -> dict[str, Any]:
     gauge = [f"{plain(name)} {1e3 * v:.0f} ± {1e3 * gauge_std:.0f} mm" for name, v in calibration.gauge.items()]
-    raw = sorted(
-        {"ready orientations" if s.ready else "gyroscope and accelerometer" for s in recording.sensors.values()}
-    )
+    imu, fused = len(recording.imus), len(recording.sensors) - len(recording.imus)
+    raw = ["gyroscope and accelerometer"] * (imu > 0) + ["measured orientations"] * (fused > 0)
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
         ("sensors", f"{', '.join(map(plain, recording.sensors))} ({', '.join(raw)})"),
@@ -397,7 +396,7 @@ def _run(
         ("filter", method),
         ("measured lengths", ", ".join(gauge) or "none"),
         ("population prior", calibration.prior.note or calibration.prior.name),
-        ("strapping", recording.strapping.replace("_", " ")),
+        ("sensors strapped on anew", "yes" if recording.remounted else "no"),
         *(("while reading", note) for note in recording.notes),
         ("made with", versions()),
     ]

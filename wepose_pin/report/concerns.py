@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..recording import OrientationSensor
 from ..recording.limits import STANDARD_GRAVITY
 from ..tracking import TrackedRecording
 from .measures import BENT, Budget, Elbow, Hand, Signal, between, from_start, largest, longest
@@ -156,7 +157,7 @@ def _of_signals(pose: TrackedRecording, signals: Mapping[str, Signal], told: str
             False,
             f"the gyroscope's bias at the end is another than in the still phase: {which(moved)}",
             "The person swayed there, or the sensor warmed up. Record the sensors lying on a table first and name "
-            "those seconds `phases.still`.",
+            "those seconds `phases.static`.",
         )
     restless = {
         name: f"{100 * float(signal.rest.mean()):.1f} % of the time, {seconds:.0f} s without"
@@ -310,14 +311,14 @@ def _of_subject(pose: TrackedRecording) -> Iterator[Concern]:
             "Positions are off by centimetres where this person differs. Let the person hold the hands together for a "
             "minute, `wepose calibrate` it with one taped length, and track with `--subject`.",
         )
-    ready = [plain(name) for name, sensor in pose.recording.sensors.items() if sensor.ready]
-    if ready:
+    fused = [plain(name) for name, sensor in pose.recording.sensors.items() if isinstance(sensor, OrientationSensor)]
+    if fused:
         yield Concern(
             False,
-            f"ready orientations of the device: {listed(ready)}",
+            f"measured orientations of the device: {listed(fused)}",
             "They are taken as they come: their noise, bias, rest and uncertainty are the device's, not known here.",
         )
-    if pose.recording.strapping == "new" and pose.subject.mounts:
+    if pose.recording.remounted and pose.subject.mounts:
         yield Concern(
             False,
             "the sensors were strapped on anew: of the subject only the lengths are used",

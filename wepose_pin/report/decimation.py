@@ -137,10 +137,7 @@ def _joined_signal(parts: list[Signal]) -> Signal:
 def _decimated(tracked: TrackedRecording, at: np.ndarray, rate_hz: float) -> TrackedRecording:
     """The samples `at` of a recording, as if it had been recorded so slowly."""
     pose, recording, segments = tracked.pose, tracked.recording, tracked.segments
-    sensors = {}
-    for name, sensor in recording.sensors.items():
-        signals = {key: getattr(sensor, key) for key in ("gyro_S", "accel_S", "quat_WS", "gap")}
-        sensors[name] = replace(sensor, **{key: v[at] for key, v in signals.items() if v is not None})
+    sensors = {name: sensor.part(at) for name, sensor in recording.sensors.items()}
     orientation = {
         name: of._replace(**{field: _rows(getattr(of, field), at) for field in _OF_EACH_SAMPLE})
         for name, of in segments.orientation.items()

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..pose import Pose, spread
-from ..recording import Recording, Sensor
+from ..recording import OrientationSensor, Recording
 from ..recording.gaps import runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
 from ..recording.plausibility import cut_off
@@ -38,10 +38,10 @@ class Signal(NamedTuple):
     """One sensor's signal."""
 
     rate: np.ndarray  # (n,) [rad/s], how fast it turns
-    peak_accel: float  # [m/s²], NaN for ready orientations
+    peak_accel: float  # [m/s²], NaN for measured orientations
     cut: np.ndarray  # (n,) bool, an axis is cut off at the end of its range
     gap: np.ndarray  # (n,) bool, bridged over a long gap
-    rest: np.ndarray | None  # (n,) bool, still by the filter's test; None for ready orientations
+    rest: np.ndarray | None  # (n,) bool, still by the filter's test; None for measured orientations
     gyro_noise: float  # [rad/s], root mean square of an axis in the still phase
     accel_noise: float  # [m/s²], the same
     gravity: float  # [m/s²]
@@ -50,10 +50,10 @@ class Signal(NamedTuple):
 
 def signal_of(recording: Recording, name: str, pose: TrackedRecording) -> Signal:
     """The signal of a sensor, and what its filter found."""
-    sensor: Sensor = recording.sensors[name]
+    sensor = recording.sensors[name]
     nothing = np.zeros(len(recording), dtype=bool)
     gap = sensor.gap if sensor.gap is not None else nothing
-    if sensor.gyro_S is None or sensor.accel_S is None:
+    if isinstance(sensor, OrientationSensor):
         R = Rotation.from_quat(sensor.quat_WS)
         rate = (R[:-1].inv() * R[1:]).magnitude() * recording.rate_hz
         nan = float("nan")
@@ -100,7 +100,7 @@ def longest(which: np.ndarray, rate_hz: float) -> float:
 
 def stated_mounts(pose: TrackedRecording) -> bool:
     """The mounts are the session's and not calibrated ones."""
-    return not pose.subject.mounts or pose.recording.strapping == "new"
+    return not pose.subject.mounts or pose.recording.remounted
 
 
 # Headings -------------------------------------------------------------------------------------------------------------

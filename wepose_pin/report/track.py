@@ -150,8 +150,7 @@ def _drift(pose: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, A
     recording = pose.recording
     assert recording is not None
     if not budgets:
-        ready = all(sensor.ready for sensor in recording.sensors.values())
-        return {"method": None if ready else pose.options.method, "known": False}
+        return {"method": pose.options.method if recording.imus else None, "known": False}
     since = from_start(pose)
     stds = {name: np.nan_to_num(np.where(since, budget.std, 0.0)) for name, budget in budgets.items()}
     worst = max(stds, key=lambda name: float(stds[name].max()))
@@ -233,7 +232,7 @@ def _run(pose: TrackedRecording) -> dict[str, Any]:
     lengths = ", ".join(f"{plain(name)} {1e3 * value:.0f} mm" for name, value in subject.lengths.items())
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
-        ("filter", pose.options.method if pose.segments.orientation else "none: ready orientations"),
+        ("filter", pose.options.method if pose.segments.orientation else "none: measured orientations"),
         ("start pose", f"{recording.start_pose.replace('_', '-')}, {intervals([pose.segments.start])}"),
         ("still phase", intervals([pose.segments.still])),
         ("person", f"{subject.name}; {subject.note}" if subject.note else subject.name),

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..arguments import Count, NonNegative, Positive, check_arguments
 from ..errors import BadOption
 from ..pose import Pose
-from ..recording import Recording, Sensor, check, mount_from_axes
+from ..recording import ImuSensor, Recording, check, mount_from_axes
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, lost_samples
 from ..subject import LENGTHS, SEXES, Subject, average_subject, check_lengths
@@ -99,7 +99,7 @@ class Simulation:
         for segment, gyro_S in self.gyro_S.items():
             marks = lost_samples(clock, np.isfinite(gyro_S).all(axis=1))
             stated = self.stated_mount[segment]
-            sensors[segment] = Sensor(
+            sensors[segment] = ImuSensor(
                 gyro_S=bridge(gyro_S, marks, clock, rate=True),
                 accel_S=bridge(self.accel_S[segment], marks, clock),
                 stated_quat_LS=None if stated is None else mount_from_axes(*stated),

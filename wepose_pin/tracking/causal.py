@@ -30,7 +30,7 @@ from ..filters.bank import LiveBank, OneByOne, bank_of
 from ..filters.sensors import SensorFilters, filtered_chunk
 from ..filters.static import StaticTest
 from ..pose import spread
-from ..recording import Recording, join
+from ..recording import OrientationSensor, Recording, join
 from ..rotations import product
 from ..subject import Subject
 from .segments import Oriented
@@ -109,9 +109,9 @@ class CausalEstimator:
     def _wait(self, chunk: Recording) -> Recording:
         """Look for the end of the start pose in a chunk, and begin there; gives what of the chunk follows it."""
         for name, sensor in chunk.sensors.items():
-            if sensor.ready:
+            if isinstance(sensor, OrientationSensor):
                 raise BadOption(
-                    f"{chunk.where()}: sensors.{name} comes with ready orientations: there is no filter to run "
+                    f"{chunk.where()}: sensors.{name} comes with measured orientations: there is no filter to run "
                     f"causally; leave the option out"
                 )
         came = chunk if self._until is None else join(self._until, chunk)
@@ -124,7 +124,7 @@ class CausalEstimator:
         else:
             if self._guide is None:
                 self._guide = StartGuide(came.rate_hz, len(came.sensors))
-            rates = [of.gyro_S for of in chunk.sensors.values() if of.gyro_S is not None]
+            rates = [sensor.gyro_S for sensor in chunk.imus.values()]
             for tick in np.stack(rates, axis=1):
                 if self._guide.push(tick) == "ready":
                     break

@@ -68,12 +68,12 @@ class TrackedChain:
         return {
             "recording": self.recording.name,
             "session": str(self.recording.source) if self.recording.source else None,
-            "method": self.method if self.segments.orientation else "ready orientations",
+            "method": self.method if self.segments.orientation else "measured orientations",
             "model": self.model.name,
             "samples": len(self.time),
             "rate_hz": round(self.recording.rate_hz, 4),
             "duration_s": round(float(self.time[-1] - self.time[0]), 3),
-            "phases": {"start": list(self.segments.start), "still": list(self.segments.still)},
+            "phases": {"start": list(self.segments.start), "static": list(self.segments.still)},
             "start": dict(self.recording.joints),
             "orientation_residual_rms_deg": {
                 link: round(float(np.degrees(np.sqrt(np.mean(angle**2)))), 3) for link, angle in self.residual.items()

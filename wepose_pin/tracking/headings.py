@@ -66,7 +66,7 @@ class HeadingCorrector:
         self._chain = (*CHAIN, *(hand for hand in HANDS if hand in segments))
         self._subject, self._start, self._clasp = subject, begin, chunk.phases.get("clasp", ())
         # A hinge was seen through the mounts of its calibration and holds as long as they do.
-        self._hinges = subject.hinges if chunk.strapping != "new" else {}
+        self._hinges = subject.hinges if not chunk.remounted else {}
         self.has_observations = bool(self._hinges) or any(end >= begin for _, end in self._clasp)
         self._stride = max(1, round(chunk.rate_hz / SAMPLE_RATE_HZ))
         self._share = 1.0 / max(1.0, CORRELATION_S * chunk.rate_hz / self._stride)

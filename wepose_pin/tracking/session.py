@@ -76,7 +76,7 @@ def _chunks(reader: SessionReader, seconds: float, multiple: int) -> Iterator[Re
     def samples(duration_s: float) -> int:
         return max(1, int(np.ceil(duration_s * rate_hz / multiple))) * multiple
 
-    ends = [spans[0][1] for name, spans in reader.phases.items() if name in ("start", "still") and spans]
+    ends = [spans[0][1] for name, spans in reader.phases.items() if name in ("start", "static") and spans]
     first_s = max(seconds, max(ends or [time[0] + BEGINNING_S]) - time[0])
     first, size = 0, samples(first_s + 2.0 / rate_hz)
     while first < len(time):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import BadPhase
 from ..filters.phases import SWAYS_DEG, SWAYS_DEG_S
-from ..recording import Intervals, Recording, Sensor
+from ..recording import Intervals, OrientationSensor, Recording, Sensor
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
 
@@ -79,7 +79,7 @@ class StartGuide:
 
 
 def until_start(recording: Recording, interval: tuple[float, float]) -> Recording:
-    """From the start pose's begin, or that of a phase `still` before its end, to its end.
+    """From the start pose's begin, or that of a phase `static` before its end, to its end.
 
     What was lost in it is bridged by what is left of it: whoever reads a whole recording bridges with what came later.
 
@@ -89,12 +89,12 @@ def until_start(recording: Recording, interval: tuple[float, float]) -> Recordin
         A sensor that sent nothing in it.
     """
     before: dict[str, Intervals] = {"start": (interval,)}
-    still = recording.phases.get("still", ())
+    static = recording.phases.get("static", ())
     span = recording.span(interval)
     begin = span.start
-    if still and still[0][1] <= interval[1]:
-        before["still"] = still[:1]
-        begin = min(begin, recording.span(still[0]).start)
+    if static and static[0][1] <= interval[1]:
+        before["static"] = static[:1]
+        begin = min(begin, recording.span(static[0]).start)
     part = recording.cut(slice(begin, span.stop))
     clock = Clock(np.arange(len(part)) / part.rate_hz, np.arange(len(part)), 1.0 / part.rate_hz)
     sensors = {name: _bridged(part, name, clock) for name in part.sensors}
@@ -104,7 +104,7 @@ def until_start(recording: Recording, interval: tuple[float, float]) -> Recordin
 def _bridged(part: Recording, name: str, clock: Clock) -> Sensor:
     """A sensor with its gaps filled anew."""
     sensor = part.sensors[name]
-    if sensor.gap is None or not sensor.gap.any() or sensor.gyro_S is None or sensor.accel_S is None:
+    if isinstance(sensor, OrientationSensor) or sensor.gap is None or not sensor.gap.any():
         return sensor
     if sensor.gap.all():
         raise BadPhase(f"{part.where()}: phases.start: sensors.{name} sent nothing in it; name seconds in which all do")

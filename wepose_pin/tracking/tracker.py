@@ -147,7 +147,7 @@ def heading_corrector(oriented: Oriented, subject: Subject | None, options: Trac
     recording, segments = oriented
     if subject is None or not subject.mounts or options.causal or not options.correct_headings:
         return None
-    if recording.strapping == "new" or any(sensor.aligned for sensor in recording.sensors.values()):
+    if recording.remounted or any(sensor.aligned for sensor in recording.sensors.values()):
         return None  # frames that no calibration knows
     headings = HeadingCorrector(recording, segments.quat_WL, segments.start[1], subject)
     return headings if headings.has_chain and headings.has_observations else None

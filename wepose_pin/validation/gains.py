@@ -155,9 +155,7 @@ def _person(seed: int, imperfections: Imperfections) -> list[TuningTrial]:
     for phase in ("clasp", "circles"):
         moving[recording.span(recording.phases[phase][0])] = True
     found = []
-    for segment, sensor in recording.sensors.items():
-        assert sensor.gyro_S is not None
-        assert sensor.accel_S is not None
+    for segment, sensor in recording.imus.items():
         true = simulation.quat_WS[segment]
         found.append(_trial(sensor.gyro_S, sensor.accel_S, recording.rate_hz, true, rest, moving))
     return found

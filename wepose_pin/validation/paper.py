@@ -19,7 +19,7 @@ from .. import rotations
 from ..calibration import calibrate_lengths
 from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
 from ..filters.noise import noise_of
-from ..recording import Recording, Sensor
+from ..recording import OrientationSensor, Recording
 from ..simulation import (
     PERFECT_WORLD,
     REALISTIC,
@@ -152,7 +152,7 @@ def _error_budget(experiment: str, trial: str, seed: int) -> list[Result]:
         prior = person.average if label == "mounts as stated" else mounts_known(person.average, simulation)
         if label == "orientations exact":
             sensors = {
-                name: replace(sensor, gyro_S=None, accel_S=None, quat_WS=simulation.quat_WS[name])
+                name: OrientationSensor(simulation.quat_WS[name], sensor.stated_quat_LS, sensor.gap)
                 for name, sensor in recording.sensors.items()
             }
             recording = replace(recording, sensors=sensors)
@@ -198,15 +198,13 @@ def mounts_known(subject: Subject, simulation: Simulation) -> Subject:
 
 
 def oriented(recording: Recording, contender: Contender) -> tuple[Recording, str]:
-    """What `track` takes to run a contender: the recording and a method, or one of ready orientations."""
+    """What `track` takes to run a contender: the recording and a method, or one of measured orientations."""
     if contender.method is not None:
         return recording, contender.method
     sensors = {}
     rest = recording.span(recording.phases["start"][0])
-    for segment, sensor in recording.sensors.items():
-        assert sensor.gyro_S is not None
-        assert sensor.accel_S is not None
+    for segment, sensor in recording.imus.items():
         noise = noise_of(sensor.gyro_S[rest], sensor.accel_S[rest], recording.rate_hz)
         quat_WS = contender.orient(sensor.gyro_S, sensor.accel_S, recording.rate_hz, noise)
-        sensors[segment] = Sensor(quat_WS=quat_WS, stated_quat_LS=sensor.stated_quat_LS)
+        sensors[segment] = OrientationSensor(quat_WS, sensor.stated_quat_LS)
     return replace(recording, sensors=sensors), "smekf"

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ..errors import ExistingOutput
-from ..readers.live_log import BLOCK, EVENT, HEAD, MAGIC, POSES, SAMPLES
+from ..readers.live_log import BLOCK, EVENT, FORMAT, HEAD, MAGIC, POSES, SAMPLES
 from ..recording.arrivals import Arrivals
 
 FLUSH_S = 0.25  # [s] what a kill may cost at most
@@ -53,7 +53,7 @@ class LiveLog:
         self._flushed = time.monotonic()
         self._closing = threading.Event()
         self._write(MAGIC)
-        self._block(HEAD, json.dumps({"format": 1, **header}).encode())
+        self._block(HEAD, json.dumps({"format": FORMAT, **header}).encode())
         self.flush()
         self._syncer = threading.Thread(target=self._sync, name="sync of the recording", daemon=True)
         self._syncer.start()

@@ -9,7 +9,7 @@ from pathlib import Path
 import polars as pl
 
 from ..pose import Pose, pose_table
-from ..recording import Recording, axes_from_mount
+from ..recording import ImuSensor, Recording, axes_from_mount
 from .result import write_table
 
 
@@ -19,7 +19,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     lines = [
         f"name = {json.dumps(recording.name, ensure_ascii=False)}",
         f'start_pose = "{recording.start_pose}"',
-        *([f'strapping = "{recording.strapping}"'] if recording.strapping == "new" else []),
+        *(["remounted = true"] if recording.remounted else []),
         "",
         "[data]",
         'file = "recording.parquet"',
@@ -37,13 +37,14 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
         lines += [f"{_key(name)} = {float(value)!r}" for name, value in recording.joints.items()]
     for segment, sensor in recording.sensors.items():
         lines += ["", f"[sensors.{_key(segment)}]"]
-        signals = {"gyr": sensor.gyro_S, "acc": sensor.accel_S} if not sensor.ready else {"q": sensor.quat_WS}
-        keys = {"gyr": "gyro", "acc": "accel", "q": "orientation"}
-        for short, values in signals.items():
-            assert values is not None
-            names = [f"{segment}_q{c}" if short == "q" else f"{segment}_{short}_{c}" for c in "xyzw"[: values.shape[1]]]
+        if isinstance(sensor, ImuSensor):
+            signals = {"gyro": ("gyr_", sensor.gyro_S), "accel": ("acc_", sensor.accel_S)}
+        else:
+            signals = {"orientation": ("q", sensor.quat_WS)}
+        for key, (short, values) in signals.items():
+            names = [f"{segment}_{short}{c}" for c in "xyzw"[: values.shape[1]]]
             table |= {name: values[:, k] for k, name in enumerate(names)}
-            lines.append(f"{keys[short]} = {json.dumps(names)}")
+            lines.append(f"{key} = {json.dumps(names)}")
         if sensor.aligned:
             lines.append("aligned = true")
         if sensor.stated_quat_LS is not None:

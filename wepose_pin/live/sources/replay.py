@@ -34,16 +34,16 @@ class ReplaySource:
     Raises
     ------
     BadOption
-        A sensor that gives ready orientations, or a speed that is not positive.
+        A sensor that gives measured orientations, or a speed that is not positive.
     """
 
     def __init__(self, recording: Recording, speed: float = 1.0) -> None:
         if not speed > 0.0:
             raise BadOption(f"speed: {speed:g}; it must be positive: 1.0 is the recording's own, 4.0 four times that")
-        ready = [segment for segment, sensor in recording.sensors.items() if sensor.ready]
-        if ready:
+        fused = [segment for segment in recording.sensors if segment not in recording.imus]
+        if fused:
             raise BadOption(
-                f"{recording.where()}: sensors.{ready[0]} gives ready orientations; live needs gyro and accel"
+                f"{recording.where()}: sensors.{fused[0]} gives measured orientations; live needs gyro and accel"
             )
         self.sensors = tuple(recording.sensors)
         self.rate_hz: float | None = recording.rate_hz
@@ -80,9 +80,7 @@ class ReplaySource:
             time.sleep(min(max(wait, SHORTEST_SLEEP_S), left))
         self._next = last
         samples = []
-        for segment, sensor in recording.sensors.items():
-            assert sensor.gyro_S is not None
-            assert sensor.accel_S is not None
+        for segment, sensor in recording.imus.items():
             kept: slice | np.ndarray = slice(first, last)
             if sensor.gap is not None and sensor.gap[kept].any():
                 kept = first + np.flatnonzero(~sensor.gap[first:last])

@@ -1,4 +1,4 @@
-"""Who wears the sensors, and how: all that is known before the first sample."""
+"""`SensorSetup`: the subject and how the sensors sit on it, as far as it is known before the first sample."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadSession, one_of
-from ..readers.keys import Keys, read_toml
-from ..readers.stated import phases_stated, sensor_stated
+from ..readers.keys import read_toml
+from ..readers.stated import joints_stated, phases_stated, sensor_stated, session_keys
 from ..recording import SEGMENTS, START_POSES, Intervals, Recording
 from ..subject import Subject, subject_of, subject_toml
 
 
 @dataclass(frozen=True)
-class Wearing:
-    """A person with sensors on.
+class SensorSetup:
+    """A subject and how the sensors sit on it.
 
     Parameters
     ----------
@@ -34,11 +34,13 @@ class Wearing:
     mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, Intervals] = field(default_factory=dict)
     start_pose: str = "n_pose"
-    strapping: str = "as_calibrated"
+    remounted: bool = False
 
     @classmethod
-    def of(cls, recording: Recording, subject: Subject | None = None, subject_text: str = "") -> Wearing:
-        """As a recording has it that is replayed."""
+    def from_recording(
+        cls, recording: Recording, subject: Subject | None = None, subject_text: str = ""
+    ) -> SensorSetup:
+        """The setup of a recording that is replayed."""
         return cls(
             recording.name,
             subject,
@@ -46,10 +48,10 @@ class Wearing:
             {n: s.stated_quat_LS for n, s in recording.sensors.items() if s.stated_quat_LS is not None},
             recording.phases,
             recording.start_pose,
-            recording.strapping,
+            recording.remounted,
         )
 
-    def as_recorded(self) -> Wearing:
+    def as_recorded(self) -> SensorSetup:
         """With the subject as who reads the session's recording will have it: decimals of a text are not all."""
         if self.subject is None or self.subject_text:
             return self
@@ -64,12 +66,12 @@ class Wearing:
             "mounts": {name: np.asarray(quat).tolist() for name, quat in self.mounts.items() if name in sensors},
             "phases": {name: [list(span) for span in spans] for name, spans in self.phases.items()},
             "start_pose": self.start_pose,
-            "strapping": self.strapping,
+            "remounted": self.remounted,
             "subject": self.subject_text or None,
         }
 
 
-def read_wearing(path: Path, subject: Subject | None = None, subject_text: str = "") -> Wearing:
+def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "") -> SensorSetup:
     """What a session file says of the sensors' mounts; what it says of data and phases is of another recording.
 
     Raises
@@ -78,8 +80,7 @@ def read_wearing(path: Path, subject: Subject | None = None, subject_text: str =
         Not there, or a key in it that no session has.
     """
     path = path / "session.toml" if path.is_dir() else path
-    top = Keys(read_toml(path, "a session file"), str(path))
-    top.allow("name", "start_pose", "strapping", "data", "phases", "sensors")
+    top = session_keys(read_toml(path, "a session file"), path)
     phases_stated(top.table("phases", {}))
     tables = top.table("sensors")
     mounts = {}
@@ -89,11 +90,13 @@ def read_wearing(path: Path, subject: Subject | None = None, subject_text: str =
         mount = sensor_stated(tables.table(segment)).mount
         if mount is not None:
             mounts[segment] = mount
-    return Wearing(
+    start_pose = top.choice("start_pose", START_POSES, "n_pose")
+    joints_stated(top, start_pose)
+    return SensorSetup(
         top.text("name", None) or path.absolute().parent.name,
         subject,
         subject_text,
         mounts,
-        start_pose=top.choice("start_pose", START_POSES, "n_pose"),
-        strapping=top.choice("strapping", ("as_calibrated", "new"), "as_calibrated"),
+        start_pose=start_pose,
+        remounted=top.flag("remounted"),
     )
