@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
 
 from . import rotations
 from .errors import BadPhase, BadSession, WeposeError
@@ -491,7 +491,7 @@ def _common_rotation(recording: Recording, noises: dict[str, SensorNoise], inter
     mean = float(rates.mean())
     if len(rates) >= 3:
         spread = max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
-        turns = abs(mean) > COMMON_RATE and 2.0 * stats.t.sf(abs(mean) / spread, len(rates) - 1) < COMMON_RATE_CHANCE
+        turns = abs(mean) > COMMON_RATE and 2.0 * stdtr(len(rates) - 1, -abs(mean) / spread) < COMMON_RATE_CHANCE
     else:
         turns = abs(mean) > LARGEST_BIAS
     if not turns:

@@ -31,6 +31,7 @@ GRID_CELL = 0.25  # [m]
 GRID_RADIUS = 3.0  # [m] where the grid has faded away
 CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
 _SPARSE = 30  # frames a sample, on average, from which on all samples are frames
+MOST_POSES = 150  # by which the camera is placed
 FIELD_OF_VIEW_DEG = 28.0  # a long lens: near hands do not look larger than they are
 LIGHTS = (  # meshcat's own; positions in W [m]
     ("AmbientLight", 0.66, None),
@@ -80,7 +81,8 @@ def pose_html(
         q = pose.q[frames]
     else:
         q = configuration(model, {segment: quat_WL[frames] for segment, quat_WL in pose.quat_WL.items()})
-    visuals = [visual for visual in model.visuals if visual.link in known_links(model, pose.quat_WL)]
+    known = set(known_links(model, pose.quat_WL))
+    visuals = [visual for visual in model.visuals if visual.link in known]
     return view_html(
         visuals,
         pose.time[frames],
@@ -100,7 +102,8 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     frames = frame_indices(trajectory.time, fps)
     nearest = np.abs(pose.time[:, None] - trajectory.recorded[frames][None, :]).argmin(axis=0)
     q = configuration(model, {segment: quat_WL[nearest] for segment, quat_WL in pose.quat_WL.items()})
-    visuals = [visual for visual in model.visuals if visual.link in known_links(model, pose.quat_WL)]
+    known = set(known_links(model, pose.quat_WL))
+    visuals = [visual for visual in model.visuals if visual.link in known]
     placed = placements(model, q, dict.fromkeys(visual.link for visual in visuals))
     robot = trajectory.robot
     drawn = parts(robot)
@@ -291,22 +294,26 @@ def view(
     right = np.cross([0.0, 0.0, 1.0], toward)
     right /= np.linalg.norm(right)
     R_WC = np.stack([right, np.cross(toward, right), toward], axis=1)
-    motion = motion[:, :: max(1, motion.shape[1] // 150)].astype(float)
-    seen_W = [np.array([[0.0, 0.0, 0.0]]), *trails]
-    for visual in visuals:
-        placed = motion[links.index(visual.link)]
+    motion = motion[:, :: max(1, motion.shape[1] // MOST_POSES)].astype(float)
+    seen_W = [np.zeros((1, 3)), *(trail[:: max(1, len(trail) // (4 * MOST_POSES))] for trail in trails)]
+    for link, placed in zip(links, motion, strict=True):
         placed = placed[np.isfinite(placed).all(axis=1)]
-        corners_V = np.array(list(product((-1.0, 1.0), repeat=3))) * _half_edges(visual)
-        corners_L = Rotation.from_quat(visual.quat_LV).apply(corners_V) + visual.p_LV
+        corners_L = [_corners(visual) for visual in visuals if visual.link == link]
         if len(placed):
             R_WL = Rotation.from_quat(placed[:, :4]).as_matrix()
-            seen_W.append(((R_WL @ corners_L.T).swapaxes(1, 2) + placed[:, None, 4:]).reshape(-1, 3))
+            seen_W.append((np.concatenate(corners_L) @ R_WL.swapaxes(1, 2) + placed[:, None, 4:]).reshape(-1, 3))
     seen_C = np.concatenate(seen_W) @ R_WC
     seen_C = seen_C[np.isfinite(seen_C).all(axis=1)]
     angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
-    fan = np.stack([np.cos(angle), np.sin(angle)])
-    outermost = np.unique([np.argmax(seen_C[:, plane] @ fan, axis=0) for plane in ([0, 2], [1, 2])])
+    fan = np.column_stack([np.cos(angle), np.sin(angle)])
+    outermost = np.unique([np.argmax(fan @ seen_C[:, plane].T, axis=1) for plane in ([0, 2], [1, 2])])
     return {"axes": R_WC.T.tolist(), "points": np.round(seen_C[outermost], 4).tolist()}
+
+
+def _corners(visual: Visual) -> np.ndarray:
+    """(8, 3) [m] of the box around a visual, in its link."""
+    corners_V = np.array(list(product((-1.0, 1.0), repeat=3))) * _half_edges(visual)
+    return Rotation.from_quat(visual.quat_LV).apply(corners_V) + visual.p_LV
 
 
 def _half_edges(visual: Visual) -> np.ndarray:

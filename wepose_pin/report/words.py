@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import platform
 import re
 from collections.abc import Sequence
-from importlib.metadata import version
 
 import numpy as np
 
-from .. import __version__
 from ..recording import span_text
+from ..writers.result import versions as package_versions
 
 
 def capital(text: str) -> str:
@@ -64,8 +62,4 @@ def whole(value: float) -> str:
 
 def versions() -> str:
     """What a report was made with."""
-    packages = ("pin", "casadi", "numpy", "scipy")
-    found = {"wepose-pin": __version__, "python": platform.python_version()} | {
-        name: version(name) for name in packages
-    }
-    return ", ".join(f"{name} {number}" for name, number in found.items())
+    return ", ".join(f"{name} {number}" for name, number in package_versions().items())

@@ -6,21 +6,24 @@ import json
 import platform
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
 from .. import __version__
-from ..angles.torques import Torques, torque_table
 from ..errors import BadData, ExistingOutput, MissingFile
 from ..model import BodyModel, load_model
 from ..pose import Pose, pose_from_table, pose_table
 from ..readers.tables import read_table
 from ..subject import Subject, subject_toml
 from ..tracking import TrackedPose
+
+if TYPE_CHECKING:  # it loads scipy.signal, which few results need
+    from ..angles.torques import Torques
 
 
 def write_result(
@@ -39,6 +42,8 @@ def write_result(
     write_table(folder / "pose.parquet", pose_table(pose, covariance))
     summary = pose.summary()
     if torques is not None:
+        from ..angles.torques import torque_table
+
         write_table(folder / "torques.parquet", torque_table(torques))
         summary["torques"] = torques.summary()
     write_about(folder, pose, summary, phases, provenance)
@@ -115,6 +120,7 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
     return pose, load_model(folder / "subject.urdf"), summary
 
 
+@cache
 def versions() -> dict[str, str]:
     """What a result was made with."""
     packages = ("pin", "casadi", "numpy", "scipy", "numba", "polars")
