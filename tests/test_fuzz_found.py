@@ -34,7 +34,7 @@ from wepose_pin.errors import (
 )
 from wepose_pin.readers.arrays import ArrayFile
 from wepose_pin.readers.mat5 import read_mat5
-from wepose_pin.viewer import frame_indices
+from wepose_pin.report.viewer import frame_indices
 from wepose_pin.writers import whole_folder
 from wepose_pin.writers.folder import written
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from wepose_pin.report.viewer import pose_html
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track
-from wepose_pin.viewer import pose_html
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome")

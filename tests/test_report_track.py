@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from reading import captions, headings, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
@@ -20,8 +21,8 @@ from wepose_pin.pose import Pose, spread
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.recording.plausibility import cut_off
 from wepose_pin.report import track_report
+from wepose_pin.report.chart import COLUMNS, envelope
 from wepose_pin.report.concerns import ADVICE, Concern, concerns
-from wepose_pin.report.drawing import COLUMNS, envelope
 from wepose_pin.report.measures import between, elbow_of, hands_of, heading_budgets, longest, signal_of
 from wepose_pin.report.words import listed, signed, whole
 from wepose_pin.simulation import Simulation, simulate, simulated_person
@@ -50,25 +51,6 @@ def page(pose: TrackedPose) -> str:
     return track_report(pose)
 
 
-def without_frame(page: str) -> str:
-    return re.sub(r'srcdoc="[^"]*"', "", page)
-
-
-def text_of(page: str) -> str:
-    """What a reader sees."""
-    body = without_frame(page).split("<body>")[1]
-    return unescape(re.sub(r"<[^>]+>", " ", body))
-
-
-def headings(page: str) -> list[str]:
-    return [unescape(text) for text in re.findall(r"<h2[^>]*>(.*?)</h2>", without_frame(page))]
-
-
-def rows(page: str) -> list[list[str]]:
-    found = re.findall(r"<tr>(<td>.*?)</tr>", without_frame(page))
-    return [[unescape(cell) for cell in re.findall(r"<td>(.*?)</td>", row)] for row in found]
-
-
 def changed(recording: Recording, name: str, **signals: np.ndarray) -> Recording:
     return replace(recording, sensors={**recording.sensors, name: replace(recording.sensors[name], **signals)})
 
@@ -93,8 +75,7 @@ def said(pose: TrackedPose, words: str) -> Concern:
 
 def test_it_has_its_sections_and_every_figure_a_caption(page: str) -> None:
     assert headings(page) == SECTIONS
-    figures = re.findall(r'<img alt="([^"]+)" src="data:image/png;base64,[^"]+"><figcaption>(.+?)</figcaption>', page)
-    assert len(figures) == 8  # timeline, noise, headings, paths, reach; thorax, shoulders, elbows
+    assert len(captions(page)) == 8  # timeline, noise, headings, paths, reach; thorax, shoulders, elbows
     assert 'title="The motion in 3D"' in page
     assert "anna &lt;3" in page
 

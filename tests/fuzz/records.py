@@ -165,7 +165,7 @@ def result(folder: Path, data: bytes) -> object:
     from wepose_pin.evaluation import evaluate
     from wepose_pin.pose import pose_from_table
     from wepose_pin.readers.tables import read_table
-    from wepose_pin.viewer import pose_html
+    from wepose_pin.report.viewer import pose_html
     from wepose_pin.writers.export import export
     from wepose_pin.writers.result import read_result
 

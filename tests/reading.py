@@ -1,0 +1,34 @@
+"""What a reader sees of a page."""
+
+from __future__ import annotations
+
+import re
+from html import unescape
+
+
+def without_frame(page: str) -> str:
+    """The page without the 3D view in it."""
+    return re.sub(r'srcdoc="[^"]*"', "", page)
+
+
+def text_of(page: str) -> str:
+    """Its words, each white space one space."""
+    return " ".join(unescape(re.sub(r"<[^>]+>", " ", without_frame(page).split("<body>")[1])).split())
+
+
+def headings(page: str) -> list[str]:
+    return [unescape(text) for text in re.findall(r"<h2[^>]*>(.*?)</h2>", without_frame(page))]
+
+
+def rows(page: str) -> list[list[str]]:
+    """The cells of its tables."""
+    found = re.findall(r"<tr>(<td>.*?)</tr>", without_frame(page), flags=re.DOTALL)
+    return [[unescape(cell) for cell in re.findall(r"<td>(.*?)</td>", row)] for row in found]
+
+
+def captions(page: str) -> list[tuple[str, str]]:
+    """Of each chart what it is called for who cannot see it, and its caption."""
+    found = re.findall(
+        r'<svg class="chart"[^>]* aria-label="([^"]+)".*?<figcaption>(.*?)</figcaption>', page, re.DOTALL
+    )
+    return [(unescape(label), unescape(caption)) for label, caption in found]
