@@ -226,9 +226,11 @@ class Chart:
         """Height [px], panels and legend, as the template takes them."""
         keys, top = self._drawn_legend()
         panels = []
-        left = [max(_room_left(row[k]) for row in self.rows if k < len(row)) for k in range(max(map(len, self.rows)))]
+        rows = list(zip(self.rows, self.heights, strict=True))
+        columns = range(max(map(len, self.rows)))
+        left = [max(_room_left(row[k], height) for row, height in rows if k < len(row)) for k in columns]
         width = (WIDTH - sum(left) - max(sum(panel.right for panel in row) for row in self.rows)) / len(left)
-        for row, height in zip(self.rows, self.heights, strict=True):
+        for row, height in rows:
             top += _LINE if any(panel.title for panel in row) else 5.0
             x = 0.0
             for panel, room in zip(row, left, strict=False):
@@ -305,13 +307,14 @@ def category_rows(panel: Panel, names: Sequence[str]) -> list[float]:
 # From data to pixels --------------------------------------------------------------------------------------------------
 
 
-def _room_left(panel: Panel) -> float:
+def _room_left(panel: Panel, height: float) -> float:
+    """[px] that the labels at the ticks of y take."""
     if panel.bare or not panel.shown_y:
         return 12.0
     ticks = panel.y_ticks
     if ticks is None:
-        ticks = _ticks(panel, "y", *panel.limits("y"), 100.0)
-    return 12.0 + _LETTER * max((len(label) for _, label in ticks), default=0)
+        ticks = _ticks(panel, "y", *panel.limits("y"), height)
+    return 12.0 + _LETTER * panel.equal + _LETTER * max((len(label) for _, label in ticks), default=0)
 
 
 def _ticks(panel: Panel, axis: Literal["x", "y"], low: float, high: float, length: float) -> Sequence[Tick]:

@@ -46,7 +46,7 @@ def timeline_picture(time: np.ndarray, signals: Mapping[str, Signal], phases: Ma
         rows.append(panel)
     rows[-1].shown_x, rows[-1].x_label = True, TIME
     heights = [18.0] * bool(phases) + [38.0] * len(signals)
-    caption = "How fast each sensor turned, on one scale. Dark bars under the zero line: at rest by the filter's test."
+    caption = "How fast each sensor turned, on one scale. Bars under the zero line: at rest by the filter's test."
     return Picture("timeline", caption, Chart([[row] for row in rows], heights, legend))
 
 
