@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from ..alignment import Segments
+from ..diagnostics import INFO, WARNING, Diagnostic, as_json, unclassified
 from ..model import POINTS, BodyModel, load_model
 from ..pose import Pose, Poser, deviation, point_covariance
 from ..recording import SEGMENTS, Recording
 from ..subject import Subject, average_subject
 from .headings import Reset
 
-_WORTH_A_WARNING_DEG = 1.0
+MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment
 _MOST_NOTES = 10  # of the later pieces of a long recording
 
 
@@ -96,15 +97,18 @@ class Tally:
                 about["gaps"], lost, _ = self._lost[segment]
                 about["gap_s"] = round(lost / last.recording.rate_hz, 3)
             sensors[segment] = about
-        missed = {
-            name: round(float(np.degrees(np.sqrt(squares / self._samples))), 3)
-            for name, squares in self._missed.items()
-        }
-        lame = [f"{segment} {angle:.3g}" for segment, angle in missed.items() if angle > _WORTH_A_WARNING_DEG]
-        if lame:
-            lame = [
-                f"the model's joints are too few or end too soon and miss segments by, rms [deg]: {', '.join(lame)}"
-            ]
+        residual_rms = {name: float(np.sqrt(squares / self._samples)) for name, squares in self._missed.items()}
+        diagnostics = [
+            *map(unclassified, last.segments.warnings),
+            *self._later(),
+            *_not_known(last),
+            *(
+                Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
+                for segment, rms in residual_rms.items()
+                if rms > MOST_RESIDUAL
+            ),
+            *(last.model.diagnostics if last.model else ()),
+        ]
         return {
             "recording": last.recording.name,
             "session": str(last.recording.source) if last.recording.source else None,
@@ -118,21 +122,15 @@ class Tally:
             "phases": {"start": list(last.segments.start), "still": list(last.segments.still)},
             "sensors": sensors,
             "points": sorted(last.points),
-            "not_followed_rms_deg": missed,
+            "not_followed_rms_deg": {name: round(float(np.degrees(v)), 3) for name, v in residual_rms.items()},
             "headings_held_together": _held_together(last.reset),
-            "warnings": [
-                *last.segments.warnings,
-                *self._later(),
-                *_not_known(last),
-                *lame,
-                *(last.model.warnings if last.model else ()),
-            ],
+            "diagnostics": [as_json(diagnostic) for diagnostic in diagnostics],
         }
 
-    def _later(self) -> list[str]:
-        """Notes of later pieces; a day's would be too many to read."""
-        more = len(self._notes) - _MOST_NOTES
-        return self._notes[:_MOST_NOTES] + ([f"and {more} more notes like these"] if more > 0 else [])
+    def _later(self) -> list[Diagnostic]:
+        """Those of later pieces; a day's would be too many to read."""
+        found, more = [unclassified(note) for note in self._notes[:_MOST_NOTES]], len(self._notes) - _MOST_NOTES
+        return [*found, Diagnostic("diagnostics-omitted", INFO, value=more)] if more > 0 else found
 
 
 def _held_together(reset: Reset | None) -> dict[str, Any] | None:
@@ -148,13 +146,14 @@ def _held_together(reset: Reset | None) -> dict[str, Any] | None:
     return about
 
 
-def _not_known(pose: TrackedPose) -> list[str]:
-    """A line on the points that have no place for want of a sensor."""
+def _not_known(pose: TrackedPose) -> list[Diagnostic]:
+    """The points that have no place for want of a sensor."""
     missing = [point for point in POINTS if point not in pose.points]
     lacking = [name for name in SEGMENTS[:5] if name not in pose.quat_WL]
     if not missing or not lacking:
         return []
-    return [f"no sensor on {', '.join(lacking)}: not known and not written: {', '.join(missing)}"]
+    facts = {"segments": ", ".join(lacking), "points": ", ".join(missing)}
+    return [Diagnostic("points-unknown", INFO, facts=facts)]
 
 
 def tracked_pose(
