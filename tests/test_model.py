@@ -13,7 +13,7 @@ import yourdfpy
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.assets import asset
-from wepose_pin.diagnostics import render
+from wepose_pin.diagnostics import from_json, render
 from wepose_pin.errors import BadModel, BadOption, MissingFile
 from wepose_pin.model import POINTS, BodyModel, SegmentLink, chains, load_model
 from wepose_pin.pose import forward_kinematics, pose_of
@@ -612,8 +612,8 @@ def test_a_torso_that_cannot_move_is_warned_of(tmp_path: Path) -> None:
 def test_warnings_of_the_body_reach_the_summary(simulation) -> None:
     recording = simulation.recording("long arm")
     body = load_model(lengths={"left_upper_arm": 1.1})
-    warnings = track(recording, model=body).summary()["warnings"]
-    assert sum("left_upper_arm is 1.1 m long" in text for text in warnings) == 1
+    found = map(from_json, track(recording, model=body).summary()["diagnostics"])
+    assert [d.place for d in found if d.code == "model-length-implausible"] == ["left_upper_arm"]
 
 
 HINGE = triple("left_upper_arm", "left_forearm", "0 0 -0.3", ("0 1 0",), ("0 0 0",))

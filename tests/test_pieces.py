@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.bench.day import there_and_back
 from wepose_pin.calibration import calibrate_lengths
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import from_json
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.filters import METHODS, SensorRun, piece_multiple, run_filter
 from wepose_pin.model import load_model
@@ -265,7 +266,7 @@ def test_a_thinned_report_keeps_extremes(session: Path, subject: Subject, monkey
     for piece in track_pieces(session, subject, seconds=7.31):
         thinner.add(piece)
     assert pose.recording is not None
-    thin, whole = thinner.thinned(pose.recording.phases, pose.summary()["warnings"])
+    thin, whole = thinner.thinned(pose.recording.phases, [from_json(each) for each in pose.summary()["diagnostics"]])
     wanted = whole_of(pose)
     assert whole.samples == len(pose.time) == 5698
     assert len(thin.time) == 317
