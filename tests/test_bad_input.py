@@ -349,7 +349,7 @@ def test_the_unspoilt_files_pass(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert stop.value.code == 0
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1
-    assert said[0].startswith("note: no sensor on left_upper_arm")  # the files hold a torso alone
+    assert said[0].startswith("info: There is no sensor on left upper arm")  # the files hold a torso alone
     assert (tmp_path / "out" / "pose.parquet").is_file()
 
 

@@ -177,7 +177,7 @@ def test_steps_give_what_the_commands_give(study: Path) -> None:
         for name in ("subject.toml", "subject.urdf"):
             assert (study / made_so / name).read_bytes() == (place / made_there / name).read_bytes()
     assert (study / "motion.trc").read_bytes() == (place / "export" / "motion.trc").read_bytes()
-    assert row["grade"] in ("pass", "poor", "fail")
+    assert row["quality"] in ("pass", "poor", "fail")
     assert row["page"] == "calibrate/report.html"
 
 

@@ -112,8 +112,9 @@ def test_without_a_gauge_it_says_whose_scale_it_is(
 ) -> None:
     assert run("calibrate", session, "-o", tmp_path / "subject") == 3
     said = capsys.readouterr()
-    assert "note: no gauge" in said.err
     assert "Quality: poor" in said.out
+    assert "No length was measured." in said.out
+    assert "No length was measured." not in said.err  # not twice
 
 
 def test_simulate_is_seeded(tmp_path: Path) -> None:

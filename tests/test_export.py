@@ -292,16 +292,19 @@ def test_uneven_times_are_made_even_where_the_format_has_only_a_rate(tmp_path: P
     late = pose.time + np.where(np.arange(301) > 150, 0.004, 0.0)
     folder = write_folder(tmp_path / "r", replace(pose, time=late))
     found = export(folder, tmp_path / "x.bvh")
-    assert "resampled at 100 Hz" in found.notes[0]
-    assert export(folder, tmp_path / "x.mot").notes[0].startswith("elbows")  # has a column of times
+    assert [each.code for each in found.diagnostics][:1] == ["export-resampled"]
+    assert found.diagnostics[0].facts["rate"] == pytest.approx(100.0)
+    codes = {each.code for each in export(folder, tmp_path / "x.mot").diagnostics}
+    assert codes == {"opensim-axes-too-few"}  # has a column of times
 
 
 def test_gaps_that_cannot_be_marked_are_told(tmp_path: Path, pose: Pose) -> None:
     folder = write_folder(tmp_path / "r", with_gap(pose))
     for name in ("x.mot", "x.sto", "x.bvh"):
-        assert any("right_forearm 10" in note for note in export(folder, tmp_path / name).notes)
+        unmarked = [d for d in export(folder, tmp_path / name).diagnostics if d.code == "export-gaps-unmarked"]
+        assert [(d.place, d.value) for d in unmarked] == [("right_forearm", 10)]
     for name in ("x.csv", "x.trc"):
-        assert export(folder, tmp_path / name).notes == []
+        assert export(folder, tmp_path / name).diagnostics == []
     assert pl.read_csv(tmp_path / "x.csv")["right_forearm_gap"].sum() == 10
 
 
@@ -381,4 +384,4 @@ def test_the_command_says_what_it_wrote(result: Path, tmp_path: Path, capsys: py
     assert stop.value.code == 0
     said = capsys.readouterr()
     assert said.out == f"Written: {tmp_path / 'x.mot'}  (mot)\n"
-    assert said.err.startswith("note: elbows and wrists of the model have two axes")
+    assert said.err.startswith("warning: The OpenSim model misses the orientation of ")

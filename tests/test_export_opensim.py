@@ -188,7 +188,8 @@ def pose_by_opensim(peer: Callable[..., Any], values: Mapping[str, np.ndarray], 
 def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_path: Path) -> None:
     values = motion(60)
     pose = pose_by_opensim(peer, values)
-    assert export(write_folder(tmp_path / "r", pose), tmp_path / "x.mot").notes == []  # the model reaches all of it
+    folder = write_folder(tmp_path / "r", pose)
+    assert export(folder, tmp_path / "x.mot").diagnostics == []  # the model reaches all of it
     table = peer("read", tmp_path / "x.mot")
     assert set(table["labels"]) == set(values)
     assert table["header"]["inDegrees"] == "yes"
@@ -202,7 +203,7 @@ def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_pa
 def test_opensense_finds_the_same_angles_from_the_sto(peer: Callable[..., Any], tmp_path: Path) -> None:
     pose = pose_by_opensim(peer, motion(12), noise=0.15)  # what no elbow of two axes follows
     folder = write_folder(tmp_path / "r", pose)
-    assert "humerus_r" in export(folder, tmp_path / "x.mot").notes[0]
+    assert "humerus_r" in {each.place for each in export(folder, tmp_path / "x.mot").diagnostics}
     export(folder, tmp_path / "x.sto")
     export(folder, tmp_path / "placement.sto", "placement")
     solved, ours = peer("opensense", tmp_path), peer("read", tmp_path / "x.mot")

@@ -134,7 +134,7 @@ def test_no_home_and_no_cache(session: Path, tmp_path: Path) -> None:
     run = subprocess.run(command, env=os.environ | nowhere, cwd="/", capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert {path.name for path in (tmp_path / "out").iterdir()} == TRACKED
-    assert all(line.startswith("note: ") for line in run.stderr.splitlines()), run.stderr
+    assert all(line.startswith("info: ") for line in run.stderr.splitlines()), run.stderr
 
 
 # What is no file ---------------------------------------------------------------------------------------------------

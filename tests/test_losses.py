@@ -29,15 +29,14 @@ def lossy(simulation: Simulation, lost: tuple[float, float], names: tuple[str, .
     first = recording.phases["clasp"][0][0]
     gap = (recording.time > first + lost[0]) & (recording.time < first + lost[1])
 
-    def of(name: str, sensor: Sensor) -> Sensor:
-        assert sensor.gyro_S is not None
+    def of(name: str, sensor: ImuSensor) -> ImuSensor:
         mount = sensor.stated_quat_LS if stated else None
         if name not in names:
             return replace(sensor, stated_quat_LS=mount)
         gyro_S = np.where(gap[:, None], 0.0, sensor.gyro_S)
         return replace(sensor, stated_quat_LS=mount, gyro_S=gyro_S, gap=gap)
 
-    return replace(recording, sensors={name: of(name, sensor) for name, sensor in recording.sensors.items()})
+    return replace(recording, sensors={name: of(name, sensor) for name, sensor in recording.imus.items()})
 
 
 def worst_mount(found: Calibration, simulation: Simulation) -> float:
@@ -97,7 +96,14 @@ def test_what_lies_beyond_a_loss() -> None:
 
 
 def test_nothing_lost_is_no_step() -> None:
-    assert losses_of(Recording("none", np.arange(3.0), 1.0, {"torso": ImuSensor(np.zeros((3, 3)), np.zeros((3, 3)))}), (0.0, 1.0), ("torso",)) == []
+    assert (
+        losses_of(
+            Recording("none", np.arange(3.0), 1.0, {"torso": ImuSensor(np.zeros((3, 3)), np.zeros((3, 3)))}),
+            (0.0, 1.0),
+            ("torso",),
+        )
+        == []
+    )
     names, std, beyond = steps_of([], np.arange(4))
     assert (names, len(std), beyond.shape) == ((), 0, (0, 4))
     assert connected([], np.arange(2)).all()

@@ -16,6 +16,7 @@ from wepose_pin.batch.items import make_items
 from wepose_pin.batch.page import study_page
 from wepose_pin.batch.plan import Item, Plan, step_options
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import as_json
 from wepose_pin.recording import ImuSensor, Recording, check, mount_from_axes
 from wepose_pin.report import track_report, write_decimated_pages
 from wepose_pin.report.decimation import Decimator
@@ -141,7 +142,7 @@ def test_a_study_whose_figures_are_all_one_up_to_rounding() -> None:
 
 BROKEN = {
     "wepose_pin.report.track.timeline_picture": ("report.html", {"view.html", "report.html"}),
-    "wepose_pin.report.track.concerns": ("report.html", {"view.html", "report.html"}),
+    "wepose_pin.report.track.pose_diagnostics": ("report.html", {"view.html", "report.html"}),
     "wepose_pin.report.pages.track_report": ("report.html", {"view.html"}),
     "wepose_pin.report.pages.pose_html": ("view.html", {"report.html"}),
 }
@@ -168,7 +169,9 @@ def test_a_page_that_fails_is_a_warning(
     (line,) = [line for line in said.err.splitlines() if page in line]
     assert "ValueError: cannot convert float NaN to integer" in line
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert line.removeprefix("note: ") in summary["warnings"]
+    (saved,) = [each for each in summary["diagnostics"] if each["code"] == "page-incomplete"]
+    assert saved["place"] == page
+    assert saved["text"]["what"] in line
     for name in left:
         assert "of another motion" not in (tmp_path / "out" / name).read_text()
     for name in {"view.html", "report.html"} - left:
@@ -179,10 +182,11 @@ def test_a_page_that_fails_is_a_warning(
 def test_a_recording_in_pieces_whose_pages_cannot_be_gathered(pose: TrackedRecording, tmp_path: Path) -> None:
     decimator = Decimator(len(pose.time))
     decimator.add(replace(pose, segments=None))
-    (tmp_path / "summary.json").write_text('{"warnings": ["before"]}')
+    (tmp_path / "summary.json").write_text('{"diagnostics": [{}]}')
     (warning,) = write_decimated_pages(tmp_path, decimator, {}, [])
-    assert "view.html" in warning
-    assert json.loads((tmp_path / "summary.json").read_text())["warnings"] == ["before", warning]
+    assert (warning.code, warning.place) == ("page-incomplete", "view.html and report.html")
+    saved = json.loads((tmp_path / "summary.json").read_text())["diagnostics"]
+    assert saved == [{}, as_json(warning)]
     assert names(tmp_path) == {"summary.json"}
 
 
@@ -220,7 +224,9 @@ def test_a_calibration_outlasts_its_report(
     assert run("calibrate", tmp_path, "-o", tmp_path / "anna") in (0, 3)
     assert names(tmp_path / "anna") == {"subject.toml", "subject.urdf", "calibration.json"} | left
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "ValueError" in line]
-    assert line.removeprefix("note: ") in json.loads((tmp_path / "anna" / "calibration.json").read_text())["warnings"]
+    found = json.loads((tmp_path / "anna" / "calibration.json").read_text())["diagnostics"]
+    (saved,) = [each for each in found if each["code"] == "page-incomplete"]
+    assert saved["text"]["what"] in line
 
 
 def test_an_item_of_a_batch_outlasts_its_pages(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

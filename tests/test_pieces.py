@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.long_recordings import there_and_back
 from wepose_pin.calibration import calibrate_lengths
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import from_json
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.filters import METHODS, SensorRun, piece_multiple, run_filter
 from wepose_pin.filters.noise import noise_of
@@ -260,7 +261,9 @@ def test_a_thinned_report_keeps_extremes(session: Path, subject: Subject, monkey
     decimator = Decimator(len(pose.time))
     for piece in track_session(session, subject, seconds=7.31):
         decimator.add(piece)
-    thin, whole = decimator.decimated(pose.recording.phases, pose.summary()["warnings"])
+    thin, whole = decimator.decimated(
+        pose.recording.phases, [from_json(each) for each in pose.summary()["diagnostics"]]
+    )
     wanted = whole_of(pose)
     assert whole.samples == len(pose.time) == 5698
     assert len(thin.time) == 317

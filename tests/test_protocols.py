@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import PROTOCOLS, Calibration, calibrate_lengths, judge, load_protocol
+from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate_lengths, load_protocol
 from wepose_pin.calibration.chain import CHAIN, REACHES, links
 from wepose_pin.calibration.problem import Layout, Looks, residuals
 from wepose_pin.calibration.protocols import Closure
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import ERROR, render, render_all
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
 from wepose_pin.model import load_model
 from wepose_pin.pose import pose_of
@@ -79,6 +80,16 @@ def length_errors(found: Calibration, person: Person, names: tuple[str, ...]) ->
 
 
 # --------------------------------------------------------------------------------------------------------------- data
+
+
+def codes(found: Calibration) -> set[str]:
+    return {diagnostic.code for diagnostic in found.diagnostics}
+
+
+def measured_instead(found: Calibration) -> set[tuple[str, str]]:
+    """What is said of the scale, and which length to measure."""
+    scale = [d for d in found.diagnostics if d.code.startswith("scale")]
+    return {(d.code, str(d.facts["measured"]).partition("=")[0]) for d in scale}
 
 
 def test_every_protocol_file_is_known_and_says_what_to_do() -> None:
@@ -203,8 +214,9 @@ def test_a_handle_fixes_the_scale_by_itself() -> None:
     recording = simulation.recording()
     found = calibrate_lengths(recording, prior=person.average, protocol="handle")
     given = calibrate_lengths(recording, prior=person.average, protocol="handle", gauge={"handle": 0.40})
-    assert any("handle = 0.4 m is the protocol's" in text for text in found.warnings)
-    assert not any("handle = " in text or "no gauge" in text for text in given.warnings)
+    (assumed,) = [d for d in found.diagnostics if d.code == "protocol-distance-assumed"]
+    assert (assumed.place, assumed.value) == ("handle", 0.4)
+    assert not {"protocol-distance-assumed", "scale-from-prior"} & codes(given)
     assert given.subject.lengths == pytest.approx(found.subject.lengths)
     assert found.subject.note == "hands on a handle; scale taped: handle"
     # The scale is the bar's more than the average person's.
@@ -243,13 +255,13 @@ def test_a_fixed_point_says_that_it_has_no_scale_and_which_gauge_would_serve() -
     person, simulation = made("touch_right", 4, real=True)
     recording = simulation.recording()
     free = calibrate_lengths(recording, prior=person.average, protocol="touch_right")
-    assert any(text.startswith("no gauge in the chain") and "right_upper_arm=" in text for text in free.warnings)
+    assert ("scale-from-prior", "right_upper_arm") in measured_instead(free)
     width = {"shoulder_width": person.lengths["shoulder_width"]}
     loose = calibrate_lengths(recording, gauge=width, prior=person.average, protocol="touch_right")
-    assert any("hardly tells the scale" in text and "right_upper_arm=" in text for text in loose.warnings)
+    assert ("scale-uncertain", "right_upper_arm") in measured_instead(loose)
     upper = {"right_upper_arm": person.lengths["right_upper_arm"]}
     good = calibrate_lengths(recording, gauge=upper, prior=person.average, protocol="touch_right")
-    assert not any("scale" in text for text in good.warnings)
+    assert not measured_instead(good)
     assert good.subject.std("trunk") < 0.7 * person.average.std("trunk")  # seen beside the arm
 
 
@@ -266,8 +278,9 @@ def test_a_trunk_that_keeps_still_leaves_headings_unknown_and_says_so(monkeypatc
     person, simulation = made("touch_right", 9, real=False)
     found = calibrate_lengths(simulation.recording(), prior=person.average, protocol="touch_right")
     error, std = mount_errors(found, simulation)
-    print(found.warnings, error[:, 2], std[:, 2])
-    assert any(text.startswith("headings that the motion hardly told: torso ±") for text in found.warnings)
+    quality = assess(found)
+    print(quality.reasons, error[:, 2], std[:, 2])
+    assert ("mount-heading-uncertain", "torso", ERROR) in {(d.code, d.place, d.severity) for d in quality.reasons}
     assert std[0, 2] > 50.0
     # The swivel's radius tells upper arm against forearm; of the trunk nothing is seen.
     assert found.subject.std("trunk") > 0.95 * person.average.std("trunk")
@@ -279,7 +292,9 @@ def test_a_palm_off_its_point_is_found_and_left_out() -> None:
     first, last = recording.phases["touch"][0]
     early = replace(recording, phases={**recording.phases, "touch": ((first - 2.3, last),)})  # the way to the table
     found = calibrate_lengths(early, prior=person.average, protocol="touch_right")
-    assert any(text.startswith("the palm was off its point for ") for text in found.warnings)
+    (off,) = [d for d in found.diagnostics if d.code == "closure-open"]
+    assert (off.place, off.facts["variant"]) == ("touch", "fixed_point")
+    assert render(off).what.startswith("The palm was off its point for ")
     assert found.kept[:8].max() < 0.1
     whole = calibrate_lengths(recording, prior=person.average, protocol="touch_right")
     error, std = length_errors(found, person, load_protocol("touch_right").chain)
@@ -295,14 +310,16 @@ def test_advice_is_of_what_was_done(name: str, closed: str) -> None:
     phase, (begin, _) = next((n, spans[0]) for n, spans in recording.phases.items() if n in ("touch", "handle"))
     short = replace(recording, phases={**recording.phases, phase: ((begin, begin + 9.0),)})
     found = calibrate_lengths(short, prior=person.average, protocol=name)
-    words = " ".join(judge(found).in_words())
-    assert "independent looks only" in words
+    quality = assess(found)
+    assert "motion-too-short" in {d.code for d in quality.reasons}
+    words = " ".join(text.line() for text in render_all(quality.reasons))
     assert closed in words
     assert "joined" not in words
     assert "palms together" not in words
     assert found.tape == load_protocol(name).tape
-    scale = next(f for f in judge(found).findings if f.name == "scale")
-    assert scale.do.endswith(found.tape)
+    assert ("scale-uncertain" if found.scaling else "scale-from-prior", found.tape) in {
+        (c.diagnostic.code, c.diagnostic.facts.get("measured")) for c in quality.checks
+    }
 
 
 def test_poses_tell_headings_and_no_length() -> None:
@@ -312,7 +329,7 @@ def test_poses_tell_headings_and_no_length() -> None:
     assert found.subject.lengths == pytest.approx(person.average.lengths)
     for name in LENGTHS:
         assert found.subject.std(name) == pytest.approx(person.average.std(name))
-    assert any("(N-pose, T-pose and bow) tells headings and no length" in text for text in found.warnings)
+    assert "lengths-not-observed" in codes(found)
     _, std = mount_errors(found, simulation)
     assert np.all((std[:, 2] > 5.0) & (std[:, 2] < 9.0))  # as well as the poses are held
     taped = calibrate_lengths(recording, prior=person.average, protocol="poses", gauge={"trunk": 0.47})

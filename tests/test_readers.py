@@ -272,7 +272,7 @@ def test_accepted_gaps_are_marked_and_counted_in_the_result(tmp_path: Path, caps
     with pytest.raises(SystemExit) as stop:
         main(["track", str(path), "--gaps", "-o", str(tmp_path / "out")])
     assert stop.value.code == 0
-    assert "note: sensors.torso: 2 long gaps accepted, bridged and marked: 70 samples" in capsys.readouterr().err
+    assert "warning: sensors.torso: 2 long gaps accepted, bridged and marked: 70 samples" in capsys.readouterr().err
     np.testing.assert_array_equal(pl.read_parquet(tmp_path / "out" / "pose.parquet")["torso_gap"], gap)
     torso = json.loads((tmp_path / "out" / "summary.json").read_text())["sensors"]["torso"]
     assert (torso["gaps"], torso["gap_s"]) == (2, 0.7)

@@ -12,17 +12,17 @@ import pytest
 from reading import captions, headings, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import Calibration, calibrate_lengths
-from wepose_pin.calibration.verdict import judge
+from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate_lengths
+from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import Recording
-from wepose_pin.report import calibration_report, unsaid
+from wepose_pin.report import calibration_report
 from wepose_pin.report.calibration_figures import broken, direction, smoothed
 from wepose_pin.report.words import plus_minus
 from wepose_pin.simulation import REALISTIC, simulate, simulated_person
 from wepose_pin.tracking import TrackedRecording, track
 
 Made = tuple[Calibration, Recording, TrackedRecording]
-REASONS = ["the left upper arm ± 9 mm, more than 8 mm: move the joined hands up and down"]
+UNCERTAIN = Diagnostic("upper-arm-length-uncertain", WARNING, "left_upper_arm", 0.013, 0.010)
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +34,13 @@ def made() -> Made:
     return found, recording, track(recording, found.subject)
 
 
+def poor(found: Calibration) -> CalibrationQuality:
+    return replace(assess(found), quality="poor", reasons=(UNCERTAIN,))
+
+
 @pytest.fixture(scope="module")
 def page(made: Made) -> str:
-    return calibration_report(made[0], made[1], verdict=("poor", REASONS), pose=made[2])
+    return calibration_report(made[0], made[1], quality=poor(made[0]), pose=made[2])
 
 
 def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) -> None:
@@ -60,37 +64,37 @@ def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) 
     ]
 
 
-def test_the_verdict_comes_first_with_its_reasons(made: Made, page: str) -> None:
-    failed = calibration_report(made[0], made[1], verdict=("fail", REASONS), pose=made[2])
+def test_the_quality_comes_first_with_its_reasons(made: Made, page: str) -> None:
+    failed = calibration_report(made[0], made[1], quality=replace(poor(made[0]), quality="fail"), pose=made[2])
     for text, word, said in ((page, "poor", "Poor:"), (failed, "fail", "Fail:")):
         text = without_frame(text)
         assert text.index(f'<section class="banner {word}">') < text.index(said)
-        assert text.index(said) < text.index("The left upper arm ± 9 mm") < text.index("<h2")
+        assert text.index(said) < text.index(render(UNCERTAIN).what) < text.index("<h2")
 
 
-def test_the_judges_verdict_with_its_numbers(made: Made) -> None:
-    verdict = judge(made[0])
-    page = without_frame(calibration_report(made[0], made[1], verdict=verdict, pose=made[2]))
-    assert f'<section class="banner {verdict.grade}">' in page
-    assert "Behind the verdict" in headings(page)
-    for finding in verdict.reasons:
-        assert finding.said in unescape(page)
+def test_the_quality_with_its_checks(made: Made) -> None:
+    quality = assess(made[0])
+    page = without_frame(calibration_report(made[0], made[1], quality=quality, pose=made[2]))
+    assert f'<section class="banner {quality.quality}">' in page
+    assert "Behind the quality" in headings(page)
+    for diagnostic in quality.reasons:
+        assert render(diagnostic).what in unescape(page)
     assert "<td>up to 10 mm</td><td>up to 20 mm</td>" in page  # limits of the lengths
     assert " rad<" not in page
 
 
-def test_warnings_stand_above_the_figures_in_words(made: Made) -> None:
-    warned = replace(made[0], warnings=("the palms were apart for 12 % of the phase",))
+def test_diagnostics_stand_above_the_figures_in_words(made: Made) -> None:
+    facts = {"intervals": "12 to 14 s", "variant": "coincide"}
+    warned = replace(made[0], diagnostics=(Diagnostic("closure-open", INFO, "clasp", 0.12, 0.1, facts),))
     page = without_frame(calibration_report(warned, made[1], pose=made[2]))
-    assert page.index("The palms were apart for 12 %") < page.index("<figure")
-    assert 'class="banner p' not in page  # nobody gave a verdict
+    assert page.index("The palms were apart for 12 % of the phase") < page.index("<figure")
+    assert 'class="banner p' not in page  # nobody assessed it
 
 
-def test_what_the_verdict_says_is_not_said_twice(made: Made) -> None:
-    verdict = judge(made[0])
-    finding = verdict.findings[0]._replace(grade="fail", said="the left elbow would bend backward", why="", do="look")
-    verdict = replace(verdict, grade="fail", findings=(finding,))
-    assert unsaid(("the left elbow would bend backward", "another"), verdict) == ["another"]
+def test_what_keeps_it_from_passing_is_not_said_twice(made: Made) -> None:
+    twice = replace(made[0], diagnostics=(Diagnostic("scale-from-prior", INFO, value=0.05), *made[0].diagnostics))
+    quality = assess(replace(twice, scaling=(), scale_std=0.05))
+    assert [d.code for d in quality.diagnostics].count("scale-from-prior") == 1
 
 
 def test_it_opens_offline_and_is_one_small_file(page: str) -> None:
@@ -120,7 +124,7 @@ def test_it_prints(page: str) -> None:
 
 
 def test_equal_arguments_give_equal_text(made: Made, page: str) -> None:
-    assert calibration_report(made[0], made[1], verdict=("poor", REASONS), pose=made[2]) == page
+    assert calibration_report(made[0], made[1], quality=poor(made[0]), pose=made[2]) == page
 
 
 def test_hands_that_came_apart_are_shown(made: Made) -> None:
@@ -217,9 +221,10 @@ def test_a_line_breaks_where_time_jumps() -> None:
 
 def test_the_effective_sample_size_stands_as_itself_beside_its_limits(made: Made) -> None:
     found = replace(made[0], independent=18.2)
-    page = calibration_report(found, made[1], verdict=judge(found), pose=made[2])
+    page = calibration_report(found, made[1], quality=assess(found), pose=made[2])
     text = re.sub(r"<[^>]+>", "|", without_frame(page))
     assert re.search(r"effective sample size[^|]*\|+18\|+at least 6\|+at least 2\|+pass", text)
-    for size, grade in ((6.0, "pass"), (5.9, "poor"), (2.0, "poor"), (1.9, "fail")):
-        (finding,) = [each for each in judge(replace(found, independent=size)).findings if each.name == "motion"]
-        assert (finding.value, finding.grade) == (size, grade)
+    for size, wanted in ((6.0, "pass"), (5.9, "poor"), (2.0, "poor"), (1.9, "fail")):
+        checks = assess(replace(found, independent=size)).checks
+        (check,) = [each for each in checks if each.diagnostic.code == "motion-too-short"]
+        assert (check.value, check.quality) == (size, wanted)

@@ -110,8 +110,8 @@ def test_what_another_version_has_made_is_made_again_and_said(result: Path, caps
     capsys.readouterr()
     assert run("reproduce", result) == 0
     said = capsys.readouterr()
-    assert "note: made by wepose-pin 0.0.9 (abc); this is " in said.err
-    assert "note: other versions now: numpy " in said.err
+    assert "warning: The result was made by wepose-pin 0.0.9 (abc); this is " in said.err
+    assert "warning: Other versions are installed now: numpy " in said.err
     assert "the same, made again by wepose track" in said.out
 
 

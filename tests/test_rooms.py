@@ -13,7 +13,7 @@ import wepose_pin
 
 PACKAGE = Path(wepose_pin.__file__).parent
 ORDER = (
-    "errors arguments compilation rotations assets recording readers subject filters model alignment pose "
+    "errors diagnostics arguments compilation rotations assets recording readers subject filters model alignment pose "
     "calibration tracking simulation evaluation angles writers retargeting report live validation jobs batch cli"
 ).split()
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if "_assets" not in path.parts)

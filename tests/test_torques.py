@@ -110,7 +110,6 @@ def test_noise_is_smoothed_away_below_the_cut_off() -> None:
 
 def test_a_hanging_arm_bears_nothing_and_a_raised_one_its_weight(simulation: Simulation) -> None:
     pose = track(simulation.recording())
-    assert pose.model is not None
     assert pose.q is not None
     found = joint_torques(pose.model.pin, pose.time, pose.q)
     table = torque_table(found)

@@ -61,7 +61,6 @@ def test_the_real_person_hangs_the_arms_again(data: Path) -> None:
     """Second standing phase, 86.6 to 88.0 s, after half a minute of work: the tilt agrees with the accelerometers'."""
     recording = load_session(data / "upper_body" / "session.toml")
     pose = track(recording)
-    assert pose.segments is not None
     standing = recording.span((86.6, 88.0))
     for segment in ("torso", "left_forearm", "right_forearm"):
         R_LS = Rotation.from_quat(pose.segments.quat_LS[segment])

@@ -74,16 +74,16 @@ class LostWorker(WeposeError):
 
 
 class CalibrationFailed(WeposeError):
-    """A calibration whose verdict is "fail": what it found must not be used unread.
+    """A calibration whose quality is "fail": what it found must not be used unread.
 
     Parameters
     ----------
-    calibration, verdict : what was found, and what is wrong with it
+    calibration, quality : what was found, and what is wrong with it
     """
 
-    def __init__(self, text: str, calibration: Any = None, verdict: Any = None) -> None:
+    def __init__(self, text: str, calibration: Any = None, quality: Any = None) -> None:
         super().__init__(text)
-        self.calibration, self.verdict = calibration, verdict
+        self.calibration, self.quality = calibration, quality
 
 
 class WeposeWarning(UserWarning):

@@ -298,7 +298,7 @@ def warnings_of(summary: Mapping[str, object]) -> list[str]:
     """The texts of all that a summary warns of."""
     texts = list(summary.get("warnings") or ())  # type: ignore[call-overload]
     for item in summary.get("diagnostics") or ():  # type: ignore[attr-defined]
-        texts.append(" ".join(str(item.get(key, "")) for key in ("place", "code", "text")))
+        texts.append(f"{item['place']} {item['code']} {item['text']['what']}")
     return [str(text) for text in texts]
 
 

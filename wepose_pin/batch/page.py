@@ -20,7 +20,7 @@ MOST_ROWS = 2000  # of a table in the page; results.parquet has all
 MOST_PICTURES = 12
 # What says most, first; others follow in the order in which steps give them.
 _TELLING = ("gap_mm", "right_hand_arm_error_mm", "left_hand_arm_error_mm", "right_hand_error_mm", "left_hand_error_mm")
-_TOLD = ("item", "session", "subject", "status", "error", "message", "page", "grade")
+_TOLD = ("item", "session", "subject", "status", "error", "message", "page", "quality")
 _COST = ("seconds", "memory_mb")
 _UNITS = {"mm": "mm", "deg": "deg", "hz": "Hz", "s": "s"}
 _WORDS = {
@@ -96,9 +96,9 @@ def _facts(plan: Plan, table: pl.DataFrame, done: pl.DataFrame) -> list[tuple[st
     facts = [("steps", ", ".join(steps)), ("sessions", str(len(plan.items)))]
     if subjects:
         facts.append(("subjects", str(subjects)))
-    if "grade" in done.columns:
-        counts = dict(done["grade"].drop_nulls().value_counts().iter_rows())
-        told = ", ".join(f"{counts[grade]} {grade}" for grade in ("pass", "poor", "fail") if grade in counts)
+    if "quality" in done.columns:
+        counts = dict(done["quality"].drop_nulls().value_counts().iter_rows())
+        told = ", ".join(f"{counts[quality]} {quality}" for quality in ("pass", "poor", "fail") if quality in counts)
         facts.append(("calibrations", told or "none"))
     if "duration_s" in done.columns:
         facts.append(("recorded", f"{float(done['duration_s'].sum()) / 3600.0:.2f} h"))
@@ -170,7 +170,7 @@ def _outliers(done: pl.DataFrame, columns: Sequence[str]) -> dict[str, Any] | No
 
 
 def _items(table: pl.DataFrame, columns: Sequence[str]) -> dict[str, Any]:
-    shown = [*(name for name in ("grade",) if name in table.columns), *columns[:6]]
+    shown = [*(name for name in ("quality",) if name in table.columns), *columns[:6]]
     shown += ["seconds"] if "seconds" not in shown else []
     header = ["item", *(["subject"] if table["subject"].drop_nulls().len() else []), "status"]
     rows = []

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import polars as pl
 
+from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, BadOption, MissingFile, WeposeError
 from ..jobs import Progress, no_progress
 from ..jobs.calibrate import CalibrateJob, run_calibrate
@@ -45,7 +46,7 @@ class Reproduction(NamedTuple):
 
     command: str
     differences: list[str]  # a line each; empty: the same
-    notes: list[str]  # what else is not as it was: code, packages, machine
+    diagnostics: list[Diagnostic]  # what else is not as it was: code, packages, machine
 
 
 def run_reproduce(job: ReproduceJob, progress: Progress = no_progress) -> Reproduction:
@@ -85,7 +86,7 @@ def _reproduce(result: Path) -> Reproduction:
             run(_job_of(result, kind, provenance, out))
         else:
             raise BadData(f"{result}: made by '{command}', which cannot be made again one by one")
-        return Reproduction(command, differences(result, out), _notes(provenance))
+        return Reproduction(command, differences(result, out), _changes(provenance))
 
 
 def _job_of(result: Path, kind: type, provenance: Mapping[str, Any], out: Path) -> Any:
@@ -102,7 +103,7 @@ def _job_of(result: Path, kind: type, provenance: Mapping[str, Any], out: Path) 
 def _reproduce_study(study: Path, progress: Progress) -> Reproduction:
     """All items of a study that were done, one by one; one that cannot be made again is a difference."""
     names, failed = _done_items(study)
-    lines, notes = list[str](), dict[str, None]()
+    lines, diagnostics = list[str](), list[Diagnostic]()
     for k, name in enumerate(names):
         progress(f"making {name} again", k / len(names))
         try:
@@ -110,10 +111,10 @@ def _reproduce_study(study: Path, progress: Progress) -> Reproduction:
         except WeposeError as error:
             again = Reproduction(COMMAND, [f"cannot be made again: {error}"], [])
         lines += [f"{name}: {line}" for line in again.differences]
-        notes |= dict.fromkeys(again.notes)
+        diagnostics += [each for each in again.diagnostics if each not in diagnostics]
     if failed:
-        notes[f"{failed} items had failed and are not made again"] = None
-    return Reproduction("batch", lines, list(notes))
+        diagnostics.append(Diagnostic("reproduce-items-skipped", INFO, value=failed))
+    return Reproduction("batch", lines, diagnostics)
 
 
 def _done_items(study: Path) -> tuple[list[str], int]:
@@ -158,15 +159,21 @@ def _check_inputs(result: Path, provenance: Mapping[str, Any], place: Path) -> N
                 )
 
 
-def _notes(provenance: Mapping[str, Any]) -> list[str]:
-    now, notes = code(), []
+def _changes(provenance: Mapping[str, Any]) -> list[Diagnostic]:
+    """What is not as it was: code, machine, packages."""
+    now, found = code(), []
     if provenance.get("code") != now["code"]:
-        was = f"{provenance.get('version')} ({provenance.get('commit') or 'commit not known'})"
-        notes.append(f"made by wepose-pin {was}; this is {now['version']} ({now['commit'] or 'commit not known'})")
+        versions_of_code = {
+            "before": f"{provenance.get('version')} ({provenance.get('commit') or 'commit not known'})",
+            "now": f"{now['version']} ({now['commit'] or 'commit not known'})",
+        }
+        found.append(Diagnostic("reproduce-version-differs", WARNING, facts=versions_of_code))
     if provenance.get("machine") not in (None, machine()):
-        notes.append(f"made on {provenance['machine']}; this is {machine()}, which may round the last bits otherwise")
+        machines = {"before": str(provenance["machine"]), "now": machine()}
+        found.append(Diagnostic("reproduce-machine-differs", INFO, facts=machines))
     packages = provenance.get("packages")
     changed = {name: of for name, of in versions().items() if isinstance(packages, dict) and packages.get(name) != of}
     if changed:
-        notes.append(f"other versions now: {', '.join(f'{name} {of}' for name, of in changed.items())}")
-    return notes
+        installed = {"packages": ", ".join(f"{name} {of}" for name, of in changed.items())}
+        found.append(Diagnostic("reproduce-packages-differ", WARNING, facts=installed))
+    return found

@@ -63,7 +63,7 @@ class ItemSteps:
         self._subject = out
         calibration = outcome.calibration
         row = {
-            "grade": outcome.quality.grade,
+            "quality": outcome.quality.quality,
             "gap_mm": _finite(1e3 * calibration.rms_gap),
             "independent": calibration.independent,
         }
@@ -82,7 +82,7 @@ class ItemSteps:
             "duration_s": summary["duration_s"],
             "sensors": len(summary.get("sensors", ())),
             "static_share": float(np.mean(static)) if static else None,
-            "warnings": len(summary["warnings"]) + len(outcome.page_failures),
+            "diagnostics": len(summary["diagnostics"]) + len(outcome.page_failures),
         }
 
     def _retarget(self, out: Path, options: Row) -> Row:
@@ -98,14 +98,15 @@ class ItemSteps:
         from ..writers.export import SUFFIXES
 
         out.mkdir()
-        formats, notes = options.pop("formats"), 0
+        formats, diagnostics = options.pop("formats"), 0
         for format in formats:
             file = out / (f"placement{SUFFIXES[format]}" if format in SUFFIXES else f"motion.{format}")
             without = {} if format == "mot" else {"names": None}
             without |= {"rate_hz": None} if format in ("urdf", "placement") else {}
             result = {"result": self._files.folder / "track", "out": file, "format": format}
-            notes += len(run_export(build_job(ExportJob, options | without | result), provenance={}).notes)
-        return {"export_notes": notes}
+            written = run_export(build_job(ExportJob, options | without | result), provenance={})
+            diagnostics += len(written.diagnostics)
+        return {"export_diagnostics": diagnostics}
 
     def _evaluate(self, out: Path, options: Row) -> Row:
         recording = None if self._tracked is None else self._tracked.recording

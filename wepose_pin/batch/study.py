@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 
 import polars as pl
 
+from ..diagnostics import Diagnostic
 from ..errors import ExistingOutput, reason
 from ..jobs.batch import BatchJob
+from ..report.page import page_incomplete
 from ..writers.provenance import code, collect_provenance
 from .cluster import connected, made
 from .items import FAILED, MADE, Row, failed
@@ -37,7 +39,7 @@ class Study(NamedTuple):
     plan: Plan
     table: pl.DataFrame  # a row an item, in the order of the plan
     kept: int  # items that were done before
-    warnings: list[str]  # of the page, where it or a part of it cannot be made
+    diagnostics: list[Diagnostic]  # of the page, where it or a part of it cannot be made
 
 
 def run_batch(job: BatchJob, progress: ItemProgress = lambda *_: None) -> Study:
@@ -69,9 +71,9 @@ def run_batch(job: BatchJob, progress: ItemProgress = lambda *_: None) -> Study:
         try:
             write_bytes(f"{out}/{REPORT}", study_page(plan, table, failures).encode())
         except Exception as error:
-            failures.append(f"cannot be made: {reason(error)}; {RESULTS} is whole")
+            failures.append(f"cannot be made: {reason(error)}")
     kept = sum(bool(row.get("kept")) and row["status"] == MADE for row in rows.values())
-    return Study(plan, table, kept, [f"{REPORT}: {failure}" for failure in failures])
+    return Study(plan, table, kept, [page_incomplete(REPORT, failure) for failure in failures])
 
 
 def _claim(out: str, path: Path) -> None:

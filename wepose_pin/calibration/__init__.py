@@ -3,8 +3,8 @@
 `protocols` says what holds in which phase, `chain` is the chain in CasADi, `problem` the least squares over all that is
 not known, `known` what is known before, `start` finds headings without a guess, `joints` what accelerations tell of
 them, `weighing` what the looks are worth, `lengths` is the calibration from a recording to a subject. `touching` and
-`anatomy` guard it against hands apart and sensors exchanged; `verdict` says what it is worth, in words of `remarks` and
-`advice`.
+`anatomy` guard it against hands apart and sensors exchanged; `observability` says what the motion does not show, and
+`quality` what the calibration is worth.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 
+from ..diagnostics import lines
 from ..errors import CalibrationFailed, WeposeWarning
 from ..filters import BEST
 from ..recording import Recording
@@ -19,7 +20,7 @@ from ..subject import Subject
 from .chain import ARMS, CHAIN, palm_gap, rotate
 from .lengths import GAUGE_STD, Calibration, calibrate_lengths
 from .protocols import PROTOCOLS, Protocol, load_protocol
-from .verdict import Finding, Verdict, document, judge
+from .quality import CalibrationQuality, Check, assess, document
 
 __all__ = [
     "ARMS",
@@ -27,13 +28,13 @@ __all__ = [
     "GAUGE_STD",
     "PROTOCOLS",
     "Calibration",
-    "Finding",
+    "CalibrationQuality",
+    "Check",
     "Protocol",
-    "Verdict",
+    "assess",
     "calibrate",
     "calibrate_lengths",
     "document",
-    "judge",
     "load_protocol",
     "palm_gap",
     "rotate",
@@ -51,27 +52,28 @@ def calibrate(
 ) -> Subject:
     """The subject of a hands-together recording, if the calibration does not fail. Parameters as `calibrate_lengths`.
 
-    What else was found: `calibrate_lengths`, and `judge` for what it is worth.
+    What else was found: `calibrate_lengths`, and `assess` for what it is worth.
 
     Raises
     ------
     CalibrationFailed
-        The verdict is "fail"; the error has what was found all the same, in `calibration.subject`, and the `verdict`.
+        Its quality is "fail"; the error has what was found all the same, in `calibration.subject`, and the `quality`.
     WeposeError
         As `calibrate_lengths`.
 
     Warns
     -----
     WeposeWarning
-        The verdict is "poor": what is uncertain, and what to do better.
+        Its quality is "poor": what is uncertain, and what to do better.
     """
     found = calibrate_lengths(
         recording, gauge=gauge, prior=prior, protocol=protocol, method=method, gauge_std=gauge_std
     )
-    verdict = judge(found)
-    text = f"{recording.where()}: the calibration is of grade '{verdict.grade}': {'; '.join(verdict.in_words())}"
-    if verdict.grade == "fail":
-        raise CalibrationFailed(f"{text}; what was found is in this error's calibration.subject", found, verdict)
-    if verdict.grade == "poor":
+    quality = assess(found)
+    reasons = " ".join(line for _, line in lines(quality.reasons))
+    text = f"{recording.where()}: the calibration's quality is '{quality.quality}'. {reasons}"
+    if quality.quality == "fail":
+        raise CalibrationFailed(f"{text} This error's calibration.subject has what was found.", found, quality)
+    if quality.quality == "poor":
         warnings.warn(text, WeposeWarning, stacklevel=2)
     return found.subject

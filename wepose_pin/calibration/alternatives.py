@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..diagnostics import WARNING, Diagnostic
 from .problem import Fit, K, Layout, Looks, placed, solve
 from .start import distinct_headings
 
@@ -91,13 +92,10 @@ def spread_over(covariance: np.ndarray, others: list[Alternative], layout: Layou
     return spread * np.outer(shrunk, shrunk)
 
 
-def on_others(others: list[Alternative], layout: Layout) -> list[str]:
-    """A warning where another solution is not to be told from the one that is handed on."""
+def ambiguous_headings(others: list[Alternative], layout: Layout) -> list[Diagnostic]:
+    """The sensor whose heading differs most in the likeliest other solution, where there is one."""
     if not others:
         return []
-    turned = np.degrees(np.abs(others[0].off[layout.heading]))
+    turned = np.abs(others[0].off[layout.heading])
     worst = int(np.argmax(turned))
-    return [
-        f"the motion fits other headings nearly as well, the {layout.sensors[worst].replace('_', ' ')} sensor's "
-        f"{turned[worst]:.0f} deg off: the hands moved too little to tell; state the mounts, or move further"
-    ]
+    return [Diagnostic("headings-ambiguous", WARNING, layout.sensors[worst], float(turned[worst]))]

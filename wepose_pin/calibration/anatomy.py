@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG, heading_to, nominal_mount
+from ..diagnostics import ERROR, Diagnostic, Severity
 from ..filters.sensors import FilteredRecording
 from ..recording import Recording
 from ..subject import Subject
@@ -48,23 +49,25 @@ class Arms(NamedTuple):
 
     def doubt(self) -> float:
         """How far from a person: the worst of all over its limit."""
-        return max(self._doubts().values())
+        return max(doubt for doubt, _ in self._doubts())
 
-    def contradiction(self) -> str:
-        """What is worst, in words."""
-        doubts = self._doubts()
-        return max(doubts, key=lambda text: doubts[text])
+    def contradiction(self) -> Diagnostic:
+        """What is worst."""
+        return max(self._doubts(), key=lambda pair: pair[0])[1]
 
-    def _doubts(self) -> dict[str, float]:
-        found = {
-            f"the hands would be behind the body in {100 * self.behind:.0f} % of the phase": self.behind / BEHIND,
-            f"the chain stays open by {1e3 * self.gap:.0f} mm rms": self.gap / OPEN,
-        }
-        for side, share in self.backward.items():
-            found[f"the {side} elbow would bend backward in {100 * share:.0f} % of the phase"] = share / BACKWARD
+    def _doubts(self) -> list[tuple[float, Diagnostic]]:
+        """Each value over its limit, and what it is about."""
+        found = [
+            ("calibration-hands-behind", "", self.behind, BEHIND),
+            ("calibration-chain-open", "", self.gap, OPEN),
+        ]
+        found += [("calibration-elbow-backward", f"{s}_elbow", v, BACKWARD) for s, v in self.backward.items()]
+        doubts = [(value / limit, Diagnostic(code, ERROR, place, value, limit)) for code, place, value, limit in found]
         for side, angle in self.sideways.items():
-            found[f"the {side} elbow would bend sideways by {angle:.0f} deg rms"] = angle / SIDEWAYS_DEG
-        return found
+            sideways = np.deg2rad([angle, SIDEWAYS_DEG]).tolist()
+            code = "calibration-elbow-sideways"
+            doubts.append((angle / SIDEWAYS_DEG, Diagnostic(code, ERROR, f"{side}_elbow", *sideways)))
+        return doubts
 
 
 @dataclass(frozen=True)
@@ -74,32 +77,28 @@ class Labels:
     Parameters
     ----------
     doubt : of the labels as stated, above 1 where a person cannot move so
-    contradiction : what a person cannot do, in words; empty where all is well
+    contradiction : what a person cannot do; None where all is well
     moved : segment → segment whose name the sensor on it carries, of the labelling that is a person's; empty where that
         is the stated one, or none is
     """
 
     doubt: float = 0.0
-    contradiction: str = ""
+    contradiction: Diagnostic | None = None
     moved: Mapping[str, str] = field(default_factory=dict)
 
-    def said(self) -> str:
-        """The contradiction in one sentence, empty where there is none."""
-        if not self.contradiction:
-            return ""
+    def diagnostic(self, severity: Severity = ERROR) -> Diagnostic:
+        """Which sensors sit elsewhere than labelled, or how far the arms move from a person's."""
         if not self.moved:
-            return f"{self.contradiction}; no other labelling of the sensors explains it"
+            return Diagnostic("arm-motion-implausible", severity, "", self.doubt, 1.0)
         pairs = {tuple(sorted(pair, key=PLACES.index)) for pair in self.moved.items()}
         exchanged = all(self.moved[b] == a for a, b in self.moved.items())
-        if exchanged and pairs == {(f"left_{part}", f"right_{part}") for part in PARTS}:
-            return (
-                f"left and right sensors look exchanged: {self.contradiction}; exchange left and right in the session"
-            )
+        variant = {} if exchanged else {"variant": "mixed"}
+        place = ", ".join(f"{label} sits on the {place}" for place, label in sorted(self.moved.items()))
         if exchanged:
-            names = ", ".join(f"{a} and {b}" for a, b in sorted(pairs))
-            return f"sensors {names} look exchanged: {self.contradiction}; exchange their names in the session"
-        names = ", ".join(f"{label} sits on the {place}" for place, label in sorted(self.moved.items()))
-        return f"sensors look mixed up: {self.contradiction}; {names}: correct their names in the session"
+            place = ", ".join(f"{a} and {b}" for a, b in sorted(pairs))
+            if pairs == {(f"left_{part}", f"right_{part}") for part in PARTS}:
+                variant = {"variant": "sides"}
+        return Diagnostic("sensors-exchanged", severity, place, self.doubt, 1.0, variant)
 
 
 def arms(quat_WL: Mapping[str, np.ndarray], lengths: Mapping[str, float], gap: float) -> Arms:

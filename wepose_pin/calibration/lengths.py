@@ -28,14 +28,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import heading_to, nominal_mount
+from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG, heading_to, nominal_mount
 from ..arguments import Positive, check_arguments
+from ..diagnostics import WARNING, Diagnostic, unclassified
 from ..errors import BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import FilteredRecording, filter_recording
 from ..recording import Recording
 from ..subject import LENGTHS, Drift, Hinge, StartTilt, Subject, average_subject
-from .alternatives import Alternative, alternatives, on_others, spread_over
+from .alternatives import Alternative, alternatives, ambiguous_headings, spread_over
 from .anatomy import (
     BETTER,
     Arms,
@@ -52,9 +53,9 @@ from .chain import CHAIN, SIDES
 from .joints import coupled, couplings
 from .known import known_before, known_lengths, stated_headings
 from .losses import connected, losses_of, need_start_pose, steps_of, tilted
+from .observability import assumed_distances, open_closures, unknown_mounts, unobserved_lengths
 from .problem import HINGE_STD, K, Layout, Looks, carrier, placed, residuals
 from .protocols import Closure, Protocol, load_protocol
-from .remarks import on_headings, on_lengths, on_looks, on_unseen
 from .start import is_linear
 from .touching import touching_start
 from .weighing import TOUCHED, Tape, covariance_of, handed_on, learned_of, taped, weighed
@@ -81,7 +82,7 @@ class Calibration:
     independent : how many independent looks at the gap the phase is worth
     gauge : the measured lengths [m]; empty: the scale is the prior's
     scale_std : relative standard deviation of the overall scale, the proportions taken as found
-    warnings : what the user should know
+    diagnostics : what the user should know besides its quality, see `assess`
     time, gap, prior_gap : (n,) [s], (n,) [m] the residual's length at each look, and with the prior's lengths
     kept : (n,) the weight that each look kept, near 0 where the palms were apart
     start_tilt : segment → (2,) [rad] about x and y of W, how far it was off the start pose
@@ -97,7 +98,8 @@ class Calibration:
     tape : the gauge that serves it best, with an example
     tapes : each measured length beside what is known without it
     labels : whether the sensors sit where the session says
-    contradicted : stated mounts that could not be and were not used, in words
+    contradicted : stated mounts that could not be and were not used
+    scaling : measured lengths that fix the scale; empty: the prior does
     """
 
     subject: Subject
@@ -107,7 +109,7 @@ class Calibration:
     independent: float
     gauge: Mapping[str, float]
     scale_std: float
-    warnings: tuple[str, ...]
+    diagnostics: tuple[Diagnostic, ...]
     time: np.ndarray
     gap: np.ndarray
     prior_gap: np.ndarray
@@ -124,7 +126,8 @@ class Calibration:
     tape: str = Protocol.tape
     tapes: Mapping[str, Tape] = field(default_factory=dict)
     labels: Labels = field(default_factory=Labels)
-    contradicted: tuple[str, ...] = ()
+    contradicted: tuple[Diagnostic, ...] = ()
+    scaling: tuple[str, ...] = ()
 
     def arms(self) -> Arms:
         """How the arms moved while the chain was closed."""
@@ -201,11 +204,8 @@ def _believed(
     def tried(recording: Recording, found: FilteredRecording, prior: Subject) -> Calibration:
         return _solve(recording, found, protocol, prior, gauge, gauge_std, quick=True)
 
-    where = "correct it in the session or leave it out"
-    notes = []
     wrong = against_gravity(recording, prior, found)
-    for name, off in wrong.items():
-        notes.append(f"sensors.{name}.mount is {off:.0f} deg off gravity in the start pose and was not used; {where}")
+    contradicted = [_not_used(name, off, STATED_LIMIT_DEG) for name, off in wrong.items()]
     recording, prior = without_mounts(recording, prior, wrong)
     _need_start_pose(recording, found, protocol, prior)
     stated = tried(recording, found, prior)
@@ -215,10 +215,7 @@ def _believed(
         free = tried(bare, found, unknown)
         if free.arms().doubt() < min(1.0, BETTER * max(doubt, 1.0 / BETTER)):
             wrong = against_motion(recording, prior, free.subject.mounts)
-            for name, off in wrong.items():
-                notes.append(
-                    f"sensors.{name}.mount is {off:.0f} deg off what the motion says and was not used; {where}"
-                )
+            contradicted += [_not_used(name, off, STATED_WARNING_DEG, "motion") for name, off in wrong.items()]
             recording, prior = without_mounts(recording, prior, wrong)
             doubt = 0.0 if wrong else doubt
     if doubt > 1.0:
@@ -228,19 +225,24 @@ def _believed(
             tuple(found.R_VS),
         )
         if labels.moved:
-            return _nothing_learned(stated, labels, (labels.said(), *notes, *stated.warnings), gauge, gauge_std)
+            stated = replace(stated, diagnostics=(*contradicted, *stated.diagnostics))
+            return _nothing_learned(stated, labels, gauge, gauge_std)
     try:
         best = _solve(recording, found, protocol, prior, gauge, gauge_std)
     except NoSolution as error:
         raise NoSolution(f"{recording.where()}: {error}") from error
     how = best.arms()
-    labels = Labels(how.doubt(), how.contradiction() if how.doubt() > 1.0 else "")
-    said = [labels.said()] if labels.said() else []
-    return replace(best, labels=labels, contradicted=tuple(notes), warnings=(*said, *notes, *best.warnings))
+    labels = Labels(how.doubt(), how.contradiction() if how.doubt() > 1.0 else None)
+    return replace(best, labels=labels, contradicted=tuple(contradicted))
+
+
+def _not_used(segment: str, off_deg: float, limit_deg: float, by: str = "") -> Diagnostic:
+    off, limit = np.deg2rad([off_deg, limit_deg]).tolist()
+    return Diagnostic("mount-not-used", WARNING, segment, off, limit, {"variant": by} if by else {})
 
 
 def _nothing_learned(
-    calibration: Calibration, labels: Labels, warnings: tuple[str, ...], gauge: Mapping[str, float], gauge_std: float
+    calibration: Calibration, labels: Labels, gauge: Mapping[str, float], gauge_std: float
 ) -> Calibration:
     """What is handed on where sensors sit elsewhere than labelled: the lengths and spreads of before the motion."""
     lengths, information = known_lengths(calibration.prior, gauge, gauge_std)
@@ -254,7 +256,7 @@ def _nothing_learned(
         note="sensors sit elsewhere than labelled: nothing of the motion is used",
     )
     scale_std = float(np.sqrt(lengths @ information @ lengths) ** -1)
-    return replace(calibration, subject=subject, scale_std=scale_std, labels=labels, warnings=warnings)
+    return replace(calibration, subject=subject, scale_std=scale_std, labels=labels)
 
 
 def _looks(
@@ -371,12 +373,13 @@ def _solve(
     without_data = np.linalg.inv(known[:K, :K])
     measured = {name: (value, gauge_std) for name, value in gauge.items()}
     measured |= {c.gauge: (c.metres, c.metres_std) for c in protocol.closures if c.gauge and c.gauge not in gauge}
-    tapes = taped(fit, layout, measured)
     loose = None if scaling else scale_std
-    warnings = on_lengths(protocol, lengths, covariance[:K, :K], without_data, prior, loose, tapes)
-    warnings += on_headings(protocol, layout, covariance, gauge)
-    warnings += on_others(others, layout)
-    warnings += on_unseen([name for name in found.R_VS if name not in mounts], protocol)
+    diagnostics = [unclassified(text) for text in found.warnings]
+    diagnostics += unobserved_lengths(protocol, lengths, covariance[:K, :K], without_data, prior, loose)
+    diagnostics += assumed_distances(protocol, gauge)
+    diagnostics += ambiguous_headings(others, layout)
+    diagnostics += unknown_mounts([name for name in found.R_VS if name not in mounts], protocol)
+    diagnostics += open_closures(recording.time[at], weight, looks)
     seen = {side: SIDES.index(side) for side in (layout.arms if looks.closed.any() else ())}
     axes = {side: np.array([x, 1.0, z]) for side, (x, z) in zip(SIDES, fit.x[layout.hinge].reshape(2, 2), strict=True)}
     hinge = {side: axes[side] / np.linalg.norm(axes[side]) for side in seen}
@@ -415,7 +418,7 @@ def _solve(
         independent=independent,
         gauge=gauge,
         scale_std=scale_std,
-        warnings=(*found.warnings, *warnings, *on_looks(recording.time[at], weight, looks)),
+        diagnostics=tuple(diagnostics),
         time=recording.time[at],
         gap=gap,
         prior_gap=prior_gap,
@@ -430,7 +433,8 @@ def _solve(
         protocol=protocol.name,
         closure=next((closure.kind for closure in protocol.closures), ""),
         tape=protocol.tape,
-        tapes=tapes,
+        tapes=taped(fit, layout, measured),
+        scaling=tuple(scaling),
     )
 
 

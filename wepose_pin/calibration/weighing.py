@@ -46,13 +46,6 @@ class Tape(NamedTuple):
         """By how many standard deviations the two differ."""
         return abs(self.metres - self.expected) / float(np.hypot(self.std, self.measured_std))
 
-    def said(self, name: str) -> str:
-        """The contradiction in one clause."""
-        return (
-            f"{name} = {1e3 * self.metres:.0f} mm is {self.off:.1f} standard deviations from the "
-            f"{1e3 * self.expected:.0f} ± {1e3 * self.std:.0f} mm that it should be by all else that is known"
-        )
-
 
 def weighed(
     looks: Looks, center: np.ndarray, information: np.ndarray, start: np.ndarray, touching: np.ndarray, quick: bool

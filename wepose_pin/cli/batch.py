@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from ..jobs.batch import BatchJob
-from .output import note, print_table, progress_bar, say
+from .output import print_diagnostics, print_table, progress_bar, say
 from .parser import Command
 
 
@@ -31,7 +31,7 @@ def run(job: BatchJob) -> int:
         first = failed.unique("error", keep="first", maintain_order=True)
         for item, message in first.select("item", "message").iter_rows():
             say(f"  {item}: {message}")
-    note(study.warnings)
+    print_diagnostics(study.diagnostics)
     kept = f", {study.kept} of them before" if study.kept else ""
     say(f"{study.table.height - failed.height} of {study.table.height} items done{kept}")
     place = job.out.rstrip("/")

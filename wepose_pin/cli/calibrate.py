@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ..diagnostics import lines
 from ..jobs.calibrate import CalibrateJob, run_calibrate
-from .output import note, print_table, progress_bar, say, say_indented, say_pages
+from .output import print_diagnostics, print_table, progress_bar, say, say_indented, say_pages
 from .parser import Command
 from .tables import print_lengths
 
 if TYPE_CHECKING:
-    from ..calibration import Calibration, Verdict
+    from ..calibration import Calibration, CalibrationQuality
 
 EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
 COLOURS = {"pass": "green", "poor": "yellow", "fail": "red"}
@@ -21,10 +22,8 @@ def run(job: CalibrateJob) -> int:
     """Calibrate; say lengths, mounts, the gap between the palms and the quality."""
     with progress_bar() as progress:
         outcome = run_calibrate(job, progress)
-    from ..report import unsaid
-
     calibration, quality, protocol = outcome.calibration, outcome.quality, outcome.protocol
-    note([*unsaid(calibration.warnings, quality), *outcome.page_failures])
+    print_diagnostics([*quality.further, *outcome.page_failures])
     print_lengths(f"Lengths, by {protocol.title}", calibration.subject, outcome.prior, job.measured)
     _print_mounts(calibration)
     if protocol.closures:
@@ -36,7 +35,7 @@ def run(job: CalibrateJob) -> int:
         say_pages(job.out, {"Report to look at": "report.html"})
     say(f"Subject: {job.out / 'subject.toml'}  {job.out / 'subject.urdf'}  {job.out / 'calibration.json'}")
     _print_quality(quality)
-    return EXIT_CODES[quality.grade]
+    return EXIT_CODES[quality.quality]
 
 
 def _print_mounts(calibration: Calibration) -> None:
@@ -56,14 +55,14 @@ def _print_mounts(calibration: Calibration) -> None:
     print_table("Mounts, in deg: ± is one standard deviation", header, rows)
 
 
-def _print_quality(quality: Verdict) -> None:
+def _print_quality(quality: CalibrationQuality) -> None:
     from rich.console import Console
 
-    colour = COLOURS[quality.grade]
+    colour = COLOURS[quality.quality]
     determined = f"the motion determines {quality.determined} of {quality.unknowns} unknowns better than the prior"
-    Console(width=160).print(f"Quality: [bold {colour}]{quality.grade}[/] ({determined})", highlight=False)
-    for text in quality.in_words():
-        say_indented(text)
+    Console(width=160).print(f"Quality: [bold {colour}]{quality.quality}[/] ({determined})", highlight=False)
+    for _, line in lines(quality.reasons):
+        say_indented(line)
 
 
 COMMAND = Command(

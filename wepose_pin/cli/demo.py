@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..jobs.demo import DemoJob, run_demo
-from .output import note, print_table, progress_bar, say, say_pages
+from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 from .parser import Command
 from .tables import mean_std, print_lengths
 
@@ -28,7 +28,7 @@ def run(job: DemoJob) -> int:
     )
     say("One person, one motion: the order of the filters changes with both, see --seed. Each filter tracks with the")
     say("lengths that it calibrated. From the root the trunk counts too, whose length joined hands do not show.")
-    note(outcome.page_failures)
+    print_diagnostics(outcome.page_failures)
     out = job.out
     say_pages(out / "result", {"Motion to look at": "view.html"})
     say(f"Session, subject, result, figures:  {out}/session  {out}/subject  {out}/result  {out}/demo.json")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..jobs.export import ExportJob, run_export
-from .output import note, progress_bar, say
+from .output import print_diagnostics, progress_bar, say
 from .parser import Command
 
 
@@ -11,7 +11,7 @@ def run(job: ExportJob) -> int:
     """Write the file; say what it cannot hold."""
     with progress_bar() as progress:
         written = run_export(job, progress)
-    note(written.notes)
+    print_diagnostics(written.diagnostics)
     say(f"Written: {job.out}  ({written.format})")
     return 0
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ..diagnostics import WARNING, Diagnostic
 from ..jobs.live import LiveJob, run_live
-from .output import note, print_table, say
+from .output import print_diagnostics, print_table, say
 from .parser import Command
 from .stopping import stop_requests
 
@@ -18,14 +19,15 @@ def run(job: LiveJob) -> int:
     """Follow the stream in the terminal; say at its end what came of it."""
     from ..live.terminal import TerminalView
 
-    outcome = run_live(job, views=[TerminalView()], stop=stop_requests(), say=say, note=note)
+    outcome = run_live(job, views=[TerminalView()], stop=stop_requests(), say=say, tell=print_diagnostics)
     ended = outcome.session
-    note(ended.warnings)
+    print_diagnostics(ended.diagnostics)
     _print_session(ended)
     if outcome.robot is not None:
         _print_robot(outcome.robot)
     if ended.problem:
-        note([ended.problem])
+        reason = {"reason": ended.problem}
+        print_diagnostics([Diagnostic("live-recording-incomplete", WARNING, str(job.record), facts=reason)])
     elif job.record is not None:
         again = f"  (wepose track {job.record} -o DIR gives these poses again)" if ended.poses else ""
         say(f"Recorded: {job.record}{again}")
@@ -67,12 +69,7 @@ def _print_robot(driven: Driven) -> None:
             for side, error in driven.error.items()
         ],
     )
-    if driven.skipped:
-        note([f"{driven.skipped} commands were skipped: the machine was too slow for them; --robot-hz asks for fewer"])
-    if driven.held:
-        note([f"in {driven.held} steps links were near each other and the joints' limits left no way apart"])
-    if driven.dropped:
-        note([f"{driven.dropped} commands were not taken by the network or by their receiver"])
+    print_diagnostics(driven.diagnostics)
 
 
 COMMAND = Command(LiveJob, run, example="live --source udp:9000 --subject anna --record morning.wepose")

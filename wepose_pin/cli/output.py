@@ -1,4 +1,4 @@
-"""What the user sees: lines, notes, tables and a progress bar, without the control characters that a file may hold."""
+"""What the user sees: lines, diagnostics, tables, a progress bar; without the control characters a file may hold."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from ..diagnostics import Diagnostic, lines
 from ..errors import printable
 from ..jobs import Progress
 from .stopping import check_stopped
@@ -26,10 +27,10 @@ def say_indented(text: str) -> None:
     say(textwrap.fill(text, WIDTH, initial_indent="  ", subsequent_indent="    "))
 
 
-def note(warnings: Iterable[str]) -> None:
-    """A line each on standard error."""
-    for warning in warnings:
-        print(f"note: {_shown(str(warning))}", file=sys.stderr)
+def print_diagnostics(diagnostics: Iterable[Diagnostic]) -> None:
+    """A line each on standard error, the gravest first."""
+    for severity, line in lines(diagnostics):
+        print(f"{severity}: {_shown(line)}", file=sys.stderr)
 
 
 def say_pages(folder: Path, pages: Mapping[str, str]) -> None:

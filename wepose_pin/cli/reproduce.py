@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..jobs.reproduce import ReproduceJob
-from .output import note, progress_bar, say
+from .output import print_diagnostics, progress_bar, say
 from .parser import Command
 
 
@@ -13,7 +13,7 @@ def run(job: ReproduceJob) -> int:
 
     with progress_bar() as progress:
         found = run_reproduce(job, progress)
-    note(found.notes)
+    print_diagnostics(found.diagnostics)
     same = "different" if found.differences else "the same"
     say(f"{job.result}: {same}, made again by wepose {found.command}" + ":" * bool(found.differences))
     for line in found.differences:

@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ..diagnostics import from_json
 from ..jobs.retarget import RetargetJob, run_retarget
-from .output import note, print_table, progress_bar, say, say_pages
+from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 from .parser import Command
-
-MOST_MOMENTS = 6  # of those at which the motion was slowed
 
 
 def run(job: RetargetJob) -> int:
     """Compute the trajectory; say how well the hands follow and what it keeps."""
     with progress_bar() as progress:
         outcome = run_retarget(job, progress)
-    note(outcome.page_failures)
+    print_diagnostics([*map(from_json, outcome.summary["diagnostics"]), *outcome.page_failures])
     _print_arms(outcome.summary)
     _print_checks(outcome.summary)
     out = job.out
@@ -55,27 +54,14 @@ def _print_arms(summary: Mapping[str, Any]) -> None:
 
 
 def _print_checks(summary: Mapping[str, Any]) -> None:
-    """What the trajectory keeps, where it was slowed, and how long a step took."""
+    """What the trajectory keeps, and how long a step took."""
     margins, touched = summary["limit_margins"], summary["self_collision"]
     say(
         f"Limits {'kept' if summary['limits_kept'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "
         f"velocity {100 * margins['velocity_share']:.1f} %, "
         f"acceleration {100 * margins['acceleration_share']:.1f} %, jerk {100 * margins['jerk_share']:.1f} % to spare"
     )
-    slow = summary["slowest"]
-    if slow is not None:
-        say(f"Slowed most for {slow['joint']} at {slow['time']:.1f} s of the recording ({slow['what']})")
-    if summary["slowed_for_contact_s"]:
-        moments = ", ".join(f"{moment:.1f}" for moment in summary["slowed_for_contact_s"][:MOST_MOMENTS])
-        say(f"Slowed so that it can stop before it touches itself, about {moments} s of the recording")
-    if touched["samples_touching"]:
-        note(
-            [
-                f"the robot touches itself in {touched['samples_touching']} samples, first {touched['first']}: do not "
-                f"run this trajectory; a smaller --scale keeps the hands apart"
-            ]
-        )
-    else:
+    if not touched["samples_touching"]:
         closest = touched["closest_hulls_mm"]
         say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
     say(f"Solved in {summary['solve_ms']['p50']:.2f} ms (p50), {summary['solve_ms']['p99']:.2f} ms (p99) a step")

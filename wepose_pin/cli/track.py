@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from ..diagnostics import from_json
 from ..jobs.track import TrackJob, TrackOutcome, run_track
-from .output import note, print_table, progress_bar, say, say_pages
+from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 from .parser import Command
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ def run(job: TrackJob) -> int:
     """Track, and say what was found of the sensors."""
     with progress_bar() as progress:
         outcome = run_track(job, progress)
-    note(outcome.summary["warnings"])
+    print_diagnostics(from_json(each) for each in outcome.summary["diagnostics"])
     if outcome.chain is not None:
         _print_chain(job, outcome.chain, outcome.summary)
     else:
@@ -33,7 +34,7 @@ def _print_pose(job: TrackJob, outcome: TrackOutcome) -> None:
         ("sensor", "static", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
         [(segment, *_sensor_cells(about)) for segment, about in summary["sensors"].items()],
     )
-    note(outcome.page_failures)
+    print_diagnostics(outcome.page_failures)
     motion = "Motion to look at" + (f", {rate_hz:.2g} pictures a second" if rate_hz else "")
     pages = {"Report to look at": "report.html"} if job.report else {}
     say_pages(job.out, pages | ({motion: "view.html"} if job.view else {}))

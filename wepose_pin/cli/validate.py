@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..jobs.validate import ValidateJob, run_validate
-from .output import note, print_table, progress_bar, say
+from .output import print_diagnostics, print_table, progress_bar, say
 from .parser import Command
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ def run(job: ValidateJob) -> int:
     with progress_bar() as progress:
         document, failures = run_validate(job, progress)
     print_experiments(document)
-    note([*(each.line() for each in document.skipped), *failures])
+    print_diagnostics([*(each.diagnostic() for each in document.skipped), *failures])
     if job.out is not None and (job.out / "validation.html").is_file():
         say(f"Page: {job.out / 'validation.html'}  {job.out / 'validation.md'}  {job.out / 'validation'}/*.svg")
     if job.out is not None and job.from_ is None:

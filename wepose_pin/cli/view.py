@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from ..diagnostics import INFO, Diagnostic
 from ..jobs.view import ViewJob, run_view
-from .output import note, progress_bar, say
+from .output import print_diagnostics, progress_bar, say
 from .parser import Command
 
 
@@ -13,7 +14,7 @@ def run(job: ViewJob) -> int:
         outcome = run_view(job, progress)
     say(f"Motion to look at:  {outcome.page}")
     if job.open and not outcome.opened:
-        note(["no browser could be started; open the page yourself"])
+        print_diagnostics([Diagnostic("browser-not-started", INFO)])
     return 0
 
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from ..diagnostics import Diagnostic
 from ..errors import BadOption, one_of
 from . import Method, Progress, no_progress
 from .fields import field_values
 
 if TYPE_CHECKING:
-    from ..calibration import Calibration, Protocol, Verdict
+    from ..calibration import Calibration, CalibrationQuality, Protocol
     from ..subject import Subject
 
 
@@ -80,10 +81,10 @@ class CalibrateOutcome(NamedTuple):
     """What came of a `CalibrateJob`."""
 
     calibration: Calibration
-    quality: Verdict
+    quality: CalibrationQuality
     protocol: Protocol
     prior: Subject
-    page_failures: list[str]  # a line for each page, or part of one, that could not be made
+    page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
 
 
 def run_calibrate(
@@ -100,7 +101,7 @@ def run_calibrate(
     WeposeError
         What the session, the protocol or an option lacks.
     """
-    from ..calibration import calibrate_lengths, judge, load_protocol
+    from ..calibration import assess, calibrate_lengths, load_protocol
     from ..model import load_model
     from ..readers import load_session
     from ..report import write_calibration_page
@@ -120,15 +121,15 @@ def run_calibrate(
         calibration = calibrate_lengths(
             recording, gauge=dict(job.measured), prior=prior, protocol=protocol, method=job.method
         )
-        quality = judge(calibration)
+        quality = assess(calibration)
         write_subject(folder, calibration.subject, load_model(lengths=calibration.subject.lengths))
         if provenance is None:
             provenance = collect_provenance("calibrate", field_values(job))
         write_calibration(folder, calibration, quality, provenance)
-    failures = []
+    failures: list[Diagnostic] = []
     if job.report:
         progress("writing the report", 2 / 3)
         failures = write_calibration_page(
-            job.out, calibration, recording, method=job.method, protocol=protocol, verdict=quality
+            job.out, calibration, recording, method=job.method, protocol=protocol, quality=quality
         )
     return CalibrateOutcome(calibration, quality, protocol, prior, failures)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from ..diagnostics import Diagnostic
 from . import Progress, no_progress
 from .fields import field_values
 from .simulate import check_seed
@@ -49,7 +50,7 @@ class DemoOutcome(NamedTuple):
     person: Person
     best: Calibration  # by the default method
     errors: Mapping[str, Evaluation]  # by method, while the circles are drawn
-    page_failures: list[str]
+    page_failures: list[Diagnostic]
 
 
 def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:

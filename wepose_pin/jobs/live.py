@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from ..diagnostics import INFO, Diagnostic
 from ..errors import BadOption
 from . import Arms, LiveMethod, arm_sides
 
@@ -114,7 +115,7 @@ def run_live(
     views: Sequence[Output] = (),
     stop: contextlib.AbstractContextManager[Callable[[], bool]] | None = None,
     say: Callable[[str], None] = lambda _: None,
-    note: Callable[[Sequence[str]], None] = lambda _: None,
+    tell: Callable[[Sequence[Diagnostic]], None] = lambda _: None,
 ) -> LiveOutcome:
     """Follow a stream to its end.
 
@@ -122,7 +123,7 @@ def run_live(
     ----------
     views : outputs that show the person to the user, and the robot's state beside it
     stop : gives what is asked again and again whether to stop, while the stream is followed
-    say, note : told where the page is, and what the user should know, before the stream begins
+    say, tell : told where the page is, and what the user should know, before the stream begins
 
     Raises
     ------
@@ -139,7 +140,7 @@ def run_live(
     source = open_source(job.source, sensors=named or None, speed=job.speed)
     setup = stated or find_setup(source, job.subject, None)
     model = wearer_model(setup.subject, load_model(job.model) if job.model else None)
-    note(model.warnings)
+    tell(model.diagnostics)
     outputs: list[Output] = []
     robot: RobotOut | None = None
     try:
@@ -178,7 +179,7 @@ def run_live(
                 import webbrowser
 
                 if not webbrowser.open(page.url):
-                    note(["no browser could be started; open the page yourself"])
+                    tell([Diagnostic("browser-not-started", INFO)])
         outputs += [_with_robot(view, robot) for view in views]
         if robot is not None:
             warm(job.method)  # what is compiled then does not hold up commands

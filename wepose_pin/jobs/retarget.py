@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from ..diagnostics import Diagnostic
 from ..errors import BadOption
 from . import Arms, Progress, arm_sides, no_progress
 from .fields import field_values
@@ -77,7 +78,7 @@ class RetargetOutcome(NamedTuple):
     """What came of a `RetargetJob`."""
 
     summary: Mapping[str, Any]  # as in summary.json, page failures apart
-    page_failures: list[str]
+    page_failures: list[Diagnostic]
     duration_s: float
 
     @property
@@ -139,12 +140,12 @@ def run_retarget(
             provenance = collect_provenance("retarget", field_values(job))
         text = json.dumps({**summary, "provenance": provenance}, indent=2)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
-    failures = []
+    failures: list[Diagnostic] = []
     if job.view:
         progress("making the page", 0.99)
         title = f"{about.get('recording') or job.result.name} on {robot.map.name}"
         writer = PageWriter(job.out, ["view.html"])
         writer.write("view.html", lambda _: retarget_html(body, pose, trajectory, title=title))
-        writer.add_warnings("summary.json")
-        failures = writer.warnings
+        writer.save_diagnostics("summary.json")
+        failures = writer.diagnostics
     return RetargetOutcome(summary, failures, float(trajectory.time[-1]))

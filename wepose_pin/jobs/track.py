@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ..diagnostics import Diagnostic, from_json
 from ..errors import BadOption
 from . import Method, Progress, no_progress
 from .fields import field_values
@@ -50,7 +51,7 @@ class TrackJob:
     view
         Write view.html, the motion to look at.
     report
-        Write report.html: warnings and what to do, noise, drift, hands, joint angles.
+        Write report.html: diagnostics and what to do, noise, drift, hands, joint angles.
     chunk_seconds : SECONDS
         Track in chunks of this length, in a memory that does not grow with the recording (docs/long-recordings.md).
         Recordings of 500 MB and more are always tracked so, in chunks of 120 s (smoother: 600 s); 0 tracks them as a
@@ -84,7 +85,7 @@ class TrackOutcome(NamedTuple):
     """What came of a `TrackJob`."""
 
     summary: Mapping[str, Any]  # as in summary.json, page failures apart
-    page_failures: list[str]  # a line for each page, or part of one, that could not be made
+    page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
     view_rate_hz: float | None = None  # of view.html, where it shows fewer samples than there are
     tracked: TrackedRecording | None = None  # where a person was tracked as a whole
     chain: TrackedChain | None = None  # where another chain was
@@ -156,7 +157,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
 
             torques = pose_torques(tracked)
         write_result(folder, tracked, job.covariance, recording.phases, torques, provenance)
-    failures = []
+    failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 2 / 3)
         failures = write_track_pages(job.out, tracked, view=job.view, report=job.report)
@@ -191,12 +192,12 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
         progress("writing the result", 1.0)
         writer.finish(reader.phases, provenance)
         summary = writer.accumulator.summary()
-    view_rate_hz, failures = min(30.0, MOST_FRAMES / max(summary["duration_s"], 1e-3)), []
+    view_rate_hz = min(30.0, MOST_FRAMES / max(summary["duration_s"], 1e-3))
+    failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 1.0)
-        failures = write_decimated_pages(
-            job.out, decimator, reader.phases, summary["warnings"], report=job.report, fps=view_rate_hz
-        )
+        found = [from_json(each) for each in summary["diagnostics"]]
+        failures = write_decimated_pages(job.out, decimator, reader.phases, found, report=job.report, fps=view_rate_hz)
     if not job.view:
         (job.out / "view.html").unlink(missing_ok=True)
     return TrackOutcome(summary, failures, view_rate_hz)

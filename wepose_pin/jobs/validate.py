@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption
 from . import Progress, no_progress
 
@@ -52,7 +53,7 @@ class ValidateOutcome(NamedTuple):
     """What came of a `ValidateJob`."""
 
     document: Document
-    page_failures: list[str]
+    page_failures: list[Diagnostic]
 
 
 def run_validate(job: ValidateJob, progress: Progress = no_progress) -> ValidateOutcome:
@@ -66,6 +67,7 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
     import json
 
     from ..errors import reason
+    from ..report.page import page_incomplete
     from ..validation import Skipped, document_text, experiments, read_document, run
     from ..validation.document import as_document
     from ..validation.page import write_pages
@@ -74,11 +76,11 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
 
     job.check()
     if job.from_ is not None:
-        document, failures = read_document(job.from_), list[str]()
+        document, failures = read_document(job.from_), list[Diagnostic]()
         if job.out is not None:
             with whole_folder(job.out, job.force) as folder:
                 progress("drawing the figures", 0.0)
-                failures = write_pages(folder, document)
+                failures = [page_incomplete("validation.html", each) for each in write_pages(folder, document)]
         return ValidateOutcome(document, failures)
     trials = [trial for of in experiments(job.quick, job.data).values() for trial in of]
     steps = len(trials) + (job.out is not None)
@@ -96,12 +98,13 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
         text = document_text(results, job.quick, versions(), skipped)
         if folder_or_none is not None:
             (folder_or_none / "validation.json").write_text(text, encoding="utf-8")
-    document, failures = as_document(json.loads(text), "this run"), []
+    document, failures = as_document(json.loads(text), "this run"), list[Diagnostic]()
     if job.out is not None:
         progress("drawing the figures", 1.0)
         try:
             with whole_folder(job.out, force=True) as folder:
-                failures = write_pages(folder, document)
+                failures = [page_incomplete("validation.html", each) for each in write_pages(folder, document)]
         except Exception as error:
-            failures = [f"validation.html and validation.md: cannot be made: {reason(error)}"]
+            name = "validation.html and validation.md"
+            failures = [page_incomplete(name, f"cannot be made: {reason(error)}")]
     return ValidateOutcome(document, failures)

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from ..diagnostics import Diagnostic, unclassified
 from ..filters import BEST
 from ..model import BodyModel, load_model
 from ..pose import LiveKinematics
@@ -96,7 +97,7 @@ class Ended(NamedTuple):
     seconds: float  # [s] from the first pose to the last, on the source's clock
     counts: Mapping[str, Mapping[str, int]]  # segment → taken, missing, late, duplicate, bad
     latency: Latencies  # [s] from the newest sample's time to its pose, of every tick
-    warnings: tuple[str, ...]
+    diagnostics: tuple[Diagnostic, ...]
     problem: str  # of the recording; empty where it is whole
 
 
@@ -395,7 +396,7 @@ class LiveLoop:
                 for name, row in zip(self.source.sensors, counts, strict=True)
             },
             self._latency,
-            () if self._tracker is None else self._tracker.start.warnings,
+            () if self._tracker is None else tuple(map(unclassified, self._tracker.start.warnings)),
             "" if self.log is None else self.log.problem,
         )
 

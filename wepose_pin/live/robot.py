@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption
 from ..retargeting import Robot, find_map, load, read_map
 from ..retargeting.stream import HOLD_AFTER_S, STOP_AFTER_S, Command, CommandStream, Person, needed
@@ -45,6 +46,16 @@ class Driven(NamedTuple):
     share: Mapping[str, float]  # of the commands that had a pose, state → share
     step: Latencies  # [s] from the newest pose to its command
     error: Mapping[str, Latencies]  # side → [m] of the hand while it followed
+
+    @property
+    def diagnostics(self) -> list[Diagnostic]:
+        """Commands that the robot did not get, and steps in which it could not move."""
+        found = [
+            Diagnostic("robot-commands-skipped", WARNING, self.robot, self.skipped),
+            Diagnostic("robot-blocked", WARNING, self.robot, self.held),
+            Diagnostic("robot-commands-dropped", WARNING, self.robot, self.dropped),
+        ]
+        return [diagnostic for diagnostic in found if diagnostic.value]
 
 
 class RobotOut:

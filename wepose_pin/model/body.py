@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from ..arguments import check_arguments
 from ..assets import asset
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, MissingFile, one_of
 from ..subject import average_subject
 from . import lengths as _lengths
@@ -52,36 +53,29 @@ class BodyModel:
         return _lengths.lengths(self.robot)
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
         """What a person's body can hardly have: lengths, mass, moments of inertia; a trunk that cannot move."""
         name, average = self.robot.name, average_subject()
         found = []
         for length, value in self.lengths.items():
             mean, std = average.lengths[length], average.std(length)
             if abs(value - mean) > FAR_OFF * std:
-                found.append(
-                    f"{name}: {length} is {value:.3g} m long; adults have {max(0.0, mean - FAR_OFF * std):.3f} to "
-                    f"{mean + FAR_OFF * std:.3f} m ({FAR_OFF:g} standard deviations, de Leva 1996 and ANSUR II): check "
-                    f"the lengths and units of the body"
-                )
+                plausible = {"shortest": max(0.0, mean - FAR_OFF * std), "longest": mean + FAR_OFF * std}
+                facts: dict[str, float | str] = {"model": name, "deviations": FAR_OFF, **plausible}
+                found.append(Diagnostic("model-length-implausible", WARNING, length, value, facts=facts))
         mass = sum(inertia.mass for inertia in self.pin.inertias)
         if mass and not LIGHTEST <= mass <= HEAVIEST:
-            found.append(
-                f"{name}: a body of {mass:.4g} kg; {LIGHTEST:g} to {HEAVIEST:g} kg are plausible (ANSUR II), and its "
-                f"torques are as wrong as that"
-            )
+            facts = {"lightest": LIGHTEST, "heaviest": HEAVIEST}
+            found.append(Diagnostic("model-mass-implausible", WARNING, name, mass, facts=facts))
         impossible = impossible_inertia(self.robot)
         if impossible:
-            found.append(
-                f"{name}: no body can have the moments of inertia of {', '.join(impossible)}, one below 0 or above the "
-                f"two others together; its torques are wrong"
-            )
+            facts = {"links": ", ".join(impossible)}
+            found.append(Diagnostic("model-inertia-impossible", WARNING, name, facts=facts))
         torso = chains(self.pin).get("torso")
         if torso is not None and not torso.joints:
             rigid = ", ".join(joint.name for joint in tree_of(self.robot, name).path("torso"))
             found.append(
-                f"{name}: no joint moves the torso against the root{f' ({rigid})' if rigid else ''}: it stands still, "
-                f"whatever its sensor measures"
+                Diagnostic("model-torso-fixed", WARNING, name, facts={"joints": rigid or "the root is the torso"})
             )
         return tuple(found)
 

@@ -106,7 +106,7 @@ def _result(path: Path) -> Description:
     facts = [
         f"of {said['recording']}, by {said['method']}: {said['samples']} samples, {said['duration_s']} s at "
         f"{said['rate_hz']} Hz",
-        *(f"note: {warning}" for warning in _texts(summary.get("warnings"))),
+        *_diagnostics(summary.get("diagnostics")),
     ]
     if (path / "joints.parquet").is_file():
         facts[1:1] = [f"of a chain, sensors on: {', '.join(_texts(summary.get('orientation_residual_rms_deg')))}"]
@@ -117,6 +117,16 @@ def _result(path: Path) -> Description:
     ]
     facts.append(f"look at it: wepose view {path}")
     return Description(f"{path}: a result of `wepose track`", tuple(facts), (), None)
+
+
+def _diagnostics(value: object) -> list[str]:
+    """The texts of a summary's diagnostics, as they stand there: another version may have written them."""
+    told = []
+    for each in value if isinstance(value, list) else []:
+        text = each.get("text") if isinstance(each, dict) else None
+        if isinstance(text, dict):
+            told.append(f"{each.get('severity')}: {text.get('what')}")
+    return told
 
 
 def _texts(value: object) -> list[str]:

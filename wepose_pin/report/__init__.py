@@ -9,7 +9,6 @@ from typing import Any
 _WHERE = {
     "calibration_report": "calibration",
     "track_report": "track",
-    "unsaid": "calibration",
     "write_calibration_page": "calibration",
     "write_decimated_pages": "pages",
     "write_track_pages": "pages",
@@ -17,7 +16,6 @@ _WHERE = {
 __all__ = [
     "calibration_report",
     "track_report",
-    "unsaid",
     "write_calibration_page",
     "write_decimated_pages",
     "write_track_pages",

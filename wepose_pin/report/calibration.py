@@ -10,12 +10,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import START_POSE_STD
-from ..calibration import Calibration
+from ..calibration import Calibration, CalibrationQuality
 from ..calibration.known import DRIFT_STD
 from ..calibration.lengths import GAUGE_STD
 from ..calibration.protocols import Protocol, load_protocol
-from ..calibration.verdict import EFFECTIVE, Finding, Verdict
+from ..calibration.quality import Check
 from ..calibration.weighing import TOUCHED
+from ..diagnostics import WARNING, Diagnostic, lines, quantity
 from ..errors import WeposeError, reason
 from ..filters import BEST
 from ..pose import Pose
@@ -53,25 +54,25 @@ def write_calibration_page(
     *,
     method: str,
     protocol: Protocol,
-    verdict: Verdict,
-) -> list[str]:
+    quality: CalibrationQuality,
+) -> list[Diagnostic]:
     """Write ``report.html`` beside a calibration's result; what cannot be made, as of `write_track_pages`."""
     writer = PageWriter(folder, ["report.html"])
     writer.write(
         "report.html",
         lambda failures: calibration_report(
-            calibration, recording, method=method, protocol=protocol, verdict=verdict, failures=failures
+            calibration, recording, method=method, protocol=protocol, quality=quality, failures=failures
         ),
     )
-    writer.add_warnings("calibration.json")
-    return writer.warnings
+    writer.save_diagnostics("calibration.json")
+    return writer.diagnostics
 
 
 def calibration_report(
     calibration: Calibration,
     recording: Recording,
     *,
-    verdict: Verdict | tuple[str, Sequence[str]] | None = None,
+    quality: CalibrationQuality | None = None,
     pose: TrackedRecording | None = None,
     method: str = BEST,
     protocol: str | Path | Protocol = "clasp",
@@ -82,22 +83,22 @@ def calibration_report(
 
     Parameters
     ----------
-    verdict : of `judge`, or "pass", "poor" or "fail" and its reasons in words; None: the page gives none
+    quality : of `assess`; None: the page gives none
     pose : the recording tracked with the calibrated subject, for the hands and the 3D view; None: it is tracked here
     method, protocol, gauge_std : as the calibration was run
     failures : takes a line for each section that cannot be made; the page says so in its place
     """
     contact = _contact(protocol if isinstance(protocol, Protocol) else load_protocol(protocol))
-    trouble = ""
+    untracked: list[Diagnostic] = []
     if pose is None:
         try:
             pose = track(recording, calibration.subject, method=method)
         except Exception as error:
-            trouble = f"Without the tracked motion, hence without hand positions and 3D view: {error}"
+            untracked = [Diagnostic("motion-not-shown", WARNING, facts={"reason": str(error)})]
             if not isinstance(error, WeposeError) and failures is not None:
                 failures.append(f"the motion cannot be tracked: {reason(error)}")
     page = Page(TEMPLATE, f"Calibration of {recording.name or 'a recording'}", failures)
-    page.add("first", lambda: _first(calibration, verdict, trouble), name="The verdict")
+    page.add("first", lambda: _first(calibration, quality, untracked), name="The quality")
     page.add("short", lambda: _short(calibration, contact), name="In short")
     page.add("lengths", lambda: _lengths(calibration, contact), "Lengths")
     page.add("sensors", lambda: _sensors(calibration, recording), "Sensors")
@@ -110,15 +111,9 @@ def calibration_report(
     page.add("posture", lambda: _posture(calibration), "The start pose")
     page.add("elbows", lambda: _elbows(calibration), "The elbows as hinges")
     page.add("view", lambda: _view(calibration, recording, pose), "The motion in 3D")
-    page.add("findings", lambda: _findings(verdict, contact), "Behind the verdict")
+    page.add("checks", lambda: _checks(quality, contact), "Behind the quality")
     page.add("run", lambda: _run(calibration, recording, contact, method, gauge_std), "What was run")
     return page.html(f"Calibration of {recording.name}" if recording.name else "Calibration")
-
-
-def unsaid(warnings: Sequence[str], verdict: Verdict) -> list[str]:
-    """The warnings that the verdict does not repeat word for word."""
-    said = " ".join(verdict.in_words())
-    return [warning for warning in warnings if warning not in said]
 
 
 class _Contact(NamedTuple):
@@ -145,16 +140,13 @@ def _contact(protocol: Protocol) -> _Contact:
 
 
 def _first(
-    calibration: Calibration, verdict: Verdict | tuple[str, Sequence[str]] | None, trouble: str
+    calibration: Calibration, quality: CalibrationQuality | None, untracked: Sequence[Diagnostic]
 ) -> dict[str, Any]:
-    warnings: Sequence[str] = calibration.warnings
-    grade, reasons = verdict if isinstance(verdict, tuple) else ("", ())
-    if isinstance(verdict, Verdict):
-        grade, reasons, warnings = verdict.grade, verdict.in_words(), unsaid(warnings, verdict)
+    further = calibration.diagnostics if quality is None else quality.further
     return {
-        "grade": grade,
-        "reasons": [("warning", capital(each)) for each in reasons],
-        "notes": [("info", capital(each)) for each in (*warnings, *([trouble] if trouble else []))],
+        "quality": "" if quality is None else quality.quality,
+        "reasons": [] if quality is None else lines(quality.reasons, titled=True),
+        "further": lines([*further, *untracked], titled=True),
     }
 
 
@@ -403,22 +395,19 @@ def _run(
     return {"rows": rows}
 
 
-def _findings(verdict: Verdict | tuple[str, Sequence[str]] | None, contact: _Contact) -> dict[str, Any] | None:
-    if not isinstance(verdict, Verdict):
+def _checks(quality: CalibrationQuality | None, contact: _Contact) -> dict[str, Any] | None:
+    if quality is None:
         return None
-    lines = [
-        [
-            _checked(found.name, contact),
-            _shown(found.value, found.unit, ".0f" if found.unit == EFFECTIVE else ".1f"),
-            *(f"{_bound(found)} {_shown(limit, found.unit, '.3g')}" for limit in (found.passes, found.poor)),
-            found.grade,
-        ]
-        for found in verdict.findings
-        if np.isfinite(found.value)
-    ]
-    header = ["checked", "value", "passes", "poor", "verdict"]
-    unknowns = {"unknowns": verdict.unknowns, "rank": verdict.rank, "determined": verdict.determined}
-    return {**unknowns, "findings": Table(header, lines)} if lines else None
+    rows = []
+    for check in quality.checks:
+        if np.isfinite(check.value):
+            what, unit = _checked(check, contact)
+            bound = "at least" if check.limits.passes > check.limits.poor else "up to"
+            limits = [f"{bound} {quantity(limit, unit)}" for limit in check.limits]
+            rows.append([what, quantity(check.value, unit), *limits, check.quality])
+    header = ["checked", "value", "passes", "poor", "quality"]
+    unknowns = {"unknowns": quality.unknowns, "rank": quality.rank, "determined": quality.determined}
+    return {**unknowns, "checks": Table(header, rows)} if rows else None
 
 
 # Words and small sums -------------------------------------------------------------------------------------------------
@@ -471,43 +460,26 @@ def _sign(axis: str) -> str:
     return axis.replace("-", "−")
 
 
-def _checked(name: str, contact: _Contact) -> str:
-    """What a finding is about."""
-    what, _, of = name.partition(".")
-    if what == "heading":
-        return f"± heading, {plain(of)}"
-    if what == "tape":
-        return f"tape of {plain(of)}, against all else that is known"
+def _checked(check: Check, contact: _Contact) -> tuple[str, str]:
+    """What a check is about, and the unit in which its value is shown."""
+    place = plain(check.diagnostic.place)
     return {
-        "anatomy": "doubt of the sensors' places, by anatomy",
-        "upper_arms": "± upper arm, the scale apart",
-        "forearms": "± forearm + hand, the scale apart",
-        "shoulder_width": "± shoulder width, the scale apart",
-        "scale": "± scale, all lengths together",
-        "gap": f"{contact.gap}, root mean square",
-        "motion": "effective sample size: what the motion is worth",
-        "apart": "share of the time apart",
-        "start_pose": "segment farthest off the start pose",
-        "person": "length farthest from the average person",
-    }.get(what, plain(name))
-
-
-def _bound(found: Finding) -> str:
-    return "at least" if found.passes > found.poor else "up to"
-
-
-def _shown(value: float, unit: str, digits: str) -> str:
-    """A value of a finding in the unit that people use."""
-    scale, shown = {
-        "m": (1e3, "mm"),
-        "rad": (np.degrees(1.0), "°"),
-        "relative": (100.0, "%"),
-        "share": (100.0, "%"),
-        "std of the average person": (1.0, "std"),
-        "std of what is known without it": (1.0, "std"),
-        EFFECTIVE: (1.0, ""),
-    }.get(unit, (1.0, unit))
-    return f"{scale * value:{digits}} {shown}".replace(" °", "°").strip()
+        "arm-motion-implausible": ("doubt of the sensors' places, by anatomy", "number"),
+        "sensors-exchanged": ("doubt of the sensors' places, by anatomy", "number"),
+        "mount-not-used": (f"stated mount that was not used, {place}", "deg"),
+        "upper-arm-length-uncertain": ("± upper arm, the scale apart", "mm"),
+        "forearm-length-uncertain": ("± forearm + hand, the scale apart", "mm"),
+        "shoulder-width-uncertain": ("± shoulder width, the scale apart", "mm"),
+        "mount-heading-uncertain": (f"± heading, {place}", "deg"),
+        "scale-uncertain": ("± scale, all lengths together", "percent"),
+        "scale-from-prior": ("± scale, all lengths together", "percent"),
+        "closure-gap-large": (f"{contact.gap}, root mean square", "mm"),
+        "motion-too-short": ("effective sample size: what the motion is worth", "count"),
+        "closure-open": ("share of the time apart", "percent"),
+        "start-pose-off": (f"segment farthest off the start pose: {place}", "deg"),
+        "measured-length-contradicted": (f"standard deviations of the measured {place} from all else", "number"),
+        "length-unusual": (f"standard deviations from the population, {place}", "number"),
+    }[check.diagnostic.code]
 
 
 def _tilt(name: str, across: int, angle: float, std: float, seen: bool) -> str:

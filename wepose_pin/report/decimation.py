@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import reduce
 from typing import Any
 
 import numpy as np
 
+from ..diagnostics import Diagnostic, from_json
 from ..pose import Pose
 from ..recording import Intervals, join
 from ..tracking import TrackedRecording
@@ -27,7 +28,7 @@ class Whole:
     steps_ms: tuple[float, float]  # shortest and longest step between samples
     signals: Mapping[str, Signal]  # a row for each kept sample, of all from it to the next
     peak_speed: Mapping[str, float]  # hand → [m/s]
-    warnings: list[str]
+    diagnostics: Sequence[Diagnostic]
 
 
 def whole_of(pose: TrackedRecording) -> Whole:
@@ -41,7 +42,7 @@ def whole_of(pose: TrackedRecording) -> Whole:
         (float(steps.min()), float(steps.max())),
         {name: signal_of(recording, name, pose) for name in recording.sensors},
         {name: hand.peak_speed for name, hand in hands.items()},
-        pose.summary()["warnings"],
+        [from_json(each) for each in pose.summary()["diagnostics"]],
     )
 
 
@@ -83,8 +84,10 @@ class Decimator:
         if len(at):
             self._kept.append(_decimated(chunk, at, recording.rate_hz / self._every))
 
-    def decimated(self, phases: Mapping[str, Intervals], warnings: list[str]) -> tuple[TrackedRecording, Whole]:
-        """The pose, and what it no longer tells; `phases` and `warnings` of the whole recording.
+    def decimated(
+        self, phases: Mapping[str, Intervals], diagnostics: Sequence[Diagnostic]
+    ) -> tuple[TrackedRecording, Whole]:
+        """The pose, and what it no longer tells; `phases` and `diagnostics` of the whole recording.
 
         Raises the first error of `add`, of any kind.
         """
@@ -94,7 +97,7 @@ class Decimator:
         pose = _joined(self._kept, phases)
         signals = {name: _joined_signal(parts) for name, parts in self._signals.items()}
         rate_hz = last.recording.rate_hz * self._every
-        return pose, Whole(self._seen, rate_hz, self._steps, signals, self._peak_speed, warnings)
+        return pose, Whole(self._seen, rate_hz, self._steps, signals, self._peak_speed, diagnostics)
 
     def _take_signal(self, name: str, signal: Signal, at: np.ndarray) -> None:
         """Bins that begin at the kept samples; what comes before the first belongs to the last bin so far."""

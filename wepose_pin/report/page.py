@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template, select_autoescape
 from markupsafe import Markup, escape
 
+from ..diagnostics import WARNING, Diagnostic, as_json
 from ..errors import WeposeError, reason
 from ..writers.folder import whole_file
 from . import words
@@ -128,11 +129,11 @@ class PageWriter:
 
     Attributes
     ----------
-    warnings : a line for each page, or section of one, that cannot be made: which, and why
+    diagnostics : pages, and sections of pages, that cannot be made
     """
 
     def __init__(self, folder: Path, names: Sequence[str]) -> None:
-        self.warnings: list[str] = []
+        self.diagnostics: list[Diagnostic] = []
         self._folder = folder
         for name in names:
             with contextlib.suppress(OSError):
@@ -148,19 +149,25 @@ class PageWriter:
                 partial.write_text(made, encoding="utf-8")
             text = made
         except Exception as error:
-            failures.append(f"cannot be made: {reason(error)}; the other files of the result are whole")
-        self.warnings += [f"{name}: {failure}" for failure in failures]
+            failures.append(f"cannot be made: {reason(error)}")
+        self.diagnostics += [page_incomplete(name, failure) for failure in failures]
         return text
 
-    def add_warnings(self, file: str) -> None:
-        """Add them to the ``warnings`` of a JSON file of the result, if there are any."""
-        if not self.warnings:
+    def save_diagnostics(self, file: str) -> None:
+        """Add them to the ``diagnostics`` of a JSON file of the result, if there are any."""
+        if not self.diagnostics:
             return
         path = self._folder / file
         content = json.loads(path.read_text(encoding="utf-8"))
-        content["warnings"] = [*content.get("warnings", []), *self.warnings]
+        content["diagnostics"] = [*content.get("diagnostics", []), *map(as_json, self.diagnostics)]
         try:
             with whole_file(path, force=True) as partial:
                 partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         except (OSError, WeposeError) as error:  # a full disk, say: what is there stays as it was
-            self.warnings.append(f"{file}: these warnings cannot be added: {reason(error)}")
+            facts = {"reason": reason(error)}
+            self.diagnostics.append(Diagnostic("diagnostics-not-saved", WARNING, file, facts=facts))
+
+
+def page_incomplete(name: str, failure: str) -> Diagnostic:
+    """A page, or a section of it, that cannot be made: why."""
+    return Diagnostic("page-incomplete", WARNING, name, facts={"reason": failure})

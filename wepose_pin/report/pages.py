@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ..diagnostics import Diagnostic
 from ..errors import reason
 from ..recording import Intervals
 from ..tracking import TrackedRecording
 from .decimation import Decimator, Whole
-from .page import PageWriter
+from .page import PageWriter, page_incomplete
 from .track import track_report
 from .viewer import pose_html
 
@@ -24,7 +25,7 @@ def write_track_pages(
     report: bool = True,
     whole: Whole | None = None,
     fps: float = 30.0,
-) -> list[str]:
+) -> list[Diagnostic]:
     """Write ``view.html`` and ``report.html`` beside a result that is there already.
 
     Parameters
@@ -47,25 +48,25 @@ def write_track_pages(
         )
     if report:
         writer.write("report.html", lambda failures: track_report(pose, view=page, whole=whole, failures=failures))
-    writer.add_warnings("summary.json")
-    return writer.warnings
+    writer.save_diagnostics("summary.json")
+    return writer.diagnostics
 
 
 def write_decimated_pages(
     folder: Path,
     decimator: Decimator,
     phases: Mapping[str, Intervals],
-    warnings: list[str],
+    diagnostics: Sequence[Diagnostic],
     *,
     report: bool = True,
     fps: float = 30.0,
-) -> list[str]:
-    """`write_track_pages` of a recording that came in pieces; `phases` and `warnings` of the whole recording."""
+) -> list[Diagnostic]:
+    """`write_track_pages` of a recording that came in pieces; `phases` and `diagnostics` of the whole recording."""
     try:
-        pose, whole = decimator.decimated(phases, warnings)
+        pose, whole = decimator.decimated(phases, diagnostics)
     except Exception as error:
         writer = PageWriter(folder, PAGES)
-        writer.warnings.append(f"{' and '.join(PAGES)}: cannot be made: {reason(error)}")
-        writer.add_warnings("summary.json")
-        return writer.warnings
+        writer.diagnostics.append(page_incomplete(" and ".join(PAGES), f"cannot be made: {reason(error)}"))
+        writer.save_diagnostics("summary.json")
+        return writer.diagnostics
     return write_track_pages(folder, pose, report=report, whole=whole, fps=fps)

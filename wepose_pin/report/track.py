@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from ..diagnostics import INFO, Diagnostic, lines
 from ..pose import deviation, spread
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
-from .concerns import GRAVITY_OFF, Concern, concerns, hold
+from .concerns import GRAVITY_OFF, heading_remedy, pose_diagnostics
 from .decimation import Whole, whole_of
 from .joints import joint_angles_section
 from .measures import (
@@ -66,7 +67,7 @@ def track_report(
     page = Page(TEMPLATE, f"Motion of {recording.name or 'a recording'}", failures)
     page.add(
         "first",
-        lambda: _first(concerns(pose, signals, budgets, elbows, hands, whole.warnings)),
+        lambda: _first(pose_diagnostics(pose, signals, budgets, elbows, hands, whole.diagnostics)),
         name="What to look at",
     )
     page.add("short", lambda: _short(pose, whole, budgets), name="In short")
@@ -83,10 +84,10 @@ def track_report(
 # The sections: the values that the macros of the template take --------------------------------------------------------
 
 
-def _first(entries: Sequence[Concern]) -> dict[str, Any]:
-    grave = any(entry.grave for entry in entries)
-    kind = "poor" if grave else "note" if entries else "pass"
-    return {"kind": kind, "entries": [("warning" if each.grave else "info", each.line()) for each in entries]}
+def _first(diagnostics: Sequence[Diagnostic]) -> dict[str, Any]:
+    grave = any(diagnostic.severity != INFO for diagnostic in diagnostics)
+    kind = "poor" if grave else "note" if diagnostics else "pass"
+    return {"kind": kind, "entries": lines(diagnostics, titled=True)}
 
 
 def _short(pose: TrackedRecording, whole: Whole, budgets: Mapping[str, Budget]) -> dict[str, Any]:
@@ -178,7 +179,7 @@ def _drift(pose: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, A
         "known": True,
         "worst": (worst, float(np.degrees(stds[worst][at])), _duration(float(pose.time[at] - pose.time[0]))),
         "fastest": (fastest, float(np.degrees(growth[fastest]))) if fastest else None,
-        "advice": hold(pose),
+        "advice": heading_remedy(pose),
         "corrected": max(pose.correction.largest_deg.values(), default=0.0) if pose.correction is not None else None,
         "clasped": clasped,
         "without": [plain(name) for name in recording.sensors if name not in budgets],

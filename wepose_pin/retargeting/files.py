@@ -10,6 +10,8 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
+from ..diagnostics import ERROR, INFO, Diagnostic, as_json
+from ..recording import format_time
 from ..writers.result import write_table
 from .causes import DRAWN_IN, FAR, causes, possible
 from .check import Kept, Touching
@@ -18,6 +20,7 @@ from .person import robot_reach
 from .plan import Trajectory
 
 DIGITS = 8  # of angles in text
+MOST_MOMENTS = 6  # of those at which the motion was slowed
 BENT = 0.03  # [m] from the line shoulder-hand to the elbow: below it the swivel says nothing
 
 
@@ -145,6 +148,7 @@ def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, 
     slow = trajectory.slowest
     nearest = float(trajectory.closest.min())
     jerk = np.abs(np.diff(trajectory.a, axis=0)) / dt
+    slowed = shown_s / recorded_s if recorded_s else None
     return {
         "robot": robot.map.name,
         "urdf": robot.map.urdf.name,
@@ -154,7 +158,7 @@ def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, 
         "duration_s": round(float(trajectory.time[-1]), 3),
         "approach_s": round(float(trajectory.time[begin]), 3),
         "recorded_s": round(recorded_s, 3),
-        "slowed": round(shown_s / recorded_s, 3) if recorded_s else None,
+        "slowed": None if slowed is None else round(slowed, 3),
         "slowest": None if slow is None else slow._asdict(),
         "slowed_for_contact_s": list(trajectory.tight),
         "arms": arms,
@@ -182,7 +186,35 @@ def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, 
             "no_solution_share": round(counts.held / steps, 4),
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
+        "diagnostics": [
+            as_json(diagnostic) for diagnostic in trajectory_diagnostics(trajectory, held, touched, slowed)
+        ],
     }
+
+
+def trajectory_diagnostics(
+    trajectory: Trajectory, held: Kept, touched: Touching, slowed: float | None = None
+) -> list[Diagnostic]:
+    """What to know before a robot runs the trajectory; `slowed`: how many times as long as the recording it takes."""
+    name = trajectory.robot.map.name
+    found = []
+    margins = {key: getattr(held, key) for key in ("position", "velocity", "acceleration", "jerk")}
+    for quantity, margin in margins.items():
+        if margin < 0.0:
+            facts = {"quantity": quantity} | ({"variant": "position"} if quantity == "position" else {})
+            found.append(Diagnostic("robot-limits-exceeded", ERROR, name, -margin, 0.0, facts))
+    if not (held.even and held.rests):
+        found.append(Diagnostic("robot-limits-exceeded", ERROR, name, facts={"variant": "curve"}))
+    if touched.samples:
+        found.append(Diagnostic("robot-self-collision", ERROR, name, touched.samples, 0.0, {"first": touched.first}))
+    slow = trajectory.slowest
+    if slow is not None and slowed is not None:
+        slowest: dict[str, float | str] = {"joint": slow.joint, "moment": slow.time, "quantity": slow.what}
+        found.append(Diagnostic("trajectory-slowed", INFO, name, slowed, facts=slowest))
+    if trajectory.tight:
+        moments = ", ".join(map(format_time, trajectory.tight[:MOST_MOMENTS]))
+        found.append(Diagnostic("trajectory-slowed-for-contact", INFO, name, facts={"moments": f"{moments} s"}))
+    return found
 
 
 def _possible(far: np.ndarray, reached: np.ndarray) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..alignment import Segments
 from ..arguments import check_arguments
+from ..diagnostics import WARNING, Diagnostic, as_json, unclassified
 from ..errors import BadOption, BadSession, one_of
 from ..filters import BEST, check_method
 from ..filters.static import StaticTest
@@ -64,7 +65,9 @@ class TrackedChain:
 
     def summary(self) -> dict[str, Any]:
         """For ``summary.json``."""
-        left = f"{', '.join(self.open)}: the links with sensors do not determine these joints; read them as one motion"
+        diagnostics = [unclassified(text) for text in self.segments.warnings]
+        if self.open:
+            diagnostics.append(Diagnostic("joints-undetermined", WARNING, facts={"joints": ", ".join(self.open)}))
         return {
             "recording": self.recording.name,
             "session": str(self.recording.source) if self.recording.source else None,
@@ -79,7 +82,7 @@ class TrackedChain:
                 link: round(float(np.degrees(np.sqrt(np.mean(angle**2)))), 3) for link, angle in self.residual.items()
             },
             "joints_left_open": list(self.open),
-            "warnings": [*self.segments.warnings, *([left] if self.open else [])],
+            "diagnostics": [as_json(diagnostic) for diagnostic in diagnostics],
         }
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..alignment import Segments
+from ..diagnostics import INFO, WARNING, Diagnostic, as_json, unclassified
 from ..model import POINTS, BodyModel, load_model
 from ..pose import Pose, deviation
 from ..recording import SEGMENTS, Recording
@@ -16,7 +17,7 @@ from ..subject import Subject, average_subject
 from .headings import HeadingCorrection
 from .options import TrackOptions
 
-_WORTH_A_WARNING_DEG = 1.0
+MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment
 _MOST_NOTES = 10  # of the later chunks of a long recording
 
 
@@ -120,15 +121,18 @@ class SummaryAccumulator:
                 about["gaps"], lost, _ = self._lost[segment]
                 about["gap_s"] = round(lost / last.recording.rate_hz, 3)
             sensors[segment] = about
-        residual = {
-            name: round(float(np.degrees(np.sqrt(squares / self._samples))), 3)
-            for name, squares in self._residual.items()
-        }
-        too_few = [f"{segment} {angle:.3g}" for segment, angle in residual.items() if angle > _WORTH_A_WARNING_DEG]
-        if too_few:
-            too_few = [
-                f"the model's joints are too few or end too soon and miss segments by, rms [deg]: {', '.join(too_few)}"
-            ]
+        residual_rms = {name: float(np.sqrt(squares / self._samples)) for name, squares in self._residual.items()}
+        diagnostics = [
+            *map(unclassified, last.segments.warnings),
+            *self._later(),
+            *_not_known(last),
+            *(
+                Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
+                for segment, rms in residual_rms.items()
+                if rms > MOST_RESIDUAL
+            ),
+            *(last.model.diagnostics),
+        ]
         return {
             "recording": last.recording.name,
             "session": str(last.recording.source) if last.recording.source else None,
@@ -142,21 +146,15 @@ class SummaryAccumulator:
             "phases": {"start": list(last.segments.start), "static": list(last.segments.still)},
             "sensors": sensors,
             "points": sorted(last.points),
-            "orientation_residual_rms_deg": residual,
+            "orientation_residual_rms_deg": {name: round(float(np.degrees(v)), 3) for name, v in residual_rms.items()},
             "heading_correction": _correction_json(last.correction),
-            "warnings": [
-                *last.segments.warnings,
-                *self._later(),
-                *_not_known(last),
-                *too_few,
-                *last.model.warnings,
-            ],
+            "diagnostics": [as_json(diagnostic) for diagnostic in diagnostics],
         }
 
-    def _later(self) -> list[str]:
-        """Notes of later chunks; a day's would be too many to read."""
-        more = len(self._notes) - _MOST_NOTES
-        return self._notes[:_MOST_NOTES] + ([f"and {more} more notes like these"] if more > 0 else [])
+    def _later(self) -> list[Diagnostic]:
+        """Those of later chunks; a day's would be too many to read."""
+        found, more = [unclassified(note) for note in self._notes[:_MOST_NOTES]], len(self._notes) - _MOST_NOTES
+        return [*found, Diagnostic("diagnostics-omitted", INFO, value=more)] if more > 0 else found
 
 
 def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | None:
@@ -172,13 +170,14 @@ def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | N
     return about
 
 
-def _not_known(pose: TrackedRecording) -> list[str]:
-    """A line on the points that have no place for want of a sensor."""
-    missing = [point for point in POINTS if point not in pose.points]
-    lacking = [name for name in SEGMENTS[:5] if name not in pose.quat_WL]
+def _not_known(tracked: TrackedRecording) -> list[Diagnostic]:
+    """The points that have no place for want of a sensor."""
+    missing = [point for point in POINTS if point not in tracked.points]
+    lacking = [name for name in SEGMENTS[:5] if name not in tracked.quat_WL]
     if not missing or not lacking:
         return []
-    return [f"no sensor on {', '.join(lacking)}: not known and not written: {', '.join(missing)}"]
+    facts = {"segments": ", ".join(lacking), "points": ", ".join(missing)}
+    return [Diagnostic("points-unknown", INFO, facts=facts)]
 
 
 def body_of(subject: Subject | None, model: BodyModel | None) -> tuple[Subject, BodyModel]:

@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any, NamedTuple
 
+from ..diagnostics import INFO, Diagnostic
 from ..errors import WeposeError, reason
 
 
@@ -30,6 +31,10 @@ class Skipped(NamedTuple):
 
     def line(self) -> str:
         return f"{self.experiment}, {self.trial}: not scored: {self.reason}"
+
+    def diagnostic(self) -> Diagnostic:
+        place = f"{self.experiment}, {self.trial}"
+        return Diagnostic("validation-part-skipped", INFO, place, facts={"reason": self.reason})
 
 
 class Job(NamedTuple):

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
+from ..diagnostics import Diagnostic
 from ..errors import BadData
 from ..pose import configuration, forward_kinematics, pose_of
 from ..rotations import conjugate, multiply
@@ -80,7 +81,7 @@ def _turned(v_W: np.ndarray) -> np.ndarray:
     return v_W[..., [1, 2, 0]]
 
 
-def write_bvh(path: Path, motion: Motion) -> list[str]:
+def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
     """Hierarchy and motion; angles are followed over time, so they may go beyond 180°.
 
     Raises
@@ -89,7 +90,7 @@ def write_bvh(path: Path, motion: Motion) -> list[str]:
         The torso is not known, or a sample has no orientation.
     """
     whole(motion, "a .bvh")
-    motion, notes = even(motion)
+    motion, found = even(motion)
     root = skeleton(motion)
     columns = [100.0 * _turned(_root_position(motion, root)), *_rotations(motion, root, None)]
     lines = ["HIERARCHY", *_hierarchy(root, root.at, 0), "MOTION"]
@@ -97,7 +98,7 @@ def write_bvh(path: Path, motion: Motion) -> list[str]:
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         np.savetxt(file, np.column_stack(columns), fmt="%.6f")
-    return [*notes, *bridged(motion)]
+    return [*found, *bridged(motion)]
 
 
 def _root_position(motion: Motion, root: Bone) -> np.ndarray:

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, ExistingOutput
 from .motion import Motion, even, seen_points
 
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
 
 
-def write_c3d(path: Path, motion: Motion) -> list[str]:
+def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
     """Points in W (z up, x forward), single precision. A point in a gap is NaN with a residual of −1.
 
     Raises
@@ -32,7 +33,7 @@ def write_c3d(path: Path, motion: Motion) -> list[str]:
         import ezc3d
     except ImportError:
         raise BadOption("--format c3d: needs ezc3d, which is not installed: pip install 'wepose-pin[export]'") from None
-    motion, notes = even(motion)
+    motion, found = even(motion)
     points = seen_points(motion)
     n = len(motion.pose.time)
     if n > MOST_FRAMES:
@@ -59,7 +60,7 @@ def write_c3d(path: Path, motion: Motion) -> list[str]:
         named.replace(path)
     finally:
         named.unlink(missing_ok=True)
-    return notes
+    return found
 
 
 def _check(file: Path, points: int) -> None:

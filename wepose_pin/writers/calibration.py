@@ -1,4 +1,4 @@
-"""``calibration.json``: the verdict on a calibration, with everything that led to it."""
+"""``calibration.json``: the quality of a calibration, with everything that led to it."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..calibration import Calibration, Verdict, document
+from ..calibration import Calibration, CalibrationQuality, document
 from .result import as_json, versions
 
 
 def write_calibration(
-    folder: Path, calibration: Calibration, verdict: Verdict, provenance: Mapping[str, Any] | None = None
+    folder: Path, calibration: Calibration, quality: CalibrationQuality, provenance: Mapping[str, Any] | None = None
 ) -> None:
     """Write ``calibration.json`` into an existing folder; `provenance` becomes part of it."""
-    content = as_json(document(calibration, verdict)) | {"versions": versions()}
+    content = as_json(document(calibration, quality)) | {"versions": versions()}
     if provenance is not None:
         content["provenance"] = dict(provenance)
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)

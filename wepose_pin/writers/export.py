@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..arguments import check_arguments
+from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, MissingFile, one_of
 from .bvh import write_bvh
 from .c3d import write_c3d
@@ -20,7 +21,7 @@ from .provenance import provenance_file, provenance_text
 from .result import read_result
 from .tables import write_csv, write_parquet
 
-Writer = Callable[[Path, Motion], list[str]]  # gives notes on what the file cannot hold
+Writer = Callable[[Path, Motion], list[Diagnostic]]  # gives what the file cannot hold
 
 WRITERS: dict[str, Writer] = {
     "csv": write_csv,
@@ -38,10 +39,10 @@ NAMES = ("opensim", "isb")
 
 
 class Exported(NamedTuple):
-    """What was written: the format, and notes on what it cannot hold."""
+    """What was written: the format, and what it cannot hold."""
 
     format: str
-    notes: list[str]
+    diagnostics: list[Diagnostic]
 
 
 def export(

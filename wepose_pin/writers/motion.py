@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, BadOption
 from ..model import BodyModel
 from ..pose import Pose, pose_of
@@ -42,16 +43,15 @@ class Motion:
         return float(f"{1.0 / float(np.median(np.diff(self.pose.time))):.6g}")
 
 
-def even(motion: Motion) -> tuple[Motion, list[str]]:
-    """The motion on even times, and a note if that meant new ones."""
+def even(motion: Motion) -> tuple[Motion, list[Diagnostic]]:
+    """The motion on even times, and what to know of them if they are new."""
     time = motion.pose.time
     grid = time[0] + np.arange(len(time)) * (time[-1] - time[0]) / (len(time) - 1)
     off = float(np.max(np.abs(time - grid))) * motion.rate_hz
     if off <= EVEN:
         return motion, []
     rate_hz = motion.rate_hz
-    note = f"times are up to {off:.2g} samples off even ones, which this format needs: resampled at {rate_hz:g} Hz"
-    return resampled(motion, rate_hz), [note]
+    return resampled(motion, rate_hz), [Diagnostic("export-resampled", INFO, "", off, EVEN, {"rate": rate_hz})]
 
 
 def check_rate(rate_hz: float) -> None:
@@ -122,13 +122,10 @@ def whole(motion: Motion, what: str) -> None:
             )
 
 
-def bridged(motion: Motion) -> list[str]:
-    """A note on gaps that a format has no way to mark; empty without any."""
-    gaps = {segment: int(np.count_nonzero(gap)) for segment, gap in motion.pose.gap.items() if gap.any()}
-    if not gaps:
-        return []
-    said = ", ".join(f"{segment} {count}" for segment, count in gaps.items())
-    return [f"samples bridged over a gap of the sensor, which this format cannot mark and which are kept: {said}"]
+def bridged(motion: Motion) -> list[Diagnostic]:
+    """Segments with gaps, where a format has no way to mark them."""
+    gaps = {segment: int(np.count_nonzero(gap)) for segment, gap in motion.pose.gap.items()}
+    return [Diagnostic("export-gaps-unmarked", WARNING, segment, count) for segment, count in gaps.items() if count]
 
 
 def seen_points(motion: Motion) -> dict[str, np.ndarray]:

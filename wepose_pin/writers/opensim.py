@@ -23,6 +23,7 @@ import numpy as np
 import polars as pl
 
 from ..angles import joint_angles
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from ..readers.opensim import OWN
 from .motion import Motion, bridged, even, seen_points, whole
@@ -32,10 +33,10 @@ _TRC_KEYS = (
     *("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"),
     *("OrigDataRate", "OrigDataStartFrame", "OrigNumFrames"),
 )
-_WORTH_A_NOTE_DEG = 1.0
+MOST_MISSED = np.deg2rad(1.0)  # [rad] rms of a body of the model, whose elbows and wrists have two axes
 
 
-def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[str]:
+def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagnostic]:
     """Joint angles in degrees: `names` "opensim" are those of Rajagopal's model, "isb" those of `wepose_pin.angles`.
 
     Raises
@@ -44,7 +45,7 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[str]:
         No joint has both of its segments, or a sample has no orientation.
     """
     whole(motion, "a .mot")
-    notes = bridged(motion)
+    found = bridged(motion)
     if names == "isb":
         angles = joint_angles(motion.pose)
         columns = {
@@ -54,11 +55,11 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[str]:
         }
     else:
         columns, missed = coordinates(orientations(motion.pose.quat_WL))
-        off = ", ".join(f"{body} {np.degrees(angle):.1f}" for body, angle in missed.items())
-        if any(np.degrees(angle) > _WORTH_A_NOTE_DEG for angle in missed.values()):
-            notes.append(
-                f"elbows and wrists of the model have two axes; its bodies miss the segments by, rms [deg]: {off}"
-            )
+        found += [
+            Diagnostic("opensim-axes-too-few", WARNING, body, float(angle), MOST_MISSED)
+            for body, angle in missed.items()
+            if angle > MOST_MISSED
+        ]
     if not columns:
         raise BadData(
             f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles to write"
@@ -67,13 +68,13 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[str]:
     header = {"version": 1, "nRows": rows.height, "nColumns": rows.width, "inDegrees": "yes"}
     name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
     _write(path, [name, *(f"{key}={value}" for key, value in header.items()), "endheader"], rows)
-    return notes
+    return found
 
 
 # Orientations -----------------------------------------------------------------------------------------------------
 
 
-def write_sto(path: Path, motion: Motion) -> list[str]:
+def write_sto(path: Path, motion: Motion) -> list[Diagnostic]:
     """Orientations of the model's bodies in G, as sensors of OpenSense: ``<body>_imu``, cells ``w,x,y,z``.
 
     Raises
@@ -86,7 +87,7 @@ def write_sto(path: Path, motion: Motion) -> list[str]:
     return bridged(motion)
 
 
-def write_placement(path: Path, motion: Motion) -> list[str]:
+def write_placement(path: Path, motion: Motion) -> list[Diagnostic]:
     """One sample for OpenSense's IMU Placer: the same sensors while all coordinates of the model are zero."""
     upright = {body: np.array([[0.0, 0.0, 0.0, 1.0]]) for body in _bodies(motion)}
     _write_quaternions(path, motion, np.zeros(1), upright)
@@ -112,7 +113,7 @@ def _write_quaternions(path: Path, motion: Motion, time: np.ndarray, quat_GB: Ma
 # Points -----------------------------------------------------------------------------------------------------------
 
 
-def write_trc(path: Path, motion: Motion) -> list[str]:
+def write_trc(path: Path, motion: Motion) -> list[Diagnostic]:
     """Points in G, in mm; a point in a gap has empty cells.
 
     Raises
@@ -120,7 +121,7 @@ def write_trc(path: Path, motion: Motion) -> list[str]:
     BadData
         No point is known.
     """
-    motion, notes = even(motion)
+    motion, found = even(motion)
     points = seen_points(motion)
     n, rate = len(motion.pose.time), f"{motion.rate_hz:g}"
     keys = "\t".join(_TRC_KEYS)
@@ -133,7 +134,7 @@ def write_trc(path: Path, motion: Motion) -> list[str]:
     rows = pl.DataFrame({"Frame#": np.arange(1, n + 1), "Time": motion.pose.time, **columns, "": [None] * n})
     header = [f"PathFileType\t4\t(X/Y/Z)\t{path.name.removeprefix('.').removesuffix('.partial')}", keys, values]
     _write(path, [*header, labels, axes, ""], rows, labels=False)
-    return notes
+    return found
 
 
 def _mm(p_W: np.ndarray) -> np.ndarray:

@@ -25,6 +25,9 @@ from ..tracking import TrackedRecording
 if TYPE_CHECKING:  # it loads scipy.signal, which few results need
     from ..angles.torques import Torques
 
+if TYPE_CHECKING:  # it loads scipy.signal, which few results need
+    from ..angles.torques import Torques
+
 
 def write_result(
     folder: Path,

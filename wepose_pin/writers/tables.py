@@ -7,6 +7,7 @@ from pathlib import Path
 import polars as pl
 
 from ..angles import angle_table, joint_angles
+from ..diagnostics import Diagnostic
 from ..errors import BadData
 from ..pose import pose_table
 from .motion import Motion
@@ -23,13 +24,13 @@ def table(motion: Motion) -> pl.DataFrame:
     return pl.concat([pose, angles.drop("time")], how="horizontal")
 
 
-def write_parquet(path: Path, motion: Motion) -> list[str]:
+def write_parquet(path: Path, motion: Motion) -> list[Diagnostic]:
     """Every number to its last bit; what is not known is NaN."""
     write_table(path, table(motion))
     return []
 
 
-def write_csv(path: Path, motion: Motion) -> list[str]:
+def write_csv(path: Path, motion: Motion) -> list[Diagnostic]:
     """Every number to its last bit (the shortest text that reads back as it); what is not known is empty."""
     table(motion).fill_nan(None).write_csv(path)
     return []

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import Calibration, calibrate, calibrate_lengths, judge
+from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, calibrate_lengths
 from wepose_pin.calibration.anatomy import Arms, check_labels
-from wepose_pin.calibration.verdict import APART, GRADES
+from wepose_pin.calibration.quality import APART, QUALITIES
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import ERROR, INFO, WARNING, from_json, render
 from wepose_pin.errors import CalibrationFailed, WeposeWarning
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import REALISTIC, Imperfections, Person, Simulation, simulate, simulated_person
@@ -96,69 +97,85 @@ def arm_errors(found: Calibration, person: Person) -> np.ndarray:
 
 
 SIDES_EXCHANGED = tuple((f"left_{part}", f"right_{part}") for part in ("upper_arm", "forearm"))
-# Case → what is done to a good recording, the verdict, and what is said.
-TABLE: dict[str, tuple[Callable[[Recording], Recording], str, str]] = {
-    "as it should be": (lambda r: r, "pass", ""),
+# Case → what is done to a good recording, the quality, the codes that come first, their places and variants.
+TABLE: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, str, str]]]] = {
+    "as it should be": (lambda r: r, "pass", []),
     "left and right swapped": (
         lambda r: exchanged(r, *SIDES_EXCHANGED),
         "fail",
-        "left and right sensors look exchanged: the left elbow would bend backward",
+        [
+            (
+                "sensors-exchanged",
+                "left_forearm and right_forearm, left_upper_arm and right_upper_arm",
+                "sides",
+            ),
+            ("calibration-elbow-backward", "left_elbow", ""),
+        ],
     ),
     "upper arm and forearm exchanged": (
         lambda r: exchanged(r, ("left_upper_arm", "left_forearm")),
         "fail",
-        "sensors left_upper_arm and left_forearm look exchanged: the left elbow would bend backward",
+        [
+            ("sensors-exchanged", "left_upper_arm and left_forearm", ""),
+            ("calibration-elbow-backward", "left_elbow", ""),
+        ],
     ),
     "the forearms exchanged": (
         lambda r: exchanged(r, ("left_forearm", "right_forearm")),
         "fail",
-        "sensors left_forearm and right_forearm look exchanged",
+        [("sensors-exchanged", "left_forearm and right_forearm", "")],
     ),
     "torso and an upper arm exchanged": (
         lambda r: exchanged(r, ("torso", "right_upper_arm")),
         "fail",
-        "sensors torso and right_upper_arm look exchanged",
+        [("sensors-exchanged", "torso and right_upper_arm", "")],
     ),
     "eight seconds of motion": (
         lambda r: replace(r, phases={**r.phases, "clasp": ((20.0, 28.0),)}),
         "poor",
-        "heading of the torso sensor ±",
+        [("mount-heading-uncertain", "torso", "coincide")],
     ),
 }
 
 
+def codes(quality: CalibrationQuality) -> list[str]:
+    return [diagnostic.code for diagnostic in quality.reasons]
+
+
 @pytest.mark.parametrize("case", TABLE)
-def test_what_goes_wrong_is_said(case: str, anywhere: Simulation, person: Person) -> None:
-    change, grade, said = TABLE[case]
-    verdict = judge(solved(change(anywhere.recording()), person))
-    words = " | ".join(verdict.in_words())
-    print(case, "→", verdict.grade, words)
-    assert verdict.grade == grade, words
-    assert said in words
-    assert (not words) == (grade == "pass")
-    assert words.count("look exchanged") == words.count("fail: ")
+def test_what_goes_wrong_is_diagnosed(case: str, anywhere: Simulation, person: Person) -> None:
+    change, wanted, first = TABLE[case]
+    quality = assess(solved(change(anywhere.recording()), person))
+    found = [(d.code, d.place, str(d.facts.get("variant", ""))) for d in quality.reasons]
+    print(case, "→", quality.quality, found)
+    assert quality.quality == wanted
+    assert set(first) <= set(found)
+    assert bool(found) == (wanted != "pass")
+    if wanted == "fail":  # of another arrangement of sensors nothing else means anything
+        assert found[0] == first[0]
+        assert len(found) == 2
+    assert {d.severity for d in quality.reasons} <= {{"pass": INFO, "poor": WARNING, "fail": ERROR}[wanted]}
 
 
-def test_without_a_gauge_the_scale_is_the_average_persons(anywhere: Simulation, person: Person) -> None:
-    verdict = judge(solved(anywhere.recording(), person, gauge=False))
-    assert verdict.grade == "poor"
-    assert [f.name for f in verdict.reasons] == ["scale"]
-    assert "nothing was taped" in verdict.reasons[0].said
-    assert "--measured shoulder_width" in verdict.reasons[0].do
+def test_without_a_measured_length_the_scale_is_the_priors(anywhere: Simulation, person: Person) -> None:
+    quality = assess(solved(anywhere.recording(), person, gauge=False))
+    assert quality.quality == "poor"
+    assert codes(quality) == ["scale-from-prior"]
+    assert "--measured shoulder_width" in render(quality.reasons[0]).do
+    assert "scale-from-prior" not in {each.code for each in quality.further}  # not twice
 
 
-def test_a_tape_that_contradicts_all_else_is_named_once(anywhere: Simulation, person: Person) -> None:
+def test_a_measured_length_that_contradicts_all_else_is_named_once(anywhere: Simulation, person: Person) -> None:
     recording = anywhere.recording()
     good = solved(recording, person)
     assert good.tapes["shoulder_width"].off < 2.0
     assert good.tapes["shoulder_width"].expected == pytest.approx(person.lengths["shoulder_width"], rel=0.1)
     wrong = calibrate_lengths(recording, gauge={"shoulder_width": 0.20}, prior=person.average)
-    verdict = judge(wrong)
-    assert verdict.grade == "fail"
-    assert [f.name for f in verdict.reasons] == ["tape.shoulder_width"]
-    assert "shoulder_width = 200 mm is" in verdict.in_words()[0]
-    assert "measure it anew" in verdict.in_words()[0]
-    assert sum("standard deviations" in text for text in wrong.warnings) == 1
+    quality = assess(wrong)
+    assert quality.quality == "fail"
+    (contradicted,) = quality.diagnostics
+    assert (contradicted.code, contradicted.place) == ("measured-length-contradicted", "shoulder_width")
+    assert "Shoulder width was measured as 200 mm." in render(contradicted).what
     # Without the tape the solution finds what it said that it would; palms that slip tell a smaller person less.
     tape, free = wrong.tapes["shoulder_width"], solved(recording, person, gauge=False).subject
     assert tape.expected == pytest.approx(free.lengths["shoulder_width"], abs=1.5 * free.std("shoulder_width"))
@@ -183,40 +200,41 @@ def test_python_hands_out_no_subject_of_a_failed_calibration_in_silence(anywhere
     with warnings.catch_warnings():
         warnings.simplefilter("error", WeposeWarning)
         assert calibrate(recording, **taped, gauge_std=person.taped_std).mounts
-    with pytest.raises(CalibrationFailed, match="look exchanged") as failed:
+    with pytest.raises(CalibrationFailed, match="left upper arm and left forearm look exchanged") as failed:
         calibrate(exchanged(recording, ("left_upper_arm", "left_forearm")), **taped)
-    assert failed.value.verdict.grade == "fail"
+    assert failed.value.quality.quality == "fail"
     assert failed.value.calibration.subject.lengths
-    with pytest.warns(WeposeWarning, match="nothing was taped"):
+    with pytest.warns(WeposeWarning, match="No length was measured"):
         assert calibrate(recording).lengths
 
 
 @pytest.mark.parametrize(
-    ("share", "grade", "said"),
+    ("share", "wanted", "causes"),
     [
-        ({"all": 0.05}, "poor", "hardly"),
-        ({"roll": 0.02, "pitch": 0.02, "yaw": 0.02}, "fail", "lean and twist the torso"),
+        ({"all": 0.05}, "poor", {"motion-sideways-small", "motion-elevation-small", "motion-elbow-small"}),
+        ({"roll": 0.02, "pitch": 0.02, "yaw": 0.02}, "fail", {"motion-lean-small", "motion-twist-small"}),
     ],
 )
-def test_too_little_motion_is_named(share: dict[str, float], grade: str, said: str, person: Person) -> None:
+def test_too_little_motion_is_named(share: dict[str, float], wanted: str, causes: set[str], person: Person) -> None:
     found = solved(moved_otherwise(person, share).recording(), person)
-    verdict = judge(found)
-    print(verdict.in_words())
+    quality = assess(found)
+    print(codes(quality))
     assert found.labels.doubt < 1.0  # uncertain headings are no exchange
-    assert verdict.grade == grade
-    assert any(said in text for text in verdict.in_words())
-    assert verdict.determined < verdict.unknowns
+    assert quality.quality == wanted
+    assert causes & set(codes(quality))
+    assert quality.determined < quality.unknowns
 
 
 def test_hands_apart_for_half_of_the_time_are_found_and_left_out(person: Person, anywhere: Simulation) -> None:
     simulation = moved_otherwise(person, {"hands": 1.0}, replace(ANY, palm_slip=0.15))
     found, good = solved(simulation.recording(), person), solved(anywhere.recording(), person)
-    verdict = judge(found)
-    print(verdict.in_words(), 1e3 * arm_errors(found, person), 1e3 * arm_errors(good, person))
-    assert verdict.grade == "poor"
-    apart = next(f for f in verdict.findings if f.name == "apart")
+    quality = assess(found)
+    print(codes(quality), 1e3 * arm_errors(found, person), 1e3 * arm_errors(good, person))
+    assert quality.quality == "poor"
+    (apart,) = [d for d in quality.diagnostics if d.code == "closure-open"]
+    assert apart.value is not None
     assert APART.passes < apart.value < 0.6
-    assert "keep the palms together" in apart.do
+    assert "Keep the palms together" in render(apart).do
     assert np.abs(arm_errors(found, person)).max() < 0.025
     assert np.abs(heading_errors(found, simulation.quat_LS)[1:]).max() < 8.0
     gap = np.linalg.norm(simulation.points["left_hand"] - simulation.points["right_hand"], axis=1)
@@ -231,15 +249,16 @@ def test_a_sensor_upside_down_is_another_mount_or_said_and_solved(
     over = Rotation.from_rotvec([0.0, 0.0, np.pi])
     good = solved(anywhere.recording(), person)
     found = solved(turned(anywhere.recording(), "left_forearm", over), person)
-    assert judge(found).grade == "pass"
+    assert assess(found).quality == "pass"
     np.testing.assert_allclose(list(found.subject.lengths.values()), list(good.subject.lengths.values()), atol=2e-3)
 
     found = solved(turned(stated.recording(), "left_forearm", over), person)
-    verdict = judge(found)
-    assert verdict.grade == "poor"
-    assert len(found.contradicted) == 1
-    assert "sensors.left_forearm.mount is 1" in verdict.in_words()[0]
-    assert "off gravity" in verdict.in_words()[0]
+    quality = assess(found)
+    assert quality.quality == "poor"
+    (unused,) = found.contradicted
+    assert (unused.code, unused.place, unused.facts) == ("mount-not-used", "left_forearm", {})
+    assert unused.value == pytest.approx(np.pi, abs=0.6)
+    assert unused in quality.reasons
     true = {**stated.quat_LS}
     true["left_forearm"] = (Rotation.from_quat(true["left_forearm"]) * over.inv()).as_quat()
     assert np.abs(heading_errors(found, true)).max() < 8.0
@@ -249,11 +268,11 @@ def test_a_mount_that_faces_elsewhere_is_said_and_solved(person: Person, stated:
     """Gravity does not see it, the motion does."""
     quarter = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])  # about the axis that points up
     found = solved(turned(stated.recording(), "right_upper_arm", quarter), person)
-    assert judge(found).grade == "poor"
-    assert len(found.contradicted) == 1
-    assert found.contradicted[0].startswith("sensors.right_upper_arm.mount is ")
-    assert "off what the motion says" in found.contradicted[0]
-    assert judge(solved(stated.recording(), person)).grade == "pass"
+    assert assess(found).quality == "poor"
+    (unused,) = found.contradicted
+    assert (unused.code, unused.place) == ("mount-not-used", "right_upper_arm")
+    assert unused.facts == {"variant": "motion"}
+    assert assess(solved(stated.recording(), person)).quality == "pass"
 
 
 def test_labels_are_searched_only_where_a_person_cannot_move_so() -> None:
@@ -267,14 +286,17 @@ def test_labels_are_searched_only_where_a_person_cannot_move_so() -> None:
         return arms(0.2 if moved == {"torso": "left_forearm", "left_forearm": "torso"} else 3.0)
 
     places = ("torso", "left_upper_arm", "left_forearm")
-    assert check_labels(arms(0.9), solve, places).said() == ""
+    assert check_labels(arms(0.9), solve, places).contradiction is None
     assert tried == []
-    assert "sensors torso and left_forearm look exchanged" in check_labels(arms(3.0), solve, places).said()
+    exchanged = check_labels(arms(3.0), solve, places).diagnostic()
+    assert (exchanged.code, exchanged.place) == ("sensors-exchanged", "torso and left_forearm")
     none = check_labels(arms(3.0), lambda _: arms(3.0), places)
-    assert none.said().endswith("no other labelling of the sensors explains it")
+    assert none.diagnostic().code == "arm-motion-implausible"
+    assert none.contradiction is not None
+    assert (none.contradiction.code, none.contradiction.place) == ("calibration-elbow-backward", "left_elbow")
 
 
-def test_exit_code_and_file_carry_the_verdict(
+def test_exit_code_and_file_carry_the_quality(
     anywhere: Simulation,
     person: Person,
     tmp_path: Path,
@@ -285,19 +307,22 @@ def test_exit_code_and_file_carry_the_verdict(
     write_session(tmp_path, anywhere.recording("made"))
     taped = f"shoulder_width={person.taped['shoulder_width']:.4f}"
     words = ["--stature", f"{person.stature:.3f}", "--sex", person.sex]
-    for options, grade, code in ((["--measured", taped], "pass", 0), ([], "poor", 3)):
+    for options, wanted, code in ((["--measured", taped], "pass", 0), ([], "poor", 3)):
         with pytest.raises(SystemExit) as stop:
-            main(["calibrate", "session.toml", "-o", grade, *words, *options])
+            main(["calibrate", "session.toml", "-o", wanted, *words, *options])
         assert int(stop.value.code or 0) == code
         said = capsys.readouterr().out
-        assert f"Verdict: {grade}" in said
+        assert f"Quality: {wanted}" in said
         assert max(map(len, said.splitlines())) <= 100
-        content = json.loads((tmp_path / grade / "calibration.json").read_text(encoding="utf-8"))
-        assert content["verdict"] == grade
-        assert bool(content["reasons"]) == (grade != "pass")
+        content = json.loads((tmp_path / wanted / "calibration.json").read_text(encoding="utf-8"))
+        assert content["quality"] == wanted
+        warned = [from_json(each) for each in content["diagnostics"] if each["severity"] != "info"]
+        assert bool(warned) == (wanted != "pass")
+        assert all(each["text"]["do"] for each in content["diagnostics"])
+        assert {check["quality"] for check in content["checks"]} == {"pass", wanted}
         assert len(content["gap"]["time"]) <= 600
         assert content["mounts"].keys() == anywhere.quat_LS.keys()
         assert content["lengths"]["left_upper_arm"]["std"] > 0.0
         assert content["conditioning"]["rank"] < content["conditioning"]["unknowns"]
         assert {"wepose-pin", "casadi"} <= content["versions"].keys()
-    assert GRADES == ("pass", "poor", "fail")
+    assert QUALITIES == ("pass", "poor", "fail")

@@ -1,29 +1,30 @@
-"""Whether a calibration is good enough, what the motion left unseen, and what to do better, in a person's words.
+"""Whether a calibration is good enough, and what the motion did not determine.
 
-Each finding is one number against two stated limits: up to the first it passes, up to the second it is poor, beyond it
-fails; the verdict is the worst of them. What is uncertain is explained by what was measured of the motion: the upper
+Each check is one number against two stated limits: up to the first it passes, up to the second it is poor, beyond it
+fails; the quality is the worst of them. What is uncertain is explained by what was measured of the motion: the upper
 arms were hardly raised, the torso hardly leaned.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
+from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
 from ..subject import LENGTHS
-from .advice import ADVICE, POSED
 from .anatomy import E_Z, SIDES
 from .lengths import Calibration
+from .observability import MOST_OPEN, intervals_of, longest_intervals
 from .weighing import CONTRADICTED, TOUCHED
 
-Grade = Literal["pass", "poor", "fail"]
-GRADES: tuple[Grade, ...] = ("pass", "poor", "fail")
-EFFECTIVE = "independent measurements"  # the unit of an effective sample size
+Quality = Literal["pass", "poor", "fail"]
+QUALITIES: tuple[Quality, ...] = ("pass", "poor", "fail")
+SEVERITY: dict[Quality, Severity] = {"pass": INFO, "poor": WARNING, "fail": ERROR}
 
 
 class Limits(NamedTuple):
@@ -32,7 +33,7 @@ class Limits(NamedTuple):
     passes: float
     poor: float
 
-    def grade(self, value: float) -> Grade:
+    def quality(self, value: float) -> Quality:
         """NaN is of what was not looked at, and passes."""
         sign = -1.0 if self.passes > self.poor else 1.0
         value, passes, poor = sign * value, sign * self.passes, sign * self.poor
@@ -46,40 +47,47 @@ ARM_HEADING = Limits(np.deg2rad(3.0), np.deg2rad(6.0))  # [rad]
 TORSO_HEADING = Limits(np.deg2rad(5.0), np.deg2rad(7.0))  # [rad]; beyond, soft tissue makes it worse than stated
 HAND_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] short links, seen little
 LONE_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] by poses, or by one arm: no better is to be had
-SCALE = Limits(0.02, 0.08)  # relative; a tape has 1 %, an average person 5 %
+SCALE = Limits(0.02, 0.08)  # relative; a tape has 1 %, the population prior 5 %
 # What the solution leaves over.
 GAP = Limits(0.030, 0.060)  # [m] rms while the palms touch
-APART = Limits(0.10, 0.60)  # share of looks
+APART = Limits(MOST_OPEN, 0.60)  # share of looks
 TILT = Limits(np.deg2rad(12.0), np.deg2rad(20.0))  # [rad] of a segment in the start pose; elbows hang 5 to 8 deg bent
-UNUSUAL = Limits(4.0, 6.0)  # standard deviations of a length from the average person
-TAPE = Limits(CONTRADICTED, 5.0)  # of a taped length from what the motion and the average person say of it
+UNUSUAL = Limits(4.0, 6.0)  # standard deviations of a length from the population prior
+MEASURED = Limits(CONTRADICTED, 5.0)  # of a measured length from what the motion and the prior say of it
 SAMPLES = Limits(6.0, 2.0)  # effective sample size, at least: some six independent ones carry a calibration
 DOUBT = Limits(1.0, 1.0)  # of anatomy, see `anatomy`
 
-# What moved less than this is said to be the cause of what is uncertain.
-ENOUGH = {"elevation": 40.0, "sideways": 35.0, "elbow": 40.0, "lean": 8.0, "twist": 12.0}  # [deg]
-ENOUGH_LOOKS = 12.0  # independent ones
+# What moved less than this [rad] is said to be the cause of what is uncertain.
+ENOUGH = {
+    "motion-elevation-small": np.deg2rad(40.0),
+    "motion-sideways-small": np.deg2rad(35.0),
+    "motion-elbow-small": np.deg2rad(40.0),
+    "motion-lean-small": np.deg2rad(8.0),
+    "motion-twist-small": np.deg2rad(12.0),
+}
+ENOUGH_SAMPLES = 12.0  # effective sample size
 # A direction counts as determined by the motion where that tells more than was known before.
 SEEN = 1e-2  # information, in units of what was known before, below which a direction was not seen at all
 
 
-class Finding(NamedTuple):
+class Check(NamedTuple):
     """One number against its limits."""
 
-    name: str
-    grade: Grade
-    value: float  # in `unit`, as its limits
-    passes: float
-    poor: float
-    unit: str
-    said: str  # what it is, in words
-    why: str  # what moved too little for it; empty where nothing did
-    do: str  # what would make it better
+    diagnostic: Diagnostic  # what is checked: its value, and as limit that up to which it passes
+    quality: Quality
+    limits: Limits
+    cause: Diagnostic | None = None  # what moved too little for it
+
+    @property
+    def value(self) -> float:
+        assert self.diagnostic.value is not None
+        return self.diagnostic.value
 
     @property
     def excess(self) -> float:
         """How many times the limit up to which it passes it is, or that limit is the value where it is a least one."""
-        value, limit = (self.passes, self.value) if self.passes > self.poor else (self.value, self.passes)
+        passes, poor = self.limits
+        value, limit = (passes, self.value) if passes > poor else (self.value, passes)
         return value / max(limit, 1e-9)
 
 
@@ -112,21 +120,25 @@ class Direction(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What to think of a calibration.
+class CalibrationQuality:
+    """What a calibration is worth.
 
     Parameters
     ----------
-    grade : the worst of all findings
-    findings : in the order of the results; those that pass as well
+    quality : the worst of all checks
+    checks : in the order of the results; those that pass as well
+    reasons : what keeps it from passing, the worst first, each followed by its cause
+    further : what else the user should know
     motion : what moved
     directions : of lengths and mounts jointly, best seen first
     rank, determined, unknowns : directions seen at all, told better than before, and all
     condition : largest over smallest standard deviation after the motion, each in units of that before
     """
 
-    grade: Grade
-    findings: tuple[Finding, ...]
+    quality: Quality
+    checks: tuple[Check, ...]
+    reasons: tuple[Diagnostic, ...]
+    further: tuple[Diagnostic, ...]
     motion: Motion
     directions: tuple[Direction, ...]
     rank: int
@@ -135,37 +147,25 @@ class Verdict:
     condition: float
 
     @property
-    def reasons(self) -> tuple[Finding, ...]:
-        """What keeps it from passing, the worst first."""
-        wanting = [finding for finding in self.findings if finding.grade != "pass"]
-        return tuple(sorted(wanting, key=lambda f: (f.grade != "fail", -f.excess)))
-
-    def in_words(self) -> list[str]:
-        """What keeps it from passing, a line for each remedy."""
-        lines: dict[str, list[Finding]] = {}
-        for finding in self.reasons:
-            lines.setdefault(finding.do or finding.said, []).append(finding)
-        said = []
-        for same in lines.values():
-            worst = "fail" if any(f.grade == "fail" for f in same) else "poor"
-            what = ", ".join(f.said for f in same)
-            why = next((f": {f.why}" for f in same if f.why and f.why not in what), "")
-            do = f"; {same[0].do}" if same[0].do else ""
-            said.append(f"{worst}: {what}{why}{do}")
-        return said
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """All that a user should know of the calibration."""
+        return (*self.reasons, *self.further)
 
 
-def judge(calibration: Calibration) -> Verdict:
-    """The verdict on a calibration, with what was and was not seen."""
+def assess(calibration: Calibration) -> CalibrationQuality:
+    """The quality of a calibration, with what was and was not seen."""
     motion = _motion(calibration)
-    findings = _labels(calibration)
+    checks = _labels(calibration)
     if not calibration.labels.moved:  # of another arrangement of sensors nothing else means anything
-        findings += [*_deviations(calibration, motion), *_left_over(calibration)]
+        checks += [*_deviations(calibration, motion), *_left_over(calibration)]
+    reasons = _reasons(checks)
     directions = _directions(calibration)
     after = np.array([1.0 / (1.0 + d.information) for d in directions])
-    return Verdict(
-        grade=max((f.grade for f in findings), key=GRADES.index),
-        findings=tuple(findings),
+    return CalibrationQuality(
+        quality=max((check.quality for check in checks), key=QUALITIES.index),
+        checks=tuple(checks),
+        reasons=reasons,
+        further=tuple(each for each in calibration.diagnostics if each.code not in {of.code for of in reasons}),
         motion=motion,
         directions=directions,
         rank=sum(d.information > SEEN for d in directions),
@@ -175,32 +175,39 @@ def judge(calibration: Calibration) -> Verdict:
     )
 
 
-def _finding(name: str, value: float, limits: Limits, unit: str, said: str, do: str, why: str = "") -> Finding:
-    grade = limits.grade(value)
-    return Finding(name, grade, float(value), float(limits.passes), float(limits.poor), unit, said, why, do)
+def _reasons(checks: list[Check]) -> tuple[Diagnostic, ...]:
+    """What does not pass, the worst first; a cause once, behind the first that it explains."""
+    found: list[Diagnostic] = []
+    failing = [check for check in checks if check.quality != "pass"]
+    for check in sorted(failing, key=lambda check: (check.quality != "fail", -check.excess)):
+        found.append(check.diagnostic)
+        if check.cause is not None and check.cause.code not in {each.code for each in found}:
+            found.append(check.cause)
+    return tuple(found)
 
 
-def _labels(calibration: Calibration) -> list[Finding]:
+def _check(
+    diagnostic: Diagnostic, limits: Limits, cause: Diagnostic | None = None, quality: Quality | None = None
+) -> Check:
+    """A check of the diagnostic's value; its severity is that of the quality."""
+    value = float(diagnostic.value if diagnostic.value is not None else np.nan)
+    quality = quality or limits.quality(value)
+    severity = SEVERITY[quality]
+    diagnostic = replace(diagnostic, severity=severity, value=value, limit=float(limits.passes))
+    return Check(diagnostic, quality, limits, None if cause is None else replace(cause, severity=severity))
+
+
+def _labels(calibration: Calibration) -> list[Check]:
     """Sensors that sit elsewhere than labelled, and mounts that cannot be."""
     labels = calibration.labels
-    names = "the names of the sensors in the session, and that every strap held"
-    found = [
-        _finding(
-            "anatomy",
-            labels.doubt,
-            DOUBT,
-            "of the limit",
-            labels.said() or "elbows bend forward, hands are before the body",
-            "" if labels.moved else f"check {names}",
-        )
-    ]
-    for text in calibration.contradicted:
-        found.append(Finding("mount", "poor", 1.0, 0.0, 1.0, "contradicted", text, "", ""))
+    found = [_check(labels.diagnostic(), DOUBT, labels.contradiction)]
+    for mount in calibration.contradicted:
+        found.append(_check(mount, Limits(float(mount.limit or 0.0), np.pi), quality="poor"))
     return found
 
 
-def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
-    subject = calibration.subject
+def _deviations(calibration: Calibration, motion: Motion) -> list[Check]:
+    subject, closure = calibration.subject, calibration.closure
     names = [name for name in LENGTHS if name != "trunk"]
     lengths = np.array([subject.lengths[name] for name in names])
     covariance = subject.lengths_covariance(names)
@@ -214,137 +221,100 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Finding]:
 
     sides = [side for side in SIDES if f"{side}_upper_arm" in subject.mounts]
     found = []
-    parts = {
-        "upper_arms": (
-            "upper-arm lengths",
-            {s: std(f"{s}_upper_arm") for s in sides},
-            ("sideways", "elevation", "elbow"),
-        ),
-        "forearms": (
-            "forearm + hand lengths",
-            {s: std(f"{s}_forearm", f"{s}_hand") for s in sides},
-            ("sideways", "elbow", "elevation"),
-        ),
-        "shoulder_width": ("the shoulder width", {"": std("shoulder_width")}, ("sideways", "elevation")),
-    }
-    for name, (what, each, causes) in parts.items():
-        if each and calibration.closure in ADVICE:  # without a closure lengths are the average person's
-            side = max(each, key=lambda s: each[s])
-            why, do = _cause(calibration, motion, causes, [side] if side else sides)
-            if not side and ADVICE[calibration.closure].width:
-                why, do = "", ADVICE[calibration.closure].width
-            said = f"{what} ± {1e3 * each[side]:.0f} mm"
-            found.append(_finding(name, each[side], LENGTH, "m", said, do, why))
+    if closure:  # without a closure lengths are the prior's
+        upper_arms = {s: std(f"{s}_upper_arm") for s in sides}
+        forearms = {s: std(f"{s}_forearm", f"{s}_hand") for s in sides}
+        if sides:
+            side = max(sides, key=lambda s: upper_arms[s])
+            uncertain = Diagnostic("upper-arm-length-uncertain", INFO, f"{side}_upper_arm", upper_arms[side])
+            cause = _cause(calibration, motion, ("sideways", "elevation", "elbow"), [side])
+            found.append(_check(uncertain, LENGTH, cause))
+            side = max(sides, key=lambda s: forearms[s])
+            uncertain = Diagnostic("forearm-length-uncertain", INFO, f"{side}_forearm", forearms[side])
+            cause = _cause(calibration, motion, ("sideways", "elbow", "elevation"), [side])
+            found.append(_check(uncertain, LENGTH, cause))
+        uncertain = Diagnostic(
+            "shoulder-width-uncertain", INFO, "shoulder_width", std("shoulder_width"), facts={"variant": closure}
+        )
+        one_arm = closure == "fixed_point"
+        cause = None if one_arm else _cause(calibration, motion, ("sideways", "elevation"), sides)
+        found.append(_check(uncertain, LENGTH, cause))
     for segment in (s for s in subject.mounts if f"mounts.{s}.z" in subject.order):
-        value = subject.std(f"mounts.{segment}.z")
         torso = segment == "torso"
         causes = ("lean", "twist", "sideways") if torso else ("sideways", "elevation", "elbow")
         own = [s for s in SIDES if segment.startswith(s)]
-        why, do = _cause(calibration, motion, causes, own or sides)
-        said = f"heading of the {segment.replace('_', ' ')} sensor ± {np.degrees(value):.1f} deg"
+        cause = _cause(calibration, motion, causes, own or sides)
         limits = TORSO_HEADING if torso else HAND_HEADING if segment.endswith("hand") else ARM_HEADING
         if len(calibration.hinge_rms) < 2:
             limits = LONE_HEADING
-        found.append(_finding(f"heading.{segment}", value, limits, "rad", said, do, why))
-    whose = "" if calibration.subject.note.count("taped") else ": nothing was taped, it is the average person's"
-    found.append(
-        _finding(
-            "scale",
-            calibration.scale_std,
-            SCALE,
-            "relative",
-            f"all lengths together ± {100 * calibration.scale_std:.1f} %{whose}",
-            f"tape one length and give it, as in --measured {calibration.tape}",
+        uncertain = Diagnostic(
+            "mount-heading-uncertain",
+            INFO,
+            segment,
+            subject.std(f"mounts.{segment}.z"),
+            facts={"variant": closure or "poses"},
         )
-    )
-    return found
+        found.append(_check(uncertain, limits, cause))
+    prior = calibration.prior
+    facts: dict[str, float | str] = {"measured": calibration.tape}
+    if calibration.scaling:
+        scale = Diagnostic("scale-uncertain", INFO, value=calibration.scale_std, facts=facts)
+    else:
+        facts |= {"prior": prior.note or prior.name, "protocol": calibration.protocol}
+        scale = Diagnostic("scale-from-prior", INFO, value=calibration.scale_std, facts=facts)
+    return [*found, _check(scale, SCALE)]
 
 
-def _cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...], sides: list[str]) -> tuple[str, str]:
-    """Why something is uncertain, as a clause, and what to do: what moved least of what it needs."""
-    if calibration.closure not in ADVICE:
-        return "", POSED
+def _cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...], sides: list[str]) -> Diagnostic | None:
+    """Why something is uncertain: what moved least of what it needs, or that the motion was short."""
+    if not calibration.closure:
+        return None
 
-    def of(values: Mapping[str, Range]) -> float:
+    def size(values: Mapping[str, Range]) -> float:
         return min((values[side].size for side in sides if side in values), default=np.nan)
 
-    size = {
-        "elevation": of(motion.elevation),
-        "sideways": of(motion.sideways),
-        "elbow": of(motion.elbow),
+    sizes = {
+        "elevation": size(motion.elevation),
+        "sideways": size(motion.sideways),
+        "elbow": size(motion.elbow),
         "lean": motion.lean,
         "twist": motion.twist.size if motion.twist else np.nan,
     }
-    advice = ADVICE[calibration.closure]
-    seen = {name: size[name] for name in causes if np.isfinite(size[name])}
-    least = min(seen, key=lambda name: seen[name] / ENOUGH[name], default="")
-    if least and seen[least] < ENOUGH[least]:
-        why, do = advice.moved[least]
-        return why.format(seen[least]), do
-    if calibration.independent < ENOUGH_LOOKS:
-        return f"the motion is worth {calibration.independent:.0f} independent looks only", advice.longer
-    return "", "move further and faster, through all of the reach"
+    facts = {"variant": calibration.closure}
+    codes = {f"motion-{name}-small": np.deg2rad(sizes[name]) for name in causes if np.isfinite(sizes[name])}
+    least = min(codes, key=lambda code: codes[code] / ENOUGH[code], default="")
+    if least and codes[least] < ENOUGH[least]:
+        return Diagnostic(least, WARNING, "", float(codes[least]), float(ENOUGH[least]), facts)
+    if calibration.independent < ENOUGH_SAMPLES:
+        return Diagnostic("motion-too-short", WARNING, "", calibration.independent, ENOUGH_SAMPLES, facts)
+    return None
 
 
-def _left_over(calibration: Calibration) -> list[Finding]:
-    closed = np.isfinite(calibration.gap)
+def _left_over(calibration: Calibration) -> list[Check]:
+    closed, facts = np.isfinite(calibration.gap), {"variant": calibration.closure}
     found = []
-    if calibration.closure in ADVICE:
-        advice = ADVICE[calibration.closure]
-        gap, looks = calibration.rms_gap, calibration.independent
+    if calibration.closure:
         share = float(np.mean(calibration.kept[closed] < TOUCHED))
+        intervals = {"intervals": longest_intervals(apart(calibration))}
         found += [
-            _finding("gap", gap, GAP, "m", advice.gap.format(1e3 * gap), advice.closer),
-            _finding(
-                "motion",
-                looks,
-                SAMPLES,
-                EFFECTIVE,
-                f"the motion is worth {looks:.0f} independent looks only",
-                advice.longer,
-            ),
-            _finding("apart", share, APART, "share", advice.apart.format(100 * share), advice.together),
+            _check(Diagnostic("closure-gap-large", INFO, value=calibration.rms_gap, facts=facts), GAP),
+            _check(Diagnostic("motion-too-short", INFO, value=calibration.independent, facts=facts), SAMPLES),
+            _check(Diagnostic("closure-open", INFO, value=share, facts=facts | intervals), APART),
         ]
     tilts = {name: float(np.linalg.norm(tilt)) for name, tilt in calibration.start_tilt.items()}
     if tilts:
         name = max(tilts, key=lambda n: tilts[n])
-        found.append(
-            _finding(
-                "start_pose",
-                tilts[name],
-                TILT,
-                "rad",
-                f"the {name.replace('_', ' ')} was {np.degrees(tilts[name]):.0f} deg off in the start pose",
-                "stand upright in the start pose, arms hanging straight down",
-            )
-        )
+        found.append(_check(Diagnostic("start-pose-off", INFO, name, tilts[name]), TILT))
     for name, tape in calibration.tapes.items():
-        found.append(
-            _finding(
-                f"tape.{name}",
-                tape.off,
-                TAPE,
-                "std of what is known without it",
-                tape.said(name),
-                "measure it anew, and check --stature and --sex",
-            )
-        )
-    if any(tape.off > TAPE.passes for tape in calibration.tapes.values()):
-        return found  # all lengths have followed a tape that is wrong
+        lengths: dict[str, float | str] = {"measured": tape.metres, "expected": tape.expected, "std": tape.std}
+        found.append(_check(Diagnostic("measured-length-contradicted", INFO, name, tape.off, facts=lengths), MEASURED))
+    if any(tape.off > MEASURED.passes for tape in calibration.tapes.values()):
+        return found  # all lengths have followed a measured one that is wrong
     prior, subject = calibration.prior, calibration.subject
     z = {n: abs(subject.lengths[n] - prior.lengths[n]) / prior.std(n) for n in LENGTHS if n not in calibration.gauge}
     name = max(z, key=lambda n: z[n])
-    found.append(
-        _finding(
-            "person",
-            z[name],
-            UNUSUAL,
-            "std of the average person",
-            f"{name} = {1e3 * subject.lengths[name]:.0f} mm is {z[name]:.1f} standard deviations from the average",
-            "check --stature, the gauge and that every sensor sits where the session says",
-        )
-    )
-    return found
+    metres = {"metres": float(subject.lengths[name])}
+    return [*found, _check(Diagnostic("length-unusual", INFO, name, z[name], facts=metres), UNUSUAL)]
 
 
 def _motion(calibration: Calibration) -> Motion:
@@ -400,18 +370,27 @@ def _directions(calibration: Calibration) -> tuple[Direction, ...]:
 
 
 MOST_POINTS = 600  # of the residual over time
-UNSEEN = ("upper_arms", "forearms", "shoulder_width", "scale", "heading.")  # findings on what the motion left open
 
 
-def document(calibration: Calibration, verdict: Verdict) -> dict[str, Any]:
-    """What ``calibration.json`` holds; lengths [m], angles [deg], times [s]."""
+def document(calibration: Calibration, quality: CalibrationQuality) -> dict[str, Any]:
+    """What ``calibration.json`` holds; lengths [m], times [s], angles as named, checks and diagnostics SI."""
     subject = calibration.subject
     stride = -(-len(calibration.time) // MOST_POINTS)
     some = slice(None, None, stride)
     return {
-        "verdict": verdict.grade,
-        "reasons": verdict.in_words(),
-        "findings": verdict.findings,
+        "quality": quality.quality,
+        "diagnostics": [as_json(diagnostic) for diagnostic in quality.diagnostics],
+        "checks": [
+            {
+                "code": check.diagnostic.code,
+                "place": check.diagnostic.place,
+                "quality": check.quality,
+                "value": _number(check.value),
+                "passes": check.limits.passes,
+                "poor": check.limits.poor,
+            }
+            for check in quality.checks
+        ],
         "protocol": calibration.protocol,
         "gauge": dict(calibration.gauge),
         "scale_std": calibration.scale_std,
@@ -439,31 +418,21 @@ def document(calibration: Calibration, verdict: Verdict) -> dict[str, Any]:
         "apart": apart(calibration),
         "independent_looks": calibration.independent,
         "conditioning": {
-            "unknowns": verdict.unknowns,
-            "rank": verdict.rank,
-            "determined": verdict.determined,
-            "condition": _number(verdict.condition),
-            "directions": verdict.directions,
+            "unknowns": quality.unknowns,
+            "rank": quality.rank,
+            "determined": quality.determined,
+            "condition": _number(quality.condition),
+            "directions": quality.directions,
         },
-        "motion_deg": verdict.motion,
-        "unseen": [f"{f.said}: {f.why}" if f.why else f.said for f in verdict.reasons if f.name.startswith(UNSEEN)],
-        "labels": {
-            "doubt": _number(calibration.labels.doubt),
-            "said": calibration.labels.said(),
-            "moved": dict(calibration.labels.moved),
-        },
-        "warnings": list(calibration.warnings),
+        "motion_deg": quality.motion,
+        "labels": {"doubt": _number(calibration.labels.doubt), "moved": dict(calibration.labels.moved)},
     }
 
 
 def apart(calibration: Calibration) -> list[tuple[float, float]]:
     """From when to when [s] the palms were apart."""
     gone = np.isfinite(calibration.gap) & (calibration.kept < TOUCHED)
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], gone.view(np.int8), [0]))))
-    time = calibration.time
-    return [
-        (round(float(time[a]), 3), round(float(time[b - 1]), 3)) for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ]
+    return [(round(a, 3), round(b, 3)) for a, b in intervals_of(calibration.time, gone)]
 
 
 def _number(value: float) -> float | None:

@@ -1,0 +1,194 @@
+"""Diagnostics: every code that is made has its texts, every text can be filled, the page of codes is whole."""
+
+from __future__ import annotations
+
+import ast
+import json
+import string
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import wepose_pin
+from wepose_pin.diagnostics import (
+    ERROR,
+    INFO,
+    WARNING,
+    Diagnostic,
+    Text,
+    as_json,
+    catalogue,
+    document,
+    example,
+    from_json,
+    gravest_first,
+    merge,
+    quantity,
+    render,
+    render_all,
+    unclassified,
+)
+
+PACKAGE = Path(wepose_pin.__file__).parent
+# Functions that make a diagnostic of the code that is their first argument, beside `Diagnostic` itself.
+CONSTRUCTORS = {"Diagnostic"}
+# Codes whose rooms still give texts of their own. A code leaves this list with the change that makes it.
+NOT_YET = set(
+    """
+    time-resampled packet-times-spread long-gaps-bridged short-gaps-bridged sensor-frozen orientation-constant
+    orientations-copied arm-frames-assumed devices-left-out device-not-synchronized heading-resets-not-repeated
+    sensor-segments-unknown device-file-left-out session-unreadable start-pose-guessed phase-intervals-ignored
+    start-pose-sway person-rotates mount-contradicts-gravity mount-moved static-phase-missing
+    """.split()
+)
+ALL = [(code, variant) for code, entry in catalogue().items() for variant in ("", *entry.variants)]
+
+
+def calls() -> Iterator[tuple[str, ast.Call]]:
+    """Every call in the package that makes a diagnostic, with its place."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CONSTRUCTORS:
+                yield f"{path.relative_to(PACKAGE)}:{node.lineno}", node
+
+
+def literals(node: ast.AST) -> set[str]:
+    return {n.value for n in ast.walk(node) if isinstance(n, ast.Constant) and isinstance(n.value, str)}
+
+
+def emitted() -> set[str]:
+    """Codes that the package makes: a first argument as it stands, or strings of its module where it is a name."""
+    codes = set()
+    for place, call in calls():
+        if place.startswith("diagnostics.py") and not isinstance(call.args[0], ast.Constant):
+            continue
+        code = call.args[0]
+        if isinstance(code, ast.Constant):
+            assert code.value in catalogue(), f"{place}: {code.value} is not in the catalogue"
+            codes.add(code.value)
+        else:
+            source = ast.parse((PACKAGE / place.rpartition(":")[0]).read_text(encoding="utf-8"))
+            found = literals(source) & set(catalogue())
+            assert found, f"{place}: the code is no string, and no string of the module is one"
+            codes |= found
+    return codes
+
+
+def test_every_code_is_in_the_catalogue_and_every_entry_is_made() -> None:
+    made = emitted()
+    assert made - set(catalogue()) == set()
+    assert set(catalogue()) - made - NOT_YET == set(), "in the catalogue, and nothing makes it"
+    assert made & NOT_YET == set(), "made by now: take it from NOT_YET"
+
+
+def test_facts_of_each_call_are_those_of_its_text() -> None:
+    """Where the facts stand in the call itself."""
+    seen = 0
+    for place, call in calls():
+        facts = next((word.value for word in call.keywords if word.arg == "facts"), None)
+        facts = call.args[5] if len(call.args) > 5 else facts
+        code = call.args[0]
+        if not isinstance(code, ast.Constant) or not isinstance(facts, ast.Dict):
+            continue
+        keys = {key.value for key in facts.keys if isinstance(key, ast.Constant)}
+        if len(keys) == len(facts.keys):
+            seen += 1
+            known = {name for example in catalogue()[str(code.value)].examples.values() for name in example}
+            assert keys <= known | {"variant"}, f"{place}: the catalogue's example has no {keys - known}"
+    assert seen > 10
+
+
+@pytest.mark.parametrize(("code", "variant"), ALL)
+def test_every_text_is_filled_by_its_example_and_needs_all_of_it(code: str, variant: str) -> None:
+    text = render(example(code, variant))
+    assert text.title
+    if code != "unclassified":
+        for part in text[1:]:
+            assert part.endswith((".", "!")), part
+            assert "  " not in part
+            assert "{" not in part.replace("{ up", "")
+    assert text.line().startswith(text.what)
+    entry = catalogue()[code]
+    parts = [part for each in (entry.text, *entry.variants.values()) for part in each]
+    fields = {name for part in parts for _, name, _, _ in string.Formatter().parse(part) if name}
+    own = {name for part in entry.variants.get(variant, entry.text) for _, name, _, _ in string.Formatter().parse(part)}
+    assert own & {"place", "value", "limit"} <= set(entry.examples[variant])
+    given = set(entry.examples[variant]) - {"variant", "place", "value", "limit"}
+    assert given <= fields, f"the texts do not use {given - fields}"
+
+
+def test_tables_of_the_catalogue_have_nothing_else() -> None:
+    groups = tomllib.loads((PACKAGE / "diagnostics.toml").read_text(encoding="utf-8"))
+    codes = [code for tables in groups.values() for code in tables]
+    assert len(codes) == len(set(codes)), "a code stands in two groups"
+    for tables in groups.values():
+        for code, table in tables.items():
+            assert set(table) - {"variants"} == {*Text._fields, "example"}, code
+            for variant in table.get("variants", {}).values():
+                assert set(variant) <= {*Text._fields, "example"}, code
+
+
+def test_the_page_of_codes_is_up_to_date() -> None:
+    page = PACKAGE.parent / "docs" / "diagnostics.md"
+    assert page.read_text(encoding="utf-8") == document(), "python -m wepose_pin.diagnostics > docs/diagnostics.md"
+
+
+def test_a_code_or_a_fact_that_is_not_there_fails() -> None:
+    with pytest.raises(KeyError, match="no-such-code"):
+        render(Diagnostic("no-such-code", INFO))
+    with pytest.raises(KeyError, match="method"):
+        render(Diagnostic("method-needs-static", WARNING))
+    with pytest.raises(KeyError, match="sideways"):
+        render(Diagnostic("heading-uncertain", WARNING, "left_elbow", 0.2, 0.17, {"variant": "sideways"}))
+
+
+def test_json_holds_data_and_text_and_comes_back() -> None:
+    diagnostic = Diagnostic("elbow-overflexed", ERROR, "left_elbow", 2.967, float("nan"))
+    content = json.loads(json.dumps(as_json(diagnostic), allow_nan=False))
+    assert content["text"]["what"].startswith("The left elbow bends by up to 170°")
+    assert content["limit"] is None
+    assert from_json(content) == Diagnostic("elbow-overflexed", ERROR, "left_elbow", 2.967, None)
+    content["text"] = {"title": "another"}
+    assert from_json(content).code == "elbow-overflexed"
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (0.5, "deg", "29°"),
+        (0.0, "deg", "0°"),
+        (-0.01, "deg", "-0.57°"),
+        (0.0999999, "percent", "10 %"),
+        (0.04, "+percent", "+4 %"),
+        (0.0123, "mm", "12 mm"),
+        (1.234, "mm", "1234 mm"),
+        (9.80665, "m/s2", "9.81 m/s²"),
+        (99.75, "hz", "99.75 Hz"),
+        (1700000000.123, "time", "1700000000.123 s"),
+        (12.0, "time", "12 s"),
+        (12345.0, "count", "12345"),
+        (float("inf"), "mm", "not known"),
+        (None, "s", "not known"),
+    ],
+)
+def test_numbers_have_two_digits_at_least_and_their_unit(value: float | None, unit: str, text: str) -> None:
+    assert quantity(value, unit) == text
+
+
+def test_alike_are_told_together_the_gravest_first() -> None:
+    lost = [Diagnostic("samples-lost", WARNING, name, 0.02 + 0.01 * k, 0.01) for k, name in enumerate("abcde")]
+    texts = render_all([Diagnostic("population-lengths", INFO), *lost, lost[0], unclassified("x"), unclassified("y")])
+    assert [text.title for _, text in texts] == ["Samples lost", "Note", "Note", "Lengths of the population prior"]
+    assert texts[0][0] == WARNING
+    assert texts[0][1].what.count("lost") == 3
+    assert texts[0][1].what.endswith("So it is in 2 more: d, e.")
+    assert texts[0][1].line(titled=True).startswith("**Samples lost.** The a sensor lost 2 % of its samples")
+    assert [each.severity for each in gravest_first([*lost[:1], Diagnostic("x", ERROR)])] == [ERROR, WARNING]
+
+
+def test_what_two_rooms_find_is_told_once() -> None:
+    first, other = (Diagnostic("signal-saturated", WARNING, name, 0.4) for name in ("torso", "head"))
+    again = Diagnostic("signal-saturated", WARNING, "torso", 0.5)
+    assert merge([first], [again, other]) == (first, other)

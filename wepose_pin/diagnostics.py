@@ -1,0 +1,279 @@
+"""What a user should know, as data: `Diagnostic`, and the catalogue of its texts.
+
+A room that finds something says it as a `Diagnostic`; `render` makes words of it where it is shown. The texts of all
+codes stand in ``diagnostics.toml``. ``python -m wepose_pin.diagnostics > docs/diagnostics.md`` lists them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import string
+import sys
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Severity(StrEnum):
+    """How much a diagnostic weighs."""
+
+    INFO = "info"  # worth knowing; the results are as good as they can be
+    WARNING = "warning"  # results may be wrong or uncertain by it
+    ERROR = "error"  # results must not be used
+
+
+INFO, WARNING, ERROR = Severity.INFO, Severity.WARNING, Severity.ERROR
+_GRAVEST_FIRST = (ERROR, WARNING, INFO)
+MOST_ALIKE = 3  # of diagnostics with the same reason and remedy that are told in full
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """Something that a user should know.
+
+    Parameters
+    ----------
+    code : stable, in the catalogue, listed in docs/diagnostics.md
+    severity : how much it weighs
+    place : segment, sensor, joint, length, phase or file that it is about
+    value, limit : what was found and what it should keep to, SI
+    facts : what the text needs besides, SI; ``variant`` names the text where a code has several
+    """
+
+    code: str
+    severity: Severity
+    place: str = ""
+    value: float | None = None
+    limit: float | None = None
+    facts: Mapping[str, float | str] = field(default_factory=dict)
+
+
+class Text(NamedTuple):
+    """A diagnostic in words; each part is one or more sentences."""
+
+    title: str
+    what: str  # what is wrong, with value and limit
+    why: str  # why it matters
+    do: str  # what to do
+
+    def line(self, titled: bool = False) -> str:
+        """All parts in one line; `titled`: with the title before them, in bold."""
+        title = f"**{self.title}.**" if titled else ""
+        return " ".join(part for part in (title, self.what, self.why, self.do) if part)
+
+
+class Entry(NamedTuple):
+    """A code of the catalogue."""
+
+    group: str
+    text: Text  # with fields in braces: place, value, limit and facts, each with its unit
+    variants: Mapping[str, Text]
+    examples: Mapping[str, Mapping[str, float | str]]  # variant (or "") → place, value, limit and facts
+
+
+def render(diagnostic: Diagnostic) -> Text:
+    """The diagnostic in words.
+
+    Raises
+    ------
+    KeyError
+        The catalogue has no such code or variant, or the text needs a fact that is not there.
+    """
+    entry = catalogue()[diagnostic.code]
+    variant = str(diagnostic.facts.get("variant", ""))
+    template = entry.variants[variant] if variant else entry.text
+    known = {"place": diagnostic.place, "value": diagnostic.value, "limit": diagnostic.limit, **diagnostic.facts}
+    return Text(*(_fill(part, known) for part in template))
+
+
+def render_all(diagnostics: Iterable[Diagnostic]) -> list[tuple[Severity, Text]]:
+    """The diagnostics in words, the gravest first; those with the same reason and remedy are one text."""
+    alike: dict[tuple[str, Severity, Text], dict[str, str]] = {}  # code, severity, text without `what` → `what` → place
+    for diagnostic in gravest_first(diagnostics):
+        text = render(diagnostic)
+        key = text._replace(what="") if text.do else text
+        alike.setdefault((diagnostic.code, diagnostic.severity, key), {}).setdefault(text.what, diagnostic.place)
+    texts = []
+    for (_, severity, text), places in alike.items():
+        told, others = list(places)[:MOST_ALIKE], list(places.values())[MOST_ALIKE:]
+        if others:
+            told.append(f"So it is in {len(others)} more: {', '.join(others).replace('_', ' ')}.")
+        texts.append((severity, text._replace(what=" ".join(told))))
+    return texts
+
+
+def lines(diagnostics: Iterable[Diagnostic], titled: bool = False) -> list[tuple[Severity, str]]:
+    """`render_all`, each in one line."""
+    return [(severity, text.line(titled)) for severity, text in render_all(diagnostics)]
+
+
+def gravest_first(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:
+    """Errors, then warnings, then the rest, each in the order in which they came."""
+    return sorted(diagnostics, key=lambda diagnostic: _GRAVEST_FIRST.index(diagnostic.severity))
+
+
+def merge(diagnostics: Sequence[Diagnostic], others: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
+    """`diagnostics`, then those of `others` whose code and place are not among them: two rooms may find the same."""
+    known = {(diagnostic.code, diagnostic.place) for diagnostic in diagnostics}
+    return (*diagnostics, *(each for each in others if (each.code, each.place) not in known))
+
+
+def as_json(diagnostic: Diagnostic) -> dict[str, Any]:
+    """The diagnostic with its text, for a JSON file; numbers that are not finite become null."""
+
+    def number(value: float | str | None) -> float | str | None:
+        if value is None or isinstance(value, str):
+            return value
+        return float(value) if math.isfinite(value) else None
+
+    return {
+        "code": diagnostic.code,
+        "severity": diagnostic.severity.value,
+        "place": diagnostic.place,
+        "value": number(diagnostic.value),
+        "limit": number(diagnostic.limit),
+        "facts": {name: number(fact) for name, fact in diagnostic.facts.items()},
+        "text": render(diagnostic)._asdict(),
+    }
+
+
+def from_json(content: Mapping[str, Any]) -> Diagnostic:
+    """The diagnostic of `as_json`; its text is not read."""
+    return Diagnostic(
+        content["code"],
+        Severity(content["severity"]),
+        content["place"],
+        content["value"],
+        content["limit"],
+        dict(content["facts"]),
+    )
+
+
+def unclassified(text: str, severity: Severity = WARNING) -> Diagnostic:
+    """A diagnostic of a room that still gives its texts itself."""
+    return Diagnostic("unclassified", severity, facts={"text": text})
+
+
+# Numbers --------------------------------------------------------------------------------------------------------------
+
+
+class _Unit(NamedTuple):
+    factor: float  # from SI
+    name: str  # with the space before it
+    digits: int = 2  # significant ones, at least
+
+
+_UNITS = {
+    "deg": _Unit(180.0 / math.pi, "°"),
+    "deg/s": _Unit(180.0 / math.pi, "°/s"),
+    "deg/min": _Unit(60.0 * 180.0 / math.pi, "°/min"),
+    "rad/s": _Unit(1.0, " rad/s", 3),
+    "mm": _Unit(1e3, " mm"),
+    "m": _Unit(1.0, " m", 3),
+    "m/s2": _Unit(1.0, " m/s²", 3),
+    "s": _Unit(1.0, " s"),
+    "ms": _Unit(1e3, " ms"),
+    "time": _Unit(1.0, " s", 15),  # as it stands in the file
+    "hz": _Unit(1.0, " Hz", 4),
+    "kg": _Unit(1.0, " kg", 3),
+    "percent": _Unit(100.0, " %"),
+    "count": _Unit(1.0, ""),
+    "number": _Unit(1.0, ""),
+}
+
+
+def quantity(value: float | None, unit: str) -> str:
+    """A number in SI as a user reads it: ``quantity(0.5, "deg")`` is "29°". ``+`` before the unit: with its sign."""
+    sign, unit = ("+", unit[1:]) if unit.startswith("+") else ("", unit)
+    factor, name, digits = _UNITS[unit]
+    if value is None or not math.isfinite(value):
+        return "not known"
+    shown = factor * value
+    decimals = 3 if unit == "time" else max(0, digits - 1 - math.floor(math.log10(abs(shown)))) if shown else 0
+    text = f"{shown:{sign}.{decimals}f}"
+    return (text.rstrip("0").rstrip(".") if "." in text else text) + name
+
+
+class _Formatter(string.Formatter):
+    """Fields of a text: ``{value:deg}`` with its unit, ``{place:name}`` a name in words, ``{text}`` as it is."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if format_spec == "name":
+            return str(value).replace("_", " ")
+        return quantity(value, format_spec) if format_spec else str(value)
+
+
+def _fill(template: str, known: Mapping[str, Any]) -> str:
+    text = _Formatter().vformat(template, (), known)
+    # A name at the beginning of a sentence; a file's name stays as it is.
+    return text[:1].upper() + text[1:] if re.match(r"\{\w+:name\}", template) else text
+
+
+# The catalogue --------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def catalogue() -> Mapping[str, Entry]:
+    """Code → its texts."""
+    with Path(__file__).with_suffix(".toml").open("rb") as file:
+        groups = tomllib.load(file)
+    return {code: _parse_entry(group, table) for group, codes in groups.items() for code, table in codes.items()}
+
+
+def _parse_entry(group: str, table: Mapping[str, Any]) -> Entry:
+    variants = table.get("variants", {})
+    base = {part: table[part] for part in Text._fields}
+    examples = {"": table["example"]} | {
+        name: table["example"] | {"variant": name} | variant.get("example", {}) for name, variant in variants.items()
+    }
+    texts = {
+        name: Text(*(variant.get(part, base[part]) for part in Text._fields)) for name, variant in variants.items()
+    }
+    return Entry(group, Text(**base), texts, examples)
+
+
+def example(code: str, variant: str = "") -> Diagnostic:
+    """The diagnostic that the documentation shows for a code."""
+    known = dict(catalogue()[code].examples[variant])
+    place, value, limit = str(known.pop("place", "")), known.pop("value", None), known.pop("limit", None)
+    assert not isinstance(value, str)
+    assert not isinstance(limit, str)
+    return Diagnostic(code, WARNING, place, value, limit, known)
+
+
+def document() -> str:
+    """``docs/diagnostics.md``."""
+    lines = [
+        "# Diagnostics",
+        "",
+        "What a user should know of a recording, a calibration, a motion or a robot is a diagnostic. It has a code, a",
+        "severity, a place, a value and its limit. The severities are *info* (good to know), *warning* (results may be",
+        "wrong or uncertain by it) and *error* (do not use the results). Results hold their diagnostics under",
+        "`diagnostics` in `summary.json` and `calibration.json`, in SI units and with their text. This page lists all",
+        "codes; the numbers in the texts are examples.",
+        "",
+        "Made by `python -m wepose_pin.diagnostics > docs/diagnostics.md` from `wepose_pin/diagnostics.toml`.",
+    ]
+    group = ""
+    for code, entry in catalogue().items():
+        if entry.group != group:
+            group = entry.group
+            lines += ["", f"## {group.replace('-', ' ').capitalize()}"]
+        lines += ["", f"### {code}", "", f"**{entry.text.title}.**"]
+        first = render(example(code))
+        lines += ["", first.what, "", f"*Why:* {first.why}", "", f"*What to do:* {first.do}"]
+        for variant in entry.variants:
+            text = render(example(code, variant))
+            shown = [part for part, base in zip(text[1:], first[1:], strict=True) if part != base]
+            if shown:
+                lines += ["", f"- `{variant}`: {' '.join(shown)}"]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(document())
