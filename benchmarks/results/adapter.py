@@ -39,7 +39,7 @@ EXPORTS: tuple[tuple[str, tuple[str, ...]], ...] = (
 ACCEPTED = {"calibrate": (0, 3, 4), "retarget": (0, 3)}  # exit codes beside 0 with which files are written
 
 # Files of a result whose numbers are not compared: pages, and what tells where, when and by what it was made.
-NOT_COMPARED = ("*.html", "*.md", "*.png", "provenance.json", "*.provenance.json", "done.json", "study.json")
+NOT_COMPARED = ("*.html", "*.md", "*.svg", "provenance.json", "*.provenance.json", "done.json", "study.json")
 # Keys, of JSON or of ours, whose numbers differ from run to run: times, versions, dates.
 VOLATILE = r"(^|/)(provenance|versions|packages|machine|date|solve_ms)(/|$)|/results/(seconds|memory_mb|\w+_s)$"
 MAIN_TABLES = ("pose",)  # files whose columns stand under the result's own key
@@ -325,8 +325,8 @@ def recording_values(session: Path) -> dict[str, Any]:
     recording = wp.load_session(session)
     values: dict[str, Any] = {"time": recording.time, "rate_hz": recording.rate_hz, "phases": recording.phases}
     for name, sensor in recording.sensors.items():
-        fields = (sensor.gyro_S, sensor.accel_S, sensor.quat_WS, sensor.stated_quat_LS)
-        values[name] = dict(zip(("gyro", "accel", "quat_WS", "stated_quat_LS"), fields, strict=True))
+        fields = {"gyro": "gyro_S", "accel": "accel_S", "quat_WS": "quat_WS", "stated_quat_LS": "stated_quat_LS"}
+        values[name] = {key: getattr(sensor, field, None) for key, field in fields.items()}
     return values
 
 
@@ -339,8 +339,8 @@ def tracked_values(session: Path, subject: Path | None, method: str) -> dict[str
         "quat_WL": pose.quat_WL,
         "points": pose.points,
         "q": pose.q,
-        "segment_cov": pose.segment_cov,
-        "point_cov": pose.point_cov,
+        "segment_cov": pose.pose.segment_cov,
+        "point_cov": pose.pose.point_cov,
     }
 
 

@@ -59,7 +59,7 @@ def _print_chain(job: TrackJob, chain: TrackedChain, summary: Mapping[str, Any])
         f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {chain.method}, on "
         f"{chain.model.name}",
         ("link", "off the joints, rms [deg]"),
-        [(link, f"{angle:.2f}") for link, angle in summary["not_followed_rms_deg"].items()],
+        [(link, f"{angle:.2f}") for link, angle in summary["orientation_residual_rms_deg"].items()],
     )
     print_table(
         "Joints [rad or m]",
