@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from reading import text_of
 from scipy.spatial.transform import Rotation
 
 from benchmarks.long_recordings import there_and_back
@@ -254,7 +255,7 @@ def test_what_has_no_pieces(session: Path, tmp_path: Path, capsys, options: list
         next(track_session(session, seconds=0.5))
 
 
-def test_a_thinned_report_keeps_extremes(session: Path, subject: Subject, monkeypatch) -> None:
+def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monkeypatch) -> None:
     """What lasts, what is lost and what was largest are those of all samples, though one in eighteen is kept."""
     monkeypatch.setattr("wepose_pin.report.decimation.MOST", 300)
     pose = track(load_session(session), subject)
@@ -268,9 +269,9 @@ def test_a_thinned_report_keeps_extremes(session: Path, subject: Subject, monkey
     assert whole.samples == len(pose.time) == 5698
     assert len(thin.time) == 317
     np.testing.assert_array_equal(thin.time, pose.time[::18])
-    assert whole.steps_ms == pytest.approx(wanted.steps_ms)
+    assert totals.steps_ms == pytest.approx(wanted.steps_ms)
     for name, signal in wanted.signals.items():
-        ours = whole.signals[name]
+        ours = totals.signals[name]
         bins = [signal.rate[first : first + 18].max() for first in range(0, 5698, 18)]
         np.testing.assert_allclose(ours.rate, bins, rtol=1e-12)
         assert ours.peak_accel == signal.peak_accel
@@ -279,7 +280,7 @@ def test_a_thinned_report_keeps_extremes(session: Path, subject: Subject, monkey
         np.testing.assert_array_equal(ours.rest, [signal.rest[k : k + 18].all() for k in range(0, 5698, 18)])
         np.testing.assert_array_equal(ours.bias, signal.bias)
     for name, speed in wanted.peak_speed.items():
-        assert 0.8 * speed < whole.peak_speed[name] <= speed
-    page = track_report(thin, whole=whole)
-    assert "5698 samples at 100 Hz" in page
-    assert "of 317 samples, one in 18" in page
+        assert 0.8 * speed < totals.peak_speed[name] <= speed
+    page = track_report(thin, totals=totals)
+    assert "5698 samples at 100 Hz" in text_of(page)
+    assert "of 317 samples, one in 18" in text_of(page)
