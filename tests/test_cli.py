@@ -183,7 +183,10 @@ def test_a_session_that_lacks_sensors_says_what_is_not_known(
     fewer = {name: sensor for name, sensor in recording.sensors.items() if name != "right_forearm"}
     write_session(tmp_path, replace(recording, sensors=fewer))
     assert run("track", tmp_path, "-o", tmp_path / "result") == 0
-    assert "no sensor on right_forearm: not known and not written: right_wrist, right_hand" in capsys.readouterr().err
+    summary = json.loads((tmp_path / "result" / "summary.json").read_text())
+    (unknown,) = [each for each in summary["diagnostics"] if each["code"] == "points-unknown"]
+    assert unknown["facts"] == {"segments": "right_forearm", "points": "right_wrist, right_hand"}
+    assert unknown["text"]["what"] in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("seconds", [0.8, 1.6, 2.4])

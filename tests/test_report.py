@@ -60,6 +60,7 @@ def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) 
         "The start pose",
         "The elbows as hinges",
         "The motion in 3D",
+        "Behind the quality",
         "What was run",
     ]
 
@@ -165,7 +166,7 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
 def test_without_a_mount_it_says_why_there_is_no_motion(made: Made) -> None:
     found = replace(made[0], subject=replace(made[0].subject, mounts={}))
     page = calibration_report(found, made[1])
-    assert "without hand positions and 3D view" in page
+    assert "The report lacks the positions of the hands and the 3D view." in page
     assert "mount is not known" in page
     assert headings(page) == [
         "Lengths",
