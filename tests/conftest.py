@@ -65,7 +65,9 @@ def processor_time() -> float:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--costs", metavar="FILE", help="write the processor and wall time of each test [s] to FILE as JSON")
+    parser.addoption(
+        "--costs", metavar="FILE", help="write the processor and wall time of each test [s] to FILE as JSON"
+    )
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m takes any out
@@ -117,7 +119,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     total = sum(_WORKERS.values()) or processor_time()
     terminalreporter.section("what the suite costs")
     terminalreporter.write_line(f"wall time {time.monotonic() - _START:.0f} s, processor time {total:.0f} s")
-    terminalreporter.write_line(f"tests run: {len(processor)}; collected: " + ", ".join(f"{n} {tier}" for tier, n in _TIERS.most_common()))
+    terminalreporter.write_line(
+        f"tests run: {len(processor)}; collected: " + ", ".join(f"{n} {tier}" for tier, n in _TIERS.most_common())
+    )
     terminalreporter.write_line("the ten that take most processor time [s]:")
     for nodeid, seconds in processor.most_common(10):
         terminalreporter.write_line(f"{seconds:7.1f}  {nodeid}")

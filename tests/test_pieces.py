@@ -26,7 +26,7 @@ from wepose_pin.pose import pose_table
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.report import track_report
-from wepose_pin.report.decimation import Decimator, whole_of
+from wepose_pin.report.decimation import Decimator, totals_of
 from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.subject import Subject
 from wepose_pin.tracking import SummaryAccumulator, TrackedRecording, TrackOptions, track, track_session
@@ -262,11 +262,11 @@ def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monk
     decimator = Decimator(len(pose.time))
     for piece in track_session(session, subject, seconds=7.31):
         decimator.add(piece)
-    thin, whole = decimator.decimated(
+    thin, totals = decimator.decimated(
         pose.recording.phases, [from_json(each) for each in pose.summary()["diagnostics"]]
     )
-    wanted = whole_of(pose)
-    assert whole.samples == len(pose.time) == 5698
+    wanted = totals_of(pose)
+    assert totals.samples == len(pose.time) == 5698
     assert len(thin.time) == 317
     np.testing.assert_array_equal(thin.time, pose.time[::18])
     assert totals.steps_ms == pytest.approx(wanted.steps_ms)

@@ -20,7 +20,7 @@ _OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov")  # in `Orie
 
 
 @dataclass(frozen=True)
-class Whole:
+class Totals:
     """What a decimated pose no longer tells of the recording."""
 
     samples: int
@@ -31,12 +31,12 @@ class Whole:
     diagnostics: Sequence[Diagnostic]
 
 
-def whole_of(pose: TrackedRecording) -> Whole:
+def totals_of(pose: TrackedRecording) -> Totals:
     """That of a pose which has all its samples."""
     recording = pose.recording
     steps = 1e3 * np.diff(recording.time)
     hands = hands_of(pose.pose, recording.rate_hz)
-    return Whole(
+    return Totals(
         len(recording),
         recording.rate_hz,
         (float(steps.min()), float(steps.max())),
@@ -86,7 +86,7 @@ class Decimator:
 
     def decimated(
         self, phases: Mapping[str, Intervals], diagnostics: Sequence[Diagnostic]
-    ) -> tuple[TrackedRecording, Whole]:
+    ) -> tuple[TrackedRecording, Totals]:
         """The pose, and what it no longer tells; `phases` and `diagnostics` of the whole recording.
 
         Raises the first error of `add`, of any kind.
@@ -97,7 +97,7 @@ class Decimator:
         pose = _joined(self._kept, phases)
         signals = {name: _joined_signal(parts) for name, parts in self._signals.items()}
         rate_hz = last.recording.rate_hz * self._every
-        return pose, Whole(self._seen, rate_hz, self._steps, signals, self._peak_speed, diagnostics)
+        return pose, Totals(self._seen, rate_hz, self._steps, signals, self._peak_speed, diagnostics)
 
     def _take_signal(self, name: str, signal: Signal, at: np.ndarray) -> None:
         """Bins that begin at the kept samples; what comes before the first belongs to the last bin so far."""

@@ -9,7 +9,7 @@ from ..diagnostics import Diagnostic
 from ..errors import reason
 from ..recording import Intervals
 from ..tracking import TrackedRecording
-from .decimation import Decimator, Whole
+from .decimation import Decimator, Totals
 from .page import PageWriter, page_incomplete
 from .track import track_report
 from .viewer import pose_html
@@ -23,7 +23,7 @@ def write_track_pages(
     *,
     view: bool = True,
     report: bool = True,
-    whole: Whole | None = None,
+    totals: Totals | None = None,
     fps: float = 30.0,
 ) -> list[Diagnostic]:
     """Write ``view.html`` and ``report.html`` beside a result that is there already.
@@ -31,7 +31,7 @@ def write_track_pages(
     Parameters
     ----------
     view, report : which of them
-    whole : of a `pose` that `Decimator` made
+    totals : of a `pose` that `Decimator` made
     fps : of ``view.html``
 
     Returns
@@ -47,7 +47,7 @@ def write_track_pages(
             "view.html", lambda _: pose_html(model, pose.pose, phases=recording.phases, title=recording.name, fps=fps)
         )
     if report:
-        writer.write("report.html", lambda failures: track_report(pose, view=page, whole=whole, failures=failures))
+        writer.write("report.html", lambda failures: track_report(pose, view=page, totals=totals, failures=failures))
     writer.save_diagnostics("summary.json")
     return writer.diagnostics
 
@@ -63,10 +63,10 @@ def write_decimated_pages(
 ) -> list[Diagnostic]:
     """`write_track_pages` of a recording that came in pieces; `phases` and `diagnostics` of the whole recording."""
     try:
-        pose, whole = decimator.decimated(phases, diagnostics)
+        pose, totals = decimator.decimated(phases, diagnostics)
     except Exception as error:
         writer = PageWriter(folder, PAGES)
         writer.diagnostics.append(page_incomplete(" and ".join(PAGES), f"cannot be made: {reason(error)}"))
         writer.save_diagnostics("summary.json")
         return writer.diagnostics
-    return write_track_pages(folder, pose, report=report, whole=whole, fps=fps)
+    return write_track_pages(folder, pose, report=report, totals=totals, fps=fps)

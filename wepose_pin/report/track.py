@@ -12,7 +12,7 @@ from ..pose import deviation, spread
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
 from .concerns import GRAVITY_OFF, heading_remedy, pose_diagnostics
-from .decimation import Whole, whole_of
+from .decimation import Totals, totals_of
 from .joints import joint_angles_section
 from .measures import (
     Budget,
@@ -40,7 +40,7 @@ LARGEST_VIEW = 3_000_000  # of a view that comes ready, in characters
 
 
 def track_report(
-    pose: TrackedRecording, *, view: str | None = None, whole: Whole | None = None, failures: list[str] | None = None
+    pose: TrackedRecording, *, view: str | None = None, totals: Totals | None = None, failures: list[str] | None = None
 ) -> str:
     """``report.html``: one page that opens offline and prints; equal arguments give equal text.
 
@@ -50,28 +50,28 @@ def track_report(
     ----------
     pose : of `track`
     view : the page of `pose_html` where it is made already, to be shown here unless it is large; None: it is made here
-    whole : of a `pose` that `Decimator` made
+    totals : of a `pose` that `Decimator` made
     failures : takes a line for each section that cannot be made; the page says so in its place
     """
     recording = pose.recording
     assert recording is not None
-    whole = whole or whole_of(pose)
-    signals = whole.signals
+    totals = totals or totals_of(pose)
+    signals = totals.signals
     budgets = heading_budgets(pose)
     found = {side: elbow_of(pose.pose, side, pose.subject) for side in ("left", "right")}
     elbows = {side: elbow for side, elbow in found.items() if elbow is not None}
     hands = {
-        name: hand._replace(peak_speed=whole.peak_speed[name])
+        name: hand._replace(peak_speed=totals.peak_speed[name])
         for name, hand in hands_of(pose.pose, recording.rate_hz).items()
     }
     page = Page(TEMPLATE, f"Motion of {recording.name or 'a recording'}", failures)
     page.add(
         "first",
-        lambda: _first(pose_diagnostics(pose, signals, budgets, elbows, hands, whole.diagnostics)),
+        lambda: _first(pose_diagnostics(pose, signals, budgets, elbows, hands, totals.diagnostics)),
         name="What to look at",
     )
-    page.add("short", lambda: _short(pose, whole, budgets), name="In short")
-    page.add("recorded", lambda: _recorded(recording, whole), "What was recorded")
+    page.add("short", lambda: _short(pose, totals, budgets), name="In short")
+    page.add("recorded", lambda: _recorded(recording, totals), "What was recorded")
     page.add("noise", lambda: _noise(signals), "Noise and bias")
     page.add("drift", lambda: _drift(pose, budgets), "Drift of the headings")
     page.add("hands", lambda: _hands(pose, hands), "The hands")
@@ -90,7 +90,7 @@ def _first(diagnostics: Sequence[Diagnostic]) -> dict[str, Any]:
     return {"kind": kind, "entries": lines(diagnostics, titled=True)}
 
 
-def _short(pose: TrackedRecording, whole: Whole, budgets: Mapping[str, Budget]) -> dict[str, Any]:
+def _short(pose: TrackedRecording, totals: Totals, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = pose.recording
     assert recording is not None
     since = from_start(pose)
@@ -98,17 +98,17 @@ def _short(pose: TrackedRecording, whole: Whole, budgets: Mapping[str, Budget]) 
     stds = {name: spread(cov[since]) for name, cov in pose.pose.point_cov.items()}
     return {
         "duration": _duration(float(recording.time[-1] - recording.time[0])),
-        "rate_hz": whole.rate_hz,
-        "sensors": len(whole.signals),
+        "rate_hz": totals.rate_hz,
+        "sensors": len(totals.signals),
         "worst": max(headings.items(), key=lambda item: item[1]) if headings else None,
         "hands": {name: 1e3 * usual(stds[name]) for name in ("left_hand", "right_hand") if name in stds},
         "lengths": plain(pose.subject.note or pose.subject.name),
         "shown": len(recording),
-        "samples": whole.samples,
+        "samples": totals.samples,
     }
 
 
-def _recorded(recording: Recording, whole: Whole) -> dict[str, Any]:
+def _recorded(recording: Recording, totals: Totals) -> dict[str, Any]:
     rows = [
         [
             plain(name),
@@ -119,18 +119,18 @@ def _recorded(recording: Recording, whole: Whole) -> dict[str, Any]:
             f"{100 * float(signal.rest.mean()):.0f} %" if signal.rest is not None else "not looked for",
             f"{longest(~signal.rest, recording.rate_hz):.0f} s" if signal.rest is not None else "",
         ]
-        for name, signal in whole.signals.items()
+        for name, signal in totals.signals.items()
     ]
     header = ["sensor", "fastest turn", "largest acceleration", "cut off", "lost", "at rest", "longest without rest"]
-    low, high = (f"{step:.2f}" for step in whole.steps_ms)
+    low, high = (f"{step:.2f}" for step in totals.steps_ms)
     return {
-        "samples": whole.samples,
-        "rate_hz": whole.rate_hz,
+        "samples": totals.samples,
+        "rate_hz": totals.rate_hz,
         "begin": recording.time[0],
         "end": recording.time[-1],
         "step": low if low == high else f"{low} to {high}",
         "phases": [f"{name} {intervals(spans)}" for name, spans in recording.phases.items()],
-        "picture": timeline_picture(recording.time, whole.signals, recording.phases),
+        "picture": timeline_picture(recording.time, totals.signals, recording.phases),
         "sensors": Table(header, rows),
     }
 
