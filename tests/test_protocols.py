@@ -396,7 +396,7 @@ points = ["left_wrist", "right_wrist"]
 gauge = "rope"
 metres = 0.5
 """
-POSE = "[[pose]]\nphase = 'still'\nstd_deg = 5\ndirections = {}\n[[closure]]"
+POSE = "[[pose]]\nphase = 'static'\nstd_deg = 5\ndirections = {}\n[[closure]]"
 
 
 def test_a_protocol_of_ones_own(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ class SensorSetup:
     subject : lengths and calibrated mounts; None: the average person and stated mounts
     subject_text : the ``subject.toml`` it was read from, if any
     mounts : segment → stated `quat_LS` (4,) xyzw
-    phases : of a replay: `start` and `still` [s], else the start pose is found
+    phases : of a replay: `start` and `static` [s], else the start pose is found
     """
 
     name: str = "live"

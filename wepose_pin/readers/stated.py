@@ -15,6 +15,9 @@ from .keys import Keys, is_number
 
 SESSION_KEYS = ("name", "start_pose", "remounted", "data", "phases", "sensors", "joints")
 # Of earlier versions: what to write in their place.
+_RENAMED_PHASES = {
+    "still": "is called static now: write static = [[from, to]], seconds in which the sensors lie on a table"
+}
 _RENAMED = {"strapping": 'is called remounted now: write remounted = true where it was "new", else leave it out'}
 WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
 
@@ -87,6 +90,7 @@ def _mount(keys: Keys) -> np.ndarray:
 
 
 def phases_stated(keys: Keys) -> dict[str, Intervals]:
+    keys.allow(*keys.values, renamed=_RENAMED_PHASES)
     phases: dict[str, Intervals] = {}
     for name, value in keys.values.items():
         well = isinstance(value, list) and all(

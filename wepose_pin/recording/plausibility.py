@@ -2,7 +2,7 @@
 
 The rules are physics and not habits, so that they hold for any sensor that is strapped on anything:
 
-- at rest an accelerometer shows gravity;
+- a static accelerometer shows gravity;
 - turned by the gyroscope's own rotation, specific force averages to gravity over seconds, as speed stays bounded;
 - a sensor that was tilted has turned at least by as much.
 """
@@ -46,7 +46,8 @@ PLATEAU = 3  # samples at one value, where an axis seems cut off
 def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True) -> tuple[str, ...]:
     """What the user should know of the values.
 
-    A piece that is not the `whole` knows rest only from stated phases; `units` are checked in the first piece alone.
+    In a piece that is not the `whole` sensors are static only in stated phases; `units` are checked in the first piece
+    alone.
 
     Raises
     ------
@@ -72,15 +73,15 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
 def _gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, whole: bool) -> list[str]:
     name = next((name for name in ("static", "start") if recording.phases.get(name)), "")
     if name:
-        at_rest, when = recording.measured(segment, recording.phases[name][0]), f"in phases.{name}"
+        static, when = recording.measured(segment, recording.phases[name][0]), f"in phases.{name}"
     elif whole:
-        at_rest, when = _quiet_second(recording, sensor), "in its quietest second"
+        static, when = _most_static_second(recording, sensor), "in the second in which it turns most evenly"
     else:
         return []
-    if len(at_rest) < 2:
+    if len(static) < 2:
         return []
-    first, last = (format_time(recording.time[k]) for k in at_rest[[0, -1]])
-    norm = float(np.linalg.norm(sensor.accel_S[at_rest], axis=1).mean())
+    first, last = (format_time(recording.time[k]) for k in static[[0, -1]])
+    norm = float(np.linalg.norm(sensor.accel_S[static], axis=1).mean())
     off = abs(norm / STANDARD_GRAVITY - 1.0)
     found = f"norm {norm:.4g} m/s^2 {when} ({first} to {last} s), where gravity's {STANDARD_GRAVITY:.3g} is expected"
     if off > GRAVITY_ERROR_REFUSED:
@@ -97,11 +98,11 @@ def _accel_unit(norm: float) -> str:
         if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
             return 'the values look like thousandths of g (mg); divide them by 1000 and state accel_unit = "g"'
     if norm < 0.5:
-        return "gravity seems to have been taken out; specific force is needed, +g up at rest"
-    return "check data.accel_unit and the sensor's calibration, and that it rests there"
+        return "gravity seems to have been taken out; specific force is needed, +g up of a static sensor"
+    return "check data.accel_unit and the sensor's calibration, and that it is static there"
 
 
-def _quiet_second(recording: Recording, sensor: ImuSensor) -> np.ndarray:
+def _most_static_second(recording: Recording, sensor: ImuSensor) -> np.ndarray:
     """Samples of the second, measured as a whole, in which the rate varies least; empty where there is none."""
     n = len(recording)
     size = min(n, max(2, round(recording.rate_hz)))

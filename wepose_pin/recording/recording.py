@@ -31,7 +31,7 @@ class Recording:
     ----------
     time : (n,) [s], uniform at `rate_hz` to within the clock's jitter
     sensors : one a segment
-    phases : name → intervals [s] on `time`; `start` is the start pose, `still` sensors at rest
+    phases : name → intervals [s] on `time`; `start` is the start pose, `static` sensors on a table
     remounted : the sensors were strapped on anew since the subject's calibration: its mounts do not hold here
     source : the file it was read from, for messages
     truth : file with the reference, where there is one

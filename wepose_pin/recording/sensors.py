@@ -47,7 +47,7 @@ class ImuSensor:
     Parameters
     ----------
     gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample
-    accel_S : (n, 3) [m/s²], specific force, +g up at rest
+    accel_S : (n, 3) [m/s²], specific force, +g up of a static sensor
     stated_quat_LS : (4,) xyzw, the mount as the session states it, sensor to segment; None where it says nothing
     gap : (n,) bool, true where samples were lost for longer than is bridged in silence, or the sensor was frozen; None
         where neither can be
