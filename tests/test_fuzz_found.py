@@ -21,6 +21,7 @@ from scipy.io import loadmat, savemat
 from test_bad_input import Files, good_table, refused
 
 from wepose_pin.cli import main
+from wepose_pin.documents import whole_folder, written
 from wepose_pin.errors import (
     BadData,
     BadModel,
@@ -35,8 +36,6 @@ from wepose_pin.errors import (
 from wepose_pin.readers.arrays import ArrayFile
 from wepose_pin.readers.mat5 import read_mat5
 from wepose_pin.report.viewer import frame_indices
-from wepose_pin.writers import whole_folder
-from wepose_pin.writers.folder import written
 
 pytest.importorskip("hypothesis")
 from fuzz import seeds
@@ -530,7 +529,7 @@ def test_a_signal_while_files_move_waits_until_they_have(tmp_path: Path, monkeyp
 
 def test_what_a_killed_run_left_is_in_nobodys_way(tmp_path: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from wepose_pin.writers import whole_folder\n"
+        "import sys, time; from pathlib import Path; from wepose_pin.documents import whole_folder\n"
         "with whole_folder(Path(sys.argv[1])) as folder:\n"
         "    (folder / 'a').write_text('half'); print('now', flush=True); time.sleep(60)"
     )

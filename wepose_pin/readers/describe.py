@@ -6,13 +6,13 @@ import contextlib
 import json
 import os
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
 from ..errors import BadData, MissingFile, WeposeError, one_of
 from ..recording import AXES, CONFIGURATION, SEGMENTS, ImuSensor, OrientationSensor, Recording, format_time, span_text
 from ..recording.clocks import TIME_UNITS, time_unit_of
@@ -23,7 +23,6 @@ from .arrays import ArrayFile, is_array_file
 from .device import Device
 from .formats import TITLES, format_of, read_device
 from .guess import Guess, guess_arrays, guess_columns
-from .keys import is_number, parsed_toml, read_toml
 from .live_log import read_live_log
 from .session import SessionReader
 from .tables import FORMATS as TABLES
@@ -171,9 +170,9 @@ def _described(
     for _ in range(3):
         try:
             # All sensors are read, those too of which nobody knows yet where they were worn.
-            values = tomllib.loads("\n".join(["[data]", *head]))
+            values = parse_toml("\n".join(["[data]", *head]))
             values["start_pose"] = CONFIGURATION
-            values["sensors"] = {who: tomllib.loads("\n".join(table)) for who, table in tables.items()}
+            values["sensors"] = {who: parse_toml("\n".join(table)) for who, table in tables.items()}
             reader = SessionReader(folder / "session.toml", gaps=True, values=values)
             recording = reader.recording(0, len(reader.time))
             break
@@ -224,7 +223,15 @@ def _session_text(
     tables: Mapping[str, list[str]],
     comments: Mapping[str, list[str]],
 ) -> str:
-    lines = [f"name = {_quoted(path.stem)}", 'start_pose = "n_pose"', "", "[data]", *head, "", "[phases]   # seconds"]
+    lines = [
+        f"name = {toml_string(path.stem)}",
+        'start_pose = "n_pose"',
+        "",
+        "[data]",
+        *head,
+        "",
+        "[phases]   # seconds",
+    ]
     lines += phases
     if set(tables) >= ARMS or not any(name in SEGMENTS for name in tables):
         lines.append(
@@ -253,7 +260,7 @@ def _of_devices(
         tables: dict[str, list[str]] = {}
         for label, segment in device.labels.items():
             where = segment if segment and segment not in tables else f"?{label}"
-            tables[where] = [f"label = {_quoted(label)}"]
+            tables[where] = [f"label = {toml_string(label)}"]
         labels = {segment: str(device_label) for device_label, segment in device.labels.items() if segment}
         unknown = [label for label, segment in device.labels.items() if segment is None]
         notes = [f"segments of these are not known by their names: {', '.join(unknown)}"] if unknown else []
@@ -293,7 +300,7 @@ def _of_live(path: Path) -> tuple[list[str], list[str]]:
     about: dict[str, Any] = {}
     if subject:
         with contextlib.suppress(ValueError):  # of a file that somebody else wrote
-            about = parsed_toml(subject)
+            about = parse_toml(subject)
         calibrated = _texts(about.get("mounts"))
         names |= {who: "calibrated" for who in recording.sensors if who in calibrated}
     mounts = ", ".join(f"{who} {how}" for who, how in names.items())
@@ -384,7 +391,7 @@ def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str]
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     said = guess.time_unit
     fits = said if said is not None and 0.0 < step * TIME_UNITS[said] < LONGEST_STEP_S else time_unit_of(step)
-    line = f"time = {_quoted(name)}"
+    line = f"time = {toml_string(name)}"
     if fits in (None, "s"):
         return [line], []
     by = "its name says" if fits == said else f"it grows by {step:g} from row to row"
@@ -468,12 +475,8 @@ def _rows(recording: Recording, labels: Mapping[str, str]) -> tuple[tuple[str, .
 
 
 def _relative(path: Path, folder: Path) -> str:
-    return _quoted(Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix())
+    return toml_string(Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix())
 
 
 def _listed(names: list[str]) -> str:
-    return _quoted(names[0]) if len(names) == 1 else f"[{', '.join(_quoted(name) for name in names)}]"
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
+    return toml_string(names[0]) if len(names) == 1 else toml_strings(names)

@@ -12,7 +12,8 @@ from ..arguments import Positive, check_array, check_fields, check_finite, check
 from ..errors import BadData, BadOption, BadPhase, one_of
 from .intervals import Intervals, check_phases, check_time
 from .limits import MEDIAN_FORCE
-from .sensors import SEGMENTS, ImuSensor, OrientationSensor, Sensor, join_parts
+from .segments import SEGMENTS
+from .sensors import ImuSensor, OrientationSensor, Sensor, join_parts
 
 START_POSES = ("n_pose",)
 CONFIGURATION = "configuration"  # the start pose of any other chain: values of its joints; sensors are named by links
