@@ -757,7 +757,7 @@ def test_up_and_forward_turn_the_body_upright(tmp_path: Path) -> None:
 
 
 BAD_TABLES = {
-    "no toml": ("segments = [", "is no TOML"),
+    "no toml": ("segments = [", "not valid TOML"),
     "no urdf": ("[segments]\n", "names no URDF"),
     "unknown key": (table_toml().replace("forward", "foreward"), "did you mean 'forward'"),
     "unknown segment": (table_toml().replace("left_forearm =", "left_forarm ="), "did you mean 'left_forearm'"),
