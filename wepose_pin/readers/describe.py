@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
-from ..errors import BadData, MissingFile, WeposeError, one_of
+from ..errors import BadData, MissingFile, WeposeError, WrongUnit, one_of
 from ..recording import AXES, CONFIGURATION, SEGMENTS, ImuSensor, OrientationSensor, Recording, format_time, span_text
 from ..recording.clocks import TIME_UNITS, time_unit_of
 from ..recording.gaps import runs
@@ -178,11 +178,11 @@ def _described(
             break
         except WeposeError as error:
             # What is wrong with a unit the reader knows better than any guess from names.
-            fits = re.search(r'data\.(gyro_unit|accel_unit) = ("[^"]+") would fit', str(error))
-            if not fits:
+            if not isinstance(error, WrongUnit):
                 notes.append(f"cannot be read so: {str(error).removeprefix(str(folder / 'session.toml') + ': ')}")
                 break
-            head = [f"{fits[1]} = {fits[2]}" if line.startswith(fits[1]) else line for line in head]
+            fitting = f"{error.key} = {toml_string(error.unit)}"
+            head = [fitting if line.startswith(error.key) else line for line in head]
     if recording is None:
         text = _session_text(path, head, phases, tables, {})
         return Description(f"{path}: {what}", tuple(notes), (), text, "mend what cannot be read")

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..errors import BadData
+from ..errors import BadData, WrongUnit
 from .gaps import runs
 from .intervals import format_time
 from .limits import (
@@ -85,15 +85,20 @@ def _gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, 
     off = abs(norm / STANDARD_GRAVITY - 1.0)
     found = f"norm {norm:.4g} m/s^2 {when} ({first} to {last} s), where gravity's {STANDARD_GRAVITY:.3g} is expected"
     if off > GRAVITY_ERROR_REFUSED:
-        raise BadData(f"{place}.accel: {found}; {_accel_unit(norm)}")
+        raise _wrong_gravity(f"{place}.accel: {found}", norm)
     return [f"{place.split(': ')[-1]}.accel: {found}: the scale is taken from it"] if off > GRAVITY_ERROR_NOTED else []
 
 
-def _accel_unit(norm: float) -> str:
-    """Which unit makes gravity of a norm that is not."""
-    for factor, unit in ((STANDARD_GRAVITY, '"g"'), (1.0 / STANDARD_GRAVITY, '"m/s^2"')):
+def _wrong_gravity(found: str, norm: float) -> BadData:
+    """The error that names the unit which makes gravity of a norm [m/s²] that is not."""
+    for factor, unit in ((STANDARD_GRAVITY, "g"), (1.0 / STANDARD_GRAVITY, "m/s^2")):
         if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
-            return f"data.accel_unit = {unit} would fit"
+            return WrongUnit(f'{found}; data.accel_unit = "{unit}" would fit', "accel_unit", unit)
+    return BadData(f"{found}; {_no_gravity(norm)}")
+
+
+def _no_gravity(norm: float) -> str:
+    """What may be wrong with a norm [m/s²] that no unit makes gravity."""
     for factor in (1e-3, 1e-3 * STANDARD_GRAVITY):
         if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
             return 'the values look like thousandths of g (mg); divide them by 1000 and state accel_unit = "g"'
@@ -133,14 +138,18 @@ def _gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
     tumbles = as_stated < TUMBLES * smaller and smaller > COHERENT
     if tumbles or (as_stated < TUMBLES_FAST * smaller and speed[moving].mean() > FAST):
         peak = float(np.max(np.abs(gyro_S)))
-        raise BadData(
+        raise WrongUnit(
             f"{place}.gyro: with rates up to {peak:.3g} rad/s gravity would tumble, and accel shows that it does not; "
-            f'data.gyro_unit = "deg/s" would fit, or the time or rate_hz is wrong'
+            f'data.gyro_unit = "deg/s" would fit, or the time or rate_hz is wrong',
+            "gyro_unit",
+            "deg/s",
         )
     if as_stated < STIFF * larger and larger > COHERENT:
-        raise BadData(
+        raise WrongUnit(
             f"{place}.gyro: with rates up to {float(np.max(np.abs(gyro_S))):.3g} rad/s the sensor turns too little for "
-            f'what accel shows; data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong'
+            f'what accel shows; data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong',
+            "gyro_unit",
+            "rad/s",
         )
     mean = accel.mean(axis=1)
     norm = np.linalg.norm(mean, axis=1)
@@ -152,10 +161,12 @@ def _gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
     unseen = (tilt > TILTED) & (path[1:] + path[:-1] < UNSEEN * tilt)
     if unseen.any():
         k = int(np.argmax(np.where(unseen, tilt, 0.0)))
-        raise BadData(
+        raise WrongUnit(
             f"{place}.gyro: accel shows a tilt by {np.degrees(tilt[k]):.0f} deg between {k * size / rate_hz:g} and "
             f"{(k + 2) * size / rate_hz:g} s from the beginning, gyro turns by {np.degrees(path[k] + path[k + 1]):.2g} "
-            f'deg; data.gyro_unit = "rad/s" would fit, or the gyroscope does not measure'
+            f'deg; data.gyro_unit = "rad/s" would fit, or the gyroscope does not measure',
+            "gyro_unit",
+            "rad/s",
         )
 
 
