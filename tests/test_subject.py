@@ -83,7 +83,7 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
 
 
 def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
-    lines = ["format = 1", "[lengths]", *(f"{name} = 0.3" for name in LENGTHS), "[lengths_std]", "trunk = 0.02"]
+    lines = ["format = 2", "[lengths]", *(f"{name} = 0.3" for name in LENGTHS), "[lengths_std]", "trunk = 0.02"]
     (tmp_path / "subject.toml").write_text("\n".join(lines), encoding="utf-8")
     subject = load_subject(tmp_path)
     assert subject.std("trunk") == pytest.approx(0.02)
@@ -99,13 +99,13 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
         ("format = 2\n[lengths]\ntrunk = -0.5", "lengths.trunk = -0.5"),
         ("format = 2\n[lengths]\ntrunk = 0.5", "lengths.shoulder_width = None"),
         ("format 1", "not valid TOML"),
-        ("ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0", "mounts.torso is no unit quaternion"),
+        ("ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0", "mounts.torso: qx, qy, qz, qw must be of length 1; it is 1.4"),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [[1.0, 2.0]]", "covariance.matrix is (1, 2)"),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [['a']]", "holds something that is no number"),
         ("ALL\n[start_pose_offset.tors]\nx_deg = 1", "start_pose_offset.tors is not a segment; did you mean 'torso'"),
         ("ALL\n[start_pose_offset.torso]\nx_deg = 1", "it needs x_deg, y_deg, std_deg"),
         ("ALL\n[heading_drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1", "it needs rate_deg_min, std_deg_min"),
-        ("ALL\n[heading_drift]\ntorso = 1", "heading_drift.torso = 1; it needs rate_deg_min"),
+        ("ALL\n[heading_drift]\ntorso = 1", "heading_drift.torso = 1 is not a table"),
         (
             "ALL\n[covariance]\norder = ['trunk', 'left_hand']\nmatrix = [[1.0, 2.0], [2.0, 1.0]]",
             "positive semidefinite",
