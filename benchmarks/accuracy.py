@@ -65,10 +65,10 @@ def recorded_accuracy(paths: Mapping[str, list[Path]]) -> Table:
             trial = read_broad(path) if name == "BROAD" else read_authors_trial(path)
             gyro, accel = trial.gyro_S, trial.accel_S
             static = np.zeros(len(gyro), dtype=bool)
-            static[trial.still] = True
+            static[trial.static] = True
             if name != "BROAD":  # Vicon's world begins after the static phase
                 static = np.arange(len(gyro)) == int(np.argmax(trial.scored))
-            noise = noise_of(gyro[trial.still], accel[trial.still], trial.rate_hz)
+            noise = noise_of(gyro[trial.static], accel[trial.static], trial.rate_hz)
             data = Sample(np.ascontiguousarray(gyro), np.ascontiguousarray(accel), trial.rate_hz, noise)
             truths.append(Truth(data, trial.quat_true, static, trial.scored))
     what = " and ".join(f"{len(files)} of {name}" if name == "BROAD" else name for name, files in paths.items())

@@ -21,7 +21,7 @@ from wepose_pin.recording import (
     mount_from_axes,
 )
 from wepose_pin.simulation import Simulation, paper_dynamic
-from wepose_pin.subject import StartTilt, Subject, average_subject, mount_rows
+from wepose_pin.subject import StartPoseOffset, Subject, average_subject, mount_rows
 from wepose_pin.tracking.segments import estimate_segments
 
 
@@ -146,7 +146,7 @@ def test_a_person_stands_as_in_the_calibration() -> None:
         mounts={"torso": mount.as_quat()},
         order=tuple(mount_rows("torso")),
         covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
-        start_tilt={"torso": StartTilt(lean, np.deg2rad(1.0))},
+        start_pose_offset={"torso": StartPoseOffset(lean, np.deg2rad(1.0))},
     )
     for tilt, said in ((lean, []), (lean - [0.0, np.deg2rad(9.0)], ["is 9 deg off"]), (0.0 * lean, ["is 20 deg off"])):
         recording, _ = ready_recording({"torso": 0.0}, {"torso": Rotation.from_rotvec([*tilt, 0.0]) * mount})

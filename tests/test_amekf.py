@@ -414,13 +414,13 @@ def test_a_person_who_sways_at_rest_does_not_pass_for_bias() -> None:
 
 @pytest.mark.parametrize("method", ["amekf", "smoother"])
 def test_a_sensor_that_never_rests_converges_and_says_so(method: str) -> None:
-    """From within the motion, no still phase, a bias of 0.4 deg/s: starts from its own accelerometer, degrees off."""
+    """From within the motion, no static phase, a bias of 0.4 deg/s: starts from its own accelerometer, degrees off."""
     tilts = []
     for seed in range(6):
         of = case(seed)
         gyro, accel = of.gyro[1000:5400] + np.deg2rad([0.4, -0.3, 0.2]), of.accel[1000:5400]
-        with pytest.warns(UserWarning, match="no still phase"):
-            found = estimate_orientation(gyro, accel, RATE, method=method, still=None)
+        with pytest.warns(UserWarning, match="no static phase"):
+            found = estimate_orientation(gyro, accel, RATE, method=method, static=None)
         error = Rotation.from_quat(found.quat_WS) * Rotation.from_quat(of.true[1000:5400]).inv()
         tilts.append(tilt_deg(error))
         assert not found.static.any()
@@ -468,9 +468,9 @@ def test_broad_against_vqf(data: Path) -> None:
     shares: dict[str, list[tuple[float, float]]] = {"amekf": [], "smoother": []}
     for path in paths:
         trial = read_broad(path)
-        noise = noise_of(trial.gyro_S[trial.still], trial.accel_S[trial.still], trial.rate_hz)
+        noise = noise_of(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
         seen = np.isfinite(trial.quat_true).all(axis=1)
-        rest = np.flatnonzero(seen[trial.still]) + trial.still.start
+        rest = np.flatnonzero(seen[trial.static]) + trial.static.start
         scored = np.flatnonzero(trial.scored)[::3]
         true = Rotation.from_quat(np.where(seen[:, None], trial.quat_true, [0, 0, 0, 1]))
         for method in table:
@@ -503,7 +503,7 @@ def test_the_authors_trial_is_no_worse_than_with_smekf(data: Path) -> None:
     true = Rotation.from_quat(trial.quat_true[trial.scored])
     mean = {}
     for method in ("smekf", "amekf", "smoother"):
-        out = estimate_orientation(trial.gyro_S, trial.accel_S, trial.rate_hz, method=method, still=(0.05, 0.9))
+        out = estimate_orientation(trial.gyro_S, trial.accel_S, trial.rate_hz, method=method, static=(0.05, 0.9))
         found = Rotation.from_quat(out.quat_WS[trial.scored])
         mean[method] = float(np.degrees((true.inv() * ((true[0] * found[0].inv()) * found)).magnitude()).mean())
     print(f"mean angle [deg]: {mean}")

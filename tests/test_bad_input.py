@@ -103,6 +103,10 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
         lambda f: f.say("\n[data]", "\nstrapping = 'new'\n[data]"),
         "session.toml: strapping is called remounted now: write remounted = true where it was",
     ),
+    "a phase of an earlier version": (
+        lambda f: f.say("start = [[0.5, 2.5]]", "still = [[0.5, 2.5]]"),
+        "session.toml: phases.still is called static now: write static = [[from, to]]",
+    ),
     "remounted in words": (
         lambda f: f.say("\n[data]", "\nremounted = 'yes'\n[data]"),
         "session.toml: remounted = 'yes' is neither true nor false",
@@ -304,7 +308,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     "accel without gravity": (lambda f: f.scale("ax ay az", 0.001), "gravity seems to have been taken out"),
     "accel in g without phases": (
         lambda f: (f.scale("ax ay az", 1 / 9.81), f.say("start = [[0.5, 2.5]]", "")),
-        "norm 1 m/s^2 in its quietest second",
+        "norm 1 m/s^2 in the second in which it turns most evenly",
     ),
     "gyro in deg/s": (lambda f: f.scale("gx gy gz", 57.29578), 'data.gyro_unit = "deg/s" would fit'),
     "gyro not in deg/s": (

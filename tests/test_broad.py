@@ -1,7 +1,7 @@
 """Filters on the BROAD trials: 15 recordings of three minutes with optical truth (Laidig et al. 2021).
 
-Heading aligned in the still phase, errors over the marked motion, root mean square, averaged over trials. The bias
-measured in the still phase is removed for every filter.
+Heading aligned in the static phase, errors over the marked motion, root mean square, averaged over trials. The bias
+measured in the static phase is removed for every filter.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ def errors_deg(path: Path) -> dict[str, tuple[float, float, float]]:
     """Row → (inclination, heading, total) RMSE [deg] of one trial."""
     trial = read_broad(path)
     gyro, accel, rate_hz = trial.gyro_S, trial.accel_S, trial.rate_hz
-    noise = noise_of(gyro[trial.still], accel[trial.still], rate_hz)
+    noise = noise_of(gyro[trial.static], accel[trial.static], rate_hz)
     seen = np.isfinite(trial.quat_true).all(axis=1)
     true = Rotation.from_quat(np.where(seen[:, None], trial.quat_true, [0, 0, 0, 1]))
     resting = np.zeros(len(seen), dtype=bool)
-    resting[trial.still] = seen[trial.still]
+    resting[trial.static] = seen[trial.static]
 
     def rmse(quat_VS: np.ndarray) -> tuple[float, float, float]:
         R_VS = Rotation.from_quat(quat_VS)
@@ -49,7 +49,7 @@ def errors_deg(path: Path) -> dict[str, tuple[float, float, float]]:
 
     # Correction only up to the motion: what the corrections in the trial are worth.
     early = StaticDetector(noise, rate_hz).run(gyro, accel)
-    early[trial.still.stop + round(rate_hz) :] = False  # the motion begins a second after what counts as still
+    early[trial.static.stop + round(rate_hz) :] = False  # the motion begins a second after what counts as still
     start = rotations.quat_from_gravity(accel[: StaticTest().samples(rate_hz)].mean(axis=0))
     return {
         ROWS[0]: rmse(run("smekf")),

@@ -140,7 +140,7 @@ def ur5_session(data: Path, run: str, folder: Path) -> dict[str, Rotation]:
         gyro, accel = (json.dumps(next(iter(each.values()))) for each in columns)
         text += f'[sensors.{LINKS[sensor]}]\ngyro = {gyro}\naccel = {accel}\nmount = {{ up = "-y", forward = "-x" }}\n'
         R_WB = Rotation.from_euler("z", np.pi / 2.0) * Rotation.from_quat(trial.quat_VB)
-        start = R_WB[trial.still].mean()
+        start = R_WB[trial.static].mean()
         lift = {"radius": -np.pi / 2.0, "carpus": -np.pi}[sensor]
         truth[LINKS[sensor]] = R_WB * start.inv() * Rotation.from_euler("y", lift)
     trial = next(iter(trials.values()))
@@ -148,7 +148,7 @@ def ur5_session(data: Path, run: str, folder: Path) -> dict[str, Rotation]:
     head = (
         f'name = "{run}"\nstart_pose = "configuration"\n[data]\nfile = "ur5.csv"\nrate_hz = {trial.rate_hz}\n'
         f'gyro_unit = "rad/s"\naccel_unit = "m/s^2"\n'
-        f"[phases]\nstart = [[0.0, {(trial.still.stop - 1) / trial.rate_hz}]]\n[joints]\n"
+        f"[phases]\nstart = [[0.0, {(trial.static.stop - 1) / trial.rate_hz}]]\n[joints]\n"
         + "".join(f"{name} = {value}\n" for name, value in HOME.items())
     )
     (folder / "session.toml").write_text(head + text, encoding="utf-8")

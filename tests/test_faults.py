@@ -21,10 +21,10 @@ import pytest
 from test_bad_input import Files, good_table, refused
 
 from wepose_pin.cli import main
+from wepose_pin.documents import whole_file, whole_folder
 from wepose_pin.errors import ExistingOutput
 from wepose_pin.simulation import simulate, simulated_person
-from wepose_pin.writers import whole_folder, write_session
-from wepose_pin.writers.folder import whole_file
+from wepose_pin.writers import write_session
 
 TRACKED = {"pose.parquet", "report.html", "subject.toml", "subject.urdf", "summary.json", "view.html"}
 

@@ -361,7 +361,7 @@ def test_a_recording_may_begin_in_motion(method: str) -> None:
     for seed in range(3):
         trial = paper_dynamic(seed)
         gyro, accel, true = trial.gyro_S[800:], trial.accel_S[800:], trial.quat_WS[800:]
-        found = estimate_orientation(gyro, accel, RATE, method=method, still=(47.6, 51.6))
+        found = estimate_orientation(gyro, accel, RATE, method=method, static=(47.6, 51.6))
         tilt_deg = tilt_error_deg(found.quat_WS, true)
         assert tilt_deg[4760:].max() < 0.5
         assert len(found.static) == len(gyro)
@@ -456,7 +456,7 @@ def test_a_run_cut_in_two_and_one_by_one_give_the_same_bits(method: str, cut: in
 @pytest.mark.parametrize("method", METHODS)
 def test_every_filter_follows_a_motion_with_rests(method: str) -> None:
     gyro, accel, true, _ = measured(np.random.default_rng(4), 30.0, bias=(0.01, 0.02, -0.01))
-    out = estimate_orientation(gyro, accel, RATE, method=method, still=(0.0, 1.8))
+    out = estimate_orientation(gyro, accel, RATE, method=method, static=(0.0, 1.8))
     error = Rotation.from_quat(out.quat_WS) * Rotation.from_quat(true).inv()
     aligned = error[:150].mean().inv() * error
     assert np.degrees(aligned.magnitude()).mean() < 3.0
@@ -468,7 +468,7 @@ def test_the_start_has_the_tilt_of_the_accelerometer_and_no_heading(method: str)
     accel = np.tile(GRAVITY * Rotation.from_rotvec([0.7, -0.4, 0.0]).as_matrix()[2], (100, 1))
     rng = np.random.default_rng(5)
     accel = accel + rng.normal(scale=1e-3, size=accel.shape)
-    out = estimate_orientation(rng.normal(scale=1e-4, size=(100, 3)), accel, RATE, method=method, still=(0.0, 0.9))
+    out = estimate_orientation(rng.normal(scale=1e-4, size=(100, 3)), accel, RATE, method=method, static=(0.0, 0.9))
     first = Rotation.from_quat(out.quat_WS[0])
     assert np.degrees((first * Rotation.from_rotvec([0.7, -0.4, 0.0]).inv()).magnitude()) < 0.1
 
@@ -477,7 +477,7 @@ def test_the_input_is_left_as_it_was() -> None:
     gyro, accel, _, _ = measured(np.random.default_rng(6), 5.0)
     before = gyro.copy(), accel.copy()
     for method in METHODS:
-        estimate_orientation(gyro, accel, RATE, method=method, still=(0.0, 1.8))
+        estimate_orientation(gyro, accel, RATE, method=method, static=(0.0, 1.8))
     np.testing.assert_array_equal(gyro, before[0])
     np.testing.assert_array_equal(accel, before[1])
 
@@ -485,9 +485,9 @@ def test_the_input_is_left_as_it_was() -> None:
 def test_wrong_input_is_named() -> None:
     gyro = np.zeros((100, 3))
     with pytest.raises(BadOption, match="did you mean 'smekf'"):
-        estimate_orientation(gyro, gyro, RATE, method="smekv", still=(0, 0.5))
+        estimate_orientation(gyro, gyro, RATE, method="smekv", static=(0, 0.5))
     with pytest.raises(BadData, match=r"must both be \(n, 3\)"):
-        estimate_orientation(gyro, gyro[:50], RATE, still=(0, 0.5))
+        estimate_orientation(gyro, gyro[:50], RATE, static=(0, 0.5))
     noise = noise_of(*measured(np.random.default_rng(0), 2.0)[:2], RATE)
     for wrong in (-1.0, np.nan, np.diag([1.0, 1.0, -1.0])):
         with pytest.raises(BadOption, match="positive semidefinite"):
@@ -495,11 +495,11 @@ def test_wrong_input_is_named() -> None:
     with pytest.raises(BadData, match="as many"):
         Smekf(noise, RATE, np.array([0.0, 0.0, 0.0, 1.0])).run(np.zeros((5, 3)), np.zeros((5, 3)), True)
     with pytest.raises(BadData, match="finite"):
-        estimate_orientation(gyro * np.nan, gyro, RATE, still=(0, 0.5))
+        estimate_orientation(gyro * np.nan, gyro, RATE, static=(0, 0.5))
     with pytest.raises(BadPhase, match=r"which lasts 1\.000 s"):
-        estimate_orientation(gyro, gyro, RATE, still=(0, 5))
+        estimate_orientation(gyro, gyro, RATE, static=(0, 5))
     with pytest.raises(BadPhase, match="no gravity"):
-        estimate_orientation(gyro, gyro, RATE, still=(0, 0.9))
+        estimate_orientation(gyro, gyro, RATE, static=(0, 0.9))
 
 
 def test_starting_params_trust_tilt_and_heading_as_far_as_known() -> None:
@@ -643,7 +643,7 @@ def test_the_authors_own_trial_against_vicon(data: Any) -> None:
     trial = read_authors_trial(data / "wepose_hr" / "prova_HR.txt")
     true = Rotation.from_quat(trial.quat_true[trial.scored])
     for method, limit in (("smekf", 2.2), ("ncf", 2.5), ("gdc", 2.5)):
-        out = estimate_orientation(trial.gyro_S, trial.accel_S, trial.rate_hz, method=method, still=(0.05, 0.9))
+        out = estimate_orientation(trial.gyro_S, trial.accel_S, trial.rate_hz, method=method, static=(0.05, 0.9))
         found = Rotation.from_quat(out.quat_WS[trial.scored])
         aligned = (true[0] * found[0].inv()) * found
         angle = np.degrees((true.inv() * aligned).magnitude())

@@ -15,10 +15,11 @@ from test_mvnx import mvnx, turning
 
 import wepose_pin as wp
 from wepose_pin.errors import BadData, BadSession, MissingFile, UnknownColumn, WeposeError
-from wepose_pin.readers.device import segment_of, unwrapped
+from wepose_pin.readers.device import unwrapped
 from wepose_pin.readers.formats import format_of, read_device
 from wepose_pin.readers.guess import guess_columns
 from wepose_pin.recording import OrientationSensor, Recording
+from wepose_pin.recording.segments import segment_of
 
 N, RATE = 400, 100.0
 TIME = np.arange(N) / RATE

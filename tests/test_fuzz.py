@@ -129,7 +129,9 @@ def broken_table(draw: st.DrawFn) -> pl.DataFrame:
 @given(
     table=broken_table(),
     suffix=st.sampled_from((".csv", ".parquet")),
-    phases=st.sampled_from(("start = [[0.5, 2.5]]", "", "start = [[0.0, 8.99]]", "still = [[0, 1]]\nstart = [[1, 2]]")),
+    phases=st.sampled_from(
+        ("start = [[0.5, 2.5]]", "", "start = [[0.0, 8.99]]", "static = [[0, 1]]\nstart = [[1, 2]]")
+    ),
     gaps=st.booleans(),
 )
 def test_a_broken_recording_is_tracked_to_numbers_or_refused(

@@ -129,7 +129,7 @@ def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tm
         np.testing.assert_allclose(again.hinges[side].axis, hinge.axis, atol=1e-9)
         assert again.hinges[side].std == pytest.approx(hinge.std, rel=1e-3)
     path.write_text(subject_toml(subject).replace("[hinges.left]", "[hinges.middle]"))
-    with pytest.raises(BadSubject, match=r"hinges\.middle is no side; left or right"):
+    with pytest.raises(BadSubject, match=r"hinges\.middle is not a side; there is: left, right"):
         load_subject(path)
     path.write_text(subject_toml(subject).replace("y = 1.0", "y = 2.0"))
     with pytest.raises(BadSubject, match=r"hinges\.left: x, y, z must be of length 1"):

@@ -548,7 +548,7 @@ def test_single_sensor(make: Callable[..., SingleSensor], moving: tuple, rate_pe
         k = slice(int(moving[0] * 1000) - 1000, int(moving[0] * 1000) + 9001)  # 10 s from before the motion
         found = one.p_WS[k][0] + CubicSpline(one.time[k], accel_W[k]).antiderivative(2)(one.time[k])
         assert np.abs(found - one.p_WS[k]).max() < 1e-3
-        for a, b in one.still:
+        for a, b in one.static:
             rest = (one.time > a + 0.01) & (one.time < b - 0.01)
             assert np.abs(one.gyro_S[rest]).max() < 1e-12
             np.testing.assert_allclose(np.linalg.norm(one.accel_S[rest], axis=1), G, atol=1e-9)

@@ -166,7 +166,7 @@ def test_rest_is_found_and_proposed(capsys: pytest.CaptureFixture[str], tmp_path
     names = ["time", *table().columns[1::2], *table().columns[2::2]]
     pl.DataFrame(values, schema=names).write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv")
-    assert "all sensors at rest [s]: 0.0 to 2.5" in text
+    assert "all sensors static [s]: 0.0 to 2.5" in text
     assert "start = [[0.00, 2.49]]   # CHECK" in text
     assert 'mount = { up = "+z", forward = "+x" }' in text
 

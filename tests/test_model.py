@@ -757,12 +757,12 @@ def test_up_and_forward_turn_the_body_upright(tmp_path: Path) -> None:
 
 
 BAD_TABLES = {
-    "no toml": ("segments = [", "is no TOML"),
+    "no toml": ("segments = [", "not valid TOML"),
     "no urdf": ("[segments]\n", "names no URDF"),
     "unknown key": (table_toml().replace("forward", "foreward"), "did you mean 'forward'"),
     "unknown segment": (table_toml().replace("left_forearm =", "left_forarm ="), "did you mean 'left_forearm'"),
     "unknown link": (table_toml().replace("L_left_forearm", "L_left_foreram"), "did you mean 'L_left_forearm'"),
-    "unknown point": (table_toml(more='[points]\nleft_thumb = "torso"'), "points.left_thumb: no such point"),
+    "unknown point": (table_toml(more='[points]\nleft_thumb = "torso"'), "points.left_thumb is not a point"),
     "unknown axis": (table_toml(up="z"), "up = 'z'"),
     "parallel axes": (table_toml(up="+x"), "is parallel to up"),
     "no number": (table_toml(more='[points]\nleft_hand = {link = "torso", at = [1, 2]}'), "three numbers [m]"),

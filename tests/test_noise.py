@@ -1,4 +1,4 @@
-"""Noise and bias of a still phase, and the quietest window."""
+"""Noise and bias of a static phase, and the quietest window."""
 
 from __future__ import annotations
 

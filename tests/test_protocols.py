@@ -371,7 +371,7 @@ def test_wrong_requests_are_one_line_that_names_them() -> None:
     fewer = replace(recording, sensors={k: v for k, v in recording.sensors.items() if k != "torso"})
     for error, match, asked in (
         (BadOption, "protocol 'clap' is not known; did you mean 'clasp'", lambda: load_protocol("clap")),
-        (MissingFile, "mine.toml: no such protocol file", lambda: load_protocol("mine.toml")),
+        (MissingFile, "mine.toml: no such file; a protocol is wanted here", lambda: load_protocol("mine.toml")),
         (BadPhase, r"phases\.handle is needed here", lambda: run(without(recording, "handle"), "handle")),
         (BadPhase, r"phases\.t_pose is needed here", lambda: run(recording, "poses")),
         (BadSession, "no sensor on torso; protocol 'touch_left' needs one", lambda: run(fewer, "touch_left")),
@@ -396,7 +396,7 @@ points = ["left_wrist", "right_wrist"]
 gauge = "rope"
 metres = 0.5
 """
-POSE = "[[pose]]\nphase = 'still'\nstd_deg = 5\ndirections = {}\n[[closure]]"
+POSE = "[[pose]]\nphase = 'static'\nstd_deg = 5\ndirections = {}\n[[closure]]"
 
 
 def test_a_protocol_of_ones_own(tmp_path: Path) -> None:

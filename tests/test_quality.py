@@ -191,7 +191,7 @@ def test_of_sensors_that_sit_elsewhere_nothing_is_learned(anywhere: Simulation, 
     assert found.subject.lengths["shoulder_width"] == pytest.approx(person.taped["shoulder_width"], abs=1e-3)
     assert found.subject.std("mounts.left_forearm.z") > 1.5
     assert not found.subject.hinges
-    assert not found.subject.start_tilt
+    assert not found.subject.start_pose_offset
 
 
 def test_python_hands_out_no_subject_of_a_failed_calibration_in_silence(anywhere: Simulation, person: Person) -> None:

@@ -177,8 +177,8 @@ def test_ur5_is_read_as_it_is(data: Path) -> None:
     for recording, sensor, begins_s in (("circle-100", "carpus", 0.9), ("triangle-250", "radius", 4.2)):
         found = read_ur5(ur5_files(data / "ur5", recording, sensor))
         assert found.rate_hz == pytest.approx(125.0)
-        assert found.still.stop / found.rate_hz == pytest.approx(begins_s, abs=0.3)
-        at_rest = np.linalg.norm(found.accel_S[found.still], axis=1).mean()
+        assert found.static.stop / found.rate_hz == pytest.approx(begins_s, abs=0.3)
+        at_rest = np.linalg.norm(found.accel_S[found.static], axis=1).mean()
         assert at_rest == pytest.approx(0.97 * 9.81, abs=0.2)
 
 
@@ -199,11 +199,11 @@ def test_broad_needs_no_registration(data: Path) -> None:
     trial = read_broad(data / "broad" / "01_undisturbed_slow_rotation_A.mat")
     first = int(np.argmax(trial.scored))
     part = slice(first - 800, first + 2860)
-    gyro = trial.gyro_S[part] - trial.gyro_S[trial.still].mean(axis=0)
+    gyro = trial.gyro_S[part] - trial.gyro_S[trial.static].mean(axis=0)
     time = np.arange(len(gyro)) / trial.rate_hz
     sensor = Referenced(
-        trial.name, trial.rate_hz, gyro, trial.accel_S[part], time, trial.quat_true[part], trial.still
-    )._replace(still=slice(0, 0))
+        trial.name, trial.rate_hz, gyro, trial.accel_S[part], time, trial.quat_true[part], trial.static
+    )._replace(static=slice(0, 0))
     (found,) = register([sensor], (0.0, 12.8))
     assert found.offset_s == pytest.approx(0.5 / trial.rate_hz, abs=1e-3)
     assert np.degrees(Rotation.from_quat(found.quat_BS).magnitude()) < 0.3
@@ -273,7 +273,7 @@ def test_files_are_found_by_their_columns_wherever_they_lie(data: Path, tmp_path
     assert [job.trial for job in found["UR5"]] == ["monday carpus"]
     assert [job.trial for job in found["RING, loose mounts"]] == list(RING_SEGMENTS)
     assert find_ring(tmp_path)[0].imu["loose"].name == "imu LOOSE.csv"
-    assert read_ur5(find_ur5(tmp_path)[0]).still.stop > 50
+    assert read_ur5(find_ur5(tmp_path)[0]).static.stop > 50
 
 
 def test_a_trial_that_cannot_be_scored_is_told_and_skipped(

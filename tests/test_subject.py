@@ -13,9 +13,9 @@ from wepose_pin.errors import BadOption, BadSubject, MissingFile
 from wepose_pin.recording import SEGMENTS
 from wepose_pin.subject import (
     LENGTHS,
-    Drift,
+    HeadingDrift,
     Hinge,
-    StartTilt,
+    StartPoseOffset,
     Subject,
     average_subject,
     load_subject,
@@ -64,8 +64,8 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
         root @ root.T,
         {"torso": np.array([0.5, -0.5, 0.5, 0.5])},
         "by hand",
-        start_tilt={"torso": StartTilt(np.array([0.01, -0.07]), 0.02)},
-        drift={"torso": Drift(np.deg2rad(-0.7) / 60.0, np.deg2rad(0.3) / 60.0)},
+        start_pose_offset={"torso": StartPoseOffset(np.array([0.01, -0.07]), 0.02)},
+        heading_drift={"torso": HeadingDrift(np.deg2rad(-0.7) / 60.0, np.deg2rad(0.3) / 60.0)},
     )
     (tmp_path / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
     for path in (tmp_path, tmp_path / "subject.toml"):
@@ -75,15 +75,15 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
         assert again.order == order
         np.testing.assert_allclose(again.covariance, subject.covariance, rtol=1e-8)
         np.testing.assert_allclose(again.mounts["torso"], subject.mounts["torso"], atol=1e-9)
-        np.testing.assert_allclose(again.start_tilt["torso"].tilt, [0.01, -0.07], atol=1e-6)
-        assert again.start_tilt["torso"].std == pytest.approx(0.02, rel=1e-3)
-        assert again.drift["torso"] == pytest.approx(subject.drift["torso"], rel=1e-3)
+        np.testing.assert_allclose(again.start_pose_offset["torso"].tilt, [0.01, -0.07], atol=1e-6)
+        assert again.start_pose_offset["torso"].std == pytest.approx(0.02, rel=1e-3)
+        assert again.heading_drift["torso"] == pytest.approx(subject.heading_drift["torso"], rel=1e-3)
     assert "rate_deg_min = -0.7000" in subject_toml(subject)
     assert np.isnan(again.std("left_palm"))
 
 
 def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
-    lines = ["format = 1", "[lengths]", *(f"{name} = 0.3" for name in LENGTHS), "[lengths_std]", "trunk = 0.02"]
+    lines = ["format = 2", "[lengths]", *(f"{name} = 0.3" for name in LENGTHS), "[lengths_std]", "trunk = 0.02"]
     (tmp_path / "subject.toml").write_text("\n".join(lines), encoding="utf-8")
     subject = load_subject(tmp_path)
     assert subject.std("trunk") == pytest.approx(0.02)
@@ -93,19 +93,19 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("format = 2", "this version reads format = 1"),
-        ("format = 1\n[lengths]\nleft_uper_arm = 0.3", "did you mean 'left_upper_arm'"),
-        ("format = 1\n[lengths]\ntrunk = 'long'", "lengths.trunk = 'long'; a number in metres"),
-        ("format = 1\n[lengths]\ntrunk = -0.5", "lengths.trunk = -0.5"),
-        ("format = 1\n[lengths]\ntrunk = 0.5", "lengths.shoulder_width = None"),
+        ("format = 1", "this version reads format = 2"),
+        ("format = 2\n[lengths]\nleft_uper_arm = 0.3", "did you mean 'left_upper_arm'"),
+        ("format = 2\n[lengths]\ntrunk = 'long'", "lengths.trunk = 'long'; a number in metres"),
+        ("format = 2\n[lengths]\ntrunk = -0.5", "lengths.trunk = -0.5"),
+        ("format = 2\n[lengths]\ntrunk = 0.5", "lengths.shoulder_width = None"),
         ("format 1", "not valid TOML"),
-        ("ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0", "mounts.torso is no unit quaternion"),
+        ("ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0", "mounts.torso: qx, qy, qz, qw must be of length 1; it is 1.4"),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [[1.0, 2.0]]", "covariance.matrix is (1, 2)"),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [['a']]", "holds something that is no number"),
-        ("ALL\n[start_tilt.tors]\nx_deg = 1", "start_tilt.tors is not a segment; did you mean 'torso'"),
-        ("ALL\n[start_tilt.torso]\nx_deg = 1", "it needs x_deg, y_deg, std_deg"),
-        ("ALL\n[drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1", "it needs rate_deg_min, std_deg_min"),
-        ("ALL\n[drift]\ntorso = 1", "drift.torso = 1; it needs rate_deg_min"),
+        ("ALL\n[start_pose_offset.tors]\nx_deg = 1", "start_pose_offset.tors is not a segment; did you mean 'torso'"),
+        ("ALL\n[start_pose_offset.torso]\nx_deg = 1", "it needs x_deg, y_deg, std_deg"),
+        ("ALL\n[heading_drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1", "it needs rate_deg_min, std_deg_min"),
+        ("ALL\n[heading_drift]\ntorso = 1", "heading_drift.torso = 1 is not a table"),
         (
             "ALL\n[covariance]\norder = ['trunk', 'left_hand']\nmatrix = [[1.0, 2.0], [2.0, 1.0]]",
             "positive semidefinite",
@@ -113,7 +113,7 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, says: str) -> None:
-    every = "format = 1\n[lengths]\n" + "\n".join(f"{name} = 0.3" for name in LENGTHS)
+    every = "format = 2\n[lengths]\n" + "\n".join(f"{name} = 0.3" for name in LENGTHS)
     (tmp_path / "subject.toml").write_text(text.replace("ALL", every), encoding="utf-8")
     with pytest.raises(BadSubject) as caught:
         load_subject(tmp_path)
@@ -131,9 +131,11 @@ def test_missing_files_and_people_that_are_none() -> None:
 
 
 EXTREME: dict[str, dict[str, Any]] = {
-    "a start tilt beyond 90 deg": {"start_tilt": {"torso": StartTilt(np.deg2rad([-118.0, 60.0]), np.deg2rad(170.0))}},
-    "a start tilt of half a turn": {"start_tilt": {"left_hand": StartTilt(np.array([0.0, np.pi]), np.pi)}},
-    "a drift of tens of degrees a second": {"drift": {"head": Drift(-1.5, 1.5)}},
+    "a start tilt beyond 90 deg": {
+        "start_pose_offset": {"torso": StartPoseOffset(np.deg2rad([-118.0, 60.0]), np.deg2rad(170.0))}
+    },
+    "a start tilt of half a turn": {"start_pose_offset": {"left_hand": StartPoseOffset(np.array([0.0, np.pi]), np.pi)}},
+    "a drift of tens of degrees a second": {"heading_drift": {"head": HeadingDrift(-1.5, 1.5)}},
     "a hinge that is hardly one": {"hinges": {"left": Hinge(np.array([0.6, 0.0, -0.8]), 0.999)}},
     "a name that TOML wants escaped": {"name": 'a\x7f\x00\n"\\\u2028é\ud800', "note": "\x7f"},
     "headings that may be anywhere": {
@@ -151,10 +153,10 @@ def test_what_is_written_can_be_read(case: str, tmp_path: Path) -> None:
     again = load_subject(tmp_path)
     assert again.name.replace("?", "") == subject.name.replace("\ud800", "")
     assert again.note == subject.note
-    for name, start in subject.start_tilt.items():
-        np.testing.assert_allclose(again.start_tilt[name].tilt, start.tilt, atol=1e-5)
-        assert again.start_tilt[name].std == pytest.approx(start.std, abs=1e-5)
-    for name, drift in subject.drift.items():
-        assert again.drift[name].rate == pytest.approx(drift.rate, rel=1e-4)
+    for name, start in subject.start_pose_offset.items():
+        np.testing.assert_allclose(again.start_pose_offset[name].tilt, start.tilt, atol=1e-5)
+        assert again.start_pose_offset[name].std == pytest.approx(start.std, abs=1e-5)
+    for name, drift in subject.heading_drift.items():
+        assert again.heading_drift[name].rate == pytest.approx(drift.rate, rel=1e-4)
     np.testing.assert_allclose(again.covariance, subject.covariance, rtol=1e-8, atol=1e-12)
     assert subject_toml(again) == subject_toml(replace(subject, name=again.name))

@@ -81,7 +81,7 @@ def test_trials_that_are_none_are_named(tmp_path: Path) -> None:
 def test_real_trials_are_read_as_they_are(data: Path) -> None:
     trial = read_broad(next(iter(sorted((data / "broad").glob("*.mat")))))
     assert trial.rate_hz == pytest.approx(286, abs=1)
-    assert np.linalg.norm(trial.accel_S[trial.still], axis=1).mean() == pytest.approx(9.8, abs=0.2)
-    assert not trial.scored[trial.still].any()
+    assert np.linalg.norm(trial.accel_S[trial.static], axis=1).mean() == pytest.approx(9.8, abs=0.2)
+    assert not trial.scored[trial.static].any()
     authors = read_authors_trial(data / "wepose_hr" / "prova_HR.txt")
     assert int(np.argmax(authors.scored)) == 725

@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from wepose_pin.documents import whole_folder
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
 from wepose_pin.model import load_model
 from wepose_pin.pose import pose_from_table, pose_table
@@ -17,7 +18,7 @@ from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import average_subject
 from wepose_pin.tracking import track
-from wepose_pin.writers import read_result, whole_folder, write_result, write_session
+from wepose_pin.writers import read_result, write_result, write_session
 from wepose_pin.writers.result import write_subject
 
 

@@ -25,7 +25,7 @@ import wepose_pin as wp
 from wepose_pin.filters import AmekfParams
 from wepose_pin.retargeting import Tasks
 from wepose_pin.simulation import Imperfections, ImuNoise
-from wepose_pin.subject import Drift, Hinge, StartTilt
+from wepose_pin.subject import HeadingDrift, Hinge, StartPoseOffset
 
 NAN, INF = float("nan"), float("inf")
 ANYTHING = object()
@@ -124,7 +124,7 @@ def right() -> dict[str, dict[str, Any]]:
             "gyro_S": torso.gyro_S[:600],
             "accel_S": torso.accel_S[:600],
             "rate_hz": 100.0,
-            "still": (0.5, 4.0),
+            "static": (0.5, 4.0),
             "method": "amekf",
             "params": None,
             "static_test": None,
@@ -159,7 +159,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "gyro_S": SAMPLES,
         "accel_S": SAMPLES,
         "rate_hz": (*POSITIVE, None),
-        "still": (*INTERVAL, (-1.0, 2.0), (0.0, 1e6)),
+        "static": (*INTERVAL, (-1.0, 2.0), (0.0, 1e6)),
         "method": (*NAME, None),
         "params": ("x", 3, {}, AmekfParams),
         "static_test": THING,
@@ -372,11 +372,16 @@ def wrong_subjects(subject: wp.Subject) -> Iterator[tuple[str, wp.Subject]]:
         None,
     ):
         yield "hinges", replace(subject, hinges=hinges)
-    for tilt in (StartTilt(np.zeros(3), 0.1), StartTilt(np.full(2, NAN), 0.1), StartTilt(np.zeros(2), -0.1), "x"):
-        yield "start_tilt", replace(subject, start_tilt={"torso": tilt})
-    for drift in (Drift(NAN, 0.1), Drift(0.0, -0.1), Drift("0", 0.1), 3):
-        yield "drift", replace(subject, drift={"torso": drift})
-    yield "drift", replace(subject, drift={"arm": Drift(0.0, 0.1)})
+    for tilt in (
+        StartPoseOffset(np.zeros(3), 0.1),
+        StartPoseOffset(np.full(2, NAN), 0.1),
+        StartPoseOffset(np.zeros(2), -0.1),
+        "x",
+    ):
+        yield "start_pose_offset", replace(subject, start_pose_offset={"torso": tilt})
+    for drift in (HeadingDrift(NAN, 0.1), HeadingDrift(0.0, -0.1), HeadingDrift("0", 0.1), 3):
+        yield "heading_drift", replace(subject, heading_drift={"torso": drift})
+    yield "heading_drift", replace(subject, heading_drift={"arm": HeadingDrift(0.0, 0.1)})
 
 
 def wrong_poses(pose: Any) -> Iterator[tuple[str, Any]]:

@@ -180,7 +180,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
             both = known[:2, :2] + START_POSE_STD**2 * np.eye(2)
             R_LS = Rotation.from_rotvec(known[:, :2] @ np.linalg.solve(both, misfit)) * R_stated
             psi = heading_to(at_start, R_LS)
-            stood = subject.start_tilt.get(segment) if subject is not None else None
+            stood = subject.start_pose_offset.get(segment) if subject is not None else None
             if stood is not None:
                 # Tilt and mount of the calibration come from one start pose: what one is off by, the other is too.
                 misfit, both = misfit - stood.tilt, REPEATED_START_STD**2 * np.eye(2)

@@ -45,6 +45,19 @@ class BadData(WeposeError):
     """The recorded numbers cannot be a recording: text, NaN, time that goes back, lengths that differ."""
 
 
+class WrongUnit(BadData):
+    """Numbers that are those of another unit.
+
+    Parameters
+    ----------
+    key, unit : what would fit in a session's [data], as ``gyro_unit`` and ``deg/s``
+    """
+
+    def __init__(self, text: str, key: str = "", unit: str = "") -> None:
+        super().__init__(text)
+        self.key, self.unit = key, unit
+
+
 class BadPhase(WeposeError):
     """A phase is missing, empty, or outside the recording."""
 

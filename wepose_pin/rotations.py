@@ -66,7 +66,7 @@ def log(quat: ArrayLike) -> np.ndarray:
 
 
 def quat_from_gravity(accel_S: ArrayLike) -> np.ndarray:
-    """Orientation `quat_WS` (4,) of a sensor at rest with zero heading: the shortest rotation of accel onto +z of W.
+    """Orientation `quat_WS` (4,) of a static sensor with zero heading: the shortest rotation of accel onto +z of W.
 
     Zero heading means no twist about the vertical; that is defined for every mount but the one exactly upside down,
     where the half turn about x is taken.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,8 +20,8 @@ from .arguments import (
     check_unit,
 )
 from .assets import asset
-from .errors import BadData, BadOption, BadSubject, MissingFile, one_of
-from .readers.keys import is_number, parsed_toml
+from .documents import TomlTable, is_number, parse_toml, read_toml, toml_string, toml_strings
+from .errors import BadData, BadOption, BadSubject, one_of
 from .recording import SEGMENTS
 
 LENGTHS = (
@@ -38,8 +36,9 @@ LENGTHS = (
 )
 LONGEST = 3.0  # [m] longer is no part of a person
 SEXES = ("f", "m")
-FORMAT = 1
-MOST_TILT_DEG = 180.0  # off the start pose: all that a turn can be; whether it is plausible, the calibration says
+_TABLES = ("lengths", "lengths_std", "mounts", "hinges", "start_pose_offset", "heading_drift", "covariance")
+FORMAT = 2
+MOST_OFFSET_DEG = 180.0  # off the start pose: all that a turn can be; whether it is plausible, the calibration says
 MOST_DRIFT_DEG_MIN = 6000.0  # of a heading: 100 deg/s, beyond any gyroscope's bias
 
 
@@ -50,14 +49,14 @@ class Hinge(NamedTuple):
     std: NonNegative  # [rad] by which the forearm leaves the plane across it, soft tissue included
 
 
-class StartTilt(NamedTuple):
+class StartPoseOffset(NamedTuple):
     """How far a segment was off the start pose when its mount was calibrated."""
 
     tilt: np.ndarray  # (2,) [rad] about x and y of W
     std: NonNegative  # [rad] of each
 
 
-class Drift(NamedTuple):
+class HeadingDrift(NamedTuple):
     """How fast a sensor's heading drifted in the calibration, which is its gyroscope's bias as far as it was left."""
 
     rate: float  # [rad/s]
@@ -77,8 +76,8 @@ class Subject:
     mounts : segment → `quat_LS` (4,) xyzw, the calibrated mounts; empty where none are calibrated
     note : where the numbers come from, in a few words
     hinges : side → its elbow's axis, where a calibration found it
-    start_tilt : segment → how it was off the start pose in the calibration; a person stands so again, nearly
-    drift : segment → the heading's drift of its sensor in the calibration; its spread is what another day's may have
+    start_pose_offset : segment → how it was off the start pose in the calibration; a person stands so again, nearly
+    heading_drift : segment → that of its sensor in the calibration; its spread is what another day's may have
     """
 
     name: str
@@ -88,8 +87,8 @@ class Subject:
     mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
     note: str = ""
     hinges: Mapping[str, Hinge] = field(default_factory=dict)
-    start_tilt: Mapping[str, StartTilt] = field(default_factory=dict)
-    drift: Mapping[str, Drift] = field(default_factory=dict)
+    start_pose_offset: Mapping[str, StartPoseOffset] = field(default_factory=dict)
+    heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
 
     def check(self) -> Subject:
         """The same subject, if it can be one: made by hand it may be anything.
@@ -97,8 +96,8 @@ class Subject:
         Raises
         ------
         BadOption, BadSubject
-            A field that is not of its kind; a length, mount, hinge, tilt or drift that cannot be; a covariance that is
-            none, or has not the rows of `order`.
+            A field that is not of its kind; a length, mount, hinge, offset or drift that cannot be; a covariance that
+            is none, or has not the rows of `order`.
         """
         where = f"subject {self.name!r}: "
         check_fields(self, where)
@@ -112,12 +111,12 @@ class Subject:
             check_array(f"{where}covariance", self.covariance, (len(self.order), len(self.order)))
             check_finite(f"{where}covariance", self.covariance)
             check_covariance(f"{where}covariance", self.covariance)
-            for name in ("mounts", "start_tilt", "drift"):
+            for name in ("mounts", "start_pose_offset", "heading_drift"):
                 check_names(f"{where}{name}", getattr(self, name), SEGMENTS)
             check_names(f"{where}hinges", self.hinges, ("left", "right"))
             arrays = [(f"mounts.{s}", quat, (4,)) for s, quat in self.mounts.items()]
             arrays += [(f"hinges.{side}.axis", hinge.axis, (3,)) for side, hinge in self.hinges.items()]
-            arrays += [(f"start_tilt.{s}.tilt", start.tilt, (2,)) for s, start in self.start_tilt.items()]
+            arrays += [(f"start_pose_offset.{s}.tilt", start.tilt, (2,)) for s, start in self.start_pose_offset.items()]
             for name, values, shape in arrays:
                 check_array(f"{where}{name}", values, shape)
                 check_finite(f"{where}{name}", values)
@@ -209,7 +208,7 @@ def average_subject(stature: float | None = None, sex: str | None = None) -> Sub
         raise BadOption(f"stature {stature:g} is not a body height in metres; between 1.0 and 2.5")
     if sex is not None and sex not in SEXES:
         raise BadOption(f"sex '{sex}' is not known; {one_of(SEXES)}")
-    table = tomllib.loads(asset("calibration", "anthropometry.toml").read_text(encoding="utf-8"))
+    table = read_toml(asset("calibration", "anthropometry.toml"), "the anthropometric prior")
     height = stature if stature is not None else table["stature"]["mean"]
     height_std = 0.0 if stature is not None else table["stature"]["std"] / table["stature"]["mean"]
     shares = [table[{"f": "female", "m": "male"}[s]] for s in ([sex] if sex else SEXES)]
@@ -233,9 +232,9 @@ def average_subject(stature: float | None = None, sex: str | None = None) -> Sub
 
 def subject_toml(subject: Subject) -> str:
     """The text of ``subject.toml``."""
-    lines = [f"format = {FORMAT}", f"name = {_quoted(subject.name)}"]
+    lines = [f"format = {FORMAT}", f"name = {toml_string(subject.name)}"]
     if subject.note:
-        lines.append(f"note = {_quoted(subject.note)}")
+        lines.append(f"note = {toml_string(subject.note)}")
     lines += ["", "[lengths]       # m", *(f"{k} = {v:.6f}" for k, v in subject.lengths.items())]
     lines += ["", "[lengths_std]   # m, one standard deviation"]
     lines += [f"{k} = {subject.std(k):.6f}" for k in subject.lengths if k in subject.order]
@@ -249,27 +248,21 @@ def subject_toml(subject: Subject) -> str:
         lines += ["", f"[hinges.{side}]   # the elbow's axis in the upper arm's frame"]
         lines += [f"{key} = {value:.9f}" for key, value in zip("xyz", hinge.axis, strict=True)]
         lines.append(f"std_deg = {np.degrees(hinge.std):.3f}")
-    for segment, start in subject.start_tilt.items():
-        lines += ["", f"[start_tilt.{segment}]   # off the start pose in the calibration, about x and y of W"]
+    for segment, start in subject.start_pose_offset.items():
+        lines += ["", f"[start_pose_offset.{segment}]   # off the start pose in the calibration, about x and y of W"]
         lines += [f"{key} = {np.degrees(value):.4f}" for key, value in zip(("x_deg", "y_deg"), start.tilt, strict=True)]
         lines.append(f"std_deg = {np.degrees(start.std):.4f}")
-    for segment, drift in subject.drift.items():
-        lines += ["", f"[drift.{segment}]   # of its sensor's heading in the calibration"]
+    for segment, drift in subject.heading_drift.items():
+        lines += ["", f"[heading_drift.{segment}]   # of its sensor's heading in the calibration"]
         rates = {"rate_deg_min": drift.rate, "std_deg_min": drift.std}
         lines += [f"{key} = {60.0 * np.degrees(value):.4f}" for key, value in rates.items()]
     if subject.order:
         lines += ["", "[covariance]    # of lengths [m] and mount errors [rad], jointly"]
-        lines.append(f"order = {json.dumps(list(subject.order))}")
+        lines.append(f"order = {toml_strings(subject.order)}")
         lines.append("matrix = [")
         lines += ["    [" + ", ".join(f"{v:.9e}" for v in row) + "]," for row in subject.covariance]
         lines.append("]")
     return "\n".join(lines) + "\n"
-
-
-def _quoted(text: str) -> str:
-    """A string as TOML has it: as JSON, but for what cannot be encoded and for DEL, which TOML wants escaped."""
-    sound = text.encode("utf-8", "replace").decode("utf-8")
-    return json.dumps(sound, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def load_subject(path: str | Path) -> Subject:
@@ -284,12 +277,7 @@ def load_subject(path: str | Path) -> Subject:
     path = Path(path)
     if path.is_dir():
         path = path / "subject.toml"
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file; `wepose calibrate` writes one")
-    try:
-        return subject_of(path.read_text(encoding="utf-8"), path)
-    except UnicodeDecodeError as error:
-        raise BadSubject(f"{path}: not valid TOML: {error}") from error
+    return _subject(read_toml(path, "a subject, as `wepose calibrate` writes one,", BadSubject), path)
 
 
 def subject_of(text: str, path: Path) -> Subject:
@@ -301,112 +289,102 @@ def subject_of(text: str, path: Path) -> Subject:
         As `load_subject`.
     """
     try:
-        table = parsed_toml(text)
+        return _subject(parse_toml(text), path)
     except ValueError as error:
         raise BadSubject(f"{path}: not valid TOML: {error}") from error
-    if "sensors" in table:
+
+
+def _subject(values: Mapping[str, Any], path: Path) -> Subject:
+    top = TomlTable(values, str(path), error=BadSubject)
+    if "sensors" in top:
         raise BadSubject(f"{path}: is a session; a subject is wanted here, as `wepose calibrate` writes one")
-    if table.get("format") != FORMAT:
-        raise BadSubject(f"{path}: format = {table.get('format')!r}; this version reads format = {FORMAT}")
-    for key in ("lengths", "lengths_std", "mounts", "hinges", "start_tilt", "drift", "covariance"):
-        if not isinstance(table.get(key, {}), dict):
-            raise BadSubject(f"{path}: {key} = {table[key]!r} is not a table; write [{key}]")
-    lengths = table.get("lengths", {})
-    for name in [*lengths, *table.get("lengths_std", {})]:
-        if name not in LENGTHS:
-            raise BadSubject(f"{path}: '{name}' is not a length; {one_of(LENGTHS, name)}")
-    for name in LENGTHS:
-        value = lengths.get(name)
-        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 < value < LONGEST:
-            raise BadSubject(f"{path}: lengths.{name} = {value!r}; a number in metres is needed, above 0")
-    order, matrix = _covariance(path, table.get("covariance", {}), table.get("lengths_std", {}))
+    if values.get("format") != FORMAT:
+        raise BadSubject(f"{path}: format = {values.get('format')!r}; this version reads format = {FORMAT}")
+    top.allow("format", "name", "note", *_TABLES)
+    tables = {name: top.table(name, {}) for name in _TABLES}
+    of_segments = {
+        name: tables[name].tables(SEGMENTS, "segment") for name in ("mounts", "start_pose_offset", "heading_drift")
+    }
+    offset = {
+        segment: np.radians(entry.numbers("x_deg", "y_deg", "std_deg", most=MOST_OFFSET_DEG))
+        for segment, entry in of_segments["start_pose_offset"].items()
+    }
+    drift = {
+        segment: np.radians(entry.numbers("rate_deg_min", "std_deg_min", most=MOST_DRIFT_DEG_MIN)) / 60.0
+        for segment, entry in of_segments["heading_drift"].items()
+    }
+    hinges = tables["hinges"].tables(("left", "right"), "side")
+    lengths = _read_lengths(tables["lengths"])
+    order, matrix = _read_covariance(tables["covariance"], tables["lengths_std"])
     return Subject(
-        name=str(table.get("name", path.parent.name)),
-        lengths={name: float(lengths[name]) for name in LENGTHS},
+        name=str(values.get("name", path.parent.name)),
+        lengths=lengths,
         order=order,
         covariance=matrix,
-        mounts={segment: _mount(path, segment, mount) for segment, mount in table.get("mounts", {}).items()},
-        note=str(table.get("note", "")),
-        hinges={side: _read_hinge(path, side, hinge) for side, hinge in table.get("hinges", {}).items()},
-        start_tilt={
-            segment: StartTilt(np.radians([x, y]), float(np.radians(std)))
-            for segment in table.get("start_tilt", {})
-            for x, y, std in [_spread(path, table, "start_tilt", segment, ("x_deg", "y_deg", "std_deg"), MOST_TILT_DEG)]
+        mounts={
+            segment: _read_unit(entry, ("qx", "qy", "qz", "qw")) for segment, entry in of_segments["mounts"].items()
         },
-        drift={
-            segment: Drift(float(np.radians(rate)) / 60.0, float(np.radians(std)) / 60.0)
-            for segment in table.get("drift", {})
-            for rate, std in [
-                _spread(path, table, "drift", segment, ("rate_deg_min", "std_deg_min"), MOST_DRIFT_DEG_MIN)
-            ]
-        },
+        note=str(values.get("note", "")),
+        hinges={side: _read_hinge(entry) for side, entry in hinges.items()},
+        start_pose_offset={segment: StartPoseOffset(v[:2], float(v[2])) for segment, v in offset.items()},
+        heading_drift={segment: HeadingDrift(float(rate), float(std)) for segment, (rate, std) in drift.items()},
     )
 
 
-def _covariance(path: Path, table: Mapping, std: Mapping) -> tuple[tuple[str, ...], np.ndarray]:
-    for name, value in std.items():
-        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < 3.0:
-            raise BadSubject(f"{path}: lengths_std.{name} = {value!r}; a standard deviation in metres is needed")
-    if not table:
+def _read_lengths(table: TomlTable) -> dict[str, float]:
+    """Every one of `LENGTHS` [m]."""
+    table.allow(*LENGTHS)
+    for name in LENGTHS:
+        value = table.values.get(name)
+        if not is_number(value, LONGEST) or value <= 0.0:
+            raise BadSubject(f"{table.at(name)} = {value!r}; a number in metres is needed, above 0")
+    return {name: float(table.values[name]) for name in LENGTHS}
+
+
+def _read_covariance(table: TomlTable, std: TomlTable) -> tuple[tuple[str, ...], np.ndarray]:
+    """What the rows are, and the matrix; without a table of its own that of the lengths' standard deviations [m]."""
+    std.allow(*LENGTHS)
+    for name, value in std.values.items():
+        if not is_number(value, LONGEST) or value < 0.0:
+            raise BadSubject(f"{std.at(name)} = {value!r}; a standard deviation in metres is needed")
+    if not table.values:
         order = tuple(name for name in LENGTHS if name in std)
-        return order, np.diag([float(std[name]) ** 2 for name in order])
-    order = table.get("order", ())
+        return order, np.diag([float(std.values[name]) ** 2 for name in order])
+    table.allow("order", "matrix")
+    order = table.values.get("order", ())
     if not isinstance(order, list | tuple) or len(set(map(str, order))) != len(order):
-        raise BadSubject(f"{path}: covariance.order = {order!r}; a list of names is needed, each once")
+        raise BadSubject(f"{table.at('order')} = {order!r}; a list of names is needed, each once")
     for name in order:
         if name not in _ROWS:
-            raise BadSubject(f"{path}: covariance.order: {name!r} is not known; {one_of(_ROWS, str(name))}")
-    order = tuple(order)
+            raise BadSubject(f"{table.at('order')}: {name!r} is not known; {one_of(_ROWS, str(name))}")
+    place = table.at("matrix")
     try:
-        matrix = np.array(table.get("matrix"), dtype=float)
+        matrix = np.array(table.values.get("matrix"), dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise BadSubject(f"{path}: covariance.matrix holds something that is no number, or rows that differ") from None
+        raise BadSubject(f"{place} holds something that is no number, or rows that differ") from None
     if matrix.shape != (len(order), len(order)):
-        raise BadSubject(f"{path}: covariance.matrix is {matrix.shape}; {len(order)} names in order need as many rows")
+        raise BadSubject(f"{place} is {matrix.shape}; {len(order)} names in order need as many rows")
     least = -1e-9 * max(1.0, float(np.trace(matrix)))  # what rounding to the file's digits may do
     if (
         not (np.abs(matrix) < 1e6).all()
         or not np.allclose(matrix, matrix.T, atol=1e-12)
         or np.linalg.eigvalsh(matrix)[0] < least
     ):
-        raise BadSubject(f"{path}: covariance.matrix is not symmetric and positive semidefinite")
-    return order, matrix
+        raise BadSubject(f"{place} is not symmetric and positive semidefinite")
+    return tuple(order), matrix
 
 
-def _read_hinge(path: Path, side: str, table: Any) -> Hinge:
-    if side not in ("left", "right"):
-        raise BadSubject(f"{path}: hinges.{side} is no side; left or right")
-    parts = [table.get(key) for key in ("x", "y", "z", "std_deg")] if isinstance(table, dict) else [None]
-    if not all(is_number(part, 1e6) for part in parts):
-        raise BadSubject(f"{path}: hinges.{side} needs four numbers, x, y, z, std_deg")
-    axis, std = np.array(parts[:3], dtype=float), float(np.radians(parts[3]))  # type: ignore[arg-type]
-    if not abs(np.linalg.norm(axis) - 1.0) < 1e-3 or not 0.0 < std < 1.0:
-        raise BadSubject(f"{path}: hinges.{side}: x, y, z must be of length 1, and std_deg between 0 and 57")
-    return Hinge(axis / np.linalg.norm(axis), std)
+def _read_unit(table: TomlTable, names: tuple[str, ...]) -> np.ndarray:
+    """The vector or quaternion of these components, brought to length 1."""
+    values = np.array(table.numbers(*names))
+    length = np.linalg.norm(values)
+    if not abs(length - 1.0) < 1e-3:
+        raise BadSubject(f"{table.where}: {', '.join(names)} must be of length 1; it is {length:.4g}")
+    return values / length
 
 
-def _spread(path: Path, table: Mapping, key: str, segment: str, names: tuple[str, ...], most: float) -> list[float]:
-    """The numbers of a segment's table, none larger than `most`, the last of them a standard deviation."""
-    if segment not in SEGMENTS:
-        raise BadSubject(f"{path}: {key}.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
-    entry = table[key][segment]
-    found = [entry.get(name) for name in names] if isinstance(entry, dict) else [None]
-    numbers = [v for v in found if isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= most]
-    if len(numbers) != len(names) or numbers[-1] < 0.0:
-        raise BadSubject(
-            f"{path}: {key}.{segment} = {entry!r}; it needs {', '.join(names)}, numbers up to {most:g}, the last from 0"
-        )
-    return numbers
-
-
-def _mount(path: Path, segment: str, table: Any) -> np.ndarray:
-    if segment not in SEGMENTS:
-        raise BadSubject(f"{path}: mounts.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
-    parts = [table.get(key) for key in ("qx", "qy", "qz", "qw")] if isinstance(table, dict) else [None]
-    if not all(is_number(part, 1e6) for part in parts):
-        raise BadSubject(f"{path}: mounts.{segment} needs four numbers, qx, qy, qz, qw")
-    quat = np.array(parts, dtype=float)
-    norm = np.linalg.norm(quat)
-    if not abs(norm - 1.0) < 1e-3:
-        raise BadSubject(f"{path}: mounts.{segment} is no unit quaternion; it needs qx, qy, qz, qw of length 1")
-    return quat / norm
+def _read_hinge(table: TomlTable) -> Hinge:
+    axis, (std_deg,) = _read_unit(table, ("x", "y", "z")), table.numbers("std_deg")
+    if not 0.0 < np.radians(std_deg) < 1.0:
+        raise BadSubject(f"{table.at('std_deg')} = {std_deg:g}; it must be between 0 and 57")
+    return Hinge(axis, float(np.radians(std_deg)))

@@ -368,7 +368,7 @@ def orientation_values(
     import wepose_pin as wp
 
     with warnings.catch_warnings(action="ignore"):
-        found = wp.estimate_orientation(gyro, accel, rate_hz, method=method, still=static)
+        found = wp.estimate_orientation(gyro, accel, rate_hz, method=method, static=static)
     return {"quat_WS": found.quat_WS, "gyro_bias": found.gyro_bias, "static": found.static}
 
 

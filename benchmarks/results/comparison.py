@@ -49,7 +49,7 @@ class Renames:
 
 @dataclass
 class Comparison:
-    """Keys are those of the new folder, those of missing ones what they would be there."""
+    """TomlTable are those of the new folder, those of missing ones what they would be there."""
 
     equal: list[str] = field(default_factory=list)
     different: list[Difference] = field(default_factory=list)

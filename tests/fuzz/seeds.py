@@ -278,8 +278,8 @@ def subject() -> bytes:
     return subject_toml(average_subject()).encode() + (
         b"[mounts.torso]\nqx = 0.0\nqy = 0.0\nqz = 0.0\nqw = 1.0\n"
         b"[hinges.left]\nx = 0.0\ny = 1.0\nz = 0.0\nstd_deg = 5.0\n"
-        b"[start_tilt.torso]\nx_deg = 1.0\ny_deg = 2.0\nstd_deg = 1.0\n"
-        b"[drift.torso]\nrate_deg_min = 1.0\nstd_deg_min = 2.0\n"
+        b"[start_pose_offset.torso]\nx_deg = 1.0\ny_deg = 2.0\nstd_deg = 1.0\n"
+        b"[heading_drift.torso]\nrate_deg_min = 1.0\nstd_deg_min = 2.0\n"
     )
 
 

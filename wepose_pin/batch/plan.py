@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..arguments import check_value
+from ..documents import TomlTable, read_toml
 from ..errors import BadData, BadOption, BadPlan, BadSession, WeposeError, one_of
 from ..jobs.calibrate import CalibrateJob
 from ..jobs.evaluate import EvaluateJob
@@ -18,7 +19,6 @@ from ..jobs.export import ExportJob
 from ..jobs.fields import REQUIRED, build_job, convert_value, field_defaults, field_types
 from ..jobs.retarget import RetargetJob
 from ..jobs.track import TrackJob
-from ..readers.keys import Keys, read_toml
 from ..readers.tables import read_table
 from ..subject import LENGTHS, average_subject
 from .storage import find, is_remote
@@ -102,7 +102,7 @@ def read_plan(path: Path, items_at: str) -> Plan:
 
 
 def _plan(path: Path, items_at: str) -> Plan:
-    top = Keys(read_toml(path, "a plan"), str(path))
+    top = TomlTable(read_toml(path, "a plan"), str(path))
     top.allow("name", "sessions", "subjects", "steps")
     steps = _steps(top, path.parent)
     lengths = (*LENGTHS, *_distances(steps))
@@ -140,7 +140,7 @@ def step_options(step: str) -> dict[str, Any]:
     return named | {name: value for name, value in defaults.items() if name not in (*_FILLED, "format")}
 
 
-def _steps(top: Keys, folder: Path) -> dict[str, dict[str, Any]]:
+def _steps(top: TomlTable, folder: Path) -> dict[str, dict[str, Any]]:
     table = top.table("steps")
     table.allow(*STEPS)
     if not table.values:
@@ -159,7 +159,7 @@ def _steps(top: Keys, folder: Path) -> dict[str, dict[str, Any]]:
     return steps
 
 
-def _option(keys: Keys, step: str, name: str, default: Any, folder: Path) -> Any:
+def _option(keys: TomlTable, step: str, name: str, default: Any, folder: Path) -> Any:
     """The value of an option as JSON holds it."""
     if name not in keys:
         if default is REQUIRED:
@@ -180,7 +180,7 @@ def _option(keys: Keys, step: str, name: str, default: Any, folder: Path) -> Any
     return value
 
 
-def _export_formats(keys: Keys, value: Any) -> tuple[str, ...]:
+def _export_formats(keys: TomlTable, value: Any) -> tuple[str, ...]:
     from ..writers.export import FORMATS
 
     if not isinstance(value, list) or not value:
@@ -191,7 +191,7 @@ def _export_formats(keys: Keys, value: Any) -> tuple[str, ...]:
     return tuple(dict.fromkeys(value))
 
 
-def _check(step: str, options: Mapping[str, Any], keys: Keys) -> None:
+def _check(step: str, options: Mapping[str, Any], keys: TomlTable) -> None:
     """What would fail at every item, said once and before any work."""
     values = {name: value for name, value in options.items() if name != _FORMATS}
     values |= {name: Path(name) for name in _PATHS if name in field_types(STEPS[step])}
@@ -217,13 +217,13 @@ def _distances(steps: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
 # Subjects ------------------------------------------------------------------------------------------------------------
 
 
-def _named(top: Keys) -> Iterator[tuple[str, Keys]]:
+def _named(top: TomlTable) -> Iterator[tuple[str, TomlTable]]:
     table = top.table("subjects", {})
     for name in table.values:
         yield name, table.table(name)
 
 
-def _subject(keys: Keys, path: Path, lengths: Sequence[str]) -> _Subject:
+def _subject(keys: TomlTable, path: Path, lengths: Sequence[str]) -> _Subject:
     keys.allow("calibration", "file", "stature", "sex", "measured")
     calibration, file = keys.text("calibration", None), keys.text("file", None)
     if calibration is not None and file is not None:
@@ -256,7 +256,7 @@ class _Entry:
     body: Body | None = None
 
 
-def _entries(top: Keys, path: Path) -> list[tuple[str, Keys]]:
+def _entries(top: TomlTable, path: Path) -> list[tuple[str, TomlTable]]:
     """[sessions], or several [[sessions]]."""
     value = top.values.get("sessions")
     if isinstance(value, dict):
@@ -266,10 +266,10 @@ def _entries(top: Keys, path: Path) -> list[tuple[str, Keys]]:
             f"{top.at('sessions')}: a table [sessions], or several [[sessions]], with files or table is needed"
         )
     places = [f"sessions[{k}]" if len(value) > 1 else "sessions" for k in range(len(value))]
-    return [(place, Keys(entry, str(path), f"{place}.")) for place, entry in zip(places, value, strict=True)]
+    return [(place, TomlTable(entry, str(path), f"{place}.")) for place, entry in zip(places, value, strict=True)]
 
 
-def _sessions(place: str, keys: Keys, path: Path, lengths: Sequence[str]) -> list[_Entry]:
+def _sessions(place: str, keys: TomlTable, path: Path, lengths: Sequence[str]) -> list[_Entry]:
     keys.allow("files", "table", "subject")
     if ("files" in keys) == ("table" in keys):
         raise BadPlan(f"{path}: {place}: either files (globs) or table is needed")

@@ -35,7 +35,7 @@ from ..errors import BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import FilteredRecording, filter_recording
 from ..recording import Recording
-from ..subject import LENGTHS, Drift, Hinge, StartTilt, Subject, average_subject
+from ..subject import LENGTHS, HeadingDrift, Hinge, StartPoseOffset, Subject, average_subject
 from .alternatives import Alternative, alternatives, ambiguous_headings, spread_over
 from .anatomy import (
     BETTER,
@@ -251,8 +251,8 @@ def _nothing_learned(
         lengths=dict(zip(LENGTHS, lengths.tolist(), strict=True)),
         covariance=calibration.before,
         hinges={},
-        start_tilt={},
-        drift={},
+        start_pose_offset={},
+        heading_drift={},
         note="sensors sit elsewhere than labelled: nothing of the motion is used",
     )
     scale_std = float(np.sqrt(lengths @ information @ lengths) ** -1)
@@ -392,12 +392,12 @@ def _solve(
         prior,
         name=recording.name,
         hinges={side: Hinge(hinge[side], max(hinge_rms[side], HINGE_STD)) for side in seen},
-        start_tilt={
-            name: StartTilt(tilt, float(np.sqrt(np.mean(std**2))))
+        start_pose_offset={
+            name: StartPoseOffset(tilt, float(np.sqrt(np.mean(std**2))))
             for name, tilt, std in zip(layout.sensors, tilts, spread[layout.tilt].reshape(-1, 2), strict=True)
         },
-        drift={
-            name: Drift(float(rate), float(std))
+        heading_drift={
+            name: HeadingDrift(float(rate), float(std))
             for name, rate, std in zip(layout.sensors, fit.x[layout.drift], spread[layout.drift], strict=True)
         },
         lengths=dict(zip(LENGTHS, lengths.tolist(), strict=True)),

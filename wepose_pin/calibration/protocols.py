@@ -20,8 +20,8 @@ import numpy as np
 
 from ..alignment import SLIP_STD
 from ..assets import asset
-from ..errors import BadOption, MissingFile, one_of
-from ..readers.keys import is_number, parsed_toml
+from ..documents import is_number, read_toml
+from ..errors import BadOption, one_of
 from ..recording import SEGMENTS
 from ..subject import LENGTHS
 from .chain import CHAIN, REACHES
@@ -160,13 +160,7 @@ def load_protocol(name: str | Path) -> Protocol:
             f"protocol '{name}' is not known; {one_of(PROTOCOLS, str(name))}; or the path of a .toml of one's own"
         )
     path = Path(name) if own else asset("calibration", f"{name}.toml")
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such protocol file")
-    try:
-        table = parsed_toml(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise BadOption(f"{path}: not valid TOML: {error}") from error
-    return _protocol(table, path)
+    return _protocol(read_toml(path, "a protocol", BadOption), path)
 
 
 def _protocol(table: dict[str, Any], path: Path) -> Protocol:

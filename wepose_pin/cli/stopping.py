@@ -36,7 +36,7 @@ def check_stopped() -> None:
 
 def whats_written() -> str:
     """What a command that ends early has written all the same, whole."""
-    written = getattr(sys.modules.get("wepose_pin.writers.folder"), "written", ())
+    written = getattr(sys.modules.get("wepose_pin.documents"), "written", ())
     folders = [folder for folder in written if folder.exists()]
     return f"{', '.join(map(str, folders))} was written before" if folders else "nothing was written"
 

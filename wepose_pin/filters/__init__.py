@@ -1,6 +1,6 @@
 """Orientation filters: one file each, one protocol (`base.OrientationFilter`).
 
-``METHODS`` names them; `estimate_orientation` runs one on an array, from the still phase to the orientations.
+``METHODS`` names them; `estimate_orientation` runs one on an array, from the static phase to the orientations.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Orientation(NamedTuple):
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
     static: np.ndarray  # (n,) bool
     attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²], error on the right, in S; None where the filter has none
-    noise: SensorNoise  # what the still phase said
+    noise: SensorNoise  # what the static phase said
     filter: OrientationFilter | None = None  # where it stands after the last sample, to go on live; None: it cannot
     detector: StaticDetector | None = None  # the same
 
@@ -96,7 +96,7 @@ def estimate_orientation(
     rate_hz: float,
     *,
     method: str = BEST,
-    still: tuple[float, float] | None,
+    static: tuple[float, float] | None,
     params: Any = None,
     static_test: StaticTest | None = None,
 ) -> Orientation:
@@ -108,18 +108,18 @@ def estimate_orientation(
     accel_S : (n, 3) [m/s²], specific force, +g up at rest
     rate_hz : samples a second, uniform
     method : a key of `METHODS`
-    still : from, to [s] after the first sample: the sensor rests; noise and bias are measured there. None: it never
-        does; noise is then `TYPICAL`, the bias is looked for, and a warning says so
+    static : from, to [s] after the first sample: the sensor is static; noise and bias are measured there. None: it
+        never is; noise is then `TYPICAL`, the bias is looked for, and a warning says so
     params : the filter's own frozen parameters; None for its defaults
     static_test : when the sensor counts as still; None for the paper's values
 
-    The still phase begins with zero heading and the tilt of the accelerometer, averaged over it (without one: over the
+    The static phase begins with zero heading and the tilt of the accelerometer, averaged over it (without one: over the
     first window of `static_test`); the filter goes forward and backward from there.
 
     Raises
     ------
     BadOption, BadData, BadPhase
-        An unknown method; arrays that do not fit each other; a still phase outside the data.
+        An unknown method; arrays that do not fit each other; a static phase outside the data.
     """
     check_arguments(estimate_orientation, locals())
     check_method(method)
@@ -128,23 +128,23 @@ def estimate_orientation(
         gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
     except (TypeError, ValueError) as error:
         raise BadData(f"gyro_S and accel_S must be arrays of numbers (n, 3): {error}") from None
-    if not (np.isfinite(rate_hz) and rate_hz > 0.0 and (still is None or np.isfinite(still).all())):
-        raise BadOption(f"rate_hz = {rate_hz} and still = {still}: finite numbers, samples a second and seconds")
+    if not (np.isfinite(rate_hz) and rate_hz > 0.0 and (static is None or np.isfinite(static).all())):
+        raise BadOption(f"rate_hz = {rate_hz} and static = {static}: finite numbers, samples a second and seconds")
     if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
     if not np.isfinite(gyro).all() or not np.isfinite(accel).all():
         raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
-    if still is None:
+    if static is None:
         found = "finds in motion, in a minute or so" if method in ("amekf", "smoother") else "does not find in motion"
         warnings.warn(
-            "no still phase: noise is that of a usual sensor, and the gyroscope's bias starts at zero, "
+            "no static phase: noise is that of a usual sensor, and the gyroscope's bias starts at zero, "
             f"which '{method}' {found}",
             stacklevel=2,
         )
         return run_filter(gyro, accel, rate_hz, TYPICAL, method, params, static_test)
-    first, last = round(still[0] * rate_hz), round(still[1] * rate_hz) + 1
+    first, last = round(static[0] * rate_hz), round(static[1] * rate_hz) + 1
     if not 0 <= first < last <= len(gyro) + 1:
-        raise BadPhase(f"still = {still} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
+        raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
     return run_filter(
         gyro,
         accel,

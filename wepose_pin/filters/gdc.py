@@ -1,7 +1,7 @@
 """GDC: gradient-descent filter without magnetometer (Madgwick, Harrison, Vaidyanathan 2011, ICORR).
 
 Their equations (25), (26), (32) to (34): q̇ = ½ q ⊗ (gyro − b) − β ∇f/‖∇f‖ with f = R_WSᵀ e_z − a. The bias is the
-still phase's and stays; their bias step needs a magnetometer. Of ∇f only the part across q is taken: the part along q
+static phase's and stays; their bias step needs a magnetometer. Of ∇f only the part across q is taken: the part along q
 turns nothing, and in their f, which counts on ‖q‖ = 1, its size depends on how the sensor's axes lie.
 """
 
@@ -32,7 +32,7 @@ class GdcState:
 
 
 class Gdc:
-    """GDC of one sensor; the bias is the still phase's mean. A sample that is no number is passed over."""
+    """GDC of one sensor; the bias is the static phase's mean. A sample that is no number is passed over."""
 
     def __init__(
         self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: GdcParams | None = None

@@ -32,7 +32,7 @@ class NcfState:
 
 
 class Ncf:
-    """NCF of one sensor; the bias starts at the still phase's mean. A sample that is no number is passed over."""
+    """NCF of one sensor; the bias starts at the static phase's mean. A sample that is no number is passed over."""
 
     def __init__(
         self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: NcfParams | None = None

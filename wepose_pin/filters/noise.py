@@ -35,7 +35,7 @@ BEGINNING_S = 20.0
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """What a still phase says of one sensor.
+    """What a static phase says of one sensor.
 
     Parameters
     ----------
@@ -81,11 +81,11 @@ def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool
         Fewer than 10 samples, or no gravity in them.
     """
     if len(gyro_S) < 10:
-        raise BadPhase(f"the still phase holds {len(gyro_S)} samples; at least 10 are needed to measure noise")
+        raise BadPhase(f"the static phase holds {len(gyro_S)} samples; at least 10 are needed to measure noise")
     gravity = float(np.linalg.norm(accel_S, axis=1).mean())
     if not gravity > 0.0:
         raise BadPhase(
-            "the still phase holds no gravity: accel is zero; the filter needs specific force, +g up at rest"
+            "the static phase holds no gravity: accel is zero; the filter needs specific force, +g up at rest"
         )
     half_second_cov, bias_cov = _cov_of_half_seconds(gyro_S, rate_hz), _cov_of_mean(gyro_S, rate_hz)
     if worn:

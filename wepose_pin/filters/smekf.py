@@ -44,7 +44,7 @@ class SmekfParams:
 
     attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
     bias_cov0: float | np.ndarray = 1e-3  # [rad²/s²], a number or (3, 3)
-    bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the still phase's first differences
+    bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the static phase's first differences
     rest_gyro_cov: np.ndarray | None = None  # (3, 3) [rad²/s²] by which gyro at rest is not the bias; None: Σ_ω
     rest_accel_cov: np.ndarray | None = None  # (3, 3) by which accel/g at rest is not the vertical; None: Σ_g
     rest_turn_noise: float = 0.0  # [rad/√s] by which a sensor at rest may turn about the vertical unseen; the paper: 0

@@ -102,11 +102,11 @@ def run_calibrate(
         What the session, the protocol or an option lacks.
     """
     from ..calibration import assess, calibrate_lengths, load_protocol
+    from ..documents import whole_folder
     from ..model import load_model
     from ..readers import load_session
     from ..report import write_calibration_page
     from ..subject import average_subject
-    from ..writers import whole_folder
     from ..writers.calibration import write_calibration
     from ..writers.provenance import collect_provenance
     from ..writers.result import write_subject

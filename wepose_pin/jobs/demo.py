@@ -65,12 +65,13 @@ def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
     from dataclasses import asdict
 
     from ..calibration import calibrate_lengths
+    from ..documents import whole_folder
     from ..evaluation import evaluate
     from ..filters import BEST, METHODS
     from ..report import write_track_pages
     from ..simulation import simulate, simulated_person
     from ..tracking import track
-    from ..writers import whole_folder, write_result, write_session
+    from ..writers import write_result, write_session
     from ..writers.provenance import collect_provenance, write_provenance
     from ..writers.result import as_json, write_subject
 

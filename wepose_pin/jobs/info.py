@@ -59,8 +59,8 @@ def run_info(job: InfoJob, progress: Progress = no_progress) -> InfoOutcome:
     WeposeError
         No such file, or of no kind that is known; a session that exists or cannot be written, or that there is none of.
     """
+    from ..documents import check_file, whole_file
     from ..readers.describe import describe
-    from ..writers.folder import check_file, whole_file
 
     progress("reading", 0.0)
     if not (job.write or job.out):

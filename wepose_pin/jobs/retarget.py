@@ -105,9 +105,10 @@ def run_retarget(
     from dataclasses import replace
 
     from .. import retargeting
+    from ..documents import whole_folder
     from ..report.page import PageWriter
     from ..report.viewer import retarget_html
-    from ..writers import read_result, whole_folder
+    from ..writers import read_result
     from ..writers.provenance import collect_provenance
     from ..writers.result import as_json
 

@@ -104,9 +104,10 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
 
     import numpy as np
 
+    from ..documents import whole_folder
     from ..simulation import simulate, simulated_person
     from ..subject import LENGTHS, mount_rows, subject_toml
-    from ..writers import whole_folder, write_session
+    from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
 
     job.check()

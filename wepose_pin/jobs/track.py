@@ -125,6 +125,7 @@ def run_track(
 
 
 def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, Any]) -> TrackOutcome:
+    from ..documents import whole_folder
     from ..filters import BEST
     from ..model import load_model
     from ..readers import is_live_log, load_session, read_live_log
@@ -132,7 +133,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
     from ..report import write_track_pages
     from ..subject import load_subject, subject_of
     from ..tracking import track
-    from ..writers import whole_folder, write_result
+    from ..writers import write_result
 
     method, causal = job.method or BEST, job.causal
     with whole_folder(job.out, job.force) as folder:
@@ -166,6 +167,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
 
 def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str, Any]) -> TrackOutcome:
     """In a memory that does not grow with the recording."""
+    from ..documents import whole_folder
     from ..filters import BEST
     from ..model import load_model
     from ..readers.session import SessionReader
@@ -174,7 +176,6 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
     from ..report.track import MOST_FRAMES
     from ..subject import load_subject
     from ..tracking import TrackOptions, track_session
-    from ..writers import whole_folder
     from ..writers.chunks import ChunkWriter
 
     with whole_folder(job.out, job.force) as folder:

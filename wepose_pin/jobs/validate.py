@@ -66,12 +66,12 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
     """
     import json
 
+    from ..documents import whole_folder
     from ..errors import reason
     from ..report.page import page_incomplete
     from ..validation import Skipped, document_text, experiments, read_document, run
     from ..validation.document import as_document
     from ..validation.page import write_pages
-    from ..writers import whole_folder
     from ..writers.result import versions
 
     job.check()

@@ -50,9 +50,9 @@ def run_view(job: ViewJob, progress: Progress = no_progress) -> ViewOutcome:
     """
     import webbrowser
 
+    from ..documents import check_file, whole_file
     from ..report.viewer import pose_html
     from ..writers import read_result
-    from ..writers.folder import check_file, whole_file
 
     page = job.out or job.result / "view.html"
     if not (job.result / "pose.parquet").is_file():

@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import BadSession, one_of
-from ..readers.keys import read_toml
-from ..readers.stated import joints_stated, phases_stated, sensor_stated, session_keys
+from ..readers.stated import joints_stated, phases_stated, read_session_file, sensor_stated
 from ..recording import SEGMENTS, START_POSES, Intervals, Recording
 from ..subject import Subject, subject_of, subject_toml
 
@@ -25,7 +23,7 @@ class SensorSetup:
     subject : lengths and calibrated mounts; None: the average person and stated mounts
     subject_text : the ``subject.toml`` it was read from, if any
     mounts : segment → stated `quat_LS` (4,) xyzw
-    phases : of a replay: `start` and `still` [s], else the start pose is found
+    phases : of a replay: `start` and `static` [s], else the start pose is found
     """
 
     name: str = "live"
@@ -79,24 +77,17 @@ def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "
     MissingFile, BadSession
         Not there, or a key in it that no session has.
     """
-    path = path / "session.toml" if path.is_dir() else path
-    top = session_keys(read_toml(path, "a session file"), path)
+    top = read_session_file(path)
     phases_stated(top.table("phases", {}))
-    tables = top.table("sensors")
-    mounts = {}
-    for segment in tables.values:
-        if segment not in SEGMENTS:
-            raise BadSession(f"{path}: sensors.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
-        mount = sensor_stated(tables.table(segment)).mount
-        if mount is not None:
-            mounts[segment] = mount
+    sensors = top.table("sensors").tables(SEGMENTS, "segment")
+    stated = {segment: sensor_stated(table).mount for segment, table in sensors.items()}
     start_pose = top.choice("start_pose", START_POSES, "n_pose")
     joints_stated(top, start_pose)
     return SensorSetup(
-        top.text("name", None) or path.absolute().parent.name,
+        top.text("name", None) or Path(top.file).absolute().parent.name,
         subject,
         subject_text,
-        mounts,
+        {segment: mount for segment, mount in stated.items() if mount is not None},
         start_pose=start_pose,
         remounted=top.flag("remounted"),
     )

@@ -7,7 +7,7 @@ that follows, and every reader of the URDF that comes out, finds the segments wi
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -17,10 +17,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..assets import asset
-from ..errors import BadModel, MissingFile, one_of
-from ..readers.device import segment_of
-from ..readers.keys import is_number, parsed_toml
-from ..recording import AXES, SEGMENTS, mount_from_axes
+from ..documents import TomlTable, is_number, read_toml
+from ..errors import BadModel, one_of
+from ..recording import SEGMENTS, mount_from_axes
+from ..recording.segments import segment_of
+from ..recording.sensors import read_axes
 from .tree import Tree, tree_of
 
 # A point is the origin of a link; the link is moved by the joint at that point.
@@ -88,36 +89,27 @@ def table_from(values: Mapping[str, Any], where: str) -> LinkTable:
     BadModel
         A key, a segment, a point or an axis that is not known, or a value of the wrong kind.
     """
-    _known(values, ("segments", "points", "up", "forward", "root"), where)
-    for key in ("segments", "points"):
-        if not isinstance(values.get(key, {}), Mapping):
-            raise BadModel(f"{where}: {key} = {values[key]!r}; a table of name = link is wanted")
+    top = TomlTable(values, where, error=BadModel)
+    top.allow("segments", "points", "up", "forward", "root")
     segments, points = {}, {}
-    for name, value in values.get("segments", {}).items():
-        at = f"{where}: segments.{name}"
-        if name not in SEGMENTS:
-            raise BadModel(f"{at}: no such segment; {one_of(SEGMENTS, name)}")
-        entry = _entry(value, ("link", "up", "forward"), at)
+    for name, entry in _entries(top, "segments", SEGMENTS).items():
+        entry.allow("link", "up", "forward")
         if ("up" in entry) != ("forward" in entry):
-            raise BadModel(f'{at}: up and forward go together, as in up = "+z", forward = "+x"')
-        if "up" in entry:
-            _axes(entry["up"], entry["forward"], at)
-        segments[name] = SegmentLink(**entry)
-    for name, value in values.get("points", {}).items():
-        at = f"{where}: points.{name}"
-        if name not in POINTS:
-            raise BadModel(f"{at}: no such point; {one_of(POINTS, name)}")
-        entry = _entry(value, ("link", "at"), at)
-        place = entry.get("at", (0.0, 0.0, 0.0))
-        if not (isinstance(place, list | tuple) and len(place) == 3 and all(is_number(v, 1e3) for v in place)):
-            raise BadModel(f"{at}: at = {place!r}; three numbers [m] in the link are wanted")
-        points[name] = PointLink(entry["link"], (float(place[0]), float(place[1]), float(place[2])))
-    up, forward, root = values.get("up", "+z"), values.get("forward", "+x"), values.get("root") or ()
-    _axes(up, forward, where)
-    root = (root,) if isinstance(root, str) else tuple(root)
-    if not all(isinstance(link, str) for link in root):
+            raise BadModel(f'{entry.where}: up and forward go together, as in up = "+z", forward = "+x"')
+        up, forward = read_axes(entry) if "up" in entry else (None, None)
+        segments[name] = SegmentLink(entry.values["link"], up, forward)
+    for name, entry in _entries(top, "points", POINTS).items():
+        entry.allow("link", "at")
+        at = entry.values.get("at", (0.0, 0.0, 0.0))
+        if not (isinstance(at, list | tuple) and len(at) == 3 and all(is_number(v, 1e3) for v in at)):
+            raise BadModel(f"{entry.at('at')} = {at!r}; three numbers [m] in the link are wanted")
+        points[name] = PointLink(entry.values["link"], (float(at[0]), float(at[1]), float(at[2])))
+    up, forward = read_axes(top, "+z", "+x")
+    root = values.get("root") or ()
+    root = (root,) if isinstance(root, str) else root
+    if not isinstance(root, list | tuple) or not all(isinstance(link, str) for link in root):
         raise BadModel(f"{where}: root = {root!r}; the name of a link is wanted, or a list of names")
-    return LinkTable(segments, points, up, forward, root, where)
+    return LinkTable(segments, points, up, forward, tuple(root), where)
 
 
 def read_table(path: Path) -> tuple[LinkTable, Path | None]:
@@ -128,12 +120,7 @@ def read_table(path: Path) -> tuple[LinkTable, Path | None]:
     MissingFile, BadModel
         Not there; no TOML; not a table.
     """
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file; a table of links is wanted here")
-    try:
-        values = parsed_toml(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise BadModel(f"{path}: is no TOML: {error}") from error
+    values = read_toml(path, "a table of links", BadModel)
     urdf = values.pop("urdf", None)
     if urdf is not None and not isinstance(urdf, str):
         raise BadModel(f"{path}: urdf = {urdf!r}; the name of a file is wanted")
@@ -160,29 +147,17 @@ def find_table(urdf: Path, links: Iterable[str]) -> LinkTable | None:
     return None
 
 
-def _known(values: Mapping[str, Any], keys: Iterable[str], where: str) -> None:
-    for key in values:
-        if key not in keys:
-            raise BadModel(f"{where}: unknown key '{key}'; {one_of(keys, key)}")
-
-
-def _entry(value: Any, keys: tuple[str, ...], at: str) -> dict[str, Any]:
-    if isinstance(value, str):
-        return {"link": value}
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        value = {key: part for key, part in value._asdict().items() if part is not None}
-    if not isinstance(value, Mapping) or not isinstance(value.get("link"), str):
-        raise BadModel(f'{at} = {value!r}; a link\'s name is wanted, or {{ link = "name", {keys[1]} = … }}')
-    _known(value, keys, at)
-    return dict(value)
-
-
-def _axes(up: Any, forward: Any, at: str) -> None:
-    for key, axis in (("up", up), ("forward", forward)):
-        if not isinstance(axis, str) or axis not in AXES:
-            raise BadModel(f"{at}: {key} = {axis!r}; {one_of(AXES)}")
-    if abs(AXES[up] @ AXES[forward]) > 0.5:
-        raise BadModel(f"{at}: forward = '{forward}' is parallel to up = '{up}'; name two different axes")
+def _entries(top: TomlTable, key: str, names: Collection[str]) -> dict[str, TomlTable]:
+    """Segment or point → the table that names its link; a link's name stands for a table of that alone."""
+    entries = top.table(key, {})
+    found = {}
+    for name, value in entries.values.items():
+        if isinstance(value, SegmentLink | PointLink):
+            value = {part: own for part, own in value._asdict().items() if own is not None}
+        found[name] = {"link": value} if isinstance(value, str) else value
+        if not isinstance(found[name], Mapping) or not isinstance(found[name].get("link"), str):
+            raise BadModel(f'{entries.at(name)} = {value!r}; a link\'s name is wanted, or {{ link = "name", … }}')
+    return replace(entries, values=found).tables(names, key.removesuffix("s"))
 
 
 # Naming -----------------------------------------------------------------------------------------------------------

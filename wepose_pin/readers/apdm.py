@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import BadData, one_of
-from .device import Device, Text, first_lines, parsed_rows, segment_of, table_of
+from ..recording.segments import segment_of
+from .device import Device, Text, first_lines, parsed_rows, table_of
 
 US = 1e-6
 # What is measured → the signal, and its axes in the file.

@@ -6,14 +6,14 @@ import contextlib
 import json
 import os
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import BadData, MissingFile, WeposeError, one_of
+from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
+from ..errors import BadData, MissingFile, WeposeError, WrongUnit, one_of
 from ..recording import AXES, CONFIGURATION, SEGMENTS, ImuSensor, OrientationSensor, Recording, format_time, span_text
 from ..recording.clocks import TIME_UNITS, time_unit_of
 from ..recording.gaps import runs
@@ -23,16 +23,15 @@ from .arrays import ArrayFile, is_array_file
 from .device import Device
 from .formats import TITLES, format_of, read_device
 from .guess import Guess, guess_arrays, guess_columns
-from .keys import is_number, parsed_toml, read_toml
 from .live_log import read_live_log
 from .session import SessionReader
 from .tables import FORMATS as TABLES
 from .tables import Rows, columns, read_table
 
-# A sensor rests where over `BLOCK_S` its rate varies by less [rad/s] and its specific force [m/s²]: a person who stands
-# sways below.
-BLOCK_S, REST_GYRO, REST_ACCEL = 0.25, np.deg2rad(3.0), 0.4
-SHORTEST_REST_S = 1.0
+# A sensor is static where over `BLOCK_S` its rate varies by less [rad/s] and its specific force [m/s²]: a person who
+# stands sways below.
+BLOCK_S, STATIC_GYRO, STATIC_ACCEL = 0.25, np.deg2rad(3.0), 0.4
+SHORTEST_STATIC_S = 1.0
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
 # Segments whose sensors' mounts `wepose calibrate` finds.
@@ -171,25 +170,25 @@ def _described(
     for _ in range(3):
         try:
             # All sensors are read, those too of which nobody knows yet where they were worn.
-            values = tomllib.loads("\n".join(["[data]", *head]))
+            values = parse_toml("\n".join(["[data]", *head]))
             values["start_pose"] = CONFIGURATION
-            values["sensors"] = {who: tomllib.loads("\n".join(table)) for who, table in tables.items()}
+            values["sensors"] = {who: parse_toml("\n".join(table)) for who, table in tables.items()}
             reader = SessionReader(folder / "session.toml", gaps=True, values=values)
             recording = reader.recording(0, len(reader.time))
             break
         except WeposeError as error:
             # What is wrong with a unit the reader knows better than any guess from names.
-            fits = re.search(r'data\.(gyro_unit|accel_unit) = ("[^"]+") would fit', str(error))
-            if not fits:
+            if not isinstance(error, WrongUnit):
                 notes.append(f"cannot be read so: {str(error).removeprefix(str(folder / 'session.toml') + ': ')}")
                 break
-            head = [f"{fits[1]} = {fits[2]}" if line.startswith(fits[1]) else line for line in head]
+            fitting = f"{error.key} = {toml_string(error.unit)}"
+            head = [fitting if line.startswith(error.key) else line for line in head]
     if recording is None:
         text = _session_text(path, head, phases, tables, {})
         return Description(f"{path}: {what}", tuple(notes), (), text, "mend what cannot be read")
-    still = rests(recording)
-    comments = {segment: _mount_comment(recording, segment, still) for segment in tables}
-    text = _session_text(path, head, phases or _start_lines(still), tables, comments)
+    static = find_static_intervals(recording)
+    comments = {segment: _mount_comment(recording, segment, static) for segment in tables}
+    text = _session_text(path, head, phases or _start_lines(static), tables, comments)
     facts = (*notes, *_facts(recording))
     return Description(f"{path}: {what}", facts, _rows(recording, labels), text, _then(recording))
 
@@ -210,10 +209,10 @@ def _then(recording: Recording) -> str:
     return f"state the mounts of {', '.join(without)}, then wepose track SESSION -o result"
 
 
-def _start_lines(still: list[tuple[float, float]]) -> list[str]:
-    if still and still[0][1] - still[0][0] >= SHORTEST_REST_S:
-        first, last = still[0]
-        return [f"start = [[{first:.2f}, {last:.2f}]]{CHECK}all sensors rest there; is it the start pose?"]
+def _start_lines(static: list[tuple[float, float]]) -> list[str]:
+    if static and static[0][1] - static[0][0] >= SHORTEST_STATIC_S:
+        first, last = static[0]
+        return [f"start = [[{first:.2f}, {last:.2f}]]{CHECK}all sensors are static there; is it the start pose?"]
     return ["# start = [[0.5, 4.5]]   # name the seconds in which the person stands still in the start pose"]
 
 
@@ -224,7 +223,15 @@ def _session_text(
     tables: Mapping[str, list[str]],
     comments: Mapping[str, list[str]],
 ) -> str:
-    lines = [f"name = {_quoted(path.stem)}", 'start_pose = "n_pose"', "", "[data]", *head, "", "[phases]   # seconds"]
+    lines = [
+        f"name = {toml_string(path.stem)}",
+        'start_pose = "n_pose"',
+        "",
+        "[data]",
+        *head,
+        "",
+        "[phases]   # seconds",
+    ]
     lines += phases
     if set(tables) >= ARMS or not any(name in SEGMENTS for name in tables):
         lines.append(
@@ -253,7 +260,7 @@ def _of_devices(
         tables: dict[str, list[str]] = {}
         for label, segment in device.labels.items():
             where = segment if segment and segment not in tables else f"?{label}"
-            tables[where] = [f"label = {_quoted(label)}"]
+            tables[where] = [f"label = {toml_string(label)}"]
         labels = {segment: str(device_label) for device_label, segment in device.labels.items() if segment}
         unknown = [label for label, segment in device.labels.items() if segment is None]
         notes = [f"segments of these are not known by their names: {', '.join(unknown)}"] if unknown else []
@@ -293,7 +300,7 @@ def _of_live(path: Path) -> tuple[list[str], list[str]]:
     about: dict[str, Any] = {}
     if subject:
         with contextlib.suppress(ValueError):  # of a file that somebody else wrote
-            about = parsed_toml(subject)
+            about = parse_toml(subject)
         calibrated = _texts(about.get("mounts"))
         names |= {who: "calibrated" for who in recording.sensors if who in calibrated}
     mounts = ", ".join(f"{who} {how}" for who, how in names.items())
@@ -384,7 +391,7 @@ def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str]
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     said = guess.time_unit
     fits = said if said is not None and 0.0 < step * TIME_UNITS[said] < LONGEST_STEP_S else time_unit_of(step)
-    line = f"time = {_quoted(name)}"
+    line = f"time = {toml_string(name)}"
     if fits in (None, "s"):
         return [line], []
     by = "its name says" if fits == said else f"it grows by {step:g} from row to row"
@@ -395,38 +402,40 @@ def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str]
 # What a recording holds --------------------------------------------------------------------------------------------
 
 
-def rests(recording: Recording) -> list[tuple[float, float]]:
-    """Intervals [s] of at least `SHORTEST_REST_S` in which all sensors keep still."""
+def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
+    """Intervals [s] of at least `SHORTEST_STATIC_S` in which all sensors are static."""
     size = max(2, round(BLOCK_S * recording.rate_hz))
     blocks = len(recording) // size
-    still = np.ones(blocks, dtype=bool)
+    static = np.ones(blocks, dtype=bool)
     for sensor in recording.sensors.values():
         rate = angular_rate(sensor, recording.rate_hz)[: blocks * size].reshape(blocks, size, 3)
         about = rate - rate.mean(axis=1, keepdims=True) if isinstance(sensor, ImuSensor) else rate
-        still &= np.sqrt((about**2).sum(axis=2).mean(axis=1)) < REST_GYRO
+        static &= np.sqrt((about**2).sum(axis=2).mean(axis=1)) < STATIC_GYRO
         # A bias is below the rate of whoever turns evenly.
-        still &= np.linalg.norm(rate.mean(axis=1), axis=1) < 3.0 * REST_GYRO
+        static &= np.linalg.norm(rate.mean(axis=1), axis=1) < 3.0 * STATIC_GYRO
         if isinstance(sensor, ImuSensor):
-            still &= (
-                np.sqrt(sensor.accel_S[: blocks * size].reshape(blocks, size, 3).var(axis=1).sum(axis=1)) < REST_ACCEL
+            static &= (
+                np.sqrt(sensor.accel_S[: blocks * size].reshape(blocks, size, 3).var(axis=1).sum(axis=1)) < STATIC_ACCEL
             )
         if sensor.gap is not None:
-            still &= ~sensor.gap[: blocks * size].reshape(blocks, size).any(axis=1)
-    spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in runs(still)]
-    return [(first, last) for first, last in spans if last - first >= SHORTEST_REST_S - BLOCK_S]
+            static &= ~sensor.gap[: blocks * size].reshape(blocks, size).any(axis=1)
+    spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in runs(static)]
+    return [(first, last) for first, last in spans if last - first >= SHORTEST_STATIC_S - BLOCK_S]
 
 
-def _mount_comment(recording: Recording, segment: str, still: list[tuple[float, float]]) -> list[str]:
+def _mount_comment(recording: Recording, segment: str, static: list[tuple[float, float]]) -> list[str]:
     """A mount to be filled in; which axis is up, gravity says."""
     sensor = recording.sensors.get(segment)
     if sensor is None or sensor.aligned:
         return []
     up = "+x"
     if isinstance(sensor, ImuSensor):
-        rest = sensor.accel_S[recording.span(still[0])] if still else sensor.accel_S[: max(1, round(recording.rate_hz))]
-        up = max(AXES, key=lambda axis: float(AXES[axis] @ rest.mean(axis=0)))
+        force = (
+            sensor.accel_S[recording.span(static[0])] if static else sensor.accel_S[: max(1, round(recording.rate_hz))]
+        )
+        up = max(AXES, key=lambda axis: float(AXES[axis] @ force.mean(axis=0)))
     forward = "-z" if up[1] != "z" else "+x"
-    said = f"up as gravity says {'at rest' if still else 'in the first second'}; which axis is forward?"
+    said = f"up as gravity says {'where it is static' if static else 'in the first second'}; which axis is forward?"
     if isinstance(sensor, OrientationSensor):
         said = "which sensor axis is up, which forward, in the start pose? none: the segment's own orientation"
     return [f'# mount = {{ up = "{up}", forward = "{forward}" }}   # {said}']
@@ -435,9 +444,9 @@ def _mount_comment(recording: Recording, segment: str, still: list[tuple[float, 
 def _facts(recording: Recording) -> tuple[str, ...]:
     first, last = float(recording.time[0]), float(recording.time[-1])
     facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {span_text((first, last))}"]
-    still = rests(recording)
-    listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in still[:8]) + (" …" if len(still) > 8 else "")
-    facts.append(f"all sensors at rest [s]: {listed}" if still else "never are all sensors at rest for a second")
+    static = find_static_intervals(recording)
+    listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in static[:8]) + (" …" if len(static) > 8 else "")
+    facts.append(f"all sensors static [s]: {listed}" if static else "all sensors are never static for a second")
     for name, spans in recording.phases.items():
         listed = ", ".join(f"{format_time(a)} to {format_time(b)}" for a, b in spans)
         facts.append(f"phase {name} [s]: {listed or 'none'}")
@@ -466,12 +475,8 @@ def _rows(recording: Recording, labels: Mapping[str, str]) -> tuple[tuple[str, .
 
 
 def _relative(path: Path, folder: Path) -> str:
-    return _quoted(Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix())
+    return toml_string(Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix())
 
 
 def _listed(names: list[str]) -> str:
-    return _quoted(names[0]) if len(names) == 1 else f"[{', '.join(_quoted(name) for name in names)}]"
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
+    return toml_string(names[0]) if len(names) == 1 else toml_strings(names)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,18 +17,6 @@ from .tables import NO_VALUE, columns
 PREAMBLE_LINES = 100
 SEPARATORS = "\t,; "
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
-
-# Words that name a segment in a label or a file's name, after its side.
-PARTS = (
-    ("forearm", r"fore ?arm|lower ?arm|ulna|radius|wrist"),
-    ("upper_arm", r"upper ?arm|humerus|biceps|brachium"),
-    ("hand", r"hand|palm"),
-)
-MIDDLE = (
-    ("torso", r"torso|trunk|chest|sternum|stern|thorax|t ?8"),
-    ("pelvis", r"pelvis|sacrum"),
-    ("head", r"head|forehead"),
-)
 
 
 @dataclass(frozen=True)
@@ -83,15 +70,6 @@ def must_be_measured(path: Path, values: np.ndarray, what: str) -> None:
     if huge.size:
         found = np.nanmax(np.abs(values[huge[0]]))
         raise BadData(f"{path}: {what} holds {found:.3g} in row {huge[0] + 1}; no device measures as much")
-
-
-def segment_of(label: str) -> str | None:
-    """The segment that a label or a file's name speaks of, as ``humerus_r_imu`` or ``LeftForeArm``; None if unclear."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+|(?<=[a-z])(?=\d)", " ", label).lower()
-    sides = {side for side in ("left", "right") if re.search(rf"\b({side}|{side[0]})(?=\b|hand|fore|upper)", words)}
-    found = {f"{side}_{part}" for part, pattern in PARTS if re.search(pattern, words) for side in sides}
-    found |= {part for part, pattern in MIDDLE if re.search(rf"\b({pattern})\b", words)}
-    return found.pop() if len(found) == 1 else None
 
 
 def first_lines(path: Path, most: int = PREAMBLE_LINES) -> list[str]:

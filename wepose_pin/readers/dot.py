@@ -16,7 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData
-from .device import Device, Text, counted_time, read_text, segment_of, table_of, unwrapped
+from ..recording.segments import segment_of
+from .device import Device, Text, counted_time, read_text, table_of, unwrapped
 from .mt_manager import RAW, orientation
 
 FINE_S, WRAPS = 1e-6, 2.0**32

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from .device import segment_of
+from ..recording.segments import segment_of
 
 AXIS = re.compile(r"(?P<stem>.*?)[ _.\-\[(]*(?P<axis>[xyzw0-3])[\])]?\s*(?P<unit>[\[(].*[\])])?", re.IGNORECASE)
 # What is measured, in the order in which the words are looked for; (?![a-z]) for names such as gx, ax.

@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..documents import TomlTable, is_number
 from ..errors import BadData, MissingFile
 from ..recording import SEGMENTS, ImuSensor, Recording, check
 from ..recording.arrivals import Aligner, Arrivals, Ticks
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
 from .device import Device, table_of
-from .keys import Keys, is_number
 from .stated import phases_stated
 
 MAGIC = b"WEPOSE-LIVE-1\n"
@@ -188,7 +188,7 @@ def _header(path: Path, payload: bytes) -> dict[str, Any]:
         raise BadData(f"{path}: its header lacks name, start_pose, remounted or method; the file is damaged")
     if not (isinstance(mounts, dict) and all(_is_quat(mount) for mount in mounts.values())):
         raise BadData(f"{path}: mounts = {mounts!r} in its header; a unit quaternion x, y, z, w each is needed")
-    phases_stated(Keys(phases if isinstance(phases, dict) else {"phases": phases}, str(path), "phases."))
+    phases_stated(TomlTable(phases if isinstance(phases, dict) else {"phases": phases}, str(path), "phases."))
     return {"subject": None, **header}
 
 

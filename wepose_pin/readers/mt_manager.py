@@ -17,7 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData
-from .device import Device, Text, counted_time, read_text, segment_of, table_of, unwrapped
+from ..recording.segments import segment_of
+from .device import Device, Text, counted_time, read_text, table_of, unwrapped
 
 COUNTER_WRAPS = 65536.0
 FINE_S, FINE_WRAPS = 1e-4, 2.0**32

@@ -16,7 +16,8 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData
-from .device import Device, first_lines, must_be_measured, segment_of, table_of
+from ..recording.segments import segment_of
+from .device import Device, first_lines, must_be_measured, table_of
 from .tables import columns
 
 # The header line of our own files. OpenSim takes it for a remark.

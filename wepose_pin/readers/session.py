@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, one_of, printable
+from ..documents import TomlTable, is_number, read_toml
+from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, printable
 from ..recording import (
     CONFIGURATION,
     SEGMENTS,
@@ -33,13 +34,13 @@ from ..recording.resampling import on_time
 from .arrays import ArrayFile, is_array_file
 from .device import Device
 from .formats import FORMATS, USES, format_of, read_device
-from .keys import Keys, is_number, read_toml
 from .stated import (
     WIDTHS,
     Stated,
     joints_stated,
     label_stated,
     phases_stated,
+    read_session_file,
     sensor_stated,
     session_keys,
     truth_stated,
@@ -154,15 +155,14 @@ class SessionReader:
         path = Path(path)
         self.path = path / "session.toml" if path.is_dir() else path
         self.gaps = gaps
-        top = session_keys(read_toml(self.path, "a session file") if values is None else values, self.path)
+        top = read_session_file(self.path) if values is None else session_keys(values, self.path)
         data, sensors = top.table("data"), top.table("sensors", {})
         data.allow(*_FOR_SENSORS, "truth")
         self._used: set[str] = set()  # which of `_FOR_SENSORS` some sensor had a use for
         start_pose = top.choice("start_pose", (*START_POSES, CONFIGURATION), "n_pose")
-        for segment in sensors.values:
-            if segment not in SEGMENTS and start_pose != CONFIGURATION:  # else links, of a model that is not known here
-                raise BadSession(f"{self.path}: sensors.{segment} is not a segment; {one_of(SEGMENTS, segment)}")
-        if not sensors.values:
+        # Of a chain sensors are named by links, of a model that is not known here.
+        tables = sensors.tables(sensors.values if start_pose == CONFIGURATION else SEGMENTS, "segment")
+        if not tables:
             raise BadSession(
                 f"{self.path}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}"
             )
@@ -178,7 +178,7 @@ class SessionReader:
             source=self.path,
             truth=truth_stated(self.path, data),
         )
-        stated = {segment: sensor_stated(sensors.table(segment)) for segment in sensors.values}
+        stated = {segment: sensor_stated(table) for segment, table in tables.items()}
         self._units: Mapping[str, float] = SI
         if any(said.signals is not None for said in stated.values()):
             raw = any("gyro" in (said.signals or ()) for said in stated.values())
@@ -195,9 +195,9 @@ class SessionReader:
         self._device_rates: dict[Path, float | None] = {}
         for segment, said in stated.items():
             if said.signals is None:
-                self._read_device(sensors.table(segment), data)
+                self._read_device(tables[segment], data)
         self._on_one_clock()
-        self._plans = {segment: self._plan(sensors.table(segment), data, said) for segment, said in stated.items()}
+        self._plans = {segment: self._plan(tables[segment], data, said) for segment, said in stated.items()}
         unused = [key for key in _FOR_SENSORS if key in data and key not in self._used]
         if unused:
             raise BadSession(f"{data.at(unused[0])}: {_useless(unused[0])}; leave it out")
@@ -229,7 +229,7 @@ class SessionReader:
                         f"of sensors.{other}; each sensor has columns of its own"
                     )
 
-    def _file(self, keys: Keys, data: Keys) -> Path:
+    def _file(self, keys: TomlTable, data: TomlTable) -> Path:
         file = (keys if "file" in keys else data).text("file", None)
         if file is None:
             raise BadSession(f"{data.at('file')} is missing; the .csv or .parquet file beside {self.path}")
@@ -237,7 +237,7 @@ class SessionReader:
             self._used.add("file")
         return self.path.parent / file
 
-    def _read_device(self, keys: Keys, data: Keys) -> None:
+    def _read_device(self, keys: TomlTable, data: TomlTable) -> None:
         """A file whose format says where its values stand."""
         path = self._file(keys, data)
         own = keys if "format" in keys else data
@@ -279,7 +279,7 @@ class SessionReader:
                 table = table.with_columns(time=time - np.nanmin(time) + (first[path] - origin))
             self._tables[str(path)] = table
 
-    def _plan(self, keys: Keys, data: Keys, stated: Stated) -> _Plan:
+    def _plan(self, keys: TomlTable, data: TomlTable, stated: Stated) -> _Plan:
         path, segment = self._file(keys, data), keys.place.removeprefix("sensors.")[:-1]
         device = self.devices.get(path) if stated.signals is None else None
         # A file of its own has a clock of its own beside that of [data], or where [data] names no file that of all.
@@ -348,7 +348,7 @@ class SessionReader:
         return _Plan(place, path, which, signals, units, self._clocks[key], mount, aligned)
 
     def _arrays(
-        self, keys: Keys, path: Path, signals: Mapping[str, list[str]], time: str | None, own: Keys
+        self, keys: TomlTable, path: Path, signals: Mapping[str, list[str]], time: str | None, own: TomlTable
     ) -> tuple[pl.DataFrame, Mapping[str, list[str]]]:
         """The columns of an HDF5 or MATLAB file that a sensor and its clock need, and their names by signal."""
         if path not in self._array_files:

@@ -8,13 +8,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadPhase, BadSession, MissingFile, one_of
-from ..recording import AXES, CONFIGURATION, Intervals, mount_from_axes
+from ..recording import CONFIGURATION, Intervals, mount_from_axes
+from ..recording.sensors import read_axes
 from .device import Device
-from .keys import Keys, is_number
 
+# Endings of files that hold the data themselves.
+DATA = (".csv", ".parquet", ".txt", ".mat", ".h5", ".hdf5", ".mvnx", ".sto", ".wepose")
 SESSION_KEYS = ("name", "start_pose", "remounted", "data", "phases", "sensors", "joints")
 # Of earlier versions: what to write in their place.
+_RENAMED_PHASES = {
+    "still": "is called static now: write static = [[from, to]], seconds in which the sensors lie on a table"
+}
 _RENAMED = {"strapping": 'is called remounted now: write remounted = true where it was "new", else leave it out'}
 WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
 
@@ -27,14 +33,31 @@ class Stated(NamedTuple):
     aligned: bool | None
 
 
-def session_keys(values: Mapping[str, Any], path: Path) -> Keys:
-    """The keys of a session file, all of which are known."""
-    keys = Keys(values, str(path))
+def read_session_file(path: Path) -> TomlTable:
+    """The contents of a session file, or of the one in a folder.
+
+    Raises
+    ------
+    MissingFile, BadSession
+        Not there; no TOML, or data themselves; a key in it that no session has.
+    """
+    path = path / "session.toml" if path.is_dir() else path
+    if path.suffix.lower() in DATA:
+        raise BadSession(
+            f"{path}: is a table of data by its name; a session file is wanted here, which names the table (`wepose "
+            f"info {path.name} --write` writes one)"
+        )
+    return session_keys(read_toml(path, "a session file"), path)
+
+
+def session_keys(values: Mapping[str, Any], path: Path) -> TomlTable:
+    """What a session file holds, with keys that are all known."""
+    keys = TomlTable(values, str(path))
     keys.allow(*SESSION_KEYS, renamed=_RENAMED)
     return keys
 
 
-def sensor_stated(keys: Keys) -> Stated:
+def sensor_stated(keys: TomlTable) -> Stated:
     """Columns by signal, the mount, and whether the orientations are the segment's own."""
     keys.allow(
         *("gyro", "accel", "orientation", "mount", "file", "time", "time_unit", "rate_hz", "offset_s"),
@@ -57,13 +80,13 @@ def sensor_stated(keys: Keys) -> Stated:
     return Stated({"orientation": _names(keys, "orientation")}, mount, aligned)
 
 
-def _names(keys: Keys, signal: str) -> list[str]:
+def _names(keys: TomlTable, signal: str) -> list[str]:
     """The columns of a signal, or the one array that holds them all."""
     value = keys.values.get(signal)
     return [value] if isinstance(value, str) and value else keys.names(signal, WIDTHS[signal])
 
 
-def label_stated(keys: Keys, device: Device, segment: str, path: Path) -> str:
+def label_stated(keys: TomlTable, device: Device, segment: str, path: Path) -> str:
     """Which of the file's sensors is strapped to the segment: as stated, the only one, or the one that is named so."""
     label = keys.text("label", None)
     if label is not None:
@@ -76,17 +99,13 @@ def label_stated(keys: Keys, device: Device, segment: str, path: Path) -> str:
     return fitting[0]
 
 
-def _mount(keys: Keys) -> np.ndarray:
+def _mount(keys: TomlTable) -> np.ndarray:
     keys.allow("up", "forward")
-    up, forward = keys.choice("up", AXES), keys.choice("forward", AXES)
-    if abs(AXES[up] @ AXES[forward]) > 0.5:
-        raise BadSession(
-            f"{keys.at('forward')} = '{forward}' is parallel to up = '{up}'; name two different sensor axes"
-        )
-    return mount_from_axes(up, forward)
+    return mount_from_axes(*read_axes(keys))
 
 
-def phases_stated(keys: Keys) -> dict[str, Intervals]:
+def phases_stated(keys: TomlTable) -> dict[str, Intervals]:
+    keys.allow(*keys.values, renamed=_RENAMED_PHASES)
     phases: dict[str, Intervals] = {}
     for name, value in keys.values.items():
         well = isinstance(value, list) and all(
@@ -101,7 +120,7 @@ def phases_stated(keys: Keys) -> dict[str, Intervals]:
     return phases
 
 
-def joints_stated(top: Keys, start_pose: str) -> dict[str, float]:
+def joints_stated(top: TomlTable, start_pose: str) -> dict[str, float]:
     """Values of joints in the start pose of a chain that is not a person's arms."""
     if "joints" in top and start_pose != CONFIGURATION:
         raise BadSession(
@@ -113,7 +132,7 @@ def joints_stated(top: Keys, start_pose: str) -> dict[str, float]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def truth_stated(path: Path, data: Keys) -> Path | None:
+def truth_stated(path: Path, data: TomlTable) -> Path | None:
     name = data.text("truth", None)
     if name is None:
         return None

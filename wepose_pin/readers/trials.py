@@ -32,7 +32,7 @@ class Trial(NamedTuple):
     gyro_S: np.ndarray  # (n, 3) [rad/s]
     accel_S: np.ndarray  # (n, 3) [m/s²]
     quat_true: np.ndarray  # (n, 4) xyzw, sensor to the truth's world; NaN where it was not seen
-    still: slice  # samples at rest before the motion
+    static: slice  # samples before the motion, in which the sensor is static
     scored: np.ndarray  # (n,) bool, samples that count and have a truth
 
 
@@ -69,7 +69,7 @@ def read_broad(path: Path) -> Trial:
 
 
 def read_authors_trial(path: Path) -> Trial:
-    """The paper authors' trial ``prova_HR.txt``: 1 kHz, still for a second, then moved before Vicon.
+    """The paper authors' trial ``prova_HR.txt``: 1 kHz, static for a second, then moved before Vicon.
 
     Columns: time [1e-4 s], gyro [rad/s], accel [m/s²], 3 empty, 4 unused, Vicon quaternion x y z w (zeros before it
     begins), Vicon position [mm].
@@ -102,7 +102,7 @@ class Referenced(NamedTuple):
     accel_S: np.ndarray  # (n, 3) [m/s²]
     time: np.ndarray  # (m,) [s], the reference's clock
     quat_VB: np.ndarray  # (m, 4) xyzw, body to the reference's world V, whose z is up but for a tilt; NaN: not seen
-    still: slice  # samples at rest before the motion; empty where there are none
+    static: slice  # samples before the motion, in which the sensor is static; empty where there are none
 
 
 class Chain(NamedTuple):
@@ -259,8 +259,8 @@ def _complete(samples: np.ndarray, path: Path) -> np.ndarray:
 def read_ur5(files: Ur5Files) -> Referenced:
     """An IMU on a UR5 arm, and the encoders' orientations of the link that carries it.
 
-    Line k of the one was taken with line k of the other, 125 times a second. The still phase ends 0.1 s before the body
-    has turned by 0.3 deg (the encoders' own jitter is a tenth of that).
+    Line k of the one was taken with line k of the other, 125 times a second. The static phase ends 0.1 s before the
+    body has turned by 0.3 deg (the encoders' own jitter is a tenth of that).
 
     Raises
     ------
@@ -283,5 +283,5 @@ def read_ur5(files: Ur5Files) -> Referenced:
     rate_hz = 1.0 / float(np.median(steps))
     R_VB = Rotation.from_quat(quat_VB)
     turned = np.flatnonzero((R_VB[0].inv() * R_VB).magnitude() > np.deg2rad(0.3))
-    still = slice(0, max(0, int(turned[0]) - round(0.1 * rate_hz)) if len(turned) else len(time))
-    return Referenced(f"{recording} {sensor}", rate_hz, gyro, accel, time - time[0], quat_VB, still)
+    static = slice(0, max(0, int(turned[0]) - round(0.1 * rate_hz)) if len(turned) else len(time))
+    return Referenced(f"{recording} {sensor}", rate_hz, gyro, accel, time - time[0], quat_VB, static)

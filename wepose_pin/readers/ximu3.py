@@ -14,7 +14,8 @@ import numpy as np
 
 from ..errors import BadData, MissingFile
 from ..recording.limits import STANDARD_GRAVITY
-from .device import Device, Text, first_lines, read_text, segment_of, table_of
+from ..recording.segments import segment_of
+from .device import Device, Text, first_lines, read_text, table_of
 
 INERTIAL, QUATERNION = "Inertial.csv", "Quaternion.csv"
 TIMES = {"Timestamp (us)": 1e-6, "Time (s)": 1.0}

@@ -7,7 +7,8 @@ sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a f
 
 from .intervals import Intervals, check_phases, check_time, format_time, span_text
 from .recording import CONFIGURATION, EACH_TIME, START_POSES, Recording, check, join
-from .sensors import AXES, SEGMENTS, ImuSensor, OrientationSensor, Sensor, axes_from_mount, mount_from_axes
+from .segments import SEGMENTS
+from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, axes_from_mount, mount_from_axes
 
 __all__ = [
     "AXES",

@@ -38,7 +38,7 @@ class Samples(NamedTuple):
     sensor: str  # its segment
     time: np.ndarray  # (m,) [s], all sensors on one clock
     gyro_S: np.ndarray  # (m, 3) [rad/s], the rate over the interval that ends at the sample
-    accel_S: np.ndarray  # (m, 3) [m/s²], specific force, +g up at rest
+    accel_S: np.ndarray  # (m, 3) [m/s²], specific force, +g up of a static sensor
 
 
 class Arrivals(NamedTuple):

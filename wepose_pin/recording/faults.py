@@ -156,7 +156,7 @@ class SensorScan:
             self._long[name].append(run)
 
     def _noise(self, distinct: np.ndarray) -> None:
-        """Count the seconds in which all axes turn back as noise does: at rest, where it does not drown."""
+        """Count the seconds in which all axes turn back as noise does: while it is static, motion being small."""
         if len(distinct) < 2 * FROZEN_SAMPLES:
             return
         usual = max(float(np.median(np.diff(distinct[:, 0]))), 1e-9)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from .clocks import Clock
 
-# In a long gap the rate falls to the sensor's rate at rest within this time [s]: a person's motion goes on no longer.
+# In a long gap the rate falls to the static sensor's rate within this time [s]: a person's motion goes on no longer.
 FADE_S = 0.1
 
 GOOD, BRIDGED, LONG = 0, 1, 2
@@ -37,7 +37,7 @@ def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = 
 
     Where all are lost, as in a piece of a recording, they are zero.
 
-    With `rate` these are angular rates, which in long gaps fall to the rate at rest: the bias, that is.
+    With `rate` these are angular rates, which in long gaps fall to the rate of a static sensor: the bias.
     """
     lost = marks != GOOD
     if not lost.any():
@@ -48,14 +48,14 @@ def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = 
     for k in range(values.shape[1]):
         filled[lost, k] = np.interp(time[lost], time[~lost], values[~lost, k])
     if rate and (marks == LONG).any():
-        rest = _rate_at_rest(values, ~lost, clock)
+        static = _static_rate(values, ~lost, clock)
         for first, last in runs(marks == LONG):
             edges = [edge for edge in (first - 1, last) if 0 <= edge < len(time)]
             near = [np.clip(1.0 - np.abs(time[first:last] - time[edge]) / FADE_S, 0.0, None) for edge in edges]
             whole = np.maximum(1.0, np.sum(near, axis=0))
-            filled[first:last] = rest
+            filled[first:last] = static
             for edge, weight in zip(edges, near, strict=True):
-                filled[first:last] += (weight / whole)[:, None] * (values[edge] - rest)
+                filled[first:last] += (weight / whole)[:, None] * (values[edge] - static)
     return filled
 
 
@@ -85,7 +85,7 @@ def bridge_quat(
     return filled
 
 
-def _rate_at_rest(gyro_S: np.ndarray, good: np.ndarray, clock: Clock) -> np.ndarray:
+def _static_rate(gyro_S: np.ndarray, good: np.ndarray, clock: Clock) -> np.ndarray:
     """Mean rate (3,) of the second in which it varies least; zero where no second is whole."""
     size = max(2, round(1.0 / clock.step))
     blocks = len(gyro_S) // size

@@ -2,7 +2,7 @@
 
 The rules are physics and not habits, so that they hold for any sensor that is strapped on anything:
 
-- at rest an accelerometer shows gravity;
+- a static accelerometer shows gravity;
 - turned by the gyroscope's own rotation, specific force averages to gravity over seconds, as speed stays bounded;
 - a sensor that was tilted has turned at least by as much.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..errors import BadData
+from ..errors import BadData, WrongUnit
 from .gaps import runs
 from .intervals import format_time
 from .limits import (
@@ -46,7 +46,8 @@ PLATEAU = 3  # samples at one value, where an axis seems cut off
 def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True) -> tuple[str, ...]:
     """What the user should know of the values.
 
-    A piece that is not the `whole` knows rest only from stated phases; `units` are checked in the first piece alone.
+    In a piece that is not the `whole` sensors are static only in stated phases; `units` are checked in the first piece
+    alone.
 
     Raises
     ------
@@ -72,36 +73,41 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
 def _gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, whole: bool) -> list[str]:
     name = next((name for name in ("static", "start") if recording.phases.get(name)), "")
     if name:
-        at_rest, when = recording.measured(segment, recording.phases[name][0]), f"in phases.{name}"
+        static, when = recording.measured(segment, recording.phases[name][0]), f"in phases.{name}"
     elif whole:
-        at_rest, when = _quiet_second(recording, sensor), "in its quietest second"
+        static, when = _most_static_second(recording, sensor), "in the second in which it turns most evenly"
     else:
         return []
-    if len(at_rest) < 2:
+    if len(static) < 2:
         return []
-    first, last = (format_time(recording.time[k]) for k in at_rest[[0, -1]])
-    norm = float(np.linalg.norm(sensor.accel_S[at_rest], axis=1).mean())
+    first, last = (format_time(recording.time[k]) for k in static[[0, -1]])
+    norm = float(np.linalg.norm(sensor.accel_S[static], axis=1).mean())
     off = abs(norm / STANDARD_GRAVITY - 1.0)
     found = f"norm {norm:.4g} m/s^2 {when} ({first} to {last} s), where gravity's {STANDARD_GRAVITY:.3g} is expected"
     if off > GRAVITY_ERROR_REFUSED:
-        raise BadData(f"{place}.accel: {found}; {_accel_unit(norm)}")
+        raise _wrong_gravity(f"{place}.accel: {found}", norm)
     return [f"{place.split(': ')[-1]}.accel: {found}: the scale is taken from it"] if off > GRAVITY_ERROR_NOTED else []
 
 
-def _accel_unit(norm: float) -> str:
-    """Which unit makes gravity of a norm that is not."""
-    for factor, unit in ((STANDARD_GRAVITY, '"g"'), (1.0 / STANDARD_GRAVITY, '"m/s^2"')):
+def _wrong_gravity(found: str, norm: float) -> BadData:
+    """The error that names the unit which makes gravity of a norm [m/s²] that is not."""
+    for factor, unit in ((STANDARD_GRAVITY, "g"), (1.0 / STANDARD_GRAVITY, "m/s^2")):
         if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
-            return f"data.accel_unit = {unit} would fit"
+            return WrongUnit(f'{found}; data.accel_unit = "{unit}" would fit', "accel_unit", unit)
+    return BadData(f"{found}; {_no_gravity(norm)}")
+
+
+def _no_gravity(norm: float) -> str:
+    """What may be wrong with a norm [m/s²] that no unit makes gravity."""
     for factor in (1e-3, 1e-3 * STANDARD_GRAVITY):
         if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
             return 'the values look like thousandths of g (mg); divide them by 1000 and state accel_unit = "g"'
     if norm < 0.5:
-        return "gravity seems to have been taken out; specific force is needed, +g up at rest"
-    return "check data.accel_unit and the sensor's calibration, and that it rests there"
+        return "gravity seems to have been taken out; specific force is needed, +g up of a static sensor"
+    return "check data.accel_unit and the sensor's calibration, and that it is static there"
 
 
-def _quiet_second(recording: Recording, sensor: ImuSensor) -> np.ndarray:
+def _most_static_second(recording: Recording, sensor: ImuSensor) -> np.ndarray:
     """Samples of the second, measured as a whole, in which the rate varies least; empty where there is none."""
     n = len(recording)
     size = min(n, max(2, round(recording.rate_hz)))
@@ -132,14 +138,18 @@ def _gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
     tumbles = as_stated < TUMBLES * smaller and smaller > COHERENT
     if tumbles or (as_stated < TUMBLES_FAST * smaller and speed[moving].mean() > FAST):
         peak = float(np.max(np.abs(gyro_S)))
-        raise BadData(
+        raise WrongUnit(
             f"{place}.gyro: with rates up to {peak:.3g} rad/s gravity would tumble, and accel shows that it does not; "
-            f'data.gyro_unit = "deg/s" would fit, or the time or rate_hz is wrong'
+            f'data.gyro_unit = "deg/s" would fit, or the time or rate_hz is wrong',
+            "gyro_unit",
+            "deg/s",
         )
     if as_stated < STIFF * larger and larger > COHERENT:
-        raise BadData(
+        raise WrongUnit(
             f"{place}.gyro: with rates up to {float(np.max(np.abs(gyro_S))):.3g} rad/s the sensor turns too little for "
-            f'what accel shows; data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong'
+            f'what accel shows; data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong',
+            "gyro_unit",
+            "rad/s",
         )
     mean = accel.mean(axis=1)
     norm = np.linalg.norm(mean, axis=1)
@@ -151,10 +161,12 @@ def _gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
     unseen = (tilt > TILTED) & (path[1:] + path[:-1] < UNSEEN * tilt)
     if unseen.any():
         k = int(np.argmax(np.where(unseen, tilt, 0.0)))
-        raise BadData(
+        raise WrongUnit(
             f"{place}.gyro: accel shows a tilt by {np.degrees(tilt[k]):.0f} deg between {k * size / rate_hz:g} and "
             f"{(k + 2) * size / rate_hz:g} s from the beginning, gyro turns by {np.degrees(path[k] + path[k + 1]):.2g} "
-            f'deg; data.gyro_unit = "rad/s" would fit, or the gyroscope does not measure'
+            f'deg; data.gyro_unit = "rad/s" would fit, or the gyroscope does not measure',
+            "gyro_unit",
+            "rad/s",
         )
 
 

@@ -12,7 +12,8 @@ from ..arguments import Positive, check_array, check_fields, check_finite, check
 from ..errors import BadData, BadOption, BadPhase, one_of
 from .intervals import Intervals, check_phases, check_time
 from .limits import MEDIAN_FORCE
-from .sensors import SEGMENTS, ImuSensor, OrientationSensor, Sensor, join_parts
+from .segments import SEGMENTS
+from .sensors import ImuSensor, OrientationSensor, Sensor, join_parts
 
 START_POSES = ("n_pose",)
 CONFIGURATION = "configuration"  # the start pose of any other chain: values of its joints; sensors are named by links
@@ -31,7 +32,7 @@ class Recording:
     ----------
     time : (n,) [s], uniform at `rate_hz` to within the clock's jitter
     sensors : one a segment
-    phases : name → intervals [s] on `time`; `start` is the start pose, `still` sensors at rest
+    phases : name → intervals [s] on `time`; `start` is the start pose, `static` sensors on a table
     remounted : the sensors were strapped on anew since the subject's calibration: its mounts do not hold here
     source : the file it was read from, for messages
     truth : file with the reference, where there is one

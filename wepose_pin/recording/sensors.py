@@ -8,17 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-SEGMENTS = (
-    "torso",
-    "left_upper_arm",
-    "left_forearm",
-    "right_upper_arm",
-    "right_forearm",
-    "pelvis",
-    "head",
-    "left_hand",
-    "right_hand",
-)
+from ..documents import TomlTable
 
 # The sensor axes that a mount can be stated with.
 AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) for k, axis in enumerate("xyz")}
@@ -31,6 +21,14 @@ def mount_from_axes(up: str, forward: str) -> np.ndarray:
     """
     up_S, forward_S = AXES[up], AXES[forward]
     return Rotation.from_matrix([forward_S, np.cross(up_S, forward_S), up_S]).as_quat()
+
+
+def read_axes(table: TomlTable, up: str | None = None, forward: str | None = None) -> tuple[str, str]:
+    """The two axis names in a table with the keys `up` and `forward`; defaults for what is missing."""
+    up, forward = table.choice("up", AXES, up), table.choice("forward", AXES, forward)
+    if abs(AXES[up] @ AXES[forward]) > 0.5:
+        raise table.error(f"{table.at('forward')} = '{forward}' is parallel to up = '{up}'; name two different axes")
+    return up, forward
 
 
 def axes_from_mount(quat_LS: np.ndarray) -> tuple[str, str]:
@@ -47,7 +45,7 @@ class ImuSensor:
     Parameters
     ----------
     gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample
-    accel_S : (n, 3) [m/s²], specific force, +g up at rest
+    accel_S : (n, 3) [m/s²], specific force, +g up of a static sensor
     stated_quat_LS : (4,) xyzw, the mount as the session states it, sensor to segment; None where it says nothing
     gap : (n,) bool, true where samples were lost for longer than is bridged in silence, or the sensor was frozen; None
         where neither can be

@@ -42,7 +42,7 @@ class Signal(NamedTuple):
     cut: np.ndarray  # (n,) bool, an axis is cut off at the end of its range
     gap: np.ndarray  # (n,) bool, bridged over a long gap
     rest: np.ndarray | None  # (n,) bool, still by the filter's test; None for measured orientations
-    gyro_noise: float  # [rad/s], root mean square of an axis in the still phase
+    gyro_noise: float  # [rad/s], root mean square of an axis in the static phase
     accel_noise: float  # [m/s²], the same
     gravity: float  # [m/s²]
     bias: tuple[np.ndarray, np.ndarray] | None  # (3,) [rad/s] at the beginning and at the end

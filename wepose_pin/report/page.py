@@ -14,8 +14,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template, sel
 from markupsafe import Markup, escape
 
 from ..diagnostics import WARNING, Diagnostic, as_json
+from ..documents import whole_file
 from ..errors import WeposeError, reason
-from ..writers.folder import whole_file
 from . import words
 
 PACKAGE = Path(__file__).parent.parent  # templates are named by their path below it

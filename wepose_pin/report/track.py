@@ -143,7 +143,7 @@ def _noise(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
             rows.append([plain(name), _three(begin), _three(end), f"{signal.gravity:.3f} m/s²"])
     if not rows:
         return None
-    header = ["sensor", "bias in the still phase, x / y / z [°/s]", "bias at the end [°/s]", "gravity"]
+    header = ["sensor", "bias in the static phase, x / y / z [°/s]", "bias at the end [°/s]", "gravity"]
     return {"percent": 100 * GRAVITY_OFF, "picture": noise_picture(signals), "sensors": Table(header, rows)}
 
 
@@ -235,7 +235,7 @@ def _run(pose: TrackedRecording) -> dict[str, Any]:
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
         ("filter", pose.options.method if pose.segments.orientation else "none: measured orientations"),
         ("start pose", f"{recording.start_pose.replace('_', '-')}, {intervals([pose.segments.start])}"),
-        ("still phase", intervals([pose.segments.still])),
+        ("static phase", intervals([pose.segments.still])),
         ("person", f"{subject.name}; {subject.note}" if subject.note else subject.name),
         ("lengths", lengths),
         ("mounts", "as the session states them" if stated_mounts(pose) else "as calibrated"),

@@ -72,10 +72,10 @@ def noise_picture(signals: Mapping[str, Signal]) -> Picture:
         panel.markers(begin, at, "circle", "accent hollow")
         panel.markers(end, at, "diamond", "accent")
     panels.append(panel)
-    keys = [Key("bias in the still phase", "accent hollow", "circle"), Key("bias at the end", "accent", "diamond")]
+    keys = [Key("bias in the static phase", "accent hollow", "circle"), Key("bias at the end", "accent", "diamond")]
     caption = (
-        "Noise of one axis in the still phase (a person's sway counts as noise there), and the size of the bias of the "
-        "three axes together: as measured in the still phase, and as the filter knew it at the end."
+        "Noise of one axis in the static phase (a person's sway counts as noise there), and the size of the bias of "
+        "the three axes together: as measured in the static phase, and as the filter knew it at the end."
     )
     return Picture("noise", caption, Chart([panels], [26.0 * len(rows) + 6.0], keys))
 

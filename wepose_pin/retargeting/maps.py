@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..assets import asset
+from ..documents import is_number, read_toml
 from ..errors import BadModel, MissingFile, one_of
-from ..readers.keys import is_number, parsed_toml
 
 ROBOTS = ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1")
 SIDES = ("left", "right")
@@ -117,12 +117,7 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     MissingFile, BadModel
         As `find_map`.
     """
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file; a robot's map is wanted (docs/retargeting.md)")
-    try:
-        table = parsed_toml(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise BadModel(f"{path}: not valid TOML: {error}") from error
+    table = read_toml(path, "a robot's map (docs/retargeting.md)", BadModel)
     where = path.name
     _known(table, _KEYS, where)
     if table.get("format") != 1:

@@ -31,7 +31,7 @@ class SingleSensor:
     accel_S: np.ndarray  # (n, 3) [m/s^2]
     gyro_bias: np.ndarray  # (n, 3) [rad/s], exact
     accel_bias: np.ndarray  # (n, 3) [m/s^2], exact
-    still: list[tuple[float, float]]  # [s], before and after the motion
+    static: list[tuple[float, float]]  # [s], before and after the motion
     moving: tuple[float, float]  # [s]
 
 
@@ -110,7 +110,7 @@ def _record(
         rate_hz=rate_hz,
         quat_WS=motion.orientation(time).as_quat(),
         p_WS=motion.position(time),
-        still=[(0.0, motion.span[0]), (motion.span[1], duration)],
+        static=[(0.0, motion.span[0]), (motion.span[1], duration)],
         moving=motion.span,
         **readings._asdict(),
     )

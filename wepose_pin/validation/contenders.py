@@ -1,7 +1,7 @@
 """The filters as they are compared: ours, those of others, and how each was set.
 
-All start from the same still phase: its bias is removed (but for "default gains"), and where a start can be given it is
-the tilt measured at the beginning. The heading is aligned by the experiments, for all alike.
+All start from the same static phase: its bias is removed (but for "default gains"), and where a start can be given it
+is the tilt measured at the beginning. The heading is aligned by the experiments, for all alike.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DEFAULT_GAINS: dict[str, Any] = {"ncf": NcfParams(0.5, 0.0), "gdc": GdcParams(0.
 class Contender(NamedTuple):
     """A filter with its settings.
 
-    `orient` takes gyro_S (n, 3) [rad/s], accel_S (n, 3) [m/s²], rate_hz and the still phase's noise and gives quat_WS
+    `orient` takes gyro_S (n, 3) [rad/s], accel_S (n, 3) [m/s²], rate_hz and the static phase's noise and gives quat_WS
     (n, 4) xyzw, in a world of its own with z up. `method`: the key of `METHODS` where it is ours with its defaults.
     """
 
@@ -68,7 +68,7 @@ def _set(method: str, params: Any) -> Contender:
 
 
 def _default_gains(method: str, params: Any) -> Contender:
-    """Published gains, and nobody has looked at a still phase: the bias starts at zero."""
+    """Published gains, and nobody has looked at a static phase: the bias starts at zero."""
 
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
         unknown = replace(noise, gyro_bias=np.zeros(3))
@@ -78,7 +78,7 @@ def _default_gains(method: str, params: Any) -> Contender:
 
 
 # Peers with the parameters that their authors recommend. VQF (Laidig and Seel 2023; BROAD is theirs too) is meant to be
-# run with its defaults and estimates the bias itself. The still phase's is removed beforehand all the same, as for the
+# run with its defaults and estimates the bias itself. The static phase's is removed beforehand all the same, as for the
 # others: that never costs it more than 0.002 deg, and in a minute at 100 Hz it helps.
 def _vqf(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
     gyro, accel = np.ascontiguousarray(gyro_S - noise.gyro_bias), np.ascontiguousarray(accel_S, dtype=float)
@@ -92,7 +92,7 @@ def _offline_vqf(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise:
 
 
 # x-io's Fusion (chapter 7 of Madgwick's thesis) as its README and examples have it: gain 0.5, accelerations beyond
-# 10 deg rejected for up to 5 s, its `Bias` in front, here from the still phase's bias on. All others were measured to
+# 10 deg rejected for up to 5 s, its `Bias` in front, here from the static phase's bias on. All others were measured to
 # be worse (its bare defaults, which reject nothing; `Bias` from zero) or the same to 0.1 deg (the bias removed once).
 def _imufusion(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
     fusion = import_module("imufusion")

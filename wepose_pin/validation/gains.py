@@ -2,7 +2,7 @@
 
 Each setting has its own grid search, so that no filter runs with gains of another kind of motion. The score is the mean
 over trials of the total RMSE over the motion, heading aligned at rest, which is also what the experiments report; bias
-and noise are the still phase's, the start is the tilt measured there. `STATED` holds what the search found (a test and
+and noise are the static phase's, the start is the tilt measured there. `STATED` holds what the search found (a test and
 the experiment "gains" repeat it); of BROAD each half is run with the gains found on the other, and other recordings
 with those found on all of it. The drift experiment runs with those of "simulated 1 kHz": a search of its own lowers the
 total RMSE there by 3 %.
@@ -141,7 +141,7 @@ def trials(setting: str, data: Path | None = None) -> list[TuningTrial]:
 
 def _dynamic(seed: int, rate_hz: float) -> TuningTrial:
     sensor = paper_dynamic(seed, rate_hz)
-    rest = (sensor.time >= sensor.still[0][0] + 0.5) & (sensor.time <= sensor.still[0][1] - 0.5)
+    rest = (sensor.time >= sensor.static[0][0] + 0.5) & (sensor.time <= sensor.static[0][1] - 0.5)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
     return _trial(sensor.gyro_S, sensor.accel_S, rate_hz, sensor.quat_WS, rest, moving)
 
@@ -164,7 +164,7 @@ def _person(seed: int, imperfections: Imperfections) -> list[TuningTrial]:
 def _broad(path: Path) -> TuningTrial:
     trial = read_broad(path)
     rest = np.zeros(len(trial.scored), dtype=bool)
-    rest[trial.still] = True
+    rest[trial.static] = True
     seen = np.isfinite(trial.quat_true).all(axis=1)
     return _trial(trial.gyro_S, trial.accel_S, trial.rate_hz, trial.quat_true, rest, trial.scored, seen)
 

@@ -1,6 +1,6 @@
 """The paper's three experiments on simulated sensors and people with exact truth.
 
-The bias measured in the still phase is removed for every filter, and the heading is aligned once, in that phase, and
+The bias measured in the static phase is removed for every filter, and the heading is aligned once, in that phase, and
 never fitted to the truth afterwards.
 """
 
@@ -104,7 +104,7 @@ def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
 
 def _single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, AttitudeError, Rotation]]:
     """Label, its error over the motion, and the error rotation of each sample; the heading aligned at rest."""
-    rest = (sensor.time >= sensor.still[0][0] + 0.5) & (sensor.time <= sensor.still[0][1] - 0.5)
+    rest = (sensor.time >= sensor.static[0][0] + 0.5) & (sensor.time <= sensor.static[0][1] - 0.5)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
     true = Rotation.from_quat(sensor.quat_WS)
     noise = noise_of(sensor.gyro_S[rest], sensor.accel_S[rest], sensor.rate_hz)

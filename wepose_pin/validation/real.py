@@ -2,7 +2,7 @@
 
 Heading aligned once, on a stretch that is not scored, and never fitted to the truth afterwards; optical gaps left out.
 Where nobody has done it (RING, UR5) clocks, frames and the tilt of the truth's world are found on the first ten
-seconds, which are not scored (`registration`). The still phase's bias is removed for every filter. RING has no still
+seconds, which are not scored (`registration`). The static phase's bias is removed for every filter. RING has no still
 phase: there the bias found on the ten seconds is removed; "bias unknown" is without, as a user would have it.
 """
 
@@ -96,11 +96,11 @@ def experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
 
 
 def _broad(experiment: str, name: str, path: Path, first: bool) -> list[Result]:
-    """Errors over the marked motion, the heading aligned in the still phase."""
+    """Errors over the marked motion, the heading aligned in the static phase."""
     trial = read_broad(path)
     seen = np.isfinite(trial.quat_true).all(axis=1)
     at_rest = np.zeros(len(seen), dtype=bool)
-    at_rest[trial.still] = seen[trial.still]
+    at_rest[trial.static] = seen[trial.static]
     true = Rotation.from_quat(np.where(seen[:, None], trial.quat_true, [0.0, 0.0, 0.0, 1.0]))
     return [
         Result(experiment, name, label, *_scored(aligned(R_VS, true, at_rest), true, trial, first))
@@ -125,7 +125,7 @@ def _authors(experiment: str, name: str, path: Path) -> list[Result]:
 
 
 def _filtered(trial: Trial) -> Iterator[tuple[str, Rotation]]:
-    noise = noise_of(trial.gyro_S[trial.still], trial.accel_S[trial.still], trial.rate_hz)
+    noise = noise_of(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
     for contender in contenders("real", trial.name):
         yield contender.label, Rotation.from_quat(contender.orient(trial.gyro_S, trial.accel_S, trial.rate_hz, noise))
 
@@ -160,7 +160,7 @@ def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result
     """
     found = read_ur5(files)
     (registration,) = register([found], (0.0, UNSCORED_S))
-    noise = noise_of(found.gyro_S[found.still], found.accel_S[found.still], found.rate_hz)
+    noise = noise_of(found.gyro_S[found.static], found.accel_S[found.static], found.rate_hz)
     return _referenced(experiment, name, found, registration, noise, keep)
 
 

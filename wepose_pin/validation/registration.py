@@ -55,7 +55,7 @@ def register(sensors: Sequence[Referenced], stretch: tuple[float, float]) -> lis
 
     One offset of the clocks: where the correlations of ‖gyro‖ with the body's rate have their greatest sum. A mount
     each: the rotation that brings the sensor's turns over half a second to the body's (Wahba's problem, on rotation
-    vectors), refined, together with the gyroscope's bias where there is no still phase, such that the integrated
+    vectors), refined, together with the gyroscope's bias where there is no static phase, such that the integrated
     gyroscope follows the body over the whole stretch. One tilt of the reference's world: specific force, turned by the
     integrated gyroscope and averaged over the stretch with a window without jumps (what comes and goes cancels), each
     sensor as heavy as it follows.
@@ -97,8 +97,8 @@ class _Span:
         beyond = stretch[1] + 2.0 * LARGEST_OFFSET_S
         self.samples = slice(0, min(len(sensor.gyro_S), int(beyond * sensor.rate_hz)))
         self.clock = np.arange(self.samples.stop) / sensor.rate_hz
-        self.known_bias = bool(sensor.still.stop)
-        self.bias = sensor.gyro_S[sensor.still].mean(axis=0) if self.known_bias else np.zeros(3)
+        self.known_bias = bool(sensor.static.stop)
+        self.bias = sensor.gyro_S[sensor.static].mean(axis=0) if self.known_bias else np.zeros(3)
         self.angle = np.cumsum(sensor.gyro_S[self.samples], axis=0) / sensor.rate_hz  # its differences are mean rates
         inside = (sensor.time >= stretch[0]) & (sensor.time <= stretch[1])
         inside &= (sensor.time >= LARGEST_OFFSET_S) & (sensor.time <= self.clock[-1] - LARGEST_OFFSET_S)

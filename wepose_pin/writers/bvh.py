@@ -1,4 +1,6 @@
-"""Biovision hierarchy (.bvh): the skeleton with the subject's lengths, and its motion.
+"""Biovision hierarchy (.bvh), by hand: the format is a page of text, smaller than any library for it.
+
+The skeleton with the subject's lengths, and its motion.
 
 y is up, the person faces z with x on the left; centimetres and degrees. At zero the skeleton stands in the N-pose.
 

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 from ..arguments import check_arguments
 from ..diagnostics import Diagnostic
+from ..documents import whole_file
 from ..errors import BadData, BadOption, MissingFile, one_of
 from .bvh import write_bvh
 from .c3d import write_c3d
-from .folder import whole_file
 from .motion import Motion, check_rate, resampled
 from .opensim import write_mot, write_placement, write_sto, write_trc
 from .provenance import provenance_file, provenance_text

@@ -7,7 +7,6 @@ import hashlib
 import json
 import platform
 import subprocess
-import tomllib
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 from .. import __version__
 from ..assets import asset
+from ..documents import parse_toml
 from ..errors import BadData, MissingFile
 from .result import versions
 
@@ -136,8 +136,8 @@ def named_in(path: Path, truth: bool = False) -> list[str]:
     if path.suffix != ".toml" or not path.is_file():  # a pipe would hold us up
         return []
     try:
-        content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except (OSError, ValueError, RecursionError):
+        content = parse_toml(path.read_bytes().decode("utf-8"))
+    except (OSError, ValueError):
         return []  # whoever reads it says what is wrong with it
     data, sensors = content.get("data"), content.get("sensors")
     tables = [data, *(sensors.values() if isinstance(sensors, dict) else ())]

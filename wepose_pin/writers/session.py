@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import re
 from pathlib import Path
 
 import polars as pl
 
+from ..documents import toml_key, toml_string, toml_strings
 from ..pose import Pose, pose_table
 from ..recording import ImuSensor, Recording, axes_from_mount
 from .result import write_table
@@ -17,7 +16,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     """``session.toml``, ``recording.parquet`` and, with a truth, ``truth.parquet`` into an existing folder."""
     table = {"time": recording.time}
     lines = [
-        f"name = {json.dumps(recording.name, ensure_ascii=False)}",
+        f"name = {toml_string(recording.name)}",
         f'start_pose = "{recording.start_pose}"',
         *(["remounted = true"] if recording.remounted else []),
         "",
@@ -34,9 +33,9 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
         lines.append(f"{name} = [{', '.join(f'[{first:.3f}, {last:.3f}]' for first, last in spans)}]")
     if recording.joints:
         lines += ["", "[joints]   # rad, m for a prismatic joint"]
-        lines += [f"{_key(name)} = {float(value)!r}" for name, value in recording.joints.items()]
+        lines += [f"{toml_key(name)} = {float(value)!r}" for name, value in recording.joints.items()]
     for segment, sensor in recording.sensors.items():
-        lines += ["", f"[sensors.{_key(segment)}]"]
+        lines += ["", f"[sensors.{toml_key(segment)}]"]
         if isinstance(sensor, ImuSensor):
             signals = {"gyro": ("gyr_", sensor.gyro_S), "accel": ("acc_", sensor.accel_S)}
         else:
@@ -44,7 +43,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
         for key, (short, values) in signals.items():
             names = [f"{segment}_{short}{c}" for c in "xyzw"[: values.shape[1]]]
             table |= {name: values[:, k] for k, name in enumerate(names)}
-            lines.append(f"{key} = {json.dumps(names)}")
+            lines.append(f"{key} = {toml_strings(names)}")
         if sensor.aligned:
             lines.append("aligned = true")
         if sensor.stated_quat_LS is not None:
@@ -54,8 +53,3 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     if truth is not None:
         write_table(folder / "truth.parquet", pose_table(truth))
     (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _key(name: str) -> str:
-    """As TOML has a key: links and joints of a URDF may be called anything."""
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)

@@ -1,4 +1,6 @@
-"""Xbus, the protocol of Xsens MTi sensors: bytes → frames → packets → samples; no port in here.
+"""Xbus, the protocol of Xsens MTi sensors, by hand: two kinds of message are needed, and every byte of them is fuzzed.
+
+Bytes → frames → packets → samples; no port in here.
 
 A frame is ``FA FF MID LEN data checksum``; LEN ``FF`` is followed by the length in two bytes. All bytes but the first
 add up to zero in the low byte. Numbers are big endian. An MTData2 frame (MID 36) is a row of items ``id id length
