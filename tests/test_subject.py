@@ -99,7 +99,10 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
         ("format = 2\n[lengths]\ntrunk = -0.5", "lengths.trunk = -0.5"),
         ("format = 2\n[lengths]\ntrunk = 0.5", "lengths.shoulder_width = None"),
         ("format 1", "not valid TOML"),
-        ("ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0", "mounts.torso: qx, qy, qz, qw must be of length 1; it is 1.4"),
+        (
+            "ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0",
+            "mounts.torso: qx, qy, qz, qw must be of length 1; it is 1.4",
+        ),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [[1.0, 2.0]]", "covariance.matrix is (1, 2)"),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [['a']]", "holds something that is no number"),
         ("ALL\n[start_pose_offset.tors]\nx_deg = 1", "start_pose_offset.tors is not a segment; did you mean 'torso'"),
