@@ -3,13 +3,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test check lint types wheel fuzz recordings bench clean
+.PHONY: demo test test-all check lint types wheel fuzz recordings bench clean
 
 demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 	$(BIN)/wepose demo -o demo --force
 
-test: $(READY)            ## the whole test suite
+test: $(READY)            ## what must pass before a commit: minutes
 	$(BIN)/python -m pytest -n auto --dist worksteal
+
+test-all: $(READY)        ## with the second tier: Monte Carlo, fuzzing, kills, peers, robots, clusters
+	$(BIN)/python -m pytest -n auto --dist worksteal -m ""
 
 check: lint types test    ## lint, types and tests
 

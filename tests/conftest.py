@@ -8,6 +8,7 @@ import os
 import resource
 import tempfile
 import time
+import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,7 +52,8 @@ def simulation(person: Person) -> Simulation:
 # What the suite costs ------------------------------------------------------------------------------------------------
 
 # Tests of one of these markers belong to the second tier: `make test-all` runs them, `make test` does not.
-SECOND_TIER = ("monte_carlo", "fuzz", "kill", "peer", "cluster", "robots", "slow")
+_PYTEST = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["pytest"]["ini_options"]
+SECOND_TIER = tuple(line.partition(":")[0] for line in _PYTEST["markers"])
 _START = time.monotonic()
 _LAST = pytest.StashKey[float]()
 _TIERS: Counter[str] = Counter()

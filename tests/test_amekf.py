@@ -280,6 +280,7 @@ def test_wrong_parameters_are_named() -> None:
 # Consistency and accuracy on simulated trials ----------------------------------------------------------------------
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("kind", [Amekf, Smoother])
 def test_the_covariance_is_right(kind: Any) -> None:
     """Over sensors drawn from the stated priors; a NEES of 3 is right."""
@@ -288,6 +289,7 @@ def test_the_covariance_is_right(kind: Any) -> None:
     assert abs(np.mean(values) - 3.0) < 0.9
 
 
+@pytest.mark.monte_carlo
 def test_ahead_of_smekf_as_the_paper_measures() -> None:
     """12 trials at 100 Hz. With noise and biases alone smekf's error hardly changes, so its std over time is small;
     amekf's starts from the same accelerometer bias, which it then finds: the std has that change in it."""

@@ -256,6 +256,7 @@ def bucket(recorded: Path) -> Iterator[str]:
     server.stop()
 
 
+@pytest.mark.cluster
 def test_a_study_on_s3(bucket: str, tmp_path: Path, recorded: Path) -> None:
     (tmp_path / "plan.toml").write_text(PLAN.replace("data/*", f"{bucket}/data/*"))
     done = run_batch(BatchJob(tmp_path / "plan.toml", f"{bucket}/out", workers=2))
@@ -283,6 +284,7 @@ def test_a_study_on_s3(bucket: str, tmp_path: Path, recorded: Path) -> None:
     assert "another session" in table["message"][2]
 
 
+@pytest.mark.cluster
 def test_a_study_on_s3_is_that_of_a_local_folder(bucket: str, study: Path) -> None:
     import s3fs
 
@@ -298,6 +300,7 @@ def test_a_study_on_s3_is_that_of_a_local_folder(bucket: str, study: Path) -> No
     assert differences(study / "out" / "items", study / "fetched") == []
 
 
+@pytest.mark.cluster
 def test_a_long_lived_worker_sees_what_changes_on_s3(bucket: str) -> None:
     import s3fs
 
@@ -311,6 +314,7 @@ def test_a_long_lived_worker_sees_what_changes_on_s3(bucket: str) -> None:
     assert (row["status"], "another session" in row["message"]) == ("changed", True)
 
 
+@pytest.mark.cluster
 def test_what_is_not_there_on_s3_is_named(bucket: str, tmp_path: Path) -> None:
     lost = Item("lost", f"{bucket}/nobody/session.toml", QUICK)
     (row,) = make_items([lost], str(tmp_path / "items"))

@@ -30,6 +30,7 @@ from wepose_pin.batch.storage import DONE
 from wepose_pin.errors import BadData, BadOption, LostWorker
 from wepose_pin.jobs.batch import BatchJob
 
+pytestmark = pytest.mark.cluster
 WEPOSE = [sys.executable, "-m", "wepose_pin.cli"]
 APART = ("seconds", "memory_mb", "track_s", "evaluate_s")  # columns that are not the same twice
 
@@ -170,6 +171,7 @@ def test_without_any_worker_the_run_ends(study: Path, monkeypatch: pytest.Monkey
             list(made(client, [item(study)], str(study / "items")))
 
 
+@pytest.mark.kill
 def test_a_run_that_was_killed_goes_on_where_it_stopped(study: Path) -> None:
     command = [sys.executable, "-m", "wepose_pin.cli", "batch", str(study / "plan.toml"), "-o", str(study / "out")]
     command += ["--workers", "1"]
@@ -206,6 +208,7 @@ def test_no_scheduler_at_an_address() -> None:
 KILLS = int(os.environ.get("WEPOSE_KILLS", "0"))
 
 
+@pytest.mark.kill
 @pytest.mark.skipif(not KILLS, reason="WEPOSE_KILLS says how many; the test above kills once")
 def test_killed_at_random_moments_nothing_is_lost_and_nothing_half_written(study: Path) -> None:
     """The whole process group each time, on and on until it comes to its end."""

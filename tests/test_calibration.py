@@ -178,6 +178,7 @@ def test_a_hand_with_a_sensor_is_seen_by_itself(exact: tuple[Person, Recording])
     assert found.subject.std("left_hand") < 0.5 * without.subject.std("left_hand")
 
 
+@pytest.mark.monte_carlo
 def test_the_standard_deviations_are_honest() -> None:
     """MTi-3 noise, real filtering, a taped shoulder width: errors over their standard deviations, 12 people."""
     z, chi2 = [], []

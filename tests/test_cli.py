@@ -189,6 +189,7 @@ def test_a_session_that_lacks_sensors_says_what_is_not_known(
     assert unknown["text"]["what"] in capsys.readouterr().err
 
 
+@pytest.mark.kill
 @pytest.mark.parametrize("seconds", [0.8, 1.6, 2.4])
 def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: float) -> None:
     """Ctrl-C, and the SIGTERM of a cluster, at any time: exit 130 and no trace, or done before it came."""

@@ -59,6 +59,7 @@ def test_points_beyond_a_segment_without_covariance_have_none() -> None:
     assert point_covariance(points, still, {}, np.zeros((8, 8))) == {}
 
 
+@pytest.mark.monte_carlo
 def test_the_whole_chain_is_honest() -> None:
     """Realistic people, calibrated and tracked through six circles: the normalised error averages to about three.
 

@@ -102,6 +102,7 @@ def test_tuning_trials_are_scored_nowhere_else() -> None:
     assert gains_of("real", "prova_HR") is gains_of("real") is STATED["BROAD"]
 
 
+@pytest.mark.peer
 @pytest.mark.parametrize("setting", STATED)
 def test_the_stated_gains_are_the_best_around(setting: str, request: pytest.FixtureRequest) -> None:
     """No neighbour on the grid is better, and the grid goes on beyond them; `wepose validate` searches all of it."""

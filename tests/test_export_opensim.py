@@ -185,6 +185,7 @@ def pose_by_opensim(peer: Callable[..., Any], values: Mapping[str, np.ndarray], 
     return pose_of(load_model(lengths=LENGTHS), 0.01 * np.arange(n), quat_WL)
 
 
+@pytest.mark.peer
 def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_path: Path) -> None:
     values = motion(60)
     pose = pose_by_opensim(peer, values)
@@ -200,6 +201,7 @@ def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_pa
     assert peer("read_as_storage", tmp_path / "x.mot") == ("a - made² one", 60, 1 + len(values), True)
 
 
+@pytest.mark.peer
 def test_opensense_finds_the_same_angles_from_the_sto(peer: Callable[..., Any], tmp_path: Path) -> None:
     pose = pose_by_opensim(peer, motion(12), noise=0.15)  # what no elbow of two axes follows
     folder = write_folder(tmp_path / "r", pose)
@@ -211,6 +213,7 @@ def test_opensense_finds_the_same_angles_from_the_sto(peer: Callable[..., Any], 
     np.testing.assert_allclose(theirs, ours["values"], atol=0.05)
 
 
+@pytest.mark.peer
 def test_trc_by_opensim(peer: Callable[..., Any], tmp_path: Path) -> None:
     pose = with_gap(a_pose())
     export(write_folder(tmp_path / "r", pose), tmp_path / "x.trc")
@@ -227,6 +230,7 @@ def test_trc_by_opensim(peer: Callable[..., Any], tmp_path: Path) -> None:
     assert peer("frames_of_marker_data", tmp_path / "x.trc") == 301
 
 
+@pytest.mark.peer
 def test_sto_by_opensim(peer: Callable[..., Any], result: Path, tmp_path: Path) -> None:
     export(result, tmp_path / "x.sto")
     table = peer("read", tmp_path / "x.sto")

@@ -244,6 +244,7 @@ def test_names_of_data_that_are_none(name: str, tmp_path: Path, capsys: pytest.C
 # Kills -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.kill
 @pytest.mark.usefixtures("result")  # numba has compiled
 def test_a_run_that_is_killed_at_any_moment_leaves_the_whole_result_or_nothing(session: Path, tmp_path: Path) -> None:
     """Two moments of those in which it writes; twenty by hand: docs/security.md. The page comes after the result."""

@@ -65,6 +65,7 @@ def spoiled(draw: st.DrawFn, target: Target) -> bytes:
     return bytes(data)
 
 
+@pytest.mark.fuzz
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
 def test_what_is_spoiled_is_taken_or_refused_in_one_line(target: Target) -> None:
     outcomes = set()
@@ -125,6 +126,7 @@ def broken_table(draw: st.DrawFn) -> pl.DataFrame:
     return table
 
 
+@pytest.mark.fuzz
 @quick(150)
 @given(
     table=broken_table(),
@@ -161,6 +163,7 @@ def test_a_broken_recording_is_tracked_to_numbers_or_refused(
 # By coverage ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.fuzz
 def test_a_fuzzer_that_sees_coverage_finds_nothing(tmp_path: Path) -> None:
     """All targets by turns, the same inputs every time; `make fuzz` goes on where this ends."""
     pytest.importorskip("atheris")

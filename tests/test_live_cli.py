@@ -39,6 +39,7 @@ def run(*arguments: str, code: int = 0) -> None:
     assert stop.value.code == code
 
 
+@pytest.mark.kill
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_ended_at_any_moment_the_file_holds_what_was_shown(session: Path, tmp_path: Path, number: int) -> None:
     file = tmp_path / "a.wepose"

@@ -187,6 +187,7 @@ TAPED = {"handle": (), "touch_left": ("left_upper_arm",), "touch_right": ("right
 HEADINGS_DEG = {"handle": 5.0, "touch_left": 6.0, "touch_right": 6.0, "poses": 9.0}  # rms, one person
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("protocol", list(TAPED))
 def test_usual_imperfections_stay_within_the_stated_deviations(protocol: str) -> None:
     z_lengths, z_headings = [], []

@@ -26,6 +26,7 @@ def test_what_must_hold_of_every_recording(seed: int) -> None:
     assert not report.failures, f"{report.about}\n" + "\n".join(f"{f.oracle}: {f.message}" for f in report.failures)
 
 
+@pytest.mark.seeds
 @pytest.mark.parametrize("failed", FAILED_ONCE, ids=lambda failed: f"{failed['number']}-{failed['oracle'].split()[0]}")
 def test_what_failed_once(failed: dict) -> None:
     report = try_seed(failed["number"])

@@ -234,6 +234,7 @@ def test_a_task_can_be_left_out(arm, only: str) -> None:
         assert np.median(error(found)) > 0.02
 
 
+@pytest.mark.peer
 def test_the_programme_is_that_of_pink(arm) -> None:
     pink = pytest.importorskip("pink")
     import pinocchio as pin

@@ -17,7 +17,10 @@ from wepose_pin.retargeting.maps import example_data
 from wepose_pin.retargeting.person import robot_reach
 
 pytest.importorskip("daqp")
-pytestmark = pytest.mark.skipif(example_data() is None, reason="example-robot-data is not installed")
+pytestmark = [
+    pytest.mark.robots,
+    pytest.mark.skipif(example_data() is None, reason="example-robot-data is not installed"),
+]
 
 
 def is_sound(found: Trajectory) -> None:

@@ -187,6 +187,7 @@ def ratios(motion: Motion, count: int, seed: int = 0) -> dict[str, float]:
     return found
 
 
+@pytest.mark.monte_carlo
 def test_the_spread_is_what_is_stated(motion: Motion) -> None:
     found = ratios(motion, DRAWS)
     print({name: round(value, 2) for name, value in found.items()})

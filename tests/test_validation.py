@@ -44,6 +44,7 @@ def test_the_drift_experiment_is_the_papers() -> None:
     assert mean["smekf"]["drift_deg_min"] < mean["ncf"]["drift_deg_min"] < mean["ncf, default gains"]["drift_deg_min"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("world", "limit_mm"), [("MTi-3 noise alone", 12.0), ("realistic", 25.0)])
 def test_the_hand_of_one_subject(world: str, limit_mm: float) -> None:
     """The experiment's targets, 12 and 18 mm, are means over ten subjects; this one is among the worst of them."""
