@@ -59,7 +59,7 @@ def test_numbers_of_files(tmp_path: Path) -> None:
     pl.DataFrame({"time": [0.0, 0.1], "gap": [True, False], "name": ["a", "b"]}).write_parquet(
         tmp_path / "pose.parquet"
     )
-    (tmp_path / "summary.json").write_text(json.dumps({"rate_hz": 100, "made_by": {"format": 1}, "method": "amekf"}))
+    (tmp_path / "summary.json").write_text(json.dumps({"rate_hz": 100, "provenance": {"format": 1}, "method": "amekf"}))
     (tmp_path / "subject.toml").write_text("[lengths]\ntrunk = 0.5\n")
     (tmp_path / "a.trc").write_text("PathFileType\t4\n1\t-0.5\t1e-3\tnan\t3D\n")
     (tmp_path / "a.urdf").write_text('<robot><!-- 0.1.0 of 2024 --><origin xyz="0 0 1.5"/></robot>')
