@@ -121,7 +121,7 @@ def test_jobs_print_nothing_and_tell_a_growing_share(tmp_path: Path, capfd: pyte
     (tmp_path / "session").mkdir()
     write_session(tmp_path / "session", made.recording("made"), made.truth())
     outcome = run_track(TrackJob(tmp_path / "session", tmp_path / "result"), lambda *of: told.append(of))
-    assert outcome.pose is not None
+    assert outcome.tracked is not None
     assert outcome.page_failures == []
     assert outcome.summary["method"] == "amekf"
     assert [text for text, _ in told] == ["reading", "tracking by amekf", "making the pages"]

@@ -107,7 +107,6 @@ def run_track(
     """
     from ..readers import data_bytes, is_live_log
     from ..tracking import LARGE
-    from ..writers.provenance import collect_provenance
 
     job.check()
     as_whole = (
@@ -117,14 +116,12 @@ def run_track(
     )  # fmt: skip
     if job.chunk_seconds and as_whole:
         raise BadOption(f"--chunk-seconds {job.chunk_seconds:g}: {as_whole} is tracked as a whole; leave it out")
-    if provenance is None:
-        provenance = collect_provenance("track", field_values(job))
     if job.chunk_seconds or (job.chunk_seconds is None and not as_whole and data_bytes(job.session) >= LARGE):
         return _track_in_chunks(job, progress, provenance)
     return _track_as_whole(job, progress, provenance)
 
 
-def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, Any]) -> TrackOutcome:
+def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
     from ..documents import whole_folder
     from ..filters import BEST
     from ..model import load_model
@@ -157,7 +154,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
             from ..angles.torques import pose_torques
 
             torques = pose_torques(tracked)
-        write_result(folder, tracked, job.covariance, recording.phases, torques, provenance)
+        write_result(folder, tracked, job.covariance, recording.phases, torques, _provenance_of(job, provenance))
     failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 2 / 3)
@@ -165,7 +162,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
     return TrackOutcome(tracked.summary(), failures, tracked=tracked)
 
 
-def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str, Any]) -> TrackOutcome:
+def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
     """In a memory that does not grow with the recording."""
     from ..documents import whole_folder
     from ..filters import BEST
@@ -191,7 +188,7 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
             writer.add(chunk)
             decimator.add(chunk)
         progress("writing the result", 1.0)
-        writer.finish(reader.phases, provenance)
+        writer.finish(reader.phases, _provenance_of(job, provenance))
         summary = writer.accumulator.summary()
     view_rate_hz = min(30.0, MOST_FRAMES / max(summary["duration_s"], 1e-3))
     failures: list[Diagnostic] = []
@@ -205,7 +202,7 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
 
 
 def _track_chain(
-    job: TrackJob, recording: Recording, folder: Path, progress: Progress, provenance: Mapping[str, Any]
+    job: TrackJob, recording: Recording, folder: Path, progress: Progress, provenance: Mapping[str, Any] | None
 ) -> TrackOutcome:
     """Where the sensors are on the links of a chain that is no person's arms."""
     from ..angles.torques import joint_torques
@@ -223,5 +220,12 @@ def _track_chain(
     progress(f"tracking by {method}", 1 / 3)
     chain = track_chain(recording, model, method=method, limits=job.limits)
     write_chain(folder, chain, joint_torques(model, chain.time, chain.q) if job.torques else None)
-    write_provenance(folder, provenance)
+    write_provenance(folder, _provenance_of(job, provenance))
     return TrackOutcome(chain.summary(), [], chain=chain)
+
+
+def _provenance_of(job: TrackJob, stated: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """What the result says made it. Collected last: what is wrong with an input is said by what reads it."""
+    from ..writers.provenance import collect_provenance
+
+    return collect_provenance("track", field_values(job)) if stated is None else stated
