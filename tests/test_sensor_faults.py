@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_bad_input import refused
 
-from wepose_pin import load_session, rotations
+from wepose_pin import estimate_orientation, load_session, rotations
 from wepose_pin.alignment import START_POSE_STD, segment_orientations
 from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.noise import quietest
@@ -20,7 +20,7 @@ from wepose_pin.readers.session import SessionReader
 from wepose_pin.readers.trials import read_broad
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.recording.clocks import clock_of
-from wepose_pin.recording.faults import SensorScan, faults_of
+from wepose_pin.recording.faults import faults_of, scan_sensor
 from wepose_pin.recording.plausibility import sensor_notes
 from wepose_pin.simulation import PERFECT, Simulation, simulate, simulated_person
 from wepose_pin.tracking import track, track_pieces
@@ -119,19 +119,25 @@ def test_an_arm_whose_sensor_froze_is_where_its_uncertainty_says(
     assert off_by(read, made, method).max() < 6.0
 
 
-@pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
-@pytest.mark.parametrize("method", ["amekf", "smoother"])
-def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
-    unit: str, method: str, made: Simulation, tmp_path: Path
-) -> None:
-    """A wide swing is cut off in the middle; whoever believes it is off by many standard deviations."""
+def cut_off_swing(made: Simulation) -> tuple[Recording, Rotation, float]:
+    """The recording with a sensor that is swung about and cut off at a level [rad/s]; its true orientations."""
     whole, level = made.recording("cut"), np.deg2rad(120.0)
     gyro_S = whole.sensors[BROKEN].gyro_S
     fast = 4.0 * (gyro_S - gyro_S[50:450].mean(axis=0))
     turned = Rotation.from_quat(rotations.integrate(fast[1:] / RATE))
     accel = turned.inv().apply(whole.sensors[BROKEN].accel_S[0])
     accel += 0.01 * np.random.default_rng(0).standard_normal(accel.shape)
-    path = written(tmp_path / "in", with_sensor(whole, BROKEN, gyro_S=np.clip(fast, -level, level), accel_S=accel))
+    return with_sensor(whole, BROKEN, gyro_S=np.clip(fast, -level, level), accel_S=accel), turned, level
+
+
+@pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
+@pytest.mark.parametrize("method", ["amekf", "smoother"])
+def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
+    unit: str, method: str, made: Simulation, tmp_path: Path
+) -> None:
+    """A wide swing is cut off in the middle; whoever believes it is off by many standard deviations."""
+    whole, turned, level = cut_off_swing(made)
+    path = written(tmp_path / "in", whole)
     if unit == "deg/s":
         text, table = (path / "session.toml").read_text(), pl.read_parquet(path / "recording.parquet")
         (path / "session.toml").write_text(text.replace('"rad/s"', '"deg/s"'))
@@ -170,16 +176,10 @@ def axis_stopped(recording: Recording, axis: str, first: float, value: float | N
     return with_sensor(recording, BROKEN, **{f"{signal}_S": values})
 
 
-def scanned(time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> SensorScan:
-    scan = SensorScan()
-    scan.push(time, np.column_stack([gyro_S, accel_S]))
-    return scan
-
-
 def found(recording: Recording) -> dict[str, list[tuple[str, float]]]:
     """Sensor → what stands still in it and from when [s]."""
     sensors = recording.sensors.items()
-    scans = {name: scanned(recording.time, sensor.gyro_S, sensor.accel_S) for name, sensor in sensors}
+    scans = {name: scan_sensor(recording.time, sensor.gyro_S, sensor.accel_S) for name, sensor in sensors}
     return {name: [(f.signals, round(f.first, 3)) for f in faults] for name, faults in faults_of(scans).items()}
 
 
@@ -231,7 +231,7 @@ def test_axes_of_a_coarse_sensor_stay_the_same(bias_deg: float, moving: bool) ->
     gyro = np.concatenate([np.zeros((1, 3)), (R[:-1].inv() * R[1:]).as_rotvec() * 25.0])
     gyro += np.deg2rad(bias_deg) * np.array([0.2, 1.0, -0.3]) + np.deg2rad(0.2) * rng.standard_normal(gyro.shape)
     accel = R.inv().apply([3.0, 1.0, 9.3]) + 0.05 * rng.standard_normal(gyro.shape)
-    scan = scanned(time, np.round(gyro / step) * step, np.round(accel / 0.04) * 0.04)
+    scan = scan_sensor(time, np.round(gyro / step) * step, np.round(accel / 0.04) * 0.04)
     assert any(scan.long_runs(axis) for axis in AXES[:3])
     assert faults_of({"one": scan}) == {}
 
@@ -242,7 +242,7 @@ def test_an_axis_between_two_digits_says_nothing_of_one_on_a_digit(noise: float)
     rng, digit, time = np.random.default_rng(0), np.deg2rad(0.06), np.arange(30_000) / 100.0
     gyro = np.array([0.0, 0.5, 0.5]) + noise * rng.standard_normal((len(time), 3))
     accel = [0.0, 0.0, 9.81] + 0.02 * rng.standard_normal((len(time), 3))
-    assert faults_of({"one": scanned(time, digit * np.round(gyro), accel)}) == {}
+    assert faults_of({"one": scan_sensor(time, digit * np.round(gyro), accel)}) == {}
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0.8, 0), (0.6, 0, 0.8)])
@@ -262,7 +262,7 @@ def test_a_clean_motion_about_one_axis_is_one(
     place = R.apply([0.3, 0.2, -0.6])
     force = R_SL.apply(R.inv().apply(np.gradient(np.gradient(place, time, axis=0), time, axis=0) + [0.0, 0.0, 9.81]))
     rate = np.gradient(angle, time)[:, None] * np.round(R_SL.apply(axis), 12)
-    scan = scanned(time, rate, np.round(force, 9))
+    scan = scan_sensor(time, rate, np.round(force, 9))
     assert tilt == 0.5 or any(scan.long_runs(axis) for axis in AXES[:3])
     assert [fault.signals for fault in faults_of({"one": scan}).get("one", []) if fault.signals in AXES] == []
 
@@ -271,13 +271,42 @@ def test_real_sensors_measure_on_every_axis(data: Path) -> None:
     scans = {}
     for path in sorted((data / "broad").glob("*.mat")):
         trial = read_broad(path)
-        scans[path.name] = scanned(np.arange(len(trial.gyro_S)) / trial.rate_hz, trial.gyro_S, trial.accel_S)
+        scans[path.name] = scan_sensor(np.arange(len(trial.gyro_S)) / trial.rate_hz, trial.gyro_S, trial.accel_S)
     worn = load_session(data / "upper_body")
     for name, sensor in worn.sensors.items():
-        scans[name] = scanned(worn.time, sensor.gyro_S, sensor.accel_S)
+        scans[name] = scan_sensor(worn.time, sensor.gyro_S, sensor.accel_S)
     assert len(scans) == 22
     assert faults_of(scans) == {}
     assert all(max(scan.repeats(axis) for axis in range(6)) < 0.5 for scan in scans.values())
+
+
+# Arrays ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
+def test_arrays_that_are_cut_off_are_as_uncertain(method: str, made: Simulation) -> None:
+    whole, turned, _ = cut_off_swing(made)
+    sensor = whole.sensors[BROKEN]
+    run = estimate_orientation(sensor.gyro_S, sensor.accel_S, RATE, method=method, still=(0.5, 4.5))
+    R_WS = Rotation.from_quat(run.quat_WS)
+    off = (turned[300].inv() * turned).inv() * (R_WS[300].inv() * R_WS)
+    assert run.attitude_cov is not None
+    z = off.magnitude() / np.sqrt(np.linalg.eigvalsh(run.attitude_cov)[:, -1])
+    assert np.degrees(off.magnitude().max()) > 30.0
+    assert z[450:].max() < 6.0
+
+
+@pytest.mark.parametrize(("signals", "since"), [("gyro", 0.0), ("gyro accel", 9.0), ("accel", 9.0)])
+def test_arrays_of_a_sensor_that_does_not_measure_are_refused(signals: str, since: float, made: Simulation) -> None:
+    sensor = stopped(made.recording("stopped"), signals, since).sensors[BROKEN]
+    with pytest.raises(BadData, match=rf"^{signals.replace(' ', ' and ')} stands? still.* from {since:g} to .* leave"):
+        estimate_orientation(sensor.gyro_S, sensor.accel_S, RATE, still=(0.5, 4.5))
+
+
+def test_arrays_with_an_axis_that_does_not_measure_are_refused(made: Simulation) -> None:
+    sensor = axis_stopped(made.recording("stopped"), "gyro x", 9.0).sensors[BROKEN]
+    with pytest.raises(BadData, match=r"^gyro x stands still at .* from 9 to "):
+        estimate_orientation(sensor.gyro_S, sensor.accel_S, RATE, still=(0.5, 4.5))
 
 
 # Lost samples are not measured ones --------------------------------------------------------------------------------

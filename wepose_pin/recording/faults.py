@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from .. import rotations
 from ..errors import BadData
@@ -58,6 +58,7 @@ ENOUGH_NOISE_S = 30.0  # [s] of it that are looked at
 UP_S, UP_OFF = 2.0, 0.8  # [s], [rad]
 UP_FORCE = 0.3  # share by which its norm may be off gravity
 
+ROWS = 1 << 16  # that are looked at together
 SAME_RANGE = 0.1  # share by which the ranges of a sensor's axes may differ: each has its own scale
 COPIED = 0.5  # share of a sensor's rows, those that repeat aside, that another has as well only if it is a copy
 AT_RANGE = 0.02  # share below its range from which on a sample counts as cut off: resampled ones mix with others
@@ -221,8 +222,8 @@ class SensorScan:
         wide = min((self._wide_steps[k] - 3.0 * np.sqrt(self._wide_steps[k])) / self._noise_steps[k] for k in others)
         if wide * min(self._noise_steps[k] for k in others) < FEWEST_WIDE:
             return 1.0
-        std = 1.0 / (np.sqrt(2.0) * float(norm.isf(min(wide, 1.0) / 2.0)))  # [digits]
-        return float(2.0 * norm.cdf(0.5 / std) - 1.0)
+        std = -1.0 / (np.sqrt(2.0) * float(ndtri(min(wide, 1.0) / 2.0)))  # [digits]
+        return float(2.0 * ndtr(0.5 / std) - 1.0)
 
     def _cut_off(self, values: np.ndarray) -> None:
         """The levels at which an axis of gyro stays though something else changes."""
@@ -260,6 +261,15 @@ class SensorScan:
     def constant(self, name: str) -> bool:
         """Whether the signal has one value in all rows."""
         return any(run.rows == self.rows for run in self.long_runs(name))
+
+
+def scan_sensor(time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> SensorScan:
+    """What the rows of one sensor show: times (n,) [s], (n, 3) [rad/s], (n, 3) [m/s²]."""
+    scan = SensorScan()
+    for first in range(0, len(time), ROWS):
+        rows = slice(first, first + ROWS)
+        scan.push(time[rows], np.column_stack([gyro_S[rows], accel_S[rows]]))
+    return scan
 
 
 def _least_s(name: str) -> float:
