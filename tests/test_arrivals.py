@@ -11,6 +11,7 @@ import pytest
 from wepose_pin.recording.arrivals import (
     BAD,
     DUPLICATE,
+    FROZEN,
     JUMP_S,
     LATE,
     LONGEST_GAP_S,
@@ -112,7 +113,7 @@ def test_overtaken_samples_find_their_place_and_later_ones_are_late() -> None:
     too_late = came[:at] + came[at + 1 : at + behind] + [came[at]] + came[at + behind :]
     aligner = Aligner(NAMES, RATE, BEGIN)
     ticks = fed(aligner, too_late)
-    assert aligner.counts[1].tolist() == [0, 1, 0, 0, 99]
+    assert aligner.counts[1].tolist() == [0, 1, 0, 0, 99, 0]
     np.testing.assert_allclose(ticks.gyro_S[50, 1], 0.5 * (gyro[1, 49] + gyro[1, 51]))  # bridged
     keep = np.ones((100, 3), dtype=bool)
     keep[50, 1] = False
@@ -135,6 +136,82 @@ def test_duplicates_and_what_is_no_measurement_are_counted_and_change_nothing() 
     assert np.array_equal(fed(aligner, mixed).gyro_S, gyro.swapaxes(0, 1))
     assert aligner.counts[:, BAD].tolist() == [len(bad), 0, 0]
     assert aligner.counts[:, DUPLICATE].tolist() == [0, 1, 1]
+
+
+def stopped(values: np.ndarray, first: int, last: int) -> np.ndarray:
+    """(k, n, 3) with the last sensor's samples `first` to `last` as the one before."""
+    values = values.copy()
+    values[2, first : last + 1] = values[2, first - 1]
+    return values
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-3])
+@pytest.mark.parametrize("stops", [300, 700])
+def test_a_sensor_that_repeats_itself_is_lost_until_it_changes(stops: int, size: float) -> None:
+    gyro, accel = signals(900)
+    gyro, accel = stopped(size * gyro, stops, stops + 99), stopped([0.0, 0.0, 9.8] + size * accel, stops, stops + 99)
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    ticks = fed(aligner, in_order(gyro, accel))
+    measured = np.isfinite(ticks.gyro_S).all(axis=2)
+    found = stops + round(LONGEST_GAP_S * RATE)  # the first that is not taken
+    assert measured[:, :2].all()
+    assert measured[:found, 2].all()
+    assert not measured[found : stops + 100, 2].any()
+    assert measured[stops + 101 :, 2].all()
+    assert ticks.lost[found + 2 : stops + 99, 2].all()
+    assert not ticks.lost[:, :2].any()
+    assert aligner.counts[:, FROZEN].tolist() == [0, 0, stops + 100 - found]
+    assert not aligner.frozen.any()
+    for i in (0, 1):
+        assert np.array_equal(ticks.gyro_S[:, i], gyro[i])
+
+
+def test_a_sensor_that_never_changes_is_lost_where_others_have_noise() -> None:
+    gyro, accel = signals(600)
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    ticks = fed(aligner, in_order(stopped(gyro, 1, 599), stopped(accel, 1, 599)))
+    assert aligner.frozen.tolist() == [False, False, True]
+    assert not np.isfinite(ticks.gyro_S[300:, 2]).any()
+    alone = Aligner(NAMES[2:], RATE, BEGIN)
+    of_one = [(0, t, g, a) for i, t, g, a in in_order(stopped(gyro, 1, 599), stopped(accel, 1, 599)) if i == 2]
+    assert np.isfinite(fed(alone, of_one).gyro_S).all()
+
+
+def test_one_sensor_alone_that_freezes_has_ticks_still() -> None:
+    gyro, accel = signals(600)
+    alone = Aligner(NAMES[2:], RATE, BEGIN)
+    came = in_order(stopped(gyro, 400, 599), stopped(accel, 400, 599))
+    ticks = fed(alone, [(0, t, g, a) for i, t, g, a in came if i == 2])
+    assert len(ticks.time) > 580
+    assert ticks.lost[420:].all()
+
+
+@pytest.mark.parametrize("digit", [0.5, 1.0, 3.0])
+def test_coarse_digits_that_repeat_are_measured(digit: float) -> None:
+    """Noise of a digit or less, at rest, now and then in motion: it stays the same for a while by chance."""
+    rng, n = np.random.default_rng(3), 6000
+    motion = 40.0 * np.sin(np.arange(n) / 30.0)[None, :, None] * (np.arange(n) % 2000 < 400)[None, :, None]
+    gyro, accel = (np.round((rng.standard_normal((3, n, 3)) + motion) / digit / 4.0) for _ in range(2))
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    ticks = fed(aligner, in_order(gyro, accel))
+    assert np.array_equal(ticks.gyro_S, gyro.swapaxes(0, 1))
+    assert aligner.counts[:, FROZEN].sum() == 0
+
+
+def test_what_has_no_noise_may_rest_after_it_has_moved() -> None:
+    n = np.arange(900)
+    motion = np.sin(n / 9.0) * (n < 400)
+    gyro, accel = (np.stack([motion, 0.5 * motion, 0.0 * motion], axis=1)[None].repeat(3, axis=0) for _ in range(2))
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    assert np.array_equal(fed(aligner, in_order(gyro, accel)).gyro_S, gyro.swapaxes(0, 1))
+
+
+@pytest.mark.parametrize("times", [2, 10])
+def test_values_that_are_held_from_sample_to_sample_are_measured(times: int) -> None:
+    """A device that samples more slowly than it sends."""
+    gyro, accel = (values.repeat(times, axis=1) for values in signals(3000 // times))
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    assert np.array_equal(fed(aligner, in_order(gyro, accel)).gyro_S, gyro.swapaxes(0, 1))
 
 
 @pytest.mark.parametrize(("lost", "bridged"), [(1, True), (5, True), (6, False), (40, False)])
@@ -169,7 +246,7 @@ def test_ticks_wait_for_a_silent_sensor_once_and_not_again() -> None:
     assert max(behind[:100]) == 0
     assert max(behind[100 + wait + 1 : 300]) == 0  # lost: none waits for it
     assert max(behind[302:]) == 0  # and back
-    assert aligner.counts[1].tolist() == [200, 0, 0, 0, 200]
+    assert aligner.counts[1].tolist() == [200, 0, 0, 0, 200, 0]
 
 
 def test_clocks_that_are_off_the_ticks_lose_no_rotation() -> None:

@@ -271,6 +271,51 @@ def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recordin
     assert sum(int.from_bytes(payload[:4], "little") for payload in of_samples) == count
 
 
+@pytest.mark.parametrize("method", ["amekf", "smekf"])
+def test_a_sensor_that_freezes_is_lost_and_said_to_be(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    """It repeats itself for three seconds in motion; what is stated of it grows, as while it sends nothing."""
+    monkeypatch.setattr("wepose_pin.live.loop.STATUS_S", 1e-3)
+    hurt, begin, end = "right_forearm", 1200, 1500
+    sensor = recording.sensors[hurt]
+    assert sensor.gyro_S is not None
+    assert sensor.accel_S is not None
+    row = np.arange(len(recording))
+    row[begin:end] = begin - 1
+    frozen = replace(sensor, gyro_S=sensor.gyro_S[row], accel_S=sensor.accel_S[row])
+    stopped = replace(recording, sensors={**recording.sensors, hurt: frozen})
+    came = [
+        (float(t) + 0.001, single(stopped, name, k)) for name in stopped.sensors for k, t in enumerate(stopped.time)
+    ]
+    watcher = Watcher()
+    ended = live(recording, tmp_path / "a.wepose", Chaos(recording, came), watcher, method=method)
+    assert ended.counts[hurt]["frozen"] == pytest.approx(end - begin, abs=10)
+    assert all(of["frozen"] == 0 for name, of in ended.counts.items() if name != hurt)
+    i = list(recording.sensors).index(hurt)
+    while_frozen = [s for s in watcher.statuses if recording.time[begin + 10] < s.time < recording.time[end]]
+    assert len(while_frozen) > 10
+    assert all(status.sensors[i].frozen and status.sensors[i].lost for status in while_frozen)
+    assert {status.message for status in while_frozen} == {
+        "The same values again and again from right forearm: switch it off and on."
+    }
+    assert watcher.statuses[-2].message == "Tracking."
+    assert all(lost[i] for t, lost in ((pose.time, pose.lost) for pose in watcher.poses) if 12.4 < t < 14.9)
+
+    found = read_live_log(tmp_path / "a.wepose")
+    again, whole = (track(each, causal=True, method=method) for each in (found.recording, recording))
+    for k, name in enumerate(recording.sensors):
+        assert np.array_equal(found.quat_WL[:, k], again.quat_WL[name])
+        if name != hurt:
+            assert np.array_equal(found.quat_WL[:, k], whole.quat_WL[name][: len(found.quat_WL)])
+    off = Rotation.from_quat(whole.quat_WL[hurt]).inv() * Rotation.from_quat(again.quat_WL[hurt])
+    since = begin - found.first
+    turned = np.degrees(off[since : since + end - begin].magnitude())
+    assert turned.max() > 20.0
+    std = np.sqrt(np.linalg.eigvalsh(again.segment_cov[hurt])[:, -1])
+    assert np.all(off.magnitude()[since + 6 :] < 6.0 * std[since + 6 :])
+
+
 def test_a_file_that_breaks_off_anywhere_is_read_up_to_there(recording: Recording, tmp_path: Path) -> None:
     whole = tmp_path / "a.wepose"
     live(recording, whole)

@@ -60,7 +60,7 @@ class Person:
 
     def status(self, state: str = "ready", message: str = "Tracking.", lost: tuple[str, ...] = ()) -> Status:
         sensors = tuple(
-            SensorStatus(s, 99.8, s in lost, s == "torso", (0.002, -0.005, 0.0), math.nan, 3.0, 1, 2, 3)
+            SensorStatus(s, 99.8, s in lost, s == "torso", (0.002, -0.005, 0.0), math.nan, 3.0, 1, 2, 3, False)
             for s in self.stage.segments
         )
         return Status(state, message, 0.4, 12.0, sensors, (3.2, 8.4), 7.0, {"bad checksums": 3})
@@ -135,7 +135,7 @@ def test_status_is_json_whatever_is_not_known(person: Person) -> None:
     assert sent["latency_ms"] == [None, None]
     assert sent["sensors"][0] | {"bias_deg_s": 0} == {
         "segment": "torso", "rate_hz": 99.8, "lost": True, "static": True, "bias_deg_s": 0, "heading_std_deg": None,
-        "heading_age_s": 3.0, "missing": 1, "late": 2, "duplicate": 3,
+        "heading_age_s": 3.0, "missing": 1, "late": 2, "duplicate": 3, "frozen": False,
     }  # fmt: skip
     assert sent["sensors"][0]["bias_deg_s"] == [0.11459, -0.28648, 0.0]
 

@@ -21,7 +21,14 @@ from wepose_pin.live.terminal import TerminalView, table
 
 def sensor(segment: str = "torso", **other: object) -> SensorStatus:
     usual = {"rate_hz": 99.8, "lost": False, "static": False, "gyro_bias": (0.002, -0.005, 0.0)}
-    usual |= {"heading_std": math.radians(1.3), "heading_age": 34.4, "missing": 2, "late": 1, "duplicate": 0}
+    usual |= {
+        "heading_std": math.radians(1.3),
+        "heading_age": 34.4,
+        "missing": 2,
+        "late": 1,
+        "duplicate": 0,
+        "frozen": False,
+    }
     return SensorStatus(segment, **(usual | other))  # type: ignore[arg-type]
 
 
@@ -39,11 +46,19 @@ def printed(one: Status) -> str:
 
 def test_a_row_a_sensor() -> None:
     lines = printed(
-        status(sensors=(sensor(), sensor("left_forearm", static=True), sensor("head", lost=True)))
+        status(
+            sensors=(
+                sensor(),
+                sensor("left_forearm", static=True),
+                sensor("head", lost=True),
+                sensor("pelvis", lost=True, frozen=True),
+            )
+        )
     ).splitlines()
-    torso, forearm, head = (
-        next(line for line in lines if line.startswith(name)) for name in ("torso", "left f", "head")
+    torso, forearm, head, pelvis = (
+        next(line for line in lines if line.startswith(name)) for name in ("torso", "left f", "head", "pelvis")
     )
+    assert "✕ frozen" in pelvis
     assert torso.split() == "torso ▶ moving 100 0.11 −0.29 0.00 1.3 34 3".split()
     assert "■ at rest" in forearm
     assert "✕ lost" in head

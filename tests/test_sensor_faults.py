@@ -11,28 +11,36 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_bad_input import refused
 
-from wepose_pin import load_session, rotations
+from wepose_pin import estimate_orientation, load_session, rotations
 from wepose_pin.alignment import START_POSE_STD
 from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.filters.noise import quietest
 from wepose_pin.readers import iter_session
 from wepose_pin.readers.session import SessionReader
+from wepose_pin.readers.trials import read_broad
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.recording.clocks import clock_of
+from wepose_pin.recording.faults import faults_of, scan_sensor
 from wepose_pin.recording.plausibility import sensor_notes
-from wepose_pin.simulation import Simulation, simulate, simulated_person
+from wepose_pin.simulation import PERFECT, Simulation, simulate, simulated_person
 from wepose_pin.tracking import TrackOptions, track, track_session
 from wepose_pin.tracking.segments import estimate_segments
 from wepose_pin.writers import write_session
 
 BROKEN = "left_forearm"
 RATE = 100.0
+AXES = [f"{signal} {axis}" for signal in ("gyro", "accel") for axis in "xyz"]
 
 
 @pytest.fixture(scope="module")
 def made() -> Simulation:
     """Twenty-five seconds: start pose from 0.5 to 4.5 s, then the arms move."""
     return simulate(simulated_person(1).lengths, seed=1, clasp_s=5.0, circles=1)
+
+
+@pytest.fixture(scope="module")
+def clean() -> Simulation:
+    return simulate(simulated_person(1).lengths, seed=1, noise=PERFECT, clasp_s=20.0, circles=1)
 
 
 def with_sensor(recording: Recording, name: str, **changes: object) -> Recording:
@@ -112,19 +120,25 @@ def test_an_arm_whose_sensor_froze_is_where_its_uncertainty_says(
     assert off_by(read, made, method).max() < 6.0
 
 
-@pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
-@pytest.mark.parametrize("method", ["amekf", "smoother"])
-def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
-    unit: str, method: str, made: Simulation, tmp_path: Path
-) -> None:
-    """A wide swing is cut off in the middle; whoever believes it is off by many standard deviations."""
+def cut_off_swing(made: Simulation) -> tuple[Recording, Rotation, float]:
+    """The recording with a sensor that is swung about and cut off at a level [rad/s]; its true orientations."""
     whole, level = made.recording("cut"), np.deg2rad(120.0)
     gyro_S = whole.sensors[BROKEN].gyro_S
     fast = 4.0 * (gyro_S - gyro_S[50:450].mean(axis=0))
     turned = Rotation.from_quat(rotations.integrate(fast[1:] / RATE))
     accel = turned.inv().apply(whole.sensors[BROKEN].accel_S[0])
     accel += 0.01 * np.random.default_rng(0).standard_normal(accel.shape)
-    path = written(tmp_path / "in", with_sensor(whole, BROKEN, gyro_S=np.clip(fast, -level, level), accel_S=accel))
+    return with_sensor(whole, BROKEN, gyro_S=np.clip(fast, -level, level), accel_S=accel), turned, level
+
+
+@pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
+@pytest.mark.parametrize("method", ["amekf", "smoother"])
+def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
+    unit: str, method: str, made: Simulation, tmp_path: Path
+) -> None:
+    """A wide swing is cut off in the middle; whoever believes it is off by many standard deviations."""
+    whole, turned, level = cut_off_swing(made)
+    path = written(tmp_path / "in", whole)
     if unit == "deg/s":
         text, table = (path / "session.toml").read_text(), pl.read_parquet(path / "recording.parquet")
         (path / "session.toml").write_text(text.replace('"rad/s"', '"deg/s"'))
@@ -150,6 +164,153 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
     if method != "smoother":
         of = estimate_segments(read, method=method).orientation[BROKEN]
         np.testing.assert_array_equal(np.concatenate(pieces), of.quat_WS)
+
+
+# One axis alone ---------------------------------------------------------------------------------------------------
+
+
+def axis_stopped(recording: Recording, axis: str, first: float, value: float | None = None) -> Recording:
+    """The recording with one axis, as "gyro x", that stays at its value, or at this one, from these seconds on."""
+    signal, letter = axis.split()
+    sensor, stands = recording.sensors[BROKEN], recording.time >= first
+    values = getattr(sensor, f"{signal}_S").copy()
+    values[stands, "xyz".index(letter)] = (
+        values[int(np.argmax(stands)), "xyz".index(letter)] if value is None else value
+    )
+    return with_sensor(recording, BROKEN, **{f"{signal}_S": values})
+
+
+def found(recording: Recording) -> dict[str, list[tuple[str, float]]]:
+    """Sensor → what stands still in it and from when [s]."""
+    sensors = recording.sensors.items()
+    scans = {name: scan_sensor(recording.time, sensor.gyro_S, sensor.accel_S) for name, sensor in sensors}
+    return {name: [(f.signals, round(f.first, 3)) for f in faults] for name, faults in faults_of(scans).items()}
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize(("first", "value"), [(0.0, 0.0), (0.0, None), (9.0, 0.0), (16.3, None)])
+def test_an_axis_that_stops_is_found_by_its_noise(
+    axis: str, first: float, value: float | None, made: Simulation
+) -> None:
+    assert found(axis_stopped(made.recording("axis"), axis, first, value)) == {BROKEN: [(axis, first)]}
+
+
+@pytest.mark.parametrize("axis", AXES[:3])
+def test_an_axis_that_stops_is_found_by_where_up_goes(axis: str, clean: Simulation) -> None:
+    """Without any noise: up, as the gyroscope takes it along, is another place."""
+    assert found(clean.recording("clean")) == {}
+    for first, value in ((0.0, 0.0), (9.0, None)):
+        told = found(axis_stopped(clean.recording("clean"), axis, first, value))
+        assert told[BROKEN][0] == (axis, first)
+
+
+def test_a_recording_with_a_dead_axis_is_refused(
+    made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path / "in", axis_stopped(made.recording("dead"), "gyro y", 0.0, 0.0))
+    line = refused(["track", str(path), "-o", str(tmp_path / "out")], capsys)
+    assert f"sensors.{BROKEN}: gyro y stands still at 0 rad/s" in line
+    assert f"take [sensors.{BROKEN}] out" in line
+
+
+@pytest.mark.parametrize("method", ["amekf", "smoother"])
+def test_a_sensor_is_lost_from_where_an_axis_stops(method: str, made: Simulation, tmp_path: Path) -> None:
+    path = written(tmp_path / "in", axis_stopped(made.recording("stuck"), "gyro x", 9.0))
+    read = load_session(path)
+    np.testing.assert_array_equal(read.sensors[BROKEN].gap, read.time > 9.0 + 1e-6)
+    assert any(f"sensors.{BROKEN}: gyro x stands still at" in note for note in read.notes)
+    pieces = [piece.sensors[BROKEN].gap for piece in iter_session(path, 3.7)]
+    np.testing.assert_array_equal(np.concatenate(pieces), read.sensors[BROKEN].gap)
+    assert off_by(with_sensor(read, BROKEN, gap=None), made, method).max() > 6.0
+    assert off_by(read, made, method).max() < 6.0
+
+
+@pytest.mark.parametrize("bias_deg", [0.0, 4.9, 5.1])
+@pytest.mark.parametrize("moving", [False, True])
+def test_axes_of_a_coarse_sensor_stay_the_same(bias_deg: float, moving: bool) -> None:
+    """25 Hz in steps of 10 deg/s, on a table for ten minutes or swung about two of its axes."""
+    rng, step, time = np.random.default_rng(0), np.deg2rad(10.0), np.arange(15_000) / 25.0
+    angle = moving * np.clip(time - 5.0, 0.0, 1.0) ** 3 * np.sin(2.0 * np.pi * 0.7 * (time - 5.0))
+    R = Rotation.from_rotvec(angle[:, None] * [0.0, 0.6, 0.8])
+    gyro = np.concatenate([np.zeros((1, 3)), (R[:-1].inv() * R[1:]).as_rotvec() * 25.0])
+    gyro += np.deg2rad(bias_deg) * np.array([0.2, 1.0, -0.3]) + np.deg2rad(0.2) * rng.standard_normal(gyro.shape)
+    accel = R.inv().apply([3.0, 1.0, 9.3]) + 0.05 * rng.standard_normal(gyro.shape)
+    scan = scan_sensor(time, np.round(gyro / step) * step, np.round(accel / 0.04) * 0.04)
+    assert any(scan.long_runs(axis) for axis in AXES[:3])
+    assert faults_of({"one": scan}) == {}
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.1, 0.2, 0.3, 0.5])
+def test_an_axis_between_two_digits_says_nothing_of_one_on_a_digit(noise: float) -> None:
+    """Noise of a share of a digit: one axis turns back at every other sample, another stays for minutes."""
+    rng, digit, time = np.random.default_rng(0), np.deg2rad(0.06), np.arange(30_000) / 100.0
+    gyro = np.array([0.0, 0.5, 0.5]) + noise * rng.standard_normal((len(time), 3))
+    accel = [0.0, 0.0, 9.81] + 0.02 * rng.standard_normal((len(time), 3))
+    assert faults_of({"one": scan_sensor(time, digit * np.round(gyro), accel)}) == {}
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0.8, 0), (0.6, 0, 0.8)])
+@pytest.mark.parametrize(
+    ("size", "hertz", "turns"), [(0.8, 1.5, 0.0), (1.2, 0.2, 0.0), (0.0, 1.0, 1.0), (0.0, 1.0, 6.0)]
+)
+@pytest.mark.parametrize("tilt", [0.0, np.pi / 2.0, 0.5])
+def test_a_clean_motion_about_one_axis_is_one(
+    axis: tuple[float, ...], size: float, hertz: float, turns: float, tilt: float
+) -> None:
+    """Simulated without noise, on a lever: swung at up to 430 deg/s, slowly, or turned on and on at `turns` [rad/s]."""
+    time = np.arange(2500) / RATE
+    on = np.clip((time - 3.0) / 4.0, 0.0, 1.0)
+    on = on**3 * (10.0 - 15.0 * on + 6.0 * on**2)
+    angle = on * size * np.sin(2.0 * np.pi * hertz * time) + turns * np.cumsum(on) / RATE
+    R, R_SL = Rotation.from_rotvec(angle[:, None] * axis), Rotation.from_rotvec([tilt, 0.0, 0.0])
+    place = R.apply([0.3, 0.2, -0.6])
+    force = R_SL.apply(R.inv().apply(np.gradient(np.gradient(place, time, axis=0), time, axis=0) + [0.0, 0.0, 9.81]))
+    rate = np.gradient(angle, time)[:, None] * np.round(R_SL.apply(axis), 12)
+    scan = scan_sensor(time, rate, np.round(force, 9))
+    assert tilt == 0.5 or any(scan.long_runs(axis) for axis in AXES[:3])
+    assert [fault.signals for fault in faults_of({"one": scan}).get("one", []) if fault.signals in AXES] == []
+
+
+def test_real_sensors_measure_on_every_axis(data: Path) -> None:
+    scans = {}
+    for path in sorted((data / "broad").glob("*.mat")):
+        trial = read_broad(path)
+        scans[path.name] = scan_sensor(np.arange(len(trial.gyro_S)) / trial.rate_hz, trial.gyro_S, trial.accel_S)
+    worn = load_session(data / "upper_body")
+    for name, sensor in worn.sensors.items():
+        scans[name] = scan_sensor(worn.time, sensor.gyro_S, sensor.accel_S)
+    assert len(scans) == 22
+    assert faults_of(scans) == {}
+    assert all(max(scan.repeats(axis) for axis in range(6)) < 0.5 for scan in scans.values())
+
+
+# Arrays ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
+def test_arrays_that_are_cut_off_are_as_uncertain(method: str, made: Simulation) -> None:
+    whole, turned, _ = cut_off_swing(made)
+    sensor = whole.sensors[BROKEN]
+    run = estimate_orientation(sensor.gyro_S, sensor.accel_S, RATE, method=method, static=(0.5, 4.5))
+    R_WS = Rotation.from_quat(run.quat_WS)
+    off = (turned[300].inv() * turned).inv() * (R_WS[300].inv() * R_WS)
+    assert run.attitude_cov is not None
+    z = off.magnitude() / np.sqrt(np.linalg.eigvalsh(run.attitude_cov)[:, -1])
+    assert np.degrees(off.magnitude().max()) > 30.0
+    assert z[450:].max() < 6.0
+
+
+@pytest.mark.parametrize(("signals", "since"), [("gyro", 0.0), ("gyro accel", 9.0), ("accel", 9.0)])
+def test_arrays_of_a_sensor_that_does_not_measure_are_refused(signals: str, since: float, made: Simulation) -> None:
+    sensor = stopped(made.recording("stopped"), signals, since).sensors[BROKEN]
+    with pytest.raises(BadData, match=rf"^{signals.replace(' ', ' and ')} stands? still.* from {since:g} to .* leave"):
+        estimate_orientation(sensor.gyro_S, sensor.accel_S, RATE, static=(0.5, 4.5))
+
+
+def test_arrays_with_an_axis_that_does_not_measure_are_refused(made: Simulation) -> None:
+    sensor = axis_stopped(made.recording("stopped"), "gyro x", 9.0).sensors[BROKEN]
+    with pytest.raises(BadData, match=r"^gyro x stands still at .* from 9 to "):
+        estimate_orientation(sensor.gyro_S, sensor.accel_S, RATE, static=(0.5, 4.5))
 
 
 # Lost samples are not measured ones --------------------------------------------------------------------------------

@@ -73,7 +73,7 @@ def _gap(case: Case, rng: np.random.Generator) -> None:
                 case.refusal = case.refusal or "may: samples are lost in the start pose"
             elif (
                 case.clasp
-                and case.stood[1] <= at < case.clasp[1]
+                and case.stood[1] <= at < case.clasp[0] + 2.0
                 and (case.method == "smekf" or any(sensor.axes is None for sensor in case.worn.values()))
             ):
                 # An orientation is lost with the samples, and what joins it to the start pose tells how a sensor sits.

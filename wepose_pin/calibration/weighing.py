@@ -74,7 +74,7 @@ def weighed(
     if not closed.any():
         return solve(looks, center, information, weights, x, steps, not quick), weights, kept, independent
     for k in rounds:
-        x = fit = solve(looks, center, information, weights, x, steps, not quick)
+        x = fit = solve(looks, center, information, weights, x, steps, strict=False)  # these weights are not the last
         independent = 0.0
         for closure, span in looks.spans():
             if isinstance(closure, Closure):

@@ -44,9 +44,9 @@ def _print_session(ended: Ended) -> None:
         )
     print_table(
         title,
-        ("sensor", "samples", "ticks without", "late", "twice", "unsound"),
+        ("sensor", "samples", "ticks without", "late", "twice", "unsound", "frozen"),
         [
-            (name, *(str(of[key]) for key in ("taken", "missing", "late", "duplicate", "bad")))
+            (name, *(str(of[key]) for key in ("taken", "missing", "late", "duplicate", "bad", "frozen")))
             for name, of in ended.counts.items()
         ],
     )

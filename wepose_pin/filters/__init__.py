@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arguments import check_arguments
 from ..errors import BadData, BadOption, BadPhase, one_of
+from ..recording.faults import faults_of, scan_sensor
 from ..recording.limits import STANDARD_GRAVITY
 from .amekf import Amekf, AmekfParams
 from .base import FilterRun, OrientationFilter
@@ -114,12 +115,14 @@ def estimate_orientation(
     static_test : when the sensor counts as still; None for the paper's values
 
     The static phase begins with zero heading and the tilt of the accelerometer, averaged over it (without one: over the
-    first window of `static_test`); the filter goes forward and backward from there.
+    first window of `static_test`); the filter goes forward and backward from there. Where gyro_S is cut off by the
+    sensor's range, `attitude_cov` grows by what it may have turned beyond.
 
     Raises
     ------
     BadOption, BadData, BadPhase
-        An unknown method; arrays that do not fit each other; a static phase outside the data.
+        An unknown method; arrays that do not fit each other; samples in which the sensor does not measure; a static
+        phase outside the data.
     """
     check_arguments(estimate_orientation, locals())
     check_method(method)
@@ -134,6 +137,10 @@ def estimate_orientation(
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
     if not np.isfinite(gyro).all() or not np.isfinite(accel).all():
         raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
+    scan = scan_sensor(np.arange(len(gyro)) / rate_hz, gyro, accel)
+    for fault in faults_of({"": scan}).get("", []):
+        raise BadData(f"{fault.described(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
+    noise, start = TYPICAL, None
     if static is None:
         found = "finds in motion, in a minute or so" if method in ("amekf", "smoother") else "does not find in motion"
         warnings.warn(
@@ -141,20 +148,13 @@ def estimate_orientation(
             f"which '{method}' {found}",
             stacklevel=2,
         )
-        return run_filter(gyro, accel, rate_hz, TYPICAL, method, params, static_test)
-    first, last = round(static[0] * rate_hz), round(static[1] * rate_hz) + 1
-    if not 0 <= first < last <= len(gyro) + 1:
-        raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
-    return run_filter(
-        gyro,
-        accel,
-        rate_hz,
-        noise_of(gyro[first:last], accel[first:last], rate_hz),
-        method,
-        params,
-        static_test,
-        start=slice(first, last),
-    )
+    else:
+        first, last = round(static[0] * rate_hz), round(static[1] * rate_hz) + 1
+        if not 0 <= first < last <= len(gyro) + 1:
+            raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
+        noise, start = noise_of(gyro[first:last], accel[first:last], rate_hz), slice(first, last)
+    run = SensorRun(rate_hz, noise, method, params, static_test, start=start, gyro_range=scan.gyro_range)
+    return run.push(gyro, accel) or run.finish()
 
 
 def with_range(method: str, params: Any, gyro_range: float) -> Any:

@@ -17,6 +17,7 @@ from ..pose import LiveKinematics
 from ..readers.live_log import recording_of
 from ..recording import SEGMENTS, ImuSensor, Recording
 from ..recording.arrivals import (
+    COUNTS,
     DUPLICATE,
     JUMP_S,
     LATE,
@@ -95,7 +96,7 @@ class Ended(NamedTuple):
 
     poses: int
     seconds: float  # [s] from the first pose to the last, on the source's clock
-    counts: Mapping[str, Mapping[str, int]]  # segment → taken, missing, late, duplicate, bad
+    counts: Mapping[str, Mapping[str, int]]  # segment → each of `arrivals.COUNTS`
     latency: Latencies  # [s] from the newest sample's time to its pose, of every tick
     diagnostics: tuple[Diagnostic, ...]
     problem: str  # of the recording; empty where it is whole
@@ -319,19 +320,20 @@ class LiveLoop:
     def _status(self) -> Status:
         sensors, aligner, tracker = self.source.sensors, self._aligner, self._tracker
         now = self.source.clock()
-        counts = np.zeros((len(sensors), 5), dtype=np.int64) if aligner is None else aligner.counts.copy()
+        counts = np.zeros((len(sensors), len(COUNTS)), dtype=np.int64) if aligner is None else aligner.counts.copy()
         self._taken.append((now, counts[:, TAKEN]))
         (then, before), (_, after) = self._taken[0], self._taken[-1]
         rates = (after - before) / (now - then) if now > then else np.zeros(len(sensors))
         silent = np.array([now - self._newest[name] > SILENT_S for name in sensors])
-        lost = silent if aligner is None else silent | aligner.lost
+        frozen = np.zeros(len(sensors), dtype=bool) if aligner is None else aligner.frozen.copy()
+        lost = silent if aligner is None else silent | aligner.lost | frozen
         static = np.zeros(len(sensors), dtype=bool) if tracker is None else tracker.static
         bias = np.zeros((len(sensors), 3)) if tracker is None else tracker.gyro_bias
         heading = np.full(len(sensors), np.nan)
         if tracker is not None:
             heading = tracker.heading_std()
         latest = 1e3 * np.array(self._latest or [0.0])
-        state, message, progress = self._state(lost)
+        state, message, progress = self._state(lost, frozen)
         return Status(
             state,
             message,
@@ -349,6 +351,7 @@ class LiveLoop:
                     int(counts[i, MISSING]),
                     int(counts[i, LATE]),
                     int(counts[i, DUPLICATE]),
+                    bool(frozen[i]),
                 )
                 for i, name in enumerate(sensors)
             ),
@@ -357,13 +360,12 @@ class LiveLoop:
             dict(self.source.problems) | ({self.log.problem: 1} if self.log is not None and self.log.problem else {}),
         )
 
-    def _state(self, lost: np.ndarray) -> tuple[str, str, float]:
+    def _state(self, lost: np.ndarray, frozen: np.ndarray) -> tuple[str, str, float]:
         """State, what to tell the person, and how far the start pose is."""
         if self._ended:
             return "ended", "The session has ended.", 1.0
         if self._tracker is not None:
-            gone = [name for name, is_lost in zip(self.source.sensors, lost, strict=True) if is_lost]
-            return "ready", f"No samples from {_listed(gone)}." if gone else "Tracking.", 1.0
+            return "ready", self._of_lost(lost, frozen) or "Tracking.", 1.0
         if self._aligner is None or self._guide is None:
             absent = [name for name in self.source.sensors if self._newest[name] == -np.inf]
             return "waiting", f"Waiting for {_listed(absent)}." if absent else "Counting samples.", 0.0
@@ -373,12 +375,25 @@ class LiveLoop:
         guide = self._guide
         progress = min(1.0, guide.held_s / HOLD_S)
         if guide.state == "waiting":
-            absent = [self.source.sensors[i] for i in guide.missing]
-            return "waiting", f"Waiting for {_listed(absent)}.", 0.0
+            missing = np.isin(np.arange(len(lost)), guide.missing)
+            return "waiting", self._of_lost(missing & frozen, frozen) or f"Waiting for {self._listed(missing)}.", 0.0
         if guide.state == "moved":
             moved = _listed([self.source.sensors[i] for i in guide.moving])
             return "moved", f"You moved ({moved}). Once more: {pose[0].lower()}{pose[1:]}.", progress
         return "hold", f"{pose}: {max(0.0, HOLD_S - guide.held_s):.0f} s more.", progress
+
+    def _of_lost(self, lost: np.ndarray, frozen: np.ndarray) -> str:
+        """What to say of sensors that are lost (k,) bool, of them those that are frozen; empty where none is."""
+        said = []
+        if (lost & ~frozen).any():
+            said.append(f"No samples from {self._listed(lost & ~frozen)}.")
+        if (lost & frozen).any():
+            said.append(f"The same values again and again from {self._listed(lost & frozen)}: switch it off and on.")
+        return " ".join(said)
+
+    def _listed(self, which: np.ndarray) -> str:
+        """The sensors (k,) bool in words."""
+        return _listed([name for name, is_one in zip(self.source.sensors, which, strict=True) if is_one])
 
     def _share_of_named(self) -> float:
         assert self._named is not None
@@ -386,13 +401,13 @@ class LiveLoop:
         return float(np.clip((self._aligner.newest - self._named[0]) / (self._named[1] - self._named[0]), 0.0, 1.0))
 
     def _summary(self) -> Ended:
-        counts = np.zeros((len(self.source.sensors), 5), int) if self._aligner is None else self._aligner.counts
-        names = ("missing", "late", "duplicate", "bad", "taken")
+        shape = len(self.source.sensors), len(COUNTS)
+        counts = np.zeros(shape, int) if self._aligner is None else self._aligner.counts
         return Ended(
             self._latency.count,
             self._last_pose - self._first_pose if self._latency.count else 0.0,
             {
-                name: dict(zip(names, row.tolist(), strict=True))
+                name: dict(zip(COUNTS, row.tolist(), strict=True))
                 for name, row in zip(self.source.sensors, counts, strict=True)
             },
             self._latency,

@@ -263,6 +263,7 @@ def status_json(status: Status) -> str:
                     "missing": sensor.missing,
                     "late": sensor.late,
                     "duplicate": sensor.duplicate,
+                    "frozen": bool(sensor.frozen),
                 }
                 for sensor in status.sensors
             ],

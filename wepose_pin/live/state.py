@@ -14,7 +14,7 @@ class LivePose(NamedTuple):
     quat_WL: np.ndarray  # (k, 4) xyzw, in the order of `Stage.segments`
     points: np.ndarray  # (p, 3) [m] in W, in the order of `Stage.points`
     std: np.ndarray  # (k,) [rad] one standard deviation of an axis; NaN where the filter has none
-    lost: np.ndarray  # (k,) bool: its sensor has been silent for longer than the loop waits
+    lost: np.ndarray  # (k,) bool: its sensor has been silent for longer than the loop waits, or is frozen
     latency: float  # [s] from the newest sample's time to this pose
 
 
@@ -31,7 +31,7 @@ class SensorStatus(NamedTuple):
 
     segment: str
     rate_hz: float  # samples a second over the last second, on the source's clock
-    lost: bool  # silent for longer than the loop waits
+    lost: bool  # silent for longer than the loop waits, or frozen
     static: bool
     gyro_bias: tuple[float, float, float]  # [rad/s]
     heading_std: float  # [rad]; NaN where the filter has no covariance
@@ -39,6 +39,7 @@ class SensorStatus(NamedTuple):
     missing: int  # ticks that it had no sample for
     late: int  # samples that came after their tick had gone
     duplicate: int
+    frozen: bool  # it repeats itself bit for bit, and has noise
 
 
 class Status(NamedTuple):

@@ -95,7 +95,9 @@ class TerminalView:
 
     def _changes(self, status: Status) -> list[str]:
         """Lines on what is not as it was told before; the seconds of a countdown are no change."""
-        now = {"": status.state} | {f"{s.segment}: ": "lost" if s.lost else "there" for s in status.sensors}
+        now = {"": status.state} | {
+            f"{s.segment}: ": "frozen" if s.frozen else "lost" if s.lost else "there" for s in status.sensors
+        }
         now |= {f"{problem}: ": "since now" for problem, count in status.problems.items() if count}
         changed = [what for what, state in now.items() if self._told.get(what, "there") != state]
         self._told |= now
@@ -146,7 +148,9 @@ def table(status: Status, *, keys: bool = False, width: int = 80) -> Any:
 
 
 def _row(sensor: SensorStatus, begun: bool) -> tuple[str, ...]:
-    state = "✕ lost" if sensor.lost else "● there" if not begun else "■ at rest" if sensor.static else "▶ moving"
+    state = "● there" if not begun else "■ at rest" if sensor.static else "▶ moving"
+    if sensor.lost:
+        state = "✕ frozen" if sensor.frozen else "✕ lost"
     bias = " ".join(f"{_known(math.degrees(axis) if begun else math.nan, 2):>6}" for axis in sensor.gyro_bias)
     heading = _known(math.degrees(sensor.heading_std), 1)
     age = _known(sensor.heading_age if begun else math.nan, 0)

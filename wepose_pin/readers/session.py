@@ -26,7 +26,7 @@ from ..recording import (
     span_text,
 )
 from ..recording.clocks import TIME_UNITS, Clock, clock_of, common_time
-from ..recording.faults import Scan
+from ..recording.faults import ROWS, Scan
 from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, lost_samples, runs
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from ..recording.plausibility import sensor_notes
@@ -56,7 +56,6 @@ SI = {"gyro": 1.0, "accel": 1.0}
 # Keys of [data] that a session need not have; one that no sensor has a use for is an error.
 _FOR_SENSORS = ("file", "time", "time_unit", "rate_hz", "gyro_unit", "accel_unit", "format", "use")
 _NO_ROW = 2**31 - 1
-_SCAN_ROWS = 1 << 16  # that are looked at together for faults
 _BEGINNING_S = 20.0  # [s] of a recording in which somebody stands still for a second
 
 
@@ -379,8 +378,8 @@ class SessionReader:
             for key, clock in clocks.items()
         }
         scan = Scan()
-        for first in range(0, max(map(len, times.values())), _SCAN_ROWS):
-            rows = slice(first, first + _SCAN_ROWS)
+        for first in range(0, max(map(len, times.values())), ROWS):
+            rows = slice(first, first + ROWS)
             tables = {plan.table: self._tables[plan.table][rows] for plan in self._plans.values()}
             blocks = {}
             for segment, plan in self._plans.items():

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..compilation import kernel
 from .clocks import LONGEST_GAP_S
+from .faults import FROZEN_SAMPLES, NOISY_S, ROUNDING, TURNS_BACK, TURNS_BACK_HZ
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 
 # A sample this near to a tick, as a share of a step, is the tick's own.
@@ -23,12 +24,20 @@ REORDER_S = 0.02  # [s] for how long a sample may come after one that is later, 
 WAIT_S = 0.1  # [s] for how long a tick waits for a sensor; then the sensor is lost until it comes again
 JUMP_S = 1.0  # [s] a time further ahead of all others is an error, unless the sensor goes on from there
 
-MISSING, LATE, DUPLICATE, BAD, TAKEN = range(5)
-COUNTS = ("missing", "late", "duplicate", "bad", "taken")
+# A sensor that has noise is frozen when it repeats itself this many times as often as it ever did.
+MOST_REPEATS = 4.0
+
+MISSING, LATE, DUPLICATE, BAD, TAKEN, FROZEN = range(6)
+COUNTS = ("missing", "late", "duplicate", "bad", "taken", "frozen")
 
 # A row of a sensor's room: time, gyro, accel.
 _T, _GX, _AX, _WIDTH = 0, 1, 4, 7
 _OUT = 1024
+# What is remembered of a sensor's values. Of each of the six: the newest, its step, its largest size, how often it
+# turned back in this second and whether it changed. Of all: when the second began and its samples; since when the
+# values repeat, how often by now and at most before; [s] of noise; samples unlike the one before; the newest time.
+_LAST, _STEP, _SIZE, _TURNS, _CHANGES = 0, 6, 12, 18, 24
+_SECOND, _SAMPLES, _SINCE, _REPEATS, _MOST, _NOISY, _VALUES, _TIME, _MEMORY = 30, 31, 32, 33, 34, 35, 36, 37, 38
 _TICK, _NEWEST = 0, 1  # of the scalars: ticks given, the newest time of all
 
 
@@ -77,7 +86,8 @@ class Aligner:
     overtaken and `wait_s` for a silent sensor, measured on the samples' own times; from then on the sensor is lost and
     none waits for it until it comes again. A sample on its tick is taken as it is; between ticks the rate is the mean
     over the step (each sample's rate holds for the interval that ends there) and the specific force is interpolated.
-    Holes of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN.
+    Holes of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN. A sensor that has noise and repeats itself
+    bit for bit, for longer than is bridged and than it ever did, is frozen: what it sends is lost until it changes.
 
     Parameters
     ----------
@@ -92,6 +102,8 @@ class Aligner:
         k = len(self.sensors)
         self.counts = np.zeros((k, len(COUNTS)), dtype=np.int64)
         self.lost = np.zeros(k, dtype=np.bool_)
+        self.frozen = np.zeros(k, dtype=np.bool_)
+        self._memory = np.zeros((k, _MEMORY))
         # A sensor may be much faster than the ticks.
         room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, LONGEST_GAP_S))
         self._kept, self._held = np.zeros((k, room, _WIDTH)), np.zeros(k, dtype=np.int64)
@@ -131,6 +143,8 @@ class Aligner:
                 self._settings,
                 self.counts,
                 self.lost,
+                self.frozen,
+                self._memory,
                 *came,
                 at,
                 values,
@@ -142,7 +156,9 @@ class Aligner:
 
 
 @kernel
-def _take(kept, held, jump, scalars, settings, counts, lost, which, time, gyro, accel, at, out, out_lost):  # type: ignore[no-untyped-def]
+def _take(  # type: ignore[no-untyped-def]
+    kept, held, jump, scalars, settings, counts, lost, frozen, memory, which, time, gyro, accel, at, out, out_lost
+):
     """Samples from `at` on; gives how far it came and how many ticks it made, at most as many as `out` holds."""
     made = 0
     while True:
@@ -151,19 +167,26 @@ def _take(kept, held, jump, scalars, settings, counts, lost, which, time, gyro, 
             made += 1
         if made == len(out) or at == len(time):
             return at, made
-        _insert(kept, held, jump, scalars, settings, counts, lost, which[at], time[at], gyro[at], accel[at])
+        s, t = which[at], time[at]
+        if _is_sound(jump, scalars, counts, s, t, gyro[at], accel[at]):
+            if t > memory[s, _TIME] or memory[s, _VALUES] == 0.0:
+                frozen[s] = _repeats_itself(memory, frozen[s], s, t, gyro[at], accel[at])
+            if frozen[s] and t > memory[s, _SINCE]:
+                counts[s, FROZEN] += 1
+                scalars[_NEWEST] = max(scalars[_NEWEST], t)
+            else:
+                _insert(kept, held, scalars, settings, counts, lost, s, t, gyro[at], accel[at])
         at += 1
 
 
 @kernel
-def _insert(kept, held, jump, scalars, settings, counts, lost, s, t, gyro, accel):  # type: ignore[no-untyped-def]
-    """One sample into its sensor's room, in order of time."""
-    dt = settings[1]
+def _is_sound(jump, scalars, counts, s, t, gyro, accel):  # type: ignore[no-untyped-def]
+    """Whether a sample may have been measured, and at this time."""
     size = gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2]
     force = accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2]
     if not (abs(t) < 1e12 and size < HIGHEST_RATE_SQUARED and force < HIGHEST_ACCEL_SQUARED):
         counts[s, BAD] += 1
-        return
+        return False
     if t > scalars[_NEWEST] + JUMP_S and scalars[_NEWEST] > -np.inf:
         # One wild time must not make hours of ticks; a clock that really went on does so for some samples.
         goes_on = jump[s, 0] > 0.0 and 0.0 < t - jump[s, 1] < 1.0
@@ -171,8 +194,73 @@ def _insert(kept, held, jump, scalars, settings, counts, lost, s, t, gyro, accel
         jump[s, 1] = t
         if jump[s, 0] < 4.0:
             counts[s, BAD] += 1
-            return
+            return False
     jump[s, 0] = 0.0
+    return True
+
+
+@kernel
+def _repeats_itself(memory, frozen, s, t, gyro, accel):  # type: ignore[no-untyped-def]
+    """Whether sensor s is `frozen` with this sample, its newest, or is so still."""
+    m = memory[s]
+    same = m[_VALUES] > 0.0
+    for k in range(6):
+        same = same and m[_LAST + k] == (gyro[k] if k < 3 else accel[k - 3])
+    m[_TIME] = t
+    if not same:
+        if not frozen:
+            m[_MOST] = max(m[_MOST], m[_REPEATS], 1.0)
+        _remember(m, t, gyro, accel)
+        return False
+    m[_REPEATS] += 1.0
+    lasts = t - m[_SINCE]
+    if m[_REPEATS] < FROZEN_SAMPLES or lasts <= LONGEST_GAP_S * (1.0 + 1e-6):
+        return False
+    if m[_NOISY] >= NOISY_S:
+        return m[_REPEATS] > MOST_REPEATS * m[_MOST]
+    # What never gave anything else shows no noise of its own; the others are of its kind.
+    others_noisy = False
+    for other in range(len(memory)):
+        others_noisy = others_noisy or memory[other, _NOISY] >= NOISY_S
+    return others_noisy and m[_VALUES] == 1.0 and lasts >= NOISY_S
+
+
+@kernel
+def _remember(m, t, gyro, accel):  # type: ignore[no-untyped-def]
+    """Values that are not those of the sample before; of each second, whether they turn back as noise does."""
+    if m[_VALUES] == 0.0:
+        m[_SECOND] = t
+    m[_REPEATS], m[_SINCE] = 0.0, t
+    m[_VALUES] += 1.0
+    m[_SAMPLES] += 1.0
+    for k in range(6):
+        value = gyro[k] if k < 3 else accel[k - 3]
+        step = value - m[_LAST + k] if m[_VALUES] > 1.0 else 0.0
+        m[_SIZE + k] = max(m[_SIZE + k], abs(value))
+        if abs(step) < ROUNDING * m[_SIZE + k]:
+            step = 0.0
+        if step * m[_STEP + k] < 0.0:
+            m[_TURNS + k] += 1.0
+        if step != 0.0:
+            m[_CHANGES + k] = 1.0
+        m[_LAST + k], m[_STEP + k] = value, step
+    seconds = t - m[_SECOND]
+    if seconds >= 1.0:
+        least = m[_SAMPLES] * min(TURNS_BACK, TURNS_BACK_HZ * seconds / m[_SAMPLES])
+        changes, turns = False, m[_SAMPLES] >= 2.0 * FROZEN_SAMPLES
+        for k in range(6):
+            if m[_CHANGES + k] > 0.0:
+                changes, turns = True, turns and m[_TURNS + k] > least
+            m[_TURNS + k], m[_CHANGES + k] = 0.0, 0.0
+        if changes and turns:
+            m[_NOISY] += seconds
+        m[_SECOND], m[_SAMPLES] = t, 0.0
+
+
+@kernel
+def _insert(kept, held, scalars, settings, counts, lost, s, t, gyro, accel):  # type: ignore[no-untyped-def]
+    """One sample into its sensor's room, in order of time."""
+    dt = settings[1]
     last = settings[0] + (scalars[_TICK] - 1.0) * dt  # the tick that went last
     room, n = kept[s], held[s]
     if t < last + SAME * dt:

@@ -7,6 +7,13 @@ It is a fault where physics contradicts it, or where the sensor shows noise when
 - a rate that stays the same while the specific force changes as only motion does;
 - both the same, of a sensor whose noise is finer than its digits: then two samples in a row are never alike.
 
+So it is with a single axis, which stays the same in motion about another as well. Two things tell that it does not
+measure:
+
+- it has the noise of the other axes, and by that would not repeat so often;
+- the mean specific force of some seconds, turned by the gyroscope, points up, and seconds later again; where an axis
+  of either is missing it does not.
+
 All is gathered block by block, so that a recording in pieces is judged as the whole is.
 """
 
@@ -14,20 +21,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtr, ndtri
 
+from .. import rotations
 from ..errors import BadData
 from .clocks import LONGEST_GAP_S, Clock
 from .gaps import GOOD, runs
 from .intervals import format_time
-from .limits import NARROWEST_GYRO_RANGE
+from .limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE, STANDARD_GRAVITY
 from .plausibility import cut_off
 
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5  # of rate and force both at one value: longer than gaps that are bridged in silence
-STUCK_S = 1.0  # of one of them alone
+STUCK_S = 1.0  # of one of them alone, or of one axis
 # While accel stays the same: how fast gyro tips it [rad/s], beyond any bias, and by how much in all [rad], one alone.
 TIPS, TIPPED = 0.2, 1.0
 MOVES = 2.0  # [m/s²] by which accel changes on an axis only where the sensor moves
@@ -37,6 +47,18 @@ ROUNDING = 1e-9  # steps below this share of the largest value are rounding, not
 NOISY_S = 1.5  # [s] of noise that show a sensor to be noisy
 COARSE = 1e-4  # share of runs of equal samples that are longer than twice the usual, from which the digits are coarse
 
+# An axis does not measure that repeats so often that the noise of its neighbours makes it as improbable as e^-60.
+# Digits count up to these sizes [rad/s], [m/s²]: tremor may be wider than coarser ones about one axis alone.
+IMPROBABLE = 60.0
+COARSEST = np.repeat([np.deg2rad(0.25), 0.05], 3)
+WIDE = 1.5  # digits from which on a step is wider than one
+FEWEST_WIDE = 10  # steps
+ENOUGH_NOISE_S = 30.0  # [s] of it that are looked at
+# Up is the mean specific force of so many seconds; that of two windows on it is off by less, wherever the arm has been.
+UP_S, UP_OFF = 2.0, 0.8  # [s], [rad]
+UP_FORCE = 0.3  # share by which its norm may be off gravity
+
+ROWS = 1 << 16  # that are looked at together
 SAME_RANGE = 0.1  # share by which the ranges of a sensor's axes may differ: each has its own scale
 COPIED = 0.5  # share of a sensor's rows, those that repeat aside, that another has as well only if it is a copy
 AT_RANGE = 0.02  # share below its range from which on a sample counts as cut off: resampled ones mix with others
@@ -45,7 +67,7 @@ AT_RANGE = 0.02  # share below its range from which on a sample counts as cut of
 class Fault(NamedTuple):
     """A stretch in which a sensor gave one value over and over."""
 
-    signals: str  # which: "gyro", "accel" or "gyro and accel"
+    signals: str  # which: "gyro", "accel", "gyro and accel", or an axis of one, "gyro x"
     first: float  # [s], the last sample that was measured
     last: float  # [s], the last that was not
     value: tuple[float, ...]  # at which it stood, SI
@@ -53,8 +75,8 @@ class Fault(NamedTuple):
     def described(self, since: float) -> str:
         """In words, from the time [s] `since`."""
         value = ", ".join(f"{v:.4g}" for v in self.value[:3])
-        unit = "m/s^2" if self.signals == "accel" else "rad/s"
-        stands = "stand still, gyro" if " " in self.signals else "stands still"
+        unit = "m/s^2" if self.signals.startswith("accel") else "rad/s"
+        stands = "stand still, gyro" if "and" in self.signals else "stands still"
         return f"{self.signals} {stands} at {value} {unit} from {format_time(since)} to {format_time(self.last)} s"
 
 
@@ -69,13 +91,16 @@ class _Run:
     low: np.ndarray  # (3,) of accel
     high: np.ndarray  # (3,)
     tipped: float  # [rad], ∫ |gyro × up|
+    up_off: float  # [rad] by which up changes, as the whole sensor sees it; 0 where it is not looked at
+    distinct: int  # rows in which the other axes of the signal are not those of the row before
     first_row: bool  # of the recording
 
     def joined(self, after: _Run) -> _Run:
         """Both as one; the last row of this is the first of the one after it."""
         low, high = np.minimum(self.low, after.low), np.maximum(self.high, after.high)
         rows, tipped = self.rows + after.rows - 1, self.tipped + after.tipped
-        return _Run(rows, self.first, after.last, self.value, low, high, tipped, self.first_row)
+        up_off, distinct = max(self.up_off, after.up_off), self.distinct + after.distinct
+        return _Run(rows, self.first, after.last, self.value, low, high, tipped, up_off, distinct, self.first_row)
 
     @property
     def seconds(self) -> float:
@@ -89,7 +114,8 @@ class _Run:
 
 _Sample = tuple[float, np.ndarray]  # when [s], what
 _LONGEST = 1000  # rows of a run that are counted
-_SIGNALS = {"gyro and accel": slice(0, 6), "gyro": slice(0, 3), "accel": slice(3, 6)}
+_AXES = {f"{name} {axis}": slice(k, k + 1) for k, (name, axis) in enumerate(product(("gyro", "accel"), "xyz"))}
+_SIGNALS = {"gyro and accel": slice(0, 6), "gyro": slice(0, 3), "accel": slice(3, 6), **_AXES}
 
 
 @dataclass
@@ -104,6 +130,8 @@ class SensorScan:
     _open: dict[str, _Run | None] = field(default_factory=lambda: dict.fromkeys(_SIGNALS))
     _lengths: np.ndarray = field(default_factory=lambda: np.zeros(_LONGEST + 1, dtype=np.int64))  # rows → runs
     _noisy_s: float = 0.0  # [s] in which it turns back as noise does
+    _noise_steps: np.ndarray = field(default_factory=lambda: np.zeros(6))  # of each axis then, from sample to sample
+    _wide_steps: np.ndarray = field(default_factory=lambda: np.zeros(6))  # of them, those by more than a digit
     _peak: float = 0.0  # [rad/s] the largest of all axes
     _levels: list[float] = field(default_factory=list)  # [rad/s] at which an axis seems cut off
 
@@ -125,7 +153,7 @@ class SensorScan:
         for name, axes in _SIGNALS.items():
             self._gather(name, block, np.logical_and.reduce(equal[axes]), first_row)
         changing = block[np.concatenate([[True], ~np.logical_and.reduce(equal)])]
-        if self._noisy_s < NOISY_S:
+        if self._noisy_s < ENOUGH_NOISE_S:
             self._noise(changing)
         self._cut_off(changing[:, 1:])
 
@@ -137,12 +165,13 @@ class SensorScan:
             self._lengths += np.bincount(length, minlength=_LONGEST + 1)
             self._lengths[1] += int(len(same) - same.sum()) - len(spans)
         edge = (spans[:, 0] == 0) | (spans[:, 1] == len(same))
+        seconds = block[spans[:, 1], 0] - block[spans[:, 0], 0]
         open_, self._open[name] = self._open[name], None
         if open_ is not None and not same[0]:
             self._close(name, open_)
             open_ = None
-        for a, b in spans[(length >= FROZEN_SAMPLES) | edge]:
-            run = _run(block[a : b + 1], first_row and a == 0)
+        for a, b in spans[((length >= FROZEN_SAMPLES) & (seconds >= _least_s(name))) | edge]:
+            run = _run(block[a : b + 1], name, first_row and a == 0)
             if open_ is not None and a == 0:
                 run, open_ = open_.joined(run), None
             if b == len(same):
@@ -151,8 +180,7 @@ class SensorScan:
                 self._close(name, run)
 
     def _close(self, name: str, run: _Run) -> None:
-        least = FROZEN_S if name == "gyro and accel" else STUCK_S
-        if run.rows >= FROZEN_SAMPLES and run.seconds >= least * (1.0 - 1e-6):
+        if run.rows >= FROZEN_SAMPLES and run.seconds >= _least_s(name):
             self._long[name].append(run)
 
     def _noise(self, distinct: np.ndarray) -> None:
@@ -168,7 +196,34 @@ class SensorScan:
         varies = (steps[1:] != 0.0)[: count * size].reshape(count, size, 6).any(axis=1)
         share = np.where(varies, turns, np.inf).min(axis=1)  # of all axes: in motion some go on
         share[~varies.any(axis=1)] = 0.0
-        self._noisy_s += float(np.count_nonzero(share > min(TURNS_BACK, TURNS_BACK_HZ * usual))) * size * usual
+        noise = share > min(TURNS_BACK, TURNS_BACK_HZ * usual)
+        self._noisy_s += float(np.count_nonzero(noise)) * size * usual
+        self._digits(np.abs(steps[1:])[: count * size].reshape(count, size, 6)[noise])
+
+    def _digits(self, steps: np.ndarray) -> None:
+        """Count steps (m, size, 6) of noise, and those wider than one digit: than the smallest step of their time."""
+        digit = np.where(steps > 0.0, steps, np.inf).min(axis=1)  # (m, 6)
+        fine = digit < COARSEST
+        for signal in (_SIGNALS["gyro"], _SIGNALS["accel"]):
+            measured = (steps[:, :, signal] > 0.0).any(axis=2).sum(axis=1)  # a signal may be slower than the other
+            self._noise_steps[signal] += measured @ fine[:, signal]
+        self._wide_steps += ((steps > WIDE * digit[:, None]) & fine[:, None]).sum(axis=(0, 1))
+
+    def repeats(self, axis: int) -> float:
+        """Probability that a sample of this axis is at most the one before, by the noise of the signal's other axes.
+
+        A step wider than a digit is a change of noise by more than a digit, wherever between two digits the sensor
+        stands: that bounds the noise from below, and how often it stays within one digit from above.
+        """
+        first = 3 * (axis // 3)
+        others = [k for k in range(first, first + 3) if k != axis and self._noise_steps[k] > 0]
+        if not others:
+            return 1.0
+        wide = min((self._wide_steps[k] - 3.0 * np.sqrt(self._wide_steps[k])) / self._noise_steps[k] for k in others)
+        if wide * min(self._noise_steps[k] for k in others) < FEWEST_WIDE:
+            return 1.0
+        std = -1.0 / (np.sqrt(2.0) * float(ndtri(min(wide, 1.0) / 2.0)))  # [digits]
+        return float(2.0 * ndtr(0.5 / std) - 1.0)
 
     def _cut_off(self, values: np.ndarray) -> None:
         """The levels at which an axis of gyro stays though something else changes."""
@@ -188,9 +243,8 @@ class SensorScan:
 
     def long_runs(self, name: str) -> list[_Run]:
         """Runs of rows that are equal in the signal, as far as they have come."""
-        open_, least = self._open[name], FROZEN_S if name == "gyro and accel" else STUCK_S
-        known = self._long[name]
-        if open_ is None or open_.rows < FROZEN_SAMPLES or open_.seconds < least * (1.0 - 1e-6):
+        open_, known = self._open[name], self._long[name]
+        if open_ is None or open_.rows < FROZEN_SAMPLES or open_.seconds < _least_s(name):
             return known
         return [*known, open_]
 
@@ -209,12 +263,50 @@ class SensorScan:
         return any(run.rows == self.rows for run in self.long_runs(name))
 
 
-def _run(rows: np.ndarray, first_row: bool) -> _Run:
+def scan_sensor(time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> SensorScan:
+    """What the rows of one sensor show: times (n,) [s], (n, 3) [rad/s], (n, 3) [m/s²]."""
+    scan = SensorScan()
+    for first in range(0, len(time), ROWS):
+        rows = slice(first, first + ROWS)
+        scan.push(time[rows], np.column_stack([gyro_S[rows], accel_S[rows]]))
+    return scan
+
+
+def _least_s(name: str) -> float:
+    """[s] from which on equal samples are a run that is kept."""
+    return (FROZEN_S if name == "gyro and accel" else STUCK_S) * (1.0 - 1e-6)
+
+
+def _run(rows: np.ndarray, name: str, first_row: bool) -> _Run:
     time, gyro, accel = rows[:, 0], rows[1:, 1:4], rows[1:, 4:]
     up = accel / np.maximum(np.linalg.norm(accel, axis=1), 1e-9)[:, None]
     tipped = float(np.sum(np.linalg.norm(np.cross(gyro, up), axis=1) * np.diff(time)))
     low, high = rows[:, 4:].min(axis=0), rows[:, 4:].max(axis=0)
-    return _Run(len(rows), float(time[0]), float(time[-1]), rows[0, 1:].copy(), low, high, tipped, first_row)
+    up_off, distinct = 0.0, 0
+    if name in _AXES:
+        signal = rows[:, 1:4] if name.startswith("gyro") else rows[:, 4:]
+        up_off, distinct = _up_off(rows), int(np.count_nonzero((np.diff(signal, axis=0) != 0.0).any(axis=1)))
+    value = rows[0, 1:].copy()
+    return _Run(len(rows), float(time[0]), float(time[-1]), value, low, high, tipped, up_off, distinct, first_row)
+
+
+def _up_off(rows: np.ndarray) -> float:
+    """[rad] by which the mean specific force of `UP_S` differs from that of two such windows on, in the world."""
+    time, gyro, accel = rows[:, 0], rows[1:, 1:4], rows[:, 4:]
+    window = np.floor((time - time[0]) / UP_S).astype(int)
+    count = int(window[-1])  # whole ones
+    if count < 3:
+        return 0.0
+    force = Rotation.from_quat(rotations.integrate(gyro * np.diff(time)[:, None])).apply(accel)
+    edges = np.searchsorted(window, np.arange(count + 1))
+    if (np.diff(edges) == 0).any():
+        return 0.0
+    mean = np.add.reduceat(force, edges[:-1])[:count] / np.diff(edges)[:, None]
+    size = np.linalg.norm(mean, axis=1)
+    known = np.abs(size / STANDARD_GRAVITY - 1.0) < UP_FORCE
+    up = mean / np.maximum(size, 1e-9)[:, None]
+    off = np.arccos(np.clip(np.sum(up[2:] * up[:-2], axis=1), -1.0, 1.0))
+    return float(np.max(off * (known[2:] & known[:-2]), initial=0.0))
 
 
 def faults_of(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
@@ -238,6 +330,15 @@ def faults_of(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
         for run in scan.long_runs("accel"):
             if run.tipped > TIPPED and run.tips > TIPS and not _within(run, whole):
                 faults.append(_fault("accel", run))
+        whole = [(fault.first, fault.last) for fault in faults]
+        for axis, signals in enumerate(_AXES):
+            repeats = -np.log(max(scan.repeats(axis), 1e-300))
+            limit = scan.gyro_range if axis < 3 else NARROWEST_ACCEL_RANGE
+            for run in scan.long_runs(signals):
+                stuck = run.distinct * repeats > IMPROBABLE or run.up_off > UP_OFF
+                # What stays at the end of its range is cut off there.
+                if stuck and abs(run.value[axis]) < limit and not _within(run, whole):
+                    faults.append(_fault(signals, run))
         if faults:
             found[name] = sorted(faults, key=lambda fault: fault.first)
     return found

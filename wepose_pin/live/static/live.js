@@ -109,7 +109,7 @@ function show(status) {
     const is = sensor.lost ? "lost" : !begun ? "there" : sensor.static ? "at rest" : "moving";
     if (sensor.lost) row.className = "lost";
     text(row, "td", words(sensor.segment));
-    text(row, "td", is).prepend(shape(is));
+    text(row, "td", sensor.frozen ? "frozen" : is).prepend(shape(is));
     text(row, "td", known(sensor.rate_hz, 0));
     text(row, "td", sensor.bias_deg_s.map((axis) => known(begun ? axis : null, 2).padStart(5, "\u2007")).join(" "));
     text(row, "td", known(sensor.heading_std_deg, 1));
