@@ -10,6 +10,7 @@ import pytest
 
 from wepose_pin.recording.arrivals import (
     BAD,
+    CUT_OFF,
     DUPLICATE,
     FROZEN,
     JUMP_S,
@@ -113,7 +114,7 @@ def test_overtaken_samples_find_their_place_and_later_ones_are_late() -> None:
     too_late = came[:at] + came[at + 1 : at + behind] + [came[at]] + came[at + behind :]
     aligner = Aligner(NAMES, RATE, BEGIN)
     ticks = fed(aligner, too_late)
-    assert aligner.counts[1].tolist() == [0, 1, 0, 0, 99, 0]
+    assert aligner.counts[1].tolist() == [0, 1, 0, 0, 99, 0, 0]
     np.testing.assert_allclose(ticks.gyro_S[50, 1], 0.5 * (gyro[1, 49] + gyro[1, 51]))  # bridged
     keep = np.ones((100, 3), dtype=bool)
     keep[50, 1] = False
@@ -186,6 +187,37 @@ def test_one_sensor_alone_that_freezes_has_ticks_still() -> None:
     assert ticks.lost[420:].all()
 
 
+@pytest.mark.parametrize("digits", [1.0, 20.0])
+def test_a_rate_that_is_cut_off_is_not_known(digits: float) -> None:
+    """Swings of up to 6 rad/s behind a range of 4: all but the first samples of the first time there."""
+    rng, n = np.random.default_rng(5), 1000
+    swing = 6.0 * np.sin(2.0 * np.pi * 0.5 * np.arange(n) / RATE) * (np.arange(n) > 300)
+    gyro, accel = (0.02 * rng.standard_normal((3, n, 3)) for _ in range(2))
+    gyro[1, :, 2] += swing
+    gyro[2, :, 0] += 0.6 * swing
+    gyro = np.round(np.clip(gyro, -4.0, 4.0) * 1000.0 / digits) / 1000.0 * digits
+    aligner = Aligner(NAMES, RATE, BEGIN)
+    ticks = fed(aligner, in_order(gyro, accel))
+    beyond = np.abs(gyro).max(axis=2) > 0.98 * 4.0
+    assert beyond[1].sum() > 100
+    known = np.isfinite(ticks.gyro_S).all(axis=2).T
+    assert known[[0, 2]].all()
+    assert known[1][~beyond[1]].all()
+    assert np.count_nonzero(known[1][beyond[1]]) < 10  # and those just below it, before it was known
+    assert aligner.counts[:, CUT_OFF].tolist() == [0, np.count_nonzero(~known[1]), 0]
+    assert not ticks.lost.any()
+
+
+def test_larger_rates_tell_that_it_was_no_range() -> None:
+    gyro, accel = signals(400)
+    gyro *= 0.1
+    gyro[1, 200:210, 0] = 3.0
+    gyro[1, 300, 0] = 3.01
+    gyro[1, 350:354, 0] = 3.0
+    known = np.isfinite(fed(Aligner(NAMES, RATE, BEGIN), in_order(gyro, accel)).gyro_S).all(axis=2).T
+    assert np.flatnonzero(~known[1]).tolist() == list(range(204, 210))
+
+
 @pytest.mark.parametrize("digit", [0.5, 1.0, 3.0])
 def test_coarse_digits_that_repeat_are_measured(digit: float) -> None:
     """Noise of a digit or less, at rest, now and then in motion: it stays the same for a while by chance."""
@@ -246,7 +278,7 @@ def test_ticks_wait_for_a_silent_sensor_once_and_not_again() -> None:
     assert max(behind[:100]) == 0
     assert max(behind[100 + wait + 1 : 300]) == 0  # lost: none waits for it
     assert max(behind[302:]) == 0  # and back
-    assert aligner.counts[1].tolist() == [200, 0, 0, 0, 200, 0]
+    assert aligner.counts[1].tolist() == [200, 0, 0, 0, 200, 0, 0]
 
 
 def test_clocks_that_are_off_the_ticks_lose_no_rotation() -> None:

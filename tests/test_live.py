@@ -316,6 +316,26 @@ def test_a_sensor_that_freezes_is_lost_and_said_to_be(
     assert np.all(off.magnitude()[since + 6 :] < 6.0 * std[since + 6 :])
 
 
+@pytest.mark.parametrize("method", ["amekf", "smekf"])
+def test_what_turned_beyond_its_range_is_uncertain(recording: Recording, tmp_path: Path, method: str) -> None:
+    hurt, level = "right_forearm", 2.1
+    gyro_S = recording.sensors[hurt].gyro_S
+    assert gyro_S is not None
+    assert np.abs(gyro_S).max() > 1.5 * level
+    cut = replace(recording.sensors[hurt], gyro_S=np.clip(gyro_S, -level, level))
+    ended = live(replace(recording, sensors={**recording.sensors, hurt: cut}), tmp_path / "a.wepose", method=method)
+    beyond = int(np.count_nonzero(np.abs(gyro_S).max(axis=1) > level))
+    assert ended.counts[hurt]["cut_off"] > 0.8 * beyond > 20
+    assert all(of["cut_off"] == 0 for name, of in ended.counts.items() if name != hurt)
+    found = read_live_log(tmp_path / "a.wepose")
+    again, whole = (track(each, causal=True, method=method) for each in (found.recording, recording))
+    assert np.array_equal(found.quat_WL[:, list(recording.sensors).index(hurt)], again.quat_WL[hurt])
+    off = (Rotation.from_quat(whole.quat_WL[hurt]).inv() * Rotation.from_quat(again.quat_WL[hurt])).magnitude()
+    std = np.sqrt(np.linalg.eigvalsh(again.segment_cov[hurt])[:, -1])
+    assert np.degrees(off.max()) > 10.0
+    assert np.all(off < 6.0 * std)
+
+
 def test_a_file_that_breaks_off_anywhere_is_read_up_to_there(recording: Recording, tmp_path: Path) -> None:
     whole = tmp_path / "a.wepose"
     live(recording, whole)

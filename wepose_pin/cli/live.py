@@ -44,9 +44,9 @@ def _print_session(ended: Ended) -> None:
         )
     print_table(
         title,
-        ("sensor", "samples", "ticks without", "late", "twice", "unsound", "frozen"),
+        ("sensor", "samples", "ticks without", "late", "twice", "unsound", "frozen", "cut off"),
         [
-            (name, *(str(of[key]) for key in ("taken", "missing", "late", "duplicate", "bad", "frozen")))
+            (name, *(str(of[key]) for key in ("taken", "missing", "late", "duplicate", "bad", "frozen", "cut_off")))
             for name, of in ended.counts.items()
         ],
     )

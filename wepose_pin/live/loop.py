@@ -18,6 +18,7 @@ from ..readers.live_log import recording_of
 from ..recording import SEGMENTS, ImuSensor, Recording
 from ..recording.arrivals import (
     COUNTS,
+    CUT_OFF,
     DUPLICATE,
     JUMP_S,
     LATE,
@@ -357,8 +358,18 @@ class LiveLoop:
             ),
             (float(np.quantile(latest, 0.5)), float(np.quantile(latest, 0.99))),
             0.0 if self.log is None or aligner is None else max(0.0, aligner.newest - aligner.begin),
-            dict(self.source.problems) | ({self.log.problem: 1} if self.log is not None and self.log.problem else {}),
+            self._problems(counts),
         )
+
+    def _problems(self, counts: np.ndarray) -> dict[str, int]:
+        """What is wrong → how often, beside what each sensor's row says."""
+        problems = dict(self.source.problems)
+        for name, count in zip(self.source.sensors, counts[:, CUT_OFF].tolist(), strict=True):
+            if count:
+                problems[f"rates of {_listed([name])} beyond the range of its gyroscope"] = count
+        if self.log is not None and self.log.problem:
+            problems[self.log.problem] = 1
+        return problems
 
     def _state(self, lost: np.ndarray, frozen: np.ndarray) -> tuple[str, str, float]:
         """State, what to tell the person, and how far the start pose is."""

@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..compilation import kernel
+from ..compilation import inlined, kernel
 from .clocks import LONGEST_GAP_S
-from .faults import FROZEN_SAMPLES, NOISY_S, ROUNDING, TURNS_BACK, TURNS_BACK_HZ
-from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
+from .faults import AT_RANGE, FROZEN_SAMPLES, NOISY_S, ROUNDING, SAME_RANGE, TURNS_BACK, TURNS_BACK_HZ
+from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED, NARROWEST_GYRO_RANGE
+from .plausibility import STEEP
 
 # A sample this near to a tick, as a share of a step, is the tick's own.
 SAME = 0.01
@@ -26,9 +27,12 @@ JUMP_S = 1.0  # [s] a time further ahead of all others is an error, unless the s
 
 # A sensor that has noise is frozen when it repeats itself this many times as often as it ever did.
 MOST_REPEATS = 4.0
+# Samples for which gyro stands at its largest value so far, where its range cuts it off: more than of a whole recording
+# (`plausibility.PLATEAU`), since there may be larger ones to come. The value is so many digits at least.
+STANDS, FEWEST_DIGITS = 5, 100.0
 
-MISSING, LATE, DUPLICATE, BAD, TAKEN, FROZEN = range(6)
-COUNTS = ("missing", "late", "duplicate", "bad", "taken", "frozen")
+MISSING, LATE, DUPLICATE, BAD, TAKEN, FROZEN, CUT_OFF = range(7)
+COUNTS = ("missing", "late", "duplicate", "bad", "taken", "frozen", "cut_off")
 
 # A row of a sensor's room: time, gyro, accel.
 _T, _GX, _AX, _WIDTH = 0, 1, 4, 7
@@ -36,8 +40,9 @@ _OUT = 1024
 # What is remembered of a sensor's values. Of each of the six: the newest, its step, its largest size, how often it
 # turned back in this second and whether it changed. Of all: when the second began and its samples; since when the
 # values repeat, how often by now and at most before; [s] of noise; samples unlike the one before; the newest time.
-_LAST, _STEP, _SIZE, _TURNS, _CHANGES = 0, 6, 12, 18, 24
-_SECOND, _SAMPLES, _SINCE, _REPEATS, _MOST, _NOISY, _VALUES, _TIME, _MEMORY = 30, 31, 32, 33, 34, 35, 36, 37, 38
+# Of each axis of gyro: its smallest step, the last ones, how often it stood since, and where it is cut off.
+_LAST, _STEP, _SIZE, _TURNS, _CHANGES, _DIGIT, _ENTRY, _STANDS, _LEVEL = 0, 6, 12, 18, 24, 30, 33, 36, 39
+_SECOND, _SAMPLES, _SINCE, _REPEATS, _MOST, _NOISY, _VALUES, _TIME, _MEMORY = 42, 43, 44, 45, 46, 47, 48, 49, 50
 _TICK, _NEWEST = 0, 1  # of the scalars: ticks given, the newest time of all
 
 
@@ -88,6 +93,8 @@ class Aligner:
     over the step (each sample's rate holds for the interval that ends there) and the specific force is interpolated.
     Holes of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN. A sensor that has noise and repeats itself
     bit for bit, for longer than is bridged and than it ever did, is frozen: what it sends is lost until it changes.
+    Where an axis of gyro stood at its extreme, to which it came steeply, the sensor's range cuts it off: from then on
+    ticks with a rate at that level are NaN, since nobody knows how far the sensor turned.
 
     Parameters
     ----------
@@ -104,6 +111,7 @@ class Aligner:
         self.lost = np.zeros(k, dtype=np.bool_)
         self.frozen = np.zeros(k, dtype=np.bool_)
         self._memory = np.zeros((k, _MEMORY))
+        self._memory[:, _DIGIT:_ENTRY] = self._memory[:, _LEVEL:_SECOND] = np.inf
         # A sensor may be much faster than the ticks.
         room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, LONGEST_GAP_S))
         self._kept, self._held = np.zeros((k, room, _WIDTH)), np.zeros(k, dtype=np.int64)
@@ -163,7 +171,7 @@ def _take(  # type: ignore[no-untyped-def]
     made = 0
     while True:
         while made < len(out) and _due(kept, held, scalars, settings, lost):
-            _tick(kept, held, scalars, settings, counts, lost, out[made], out_lost[made])
+            _tick(kept, held, scalars, settings, counts, lost, memory, out[made], out_lost[made])
             made += 1
         if made == len(out) or at == len(time):
             return at, made
@@ -244,6 +252,7 @@ def _remember(m, t, gyro, accel):  # type: ignore[no-untyped-def]
         if step != 0.0:
             m[_CHANGES + k] = 1.0
         m[_LAST + k], m[_STEP + k] = value, step
+    _look_for_range(m)
     seconds = t - m[_SECOND]
     if seconds >= 1.0:
         least = m[_SAMPLES] * min(TURNS_BACK, TURNS_BACK_HZ * seconds / m[_SAMPLES])
@@ -255,6 +264,31 @@ def _remember(m, t, gyro, accel):  # type: ignore[no-untyped-def]
         if changes and turns:
             m[_NOISY] += seconds
         m[_SECOND], m[_SAMPLES] = t, 0.0
+
+
+@kernel
+def _look_for_range(m):  # type: ignore[no-untyped-def]
+    """Where axes of gyro are cut off: as `plausibility.cut_off`, with what came so far."""
+    largest = max(m[_SIZE], m[_SIZE + 1], m[_SIZE + 2])
+    for k in range(3):
+        value, step = abs(m[_LAST + k]), abs(m[_STEP + k])
+        if m[_SIZE + k] > m[_LEVEL + k] or (1.0 - SAME_RANGE) * largest > m[_LEVEL + k]:
+            m[_LEVEL + k] = np.inf  # there are larger rates
+        if step > 0.0:
+            m[_DIGIT + k], m[_STANDS + k] = min(m[_DIGIT + k], step), 1.0
+            m[_ENTRY + k] = max(step, 0.75 * m[_ENTRY + k])  # the last may be cut off itself
+            continue
+        m[_STANDS + k] += 1.0
+        steep = m[_ENTRY + k] > STEEP * m[_DIGIT + k] and value > FEWEST_DIGITS * m[_DIGIT + k]
+        at_extreme = value == m[_SIZE + k] and value >= max(NARROWEST_GYRO_RANGE, (1.0 - SAME_RANGE) * largest)
+        if steep and at_extreme and m[_STANDS + k] >= STANDS:
+            m[_LEVEL + k] = value
+
+
+@inlined
+def _range(m):  # type: ignore[no-untyped-def]
+    """[rad/s] at which gyro is cut off; infinite where that was not seen."""
+    return min(m[_LEVEL], m[_LEVEL + 1], m[_LEVEL + 2])
 
 
 @kernel
@@ -332,7 +366,7 @@ def _reached(room, n, t, dt):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _tick(kept, held, scalars, settings, counts, lost, out, out_lost):  # type: ignore[no-untyped-def]
+def _tick(kept, held, scalars, settings, counts, lost, memory, out, out_lost):  # type: ignore[no-untyped-def]
     """The next tick into `out` (k, 6); what no later tick needs is forgotten."""
     dt = settings[1]
     t = settings[0] + scalars[_TICK] * dt
@@ -343,8 +377,10 @@ def _tick(kept, held, scalars, settings, counts, lost, out, out_lost):  # type: 
             lost[s] = True
         if not _value(room, n, i, t, dt, out[s]):
             counts[s, MISSING] += 1
-            for m in range(6):
-                out[s, m] = np.nan
+            out[s, :] = np.nan
+        elif max(abs(out[s, 0]), abs(out[s, 1]), abs(out[s, 2])) >= (1.0 - AT_RANGE) * _range(memory[s]):
+            counts[s, CUT_OFF] += 1
+            out[s, :] = np.nan
         out_lost[s] = lost[s]
         # The last at or before the tick is where the next step begins.
         done = i if i < n and room[i, _T] <= t + SAME * dt else i - 1

@@ -41,6 +41,7 @@ TILTED = np.deg2rad(20.0)  # between two windows, from which the gyroscope must 
 UNSEEN = 0.25  # share of that tilt which the gyroscope has seen at most, where its unit is too small
 
 PLATEAU = 3  # samples at one value, where an axis seems cut off
+STEEP = 3  # quanta by which it comes there from a sample before or goes to one after
 
 
 def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True) -> tuple[str, ...]:
@@ -215,6 +216,6 @@ def cut_off(values: np.ndarray, least: float) -> np.ndarray:
             steps = np.abs(np.diff(x))
             quantum = float(steps[steps > same].min())
             for a, b in plateaus:
-                if max(*steps[max(a - 1, 0) : a], *steps[b - 1 : b], 0.0) > 3 * quantum:
+                if max(*steps[max(a - 1, 0) : a], *steps[b - 1 : b], 0.0) > STEEP * quantum:
                     cut[a:b, axis] = True
     return cut
