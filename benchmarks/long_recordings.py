@@ -46,7 +46,7 @@ def long_recordings(hours: tuple[float, ...]) -> Table:
             Column("faster", "times real time", 0),
             Column("memory", "memory [MB]", 0),
             Column("same", "bit-identical", 0),
-            Column("largest", "largest deviation [deg]", 4),
+            Column("largest", "largest [deg]", 4),
             Column("rms", "rms [deg]", 4),
         ),
     )
