@@ -312,7 +312,7 @@ def test_a_sensor_that_freezes_is_lost_and_said_to_be(
     since = begin - found.first
     turned = np.degrees(off[since : since + end - begin].magnitude())
     assert turned.max() > 20.0
-    std = np.sqrt(np.linalg.eigvalsh(again.segment_cov[hurt])[:, -1])
+    std = np.sqrt(np.linalg.eigvalsh(again.pose.segment_cov[hurt])[:, -1])
     assert np.all(off.magnitude()[since + 6 :] < 6.0 * std[since + 6 :])
 
 
@@ -331,7 +331,7 @@ def test_what_turned_beyond_its_range_is_uncertain(recording: Recording, tmp_pat
     again, whole = (track(each, causal=True, method=method) for each in (found.recording, recording))
     assert np.array_equal(found.quat_WL[:, list(recording.sensors).index(hurt)], again.quat_WL[hurt])
     off = (Rotation.from_quat(whole.quat_WL[hurt]).inv() * Rotation.from_quat(again.quat_WL[hurt])).magnitude()
-    std = np.sqrt(np.linalg.eigvalsh(again.segment_cov[hurt])[:, -1])
+    std = np.sqrt(np.linalg.eigvalsh(again.pose.segment_cov[hurt])[:, -1])
     assert np.degrees(off.max()) > 10.0
     assert np.all(off < 6.0 * std)
 

@@ -313,7 +313,7 @@ def test_advice_is_of_what_was_done(name: str, closed: str) -> None:
     found = calibrate_lengths(short, prior=person.average, protocol=name)
     quality = assess(found)
     assert "motion-too-short" in {d.code for d in quality.reasons}
-    words = " ".join(text.line() for text in render_all(quality.reasons))
+    words = " ".join(text.line() for _, text in render_all(quality.reasons))
     assert closed in words
     assert "joined" not in words
     assert "palms together" not in words
@@ -446,7 +446,7 @@ def test_a_protocol_is_simulated_and_calibrated(tmp_path: Path, capsys: pytest.C
     assert command("simulate", "-o", str(made), "--protocol", "poses") == 0
     assert set(load_session(made).phases) >= {"start", "t_pose", "bow"}
     assert command("calibrate", str(made), "--protocol", "poses", "--gaps", "-o", str(tmp_path / "out")) == 3
-    assert "tells headings and no length" in capsys.readouterr().err
+    assert "shows headings and no length" in capsys.readouterr().err
 
 
 def test_the_command_takes_protocols(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -290,7 +290,7 @@ def test_a_trial_that_cannot_be_scored_is_told_and_skipped(
     assert not stop.value.code
     said = capsys.readouterr()
     (line,) = said.err.splitlines()
-    for words in ("BROAD", "00_damaged", "not scored", "is no trial"):
+    for words in ("BROAD", "00_damaged", "was not run", "is no trial"):
         assert words in line
     document = json.loads((out / "validation.json").read_text())
     assert [each["trial"] for each in document["skipped"]] == ["00_damaged"]

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from wepose_pin.report.measures import between, elbow_of, hands_of, heading_budg
 from wepose_pin.report.words import listed, signed, whole
 from wepose_pin.simulation import Simulation, simulate, simulated_person
 from wepose_pin.subject import Hinge, Subject, average_subject
-from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.tracking import TrackedRecording, TrackOptions, track
 from wepose_pin.writers import write_session
 
 SECTIONS = [
@@ -56,11 +57,16 @@ def changed(recording: Recording, name: str, **signals: np.ndarray) -> Recording
     return replace(recording, sensors={**recording.sensors, name: replace(recording.sensors[name], **signals)})
 
 
+def with_pose(tracked: TrackedRecording, **changes: Any) -> TrackedRecording:
+    """The same with another pose."""
+    return replace(tracked, pose=replace(tracked.pose, **changes))
+
+
 def looked_at(pose: TrackedRecording, known: Sequence[Diagnostic] = ()) -> list[Diagnostic]:
     signals = {name: signal_of(pose.recording, name, pose) for name in pose.recording.sensors}
-    found = {side: elbow_of(pose, side, pose.subject) for side in ("left", "right")}
+    found = {side: elbow_of(pose.pose, side, pose.subject) for side in ("left", "right")}
     elbows = {side: elbow for side, elbow in found.items() if elbow is not None}
-    hands = hands_of(pose, pose.recording.rate_hz)
+    hands = hands_of(pose.pose, pose.recording.rate_hz)
     return pose_diagnostics(pose, signals, heading_budgets(pose), elbows, hands, known)
 
 
@@ -97,7 +103,7 @@ def test_it_gives_the_sensors_in_numbers(page: str, pose: TrackedRecording) -> N
 
 def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedRecording) -> None:
     table = rows(page)
-    std = {name: np.degrees(np.sqrt(cov[:, 2, 2])) for name, cov in pose.segment_cov.items()}
+    std = {name: np.degrees(np.sqrt(cov[:, 2, 2])) for name, cov in pose.pose.segment_cov.items()}
     since = pose.time >= pose.segments.start[1]
     for name, values in std.items():
         line = [row for row in table if row[0] == name.replace("_", " ")][2]
@@ -242,7 +248,7 @@ def test_a_person_who_never_rests(pose: TrackedRecording) -> None:
     restless = {name: of._replace(static=np.zeros_like(of.static)) for name, of in pose.segments.orientation.items()}
     never = replace(pose, segments=replace(pose.segments, orientation=restless))
     for method, severity in (("amekf", INFO), ("smekf", WARNING)):
-        rare = [d for d in looked_at(replace(never, method=method)) if d.code == "static-phases-rare"]
+        rare = [d for d in looked_at(replace(never, options=TrackOptions(method))) if d.code == "static-phases-rare"]
         assert [d.place for d in rare] == list(restless)
         assert {d.severity for d in rare} == {severity}
     assert longest(np.array([True, False, True, True, True, False]), 2.0) == 1.5
@@ -254,20 +260,20 @@ def test_a_late_start_pose(pose: TrackedRecording) -> None:
 
 
 def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
-    wide = replace(pose, segment_cov={name: 100.0 * cov for name, cov in pose.segment_cov.items()})
+    wide = with_pose(pose, segment_cov={name: 100.0 * cov for name, cov in pose.pose.segment_cov.items()})
     uncertain = [d for d in looked_at(wide) if d.code == "heading-uncertain"]
     assert {d.place for d in uncertain} == {"left_shoulder", "left_elbow", "right_shoulder", "right_elbow"}
     assert {d.severity for d in uncertain} == {WARNING}
     assert "calibrate the person" in render(uncertain[0]).do
     assert [d.value for d in uncertain] == sorted((d.value for d in uncertain), reverse=True)  # type: ignore[type-var]
     assert len(between(heading_budgets(wide))) == 4
-    assert the("method-needs-static", replace(wide, method="smekf")).severity == WARNING
+    assert the("method-needs-static", replace(wide, options=TrackOptions("smekf"))).severity == WARNING
 
 
 def test_headings_that_were_turned_far(pose: TrackedRecording) -> None:
-    from wepose_pin.tracking.headings import Reset
+    from wepose_pin.tracking.headings import HeadingCorrection
 
-    turned = replace(pose, reset=Reset(None, {}, {"right_forearm": 23.0, "torso": 1.0}))
+    turned = replace(pose, correction=HeadingCorrection(None, {}, {"right_forearm": 23.0, "torso": 1.0}))
     corrected = the("heading-corrected-far", turned)
     assert (corrected.place, corrected.value) == ("right_forearm", pytest.approx(np.deg2rad(23.0)))
 
@@ -285,7 +291,7 @@ def with_elbow(
     pose: TrackedRecording, forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0
 ) -> TrackedRecording:
     quat_WL = {**pose.quat_WL, **bent(forward_deg, aside_deg)}
-    return replace(pose, quat_WL=quat_WL)
+    return with_pose(pose, quat_WL=quat_WL)
 
 
 def test_elbows_that_cannot_be(pose: TrackedRecording) -> None:
@@ -375,7 +381,7 @@ def test_hands_are_seen_from_the_torso(pose: TrackedRecording) -> None:
         {"torso": (turn * Rotation.from_quat(pose.quat_WL["torso"])).as_quat()},
         {name: turn.apply(p) + 1.0 for name, p in pose.points.items()},
     )
-    as_was, now = (hands_of(of, pose.recording.rate_hz) for of in (pose, turned))
+    as_was, now = (hands_of(of, pose.recording.rate_hz) for of in (pose.pose, turned))
     for name in ("left_hand", "right_hand"):
         np.testing.assert_allclose(now[name].reach, as_was[name].reach, atol=1e-9)
         assert now[name].std is None
@@ -478,9 +484,9 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
         return np.where(before[:, None, None], factor**2 * cov, cov)
 
     late = replace(pose, segments=replace(pose.segments, start=(begin, begin + 2.0)))
-    peak = replace(late, point_cov={name: wider(cov, 60.0) for name, cov in late.point_cov.items()})
+    peak = with_pose(late, point_cov={name: wider(cov, 60.0) for name, cov in late.pose.point_cov.items()})
     assert rows_of_hands(track_report(peak, view="<p>")) == rows_of_hands(track_report(late, view="<p>"))
-    most = max(float(spread(peak.point_cov[name]).max()) for name in ("left_hand", "right_hand"))
+    most = max(float(spread(peak.pose.point_cov[name]).max()) for name in ("left_hand", "right_hand"))
     assert the("position-uncertain-before-start", peak).value == pytest.approx(most)
     assert not any(each.code.endswith("-before-start") for each in looked_at(late))
     text = text_of(track_report(peak, view="<p>"))
@@ -489,8 +495,8 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
 
 
 def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackedRecording) -> None:
-    cov = {name: np.broadcast_to(0.12**2 * np.eye(3), cov.shape) for name, cov in pose.point_cov.items()}
-    uncertain = the("position-uncertain", replace(pose, point_cov=cov), "right_hand")
+    cov = {name: np.broadcast_to(0.12**2 * np.eye(3), cov.shape) for name, cov in pose.pose.point_cov.items()}
+    uncertain = the("position-uncertain", with_pose(pose, point_cov=cov), "right_hand")
     assert uncertain.severity == WARNING
     assert "The position of the right hand may be off by ± 120 mm" in render(uncertain).what
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wepose_pin.diagnostics import render
 from wepose_pin.report.chart import Chart, Key, Panel, Picture, category_rows, log_ticks, round_ticks
 from wepose_pin.report.page import Link, Page, PageWriter, Table, inline, load_template
 from wepose_pin.report.words import capital, slug
@@ -83,8 +84,9 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert writer.write("a.html", lambda _: "new") == "new"
     assert writer.write("b.html", lambda _: 1 / 0) is None  # type: ignore[arg-type,return-value]
     assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
-    (warning,) = writer.warnings
-    assert warning.startswith("b.html: cannot be made: ZeroDivisionError")
+    (diagnostic,) = writer.diagnostics
+    assert (diagnostic.code, diagnostic.place) == ("page-incomplete", "b.html")
+    assert "ZeroDivisionError" in render(diagnostic).what
 
 
 def test_names() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import ATTITUDE_STD, START_POSE_STD, Filtered
+from wepose_pin.alignment import ATTITUDE_STD, START_POSE_STD
 from wepose_pin.calibration import load_protocol, weighing
 from wepose_pin.calibration.known import (
     DRIFT_STD,
@@ -23,6 +23,7 @@ from wepose_pin.calibration.known import (
 )
 from wepose_pin.calibration.lengths import Calibration, _solve
 from wepose_pin.calibration.weighing import LEAST_CORRELATION_S
+from wepose_pin.filters.sensors import FilteredRecording
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import PERFECT, Person, simulate, simulated_person
 from wepose_pin.subject import LENGTHS, mount_rows
@@ -121,7 +122,7 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
             R_VS[name] = Rotation.concatenate([*[at_start[name]] * len(start_time), Q * at_start[name]])
         found = _solve(
             recording,
-            Filtered(R_VS, at_start, {}, START, START, []),
+            FilteredRecording(R_VS, at_start, {}, START, START, []),
             protocol,
             prior,
             taped,

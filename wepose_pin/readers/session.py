@@ -80,7 +80,7 @@ def iter_session(path: str | Path, seconds: float = 600.0) -> Iterator[Recording
     """A session in pieces of `seconds`, for recordings that do not fit in memory: only its times are held as a whole.
 
     Put together, the pieces are what `load_session` gives: to the bit, or to rounding where clocks differ and it is
-    resampled. A piece has the phases of the whole. Units are checked by the first.
+    resampled. A piece has the phases that touch it. Units are checked by the first.
 
     Raises
     ------
@@ -436,7 +436,7 @@ class SessionReader:
         check(recording)
         begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
         notes = sensor_notes(recording, whole=begins, units=first == 0)
-        return replace(recording, phases=self._head.phases, notes=(*recording.notes, *notes))
+        return replace(recording, notes=(*recording.notes, *notes))
 
     def _window(self, plan: _Plan, first: int, last: int) -> tuple[int, int]:
         """The samples on a sensor's own clock that the piece needs, neighbours for bridging and resampling included."""

@@ -8,6 +8,7 @@ numbers every two seconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +71,7 @@ def track_session(
 
 
 def _chunks(reader: SessionReader, seconds: float, multiple: int) -> Iterator[Recording]:
-    """Chunks of a multiple of so many samples; none at the end that is too short to be one."""
+    """Chunks of a multiple of so many samples, with the phases of the whole; the last one is not too short."""
     time, rate_hz = reader.time, reader.rate_hz
 
     def samples(duration_s: float) -> int:
@@ -81,5 +82,5 @@ def _chunks(reader: SessionReader, seconds: float, multiple: int) -> Iterator[Re
     first, size = 0, samples(first_s + 2.0 / rate_hz)
     while first < len(time):
         last = len(time) if len(time) - first < size + samples(SHORTEST_S) else first + size
-        yield reader.recording(first, last)
+        yield replace(reader.recording(first, last), phases=reader.phases)
         first, size = last, samples(seconds)
