@@ -57,6 +57,7 @@ def test_every_method_is_measured() -> None:
     assert 0.0 < measured["accuracy"].rows["smekf"]["total_rmse"] < 1.0
 
 
+@pytest.mark.peer
 def test_scipy_solves_the_same_calibration() -> None:
     rows = calibration.calibration(10.0, (10.0,), 1).rows
     names = [name.partition(": ")[2] for name in rows]
