@@ -16,7 +16,7 @@ from wepose_pin import rotations
 from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import attitude_error, uncertainty
 from wepose_pin.filters import TYPICAL, Amekf, AmekfParams, FilterRun, Smoother, estimate_orientation, run_filter
-from wepose_pin.filters.amekf import STATES, TAPE, transition_rows
+from wepose_pin.filters.amekf import BLOCK, ERROR, STATES, transition_rows
 from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.noise import SensorNoise, noise_of
 from wepose_pin.filters.static import StaticDetector
@@ -25,7 +25,7 @@ from wepose_pin.simulation import PERFECT_WORLD, REALISTIC, paper_dynamic
 
 RATE = 100.0
 GRAVITY = 9.81
-V, P, B, M, F, D = 3, 5, 7, 10, 19, 22  # the error states, as the module's docstring has them
+V, P, B, M, F, D = (states.start for states in ERROR[1:])
 
 
 class Case(NamedTuple):
@@ -126,10 +126,13 @@ def strapdown(x: np.ndarray, gyro: np.ndarray, moving: np.ndarray, force_S: np.n
     return np.concatenate([R.as_rotvec(), v, p])
 
 
-def block_sums(R: np.ndarray, rate: np.ndarray, moving: np.ndarray, dt: float) -> np.ndarray:
-    """Σ R dt, Σ R ω_c dt for c = x, y, z, and Σ_moving R dt, each rows first."""
-    parts = [R.sum(axis=0)] + [np.einsum("kij,k->ij", R, rate[:, c]) for c in range(3)]
-    return dt * np.concatenate([part.ravel() for part in [*parts, R[moving.astype(bool)].sum(axis=0)]])
+def block_of(R: np.ndarray, rate: np.ndarray, moving: np.ndarray, dt: float) -> np.ndarray:
+    """(1,) of `BLOCK` with the sums of samples with orientations (n, 3, 3) and rates (n, 3)."""
+    block = np.zeros(1, BLOCK)
+    block["R"], block["R_moving"] = dt * R.sum(axis=0), dt * R[moving.astype(bool)].sum(axis=0)
+    block["R_rate"] = dt * np.einsum("kij,kc->cij", R, rate)
+    block["length"] = len(R) * dt
+    return block
 
 
 def test_the_transition_is_the_derivative_of_the_strapdown() -> None:
@@ -143,9 +146,9 @@ def test_the_transition_is_the_derivative_of_the_strapdown() -> None:
         R = R * Rotation.from_rotvec(rate[k] * dt)
         turns.append(R)
     force = np.array([turn.inv().apply([0.0, 0.0, GRAVITY]) for turn in turns])
-    sums = block_sums(np.array([turn.as_matrix() for turn in turns[1:]]), rate, moving, dt)
+    block = block_of(np.array([turn.as_matrix() for turn in turns[1:]]), rate, moving, dt)
     found = np.empty((7, STATES))
-    transition_rows(sums, n * dt, GRAVITY, np.eye(STATES), found)
+    transition_rows(block[0], GRAVITY, np.eye(STATES), found)
     step, expected = 1e-6, np.empty((7, STATES))
     for j in range(STATES):
         ends = [strapdown(sign * step * np.eye(STATES)[j], rate, moving, force, dt) for sign in (1.0, -1.0)]
@@ -171,25 +174,25 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     filter_.state.P[:] = np.outer(scale, scale) * (np.eye(STATES) + half @ half.T)
     filter_.state.x[V : P + 2] = 0.1, -0.2, 0.05, 0.02
     x_before, P_start = filter_.state.x.copy(), filter_.state.P.copy()
-    tape = np.empty((1, TAPE))
-    found = filter_.taped(of.gyro[at], of.accel[at], np.full(25, still), tape)
+    blocks = np.empty(1, BLOCK)
+    found = filter_.run_recorded(of.gyro[at], of.accel[at], np.full(25, still), blocks)
 
     rows, T = np.empty((7, STATES)), 0.25
-    transition_rows(tape[0, :45], T, of.noise.gravity, np.eye(STATES), rows)
+    transition_rows(blocks[0], of.noise.gravity, np.eye(STATES), rows)
     whole = np.eye(STATES)
     whole[:7] = rows
     variance = float(np.trace(of.noise.gyro_cov)) / 3.0
     q = np.zeros(STATES)
     q[:3] = variance * T / RATE
-    q[2] += still * params.rest_turn_noise**2 * T
+    q[2] += still * params.static_turn_noise**2 * T
     q[V : V + 2] = float(np.trace(of.noise.accel_cov)) / 3.0 * of.noise.gravity**2 * T / RATE
     q[B : B + 3], q[M : M + 9] = params.gyro_bias_walk**2 * T, params.gyro_matrix_walk**2 * T
     q[F : F + 3], q[D:] = params.accel_bias_walk**2 * T, params.motion_bias_walk**2 * T
     P_before = whole @ P_start @ whole.T + np.diag(q)
     of_state = [V, V + 1, B, B + 1, B + 2] if still else [V, V + 1, P, P + 1]
     H = np.eye(STATES)[of_state]
-    r = [params.rest_speed_std**2] * 2 if still else [params.speed_std**2 / T] * 2
-    r += [params.rest_bias_std**2 + variance / 25] * 3 if still else [params.position_std**2 / T] * 2
+    r = [params.static_speed_std**2] * 2 if still else [params.speed_std**2 / T] * 2
+    r += [params.static_bias_std**2 + variance / 25] * 3 if still else [params.position_std**2 / T] * 2
     gain = P_before @ H.T @ np.linalg.inv(H @ P_before @ H.T + np.diag(r))
     np.testing.assert_allclose(filter_.state.P, P_before - gain @ H @ P_before, atol=1e-12, rtol=1e-7)
     # The correction, from the strapdown's own end: the filter on a copy of which a block is a sample longer has it.
@@ -376,13 +379,13 @@ def test_a_clipped_gyroscope_is_known_to_be_wrong() -> None:
     assert not within(of, untold, 500)
 
 
-def test_a_knock_does_not_tip_the_attitude() -> None:
+def test_an_impact_does_not_tip_the_attitude() -> None:
     """150 m/s² for 20 ms, a velocity change of 3 m/s that never was."""
     of = case(7)
     accel = of.accel.copy()
     accel[2500:2502] += [150.0, -100.0, 50.0]
     clean, found = (tilt_deg(errors(of, run(c).quat_WS)) for c in (of, of._replace(accel=accel)))
-    print(f"tilt after the knock: {found[2500:].max():.2f} deg, without {clean[2500:].max():.2f} deg")
+    print(f"tilt after the impact: {found[2500:].max():.2f} deg, without {clean[2500:].max():.2f} deg")
     assert found[2500:].max() < 1.0
 
 
@@ -513,7 +516,7 @@ def test_the_authors_trial_is_no_worse_than_with_smekf(data: Path) -> None:
     assert max(mean["amekf"], mean["smoother"]) <= mean["smekf"] + 0.03
 
 
-def test_a_bank_of_sensors_gives_the_bits_of_each() -> None:
+def test_a_create_bank_sensors_gives_the_bits_of_each() -> None:
     cases = [case(seed) for seed in range(3)]
     filters = [Amekf(of.noise, RATE, of.start) for of in cases]
     bank = LiveBank(filters, [StaticDetector(of.noise, RATE) for of in cases])

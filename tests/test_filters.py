@@ -530,7 +530,7 @@ def sensors(
     return gyro, accel, true, noises, [quat_from_gravity(accel[:50, i].mean(axis=0)) for i in range(count)]
 
 
-def test_a_bank_of_sensors_gives_the_bits_of_each_alone() -> None:
+def test_a_create_bank_sensors_gives_the_bits_of_each_alone() -> None:
     gyro, accel, _, noises, starts = sensors(5)
     gyro[700:703, 2] = np.nan  # one sensor's samples do not come
     accel[1400, 4] = np.nan
@@ -544,7 +544,7 @@ def test_a_bank_of_sensors_gives_the_bits_of_each_alone() -> None:
         detectors = [StaticDetector(noise, RATE) for noise in noises]
         for i, (filter_, detector) in enumerate(zip(filters, detectors, strict=True)):
             filter_.run(gyro[:first, i], accel[:first, i], detector.run(gyro[:first, i], accel[:first, i]))
-        before = filters[0].state.row.copy()
+        before = filters[0].state.record.copy()
         bank = LiveBank(filters, detectors)
         for k in range(first, len(gyro)):
             quat = bank.update(gyro[k], accel[k])
@@ -553,7 +553,7 @@ def test_a_bank_of_sensors_gives_the_bits_of_each_alone() -> None:
         assert quat is bank.quat_WS
         np.testing.assert_array_equal(bank.gyro_bias, [run.gyro_bias[-1] for run in alone])
         np.testing.assert_array_equal(bank.attitude_cov, [run.attitude_cov[-1] for run in alone])  # type: ignore[index]
-        np.testing.assert_array_equal(filters[0].state.row, before)  # on copies
+        np.testing.assert_array_equal(filters[0].state.record, before)  # on copies
 
 
 def test_a_bank_takes_any_array_and_names_what_does_not_fit() -> None:

@@ -19,7 +19,7 @@ from wepose_pin.calibration import calibrate_lengths
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import from_json
 from wepose_pin.errors import BadData, BadOption
-from wepose_pin.filters import METHODS, SensorRun, piece_multiple, run_filter
+from wepose_pin.filters import METHODS, SensorRun, chunk_multiple, run_filter
 from wepose_pin.filters.noise import noise_of
 from wepose_pin.model import load_model
 from wepose_pin.pose import pose_table
@@ -157,7 +157,7 @@ def test_filters_in_pieces(made: Simulation, method: str) -> None:
     gyro, accel = one_sensor(made)
     noise = noise_of(gyro[50:450], accel[50:450], RATE)
     whole = run_filter(gyro, accel, RATE, noise, method)
-    size = 40 * piece_multiple(method, RATE)
+    size = 40 * chunk_multiple(method, RATE)
     edges = [*range(0, len(gyro) - size, size), len(gyro)] if size > 40 else [0, 60, 1000, 1001, 3000, len(gyro)]
     run, found = SensorRun(RATE, noise, method), []
     for first, last in pairwise(edges):

@@ -139,12 +139,12 @@ def _kernels(quat, rate, dt, by_rate, in_world, R):  # type: ignore[no-untyped-d
 @pytest.mark.parametrize("angle", [*ANGLES, 0.1414, 0.1415, 0.2828, 0.2829])
 def test_kernels_on_both_sides_of_their_switches(angle: float) -> None:
     dt, axis, start = 0.01, np.array([0.36, -0.48, 0.8]), Rotation.from_rotvec([0.3, -0.5, 0.9])
-    by_rate, in_world, R = np.empty(4), np.empty(4), np.empty(9)
+    by_rate, in_world, R = np.empty(4), np.empty(4), np.empty((3, 3))
     terms, derivative = _kernels(start.as_quat(), angle / dt * axis, dt, by_rate, in_world, R)
     turn = Rotation.from_rotvec(angle * axis)
     np.testing.assert_allclose(Rotation.from_quat(by_rate).as_matrix(), (start * turn).as_matrix(), atol=1e-14)
     np.testing.assert_allclose(Rotation.from_quat(in_world).as_matrix(), (turn * start).as_matrix(), atol=1e-14)
-    np.testing.assert_allclose(R.reshape(3, 3), start.as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(R, start.as_matrix(), atol=1e-15)
     cosine, s, c, d = terms
     W = cross_matrix(angle * axis)
     outer = np.outer(axis, axis) * angle**2

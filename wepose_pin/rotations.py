@@ -196,12 +196,12 @@ def derivative(x, y, z, w, wx, wy, wz):  # type: ignore[no-untyped-def]
 
 @inlined
 def fill_matrix(quat, R):  # type: ignore[no-untyped-def]
-    """`R` (9,) rows first, of `quat` (4,) xyzw."""
+    """`R` (3, 3) of `quat` (4,) xyzw."""
     x, y, z, w = quat[0], quat[1], quat[2], quat[3]
     x2, y2, z2 = 2.0 * x, 2.0 * y, 2.0 * z
-    R[0], R[1], R[2] = 1.0 - y * y2 - z * z2, x * y2 - w * z2, x * z2 + w * y2
-    R[3], R[4], R[5] = x * y2 + w * z2, 1.0 - x * x2 - z * z2, y * z2 - w * x2
-    R[6], R[7], R[8] = x * z2 - w * y2, y * z2 + w * x2, 1.0 - x * x2 - y * y2
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - y * y2 - z * z2, x * y2 - w * z2, x * z2 + w * y2
+    R[1, 0], R[1, 1], R[1, 2] = x * y2 + w * z2, 1.0 - x * x2 - z * z2, y * z2 - w * x2
+    R[2, 0], R[2, 1], R[2, 2] = x * z2 - w * y2, y * z2 + w * x2, 1.0 - x * x2 - y * y2
 
 
 @kernel

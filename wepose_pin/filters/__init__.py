@@ -45,8 +45,8 @@ __all__ = [
     "SmekfParams",
     "Smoother",
     "check_method",
+    "chunk_multiple",
     "estimate_orientation",
-    "piece_multiple",
     "run_filter",
 ]
 
@@ -54,8 +54,8 @@ METHODS: dict[str, type] = {"amekf": Amekf, "smoother": Smoother, "smekf": Smekf
 BEST = "amekf"  # of those that need no future (docs/validation.md)
 OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
 
-# Of a sensor that is never seen at rest: noise of a usual MEMS sensor at 100 to 300 Hz, a bias as it may be from the
-# factory. Only amekf and smoother find the bias in motion.
+# For a sensor without a static phase: noise of a usual MEMS sensor at 100 to 300 Hz, a bias as it may be from the
+# factory. Only amekf and smoother estimate the bias in motion.
 TYPICAL = SensorNoise(
     gyro_bias=np.zeros(3),
     gyro_bias_cov=np.deg2rad(0.5) ** 2 * np.eye(3),
@@ -73,9 +73,9 @@ class Orientation(NamedTuple):
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
     static: np.ndarray  # (n,) bool
     attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²], error on the right, in S; None where the filter has none
-    noise: SensorNoise  # what the static phase said
-    filter: OrientationFilter | None = None  # where it stands after the last sample, to go on live; None: it cannot
-    detector: StaticDetector | None = None  # the same
+    noise: SensorNoise  # of the static phase
+    filter: OrientationFilter | None = None  # after the last sample, to continue live; None: it cannot
+    detector: StaticDetector | None = None  # after the last sample as well
 
 
 def check_method(method: str) -> str:
@@ -109,10 +109,10 @@ def estimate_orientation(
     accel_S : (n, 3) [m/s²], specific force, +g up at rest
     rate_hz : samples a second, uniform
     method : a key of `METHODS`
-    static : from, to [s] after the first sample: the sensor is static; noise and bias are measured there. None: it
-        never is; noise is then `TYPICAL`, the bias is looked for, and a warning says so
+    static : from, to [s] after the first sample: the sensor is static; noise and bias are measured there. None:
+        nothing is known to be; noise is then `TYPICAL`, the bias starts at zero, and a warning says so
     params : the filter's own frozen parameters; None for its defaults
-    static_test : when the sensor counts as still; None for the paper's values
+    static_test : when the sensor counts as static; None for the default values
 
     The static phase begins with zero heading and the tilt of the accelerometer, averaged over it (without one: over the
     first window of `static_test`); the filter goes forward and backward from there. Where gyro_S is cut off by the
@@ -142,10 +142,10 @@ def estimate_orientation(
         raise BadData(f"{fault.described(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
     noise, start = TYPICAL, None
     if static is None:
-        found = "finds in motion, in a minute or so" if method in ("amekf", "smoother") else "does not find in motion"
+        estimates = "estimates in motion, in a minute or so" if method in ("amekf", "smoother") else "cannot estimate"
         warnings.warn(
             "no static phase: noise is that of a usual sensor, and the gyroscope's bias starts at zero, "
-            f"which '{method}' {found}",
+            f"which '{method}' {estimates}",
             stacklevel=2,
         )
     else:
@@ -166,19 +166,18 @@ def with_range(method: str, params: Any, gyro_range: float) -> Any:
     return replace(params, gyro_range=min(gyro_range, params.gyro_range))
 
 
-def piece_multiple(method: str, rate_hz: float) -> int:
-    """How many samples the pieces of a recording are a multiple of, the last one excepted."""
+def chunk_multiple(method: str, rate_hz: float) -> int:
+    """Number of samples of which the chunks of a recording are a multiple, the last one excepted."""
     return max(1, round(AmekfParams().block_s * rate_hz)) if method in OFFLINE else 1
 
 
 class SensorRun:
-    """`run_filter` of a recording that comes in chunks; all that it gives, put together, is that of the whole.
+    """`run_filter` of a recording that comes in chunks; its results, put together, are those of the whole.
 
     The filter starts with the tilt of the start phase and goes forward from its first sample; what lies before is
     filtered backward from there, so that a recording may begin in motion. The smoother goes forward over all, from
-    where the way back has ended; it alone looks ahead, by one chunk: `push` gives the chunk before, and what lies
-    further ahead does not count. Its chunks are multiples of `piece_multiple`. Parameters as `run_filter`; the start
-    phase is in the first chunk.
+    where the way back has ended; it alone looks ahead, by one chunk: `push` returns the chunk before. Its chunks are
+    multiples of `chunk_multiple`. Parameters as `run_filter`; the start phase is in the first chunk.
 
     Raises
     ------
@@ -203,18 +202,18 @@ class SensorRun:
         self._measured_start, self._start = measured_start, start
         self._detector = StaticDetector(noise, rate_hz, self.test)
         self._filter: Any = None
-        self._before: Orientation | None = None  # what lies before the start phase, until it is given
+        self._before: Orientation | None = None  # before the start phase, until it is returned
         self._static: np.ndarray | None = None  # of the smoother's chunk
 
     def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation | None:
-        """Take a chunk (n, 3) [rad/s], (n, 3) [m/s²]; gives it filtered, or the one before it smoothed."""
+        """Take a chunk (n, 3) [rad/s], (n, 3) [m/s²]; returns it filtered, or the one before it smoothed."""
         if self._filter is None:
             first = self._begin(gyro_S, accel_S)
             gyro_S, accel_S = gyro_S[first:], accel_S[first:]
         static = self._detector.run(gyro_S, accel_S)
         if self._method in OFFLINE:
-            done, self._static, before = self._filter.push(gyro_S, accel_S, static), static, self._static
-            return None if done is None or before is None else self._orientation(done, before)
+            smoothed, self._static, before = self._filter.push(gyro_S, accel_S, static), static, self._static
+            return None if smoothed is None or before is None else self._orientation(smoothed, before)
         return self._orientation(self._filter.run(gyro_S, accel_S, static), static)
 
     def finish(self) -> Orientation:
@@ -223,11 +222,11 @@ class SensorRun:
         return self._orientation(self._filter.finish(), self._static)
 
     def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> int:
-        """Make the filter, and filter what lies before the start phase; gives the filter's first sample."""
+        """Make the filter, and filter the samples before the start phase; returns the filter's first sample."""
         phase = self._start or slice(0, self.test.samples(self._rate_hz))
         first = phase.start
         start = start_tilt(gyro_S[phase], accel_S[phase], self._noise, self._rate_hz)
-        if self._start is None:  # nobody says that it rests there
+        if self._start is None:  # it may move there
             static = StaticDetector(self._noise, self._rate_hz, self.test).run(gyro_S[phase], accel_S[phase])
             if not static[-1]:
                 start = start._replace(tilt_std=MOVING_TILT_STD)
@@ -236,13 +235,13 @@ class SensorRun:
             if self._method in OFFLINE:  # goes forward over all, from where the way back has ended
                 turn = np.nan_to_num(gyro_S[0] - before.gyro_bias[0]) / self._rate_hz
                 quat_WS = (Rotation.from_quat(before.quat_WS[0]) * Rotation.from_rotvec(-turn)).as_quat()
-                start, first = StartTilt(quat_WS, MOVING_TILT_STD), 0  # what the way back knows counts but once
+                start, first = StartTilt(quat_WS, MOVING_TILT_STD), 0  # the samples count once, on the way forward
             self._before = before
-        self._filter = self._made(self._method, self._noise, start)
+        self._filter = self._create_filter(self._method, self._noise, start)
         return first
 
     def _backward(self, start: StartTilt, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation:
-        """Of the samples `accel_S` before the start phase; `gyro_S` has its first sample as well, which leads to it.
+        """Orientation at the samples `accel_S` before the start phase; `gyro_S` has the first of the phase as well.
 
         Backward in time rates change their sign, the bias' too; specific forces do not.
         """
@@ -252,11 +251,12 @@ class SensorRun:
         gyro, accel = -gyro_S[:0:-1], accel_S[::-1]
         static = StaticDetector(noise, self._rate_hz, self.test).run(gyro, accel)
         method = BEST if self._method in OFFLINE else self._method
-        run = self._made(method, noise, start._replace(quat_WS=quat_WS)).run(gyro, accel, static)
+        filter_ = self._create_filter(method, noise, start._replace(quat_WS=quat_WS))
+        run = filter_.run(gyro, accel, static)
         cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
         return Orientation(run.quat_WS[::-1], -run.gyro_bias[::-1], static[::-1], cov, self._noise)
 
-    def _made(self, method: str, noise: SensorNoise, start: StartTilt) -> Any:
+    def _create_filter(self, method: str, noise: SensorNoise, start: StartTilt) -> Any:
         params = self._params
         if params is None and method in ("amekf", "smoother") and self._start is not None:
             params = AmekfParams(tilt_std=start.tilt_std)
@@ -270,7 +270,7 @@ class SensorRun:
         live = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
         before, self._before = self._before, None
         if before is not None and self._method in OFFLINE:
-            # Its own heading is exact where the recording begins; the headings are aligned in the start phase.
+            # The smoother's heading is exact where the recording begins; the headings are aligned in the start phase.
             assert run.attitude_cov is not None
             run.attitude_cov[: len(before.static)] = before.attitude_cov
         elif before is not None:
@@ -297,7 +297,7 @@ def run_filter(
     """`estimate_orientation` once the noise is known and the arrays are checked.
 
     `measured_start`: without `params`, smekf takes P₀ from `noise` in place of the paper's (`smekf.starting_params`).
-    `start`: samples of the start phase; None: the first window of `static_test`, at rest or not.
+    `start`: samples of the start phase; None: the first window of `static_test`, static or not.
     """
     run = SensorRun(rate_hz, noise, method, params, static_test, measured_start, start)
     return run.push(gyro_S, accel_S) or run.finish()

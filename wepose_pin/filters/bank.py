@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadData, BadOption
-from .smekf import P_AA, P_AB, symmetric
+from .covariance import symmetric
 from .static import StaticDetector, StaticState
 
 
 class LiveBank:
     """k sensors that are sampled together, each with a filter and a detector made (and perhaps run) on its own.
 
-    The bank goes on from where those are, on a copy of their states, and gives the same bits as they would. Nothing is
-    allocated by `update`: what it gives and the arrays named here are overwritten by the next.
+    The bank continues from their states, on a copy, with bit-identical results. `update` allocates nothing: the next
+    one overwrites its result and the arrays named here.
 
     Parameters
     ----------
@@ -46,13 +46,14 @@ class LiveBank:
                 "one of each a sensor and one length are needed"
             )
         self._step = filters[0].live
-        self._rows = np.stack([filter_.state.row for filter_ in filters])
-        self._models = np.stack([filter_.model for filter_ in filters])
-        self._still = StaticState(*map(np.concatenate, zip(*(detector.state for detector in detectors), strict=True)))
+        self._states = np.concatenate([filter_.state.record for filter_ in filters])
+        self._models = np.concatenate([filter_.model for filter_ in filters])
+        detector_states = zip(*(detector.state for detector in detectors), strict=True)
+        self._detectors = StaticState(*map(np.concatenate, detector_states))
         self._shape = (len(filters), 3)
         self.static = np.zeros(len(filters), dtype=np.bool_)
-        self.quat_WS = self._rows[:, :4]
-        self.gyro_bias = self._rows[:, 4:7]
+        self.quat_WS = self._states["quat_WS"]
+        self.gyro_bias = self._states["gyro_bias"]
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """`quat_WS` (k, 4) after one sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²].
@@ -62,17 +63,17 @@ class LiveBank:
         gyro, accel = np.ascontiguousarray(gyro_S, dtype=float), np.ascontiguousarray(accel_S, dtype=float)
         if gyro.shape != self._shape or accel.shape != self._shape:  # the compiled step would read beyond their ends
             raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape}: a row for each of {self._shape[0]} sensors")
-        self._step(self._rows, self._models, *self._still, gyro, accel, self.static)
+        self._step(self._states, self._models, *self._detectors, gyro, accel, self.static)
         return self.quat_WS
 
     @property
     def attitude_cov(self) -> np.ndarray:
         """(k, 3, 3) [rad²] of the error on the right, in S; a copy."""
-        return symmetric(self._rows[:, P_AA:P_AB])
+        return symmetric(self._states["attitude_cov"])
 
 
 class OneByOne:
-    """As `LiveBank`, for filters without a kernel for many: each is updated on its own, and goes on itself."""
+    """As `LiveBank`, for filters without a kernel for many: each filter itself is updated, one after the other."""
 
     def __init__(self, filters: Sequence[Any], detectors: Sequence[StaticDetector]) -> None:
         self._filters, self._detectors = filters, detectors
@@ -93,7 +94,7 @@ class OneByOne:
         return None
 
 
-def bank_of(filters: Sequence[Any], detectors: Sequence[StaticDetector]) -> LiveBank | OneByOne:
-    """The fastest of the two that these filters allow."""
+def create_bank(filters: Sequence[Any], detectors: Sequence[StaticDetector]) -> LiveBank | OneByOne:
+    """A `LiveBank` if the filters have a kernel for it, else `OneByOne`."""
     kind = LiveBank if all(hasattr(filter_, "live") for filter_ in filters) else OneByOne
     return kind(filters, detectors)

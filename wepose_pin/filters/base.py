@@ -1,4 +1,4 @@
-"""What every orientation filter is: frozen parameters, a state apart from them, one compiled step for one and many."""
+"""The protocol of orientation filters: frozen parameters, a state apart from them, one compiled step for all uses."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from .noise import SensorNoise
 
 T = TypeVar("T")
 
-# [rad/√s] by which a sensor that counts as static may turn about the vertical unseen: 0.01 deg/s for 10 s at a time
-REST_TURN_NOISE = 8e-4
+# [rad/√s] by which a static sensor may rotate about the vertical undetected: 0.01 deg/s for 10 s at a time
+STATIC_TURN_NOISE = 8e-4
 
 
 class FilterRun(NamedTuple):
-    """What a run gives, one row a sample."""
+    """Results of a run, one row a sample."""
 
     quat_WS: np.ndarray  # (n, 4) xyzw, orientation after the sample
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
@@ -36,11 +36,11 @@ class OrientationFilter(Protocol):
     def __init__(self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray) -> None: ...
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
-        """Take one sample, `gyro_S` (3,) [rad/s], `accel_S` (3,) [m/s²]; gives `quat_WS` (4,) xyzw after it."""
+        """Take one sample, `gyro_S` (3,) [rad/s], `accel_S` (3,) [m/s²]; returns `quat_WS` (4,) xyzw after it."""
         ...
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray) -> FilterRun:
-        """Take samples (n, 3), (n, 3), `static` (n,) bool; the state goes on from where it was."""
+        """Take samples (n, 3), (n, 3), `static` (n,) bool; the state continues from the run before."""
         ...
 
 
@@ -50,16 +50,16 @@ def samples(
     """One sample or many as the contiguous arrays that the compiled steps take: (n, 3), (n, 3), (n,)."""
     gyro = np.ascontiguousarray(np.reshape(gyro_S, (-1, 3)), dtype=float)
     accel = np.ascontiguousarray(np.reshape(accel_S, (-1, 3)), dtype=float)
-    at_rest = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
-    if not len(gyro) == len(accel) == len(at_rest):  # the compiled steps would read beyond an array's end
+    is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
+    if not len(gyro) == len(accel) == len(is_static):  # the compiled steps would read beyond an array's end
         raise BadData(
-            f"{len(gyro)} rows of gyro_S, {len(accel)} of accel_S, {len(at_rest)} of static: not as many each"
+            f"{len(gyro)} rows of gyro_S, {len(accel)} of accel_S, {len(is_static)} of static: not as many each"
         )
-    return gyro, accel, at_rest
+    return gyro, accel, is_static
 
 
 class OneSample:
-    """Room for one sample and what a run gives of it, so that `update` calls the run's kernel and allocates little."""
+    """Arrays for one sample and its results, so that `update` calls the run's kernel and allocates little."""
 
     def __init__(self) -> None:
         self.inputs = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1, dtype=np.bool_)
@@ -67,8 +67,8 @@ class OneSample:
 
     def fill(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The sample as arrays of one row."""
-        gyro, accel, at_rest = self.inputs
-        gyro[0], accel[0], at_rest[0] = gyro_S, accel_S, static
+        gyro, accel, is_static = self.inputs
+        gyro[0], accel[0], is_static[0] = gyro_S, accel_S, static
         return self.inputs
 
 
@@ -88,8 +88,8 @@ def in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads: in
 
 def processors() -> int:
     """Processors that this process may use; WEPOSE_THREADS says fewer, as where processes share the machine."""
-    if (said := os.environ.get("WEPOSE_THREADS", "")).isdecimal():
-        return max(1, int(said))
+    if (stated := os.environ.get("WEPOSE_THREADS", "")).isdecimal():
+        return max(1, int(stated))
     if hasattr(os, "sched_getaffinity"):  # Linux: a container or taskset may have fewer than the machine
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

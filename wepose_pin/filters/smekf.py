@@ -20,7 +20,8 @@ from ..compilation import inlined, kernel
 from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, rotation_terms, up_in_sensor
-from .base import REST_TURN_NOISE, FilterRun, OneSample, samples
+from .base import STATIC_TURN_NOISE, FilterRun, OneSample, samples
+from .covariance import fill_symmetric, symmetric
 from .noise import SWAY_CORRELATION_S, SensorNoise
 from .start import ACCEL_BIAS_STD
 from .static import static_step
@@ -45,9 +46,9 @@ class SmekfParams:
     attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
     bias_cov0: float | np.ndarray = 1e-3  # [rad²/s²], a number or (3, 3)
     bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the static phase's first differences
-    rest_gyro_cov: np.ndarray | None = None  # (3, 3) [rad²/s²] by which gyro at rest is not the bias; None: Σ_ω
-    rest_accel_cov: np.ndarray | None = None  # (3, 3) by which accel/g at rest is not the vertical; None: Σ_g
-    rest_turn_noise: float = 0.0  # [rad/√s] by which a sensor at rest may turn about the vertical unseen; the paper: 0
+    static_gyro_cov: np.ndarray | None = None  # (3, 3) [rad²/s²] of static gyro about the bias; None: Σ_ω
+    static_accel_cov: np.ndarray | None = None  # (3, 3) of static accel/g about the vertical; None: Σ_g
+    static_turn_noise: float = 0.0  # [rad/√s] by which a static sensor may turn about the vertical unseen; the paper: 0
     first_order: bool = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
     gyro_range: float = np.inf  # [rad/s]; a sample at it is cut off: turned by it, but what is beyond went unseen
 
@@ -68,9 +69,9 @@ def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, til
     return SmekfParams(
         attitude_cov0=tilt_std**2 * across + HEADING_FLOOR**2 * np.eye(3),
         bias_cov0=noise.gyro_bias_cov,
-        rest_gyro_cov=noise.gyro_cov + noise.sway_density(rate_hz) * rate_hz * np.eye(3),
-        rest_accel_cov=noise.accel_cov + ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz * np.eye(3),
-        rest_turn_noise=REST_TURN_NOISE,
+        static_gyro_cov=noise.gyro_cov + noise.sway_density(rate_hz) * rate_hz * np.eye(3),
+        static_accel_cov=noise.accel_cov + ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz * np.eye(3),
+        static_turn_noise=STATIC_TURN_NOISE,
     )
 
 
@@ -79,34 +80,51 @@ def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, til
 HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
 UNSEEN_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
 
-# The state of a sensor is one row of numbers: quat_WS xyzw, bias [rad/s], the upper triangle of P by blocks, rate last
-# seen [rad/s], time [s] since then. What does not change is another: `_model`.
-QUAT, BIAS, P_AA, P_AB, P_BB, RATE, UNSEEN, STATE_SIZE = 0, 4, 7, 13, 22, 28, 31, 32
+# The state of a sensor is one record, what does not change is another. Upper triangles are xx xy xz yy yz zz.
+STATE = np.dtype(
+    [
+        ("quat_WS", float, 4),  # xyzw
+        ("gyro_bias", float, 3),  # [rad/s]
+        ("attitude_cov", float, 6),  # [rad²] upper triangle of P_aa
+        ("P_ab", float, (3, 3)),
+        ("P_bb", float, 6),  # [rad²/s²] upper triangle
+        ("held_rate", float, 3),  # [rad/s] the last that was measured
+        ("unseen_s", float),  # [s] since then
+    ],
+    align=True,
+)
+MODEL = np.dtype(
+    [
+        ("dt", float),  # [s]
+        ("inverse_gravity", float),  # [s²/m]
+        ("attitude_step", float, 6),  # [rad²] δt² Σ_ω
+        ("bias_step", float, 6),  # δt² Σ_b
+        ("static_gyro_cov", float, 6),
+        ("static_accel_cov", float, 6),
+        ("fade", float),  # what a sample leaves of a held rate
+        ("first_order", np.bool_),
+        ("static_turn", float),  # [rad²] variance of an unseen turn in a static sample
+        ("gyro_range", float),  # [rad/s]
+    ],
+    align=True,
+)
 _UPPER = np.triu_indices(3)
 
 
 class SmekfState:
-    """Views of the row of numbers that the compiled steps work on."""
+    """Views of the record that the compiled steps work on."""
 
-    def __init__(self, row: np.ndarray) -> None:
-        self.row = row  # (32,)
-        self.quat_WS = row[QUAT : QUAT + 4]  # (4,) xyzw
-        self.gyro_bias = row[BIAS : BIAS + 3]  # (3,) [rad/s]
+    def __init__(self, record: np.ndarray) -> None:
+        self.record = record  # (1,) of `STATE`
+        self.quat_WS = record["quat_WS"][0]  # (4,) xyzw
+        self.gyro_bias = record["gyro_bias"][0]  # (3,) [rad/s]
 
     @property
     def P(self) -> np.ndarray:
         """Covariance (6, 6) of [a; b]; a copy."""
-        P = np.empty((6, 6))
-        P[:3, :3] = symmetric(self.row[P_AA:P_AB])
-        P[:3, 3:] = self.row[P_AB:P_BB].reshape(3, 3)
-        P[3:, :3] = P[:3, 3:].T
-        P[3:, 3:] = symmetric(self.row[P_BB:RATE])
-        return P
-
-
-def symmetric(upper: np.ndarray) -> np.ndarray:
-    """Matrices (…, 3, 3) from their upper triangles (…, 6): xx xy xz yy yz zz."""
-    return upper[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+        record = self.record[0]
+        aa, bb = symmetric(record["attitude_cov"]), symmetric(record["P_bb"])
+        return np.block([[aa, record["P_ab"]], [record["P_ab"].T, bb]])
 
 
 class Smekf:
@@ -123,11 +141,11 @@ class Smekf:
         self.noise = noise
         self.rate_hz = rate_hz
         self.model = _model(noise, 1.0 / rate_hz, self.params)
-        row = np.zeros(STATE_SIZE)
-        row[QUAT:BIAS], row[BIAS:P_AA] = quat_WS, noise.gyro_bias
-        row[P_AA:P_AB] = _matrix(self.params.attitude_cov0)[_UPPER]
-        row[P_BB:RATE] = _matrix(self.params.bias_cov0)[_UPPER]
-        self.state = SmekfState(row)
+        record = np.zeros(1, STATE)
+        record["quat_WS"], record["gyro_bias"] = quat_WS, noise.gyro_bias
+        record["attitude_cov"] = _matrix(self.params.attitude_cov0)[_UPPER]
+        record["P_bb"] = _matrix(self.params.bias_cov0)[_UPPER]
+        self.state = SmekfState(record)
         self._one = OneSample()
 
     @property
@@ -136,15 +154,15 @@ class Smekf:
         return _live
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
-        gyro, accel, at_rest = samples(gyro_S, accel_S, static)
+        gyro, accel, is_static = samples(gyro_S, accel_S, static)
         out = FilterRun(np.empty((len(gyro), 4)), np.empty((len(gyro), 3)), np.empty((len(gyro), 3, 3)))
-        _run(self.state.row, self.model, gyro, accel, at_rest, *out)
+        _run(self.state.record, self.model, gyro, accel, is_static, *out)
         return out
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
         one = self._one
         sample = one.fill(gyro_S, accel_S, static)
-        _run(self.state.row, self.model, *sample, one.quat_WS, one.gyro_bias, one.attitude_cov)
+        _run(self.state.record, self.model, *sample, one.quat_WS, one.gyro_bias, one.attitude_cov)
         return one.quat_WS[0].copy()
 
 
@@ -158,71 +176,103 @@ def _matrix(cov: float | np.ndarray) -> np.ndarray:
 
 
 def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
-    """(30,): δt, 1/g, δt² Σ_ω, δt² Σ_b, gyro's at rest, Σ_g as upper triangles, what is left of a held rate after a
-    sample, whether the transition is of first order, variance of an unseen turn in a sample at rest,
-    the gyroscope's range."""
-    step, rest = params.bias_step_cov, params.rest_gyro_cov
-    bias_step_cov = noise.bias_step_cov if step is None else _matrix(step)
-    rest_gyro_cov = noise.gyro_cov if rest is None else _matrix(rest)
-    accel = params.rest_accel_cov
-    rest_accel_cov = noise.accel_cov if accel is None else _matrix(accel)
-    covs = dt * dt * noise.gyro_cov, dt * dt * bias_step_cov, rest_gyro_cov, rest_accel_cov
-    ends = [np.exp(-dt / HOLD_S), float(params.first_order), params.rest_turn_noise**2 * dt, params.gyro_range]
-    return np.concatenate([[dt, 1.0 / noise.gravity], *(cov[_UPPER] for cov in covs), ends])
+    """(1,) of `MODEL`."""
+
+    def chosen(cov: np.ndarray | None, default: np.ndarray) -> np.ndarray:
+        return (default if cov is None else _matrix(cov))[_UPPER]
+
+    model = np.zeros(1, MODEL)
+    model["dt"], model["inverse_gravity"] = dt, 1.0 / noise.gravity
+    model["attitude_step"] = (dt * dt * noise.gyro_cov)[_UPPER]
+    model["bias_step"] = dt * dt * chosen(params.bias_step_cov, noise.bias_step_cov)
+    model["static_gyro_cov"] = chosen(params.static_gyro_cov, noise.gyro_cov)
+    model["static_accel_cov"] = chosen(params.static_accel_cov, noise.accel_cov)
+    model["fade"], model["first_order"] = np.exp(-dt / HOLD_S), params.first_order
+    model["static_turn"], model["gyro_range"] = params.static_turn_noise**2 * dt, params.gyro_range
+    return model
 
 
 @inlined
-def step(x, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
-    """One sample of one sensor: `x` (32,) its state, `model` (30,), gyro [rad/s], accel [m/s²]."""
-    dt = model[0]
+def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
+    """One sample of one sensor: records of `STATE` and `MODEL`, gyro [rad/s], accel [m/s²]."""
+    dt, bias, held = model.dt, state.gyro_bias, state.held_rate
     seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
     unseen_cov = 0.0
     if seen:
-        wx, wy, wz = gx - x[4], gy - x[5], gz - x[6]
+        wx, wy, wz = gx - bias[0], gy - bias[1], gz - bias[2]
     else:
-        wx, wy, wz = model[26] * x[28], model[26] * x[29], model[26] * x[30]
-    if seen and max(abs(gx), abs(gy), abs(gz)) < model[29]:
-        x[31] = 0.0
+        wx, wy, wz = model.fade * held[0], model.fade * held[1], model.fade * held[2]
+    if seen and max(abs(gx), abs(gy), abs(gz)) < model.gyro_range:
+        state.unseen_s = 0.0
     else:
-        before, after = x[31], x[31] + dt
+        before, after = state.unseen_s, state.unseen_s + dt
         std_before = min(np.pi, UNSEEN_RATE_STD * before * before / (before + HOLD_S))
         std_after = min(np.pi, UNSEEN_RATE_STD * after * after / (after + HOLD_S))
         unseen_cov = std_after * std_after - std_before * std_before
-        x[31] = after
-    x[28], x[29], x[30] = wx, wy, wz
-    predict(x, model, wx * dt, wy * dt, wz * dt, unseen_cov)
+        state.unseen_s = after
+    held[0], held[1], held[2] = wx, wy, wz
+    predict(state, model, wx * dt, wy * dt, wz * dt, unseen_cov)
     if static and seen and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
-        correct(x, model, gx, gy, gz, ax, ay, az)
+        correct(state, model, gx, gy, gz, ax, ay, az)
 
 
 @inlined
-def predict(x, model, wx, wy, wz, unseen_cov):  # type: ignore[no-untyped-def]
+def predict(state, model, wx, wy, wz, unseen_cov):  # type: ignore[no-untyped-def]
     """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w), P ← F P Fᵀ + G Q Gᵀ.
 
     G Q Gᵀ = δt² diag(Σ_ω, Σ_b). `unseen_cov` [rad²] is added on top.
     """
-    rotate_by_vector(x, wx, wy, wz)
-    carry(x, wx, wy, wz, model[0], model[27] != 0.0)
-    x[7] += model[2] + unseen_cov
-    x[8] += model[3]
-    x[9] += model[4]
-    x[10] += model[5] + unseen_cov
-    x[11] += model[6]
-    x[12] += model[7] + unseen_cov
-    x[22] += model[8]
-    x[23] += model[9]
-    x[24] += model[10]
-    x[25] += model[11]
-    x[26] += model[12]
-    x[27] += model[13]
+    rotate_by_vector(state.quat_WS, wx, wy, wz)
+    propagate(state, wx, wy, wz, model.dt, model.first_order)
+    P_aa, P_bb = state.attitude_cov, state.P_bb
+    for i in range(6):
+        diagonal = i == 0 or i == 3 or i == 5
+        P_aa[i] += model.attitude_step[i] + unseen_cov if diagonal else model.attitude_step[i]
+        P_bb[i] += model.bias_step[i]
+
+
+# 3×3 matrices in the kernels below are nine numbers, rows first, so that they stay in registers.
 
 
 @inlined
-def carry(x, wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
-    """P ← F P Fᵀ over the turn w [rad] in δt [s], block by block.
+def full(upper):  # type: ignore[no-untyped-def]
+    """The symmetric matrix of an upper triangle (6,)."""
+    return upper[0], upper[1], upper[2], upper[1], upper[3], upper[4], upper[2], upper[4], upper[5]
 
-    F = [[A, B], [0, I]] with A = exp(−[w]×) and B = −δt ∫₀¹ exp(−[w]× u) du; to first order, as the paper writes it,
-    A = I − [w]× and B = −δt I.
+
+@inlined
+def nine(matrix):  # type: ignore[no-untyped-def]
+    """A matrix (3, 3)."""
+    a, b, c = matrix[0], matrix[1], matrix[2]
+    return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
+
+
+@inlined
+def transposed(A):  # type: ignore[no-untyped-def]
+    return A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]
+
+
+@inlined
+def products(A, X, B, Y):  # type: ignore[no-untyped-def]
+    """A X + B Y."""
+    return (
+        A[0] * X[0] + A[1] * X[3] + A[2] * X[6] + B[0] * Y[0] + B[1] * Y[3] + B[2] * Y[6],
+        A[0] * X[1] + A[1] * X[4] + A[2] * X[7] + B[0] * Y[1] + B[1] * Y[4] + B[2] * Y[7],
+        A[0] * X[2] + A[1] * X[5] + A[2] * X[8] + B[0] * Y[2] + B[1] * Y[5] + B[2] * Y[8],
+        A[3] * X[0] + A[4] * X[3] + A[5] * X[6] + B[3] * Y[0] + B[4] * Y[3] + B[5] * Y[6],
+        A[3] * X[1] + A[4] * X[4] + A[5] * X[7] + B[3] * Y[1] + B[4] * Y[4] + B[5] * Y[7],
+        A[3] * X[2] + A[4] * X[5] + A[5] * X[8] + B[3] * Y[2] + B[4] * Y[5] + B[5] * Y[8],
+        A[6] * X[0] + A[7] * X[3] + A[8] * X[6] + B[6] * Y[0] + B[7] * Y[3] + B[8] * Y[6],
+        A[6] * X[1] + A[7] * X[4] + A[8] * X[7] + B[6] * Y[1] + B[7] * Y[4] + B[8] * Y[7],
+        A[6] * X[2] + A[7] * X[5] + A[8] * X[8] + B[6] * Y[2] + B[7] * Y[5] + B[8] * Y[8],
+    )
+
+
+@inlined
+def transition(wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
+    """A and B of F = [[A, B], [0, I]] over the turn w [rad] in δt [s].
+
+    A = exp(−[w]×) and B = −δt ∫₀¹ exp(−[w]× u) du; to first order, as the paper writes it, A = I − [w]×, B = −δt I.
     """
     cosine, s, c, d = 1.0, 1.0, 0.0, 0.0
     e = 1.0  # B's share of I, s where A's is cos θ
@@ -232,129 +282,112 @@ def carry(x, wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
     # A = cos θ I − s [w]× + c w wᵀ
     xy, xz, yz = c * wx * wy, c * wx * wz, c * wy * wz
     ux, uy, uz = s * wx, s * wy, s * wz
-    A00, A01, A02 = cosine + c * wx * wx, xy + uz, xz - uy
-    A10, A11, A12 = xy - uz, cosine + c * wy * wy, yz + ux
-    A20, A21, A22 = xz + uy, yz - ux, cosine + c * wz * wz
+    A = (
+        cosine + c * wx * wx, xy + uz, xz - uy,
+        xy - uz, cosine + c * wy * wy, yz + ux,
+        xz + uy, yz - ux, cosine + c * wz * wz,
+    )  # fmt: skip
     # B = −δt (s I − c [w]× + d w wᵀ)
     d, ux, uy, uz = -dt * d, -dt * c * wx, -dt * c * wy, -dt * c * wz
     xy, xz, yz = d * wx * wy, d * wx * wz, d * wy * wz
-    B00, B01, B02 = d * wx * wx - dt * e, xy + uz, xz - uy
-    B10, B11, B12 = xy - uz, d * wy * wy - dt * e, yz + ux
-    B20, B21, B22 = xz + uy, yz - ux, d * wz * wz - dt * e
-    axx, axy, axz, ayy, ayz, azz = x[7], x[8], x[9], x[10], x[11], x[12]
-    bxx, bxy, bxz, byx, byy, byz, bzx, bzy, bzz = x[13], x[14], x[15], x[16], x[17], x[18], x[19], x[20], x[21]
-    cxx, cxy, cxz, cyy, cyz, czz = x[22], x[23], x[24], x[25], x[26], x[27]
-    # M = A P_ab + B P_bb, the new P_ab
-    M00 = A00 * bxx + A01 * byx + A02 * bzx + B00 * cxx + B01 * cxy + B02 * cxz
-    M01 = A00 * bxy + A01 * byy + A02 * bzy + B00 * cxy + B01 * cyy + B02 * cyz
-    M02 = A00 * bxz + A01 * byz + A02 * bzz + B00 * cxz + B01 * cyz + B02 * czz
-    M10 = A10 * bxx + A11 * byx + A12 * bzx + B10 * cxx + B11 * cxy + B12 * cxz
-    M11 = A10 * bxy + A11 * byy + A12 * bzy + B10 * cxy + B11 * cyy + B12 * cyz
-    M12 = A10 * bxz + A11 * byz + A12 * bzz + B10 * cxz + B11 * cyz + B12 * czz
-    M20 = A20 * bxx + A21 * byx + A22 * bzx + B20 * cxx + B21 * cxy + B22 * cxz
-    M21 = A20 * bxy + A21 * byy + A22 * bzy + B20 * cxy + B21 * cyy + B22 * cyz
-    M22 = A20 * bxz + A21 * byz + A22 * bzz + B20 * cxz + B21 * cyz + B22 * czz
-    # N = A P_aa + B P_ba
-    N00 = A00 * axx + A01 * axy + A02 * axz + B00 * bxx + B01 * bxy + B02 * bxz
-    N01 = A00 * axy + A01 * ayy + A02 * ayz + B00 * byx + B01 * byy + B02 * byz
-    N02 = A00 * axz + A01 * ayz + A02 * azz + B00 * bzx + B01 * bzy + B02 * bzz
-    N10 = A10 * axx + A11 * axy + A12 * axz + B10 * bxx + B11 * bxy + B12 * bxz
-    N11 = A10 * axy + A11 * ayy + A12 * ayz + B10 * byx + B11 * byy + B12 * byz
-    N12 = A10 * axz + A11 * ayz + A12 * azz + B10 * bzx + B11 * bzy + B12 * bzz
-    N20 = A20 * axx + A21 * axy + A22 * axz + B20 * bxx + B21 * bxy + B22 * bxz
-    N21 = A20 * axy + A21 * ayy + A22 * ayz + B20 * byx + B21 * byy + B22 * byz
-    N22 = A20 * axz + A21 * ayz + A22 * azz + B20 * bzx + B21 * bzy + B22 * bzz
-    # N Aᵀ + M Bᵀ, the new P_aa
-    x[7] = N00 * A00 + N01 * A01 + N02 * A02 + M00 * B00 + M01 * B01 + M02 * B02
-    x[8] = N00 * A10 + N01 * A11 + N02 * A12 + M00 * B10 + M01 * B11 + M02 * B12
-    x[9] = N00 * A20 + N01 * A21 + N02 * A22 + M00 * B20 + M01 * B21 + M02 * B22
-    x[10] = N10 * A10 + N11 * A11 + N12 * A12 + M10 * B10 + M11 * B11 + M12 * B12
-    x[11] = N10 * A20 + N11 * A21 + N12 * A22 + M10 * B20 + M11 * B21 + M12 * B22
-    x[12] = N20 * A20 + N21 * A21 + N22 * A22 + M20 * B20 + M21 * B21 + M22 * B22
-    x[13], x[14], x[15] = M00, M01, M02
-    x[16], x[17], x[18] = M10, M11, M12
-    x[19], x[20], x[21] = M20, M21, M22
+    B = (
+        d * wx * wx - dt * e, xy + uz, xz - uy,
+        xy - uz, d * wy * wy - dt * e, yz + ux,
+        xz + uy, yz - ux, d * wz * wz - dt * e,
+    )  # fmt: skip
+    return A, B
 
 
 @inlined
-def correct(x, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
-    """Algorithm 1, correction at rest: y = [accel/g; gyro], h = [R_WSᵀ e_z; b̂], H = [[[R_WSᵀ e_z]×, 0], [0, I]].
+def propagate(state, wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
+    """P ← F P Fᵀ over the turn w [rad] in δt [s], block by block."""
+    A, B = transition(wx, wy, wz, dt, first_order)
+    P_aa, P_ab, P_bb = full(state.attitude_cov), nine(state.P_ab), full(state.P_bb)
+    new_ab = products(A, P_ab, B, P_bb)
+    new_aa = products(products(A, P_aa, B, transposed(P_ab)), transposed(A), new_ab, transposed(B))
+    upper, ab = state.attitude_cov, state.P_ab
+    upper[0], upper[1], upper[2], upper[3], upper[4], upper[5] = (
+        new_aa[0], new_aa[1], new_aa[2], new_aa[4], new_aa[5], new_aa[8],
+    )  # fmt: skip
+    ab[0, 0], ab[0, 1], ab[0, 2] = new_ab[0], new_ab[1], new_ab[2]
+    ab[1, 0], ab[1, 1], ab[1, 2] = new_ab[3], new_ab[4], new_ab[5]
+    ab[2, 0], ab[2, 1], ab[2, 2] = new_ab[6], new_ab[7], new_ab[8]
+
+
+@inlined
+def correct(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+    """Algorithm 1, correction in a static phase.
+
+    y = [accel/g; gyro], h = [R_WSᵀ e_z; b̂], H = [[[R_WSᵀ e_z]×, 0], [0, I]].
 
     The noises of the two are independent, so gyro is taken first and accel after it, which is the same correction with
     two S of (3, 3) in place of one of (6, 6).
     """
-    ux, uy, uz = up_in_sensor(x)
+    bias, P_aa, P_bb = state.gyro_bias, state.attitude_cov, state.P_bb
+    ux, uy, uz = up_in_sensor(state.quat_WS)
     # gyro: H P = [P_ba, P_bb], S = P_bb + Σ_ω
-    innovation = gx - x[4], gy - x[5], gz - x[6]
-    S = x[22] + model[14], x[23] + model[15], x[24] + model[16], x[25] + model[17], x[26] + model[18], x[27] + model[19]
-    row0 = x[13], x[16], x[19], x[22], x[23], x[24]
-    row1 = x[14], x[17], x[20], x[23], x[25], x[26]
-    row2 = x[15], x[18], x[21], x[24], x[26], x[27]
-    d = fuse(x, row0, row1, row2, S, innovation)
+    R = model.static_gyro_cov
+    b, c = nine(state.P_ab), full(P_bb)
+    S = P_bb[0] + R[0], P_bb[1] + R[1], P_bb[2] + R[2], P_bb[3] + R[3], P_bb[4] + R[4], P_bb[5] + R[5]
+    rows = (
+        (b[0], b[3], b[6], c[0], c[1], c[2]),
+        (b[1], b[4], b[7], c[3], c[4], c[5]),
+        (b[2], b[5], b[8], c[6], c[7], c[8]),
+    )
+    d = fuse(state, rows, S, (gx - bias[0], gy - bias[1], gz - bias[2]))
     # accel: H P = [u]× [P_aa, P_ab], S = [u]× P_aa [u]×ᵀ + Σ_g; what gyro said of the attitude is off the innovation
+    R = model.static_accel_cov
+    g = model.inverse_gravity
     innovation = (
-        ax * model[1] - ux - (uy * d[2] - uz * d[1]),
-        ay * model[1] - uy - (uz * d[0] - ux * d[2]),
-        az * model[1] - uz - (ux * d[1] - uy * d[0]),
+        ax * g - ux - (uy * d[2] - uz * d[1]),
+        ay * g - uy - (uz * d[0] - ux * d[2]),
+        az * g - uz - (ux * d[1] - uy * d[0]),
     )
-    ex, ey, ez = (x[7], x[8], x[9]), (x[8], x[10], x[11]), (x[9], x[11], x[12])
-    fx, fy, fz = (x[13], x[14], x[15]), (x[16], x[17], x[18]), (x[19], x[20], x[21])
-    row0 = (
-        uy * ez[0] - uz * ey[0],
-        uy * ez[1] - uz * ey[1],
-        uy * ez[2] - uz * ey[2],
-        uy * fz[0] - uz * fy[0],
-        uy * fz[1] - uz * fy[1],
-        uy * fz[2] - uz * fy[2],
-    )
-    row1 = (
-        uz * ex[0] - ux * ez[0],
-        uz * ex[1] - ux * ez[1],
-        uz * ex[2] - ux * ez[2],
-        uz * fx[0] - ux * fz[0],
-        uz * fx[1] - ux * fz[1],
-        uz * fx[2] - ux * fz[2],
-    )
-    row2 = (
-        ux * ey[0] - uy * ex[0],
-        ux * ey[1] - uy * ex[1],
-        ux * ey[2] - uy * ex[2],
-        ux * fy[0] - uy * fx[0],
-        ux * fy[1] - uy * fx[1],
-        ux * fy[2] - uy * fx[2],
-    )
+    a, b = full(P_aa), nine(state.P_ab)
+    x, y = (a[0], a[1], a[2], b[0], b[1], b[2]), (a[3], a[4], a[5], b[3], b[4], b[5])
+    z = a[6], a[7], a[8], b[6], b[7], b[8]
+    row0, row1, row2 = difference(uy, z, uz, y), difference(uz, x, ux, z), difference(ux, y, uy, x)
     S = (
-        row0[2] * uy - row0[1] * uz + model[20],
-        row0[0] * uz - row0[2] * ux + model[21],
-        row0[1] * ux - row0[0] * uy + model[22],
-        row1[0] * uz - row1[2] * ux + model[23],
-        row1[1] * ux - row1[0] * uy + model[24],
-        row2[1] * ux - row2[0] * uy + model[25],
+        row0[2] * uy - row0[1] * uz + R[0],
+        row0[0] * uz - row0[2] * ux + R[1],
+        row0[1] * ux - row0[0] * uy + R[2],
+        row1[0] * uz - row1[2] * ux + R[3],
+        row1[1] * ux - row1[0] * uy + R[4],
+        row2[1] * ux - row2[0] * uy + R[5],
     )
-    e = fuse(x, row0, row1, row2, S, innovation)
-    rotate_by_vector(x, d[0] + e[0], d[1] + e[1], d[2] + e[2])
-    if model[27] == 0.0:
+    e = fuse(state, (row0, row1, row2), S, innovation)
+    turn = d[0] + e[0], d[1] + e[1], d[2] + e[2]
+    rotate_by_vector(state.quat_WS, turn[0], turn[1], turn[2])
+    if not model.first_order:
         # The vertical, which accel does not measure about, turns in S with the correction, and P with it: left as it
         # was, P would lie askew and the next sample would take its long axis for one that accel measures.
-        carry(x, d[0] + e[0], d[1] + e[1], d[2] + e[2], 0.0, False)
-    x[4] += d[3] + e[3]
-    x[5] += d[4] + e[4]
-    x[6] += d[5] + e[5]
-    tx, ty, tz = model[28] * ux, model[28] * uy, model[28] * uz
-    x[7] += tx * ux
-    x[8] += tx * uy
-    x[9] += tx * uz
-    x[10] += ty * uy
-    x[11] += ty * uz
-    x[12] += tz * uz
+        propagate(state, turn[0], turn[1], turn[2], 0.0, False)
+    for i in range(3):
+        bias[i] += d[3 + i] + e[3 + i]
+    tx, ty, tz = model.static_turn * ux, model.static_turn * uy, model.static_turn * uz
+    P_aa[0] += tx * ux
+    P_aa[1] += tx * uy
+    P_aa[2] += tx * uz
+    P_aa[3] += ty * uy
+    P_aa[4] += ty * uz
+    P_aa[5] += tz * uz
 
 
 @inlined
-def fuse(x, row0, row1, row2, S, innovation):  # type: ignore[no-untyped-def]
+def difference(a, x, b, y):  # type: ignore[no-untyped-def]
+    """a x − b y of six numbers each."""
+    return (
+        a * x[0] - b * y[0], a * x[1] - b * y[1], a * x[2] - b * y[2],
+        a * x[3] - b * y[3], a * x[4] - b * y[4], a * x[5] - b * y[5],
+    )  # fmt: skip
+
+
+@inlined
+def fuse(state, rows, S, innovation):  # type: ignore[no-untyped-def]
     """Three measurements: P ← P − (H P)ᵀ S⁻¹ (H P) in the state; gives the error state (6,) (H P)ᵀ S⁻¹ (y − h).
 
-    With S = L D Lᵀ and V = L⁻¹ H P these are P − Vᵀ D⁻¹ V and Vᵀ D⁻¹ L⁻¹ (y − h). `row0` … are H P (3, 6), S its upper
-    triangle. A direction without any variance, of P and of the noise, says nothing and is left out.
+    With S = L D Lᵀ and V = L⁻¹ H P these are P − Vᵀ D⁻¹ V and Vᵀ D⁻¹ L⁻¹ (y − h). `rows` are those of H P (3, 6), S is
+    its upper triangle. A direction without any variance, of P and of the noise, says nothing and is left out.
     """
     i0 = 1.0 / S[0] if S[0] > 0.0 else 0.0
     l10, l20 = S[1] * i0, S[2] * i0
@@ -366,73 +399,65 @@ def fuse(x, row0, row1, row2, S, innovation):  # type: ignore[no-untyped-def]
     e0 = innovation[0]
     e1 = innovation[1] - l10 * e0
     e2 = innovation[2] - l20 * e0 - l21 * e1
+    a = rows[0]
+    b = difference(1.0, rows[1], l10, a)
+    c = difference(1.0, difference(1.0, rows[2], l20, a), l21, b)
+    P_aa, P_ab, P_bb = state.attitude_cov, state.P_ab, state.P_bb
 
-    a0, a1, a2, a3, a4, a5 = row0
-    b0, b1, b2 = row1[0] - l10 * a0, row1[1] - l10 * a1, row1[2] - l10 * a2
-    b3, b4, b5 = row1[3] - l10 * a3, row1[4] - l10 * a4, row1[5] - l10 * a5
-    c0, c1, c2 = row2[0] - l20 * a0 - l21 * b0, row2[1] - l20 * a1 - l21 * b1, row2[2] - l20 * a2 - l21 * b2
-    c3, c4, c5 = row2[3] - l20 * a3 - l21 * b3, row2[4] - l20 * a4 - l21 * b4, row2[5] - l20 * a5 - l21 * b5
-
-    p, q, r = i0 * a0, i1 * b0, i2 * c0
-    x[7] -= p * a0 + q * b0 + r * c0
-    x[8] -= p * a1 + q * b1 + r * c1
-    x[9] -= p * a2 + q * b2 + r * c2
-    x[13] -= p * a3 + q * b3 + r * c3
-    x[14] -= p * a4 + q * b4 + r * c4
-    x[15] -= p * a5 + q * b5 + r * c5
+    p, q, r = i0 * a[0], i1 * b[0], i2 * c[0]
+    P_aa[0] -= p * a[0] + q * b[0] + r * c[0]
+    P_aa[1] -= p * a[1] + q * b[1] + r * c[1]
+    P_aa[2] -= p * a[2] + q * b[2] + r * c[2]
+    P_ab[0, 0] -= p * a[3] + q * b[3] + r * c[3]
+    P_ab[0, 1] -= p * a[4] + q * b[4] + r * c[4]
+    P_ab[0, 2] -= p * a[5] + q * b[5] + r * c[5]
     g0 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a1, i1 * b1, i2 * c1
-    x[10] -= p * a1 + q * b1 + r * c1
-    x[11] -= p * a2 + q * b2 + r * c2
-    x[16] -= p * a3 + q * b3 + r * c3
-    x[17] -= p * a4 + q * b4 + r * c4
-    x[18] -= p * a5 + q * b5 + r * c5
+    p, q, r = i0 * a[1], i1 * b[1], i2 * c[1]
+    P_aa[3] -= p * a[1] + q * b[1] + r * c[1]
+    P_aa[4] -= p * a[2] + q * b[2] + r * c[2]
+    P_ab[1, 0] -= p * a[3] + q * b[3] + r * c[3]
+    P_ab[1, 1] -= p * a[4] + q * b[4] + r * c[4]
+    P_ab[1, 2] -= p * a[5] + q * b[5] + r * c[5]
     g1 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a2, i1 * b2, i2 * c2
-    x[12] -= p * a2 + q * b2 + r * c2
-    x[19] -= p * a3 + q * b3 + r * c3
-    x[20] -= p * a4 + q * b4 + r * c4
-    x[21] -= p * a5 + q * b5 + r * c5
+    p, q, r = i0 * a[2], i1 * b[2], i2 * c[2]
+    P_aa[5] -= p * a[2] + q * b[2] + r * c[2]
+    P_ab[2, 0] -= p * a[3] + q * b[3] + r * c[3]
+    P_ab[2, 1] -= p * a[4] + q * b[4] + r * c[4]
+    P_ab[2, 2] -= p * a[5] + q * b[5] + r * c[5]
     g2 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a3, i1 * b3, i2 * c3
-    x[22] -= p * a3 + q * b3 + r * c3
-    x[23] -= p * a4 + q * b4 + r * c4
-    x[24] -= p * a5 + q * b5 + r * c5
+    p, q, r = i0 * a[3], i1 * b[3], i2 * c[3]
+    P_bb[0] -= p * a[3] + q * b[3] + r * c[3]
+    P_bb[1] -= p * a[4] + q * b[4] + r * c[4]
+    P_bb[2] -= p * a[5] + q * b[5] + r * c[5]
     g3 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a4, i1 * b4, i2 * c4
-    x[25] -= p * a4 + q * b4 + r * c4
-    x[26] -= p * a5 + q * b5 + r * c5
+    p, q, r = i0 * a[4], i1 * b[4], i2 * c[4]
+    P_bb[3] -= p * a[4] + q * b[4] + r * c[4]
+    P_bb[4] -= p * a[5] + q * b[5] + r * c[5]
     g4 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a5, i1 * b5, i2 * c5
-    x[27] -= p * a5 + q * b5 + r * c5
+    p, q, r = i0 * a[5], i1 * b[5], i2 * c[5]
+    P_bb[5] -= p * a[5] + q * b[5] + r * c[5]
     g5 = p * e0 + q * e1 + r * e2
     return g0, g1, g2, g3, g4, g5
 
 
 @kernel
-def _run(x, model, gyro_S, accel_S, static, out_quat, out_bias, out_cov):  # type: ignore[no-untyped-def]
+def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov):  # type: ignore[no-untyped-def]
+    state, model = states[0], models[0]
     for k in range(len(gyro_S)):
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
-        step(x, model, gx, gy, gz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2], static[k])
+        step(state, model, gx, gy, gz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2], static[k])
         for i in range(4):
-            out_quat[k, i] = x[i]
+            out_quat[k, i] = state.quat_WS[i]
         for i in range(3):
-            out_bias[k, i] = x[4 + i]
-        out_cov[k, 0, 0], out_cov[k, 1, 1], out_cov[k, 2, 2] = x[7], x[10], x[12]
-        out_cov[k, 0, 1], out_cov[k, 0, 2], out_cov[k, 1, 2] = x[8], x[9], x[11]
-        out_cov[k, 1, 0], out_cov[k, 2, 0], out_cov[k, 2, 1] = x[8], x[9], x[11]
+            out_bias[k, i] = state.gyro_bias[i]
+        fill_symmetric(state.attitude_cov, out_cov[k])
 
 
 @kernel
-def _live(  # type: ignore[no-untyped-def]
-    rows, models, block, tail, head, anchor, counts, limits, bias, gyro_S, accel_S, static
-):
+def _live(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
     """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `bank.LiveBank` has them."""
-    for i in range(len(rows)):
+    for i in range(len(states)):
         gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]
         ax, ay, az = accel_S[i, 0], accel_S[i, 1], accel_S[i, 2]
-        still = static_step(
-            block[i], tail[i], head[i], anchor[i], counts[i], limits[i], bias[i], gx, gy, gz, ax, ay, az
-        )
-        static[i] = still
-        step(rows[i], models[i], gx, gy, gz, ax, ay, az, still)
+        static[i] = static_step(detectors[i], block[i], tail[i], gx, gy, gz, ax, ay, az)
+        step(states[i], models[i], gx, gy, gz, ax, ay, az, static[i])

@@ -1,9 +1,9 @@
-"""The static-phase detector: when a sensor counts as lying still.
+"""The static-phase detector: when a sensor counts as static.
 
 Conditions (1) to (4) of Lisini Baldi 2019 bound how much gyro and accel vary, and a steady rotation about the vertical
-varies nothing: an office chair passes them, and a filter that reads the gyroscope's bias at rest takes the chair's
-rate for it. Condition (5), ours, holds the mean rate about the vertical against the bias that is known: from the start
-phase, then from each rest that was accepted. About horizontal axes gravity would turn away, which (2) sees.
+varies nothing: an office chair passes them, and a filter that reads the gyroscope's bias in static phases takes the
+chair's rate for it. Condition (5), ours, compares the mean rate about the vertical with the known bias: that of the
+start phase, then of each accepted static phase. Rotation about horizontal axes turns gravity in S, which (2) detects.
 """
 
 from __future__ import annotations
@@ -18,19 +18,52 @@ from ..compilation import inlined, kernel
 from ..errors import BadData, BadOption
 from .noise import BLOCK_S, SensorNoise
 
-# A sample is gyro (3), accel/g (3) and the norm of accel/g. The sums are of its differences from an anchor: those
-# themselves, their products gyro xx xy xz yy yz zz, the same of accel, and the norm's square.
-_SIGNALS = 7
-_SUMS = 20
+# A sample is gyro [rad/s] (3), accel/g (3) and the norm of accel/g.
+SIGNALS = 7
+# Sums over samples, of their differences from an anchor; products are xx xy xz yy yz zz.
+SUMS = np.dtype(
+    [
+        ("gyro", float, 3),
+        ("accel", float, 3),
+        ("norm", float),
+        ("gyro_products", float, 6),
+        ("accel_products", float, 6),
+        ("norm_square", float),
+    ],
+    align=True,
+)
+# Memory of the detector of one sensor, its windows aside.
+DETECTOR = np.dtype(
+    [
+        ("samples", np.int64),  # in the current block
+        ("has_block", np.bool_),  # there is a block before it
+        ("anchor", float, SIGNALS),  # the last sample of the block before
+        ("sums", SUMS),  # of the current block so far
+        ("inverse_gravity", float),  # [s²/m]
+        # right-hand sides of conditions (1), (2), (4), each times N - 1, and of (3)
+        ("gyro_limit", float, 6),
+        ("accel_limit", float, 6),
+        ("norm_variance", float),
+        ("norm_error", float),
+        # condition (5): the known bias
+        ("bias", float, 3),  # [rad/s]
+        ("bias_var", float),  # [rad²/s²]
+        ("average_rate", float),  # [rad/s] about the vertical, beyond the known bias
+        ("squared_stds", float),  # `StaticTest.rate_stds`²
+        ("window_var", float),  # [rad²/s²] of a window's mean
+        ("average_var", float),  # [rad²/s²] of the average
+        ("spread_var", float),  # [rad²/s²]
+        ("walk_var", float),  # [rad²/s²] by which the known bias ages in a sample
+        ("fade", float),  # share of the average that a sample replaces
+    ],
+    align=True,
+)
 _UPPER = np.triu_indices(3)
-# Limits of (5), behind those of (1) to (4): rate_stds², variance of a window's mean, of the average's, bias_spread²
-# [rad²/s²], by how much the known bias' variance grows and the average fades in a sample, a sample's share of a window.
-_STDS2, _WINDOW_VAR, _AVERAGE_VAR, _SPREAD_VAR, _WALK_VAR, _FADE, _SHARE, _LIMITS = 15, 16, 17, 18, 19, 20, 21, 22
 
 
 @dataclass(frozen=True)
 class StaticTest:
-    """When a sensor counts as still; the defaults of (1) to (4) are the paper's, which leaves the window open.
+    """When a sensor counts as static; the defaults of (1) to (4) are the paper's, which leaves the window open.
 
     The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite. Condition (5) is ours, and
     ``rate_stds=inf`` leaves the paper's test alone. It holds for the window and for an average over `averaging_s`, in
@@ -39,8 +72,8 @@ class StaticTest:
     """
 
     window_s: Annotated[float, Range(0.0, closed=False, high=60.0)] = 0.5  # [s] W
-    alpha: NonNegative = 2.0  # (1) gyro covariance against the still one
-    beta: NonNegative = 2.0  # (2) accel/g covariance against the still one
+    alpha: NonNegative = 2.0  # (1) gyro covariance against that of the static phase
+    beta: NonNegative = 2.0  # (2) accel/g covariance against that of the static phase
     gamma1: NonNegative = 0.01  # (3) |mean ‖accel/g‖ − 1| at most
     gamma2: NonNegative = 0.01  # (4) variance of ‖accel/g‖ at most
     rate_stds: float = 3.0  # (5) standard deviations by which the rate about the vertical may be off the known bias
@@ -64,21 +97,15 @@ class StaticTest:
 
 
 class StaticState(NamedTuple):
-    """What the detector remembers of k sensors, a row each; a window has N samples."""
+    """Memory of the detectors of k sensors, a row each; a window has N samples."""
 
+    detector: np.ndarray  # (k,) of `DETECTOR`
     block: np.ndarray  # (k, N, 7) samples of the current block, then of the one before
-    tail: np.ndarray  # (k, N, 20) sums of the block before from each of its samples to its end
-    head: np.ndarray  # (k, 20) sums of the current block so far
-    anchor: np.ndarray  # (k, 7) what the differences are taken from: the last sample of the block before
-    counts: np.ndarray  # (k, 2) samples in the current block; whether there is a block before it
-    limits: (
-        np.ndarray
-    )  # (k, 22) right-hand sides of (1), (2) times N − 1, of (3), of (4) times N − 1; 1/gravity; of (5)
-    bias: np.ndarray  # (k, 5) (5): the known bias [rad/s], its variance [rad²/s²], the average rate off it [rad/s]
+    tail: np.ndarray  # (k, N) of `SUMS`: of the block before, from each of its samples to its end
 
 
 class StaticDetector:
-    """Says for each sample whether the window that ends there is static.
+    """Decides for each sample whether the window that ends there is static.
 
     `update` for one sample and `run` for an array go through the same compiled code; a run cut in two gives the same
     answer to the last bit. Until the first window is full the answer is no, and so it is while a sample that is no
@@ -87,13 +114,13 @@ class StaticDetector:
     The cost per sample does not grow with the window: the window is the sums of the current block of N samples and
     those of the rest of the block before, which are made backwards once a block. Nothing is ever subtracted from a sum,
     and the differences summed are from a sample within the window, so that (mean − anchor)² is at most N − 1 variances
-    of the window itself: a window at rest is as precise after 1e8 samples of any motion as in the first second.
-    Condition (5) alone remembers more, the known bias.
+    of the window itself: a static window is as precise after 1e8 samples of any motion as in the first second.
+    Condition (5) alone has a longer memory, the known bias.
     """
 
     def __init__(self, noise: SensorNoise, rate_hz: float, test: StaticTest | None = None) -> None:
         self.test = test or StaticTest()
-        self.state = static_state([noise], rate_hz, self.test)
+        self.state = _first_state(noise, rate_hz, self.test)
         self._one = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1, dtype=np.bool_)
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
@@ -113,218 +140,181 @@ class StaticDetector:
         return bool(static[0])
 
 
-def static_state(noises: list[SensorNoise], rate_hz: float, test: StaticTest) -> StaticState:
-    """The state of k detectors before their first sample, for `static_step`."""
-    k, n = len(noises), test.samples(rate_hz)
+def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> StaticState:
+    """The state of one detector before its first sample."""
+    n = test.samples(rate_hz)
     dt, window_s = 1.0 / rate_hz, n / rate_hz
-    limits, bias = np.empty((k, _LIMITS)), np.zeros((k, 5))
-    for row, known, noise in zip(limits, bias, noises, strict=True):
-        row[:6] = (n - 1) * test.alpha * noise.gyro_cov[_UPPER]
-        row[6:12] = (n - 1) * test.beta * noise.accel_cov[_UPPER]
-        row[12:15] = test.gamma1, (n - 1) * test.gamma2, 1.0 / noise.gravity
-        white, sway = np.trace(noise.gyro_cov) / 3.0 / n, 0.0
-        if noise.gyro_half_second_cov is not None:
-            sway = np.trace(noise.gyro_half_second_cov) / 3.0 * BLOCK_S / window_s
-        row[_STDS2], row[_WINDOW_VAR] = test.rate_stds**2, max(white, sway)
-        row[_AVERAGE_VAR] = row[_WINDOW_VAR] * window_s / (2.0 * test.averaging_s)
-        row[_SPREAD_VAR], row[_WALK_VAR] = test.bias_spread**2, test.bias_walk**2 * dt
-        row[_FADE], row[_SHARE] = min(1.0, dt / test.averaging_s), 1.0 / n
-        known[:3], known[3] = noise.gyro_bias, np.trace(noise.gyro_bias_cov) / 3.0
-    return StaticState(
-        block=np.zeros((k, n, _SIGNALS)),
-        tail=np.zeros((k, n, _SUMS)),
-        head=np.zeros((k, _SUMS)),
-        anchor=np.zeros((k, _SIGNALS)),
-        counts=np.zeros((k, 2), dtype=np.int64),
-        limits=limits,
-        bias=bias,
-    )
+    white, sway = np.trace(noise.gyro_cov) / 3.0 / n, 0.0
+    if noise.gyro_half_second_cov is not None:
+        sway = np.trace(noise.gyro_half_second_cov) / 3.0 * BLOCK_S / window_s
+    detector = np.zeros(1, DETECTOR)
+    values = {
+        "inverse_gravity": 1.0 / noise.gravity,
+        "gyro_limit": (n - 1) * test.alpha * noise.gyro_cov[_UPPER],
+        "accel_limit": (n - 1) * test.beta * noise.accel_cov[_UPPER],
+        "norm_error": test.gamma1,
+        "norm_variance": (n - 1) * test.gamma2,
+        "bias": noise.gyro_bias,
+        "bias_var": np.trace(noise.gyro_bias_cov) / 3.0,
+        "squared_stds": test.rate_stds**2,
+        "window_var": max(white, sway),
+        "average_var": max(white, sway) * window_s / (2.0 * test.averaging_s),
+        "spread_var": test.bias_spread**2,
+        "walk_var": test.bias_walk**2 * dt,
+        "fade": min(1.0, dt / test.averaging_s),
+    }
+    for name, value in values.items():
+        detector[name] = value
+    return StaticState(detector, np.zeros((1, n, SIGNALS)), np.zeros((1, n), SUMS))
 
 
 @inlined
-def _differences(block, at, anchor):  # type: ignore[no-untyped-def]
-    """Sample `at` of the block from the anchor, as seven floats."""
-    return (
-        block[at, 0] - anchor[0],
-        block[at, 1] - anchor[1],
-        block[at, 2] - anchor[2],
-        block[at, 3] - anchor[3],
-        block[at, 4] - anchor[4],
-        block[at, 5] - anchor[5],
-        block[at, 6] - anchor[6],
-    )
+def _add(sums, block, at, anchor):  # type: ignore[no-untyped-def]
+    """Take sample `at` of the block into the sums."""
+    gx, gy, gz = block[at, 0] - anchor[0], block[at, 1] - anchor[1], block[at, 2] - anchor[2]
+    ax, ay, az = block[at, 3] - anchor[3], block[at, 4] - anchor[4], block[at, 5] - anchor[5]
+    norm = block[at, 6] - anchor[6]
+    _add_vector(sums.gyro, sums.gyro_products, gx, gy, gz)
+    _add_vector(sums.accel, sums.accel_products, ax, ay, az)
+    sums.norm += norm
+    sums.norm_square += norm * norm
 
 
 @inlined
-def _add(head, block, at, anchor):  # type: ignore[no-untyped-def]
-    """Take sample `at` of the block into the sums `head`."""
-    gx, gy, gz, ax, ay, az, norm = _differences(block, at, anchor)
-    head[0] += gx
-    head[1] += gy
-    head[2] += gz
-    head[3] += ax
-    head[4] += ay
-    head[5] += az
-    head[6] += norm
-    head[7] += gx * gx
-    head[8] += gx * gy
-    head[9] += gx * gz
-    head[10] += gy * gy
-    head[11] += gy * gz
-    head[12] += gz * gz
-    head[13] += ax * ax
-    head[14] += ax * ay
-    head[15] += ax * az
-    head[16] += ay * ay
-    head[17] += ay * az
-    head[18] += az * az
-    head[19] += norm * norm
+def _add_vector(mean, products, x, y, z):  # type: ignore[no-untyped-def]
+    mean[0] += x
+    mean[1] += y
+    mean[2] += z
+    products[0] += x * x
+    products[1] += x * y
+    products[2] += x * z
+    products[3] += y * y
+    products[4] += y * z
+    products[5] += z * z
+
+
+@inlined
+def _clear(sums):  # type: ignore[no-untyped-def]
+    sums.norm = sums.norm_square = 0.0
+    for i in range(3):
+        sums.gyro[i] = sums.accel[i] = 0.0
+    for i in range(6):
+        sums.gyro_products[i] = sums.accel_products[i] = 0.0
 
 
 @inlined
 def _sum_up(tail, block, anchor):  # type: ignore[no-untyped-def]
     """The sums from each sample of the block to its end."""
     n = len(block)
-    for at in range(n):
-        gx, gy, gz, ax, ay, az, norm = _differences(block, at, anchor)
-        tail[at, 0] = gx
-        tail[at, 1] = gy
-        tail[at, 2] = gz
-        tail[at, 3] = ax
-        tail[at, 4] = ay
-        tail[at, 5] = az
-        tail[at, 6] = norm
-        tail[at, 7] = gx * gx
-        tail[at, 8] = gx * gy
-        tail[at, 9] = gx * gz
-        tail[at, 10] = gy * gy
-        tail[at, 11] = gy * gz
-        tail[at, 12] = gz * gz
-        tail[at, 13] = ax * ax
-        tail[at, 14] = ax * ay
-        tail[at, 15] = ax * az
-        tail[at, 16] = ay * ay
-        tail[at, 17] = ay * az
-        tail[at, 18] = az * az
-        tail[at, 19] = norm * norm
-    for at in range(n - 2, -1, -1):
-        for m in range(_SUMS):
-            tail[at, m] += tail[at + 1, m]
+    _clear(tail[n - 1])
+    for at in range(n - 1, -1, -1):
+        if at < n - 1:
+            tail[at] = tail[at + 1]
+        _add(tail[at], block, at, anchor)
 
 
 @inlined
-def _within(head, tail, row, limits, first, at, share):  # type: ignore[no-untyped-def]
+def _is_within(limit, sums, tail_sums, products, tail_products, share):  # type: ignore[no-untyped-def]
     """Conditions (1) and (2): (N − 1)(limit − S) is positive semidefinite: no principal minor is negative.
 
-    The three signals begin at `first`, their products at `at` of the sums and at − 7 of the limits. NaN says no.
+    `sums` and `products` are of three signals, of the current block and of the rest of the one before. NaN says no.
     """
-    x = head[first] + tail[row, first]
-    y = head[first + 1] + tail[row, first + 1]
-    z = head[first + 2] + tail[row, first + 2]
-    xx = limits[at - 7] - (head[at] + tail[row, at] - x * x * share)
-    yy = limits[at - 4] - (head[at + 3] + tail[row, at + 3] - y * y * share)
-    zz = limits[at - 2] - (head[at + 5] + tail[row, at + 5] - z * z * share)
+    x, y, z = sums[0] + tail_sums[0], sums[1] + tail_sums[1], sums[2] + tail_sums[2]
+    xx = limit[0] - (products[0] + tail_products[0] - x * x * share)
+    yy = limit[3] - (products[3] + tail_products[3] - y * y * share)
+    zz = limit[5] - (products[5] + tail_products[5] - z * z * share)
     if not (xx >= 0.0 and yy >= 0.0 and zz >= 0.0):
         return False
-    xy = limits[at - 6] - (head[at + 1] + tail[row, at + 1] - x * y * share)
-    xz = limits[at - 5] - (head[at + 2] + tail[row, at + 2] - x * z * share)
-    yz = limits[at - 3] - (head[at + 4] + tail[row, at + 4] - y * z * share)
+    xy = limit[1] - (products[1] + tail_products[1] - x * y * share)
+    xz = limit[2] - (products[2] + tail_products[2] - x * z * share)
+    yz = limit[4] - (products[4] + tail_products[4] - y * z * share)
     if not (xx * yy - xy * xy >= 0.0 and xx * zz - xz * xz >= 0.0 and yy * zz - yz * yz >= 0.0):
         return False
     return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz) >= 0.0
 
 
 @inlined
-def _bias_agrees(bias, limits, static, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
-    """Condition (5) for a window that passes (1) to (4), of its mean rate g and mean specific force a; learns the bias.
+def _bias_agrees(detector, window, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+    """Condition (5) for a window of mean rate g and mean specific force a; learns the bias.
 
-    `static`: whether the window passes them; where it does not the average fades and the known bias ages.
+    `window`: its length in samples where it passes (1) to (4); 0 where it does not: the average fades and the known
+    bias ages.
     """
-    bias[3] += limits[_WALK_VAR]
-    if not static:
-        bias[4] -= limits[_FADE] * bias[4]
+    bias = detector.bias
+    detector.bias_var += detector.walk_var
+    if window == 0:
+        detector.average_rate -= detector.fade * detector.average_rate
         return False
     gx, gy, gz = gx - bias[0], gy - bias[1], gz - bias[2]
     off = (gx * ax + gy * ay + gz * az) / np.sqrt(ax * ax + ay * ay + az * az)
-    known = bias[3] + limits[_SPREAD_VAR]
-    bound = np.sqrt(limits[_STDS2] * (known + limits[_WINDOW_VAR]))
+    known = detector.bias_var + detector.spread_var
+    bound = np.sqrt(detector.squared_stds * (known + detector.window_var))
     # What enters the average is bounded, so that it is soon forgotten when a fast rotation ends.
-    bias[4] += limits[_FADE] * (min(max(off, -bound), bound) - bias[4])
-    if abs(off) > bound or bias[4] * bias[4] > limits[_STDS2] * (known + limits[_AVERAGE_VAR]):
+    detector.average_rate += detector.fade * (min(max(off, -bound), bound) - detector.average_rate)
+    average = detector.average_rate
+    if abs(off) > bound or average * average > detector.squared_stds * (known + detector.average_var):
         return False
     # A window's mean measures the bias; its samples share that, since windows overlap.
-    gain = bias[3] / (bias[3] + limits[_WINDOW_VAR] / limits[_SHARE]) if bias[3] > 0.0 else 0.0
+    share, variance = 1.0 / window, detector.bias_var
+    gain = variance / (variance + detector.window_var / share) if variance > 0.0 else 0.0
     bias[0] += gain * gx
     bias[1] += gain * gy
     bias[2] += gain * gz
-    bias[3] -= gain * bias[3]
+    detector.bias_var -= gain * variance
     return True
 
 
 @inlined
-def static_step(block, tail, head, anchor, counts, limits, bias, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
-    """One sample of one sensor, rows of a `StaticState`: is the window that it ends static?"""
-    n = len(block)
-    at = counts[0]
-    ax, ay, az = ax * limits[14], ay * limits[14], az * limits[14]
+def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+    """One sample of one sensor, a row of a `StaticState`: is the window that it ends static?"""
+    n, at, anchor, head = len(block), detector.samples, detector.anchor, detector.sums
+    ax, ay, az = ax * detector.inverse_gravity, ay * detector.inverse_gravity, az * detector.inverse_gravity
     block[at, 0], block[at, 1], block[at, 2] = gx, gy, gz
     block[at, 3], block[at, 4], block[at, 5] = ax, ay, az
     norm = np.sqrt(ax * ax + ay * ay + az * az)
     block[at, 6] = norm
-    row = at + 1  # where the window begins in the block before
-    if row < n:
-        counts[0] = row
+    first = at + 1  # where the window begins in the block before
+    if first < n:
+        detector.samples = first
         _add(head, block, at, anchor)
-        if counts[1] == 0:
-            bias[3] += limits[_WALK_VAR]
+        if not detector.has_block:
+            detector.bias_var += detector.walk_var
             return False
     else:  # the block is full and is the window: sum it up backwards, begin the next
         if (gx + gy + gz + norm) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
-            for m in range(_SIGNALS):
+            for m in range(SIGNALS):
                 anchor[m] = block[at, m]
         _sum_up(tail, block, anchor)
-        for m in range(_SUMS):
-            head[m] = 0.0
-        counts[0] = 0
-        counts[1] = 1
-        row = 0
-    norm, share = head[6] + tail[row, 6], 1.0 / n
+        _clear(head)
+        detector.samples = 0
+        detector.has_block = True
+        first = 0
+    rest, share = tail[first], 1.0 / n
+    norm = head.norm + rest.norm
     static = (
-        abs(anchor[6] + norm * share - 1.0) <= limits[12]  # (3)
-        and head[19] + tail[row, 19] - norm * norm * share <= limits[13]  # (4)
-        and _within(head, tail, row, limits, 0, 7, share)  # (1)
-        and _within(head, tail, row, limits, 3, 13, share)  # (2)
+        abs(anchor[6] + norm * share - 1.0) <= detector.norm_error  # (3)
+        and head.norm_square + rest.norm_square - norm * norm * share <= detector.norm_variance  # (4)
+        and _is_within(detector.gyro_limit, head.gyro, rest.gyro, head.gyro_products, rest.gyro_products, share)  # (1)
+        and _is_within(
+            detector.accel_limit, head.accel, rest.accel, head.accel_products, rest.accel_products, share
+        )  # (2)
     )
     return _bias_agrees(
-        bias,
-        limits,
-        static,
-        anchor[0] + (head[0] + tail[row, 0]) * share,
-        anchor[1] + (head[1] + tail[row, 1]) * share,
-        anchor[2] + (head[2] + tail[row, 2]) * share,
-        anchor[3] + (head[3] + tail[row, 3]) * share,
-        anchor[4] + (head[4] + tail[row, 4]) * share,
-        anchor[5] + (head[5] + tail[row, 5]) * share,
+        detector,
+        n if static else 0,
+        anchor[0] + (head.gyro[0] + rest.gyro[0]) * share,
+        anchor[1] + (head.gyro[1] + rest.gyro[1]) * share,
+        anchor[2] + (head.gyro[2] + rest.gyro[2]) * share,
+        anchor[3] + (head.accel[0] + rest.accel[0]) * share,
+        anchor[4] + (head.accel[1] + rest.accel[1]) * share,
+        anchor[5] + (head.accel[2] + rest.accel[2]) * share,
     )
 
 
 @kernel
-def _run(block, tail, head, anchor, counts, limits, bias, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
-    block, tail, head, anchor, counts, limits = block[0], tail[0], head[0], anchor[0], counts[0], limits[0]
-    bias = bias[0]
+def _run(detectors, blocks, tails, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+    detector, block, tail = detectors[0], blocks[0], tails[0]
     for k in range(len(gyro_S)):
-        static[k] = static_step(
-            block,
-            tail,
-            head,
-            anchor,
-            counts,
-            limits,
-            bias,
-            gyro_S[k, 0],
-            gyro_S[k, 1],
-            gyro_S[k, 2],
-            accel_S[k, 0],
-            accel_S[k, 1],
-            accel_S[k, 2],
-        )
+        gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
+        ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
+        static[k] = static_step(detector, block, tail, gx, gy, gz, ax, ay, az)

@@ -26,7 +26,7 @@ from ..alignment import (
 from ..compilation import kernel
 from ..errors import BadOption, BadPhase
 from ..filters import BEST, Orientation
-from ..filters.bank import LiveBank, OneByOne, bank_of
+from ..filters.bank import LiveBank, OneByOne, create_bank
 from ..filters.sensors import SensorFilters, filtered_chunk
 from ..filters.static import StaticTest
 from ..pose import spread
@@ -169,7 +169,7 @@ class SegmentFollower:
         self.names = tuple(until.sensors)
         self.rate_hz = until.rate_hz
         started = [orientation[name] for name in self.names]
-        self._bank: LiveBank | OneByOne = bank_of(
+        self._bank: LiveBank | OneByOne = create_bank(
             [of.filter for of in started if of.filter is not None],
             [of.detector for of in started if of.detector is not None],
         )

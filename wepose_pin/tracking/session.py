@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import BadOption
-from ..filters import OFFLINE, piece_multiple
+from ..filters import OFFLINE, chunk_multiple
 from ..filters.noise import BEGINNING_S
 from ..model import BodyModel
 from ..readers.session import SessionReader
@@ -59,7 +59,7 @@ def track_session(
     reader = session if isinstance(session, SessionReader) else SessionReader(session, gaps=gaps, in_memory=False)
     if reader.start_pose == CONFIGURATION:
         raise BadOption(f'{reader.path}: start_pose = "{CONFIGURATION}" is that of a chain, which has no chunks')
-    multiple = piece_multiple(options.method, reader.rate_hz)
+    multiple = chunk_multiple(options.method, reader.rate_hz)
 
     def share(task: str, chunk: Recording) -> None:
         if progress is not None:
