@@ -15,6 +15,9 @@ from pathlib import Path
 
 import pytest
 
+# Workers share the processors already: BLAS with threads of its own spends twice the processor time for the same result.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
 # numba's cache does not see a change in a function of another file that was compiled into a caller: the tests keep one
 # cache for each state of the sources. Set before anything imports numba.
 _SOURCES = sorted((Path(__file__).resolve().parent.parent / "wepose_pin").rglob("*.py"))
