@@ -232,6 +232,12 @@ def clasp(scene: Scene, span: float = 1.0) -> Activity:
         if max(g.max() for g in gaps) < 0.95 and min(g.min() for g in gaps) > 0.4:
             break
         scale *= 0.92
+    # Joints blend into and out of the activity, so that it is followed a little before and after as well.
+    around = np.column_stack([curve(np.linspace(scene.begin - 5.0, scene.end + 5.0, 2000)) for curve in path])
+    while (
+        max(np.max(np.linalg.norm(middle + scale * around - shoulder[s], axis=1)) / sum(arm[s]) for s in SIDES) > 0.99
+    ):
+        scale *= 0.92
 
     def angle(side: str, name: str) -> Function:
         def of(t: np.ndarray) -> np.ndarray:
