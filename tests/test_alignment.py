@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import check_mounts, heading_to, mount_advice
+from wepose_pin.alignment import MOVED_MOUNT, check_mounts, heading_to, mount_advice
 from wepose_pin.calibration import load_protocol
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
+from wepose_pin.filters.phases import COMMON_RATE
 from wepose_pin.recording import (
     SEGMENTS,
     ImuSensor,
@@ -99,7 +100,7 @@ def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
         segments = estimate_segments(recording, subject)
         off = (truth.inv() * Rotation.from_quat(segments.quat_WL["left_forearm"])).magnitude()
         assert np.degrees(off.max()) == pytest.approx(5.0 * share, abs=0.05)
-        assert not segments.warnings
+        assert not segments.diagnostics
 
 
 def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
@@ -132,9 +133,15 @@ def test_a_calibrated_mount_that_has_moved_is_said() -> None:
         order=tuple(mount_rows("torso")),
         covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
     )
-    (warning,) = estimate_segments(recording, subject).warnings
-    assert "calibrated mount is 20 deg off" in warning
-    assert "remounted = true" in warning
+    (found,) = estimate_segments(recording, subject).diagnostics
+    assert (found.code, found.place, found.limit) == ("mount-moved", "torso", MOVED_MOUNT)
+    assert found.value == pytest.approx(np.deg2rad(20.0), abs=0.01)
+    (found,) = (
+        each
+        for each in estimate_segments(replace(recording, phases={}), subject).diagnostics
+        if each.code == "mount-moved"
+    )
+    assert found.facts == {"variant": "guessed"}
 
 
 def test_a_person_stands_as_in_the_calibration() -> None:
@@ -148,11 +155,11 @@ def test_a_person_stands_as_in_the_calibration() -> None:
         covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
         start_pose_offset={"torso": StartPoseOffset(lean, np.deg2rad(1.0))},
     )
-    for tilt, said in ((lean, []), (lean - [0.0, np.deg2rad(9.0)], ["is 9 deg off"]), (0.0 * lean, ["is 20 deg off"])):
+    for tilt, off in ((lean, []), (lean - [0.0, np.deg2rad(9.0)], [9.0]), (0.0 * lean, [20.0])):
         recording, _ = ready_recording({"torso": 0.0}, {"torso": Rotation.from_rotvec([*tilt, 0.0]) * mount})
-        warnings = estimate_segments(recording, subject).warnings
-        assert len(warnings) == len(said), warnings
-        assert all(text in warning for text, warning in zip(said, warnings, strict=True))
+        found = estimate_segments(recording, subject).diagnostics
+        assert [each.code for each in found] == ["mount-moved"] * len(off)
+        assert [each.value for each in found] == pytest.approx(np.deg2rad(off), abs=0.01)
 
 
 def test_a_calibrated_mount_that_cannot_be_names_the_strapping() -> None:
@@ -212,7 +219,8 @@ def test_a_mount_that_contradicts_gravity_and_one_that_is_missing(simulation: Si
 def test_without_phases_the_quietest_window_is_taken_and_said(simulation: Simulation) -> None:
     segments = estimate_segments(replace(simulation.recording(), phases={}))
     assert 0.0 <= segments.start[0] < segments.start[1] <= 5.1
-    assert any("quietest window" in warning for warning in segments.warnings)
+    (guess,) = segments.diagnostics
+    assert (guess.code, guess.facts) == ("start-pose-guessed", dict(zip(("start", "end"), segments.start, strict=True)))
     with pytest.raises(BadPhase, match="holds 2 samples"):
         estimate_segments(replace(simulation.recording(), phases={"start": ((1.0, 1.01),)}))
 
@@ -282,8 +290,10 @@ def test_a_person_who_turns_in_the_start_pose_is_named(simulation: Simulation, r
             estimate_segments(turned)
         return
     found = estimate_segments(turned)
-    assert any("turn about the vertical" in warning for warning in found.warnings)
-    assert not any("turn about the vertical" in warning for warning in estimate_segments(recording).warnings)
+    (rotates,) = (each for each in found.diagnostics if each.code == "person-rotates")
+    assert rotates.value == pytest.approx(np.deg2rad(rate_deg_s), rel=0.3)
+    assert rotates.value > rotates.limit == COMMON_RATE
+    assert "person-rotates" not in {each.code for each in estimate_segments(recording).diagnostics}
     for segment, orientation in found.orientation.items():
         still = estimate_segments(recording).orientation[segment]
         assert np.trace(orientation.noise.gyro_bias_cov - still.noise.gyro_bias_cov) > 0.9 * np.deg2rad(rate_deg_s) ** 2

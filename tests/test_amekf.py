@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import rotations
-from wepose_pin.errors import BadOption
+from wepose_pin.errors import BadOption, WeposeWarning
 from wepose_pin.evaluation import attitude_error, uncertainty
 from wepose_pin.filters import TYPICAL, Amekf, AmekfParams, FilterRun, Smoother, estimate_orientation, run_filter
 from wepose_pin.filters.amekf import BLOCK, ERROR, STATES, transition_rows
@@ -424,8 +424,9 @@ def test_a_sensor_that_never_rests_converges_and_says_so(method: str) -> None:
     for seed in range(6):
         of = case(seed)
         gyro, accel = of.gyro[1000:5400] + np.deg2rad([0.4, -0.3, 0.2]), of.accel[1000:5400]
-        with pytest.warns(UserWarning, match="no static phase"):
+        with pytest.warns(WeposeWarning, match="There is no static phase"):
             found = estimate_orientation(gyro, accel, RATE, method=method, static=None)
+        assert [each.code for each in found.diagnostics] == ["static-phase-missing"]
         error = Rotation.from_quat(found.quat_WS) * Rotation.from_quat(of.true[1000:5400]).inv()
         tilts.append(tilt_deg(error))
         assert not found.static.any()

@@ -28,21 +28,11 @@ from wepose_pin.diagnostics import (
     quantity,
     render,
     render_all,
-    unclassified,
 )
 
 PACKAGE = Path(wepose_pin.__file__).parent
 # Functions that make a diagnostic of the code that is their first argument, beside `Diagnostic` itself.
 CONSTRUCTORS = {"Diagnostic"}
-# Codes whose rooms still give texts of their own. A code leaves this list with the change that makes it.
-NOT_YET = set(
-    """
-    time-resampled packet-times-spread long-gaps-bridged short-gaps-bridged sensor-frozen orientation-constant
-    orientations-copied arm-frames-assumed devices-left-out device-not-synchronized heading-resets-not-repeated
-    sensor-segments-unknown device-file-left-out session-unreadable start-pose-guessed phase-intervals-ignored
-    start-pose-sway person-rotates mount-contradicts-gravity mount-moved static-phase-missing
-    """.split()
-)
 ALL = [(code, variant) for code, entry in catalogue().items() for variant in ("", *entry.variants)]
 
 
@@ -79,8 +69,7 @@ def emitted() -> set[str]:
 def test_every_code_is_in_the_catalogue_and_every_entry_is_made() -> None:
     made = emitted()
     assert made - set(catalogue()) == set()
-    assert set(catalogue()) - made - NOT_YET == set(), "in the catalogue, and nothing makes it"
-    assert made & NOT_YET == set(), "made by now: take it from NOT_YET"
+    assert set(catalogue()) - made == set(), "in the catalogue, and nothing makes it"
 
 
 def test_facts_of_each_call_are_those_of_its_text() -> None:
@@ -104,11 +93,10 @@ def test_facts_of_each_call_are_those_of_its_text() -> None:
 def test_every_text_is_filled_by_its_example_and_needs_all_of_it(code: str, variant: str) -> None:
     text = render(example(code, variant))
     assert text.title
-    if code != "unclassified":
-        for part in text[1:]:
-            assert part.endswith((".", "!")), part
-            assert "  " not in part
-            assert "{" not in part.replace("{ up", "")
+    for part in text[1:]:
+        assert part.endswith((".", "!")), part
+        assert "  " not in part
+        assert "{" not in part.replace("{ up", "")
     assert text.line().startswith(text.what)
     entry = catalogue()[code]
     parts = [part for each in (entry.text, *entry.variants.values()) for part in each]
@@ -179,8 +167,11 @@ def test_numbers_have_two_digits_at_least_and_their_unit(value: float | None, un
 
 def test_alike_are_told_together_the_gravest_first() -> None:
     lost = [Diagnostic("samples-lost", WARNING, name, 0.02 + 0.01 * k, 0.01) for k, name in enumerate("abcde")]
-    texts = render_all([Diagnostic("population-lengths", INFO), *lost, lost[0], unclassified("x"), unclassified("y")])
-    assert [text.title for _, text in texts] == ["Samples lost", "Note", "Note", "Lengths of the population prior"]
+    dead, slow = Diagnostic("orientation-constant", WARNING, "e", 900), Diagnostic("start-pose-late", INFO, value=12.0)
+    texts = render_all([Diagnostic("population-lengths", INFO), *lost, lost[0], dead, slow])
+    titles = [text.title for _, text in texts]
+    assert titles[:2] == ["Samples lost", "Orientation never changes"]
+    assert titles[2] == "Lengths of the population prior"
     assert texts[0][0] == WARNING
     assert texts[0][1].what.count("lost") == 3
     assert texts[0][1].what.endswith("So it is in 2 more: d, e.")

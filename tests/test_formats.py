@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from test_mvnx import mvnx, turning
 
 import wepose_pin as wp
+from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadData, BadSession, MissingFile, UnknownColumn, WeposeError
 from wepose_pin.readers.device import unwrapped
 from wepose_pin.readers.formats import format_of, read_device
@@ -115,7 +116,8 @@ def test_packets_lost_on_the_air_are_gaps(tmp_path: Path) -> None:
     path.write_text("".join(lines[:100] + lines[103:]))
     recording = load(tmp_path, '[data]\nfile = "a.txt"\n[sensors.torso]')
     assert len(recording) == N
-    assert "3 samples" in recording.notes[0]
+    (gap,) = recording.diagnostics
+    assert (gap.code, gap.place, gap.value, gap.facts["samples"]) == ("short-gaps-bridged", "torso", 1, 3)
 
 
 def test_without_a_rate_the_fine_time_counts_tenths_of_milliseconds(tmp_path: Path) -> None:
@@ -143,7 +145,7 @@ def test_mt_manager_without_a_rate_is_read_with_that_of_the_session(fine: str, s
     (tmp_path / "c.txt").write_text("".join(rows_[:50] + rows_[53:]))
     lost = load(tmp_path, '[data]\nfile = "c.txt"\nrate_hz = 100.0\n[sensors.torso]')
     assert len(lost) == N
-    assert "3 samples" in lost.notes[0]
+    assert [(each.code, each.facts["samples"]) for each in lost.diagnostics] == [("short-gaps-bridged", 3)]
     with pytest.raises(BadData, match=r"state the update rate as rate_hz in \[data\]"):
         load(tmp_path, f"[data]\n{both}")
     with pytest.raises(BadData, match="rate_hz"):  # the rate of [data] is that of its own file
@@ -289,7 +291,8 @@ def test_apdm_knows_its_sensors_by_name(tmp_path: Path) -> None:
         load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.head]')
     device = read_device(tmp_path / "a.csv", "apdm", "orientation")
     assert list(device.labels) == ["Chest"]
-    assert "Left Wrist" in device.notes[0]
+    (missing,) = device.diagnostics
+    assert (missing.code, missing.facts["devices"]) == ("devices-left-out", "Left Wrist")
 
 
 def test_a_real_export_of_apdm(data: Path, tmp_path: Path) -> None:
@@ -369,7 +372,9 @@ def test_dot_clocks_that_were_synchronised_are_one_even_where_they_begin_anew(tm
 def test_dot_that_was_not_synchronised_is_said(tmp_path: Path) -> None:
     dot(tmp_path / "a.csv", sync="Un-synced")
     recording = load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.torso]')
-    assert recording.notes == ("a.csv: SyncStatus says that it is not synced",)
+    assert recording.diagnostics == (Diagnostic("device-not-synchronized", WARNING, "a.csv"),)
+    dot(tmp_path / "a.csv", sync="Synced")
+    assert not load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.torso]').diagnostics
 
 
 def test_a_dot_without_its_preamble_must_be_named_if_rates_alone_are_in_it(tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ from test_mvnx import mvnx, turning
 
 import wepose_pin as wp
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import ERROR, Diagnostic
+from wepose_pin.readers.describe import describe
 from wepose_pin.recording import SEGMENTS, Recording
 
 
@@ -24,6 +26,11 @@ def info(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> st
     assert stop.value.code == code, err
     assert code == 0 or (out == "" and err.count("\n") == 1)
     return out if code == 0 else err
+
+
+def diagnosed(path: Path) -> dict[str, Diagnostic]:
+    """Code → what `wepose info` says of a file besides its facts."""
+    return {each.code: each for each in describe(path).diagnostics}
 
 
 def written(capsys: pytest.CaptureFixture[str], path: Path) -> Recording:
@@ -80,7 +87,7 @@ def test_files_of_one_recording_make_one_session(capsys: pytest.CaptureFixture[s
     dot(tmp_path / "D3.csv", tag="D422CD00")
     (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
     text = info(capsys, tmp_path / "D2.csv")
-    assert "which segment is not said by the names of: D3.csv" in text
+    assert diagnosed(tmp_path / "D2.csv")["sensor-segments-unknown"].facts == {"sensors": "D3.csv"}
     assert '# [sensors.SEGMENT]\n# file = "D3.csv"' in text
     recording = written(capsys, tmp_path / "D2.csv")
     assert set(recording.sensors) == {"torso", "left_forearm"}
@@ -259,7 +266,9 @@ def test_what_cannot_be_read_is_said_and_a_session_still_proposed(
     frame = table().with_columns(pl.col("torso_acc_x", "torso_acc_y", "torso_acc_z") * 0.0)
     frame.write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv")
-    assert "cannot be read so: sensors.torso.accel: norm 0 m/s^2" in text
+    unread = diagnosed(tmp_path / "a.csv")["session-unreadable"]
+    assert (unread.severity, unread.place) == (ERROR, "a.csv")
+    assert "sensors.torso.accel: norm 0 m/s^2" in str(unread.facts["reason"])
     assert "[sensors.torso]" in text
 
 
@@ -335,7 +344,7 @@ def test_sensors_without_a_segment_are_left_to_the_user(capsys: pytest.CaptureFi
     frames = [table(f"seg{k}_gyr_{{}} seg{k}_acc_{{}}", sensor=k).drop("time") for k in (1, 2, 3)]
     pl.concat([table().select("time"), *frames], how="horizontal").write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv")
-    assert "which segment is not said by the names of: seg1, seg2, seg3" in text
+    assert diagnosed(tmp_path / "a.csv")["sensor-segments-unknown"].facts == {"sensors": "seg1, seg2, seg3"}
     assert text.count("# [sensors.SEGMENT]") == 3
     assert "[sensors.torso]" not in text
     assert "name the segment of each sensor" in info(capsys, tmp_path / "a.csv", "--write")

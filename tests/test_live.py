@@ -127,7 +127,7 @@ def test_live_its_file_and_causal_tracking_give_the_same_bits(
     ended = live(recording, tmp_path / "a.wepose", method=method)
     found = read_live_log(tmp_path / "a.wepose")
     causal, again = track(recording, method=method, causal=True), track(found.recording, method=method, causal=True)
-    assert not found.broken_off
+    assert not found.recording.diagnostics
     assert found.first == len(recording) - len(causal.time)
     assert ended.poses == len(found.quat_WL) == len(causal.time) == len(again.time)
     for i, name in enumerate(recording.sensors):
@@ -359,7 +359,8 @@ def test_a_file_that_breaks_off_anywhere_is_read_up_to_there(recording: Recordin
     damaged = bytearray(data)
     damaged[len(data) // 2] ^= 0xFF
     part.write_bytes(damaged)
-    assert read_live_log(part).broken_off
+    (killed,) = read_live_log(part).recording.diagnostics
+    assert (killed.code, killed.place) == ("live-recording-incomplete", "part.wepose")
 
 
 def test_files_that_are_none_are_said_to_be(recording: Recording, tmp_path: Path) -> None:

@@ -206,7 +206,7 @@ def test_arms_referred_to_either_pose_are_told_by_the_positions(
         ours = Rotation.from_quat(device.table.select([f"{label} orientation {c}" for c in "xyzw"]).to_numpy())
         along_W = Rotation.from_quat(quat[:, k][:, [1, 2, 3, 0]]).apply(arm or (0.0, 1.0, 0.0))
         np.testing.assert_allclose(ours.apply([0.0, 0.0, -1.0]), along_W, atol=1e-6)
-    assert any("no positions" in note for note in device.notes) == (arm is None)
+    assert [each.code for each in device.diagnostics] == ["arm-frames-assumed"] * (arm is None)
     torso = device.table.select([f"T8 orientation {c}" for c in "xyzw"]).to_numpy()
     np.testing.assert_allclose(torso, quat[:, 1][:, [1, 2, 3, 0]], atol=1e-8)
 
@@ -253,7 +253,9 @@ def test_lost_frames_are_gaps(tmp_path: Path) -> None:
     path = mvnx(tmp_path, turning(58), index=index)
     recording = wp.load_session(session(tmp_path, path.name, ("torso",)))
     assert len(recording) == 60
-    assert any("bridged: 2 samples" in note for note in recording.notes)
+    (gap,) = recording.diagnostics
+    assert (gap.code, gap.place, gap.value) == ("short-gaps-bridged", "torso", 1)
+    assert gap.facts["samples"] == 2
     path = mvnx(tmp_path, turning(58), index=[k + 40 * (k > 20) for k in range(58)])
     with pytest.raises(BadData, match=r"rows are missing after row 21"):
         wp.load_session(session(tmp_path, path.name, ("torso",)))

@@ -15,13 +15,15 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin import load_session, rotations
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import Diagnostic, as_json, render
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.readers import iter_session
 from wepose_pin.readers.tables import Rows, one_column, read_table
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, Sensor, check
 from wepose_pin.recording.clocks import clock_of, common_time
 from wepose_pin.recording.gaps import BRIDGED, LONG, bridge, bridge_quat, lost_samples
-from wepose_pin.recording.plausibility import sensor_notes
+from wepose_pin.recording.limits import GRAVITY_ERROR_NOTED
+from wepose_pin.recording.plausibility import check_signals
 from wepose_pin.recording.resampling import on_time
 
 SIGNALS = {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"], "orientation": ["qx", "qy", "qz", "qw"]}
@@ -105,7 +107,7 @@ def test_values_come_through_untouched_and_in_si(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.sensors["torso"].gyro_S, table[SIGNALS["gyro"]], atol=1e-13)
     np.testing.assert_allclose(recording.sensors["torso"].accel_S, table[SIGNALS["accel"]], atol=1e-13)
     assert recording.rate_hz == pytest.approx(100.0)
-    assert recording.notes == ()
+    assert recording.diagnostics == ()
     assert recording.name == tmp_path.name
     assert same(load_session(tmp_path), recording)
 
@@ -203,9 +205,9 @@ def test_short_gaps_are_bridged_on_the_rotation(lost: str, count: int, tmp_path:
     assert error.max() < {1: 0.01, 3: 0.07, 5: 0.13}[count] * len(holes)  # [deg], at up to 260 deg/s
     accel = recording.sensors["torso"].accel_S
     assert np.abs(accel - table[SIGNALS["accel"]].to_numpy()).max() < 0.02 * count**2
-    assert f"{len(holes)} short gaps bridged: {count * len(holes)} samples, the longest {10 * count} ms" in str(
-        recording.notes
-    )
+    (gaps,) = recording.diagnostics
+    assert (gaps.code, gaps.place, gaps.value, gaps.limit) == ("short-gaps-bridged", "torso", len(holes), 0.05)
+    assert gaps.facts == {"samples": count * len(holes), "longest": pytest.approx(0.01 * count)}
     assert recording.sensors["torso"].gap is None
 
 
@@ -272,9 +274,13 @@ def test_accepted_gaps_are_marked_and_counted_in_the_result(tmp_path: Path, caps
     with pytest.raises(SystemExit) as stop:
         main(["track", str(path), "--gaps", "-o", str(tmp_path / "out")])
     assert stop.value.code == 0
-    assert "warning: sensors.torso: 2 long gaps accepted, bridged and marked: 70 samples" in capsys.readouterr().err
+    (gaps,) = (each for each in recording.diagnostics if each.code == "long-gaps-bridged")
+    assert (gaps.place, gaps.value, gaps.facts["samples"]) == ("torso", 2, 70)
+    assert f"warning: {render(gaps).what}" in capsys.readouterr().err
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert as_json(gaps) in summary["diagnostics"]
     np.testing.assert_array_equal(pl.read_parquet(tmp_path / "out" / "pose.parquet")["torso_gap"], gap)
-    torso = json.loads((tmp_path / "out" / "summary.json").read_text())["sensors"]["torso"]
+    torso = summary["sensors"]["torso"]
     assert (torso["gaps"], torso["gap_s"]) == (2, 0.7)
 
 
@@ -301,8 +307,10 @@ def test_an_uneven_rate_is_resampled_on_the_rotation(spread: float, tmp_path: Pa
     np.testing.assert_allclose(np.diff(recording.time), np.diff(recording.time)[0])
     error = rotation_error_deg(recording.sensors["torso"], recording.time)
     assert error.max() < 0.05
-    assert "resampled to" in recording.notes[0]
-    assert "(steps between" in recording.notes[0]
+    (resampled,) = recording.diagnostics
+    assert (resampled.code, resampled.value) == ("time-resampled", pytest.approx(recording.rate_hz))
+    assert resampled.facts["variant"] == ("uneven" if spread > 0.5 else "changing")
+    assert resampled.facts["shortest"] < 0.01 < resampled.facts["longest"]
 
 
 def test_resampling_beats_taking_the_rate_for_even(tmp_path: Path) -> None:
@@ -311,7 +319,7 @@ def test_resampling_beats_taking_the_rate_for_even(tmp_path: Path) -> None:
     time = 0.01 * k + 0.4 * 0.01 * np.cumsum(np.sin(2.0 * np.pi * k / 200.0))
     table = table_at(time)
     recording = load_session(write(tmp_path, table))
-    assert "the rate changes by up to" in recording.notes[0]
+    assert [(each.code, each.facts["variant"]) for each in recording.diagnostics] == [("time-resampled", "changing")]
     assert rotation_error_deg(recording.sensors["torso"], recording.time).max() < 0.1
     even = ImuSensor(gyro_S=table[SIGNALS["gyro"]].to_numpy(), accel_S=table[SIGNALS["accel"]].to_numpy())
     taken = Rotation.from_quat(rotations.integrate(even.gyro_S[1:] * np.diff(time).mean()))
@@ -324,7 +332,7 @@ def test_jitter_of_a_clock_is_left_alone(tmp_path: Path) -> None:
     steps[::500] = 0.0011
     table = table_at(np.concatenate([[0.0], np.cumsum(steps)]))
     recording = load_session(write(tmp_path, table))
-    assert recording.notes == ()
+    assert recording.diagnostics == ()
     np.testing.assert_array_equal(recording.sensors["torso"].gyro_S, table[SIGNALS["gyro"]])
 
 
@@ -347,7 +355,9 @@ def test_sensors_with_clocks_of_their_own_come_to_one_time(own_rate: float, sens
         assert error.max() < 0.02
         accel = recording.sensors[segment].accel_S
         assert np.abs(accel - true_orientation(time).inv().apply([0.0, 0.0, 9.81])).max() < 0.05
-    assert "the sensors' clocks differ" in recording.notes[0]
+    (resampled,) = recording.diagnostics
+    assert resampled.code == "time-resampled"
+    assert "variant" not in resampled.facts  # their clocks differ
 
 
 def test_a_faster_sensor_is_averaged_so_that_its_noise_does_not_fold_down() -> None:
@@ -363,7 +373,7 @@ def test_the_same_clock_in_two_files_is_not_resampled(tmp_path: Path) -> None:
     time = np.arange(1000) / 100.0
     head = table_at(time, 0.02)
     recording = load_session(write(tmp_path, table_at(time, 0.01), head=head.with_columns(pl.col("time") + 1e-7)))
-    assert recording.notes == ()
+    assert recording.diagnostics == ()
     np.testing.assert_array_equal(recording.sensors["head"].gyro_S, head[SIGNALS["gyro"]])
 
 
@@ -387,9 +397,9 @@ def test_lost_rows_are_put_back_at_their_times() -> None:
     clock = clock_of(time, "x")
     np.testing.assert_allclose(clock.time, np.arange(20) / 100.0)
     assert clock.row.tolist() == [0, 1, 2, -1, 3, 4, 5, 6, 7, 8, -1, -1, -1, *range(9, 16)]
-    base, notes = common_time("x", {"torso": clock})
+    base, diagnostics = common_time("x", {"torso": clock})
     assert base is clock.time
-    assert notes == ()
+    assert diagnostics == ()
 
 
 # Pieces ------------------------------------------------------------------------------------------------------------
@@ -458,13 +468,11 @@ def test_pieces_find_what_the_whole_finds(tmp_path: Path) -> None:
 
 def test_saturation_is_counted(tmp_path: Path) -> None:
     table = table_at(np.arange(1000) / 100.0, 0.005).with_columns(pl.col("gx", "gy").clip(-2.5, 2.5))
-    notes = load_session(write(tmp_path, table)).notes
-    for axis in "xy":
-        count = int((table[f"g{axis}"].abs() == 2.5).sum())
-        note = next(note for note in notes if f"samples on {axis} stand at" in note)
-        assert note.startswith("sensors.torso.gyro: ")
-        assert abs(int(note.split()[1]) - count) <= 4  # single and double samples at the limit do not count
-    assert len(notes) == 2
+    (saturated,) = load_session(write(tmp_path, table)).diagnostics
+    assert (saturated.code, saturated.place) == ("signal-saturated", "torso")
+    assert saturated.facts == {"variant": "gyro", "range": 2.5}
+    count = int(((table["gx"].abs() == 2.5) | (table["gy"].abs() == 2.5)).sum())
+    assert saturated.value == pytest.approx(0.01 * count, abs=0.09)  # single and double samples there do not count
 
 
 def test_a_slow_peak_of_a_coarse_sensor_is_no_saturation() -> None:
@@ -473,13 +481,15 @@ def test_a_slow_peak_of_a_coarse_sensor_is_no_saturation() -> None:
     gyro_S[:, 1] = np.round(3.0 * np.sin(2.0 * time), 3)
     quat = rotations.integrate(gyro_S[1:] / 1000.0)
     sensor = ImuSensor(gyro_S=gyro_S, accel_S=Rotation.from_quat(quat).inv().apply([0.0, 0.0, 9.81]))
-    assert sensor_notes(Recording("r", time, 1000.0, {"torso": sensor})) == ()
+    assert check_signals(Recording("r", time, 1000.0, {"torso": sensor})) == ()
 
 
 def test_a_scale_that_is_off_is_noted(tmp_path: Path) -> None:
     table = table_at(np.arange(1000) / 100.0).with_columns(pl.col(SIGNALS["accel"]) * 1.1)
-    (note,) = load_session(write(tmp_path, table)).notes
-    assert "sensors.torso.accel: norm 10.79 m/s^2 in phases.start (0.5 to 1.9 s)" in note
+    (scale,) = load_session(write(tmp_path, table)).diagnostics
+    assert (scale.code, scale.place, scale.limit) == ("accel-scale", "torso", GRAVITY_ERROR_NOTED)
+    assert scale.value == pytest.approx(10.79, abs=0.01)
+    assert scale.facts == {"share": pytest.approx(0.1, abs=0.01), "start": 0.5, "end": 1.9}
 
 
 def real_sensors(data: Path) -> dict[str, tuple[float, np.ndarray, np.ndarray]]:
@@ -515,29 +525,29 @@ def test_real_recordings_raise_no_alarm_and_their_units_are_told_apart(data: Pat
     for name, (rate_hz, gyro, accel) in sensors.items():
         time = np.arange(len(gyro)) / rate_hz
 
-        def notes(gyro: np.ndarray, accel: np.ndarray, time=time, rate_hz=rate_hz) -> tuple[str, ...]:
-            return sensor_notes(Recording("r", time, rate_hz, {"torso": ImuSensor(gyro_S=gyro, accel_S=accel)}))
+        def checked(gyro: np.ndarray, accel: np.ndarray, time=time, rate_hz=rate_hz) -> tuple[Diagnostic, ...]:
+            return check_signals(Recording("r", time, rate_hz, {"torso": ImuSensor(gyro_S=gyro, accel_S=accel)}))
 
-        assert notes(gyro, accel) == (), name
+        assert checked(gyro, accel) == (), name
         with pytest.raises(BadData, match='accel_unit = "g" would fit'):
-            notes(gyro, accel / 9.81)
+            checked(gyro, accel / 9.81)
         with pytest.raises(BadData, match=r'accel_unit = "m/s\^2" would fit'):
-            notes(gyro, accel * 9.81)
+            checked(gyro, accel * 9.81)
         for factor, unit in ((180.0 / np.pi, "deg/s"), (np.pi / 180.0, "rad/s")):
             with suppress(BadData):
-                notes(gyro * factor, accel)
+                checked(gyro * factor, accel)
                 continue
             with pytest.raises(BadData, match=f'gyro_unit = "{unit}" would fit'):
-                notes(gyro * factor, accel)
+                checked(gyro * factor, accel)
             caught[unit] += 1
     # The arm of the UR5 hardly turns about horizontal axes, and some trials of BROAD only move along.
     assert caught["deg/s"] >= len(sensors) - 5
     assert caught["rad/s"] >= len(sensors) // 2
 
 
-def test_the_upper_body_session_reads_without_a_note(data: Path) -> None:
+def test_the_upper_body_session_reads_without_a_diagnostic(data: Path) -> None:
     recording = load_session(data / "upper_body")
-    assert recording.notes == ()
+    assert recording.diagnostics == ()
     table = read_table(data / "upper_body" / "upper_body.csv")
     for segment, sensor in recording.sensors.items():
         np.testing.assert_array_equal(sensor.gyro_S, table[[f"{segment}_gyr_{axis}" for axis in "xyz"]])

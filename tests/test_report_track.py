@@ -116,12 +116,11 @@ def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedRecord
 
 
 def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedRecording, page: str) -> None:
-    warned = replace(
-        pose, segments=replace(pose.segments, warnings=("no phases.start: the quietest window was taken",))
-    )
+    guessed = Diagnostic("start-pose-guessed", WARNING, facts={"start": 0.5, "end": 2.5})
+    warned = replace(pose, segments=replace(pose.segments, diagnostics=(guessed,)))
     text = without_frame(track_report(warned))
     assert '<section class="banner poor">' in text
-    first = text.index("no phases.start: the quietest window was taken")
+    first = text.index(render(guessed).what)
     assert first < text.index("Let the person hold the hands together") < text.index("<h2") < text.index("<figure")
     assert '<section class="banner note">' in page  # the average person's lengths are worth a word and no more
     assert "The person's lengths are not known." in text_of(page)

@@ -13,6 +13,7 @@ from test_bad_input import refused
 
 from wepose_pin import estimate_orientation, load_session, rotations
 from wepose_pin.alignment import START_POSE_STD
+from wepose_pin.diagnostics import Diagnostic, render
 from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.filters.noise import quietest
 from wepose_pin.readers import iter_session
@@ -21,7 +22,7 @@ from wepose_pin.readers.trials import read_broad
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.recording.clocks import clock_of
 from wepose_pin.recording.faults import faults_of, scan_sensor
-from wepose_pin.recording.plausibility import sensor_notes
+from wepose_pin.recording.plausibility import check_signals
 from wepose_pin.simulation import PERFECT, Simulation, simulate, simulated_person
 from wepose_pin.tracking import TrackOptions, track, track_session
 from wepose_pin.tracking.segments import estimate_segments
@@ -100,8 +101,10 @@ def test_a_sensor_that_freezes_is_lost_from_there(signals: str, since: float, ma
     assert gap is not None
     assert read.time[np.argmax(gap)] == pytest.approx(since + 0.01, abs=0.011)
     assert gap[read.time > since + 0.02].all()
-    (note,) = (note for note in read.notes if BROKEN in note and "lost" in note and "from" in note)
-    assert f"from {since:g} to " in note
+    (frozen,) = (each for each in read.diagnostics if each.code == "sensor-frozen")
+    assert (frozen.place, frozen.facts["signals"]) == (BROKEN, " and ".join(signals.split()))
+    assert frozen.facts["start"] == pytest.approx(since, abs=0.011)
+    assert frozen.value == pytest.approx(read.time[-1] - since, abs=0.011)
     assert all(sensor.gap is None for name, sensor in read.sensors.items() if name != BROKEN)
     pieces = [piece.sensors[BROKEN].gap for piece in iter_session(path, 3.7)]
     np.testing.assert_array_equal(np.concatenate(pieces), gap)
@@ -146,7 +149,9 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
         table.with_columns(pl.col(rates).degrees()).write_parquet(path / "recording.parquet")
     read = load_session(path)
     assert read.sensors[BROKEN].gyro_range == pytest.approx(level, rel=0.03)
-    assert any(f"sensors.{BROKEN}.gyro" in note and "cut off" in note for note in read.notes)
+    (saturated,) = (each for each in read.diagnostics if each.code == "signal-saturated")
+    assert (saturated.place, saturated.facts["variant"]) == (BROKEN, "gyro")
+    assert saturated.facts["range"] == pytest.approx(level)
     assert all(np.isinf(sensor.gyro_range) for name, sensor in read.sensors.items() if name != BROKEN)
 
     def worst(recording: Recording) -> float:
@@ -218,7 +223,8 @@ def test_a_sensor_is_lost_from_where_an_axis_stops(method: str, made: Simulation
     path = written(tmp_path / "in", axis_stopped(made.recording("stuck"), "gyro x", 9.0))
     read = load_session(path)
     np.testing.assert_array_equal(read.sensors[BROKEN].gap, read.time > 9.0 + 1e-6)
-    assert any(f"sensors.{BROKEN}: gyro x stands still at" in note for note in read.notes)
+    (frozen,) = (each for each in read.diagnostics if each.code == "sensor-frozen")
+    assert (frozen.place, frozen.facts["signals"]) == (BROKEN, "gyro x")
     pieces = [piece.sensors[BROKEN].gap for piece in iter_session(path, 3.7)]
     np.testing.assert_array_equal(np.concatenate(pieces), read.sensors[BROKEN].gap)
     assert off_by(with_sensor(read, BROKEN, gap=None), made, method).max() > 6.0
@@ -342,7 +348,7 @@ def test_gravity_and_noise_are_those_of_measured_samples(made: Simulation) -> No
     gap = lost(whole, "torso", 1.0, 2.9)
     gap.sensors["torso"].accel_S[100:290] *= 0.7
     for phases in (gap.phases, {}):
-        assert sensor_notes(replace(gap, phases=phases)) == ()
+        assert check_signals(replace(gap, phases=phases)) == ()
     torso = estimate_segments(gap).orientation["torso"].noise
     right = estimate_segments(whole).orientation["torso"].noise
     assert torso.gravity == pytest.approx(right.gravity, rel=1e-3)
@@ -403,18 +409,18 @@ def swing(hertz: float, peak_deg_s: float, radius: float = 0.3) -> tuple[np.ndar
 def test_arms_that_swing_fast_are_measured_in_the_unit_that_is_stated(hertz: float, peak: float) -> None:
     time, gyro, accel = swing(hertz, peak)
 
-    def notes(scale: float) -> tuple[str, ...]:
+    def checked(scale: float) -> tuple[Diagnostic, ...]:
         phases = {"start": ((0.5, 4.5),)}
         sensor = ImuSensor(gyro_S=scale * gyro, accel_S=accel)
-        return sensor_notes(Recording("swing", time, RATE, {"torso": sensor}, phases))
+        return check_signals(Recording("swing", time, RATE, {"torso": sensor}, phases))
 
-    assert notes(1.0) == ()
+    assert checked(1.0) == ()
     if peak > 1000.0:  # speeds that two seconds do not average out: either unit may be
         return
     with pytest.raises(BadData, match="gyro"):
-        notes(180.0 / np.pi)
+        checked(180.0 / np.pi)
     with pytest.raises(BadData, match='"rad/s" would fit'):
-        notes(np.pi / 180.0)
+        checked(np.pi / 180.0)
 
 
 @pytest.mark.parametrize("within", [0.0, 1e-4, 2e-3])
@@ -468,9 +474,7 @@ def test_times_on_a_clock_since_1970_can_be_found(made: Simulation, tmp_path: Pa
     whole = stopped(made.recording("epoch"), "gyro accel", 9.0)
     epoch = replace(whole, time=whole.time + 1.7e9, phases={"start": ((1.7e9 + 0.5, 1.7e9 + 4.5),)})
     read = load_session(written(tmp_path / "in", epoch))
-    notes = " ".join(read.notes)
-    assert "1700000009 to 1700000025.38 s" in notes
-    assert "e+09" not in notes
-    quiet = estimate_segments(replace(read, phases={})).warnings
-    assert any(" 17000000" in note for note in quiet)
-    assert not any("e+09" in note for note in quiet)
+    texts = {each.code: render(each).what for each in estimate_segments(replace(read, phases={})).diagnostics}
+    assert "from 1700000009 s to 1700000025.38 s" in texts["sensor-frozen"]
+    assert " 17000000" in texts["start-pose-guessed"]
+    assert not any("e+09" in text for text in texts.values())

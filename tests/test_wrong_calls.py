@@ -22,6 +22,7 @@ from arms import person as moving_arm
 from arms import write_arm
 
 import wepose_pin as wp
+from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.filters import AmekfParams
 from wepose_pin.retargeting import Tasks
 from wepose_pin.simulation import Imperfections, ImuNoise
@@ -328,8 +329,8 @@ def wrong_recordings(recording: wp.Recording) -> Iterator[tuple[str, wp.Recordin
         yield "joints", replace(recording, joints=joints)
     for name in (None, 3):
         yield "name", replace(recording, name=name)
-    for notes in ("x", None, (3,)):
-        yield "notes", replace(recording, notes=notes)
+    for diagnostics in ("x", None, (3,), ("start-pose-late",), (Diagnostic(3, WARNING),)):
+        yield "diagnostics", replace(recording, diagnostics=diagnostics)
 
 
 def wrong_subjects(subject: wp.Subject) -> Iterator[tuple[str, wp.Subject]]:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from . import rotations
+from .diagnostics import WARNING, Diagnostic
 from .errors import BadSession
 from .filters import Orientation
 from .filters.sensors import FilteredRecording, sensor_rotations
@@ -53,7 +54,7 @@ class Segments:
         accelerometer's bias, and the heading of a calibrated mount. A stated mount counts as
         exact. Only where the filter has a covariance
     start, still : intervals [s] used for headings, and for noise and bias
-    warnings : what the user should know
+    diagnostics : of the recording, its start pose and its mounts
     """
 
     time: np.ndarray
@@ -64,7 +65,7 @@ class Segments:
     covariance_W: Mapping[str, np.ndarray]
     start: tuple[float, float]
     still: tuple[float, float]
-    warnings: tuple[str, ...]
+    diagnostics: tuple[Diagnostic, ...]
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Alignment:
     turn : segment → Rz(ψ), the sensor's world to W
     heading : segment → ψ [rad]
     start, still : intervals [s] used for headings, and for noise and bias
-    warnings : what the user should know
+    diagnostics : of the recording, its start pose and its mounts
     """
 
     mount: Mapping[str, Rotation]
@@ -85,7 +86,7 @@ class Alignment:
     heading: Mapping[str, float]
     start: tuple[float, float]
     still: tuple[float, float]
-    warnings: tuple[str, ...]
+    diagnostics: tuple[Diagnostic, ...]
 
 
 # Which protocols in calibration/ see a segment's sensor; a sensor that is not here none of them sees.
@@ -135,9 +136,9 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
     BadSession
         A mount that gravity contradicts.
     """
-    start, warnings = filtered.start, list(filtered.warnings)
-    named = bool(recording.phases.get("start"))
-    guessed = "" if named else ", which was only guessed: [phases] start = [[from, to]] is missing"
+    start, diagnostics = filtered.start, list(filtered.diagnostics)
+    guessed = not recording.phases.get("start")
+    facts = {"variant": "guessed"} if guessed else {}
     mount, turn, heading = {}, {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
@@ -164,14 +165,14 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
                 of, do = ": its calibrated mount", "strapped on anew? then state remounted = true and the mounts"
                 if guessed:
                     do = f"name its seconds; {do}"
+            why = ", which was only guessed: [phases] start = [[from, to]] is missing" if guessed else ""
             raise BadSession(
                 f"{recording.where()}: sensors.{segment}{of} is {off:.0f} deg off gravity in the start pose "
-                f"({span_text(start)}){guessed}; {do}"
+                f"({span_text(start)}){why}; {do}"
             )
         if off > STATED_WARNING_DEG:
-            warnings.append(
-                f"sensors.{segment}.mount is {off:.0f} deg off what gravity says in the start pose{guessed}"
-            )
+            value, limit = float(np.deg2rad(off)), float(np.deg2rad(STATED_WARNING_DEG))
+            diagnostics.append(Diagnostic("mount-contradicts-gravity", WARNING, segment, value, limit, facts))
         known = mount_covariance(recording, segment, subject)
         if known is not None:
             # The tilt's misfit is the pose's error and the mount's together; each takes its share. Of the heading,
@@ -185,14 +186,11 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
                 # Tilt and mount of the calibration come from one start pose: what one is off by, the other is too.
                 misfit, both = misfit - stood.tilt, REPEATED_START_STD**2 * np.eye(2)
             if misfit @ np.linalg.solve(both, misfit) > MOVED_MOUNT**2:
-                off = np.degrees(np.linalg.norm(misfit))
-                warnings.append(
-                    f"sensors.{segment}: its calibrated mount is {off:.0f} deg off what gravity says in the start "
-                    f"pose{guessed}; strapped on anew? then state remounted = true"
-                )
+                value = float(np.linalg.norm(misfit))
+                diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOVED_MOUNT, facts))
         mount[segment], heading[segment] = R_LS, psi
         turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi])
-    return Alignment(mount, turn, heading, start, filtered.still, tuple(warnings))
+    return Alignment(mount, turn, heading, start, filtered.still, tuple(diagnostics))
 
 
 def orient_segments(
@@ -218,7 +216,7 @@ def orient_segments(
         covariance_W,
         alignment.start,
         alignment.still,
-        alignment.warnings,
+        alignment.diagnostics,
     )
 
 

@@ -102,7 +102,7 @@ def render_all(diagnostics: Iterable[Diagnostic]) -> list[tuple[Severity, Text]]
     for (_, severity, text), places in alike.items():
         told, others = list(places)[:MOST_ALIKE], list(places.values())[MOST_ALIKE:]
         if others:
-            told.append(f"So it is in {len(others)} more: {', '.join(others).replace('_', ' ')}.")
+            told.append(f"So it is in {len(others)} more: {', '.join(dict.fromkeys(others)).replace('_', ' ')}.")
         texts.append((severity, text._replace(what=" ".join(told))))
     return texts
 
@@ -152,11 +152,6 @@ def from_json(content: Mapping[str, Any]) -> Diagnostic:
         content["limit"],
         dict(content["facts"]),
     )
-
-
-def unclassified(text: str, severity: Severity = WARNING) -> Diagnostic:
-    """A diagnostic of a room that still gives its texts itself."""
-    return Diagnostic("unclassified", severity, facts={"text": text})
 
 
 # Numbers --------------------------------------------------------------------------------------------------------------

@@ -58,6 +58,10 @@ class WrongUnit(BadData):
         self.key, self.unit = key, unit
 
 
+class MissingRate(BadData):
+    """A file whose samples have no times does not state its rate."""
+
+
 class BadPhase(WeposeError):
     """A phase is missing, empty, or outside the recording."""
 

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG, heading_to, nominal_mount
 from ..arguments import Positive, check_arguments
-from ..diagnostics import WARNING, Diagnostic, unclassified
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import FilteredRecording, filter_recording
@@ -374,7 +374,7 @@ def _solve(
     measured = {name: (value, gauge_std) for name, value in gauge.items()}
     measured |= {c.gauge: (c.metres, c.metres_std) for c in protocol.closures if c.gauge and c.gauge not in gauge}
     loose = None if scaling else scale_std
-    diagnostics = [unclassified(text) for text in found.warnings]
+    diagnostics = list(found.diagnostics)
     diagnostics += unobserved_lengths(protocol, lengths, covariance[:K, :K], without_data, prior, loose)
     diagnostics += assumed_distances(protocol, gauge)
     diagnostics += ambiguous_headings(others, layout)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..jobs.info import InfoJob, run_info
-from .output import print_table, progress_bar, say
+from .output import print_diagnostics, print_table, progress_bar, say
 from .parser import Command
 
 
@@ -14,6 +14,7 @@ def run(job: InfoJob) -> int:
     say(description.what)
     for fact in description.facts:
         say(f"  {fact}")
+    print_diagnostics(description.diagnostics)
     if description.sensors:
         header = ("sensor", "in the file", "holds", "fastest turn", "median force", "gaps over 50 ms")
         print_table("Sensors", header, description.sensors)

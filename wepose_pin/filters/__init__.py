@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arguments import check_arguments
-from ..errors import BadData, BadOption, BadPhase, one_of
+from ..diagnostics import WARNING, Diagnostic, render
+from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
 from ..recording.faults import faults_of, scan_sensor
 from ..recording.limits import STANDARD_GRAVITY
 from .amekf import Amekf, AmekfParams
@@ -76,6 +77,7 @@ class Orientation(NamedTuple):
     noise: SensorNoise  # of the static phase
     filter: OrientationFilter | None = None  # after the last sample, to continue live; None: it cannot
     detector: StaticDetector | None = None  # after the last sample as well
+    diagnostics: tuple[Diagnostic, ...] = ()
 
 
 def check_method(method: str) -> str:
@@ -110,7 +112,7 @@ def estimate_orientation(
     rate_hz : samples a second, uniform
     method : a key of `METHODS`
     static : from, to [s] after the first sample: the sensor is static; noise and bias are measured there. None:
-        nothing is known to be; noise is then `TYPICAL`, the bias starts at zero, and a warning says so
+        nothing is known to be; noise is then `TYPICAL`, and the bias starts at zero
     params : the filter's own frozen parameters; None for its defaults
     static_test : when the sensor counts as static; None for the default values
 
@@ -123,6 +125,11 @@ def estimate_orientation(
     BadOption, BadData, BadPhase
         An unknown method; arrays that do not fit each other; samples in which the sensor does not measure; a static
         phase outside the data.
+
+    Warns
+    -----
+    WeposeWarning
+        There is no static phase, as `Orientation.diagnostics` says.
     """
     check_arguments(estimate_orientation, locals())
     check_method(method)
@@ -141,20 +148,19 @@ def estimate_orientation(
     for fault in faults_of({"": scan}).get("", []):
         raise BadData(f"{fault.described(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
     noise, start = TYPICAL, None
+    diagnostics: tuple[Diagnostic, ...] = ()
     if static is None:
-        estimates = "estimates in motion, in a minute or so" if method in ("amekf", "smoother") else "cannot estimate"
-        warnings.warn(
-            "no static phase: noise is that of a usual sensor, and the gyroscope's bias starts at zero, "
-            f"which '{method}' {estimates}",
-            stacklevel=2,
-        )
+        facts = {"method": method} | ({"variant": "estimated"} if method in ("amekf", "smoother") else {})
+        missing = Diagnostic("static-phase-missing", WARNING, facts=facts)
+        diagnostics = (missing,)
+        warnings.warn(render(missing).line(), WeposeWarning, stacklevel=2)
     else:
         first, last = round(static[0] * rate_hz), round(static[1] * rate_hz) + 1
         if not 0 <= first < last <= len(gyro) + 1:
             raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
         noise, start = noise_of(gyro[first:last], accel[first:last], rate_hz), slice(first, last)
     run = SensorRun(rate_hz, noise, method, params, static_test, start=start, gyro_range=scan.gyro_range)
-    return run.push(gyro, accel) or run.finish()
+    return (run.push(gyro, accel) or run.finish())._replace(diagnostics=diagnostics)
 
 
 def with_range(method: str, params: Any, gyro_range: float) -> Any:

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
 
 from .. import rotations
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase
 from ..recording import OrientationSensor, Recording, format_time, span_text
 from .noise import SensorNoise, quietest
@@ -27,13 +28,13 @@ LARGEST_BIAS = float(np.deg2rad(5.0))
 FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 
 
-def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[str]]:
-    """The start pose's interval, the interval that noise and bias come from, and what to tell the user of them."""
-    notes = list(recording.notes)
+def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[Diagnostic]]:
+    """The start pose's interval [s], that of noise and bias, and the recording's diagnostics with those of both."""
+    diagnostics = list(recording.diagnostics)
     if recording.phases.get("start"):
         start = recording.phases["start"][0]
         if len(recording.phases["start"]) > 1:
-            notes.append(f"phases.start holds several intervals; the first, {span_text(start)}, is used")
+            diagnostics.append(_others_ignored("start", start))
     elif recording.phases.get("static"):
         raise BadPhase(
             f"{recording.where()}: phases.static without phases.start; name the seconds of the start pose, "
@@ -41,10 +42,10 @@ def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[f
         )
     else:
         start = quietest(recording)
-        notes.append(f"no phases.start: the quietest window, {span_text(start)}, is taken for the start pose")
+        diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
     still = recording.phases.get("static", ())
     if len(still) > 1:
-        notes.append(f"phases.static holds several intervals; the first, {span_text(still[0])}, is used")
+        diagnostics.append(_others_ignored("static", still[0]))
     for name, interval in (("start", start), *(("static", span) for span in still[:1])):
         place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
@@ -57,12 +58,16 @@ def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[f
                     f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: nothing "
                     f"there says how it sits; name seconds in which it measures, or take [sensors.{segment}] out"
                 )
-    return start, still[0] if still else start, notes
+    return start, still[0] if still else start, diagnostics
+
+
+def _others_ignored(phase: str, first: tuple[float, float]) -> Diagnostic:
+    return Diagnostic("phase-intervals-ignored", WARNING, phase, facts={"start": first[0], "end": first[1]})
 
 
 def check_common_rotation(
     recording: Recording, noises: dict[str, SensorNoise], interval: tuple[float, float]
-) -> list[str]:
+) -> list[Diagnostic]:
     """A warning if the person turns in a phase, whose mean rate is the gyroscopes' bias then; an error if by much.
 
     The biases of several sensors about the vertical are as different as sensors are; the same rate in all is the
@@ -76,29 +81,29 @@ def check_common_rotation(
     rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
     if len(rates) == 0:
         return []
-    mean = float(rates.mean())
+    mean, limit = float(rates.mean()), COMMON_RATE if len(rates) >= 3 else LARGEST_BIAS
+    turns = abs(mean) > limit
     if len(rates) >= 3:
         spread = max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
-        turns = abs(mean) > COMMON_RATE and 2.0 * stdtr(len(rates) - 1, -abs(mean) / spread) < COMMON_RATE_CHANCE
-    else:
-        turns = abs(mean) > LARGEST_BIAS
+        turns = turns and 2.0 * stdtr(len(rates) - 1, -abs(mean) / spread) < COMMON_RATE_CHANCE
     if not turns:
         return []
     turn_deg = abs(np.degrees(mean)) * (interval[1] - interval[0])
-    found = f"all sensors turn about the vertical at {np.degrees(mean):.1f} deg/s, by {turn_deg:.0f} deg in all"
     if turn_deg > MOVES_DEG:
         raise BadPhase(
-            f"{recording.where()}: phases.start ({format_time(interval[0])} to {format_time(interval[1])} s): {found}, "
-            f"where gyroscopes have biases of their own: name seconds in which the person does not turn"
+            f"{recording.where()}: phases.start ({span_text(interval)}): all sensors turn about the vertical at "
+            f"{np.degrees(mean):.1f} deg/s, by {turn_deg:.0f} deg in all, where gyroscopes have biases of their own: "
+            f"name seconds in which the person does not turn"
         )
     for segment, noise in noises.items():
         up = up_S[segment]
         noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + mean**2 * np.outer(up, up))
-    return [f"{found}: the biases of the gyroscopes, and so all headings, are uncertain by as much"]
+    facts = {"rotation": float(np.deg2rad(turn_deg))}
+    return [Diagnostic("person-rotates", WARNING, value=abs(mean), limit=limit, facts=facts)]
 
 
-def check_motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[str]:
-    """A note if the sensor sways in the phase, an error if it moves.
+def check_motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[Diagnostic]:
+    """A warning if the sensor sways in the phase, an error if it moves.
 
     The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
     """
@@ -112,13 +117,21 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
     turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
     guessed = phase not in recording.phases or not recording.phases[phase]
-    place = "the quietest window, taken for the start pose" if guessed else f"phases.{phase}"
-    found = f"sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} ({span_text(interval)})"
+    place = "the guessed start pose" if guessed else f"phases.{phase}"
     if rms > MOVES_DEG_S or turn > MOVES_DEG:
         raise BadPhase(
-            f"{recording.where()}: {found}; name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "
+            f"{recording.where()}: sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} "
+            f"({span_text(interval)}); name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "
             f"{MOVES_DEG:g} deg"
         )
     if rms > SWAYS_DEG_S or turn > SWAYS_DEG:
-        return [f"{found}: mounts and headings are uncertain by as much"]
+        facts: dict[str, float | str] = {
+            "rotation": float(np.deg2rad(turn)),
+            "rotation_limit": float(np.deg2rad(SWAYS_DEG)),
+            "phase": place,
+            "start": interval[0],
+            "end": interval[1],
+        }
+        limit = float(np.deg2rad(SWAYS_DEG_S))
+        return [Diagnostic("start-pose-sway", WARNING, segment, float(np.deg2rad(rms)), limit, facts)]
     return []

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..diagnostics import Diagnostic
 from ..errors import WeposeError
 from ..recording import CONFIGURATION, OrientationSensor, Recording
 from . import BEST, OFFLINE, Orientation, SensorRun, check_method
@@ -25,7 +26,7 @@ class FilteredRecording(NamedTuple):
     orientation: dict[str, Orientation]  # what the filter gave; none for measured orientations
     start: tuple[float, float]  # [s]
     still: tuple[float, float]  # [s]
-    warnings: list[str]
+    diagnostics: list[Diagnostic]  # of the recording, and of its start pose
 
 
 class SensorFilters:
@@ -38,7 +39,7 @@ class SensorFilters:
 
     Attributes
     ----------
-    start, still, warnings : as in `FilteredRecording`
+    start, still, diagnostics : as in `FilteredRecording`
     ahead : the smoother's: `push` gives the chunk before, and the last one comes from `finish`
 
     Raises
@@ -49,15 +50,15 @@ class SensorFilters:
 
     def __init__(self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> None:
         check_method(method)
-        self.start, self.still, self.warnings = reference_phases(first)
+        self.start, self.still, self.diagnostics = reference_phases(first)
         self._held: Recording | None = None  # the chunk that the smoother has not given yet
         self._runs: dict[str, SensorRun] = {}
         noises: dict[str, SensorNoise] = {}
         for segment, sensor in first.sensors.items():
             if not sensor.aligned:
-                self.warnings += check_motion(first, segment, self.start, "start")
+                self.diagnostics += check_motion(first, segment, self.start, "start")
             if self.still != self.start and not sensor.aligned:
-                self.warnings += check_motion(first, segment, self.still, "static")
+                self.diagnostics += check_motion(first, segment, self.still, "static")
             if isinstance(sensor, OrientationSensor):
                 continue
             at_rest = first.measured(segment, self.still)
@@ -67,7 +68,7 @@ class SensorFilters:
             except WeposeError as error:
                 raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
             noises[segment] = noise
-        self.warnings += check_common_rotation(first, noises, self.still)
+        self.diagnostics += check_common_rotation(first, noises, self.still)
         for segment, noise in noises.items():
             self._runs[segment] = SensorRun(
                 first.rate_hz,
@@ -127,7 +128,7 @@ def filtered_chunk(
     """A chunk that `filters` gave, if the start pose is in it."""
     R_VS = sensor_rotations(chunk, orientation)
     at_start = {segment: R[chunk.measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
-    return FilteredRecording(R_VS, at_start, dict(orientation), filters.start, filters.still, filters.warnings)
+    return FilteredRecording(R_VS, at_start, dict(orientation), filters.start, filters.still, filters.diagnostics)
 
 
 def sensor_rotations(chunk: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..diagnostics import Diagnostic, unclassified
+from ..diagnostics import Diagnostic
 from ..filters import BEST
 from ..model import BodyModel, load_model
 from ..pose import LiveKinematics
@@ -422,7 +422,7 @@ class LiveLoop:
                 for name, row in zip(self.source.sensors, counts, strict=True)
             },
             self._latency,
-            () if self._tracker is None else tuple(map(unclassified, self._tracker.start.warnings)),
+            () if self._tracker is None else self._tracker.start.diagnostics,
             "" if self.log is None else self.log.problem,
         )
 

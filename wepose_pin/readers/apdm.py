@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, one_of
 from ..recording.segments import segment_of
 from .device import Device, Text, first_lines, parsed_rows, table_of
@@ -84,10 +85,11 @@ def read_apdm(path: Path, use: str | None = None, rate_hz: float | None = None) 
         if kind == "orientation":
             values[label] = {"orientation": values[label]["orientation"][:, [1, 2, 3, 0]]}
     left_out = [label for label in places if label not in values]
-    notes = (f"{path.name}: without {' and '.join(wanted[kind])}: {', '.join(left_out)}",) if left_out else ()
+    facts = {"devices": ", ".join(left_out), "signals": " and ".join(wanted[kind])}
+    missing = (Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts),) if left_out else ()
     time = np.arange(text.cells.height) / rate_hz if rate_hz else (US if newer else 1.0) * text.numbers(["0"])[:, 0]
     labels = {label: segment_of(label) for label in values}
-    return Device("apdm", table_of(time, values), labels, kind, since_power_on=True, notes=notes)
+    return Device("apdm", table_of(time, values), labels, kind, since_power_on=True, diagnostics=missing)
 
 
 def _places_of_format_7(rows: Sequence[Sequence[str]]) -> tuple[dict[str, dict[str, list[int]]], dict[str, float]]:

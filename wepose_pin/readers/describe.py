@@ -6,14 +6,16 @@ import contextlib
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..diagnostics import ERROR, WARNING, Diagnostic
 from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
-from ..errors import BadData, MissingFile, WeposeError, WrongUnit, one_of
+from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
 from ..recording import AXES, CONFIGURATION, SEGMENTS, ImuSensor, OrientationSensor, Recording, format_time, span_text
 from ..recording.clocks import TIME_UNITS, time_unit_of
 from ..recording.gaps import runs
@@ -46,6 +48,28 @@ class Description(NamedTuple):
     sensors: tuple[tuple[str, ...], ...]  # segment, its name in the file, what it holds, rate, time, gaps
     session: str | None  # a ready session file, for data
     then: str = ""  # what to do with that session
+    diagnostics: tuple[Diagnostic, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Proposal:
+    """What the session of a data file is to hold, before it is read.
+
+    Parameters
+    ----------
+    title : what the file is
+    head : lines of [data], and of [phases] where the file states them
+    tables : segment, or "?" and a name of the file → lines of its [sensors.…]
+    labels : segment → its name in the file
+    facts : what the file says besides, a line each
+    """
+
+    title: str
+    head: list[str] = field(default_factory=list)
+    tables: Mapping[str, list[str]] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
+    facts: Sequence[str] = ()
+    diagnostics: Sequence[Diagnostic] = ()
 
 
 def describe(path: Path, folder: Path | None = None) -> Description:
@@ -73,17 +97,17 @@ def describe(path: Path, folder: Path | None = None) -> Description:
     folder = folder or path.absolute().parent
     format = format_of(path)
     if format:
-        return _described(path, folder, *_of_devices(path, folder, format))
+        return _described(path, folder, _of_devices(path, folder, format))
     if is_array_file(path):
         arrays = ArrayFile(path)
         return _described(
-            path, folder, *_of_columns(path, folder, guess_arrays(arrays.shapes), list(arrays.shapes), arrays)
+            path, folder, _of_columns(path, folder, guess_arrays(arrays.shapes), list(arrays.shapes), arrays)
         )
     if path.suffix.lower() in TABLES:
         names = Rows(path).names
         if any(re.fullmatch(r"(left|right)_(elbow|wrist|hand)_x", name) for name in names):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
-        return _described(path, folder, *_of_columns(path, folder, guess_columns(names), names, None))
+        return _described(path, folder, _of_columns(path, folder, guess_columns(names), names, None))
     known = (
         ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose; a result's folder, an "
         "x-IMU3's folder"
@@ -138,7 +162,7 @@ def _toml(path: Path) -> Description:
         recording = SessionReader(path, gaps=True)
         whole = recording.recording(0, len(recording.time))
         what = f"{path}: a session, '{whole.name}'"
-        return Description(what, _facts(whole), _rows(whole, {}), None)
+        return Description(what, _facts(whole), _rows(whole, {}), None, diagnostics=whole.diagnostics)
     if isinstance(values.get("lengths"), dict):
         lengths = {name: length for name, length in values["lengths"].items() if is_number(length)}
         facts = ["lengths [mm]: " + ", ".join(f"{name} {1e3 * length:.0f}" for name, length in lengths.items())]
@@ -151,46 +175,41 @@ def _toml(path: Path) -> Description:
 # Data: a session is proposed ---------------------------------------------------------------------------------------
 
 
-def _described(
-    path: Path,
-    folder: Path,
-    what: str,
-    notes: list[str],
-    head: list[str],
-    tables: dict[str, list[str]],
-    labels: Mapping[str, str],
-) -> Description:
-    """The description of data for which `head` ([data] of a session) and `tables` ([sensors.…]) are proposed."""
-    notes = list(notes)
-    if not tables:
-        return Description(f"{path}: {what}", tuple(notes), (), None)
-    phases = [line for line in head if line.startswith("start = ")]
-    head = [line for line in head if line not in phases]
+def _described(path: Path, folder: Path, proposal: _Proposal) -> Description:
+    """The description of data for which a session is proposed; what can be read by it is said of it."""
+    what, diagnostics = f"{path}: {proposal.title}", tuple(proposal.diagnostics)
+    if not proposal.tables:
+        return Description(what, tuple(proposal.facts), (), None, diagnostics=diagnostics)
+    phases = [line for line in proposal.head if line.startswith("start = ")]
+    head = [line for line in proposal.head if line not in phases]
     recording: Recording | None = None
     for _ in range(3):
         try:
             # All sensors are read, those too of which nobody knows yet where they were worn.
             values = parse_toml("\n".join(["[data]", *head]))
             values["start_pose"] = CONFIGURATION
-            values["sensors"] = {who: parse_toml("\n".join(table)) for who, table in tables.items()}
+            values["sensors"] = {who: parse_toml("\n".join(table)) for who, table in proposal.tables.items()}
             reader = SessionReader(folder / "session.toml", gaps=True, values=values)
             recording = reader.recording(0, len(reader.time))
             break
         except WeposeError as error:
             # What is wrong with a unit the reader knows better than any guess from names.
             if not isinstance(error, WrongUnit):
-                notes.append(f"cannot be read so: {str(error).removeprefix(str(folder / 'session.toml') + ': ')}")
+                unread = Diagnostic("session-unreadable", ERROR, path.name, facts={"reason": str(error)})
+                diagnostics = (*diagnostics, unread)
                 break
             fitting = f"{error.key} = {toml_string(error.unit)}"
             head = [fitting if line.startswith(error.key) else line for line in head]
     if recording is None:
-        text = _session_text(path, head, phases, tables, {})
-        return Description(f"{path}: {what}", tuple(notes), (), text, "mend what cannot be read")
+        text = _session_text(path, head, phases, proposal.tables, {})
+        return Description(what, tuple(proposal.facts), (), text, "mend what cannot be read", diagnostics)
     static = find_static_intervals(recording)
-    comments = {segment: _mount_comment(recording, segment, static) for segment in tables}
-    text = _session_text(path, head, phases or _start_lines(static), tables, comments)
-    facts = (*notes, *_facts(recording))
-    return Description(f"{path}: {what}", facts, _rows(recording, labels), text, _then(recording))
+    comments = {segment: _mount_comment(recording, segment, static) for segment in proposal.tables}
+    text = _session_text(path, head, phases or _start_lines(static), proposal.tables, comments)
+    facts, rows = (*proposal.facts, *_facts(recording)), _rows(recording, proposal.labels)
+    # A sensor whose segment is not known goes by its name in the file.
+    read = (replace(each, place=each.place.removeprefix("?")) for each in recording.diagnostics)
+    return Description(what, facts, rows, text, _then(recording), (*diagnostics, *read))
 
 
 def _then(recording: Recording) -> str:
@@ -244,18 +263,16 @@ def _session_text(
     return "\n".join(lines) + "\n"
 
 
-def _of_devices(
-    path: Path, folder: Path, format: str
-) -> tuple[str, list[str], list[str], dict[str, list[str]], dict[str, str]]:
+def _of_devices(path: Path, folder: Path, format: str) -> _Proposal:
     """What a known format's file holds; with those beside it where the device wrote one a sensor."""
     device, rate = _read(path, format)
     title = (
         f"{TITLES[format]}, {'gyroscope and accelerometer' if device.kind == 'raw' else 'orientations, no raw data'}"
     )
     if format == "wepose_live":
-        notes, phases = _of_live(path)
+        facts, phases = _of_live(path)
         worn = {str(segment): list[str]() for segment in device.labels.values()}
-        return title, notes, [f"file = {_relative(path, folder)}", *phases], worn, {}
+        return _Proposal(title, [f"file = {_relative(path, folder)}", *phases], worn, facts=facts)
     if len(device.labels) > 1 or format in ("mvnx", "opensim", "apdm"):
         tables: dict[str, list[str]] = {}
         for label, segment in device.labels.items():
@@ -263,15 +280,15 @@ def _of_devices(
             tables[where] = [f"label = {toml_string(label)}"]
         labels = {segment: str(device_label) for device_label, segment in device.labels.items() if segment}
         unknown = [label for label, segment in device.labels.items() if segment is None]
-        notes = [f"segments of these are not known by their names: {', '.join(unknown)}"] if unknown else []
-        return title, notes, [f"file = {_relative(path, folder)}", *rate], tables, labels
-    tables, labels, notes = {}, {}, []
+        head = [f"file = {_relative(path, folder)}", *rate]
+        return _Proposal(title, head, tables, labels, diagnostics=_unknown_segments(path, unknown))
+    tables, labels, diagnostics = {}, {}, list[Diagnostic]()
     rates: list[list[str]] = []
     for file in _siblings(path, format):
         try:
             its, its_rate = (device, rate) if file == path else _read(file, format)
         except WeposeError as error:
-            notes.append(f"left out: {error}")
+            diagnostics.append(Diagnostic("device-file-left-out", WARNING, file.name, facts={"reason": str(error)}))
             continue
         (label, segment), *_ = its.labels.items()
         where = segment if segment and segment not in tables else f"?{file.name}"
@@ -283,11 +300,15 @@ def _of_devices(
     else:
         rate = []
     unknown = [name.removeprefix("?") for name in tables if name.startswith("?")]
-    if unknown:
-        notes.append(f"which segment is not said by the names of: {', '.join(unknown)}")
     if format not in ("mvnx", "opensim") and len(tables) - len(unknown) > 1:
         title += f", {len(tables) - len(unknown)} files"
-    return title, notes, [f'format = "{format}"', *rate], tables, labels
+    diagnostics += _unknown_segments(path.parent, unknown)
+    return _Proposal(title, [f'format = "{format}"', *rate], tables, labels, diagnostics=diagnostics)
+
+
+def _unknown_segments(path: Path, sensors: Sequence[str]) -> list[Diagnostic]:
+    facts = {"sensors": ", ".join(sensors)}
+    return [Diagnostic("sensor-segments-unknown", WARNING, path.name, len(sensors), facts=facts)] if sensors else []
 
 
 def _of_live(path: Path) -> tuple[list[str], list[str]]:
@@ -313,8 +334,6 @@ def _of_live(path: Path) -> tuple[list[str], list[str]]:
     if recording.resets:
         times = ", ".join(f"{recording.time[tick]:.1f}" for tick in recording.resets)
         facts.append(f"headings set anew at [s]: {times}")
-    if log.broken_off:
-        facts.append("note: its last block is not whole; the session was killed, and it is read up to there")
     facts.append(f"track it as it was: wepose track {path} -o result; to add phases, for wepose calibrate: --write")
     first, last = np.ceil(1e3 * first) / 1e3, np.floor(1e3 * last) / 1e3
     return facts, [f"start = [[{first:.3f}, {last:.3f}]]   # as it was held live"]
@@ -336,15 +355,11 @@ def _read(path: Path, format: str) -> tuple[Device, list[str]]:
     """The device's file, and the line that states a rate for it to be read, where it has none."""
     try:
         return read_device(path, format), []
-    except BadData as error:
-        if "as rate_hz in" not in str(error):
-            raise
+    except MissingRate:
         return read_device(path, format, None, 100.0), [f"rate_hz = 100.0{CHECK}the file does not say its rate"]
 
 
-def _of_columns(
-    path: Path, folder: Path, guess: Guess, names: list[str], arrays: ArrayFile | None
-) -> tuple[str, list[str], list[str], dict[str, list[str]], dict[str, str]]:
+def _of_columns(path: Path, folder: Path, guess: Guess, names: list[str], arrays: ArrayFile | None) -> _Proposal:
     """A table whose columns, or arrays, are told by their names."""
     kind = {".parquet": "Parquet table", ".csv": "CSV table", ".mat": "MATLAB file"}.get(
         path.suffix.lower(), "HDF5 file"
@@ -352,8 +367,9 @@ def _of_columns(
     title = f"{kind}, {len(names)} {'arrays' if arrays else 'columns'}"
     if not guess.sensors:
         listed = one_of(names).removeprefix("there is: ")
-        return title, [f"no gyroscope and accelerometer, and no quaternions, by their names: {listed}"], [], {}, {}
-    time, note = _time(path, guess, arrays)
+        fact = f"no gyroscope and accelerometer, and no quaternions, by their names: {listed}"
+        return _Proposal(title, facts=[fact])
+    time, facts = _time(path, guess, arrays)
     raw = any("gyro" in signals for signals in guess.sensors.values())
     head = [f"file = {_relative(path, folder)}", *time]
     if raw:
@@ -372,9 +388,7 @@ def _of_columns(
         tables[segment] = lines
     columns_of = {name: next(iter(signals.values()))[0] for name, signals in guess.sensors.items()}
     unknown = [name.removeprefix("?") or f"{columns_of[name]}, …" for name in tables if name.startswith("?")]
-    if unknown:
-        note = [*note, f"which segment is not said by the names of: {', '.join(unknown)}"]
-    return title, note, head, tables, {}
+    return _Proposal(title, head, tables, facts=facts, diagnostics=_unknown_segments(path, unknown))
 
 
 def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str], list[str]]:
@@ -450,7 +464,6 @@ def _facts(recording: Recording) -> tuple[str, ...]:
     for name, spans in recording.phases.items():
         listed = ", ".join(f"{format_time(a)} to {format_time(b)}" for a, b in spans)
         facts.append(f"phase {name} [s]: {listed or 'none'}")
-    facts += [f"note: {note}" for note in recording.notes]
     return tuple(facts)
 
 

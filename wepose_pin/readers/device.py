@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from ..diagnostics import Diagnostic
 from ..errors import BadData, MissingFile
 from ..recording.limits import LARGEST_NUMBER
 from .tables import NO_VALUE, columns
@@ -33,7 +34,7 @@ class Device:
     wraps_s : such a clock begins anew after so long [s]; None where it does not
     aligned : the orientations are the segments' own, in one world
     mounts : label → (4,) xyzw, sensor to segment, where the file states it
-    notes : what was assumed while reading
+    diagnostics : what was assumed, or is missing
     """
 
     format: str
@@ -44,7 +45,7 @@ class Device:
     wraps_s: float | None = None
     aligned: bool = False
     mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
-    notes: tuple[str, ...] = field(default=())
+    diagnostics: tuple[Diagnostic, ...] = ()
 
     def signals(self, label: str) -> dict[str, list[str]]:
         """Columns by signal."""

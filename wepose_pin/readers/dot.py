@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from ..recording.segments import segment_of
 from .device import Device, Text, counted_time, read_text, table_of, unwrapped
@@ -55,12 +56,13 @@ def read_dot(path: Path, use: str | None = None, rate_hz: float | None = None) -
         assert increments is not None
         values = _rates(text.numbers(increments), _usual_step(text, time))
     # Nobody sets a clock by sensors that were not: each has run since it was switched on.
-    synced = text.about.get("SyncStatus", "").lower().startswith("synced")
-    notes = () if synced or "SyncStatus" not in text.about else (f"{path.name}: SyncStatus says that it is not synced",)
+    status = text.about.get("SyncStatus", "synced").lower()
+    unsynced = Diagnostic("device-not-synchronized", WARNING, path.name)
+    diagnostics = () if status.startswith("synced") else (unsynced,)
     label = text.about.get("DeviceTag") or path.stem
     labels = {label: segment_of(label) or segment_of(path.stem)}
     table = table_of(time, {label: values})
-    return Device("dot", table, labels, kind, since_power_on=True, wraps_s=wraps_s, notes=notes)
+    return Device("dot", table, labels, kind, since_power_on=True, wraps_s=wraps_s, diagnostics=diagnostics)
 
 
 def _rates(increments: np.ndarray, step: float) -> dict[str, np.ndarray]:

@@ -16,11 +16,13 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable, is_number
 from ..errors import BadData, MissingFile
 from ..recording import SEGMENTS, ImuSensor, Recording, check
@@ -49,7 +51,6 @@ class LiveRecording(NamedTuple):
     header: dict[str, Any]  # as `HEAD`
     first: int  # tick of the first pose
     quat_WL: np.ndarray  # (n, k, 4) xyzw, the poses as they were shown, in the order of the header's sensors
-    broken_off: bool  # the last block is not whole: the session was killed
 
 
 def is_live_log(path: Path) -> bool:
@@ -115,8 +116,11 @@ def read_live_log(path: Path) -> LiveRecording:
     if aligner.next_tick <= start[1] + 1:
         raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
     recording = check(recording_of(header, aligner.rate_hz, ticks, start, path, tuple(resets)))
+    if broken_off:
+        killed = Diagnostic("live-recording-incomplete", WARNING, path.name, facts={"variant": "killed"})
+        recording = replace(recording, diagnostics=(killed,))
     quat_WL = np.concatenate([quat for _, quat in poses]) if poses else np.empty((0, len(header["sensors"]), 4))
-    return LiveRecording(recording, header, poses[0][0] if poses else start[1] + 1, quat_WL, broken_off)
+    return LiveRecording(recording, header, poses[0][0] if poses else start[1] + 1, quat_WL)
 
 
 def read_live_device(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
@@ -144,14 +148,16 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
         if sensor.stated_quat_LS is not None
     }
     resets = log.recording.resets
-    notes = (f"{path.name}: headings were set anew live {len(resets)} times, which a session does not repeat",)
+    diagnostics = list(log.recording.diagnostics)
+    if resets:
+        diagnostics.append(Diagnostic("heading-resets-not-repeated", INFO, path.name, len(resets)))
     return Device(
         "wepose_live",
         table_of(log.recording.time, values),
         {label: label for label in values},
         "raw",
         mounts=mounts,
-        notes=notes if resets else (),
+        diagnostics=tuple(diagnostics),
     )
 
 

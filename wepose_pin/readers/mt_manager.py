@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import BadData
+from ..errors import BadData, MissingRate
 from ..recording.segments import segment_of
 from .device import Device, Text, counted_time, read_text, table_of, unwrapped
 
@@ -111,7 +111,7 @@ def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
         return np.arange(len(counter)) / rate_hz, None
     if ["SampleTimeFine"] in text:
         return FINE_S * unwrapped(text.numbers(["SampleTimeFine"])[:, 0], FINE_WRAPS), FINE_S * FINE_WRAPS
-    raise BadData(
+    raise MissingRate(
         f"{text.path}: no line '// Update Rate: …' and no SampleTimeFine to tell the time by; state the update rate "
         f"as rate_hz in [data], or export one of the two"
     )

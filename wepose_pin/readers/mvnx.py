@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, MissingFile
 from .device import Device, must_be_measured, table_of
 
@@ -65,7 +66,7 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         Not there; no MVNX, damaged, cut off, or without what `use` asks for; arms whose frames fit neither pose.
     """
     frames = read_frames(path, rate_hz)
-    notes: tuple[str, ...] = ()
+    assumed: tuple[Diagnostic, ...] = ()
     raw = {"sensorAngularVelocity", "sensorAcceleration"} <= set(frames.values)
     if use == "raw" and not raw:
         raise BadData(
@@ -83,9 +84,7 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         quat = frames.values["orientation"]
         pose = _reference_pose(path, frames)
         if pose is None:
-            notes = (
-                f"{path.name}: no positions of the arms' segments: their frames are taken for those of the T-pose",
-            )
+            assumed = (Diagnostic("arm-frames-assumed", WARNING, path.name),)
         values = {
             label: {"orientation": _segment_quat(label, quat[:, k], pose or "T")}
             for k, label in enumerate(frames.segments)
@@ -100,7 +99,7 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         {label: SEGMENT_OF[label] for label in values},
         "raw" if raw and use != "orientation" else "orientation",
         aligned=not raw or use == "orientation",
-        notes=notes,
+        diagnostics=assumed,
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, printable
 from ..recording import (
@@ -25,11 +26,11 @@ from ..recording import (
     check_phases,
     span_text,
 )
-from ..recording.clocks import TIME_UNITS, Clock, clock_of, common_time
+from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, clock_of, common_time
 from ..recording.faults import ROWS, Scan
 from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, lost_samples, runs
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
-from ..recording.plausibility import sensor_notes
+from ..recording.plausibility import check_signals
 from ..recording.resampling import on_time
 from .arrays import ArrayFile, is_array_file
 from .device import Device
@@ -201,13 +202,13 @@ class SessionReader:
         if unused:
             raise BadSession(f"{data.at(unused[0])}: {_useless(unused[0])}; leave it out")
         clocks = {segment: plan.clock for segment, plan in self._plans.items()}
-        self.time, self._notes = common_time(str(self.path), clocks)
-        self._resampled = bool(self._notes)
-        self._notes += tuple(note for device in self.devices.values() for note in device.notes)
+        self.time, resampled = common_time(str(self.path), clocks)
+        self._resampled = bool(resampled)
         packets = {plan.path: clock.packet for plan in self._plans.values() if (clock := plan.clock).packet > 1}
-        self._notes += tuple(
-            f"{path.name}: rows came in packets of {packet}; their times are spread evenly between those of the packets"
-            for path, packet in packets.items()
+        self._diagnostics = (
+            *resampled,
+            *(each for device in self.devices.values() for each in device.diagnostics),
+            *(Diagnostic("packet-times-spread", INFO, path.name, packet) for path, packet in packets.items()),
         )
         self.rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
         check_phases(str(self.path), self.time, self._head.phases)
@@ -409,7 +410,7 @@ class SessionReader:
         tables = {which: self._tables[which][span] for which, span in rows.items()}
 
         sensors: dict[str, Sensor] = {}
-        bridged: dict[str, list[str]] = {}
+        bridged: list[Diagnostic] = []
         for segment, (low, high) in windows.items():
             plan = self._plans[segment]
             clock = replace(plan.clock, time=plan.clock.time[low:high], row=plan.clock.row[low:high])
@@ -421,9 +422,7 @@ class SessionReader:
                 before = 1 if first else 0  # a rate needs the sample before it
                 sensor = on_time(sensor, clock.time, self.time[first - before : last])
                 sensors[segment] = sensor.part(slice(before, last - first + before))
-            for text in _gap_notes(marks, clock.step):
-                bridged.setdefault(text, []).append(segment)
-        gap_notes = [f"sensors.{', '.join(names)}: {text}" for text, names in bridged.items()]
+            bridged += _bridged_gaps(segment, marks, clock.step)
         whole = last - first == len(self.time)
         recording = replace(
             self._head,
@@ -431,12 +430,12 @@ class SessionReader:
             rate_hz=self.rate_hz,
             sensors=sensors,
             phases=self._head.phases if whole else _within(self._head.phases, time),
-            notes=(*self._notes, *scan.notes(), *gap_notes),
+            diagnostics=(*self._diagnostics, *scan.diagnostics(), *bridged),
         )
         check(recording)
         begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
-        notes = sensor_notes(recording, whole=begins, units=first == 0)
-        return replace(recording, notes=(*recording.notes, *notes))
+        doubtful = check_signals(recording, whole=begins, units=first == 0)
+        return replace(recording, diagnostics=(*recording.diagnostics, *doubtful))
 
     def _window(self, plan: _Plan, first: int, last: int) -> tuple[int, int]:
         """The samples on a sensor's own clock that the piece needs, neighbours for bridging and resampling included."""
@@ -484,7 +483,7 @@ class SessionReader:
             return OrientationSensor(quat, plan.mount, gap, plan.aligned), every
         gyro_S = bridge(found["gyro"][0], marks["gyro"], clock, rate=True)
         accel_S = bridge(found["accel"][0], marks["accel"], clock)
-        marked = np.where(frozen, GOOD, every)  # what the notes call gaps
+        marked = np.where(frozen, GOOD, every)  # what is told as gaps
         gyro_range = self._scan().sensors[segment].gyro_range
         return ImuSensor(gyro_S, accel_S, plan.mount, gap, gyro_range), marked
 
@@ -548,9 +547,10 @@ def _too_long(clock: Clock) -> str:
     )
 
 
-def _gap_notes(marks: np.ndarray, step: float) -> Iterator[str]:
-    """What was bridged, in words."""
-    for mark, word in ((LONG, "long gaps accepted, bridged and marked"), (BRIDGED, "short gaps bridged")):
+def _bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterator[Diagnostic]:
+    """The gaps of a sensor that were bridged, from the marks (n,) of its samples and their usual step [s]."""
+    for mark, code, severity in ((LONG, "long-gaps-bridged", WARNING), (BRIDGED, "short-gaps-bridged", INFO)):
         spans = [last - first for first, last in runs(marks == mark)]
         if spans:
-            yield f"{len(spans)} {word}: {sum(spans)} samples, the longest {1e3 * max(spans) * step:.0f} ms"
+            facts = {"samples": sum(spans), "longest": max(spans) * step}
+            yield Diagnostic(code, severity, segment, len(spans), max(LONGEST_GAP_S, step), facts)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData
 from .intervals import check_time, span_text
 from .limits import LONGEST_STEP_S
@@ -134,8 +135,8 @@ def _steps(time: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         yield first, np.diff(time[first : first + BLOCK + 1])
 
 
-def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """One time base for all sensors, and a note where it is not their own.
+def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tuple[Diagnostic, ...]]:
+    """One time base (n,) [s] for all sensors, and a diagnostic where it is not their own.
 
     Their own where they share an even one. Else an even one over their overlap at the rate of the slowest sensor: of a
     faster one the motion between two samples is summed and nothing is lost, of a slower one it would be invented.
@@ -164,17 +165,10 @@ def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tu
     time = np.minimum(begin + dt * np.arange(int((end - begin) / dt + 1e-6) + 1), end)
     smallest = min(float(s.min()) for clock in own for _, s in _steps(clock.time))
     largest = max(float(s.max()) for clock in own for _, s in _steps(clock.time))
-    if not shared:
-        why = "the sensors' clocks differ"
-    elif uneven > UNEVEN:
-        why = f"the rate is uneven, off the usual step by up to {100 * uneven:.0f} %"
-    else:
-        why = f"the rate changes by up to {100 * off:.1f} %"
-    note = (
-        f"resampled to {1.0 / dt:g} Hz from {begin:.3f} to {time[-1]:.3f} s: {why} "
-        f"(steps between {1e3 * smallest:.2f} and {1e3 * largest:.2f} ms)"
-    )
-    return time, (note,)
+    facts: dict[str, float | str] = {"start": begin, "end": float(time[-1]), "shortest": smallest, "longest": largest}
+    if shared:
+        facts |= {"variant": "uneven", "off": uneven} if uneven > UNEVEN else {"variant": "changing", "off": off}
+    return time, (Diagnostic("time-resampled", INFO, value=1.0 / dt, facts=facts),)
 
 
 def _same(a: Clock, b: Clock) -> bool:

@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from .. import rotations
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from .clocks import LONGEST_GAP_S, Clock
 from .gaps import GOOD, runs
@@ -417,23 +418,21 @@ class Scan:
             if pair[0] in among and alike >= FROZEN_SAMPLES and alike > COPIED * self._changes[pair[0]]
         ]
 
-    def notes(self) -> list[str]:
-        """What was found, in words."""
-        notes = []
+    def diagnostics(self) -> list[Diagnostic]:
+        """What `finish` found and did not refuse."""
+        found = []
         for name, faults in self.faults.items():
-            seconds = sum(fault.last - max(fault.first, self.sensors[name].first) for fault in faults)
-            more = f", and {len(faults) - 1} times more" if len(faults) > 1 else ""
-            notes.append(f"sensors.{name}: {faults[0].described(faults[0].first)}{more}: {seconds:.3g} s count as lost")
-        notes += [
-            f"sensors.{name}: the orientation is the same in all {scan.rows} rows: is the sensor dead?"
-            for name, scan in self.orientations.items()
-            if scan.rows >= FROZEN_SAMPLES and scan.constant
-        ]
-        notes += [
-            f"sensors.{name} and sensors.{other} hold the same orientations: is one a copy of the other?"
-            for name, other in self._copies(self.orientations)
-        ]
-        return notes
+            begin = max(faults[0].first, self.sensors[name].first)
+            lost_s = sum(fault.last - max(fault.first, self.sensors[name].first) for fault in faults)
+            facts: dict[str, float | str] = {"signals": faults[0].signals, "intervals": len(faults)}
+            facts |= {"start": begin, "end": faults[0].last}
+            found.append(Diagnostic("sensor-frozen", WARNING, name, lost_s, facts=facts))
+        for name, scan in self.orientations.items():
+            if scan.rows >= FROZEN_SAMPLES and scan.constant:
+                found.append(Diagnostic("orientation-constant", WARNING, name, scan.rows))
+        for name, other in self._copies(self.orientations):
+            found.append(Diagnostic("orientations-copied", WARNING, name, facts={"other": other}))
+        return found
 
 
 @dataclass

@@ -13,9 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongUnit
 from .gaps import runs
-from .intervals import format_time
+from .intervals import span_text
 from .limits import (
     GRAVITY_ERROR_NOTED,
     GRAVITY_ERROR_REFUSED,
@@ -44,8 +45,8 @@ PLATEAU = 3  # samples at one value, where an axis seems cut off
 STEEP = 3  # quanta by which it comes there from a sample before or goes to one after
 
 
-def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True) -> tuple[str, ...]:
-    """What the user should know of the values.
+def check_signals(recording: Recording, *, whole: bool = True, units: bool = True) -> tuple[Diagnostic, ...]:
+    """What is doubtful in the sensors' values: gravity's norm, saturation.
 
     In a piece that is not the `whole` sensors are static only in stated phases; `units` are checked in the first piece
     alone.
@@ -55,10 +56,10 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
     BadData
         Values that cannot be: of another unit, or out of every sensor's range.
     """
-    notes: list[str] = []
+    found: list[Diagnostic] = []
     for segment, sensor in recording.imus.items():
         place = f"{recording.where()}: sensors.{segment}"
-        notes += _gravity(recording, segment, sensor, place, whole)
+        found += _gravity(recording, segment, sensor, place, whole)
         if units:
             _gyro_unit(sensor, recording.rate_hz, place)
         _range(recording.time, sensor.gyro_S, HIGHEST_RATE, "rad/s", f"{place}.gyro")
@@ -67,11 +68,15 @@ def sensor_notes(recording: Recording, *, whole: bool = True, units: bool = True
             ("gyro", sensor.gyro_S, NARROWEST_GYRO_RANGE),
             ("accel", sensor.accel_S, NARROWEST_ACCEL_RANGE),
         ):
-            notes += _saturation(values, least, f"sensors.{segment}.{name}")
-    return tuple(notes)
+            cut = cut_off(values, least)
+            if cut.any():
+                facts: dict[str, float | str] = {"variant": name, "range": float(np.abs(values[cut]).min())}
+                seconds = np.count_nonzero(cut.any(axis=1)) / recording.rate_hz
+                found.append(Diagnostic("signal-saturated", WARNING, segment, seconds, facts=facts))
+    return tuple(found)
 
 
-def _gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, whole: bool) -> list[str]:
+def _gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, whole: bool) -> list[Diagnostic]:
     name = next((name for name in ("static", "start") if recording.phases.get(name)), "")
     if name:
         static, when = recording.measured(segment, recording.phases[name][0]), f"in phases.{name}"
@@ -81,13 +86,16 @@ def _gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, 
         return []
     if len(static) < 2:
         return []
-    first, last = (format_time(recording.time[k]) for k in static[[0, -1]])
+    first, last = (float(recording.time[k]) for k in static[[0, -1]])
     norm = float(np.linalg.norm(sensor.accel_S[static], axis=1).mean())
-    off = abs(norm / STANDARD_GRAVITY - 1.0)
-    found = f"norm {norm:.4g} m/s^2 {when} ({first} to {last} s), where gravity's {STANDARD_GRAVITY:.3g} is expected"
-    if off > GRAVITY_ERROR_REFUSED:
-        raise _wrong_gravity(f"{place}.accel: {found}", norm)
-    return [f"{place.split(': ')[-1]}.accel: {found}: the scale is taken from it"] if off > GRAVITY_ERROR_NOTED else []
+    share = norm / STANDARD_GRAVITY - 1.0
+    if abs(share) > GRAVITY_ERROR_REFUSED:
+        found = f"norm {norm:.4g} m/s^2 {when} ({span_text((first, last))})"
+        raise _wrong_gravity(f"{place}.accel: {found}, where gravity's {STANDARD_GRAVITY:.3g} is expected", norm)
+    if abs(share) <= GRAVITY_ERROR_NOTED:
+        return []
+    facts = {"share": share, "start": first, "end": last}
+    return [Diagnostic("accel-scale", WARNING, segment, norm, GRAVITY_ERROR_NOTED, facts)]
 
 
 def _wrong_gravity(found: str, norm: float) -> BadData:
@@ -189,16 +197,6 @@ def _range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: 
             f"{place}: {values[k, axis]:.6g} {unit} on {'xyz'[axis]} at {time[k]:.3f} s, no sensor measures above "
             f"{most:g}; check the unit, and leave cells of lost samples empty"
         )
-
-
-def _saturation(values: np.ndarray, least: float, place: str) -> list[str]:
-    """A note for each axis that stays at its extreme value as if cut off there."""
-    return [
-        f"{place}: {np.count_nonzero(cut)} samples on {name} stand at {values[cut, axis].min():.4g}, as if cut off by "
-        f"the sensor's range; choose a larger range"
-        for axis, (name, cut) in enumerate(zip("xyz", cut_off(values, least).T, strict=True))
-        if cut.any()
-    ]
 
 
 def cut_off(values: np.ndarray, least: float) -> np.ndarray:

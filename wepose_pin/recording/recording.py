@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..arguments import Positive, check_array, check_fields, check_finite, check_names, check_unit
+from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, BadPhase, one_of
 from .intervals import Intervals, check_phases, check_time
 from .limits import MEDIAN_FORCE
@@ -38,7 +39,7 @@ class Recording:
     truth : file with the reference, where there is one
     resets : samples before which headings were set anew, live: the person stood in the start pose
     joints : joint → its value [rad or m] in the start pose, where that is `CONFIGURATION`; the others are at zero
-    notes : what was assumed or mended while reading, for the summary
+    diagnostics : what was assumed, bridged or found wrong while reading
     """
 
     name: str
@@ -52,7 +53,7 @@ class Recording:
     truth: Path | None = None
     resets: tuple[int, ...] = ()
     joints: Mapping[str, float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    diagnostics: tuple[Diagnostic, ...] = ()
 
     def __len__(self) -> int:
         return len(self.time)
@@ -135,11 +136,12 @@ class Recording:
 
 
 def join(first: Recording, second: Recording) -> Recording:
-    """Two recordings of the same sensors, one after the other; all else is the first one's."""
-
+    """Two recordings of the same sensors, one after the other; diagnostics of both, all else is the first's."""
     sensors = {name: join_parts([sensor, second.sensors[name]]) for name, sensor in first.sensors.items()}
     resets = (*first.resets, *(len(first) + tick for tick in second.resets))
-    return replace(first, time=np.concatenate([first.time, second.time]), sensors=sensors, resets=resets)
+    diagnostics = (*first.diagnostics, *(each for each in second.diagnostics if each not in first.diagnostics))
+    time = np.concatenate([first.time, second.time])
+    return replace(first, time=time, sensors=sensors, resets=resets, diagnostics=diagnostics)
 
 
 def check(recording: Recording) -> Recording:

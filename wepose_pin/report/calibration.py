@@ -389,7 +389,6 @@ def _run(
         ("measured lengths", ", ".join(gauge) or "none"),
         ("population prior", calibration.prior.note or calibration.prior.name),
         ("sensors strapped on anew", "yes" if recording.remounted else "no"),
-        *(("while reading", note) for note in recording.notes),
         ("made with", versions()),
     ]
     return {"rows": rows}

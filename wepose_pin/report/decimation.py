@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnostics import Diagnostic, from_json
+from ..diagnostics import Diagnostic
 from ..pose import Pose
 from ..recording import Intervals, join
 from ..tracking import TrackedRecording
@@ -42,7 +42,7 @@ def totals_of(pose: TrackedRecording) -> Totals:
         (float(steps.min()), float(steps.max())),
         {name: signal_of(recording, name, pose) for name in recording.sensors},
         {name: hand.peak_speed for name, hand in hands.items()},
-        [from_json(each) for each in pose.summary()["diagnostics"]],
+        pose.diagnostics,
     )
 
 

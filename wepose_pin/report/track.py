@@ -251,7 +251,6 @@ def _run(pose: TrackedRecording) -> dict[str, Any]:
         ]
     rows += [
         ("points", listed([plain(name) for name in pose.points]) or "none"),
-        *(("while reading", note) for note in recording.notes),
         ("made with", versions()),
     ]
     return {"rows": rows}

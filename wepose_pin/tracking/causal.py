@@ -148,7 +148,7 @@ class SegmentFollower:
 
     Attributes
     ----------
-    start : `Segments` of the start pose: mounts, headings, warnings
+    start : `Segments` of the start pose: mounts, headings, diagnostics
     heading : (k,) ψ [rad] from each sensor's world to W
     quat_WL, static, gyro_bias : (k, 4) xyzw, (k,), (k, 3) [rad/s] after the last step; overwritten by the next
     """

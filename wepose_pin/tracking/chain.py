@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..alignment import Segments
 from ..arguments import check_arguments
-from ..diagnostics import WARNING, Diagnostic, as_json, unclassified
+from ..diagnostics import WARNING, Diagnostic, as_json
 from ..errors import BadOption, BadSession, one_of
 from ..filters import BEST, check_method
 from ..filters.static import StaticTest
@@ -63,11 +63,16 @@ class TrackedChain:
         """Link → (n, 4) xyzw, as the model has it in `q`."""
         return _orientations(self.model, self.q, list(self.quat_WL))
 
+    @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """What the user should know."""
+        if not self.open:
+            return self.segments.diagnostics
+        undetermined = Diagnostic("joints-undetermined", WARNING, facts={"joints": ", ".join(self.open)})
+        return (*self.segments.diagnostics, undetermined)
+
     def summary(self) -> dict[str, Any]:
         """For ``summary.json``."""
-        diagnostics = [unclassified(text) for text in self.segments.warnings]
-        if self.open:
-            diagnostics.append(Diagnostic("joints-undetermined", WARNING, facts={"joints": ", ".join(self.open)}))
         return {
             "recording": self.recording.name,
             "session": str(self.recording.source) if self.recording.source else None,
@@ -82,7 +87,7 @@ class TrackedChain:
                 link: round(float(np.degrees(np.sqrt(np.mean(angle**2)))), 3) for link, angle in self.residual.items()
             },
             "joints_left_open": list(self.open),
-            "diagnostics": [as_json(diagnostic) for diagnostic in diagnostics],
+            "diagnostics": [as_json(diagnostic) for diagnostic in self.diagnostics],
         }
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..alignment import Segments
-from ..diagnostics import INFO, WARNING, Diagnostic, as_json, unclassified
+from ..diagnostics import INFO, WARNING, Diagnostic, as_json
 from ..model import POINTS, BodyModel, load_model
 from ..pose import Pose, deviation
 from ..recording import SEGMENTS, Recording
@@ -18,7 +18,7 @@ from .headings import HeadingCorrection
 from .options import TrackOptions
 
 MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment
-_MOST_NOTES = 10  # of the later chunks of a long recording
+_MOST_LATER = 10  # diagnostics of the later chunks of a long recording
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,19 @@ class TrackedRecording:
         assert self.pose.q is not None  # kinematics have been run
         return self.pose.q
 
+    @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """What the user should know."""
+        return self._accumulated().diagnostics()
+
     def summary(self) -> dict[str, Any]:
         """What was run on what, in numbers and words, for ``summary.json``."""
+        return self._accumulated().summary()
+
+    def _accumulated(self) -> SummaryAccumulator:
         accumulator = SummaryAccumulator()
         accumulator.add(self)
-        return accumulator.summary()
+        return accumulator
 
     def orientation_residual(self) -> dict[str, np.ndarray]:
         """Segment → angle (n,) [rad] between its measured orientation and the model's, where joints are too few."""
@@ -82,15 +90,15 @@ class SummaryAccumulator:
         self._still: dict[str, int] = {}
         self._lost: dict[str, tuple[int, int, bool]] = {}  # segment → gaps, lost samples, whether the last one was
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
-        self._notes: list[str] = []  # what was said while reading, later than in the first chunk
+        self._later: list[Diagnostic] = []  # of reading later chunks than the first
 
     def add(self, tracked: TrackedRecording) -> None:
         """The next chunk."""
         if self.last is None:
             self._begin = float(tracked.time[0])
         else:
-            known = (*self._notes, *tracked.segments.warnings)
-            self._notes += [note for note in tracked.recording.notes if note not in known]
+            known = (*self._later, *tracked.segments.diagnostics)
+            self._later += [each for each in tracked.recording.diagnostics if each not in known]
         self._samples += len(tracked.time)
         for segment, of in tracked.segments.orientation.items():
             self._still[segment] = self._still.get(segment, 0) + int(np.count_nonzero(of.static))
@@ -121,18 +129,7 @@ class SummaryAccumulator:
                 about["gaps"], lost, _ = self._lost[segment]
                 about["gap_s"] = round(lost / last.recording.rate_hz, 3)
             sensors[segment] = about
-        residual_rms = {name: float(np.sqrt(squares / self._samples)) for name, squares in self._residual.items()}
-        diagnostics = [
-            *map(unclassified, last.segments.warnings),
-            *self._later(),
-            *_not_known(last),
-            *(
-                Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
-                for segment, rms in residual_rms.items()
-                if rms > MOST_RESIDUAL
-            ),
-            *(last.model.diagnostics),
-        ]
+        residual_rms = self._residual_rms()
         return {
             "recording": last.recording.name,
             "session": str(last.recording.source) if last.recording.source else None,
@@ -148,13 +145,30 @@ class SummaryAccumulator:
             "points": sorted(last.points),
             "orientation_residual_rms_deg": {name: round(float(np.degrees(v)), 3) for name, v in residual_rms.items()},
             "heading_correction": _correction_json(last.correction),
-            "diagnostics": [as_json(diagnostic) for diagnostic in diagnostics],
+            "diagnostics": [as_json(diagnostic) for diagnostic in self.diagnostics()],
         }
 
-    def _later(self) -> list[Diagnostic]:
-        """Those of later chunks; a day's would be too many to read."""
-        found, more = [unclassified(note) for note in self._notes[:_MOST_NOTES]], len(self._notes) - _MOST_NOTES
-        return [*found, Diagnostic("diagnostics-omitted", INFO, value=more)] if more > 0 else found
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """As `TrackedRecording.diagnostics`, of all chunks; of later ones a day's would be too many to read."""
+        last = self.last
+        assert last is not None
+        more = len(self._later) - _MOST_LATER
+        return (
+            *last.segments.diagnostics,
+            *self._later[:_MOST_LATER],
+            *([Diagnostic("diagnostics-omitted", INFO, value=more)] if more > 0 else []),
+            *_not_known(last),
+            *(
+                Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
+                for segment, rms in self._residual_rms().items()
+                if rms > MOST_RESIDUAL
+            ),
+            *last.model.diagnostics,
+        )
+
+    def _residual_rms(self) -> dict[str, float]:
+        """Segment → [rad]."""
+        return {name: float(np.sqrt(squares / self._samples)) for name, squares in self._residual.items()}
 
 
 def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | None:
