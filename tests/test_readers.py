@@ -23,7 +23,7 @@ from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, Sensor
 from wepose_pin.recording.clocks import clock_of, common_time
 from wepose_pin.recording.gaps import BRIDGED, LONG, bridge, bridge_quat, lost_samples
 from wepose_pin.recording.limits import GRAVITY_ERROR_NOTED
-from wepose_pin.recording.plausibility import check_signals
+from wepose_pin.recording.plausibility import check_signals, cut_off
 from wepose_pin.recording.resampling import on_time
 
 SIGNALS = {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"], "orientation": ["qx", "qy", "qz", "qw"]}
@@ -482,6 +482,36 @@ def test_a_slow_peak_of_a_coarse_sensor_is_no_saturation() -> None:
     quat = rotations.integrate(gyro_S[1:] / 1000.0)
     sensor = ImuSensor(gyro_S=gyro_S, accel_S=Rotation.from_quat(quat).inv().apply([0.0, 0.0, 9.81]))
     assert check_signals(Recording("r", time, 1000.0, {"torso": sensor})) == ()
+
+
+# A simulated forearm's largest rate, in digits of 2000 deg/s at 16 bits: noise of 1.1 digits has made three alike.
+NOISY_PEAK = """-1521 -1583 -1645 -1704 -1764 -1818 -1877 -1926 -1974 -2022 -2067 -2108 -2149 -2181 -2211 -2240 -2264
+-2283 -2297 -2312 -2320 -2320 -2320 -2313 -2305 -2289 -2273 -2249 -2221 -2194 -2156 -2122 -2081 -2040 -1997 -1948 -1901
+-1852 -1803 -1754 -1697 -1651 -1599 -1550"""
+
+
+def test_noise_that_levels_a_peak_is_no_saturation() -> None:
+    rate = np.array(NOISY_PEAK.split(), dtype=float) * np.deg2rad(2000.0) / 2**15
+    gyro_S = np.column_stack([rate, rate, rate])
+    assert not cut_off(gyro_S, 2.0).any()
+    assert cut_off(np.clip(gyro_S, -2.3, 2.3), 2.0).all(axis=1).sum() == np.count_nonzero(rate < -2.3)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 1.6, 3.0, 30.0])
+def test_saturation_is_told_from_noise_of_any_size(noise: float) -> None:
+    """Motion of up to 7 rad/s with noise of so many digits, whole and cut off at 0.9 of its largest rate."""
+    rng, time, found = np.random.default_rng(1), np.arange(2000) / 100.0, 0
+    for _ in range(50):
+        fast, slow = (rng.uniform(0.2, highest) * 2.0 * np.pi for highest in (2.0, 3.0))
+        motion = 5.0 * np.sin(fast * time + rng.uniform(0.0, 6.0)) + 2.0 * np.sin(slow * time)
+        digit = 10.0 ** rng.uniform(-3.5, -2.0)
+        measured = motion + noise * digit * rng.standard_normal(2000)
+        whole, cut = (np.round(np.clip(measured, -m, m) / digit) * digit for m in (9.0, 0.9 * np.abs(motion).max()))
+        values = np.column_stack([whole, cut, 0.0 * time])
+        told = cut_off(values, 2.0)
+        assert not told[:, 0].any()
+        found += bool(told[:, 1].any())
+    assert found == 50
 
 
 def test_a_scale_that_is_off_is_noted(tmp_path: Path) -> None:

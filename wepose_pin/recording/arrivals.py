@@ -13,9 +13,9 @@ import numpy as np
 
 from ..compilation import inlined, kernel
 from .clocks import LONGEST_GAP_S
-from .faults import AT_RANGE, FROZEN_SAMPLES, NOISY_S, ROUNDING, SAME_RANGE, TURNS_BACK, TURNS_BACK_HZ
+from .faults import AT_RANGE, FROZEN_SAMPLES, NOISY_S, SAME_RANGE, TURNS_BACK, TURNS_BACK_HZ
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED, NARROWEST_GYRO_RANGE
-from .plausibility import STEEP
+from .plausibility import ROUNDING
 
 # A sample this near to a tick, as a share of a step, is the tick's own.
 SAME = 0.01
@@ -30,6 +30,11 @@ MOST_REPEATS = 4.0
 # Samples for which gyro stands at its largest value so far, where its range cuts it off: more than of a whole recording
 # (`plausibility.PLATEAU`), since there may be larger ones to come. The value is so many digits at least.
 STANDS, FEWEST_DIGITS = 5, 100.0
+# It comes there by a step of so many digits. Standing for `STANDS`, it comes by so many times the usual change from one
+# step to the next: a peak as sharp is levelled by noise once in a million times, five standard deviations. What stands
+# longer has been cut off further: the limit falls with its duration to the power 1.5.
+STEEP, ROUGH = 3.0, 3.5
+USUAL_CHANGES = 32.0  # over which the usual one is averaged
 
 MISSING, LATE, DUPLICATE, BAD, TAKEN, FROZEN, CUT_OFF = range(7)
 COUNTS = ("missing", "late", "duplicate", "bad", "taken", "frozen", "cut_off")
@@ -40,9 +45,11 @@ _OUT = 1024
 # What is remembered of a sensor's values. Of each of the six: the newest, its step, its largest size, how often it
 # turned back in this second and whether it changed. Of all: when the second began and its samples; since when the
 # values repeat, how often by now and at most before; [s] of noise; samples unlike the one before; the newest time.
-# Of each axis of gyro: its smallest step, the last ones, how often it stood since, and where it is cut off.
+# Of each axis of gyro: its smallest step, the last ones, how often it stood since, where it is cut off, and the usual
+# change from step to step.
 _LAST, _STEP, _SIZE, _TURNS, _CHANGES, _DIGIT, _ENTRY, _STANDS, _LEVEL = 0, 6, 12, 18, 24, 30, 33, 36, 39
-_SECOND, _SAMPLES, _SINCE, _REPEATS, _MOST, _NOISY, _VALUES, _TIME, _MEMORY = 42, 43, 44, 45, 46, 47, 48, 49, 50
+_SECOND, _SAMPLES, _SINCE, _REPEATS, _MOST, _NOISY, _VALUES, _TIME = 42, 43, 44, 45, 46, 47, 48, 49
+_CHANGE, _MEMORY = 50, 53
 _TICK, _NEWEST = 0, 1  # of the scalars: ticks given, the newest time of all
 
 
@@ -249,6 +256,8 @@ def _remember(m, t, gyro, accel):  # type: ignore[no-untyped-def]
             step = 0.0
         if step * m[_STEP + k] < 0.0:
             m[_TURNS + k] += 1.0
+        if k < 3:
+            m[_CHANGE + k] += (abs(step - m[_STEP + k]) - m[_CHANGE + k]) / USUAL_CHANGES
         if step != 0.0:
             m[_CHANGES + k] = 1.0
         m[_LAST + k], m[_STEP + k] = value, step
@@ -280,6 +289,7 @@ def _look_for_range(m):  # type: ignore[no-untyped-def]
             continue
         m[_STANDS + k] += 1.0
         steep = m[_ENTRY + k] > STEEP * m[_DIGIT + k] and value > FEWEST_DIGITS * m[_DIGIT + k]
+        steep = steep and m[_ENTRY + k] * (m[_STANDS + k] / STANDS) ** 1.5 > ROUGH * m[_CHANGE + k]
         at_extreme = value == m[_SIZE + k] and value >= max(NARROWEST_GYRO_RANGE, (1.0 - SAME_RANGE) * largest)
         if steep and at_extreme and m[_STANDS + k] >= STANDS:
             m[_LEVEL + k] = value

@@ -35,7 +35,7 @@ from .clocks import LONGEST_GAP_S, Clock
 from .gaps import GOOD, runs
 from .intervals import format_time
 from .limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE, STANDARD_GRAVITY
-from .plausibility import cut_off
+from .plausibility import ROUNDING, cut_off
 
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5  # of rate and force both at one value: longer than gaps that are bridged in silence
 STUCK_S = 1.0  # of one of them alone, or of one axis
@@ -44,7 +44,6 @@ TIPS, TIPPED = 0.2, 1.0
 MOVES = 2.0  # [m/s²] by which accel changes on an axis only where the sensor moves
 # Noise turns back at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
 TURNS_BACK, TURNS_BACK_HZ = 0.3, 15.0
-ROUNDING = 1e-9  # steps below this share of the largest value are rounding, not noise
 NOISY_S = 1.5  # [s] of noise that show a sensor to be noisy
 COARSE = 1e-4  # share of runs of equal samples that are longer than twice the usual, from which the digits are coarse
 

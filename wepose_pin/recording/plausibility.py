@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtr, ndtri
 
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
@@ -41,8 +42,13 @@ STIFF = 0.93  # the share of the coherence of rates a factor 57.3 larger, where 
 TILTED = np.deg2rad(20.0)  # between two windows, from which the gyroscope must have seen it
 UNSEEN = 0.25  # share of that tilt which the gyroscope has seen at most, where its unit is too small
 
-PLATEAU = 3  # samples at one value, where an axis seems cut off
-STEEP = 3  # quanta by which it comes there from a sample before or goes to one after
+# An axis that stays for so many samples at its extreme is cut off there if the motion before and after would have led
+# beyond it by so many digits: a smooth peak stays within one. That noise has levelled a peak by chance is excluded from
+# so many standard deviations on, or by a probability below this.
+PLATEAU, BEYOND, IMPROBABLE, COINCIDENCE = 3, 2.0, 5.0, 1e-4
+NOISE_SAMPLES = 25  # on each side of a plateau, of which the noise is measured
+NOISE_JERK = float(ndtri(0.75) * np.sqrt(20.0))  # median size of the third differences of noise with deviation 1
+ROUNDING = 1e-9  # steps below this share of the largest value are rounding, not noise
 
 
 def check_signals(recording: Recording, *, whole: bool = True, units: bool = True) -> tuple[Diagnostic, ...]:
@@ -200,20 +206,41 @@ def _range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: 
 
 
 def cut_off(values: np.ndarray, least: float) -> np.ndarray:
-    """(n, 3) bool: where an axis of `values` (n, 3) stays at its extreme, `least` or more, as if cut off there."""
+    """(n, 3) bool: where an axis of `values` (n, 3) stays at its extreme, `least` or more, as if cut off there.
+
+    It is cut off where the motion before and after one such plateau would have led beyond it, and neither digits nor
+    noise explain that it did not.
+    """
     cut = np.zeros(values.shape, dtype=bool)
     for axis, x in enumerate(values.T):
         for extreme in (float(x.max()), float(x.min())):
             if abs(extreme) < least:
                 continue
-            same = 1e-9 * abs(extreme)
+            same = ROUNDING * abs(extreme)
             plateaus = [(a, b) for a, b in runs(np.abs(x - extreme) <= same) if PLATEAU <= b - a < len(x)]
             if not plateaus:
                 continue
-            # A slow signal rests on its peak too, a quantum below on both sides; one that is cut off comes steeply.
             steps = np.abs(np.diff(x))
-            quantum = float(steps[steps > same].min())
-            for a, b in plateaus:
-                if max(*steps[max(a - 1, 0) : a], *steps[b - 1 : b], 0.0) > STEEP * quantum:
+            digit = float(steps[steps > same].min())
+            if any(_leads_beyond(x, a, b, digit) for a, b in plateaus):
+                for a, b in plateaus:
                     cut[a:b, axis] = True
     return cut
+
+
+def _leads_beyond(x: np.ndarray, first: int, last: int, digit: float) -> bool:
+    """Whether the signal (n,) would have passed the value at which its samples `first` to before `last` stay."""
+    length = last - first
+    sides = [side for side in (x[max(0, first - length) : first], x[last : last + length]) if len(side)]
+    # A parabola that is lower by so much one plateau's length before and after it has passed it by an eighth of that.
+    excess = float(np.mean([np.abs(side - x[first]).max() for side in sides])) / 8.0
+    if excess < BEYOND * digit:
+        return False
+    near = x[max(0, first - NOISE_SAMPLES) : first], x[last : last + NOISE_SAMPLES]
+    jerks = np.abs(np.concatenate([np.diff(side, 3) for side in near]))
+    noise = float(np.hypot(np.median(jerks) / NOISE_JERK if len(jerks) else 0.0, digit / np.sqrt(12.0)))
+    # Noise would have to take the parabola's top off, sample by sample; or, of whatever form the motion is, to make the
+    # samples alike.
+    top = excess * np.sqrt(16.0 / 180.0 * (length**2 - 1.0) * (length**2 - 4.0) / length**3)
+    alike = 2.0 * float(ndtr(digit / (2.0 * np.sqrt(2.0) * noise))) - 1.0
+    return bool(top > IMPROBABLE * noise or alike ** (length - 1) < COINCIDENCE)
