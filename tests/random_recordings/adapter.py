@@ -1,4 +1,4 @@
-"""The one file that knows the project: its commands, options, exit codes, files, columns, keys and words.
+"""The one file that knows the project: its commands, options, exit codes, files, columns, keys and codes.
 
 Where a name of the project changes, it changes here and nowhere else in this folder.
 """
@@ -17,6 +17,7 @@ import warnings as python_warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -35,20 +36,20 @@ NO_COVARIANCE = ("ncf", "gdc")  # methods that state no uncertainty
 EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet", "out.urdf")
 HAND_POINTS = {"left_palm": "left_hand", "right_palm": "right_hand"}  # our point → the project's
 
-# Words of a warning that says why a segment is not to be believed, by cause; it counts where it names the segment too,
-# or all of them. Causes of ALWAYS may be there in any recording, the others only where the case has them.
+# Codes of diagnostics that say why a segment is not to be believed, by cause; each counts for the segment that it is
+# about, or for all where it is about none. Causes of ALWAYS may be there in any recording, the others only where the
+# case has them.
 CAUSES = {
-    "range": r"cut off|saturat|range",
-    "fault": r"does not measure|stands? still|stuck|fro[zs]en?|constant|same value|not change|dead|zero|lost|gap",
-    "identical": r"same|identical|equal to|copy|one sensor|two sensors",
-    "swapped": r"swap|exchanged|other'?s? name|each other",
-    "gap": r"gap|lost|bridged",
-    "start": r"in phases\.start|in the start pose|no phases\.start|guess|quietest",
-    "bias": r"bias|drift",
+    "range": {"signal-saturated"},
+    "fault": {"sensor-frozen", "orientation-constant", "long-gaps-bridged"},
+    "identical": {"orientations-copied"},
+    "swapped": {"sensors-exchanged"},
+    "gap": {"long-gaps-bridged"},
+    "start": {"start-pose-guessed", "start-pose-sway", "mount-contradicts-gravity", "mount-moved"},
+    "bias": {"person-rotates"},
 }
 ALWAYS = ("start", "bias")
-ALL_SEGMENTS = r"no phases\.start|guess|quietest|all sensors|all headings"
-NOT_A_CAUSE = r"no sensor on|not known and not written|short gaps? bridged|no gauge|resampled"
+RESAMPLED = "time-resampled"
 
 
 @dataclass
@@ -61,6 +62,14 @@ class Outcome:
     err: str
     seconds: float
     traceback: str = ""
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """What a result says of itself; `places`: segments that it is about, none where it is about all."""
+
+    code: str
+    places: tuple[str, ...]
 
 
 @dataclass
@@ -76,7 +85,7 @@ class Result:
     table: pl.DataFrame
     lengths: dict[str, float]
     start: tuple[float, float]
-    warnings: list[str]
+    diagnostics: list[Diagnosed]
     calibrated: set[str]
 
 
@@ -289,17 +298,18 @@ def read_result(folder: Path) -> Result:
         table=table,
         lengths={name: float(value) for name, value in lengths.items()},
         start=_first_span(summary["phases"]["start"]),
-        warnings=warnings_of(summary),
+        diagnostics=diagnosed(summary),
         calibrated=set(re.findall(r"^\[mounts\.(\w+)\][^\[]*?^std_deg", subject, re.MULTILINE | re.DOTALL)),
     )
 
 
-def warnings_of(summary: Mapping[str, object]) -> list[str]:
-    """The texts of all that a summary warns of."""
-    texts = list(summary.get("warnings") or ())  # type: ignore[call-overload]
-    for item in summary.get("diagnostics") or ():  # type: ignore[attr-defined]
-        texts.append(f"{item['place']} {item['code']} {item['text']['what']}")
-    return [str(text) for text in texts]
+def diagnosed(content: Mapping[str, Any]) -> list[Diagnosed]:
+    """The diagnostics of a summary or a calibration."""
+    found = []
+    for item in content["diagnostics"]:
+        places = (item["place"], item["facts"].get("other"))  # of two sensors that are alike
+        found.append(Diagnosed(item["code"], tuple(place for place in places if place)))
+    return found
 
 
 def _first_span(value: list) -> tuple[float, float]:
@@ -327,14 +337,18 @@ def write_truth(
 # Words -------------------------------------------------------------------------------------------------------------
 
 
-def names_cause(texts: Iterable[str], segments: Iterable[str], causes: Iterable[str]) -> str:
-    """The first warning that says why these segments may be wrong: it names one of them, or all, and a cause."""
-    segments, patterns = list(segments), [CAUSES[cause] for cause in {*causes, *ALWAYS}]
-    for text in texts:
-        named = any(re.search(rf"\b{segment}\b", text) for segment in segments) or re.search(ALL_SEGMENTS, text)
-        if named and not re.search(NOT_A_CAUSE, text) and any(re.search(pattern, text) for pattern in patterns):
-            return text
+def named_cause(diagnostics: Iterable[Diagnosed], segments: Iterable[str], causes: Iterable[str]) -> str:
+    """Code and places of the first diagnostic that says why these segments may be wrong; empty: none does."""
+    segments, codes = set(segments), set().union(*(CAUSES[cause] for cause in {*causes, *ALWAYS}))
+    for each in diagnostics:
+        if each.code in codes and (not each.places or segments & set(each.places)):
+            return " ".join((each.code, *each.places))
     return ""
+
+
+def is_resampled(diagnostics: Iterable[Diagnosed]) -> bool:
+    """Whether the recording was put on other times than its own."""
+    return any(each.code == RESAMPLED for each in diagnostics)
 
 
 def refusal(outcome: Outcome) -> str:

@@ -42,7 +42,7 @@ class Failure:
 
 @dataclass
 class Accuracy:
-    """The largest z of a track, and where; `excuse`: the warning that names its cause."""
+    """The largest z of a track, and where; `excuse`: the diagnostic that names its cause."""
 
     z: float = 0.0
     of: str = ""
@@ -134,7 +134,7 @@ def _rigid(result: Result) -> dict[tuple[str, str], float]:
 
 
 def of_errors(result: Result, case: Case, recorded: Recorded, shown: str) -> tuple[Accuracy, Truth]:
-    """Errors within six stated deviations, or a warning that names the cause."""
+    """Errors within six stated deviations, or a diagnostic that names the cause."""
     truth = truth_at(case, result.time, recorded.origin, result.start, result.calibrated)
     found = Accuracy()
     worst: list[tuple[float, str, int, str]] = []
@@ -159,7 +159,7 @@ def of_errors(result: Result, case: Case, recorded: Recorded, shown: str) -> tup
         worst.append((float(z[k]), name, k, f"{1e3 * error[k]:.0f} mm at ± {1e3 * std[k]:.0f}"))
     causes = {*case.suspects.values(), *(["gap"] if case.clock.lost else [])}
     for z_, name, k, error_ in sorted(worst, reverse=True):
-        excuse = adapter.names_cause(result.warnings, _behind(name, case), causes) if z_ > MOST_Z else ""
+        excuse = adapter.named_cause(result.diagnostics, _behind(name, case), causes) if z_ > MOST_Z else ""
         if z_ > found.z:
             found.z, found.of, found.at, found.error, found.excuse = z_, name, float(result.time[k]), error_, excuse
         if not excuse:

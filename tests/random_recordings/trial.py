@@ -171,7 +171,7 @@ class Trial:
         outcome = self.command(argv, out)
         if outcome.code or outcome.traceback:
             return
-        resampled = bool(chunk) and any("resampled" in text for text in self.result.warnings if self.result)
+        resampled = bool(chunk and self.result) and adapter.is_resampled(self.result.diagnostics)
         found = of_same_table(adapter.table_bytes(self.result_folder), adapter.table_bytes(out), oracle, " ".join(argv))
         if not resampled:  # then it is the same to rounding, as the documents say
             self.report.failures += found
