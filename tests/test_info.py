@@ -14,7 +14,7 @@ from test_mvnx import mvnx, turning
 
 import wepose_pin as wp
 from wepose_pin.cli import main
-from wepose_pin.diagnostics import ERROR, Diagnostic
+from wepose_pin.diagnostics import ERROR, WARNING, Diagnostic, render
 from wepose_pin.readers.describe import describe
 from wepose_pin.recording import SEGMENTS, Recording
 
@@ -92,6 +92,13 @@ def test_files_of_one_recording_make_one_session(capsys: pytest.CaptureFixture[s
     recording = written(capsys, tmp_path / "D2.csv")
     assert set(recording.sensors) == {"torso", "left_forearm"}
     assert recording.time[0] == pytest.approx(0.5)
+
+
+def test_diagnostics_are_printed_as_by_every_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        main(["info", str(dot(tmp_path / "D1.csv", tag="chest", sync="Un-synced"))])
+    unsynced = Diagnostic("device-not-synchronized", WARNING, "D1.csv")
+    assert capsys.readouterr().err == f"warning: {render(unsynced).line()}\n"
 
 
 @pytest.mark.parametrize("stated", [False, True])

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, as_json
 from wepose_pin.evaluation import evaluate
 from wepose_pin.filters import METHODS
 from wepose_pin.readers import load_session
+from wepose_pin.recording import join
 from wepose_pin.simulation import PERFECT, Person, Simulation, simulate
 from wepose_pin.subject import average_subject
-from wepose_pin.tracking import track
+from wepose_pin.tracking import SummaryAccumulator, Tracker, track
 
 
 def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
@@ -79,3 +81,31 @@ def test_the_real_person_hangs_the_arms_again(data: Path) -> None:
         np.testing.assert_allclose(hand[:2], shoulder[:2], atol=0.02)
         assert shoulder[1] * y > 0.15
         assert shoulder[2] - hand[2] > 0.55
+
+
+def test_what_reading_finds_reaches_the_result(simulation: Simulation) -> None:
+    gaps = Diagnostic("short-gaps-bridged", INFO, "torso", 2, 0.05, {"samples": 3, "longest": 0.02})
+    tracked = track(replace(simulation.recording(), phases={}, diagnostics=(gaps,)))
+    assert tracked.diagnostics[0] == gaps
+    assert tracked.diagnostics[1].code == "start-pose-guessed"
+    assert tracked.summary()["diagnostics"] == [as_json(each) for each in tracked.diagnostics]
+
+
+def test_diagnostics_of_later_chunks_are_listed_once_and_not_without_end(simulation: Simulation) -> None:
+    recording = simulation.recording()
+    cut = [Diagnostic("signal-saturated", WARNING, "torso", 0.01 * k) for k in range(30)]
+    accumulator = SummaryAccumulator()
+    tracker = Tracker()
+    for k, chunk in enumerate(recording.chunks(2.0)):
+        for tracked in tracker.push(replace(chunk, diagnostics=(cut[0], cut[min(k, 14)]))):
+            accumulator.add(tracked)
+    found = accumulator.diagnostics()
+    assert list(found[:12]) == [cut[0], *cut[:11]]
+    assert (found[12].code, found[12].value) == ("diagnostics-omitted", 4)
+
+
+def test_joined_recordings_keep_the_diagnostics_of_both(simulation: Simulation) -> None:
+    first, second = (Diagnostic("signal-saturated", WARNING, name, 0.1) for name in ("torso", "head"))
+    begin, end, *_ = simulation.recording().chunks(30.0)
+    joined = join(replace(begin, diagnostics=(first,)), replace(end, diagnostics=(first, second)))
+    assert joined.diagnostics == (first, second)

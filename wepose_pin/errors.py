@@ -78,6 +78,20 @@ class BadOption(WeposeError, ValueError):
     """An option or argument is not of the kind that is needed, or outside what it may be."""
 
 
+class WrongOption(BadOption):
+    """An option of a command whose value is not possible.
+
+    Parameters
+    ----------
+    name, value : as on the command line, the name without ``--``
+    needed : what is wrong, or what would be right
+    """
+
+    def __init__(self, name: str, value: object, needed: str) -> None:
+        super().__init__(f"--{name} {value}: {needed}")
+        self.name, self.value, self.needed = name, value, needed
+
+
 class BadSource(WeposeError):
     """A live source cannot be opened: no port, no stream, no device that answers."""
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..arguments import check_value
 from ..documents import TomlTable, read_toml
-from ..errors import BadData, BadOption, BadPlan, BadSession, WeposeError, one_of
+from ..errors import BadData, BadOption, BadPlan, BadSession, WeposeError, WrongOption, one_of
 from ..jobs.calibrate import CalibrateJob
 from ..jobs.evaluate import EvaluateJob
 from ..jobs.export import ExportJob
@@ -200,9 +200,11 @@ def _check(step: str, options: Mapping[str, Any], keys: TomlTable) -> None:
         job.check()
     except BadSession:
         raise
+    except WrongOption as error:
+        key = error.name.replace("-", "_")
+        raise BadPlan(f"{keys.file}: {keys.place}{key} = {error.value}: {error.needed}") from None
     except WeposeError as error:
-        text = re.sub(r"^--([\w-]+) ", lambda match: match[1].replace("-", "_") + " = ", str(error))
-        raise BadPlan(f"{keys.file}: {keys.place.rstrip('.')}: {text}") from None
+        raise BadPlan(f"{keys.file}: {keys.place.rstrip('.')}: {error}") from None
 
 
 def _distances(steps: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:

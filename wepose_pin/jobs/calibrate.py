@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic
-from ..errors import BadOption, one_of
+from ..errors import WrongOption, one_of
 from . import Method, Progress, no_progress
 from .fields import field_values
 
@@ -71,10 +71,11 @@ class CalibrateJob:
 
         known = (*LENGTHS, *load_protocol(self.protocol).gauges)
         for name, metres in self.measured.items():
+            stated = f"{name}={metres:g}"
             if name == "handle" and name not in known:
-                raise BadOption(f"--measured {name}={metres:g}: the bar of --protocol handle, which is not given")
+                raise WrongOption("measured", stated, "the bar of --protocol handle, which is not given")
             if name not in known:
-                raise BadOption(f"--measured {name}={metres:g}: '{name}' is not a length; {one_of(known, name)}")
+                raise WrongOption("measured", stated, f"'{name}' is not a length; {one_of(known, name)}")
 
 
 class CalibrateOutcome(NamedTuple):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import BadOption
+from ..errors import BadOption, WrongOption
 from . import Progress, no_progress
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ class EvaluateJob:
         """Raise `BadOption` where the interval is none."""
         if self.interval is not None and not self.interval[0] < self.interval[1]:
             begin, end = self.interval
-            raise BadOption(f"--interval {begin:g} {end:g}: two times in seconds are needed, the earlier one first")
+            needed = "two times in seconds are needed, the earlier one first"
+            raise WrongOption("interval", f"{begin:g} {end:g}", needed)
 
 
 def run_evaluate(job: EvaluateJob, progress: Progress = no_progress, pose: Pose | None = None) -> Evaluation:

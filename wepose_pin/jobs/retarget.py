@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic
-from ..errors import BadOption
+from ..errors import WrongOption
 from . import Arms, Progress, arm_sides, no_progress
 from .fields import field_values
 
@@ -67,11 +67,11 @@ class RetargetJob:
 
         find_map(self.robot)
         if not 10.0 <= self.rate_hz <= 2000.0:
-            raise BadOption(f"--rate-hz {self.rate_hz:g}: from 10 to 2000 samples a second")
+            raise WrongOption("rate-hz", f"{self.rate_hz:g}", "from 10 to 2000 samples a second")
         if self.scale is not None and not 0.0 < self.scale < float("inf"):
-            raise BadOption(f"--scale {self.scale:g}: a number above 0 is needed")
+            raise WrongOption("scale", f"{self.scale:g}", "a number above 0 is needed")
         if not 0.0 <= self.smoothing_hz < float("inf"):
-            raise BadOption(f"--smoothing-hz {self.smoothing_hz:g}: 0, which does not smooth, or more is needed")
+            raise WrongOption("smoothing-hz", f"{self.smoothing_hz:g}", "0, which does not smooth, or more is needed")
 
 
 class RetargetOutcome(NamedTuple):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..diagnostics import Diagnostic, from_json
-from ..errors import BadOption
+from ..errors import BadOption, WrongOption
 from . import Method, Progress, no_progress
 from .fields import field_values
 
@@ -78,7 +78,7 @@ class TrackJob:
     def check(self) -> None:
         """Raise `BadOption` where options contradict each other or name what is not there."""
         if self.model is not None and not self.model.is_file():
-            raise BadOption(f"--model {self.model}: no such file; a URDF, or a TOML that names one, is needed")
+            raise WrongOption("model", self.model, "no such file; a URDF, or a TOML that names one, is needed")
 
 
 class TrackOutcome(NamedTuple):

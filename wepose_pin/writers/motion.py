@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..errors import BadData, BadOption
+from ..errors import BadData, WrongOption
 from ..model import BodyModel
 from ..pose import Pose, pose_of
 from ..recording import span_text
@@ -57,7 +57,7 @@ def even(motion: Motion) -> tuple[Motion, list[Diagnostic]]:
 def check_rate(rate_hz: float) -> None:
     """Raises `BadOption` where no recording has that rate."""
     if not 1.0 <= rate_hz <= 10000.0:
-        raise BadOption(f"--rate-hz {rate_hz:g}: between 1 and 10000 samples a second")
+        raise WrongOption("rate-hz", f"{rate_hz:g}", "between 1 and 10000 samples a second")
 
 
 def resampled(motion: Motion, rate_hz: float) -> Motion:
