@@ -34,7 +34,7 @@ def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[f
     if recording.phases.get("start"):
         start = recording.phases["start"][0]
         if len(recording.phases["start"]) > 1:
-            diagnostics.append(_others_ignored("start", start))
+            diagnostics.append(_ignored_intervals("start", start))
     elif recording.phases.get("static"):
         raise BadPhase(
             f"{recording.where()}: phases.static without phases.start; name the seconds of the start pose, "
@@ -45,7 +45,7 @@ def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[f
         diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
     still = recording.phases.get("static", ())
     if len(still) > 1:
-        diagnostics.append(_others_ignored("static", still[0]))
+        diagnostics.append(_ignored_intervals("static", still[0]))
     for name, interval in (("start", start), *(("static", span) for span in still[:1])):
         place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
@@ -61,7 +61,7 @@ def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[f
     return start, still[0] if still else start, diagnostics
 
 
-def _others_ignored(phase: str, first: tuple[float, float]) -> Diagnostic:
+def _ignored_intervals(phase: str, first: tuple[float, float]) -> Diagnostic:
     return Diagnostic("phase-intervals-ignored", WARNING, phase, facts={"start": first[0], "end": first[1]})
 
 
