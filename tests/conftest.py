@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-# Workers share the processors already: BLAS with threads of its own spends twice the processor time for the same result.
+# Workers share the processors already: BLAS with threads of its own takes twice the processor time for the same result.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 # numba's cache does not see a change in a function of another file that was compiled into a caller: the tests keep one
