@@ -146,26 +146,26 @@ def _gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
         return
     speed = np.linalg.norm(gyro, axis=2).mean(axis=1)
     moving = at[np.argsort(-speed[at], kind="stable")[:WINDOWS]]
-    as_stated, smaller, larger = (
-        np.mean([_coherence(scale * gyro[k], accel[k], rate_hz) for k in moving])
-        for scale in (1.0, np.pi / 180.0, 180.0 / np.pi)
-    )
-    tumbles = as_stated < TUMBLES * smaller and smaller > COHERENT
-    if tumbles or (as_stated < TUMBLES_FAST * smaller and speed[moving].mean() > FAST):
+    as_stated = _mean_coherence(1.0, gyro[moving], accel[moving], rate_hz)
+    if as_stated < max(TUMBLES, TUMBLES_FAST, STIFF):  # coherence is at most 1: above it no other unit is better
+        smaller = _mean_coherence(np.pi / 180.0, gyro[moving], accel[moving], rate_hz)
+        larger = _mean_coherence(180.0 / np.pi, gyro[moving], accel[moving], rate_hz)
         peak = float(np.max(np.abs(gyro_S)))
-        raise WrongUnit(
-            f"{place}.gyro: with rates up to {peak:.3g} rad/s gravity would tumble, and accel shows that it does not; "
-            f'data.gyro_unit = "deg/s" would fit, or the time or rate_hz is wrong',
-            "gyro_unit",
-            "deg/s",
-        )
-    if as_stated < STIFF * larger and larger > COHERENT:
-        raise WrongUnit(
-            f"{place}.gyro: with rates up to {float(np.max(np.abs(gyro_S))):.3g} rad/s the sensor turns too little for "
-            f'what accel shows; data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong',
-            "gyro_unit",
-            "rad/s",
-        )
+        tumbles = as_stated < TUMBLES * smaller and smaller > COHERENT
+        if tumbles or (as_stated < TUMBLES_FAST * smaller and speed[moving].mean() > FAST):
+            raise WrongUnit(
+                f"{place}.gyro: with rates up to {peak:.3g} rad/s gravity would tumble, and accel shows that it does "
+                f'not; data.gyro_unit = "deg/s" would fit, or the time or rate_hz is wrong',
+                "gyro_unit",
+                "deg/s",
+            )
+        if as_stated < STIFF * larger and larger > COHERENT:
+            raise WrongUnit(
+                f"{place}.gyro: with rates up to {peak:.3g} rad/s the sensor turns too little for what accel shows; "
+                f'data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong',
+                "gyro_unit",
+                "rad/s",
+            )
     mean = accel.mean(axis=1)
     norm = np.linalg.norm(mean, axis=1)
     up = mean / np.maximum(norm, 1e-9)[:, None]
@@ -183,6 +183,13 @@ def _gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
             "gyro_unit",
             "rad/s",
         )
+
+
+def _mean_coherence(scale: float, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
+    """Mean over windows (k, n, 3) of the coherence of `scale` times their rates."""
+    return float(
+        np.mean([_coherence(scale * gyro, accel, rate_hz) for gyro, accel in zip(gyro_S, accel_S, strict=True)])
+    )
 
 
 def _coherence(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
