@@ -25,9 +25,9 @@ elbow = -1.2
 
 [arms.right]
 joints = [{joints}]
-shoulder = {{ link = "upper_arm", at = [0.0, 0.0, 0.0] }}
+shoulder = {{ link = "upper_arm", offset = [0.0, 0.0, 0.0] }}
 elbow = {{ link = "forearm" }}
-hand = {{ link = "hand", at = [0.0, 0.0, -0.1], fingers = "-z", thumb = "+x" }}
+hand = {{ link = "hand", offset = [0.0, 0.0, -0.1], fingers = "-z", thumb = "+x" }}
 """
 JOINTS = ("flexion", "abduction", "rotation", "elbow", "roll", "pitch", "yaw")
 

@@ -16,32 +16,32 @@ from wepose_pin import cli
 from wepose_pin.errors import BadData, BadModel, BadOption, MissingFile, NoSolution
 from wepose_pin.pose import Pose
 from wepose_pin.retargeting import (
-    Kept,
+    LimitCheck,
     Trajectory,
     find_map,
-    kept,
-    load,
+    check_limits,
+    load_robot,
     retarget,
-    summary,
-    table,
-    touching,
-    wish,
+    summarize,
+    build_table,
+    find_self_collisions,
+    compute_arm_targets,
     write_episode,
     write_trajectory,
 )
-from wepose_pin.retargeting.causes import causes, possible
-from wepose_pin.retargeting.check import Touching
-from wepose_pin.retargeting.collision import Shapes
-from wepose_pin.retargeting.limits import acceleration_bounds, urdf_limits, usable
-from wepose_pin.retargeting.person import CLAMP_FROM, CLAMP_TO, drawn_in
-from wepose_pin.retargeting.solver import Aim, State, Stepper, Tasks
+from wepose_pin.retargeting.error_attribution import attribute_errors, assess_reachability
+from wepose_pin.retargeting.checks import AT_REST, SelfCollisions
+from wepose_pin.retargeting.collision import CollisionModel
+from wepose_pin.retargeting.limits import compute_acceleration_bounds, read_joint_limits, reduce_acceleration_limits
+from wepose_pin.retargeting.targets import CLAMP_FROM, CLAMP_TO, clamp_to_reach
+from wepose_pin.retargeting.controller import HandTarget, JointState, QpController, Tasks
 
 pytest.importorskip("daqp")
 
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory):
-    return load(find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
+    return load_robot(find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
 
 
 @pytest.fixture(scope="module")
@@ -49,17 +49,17 @@ def swung(arm) -> Trajectory:
     return retarget(person(), arm)
 
 
-def checked(trajectory: Trajectory, changed: pl.DataFrame | None = None) -> Kept:
+def checked(trajectory: Trajectory, changed: pl.DataFrame | None = None) -> LimitCheck:
     of = trajectory.robot.map
-    return kept(table(trajectory) if changed is None else changed, of.urdf, of.acceleration, of.jerk)
+    return check_limits(build_table(trajectory) if changed is None else changed, of.urdf, of.acceleration, of.jerk)
 
 
 def is_sound(trajectory: Trajectory) -> None:
     """Limits against the URDF and the map, and no contact; none of it by the solver's code."""
     robot = trajectory.robot
     found = checked(trajectory)
-    assert found.all, found
-    assert touching(robot, trajectory.time, trajectory.u).samples == 0
+    assert found.passed, found
+    assert find_self_collisions(robot, trajectory.time, trajectory.u).samples == 0
     assert np.isfinite(trajectory.u).all()
 
 
@@ -75,21 +75,21 @@ def ridden(share, dt: float, seconds: float, n: int = 60):
     """Joints that take `share` of what the bounds leave at each step; where they were, between the samples too."""
     rng = np.random.default_rng(3)
     lower, upper = -rng.uniform(0.05, 2.0, n), rng.uniform(0.05, 2.0, n)  # at most 14 s from end to end
-    v_most, a_most = rng.uniform(0.3, 4.0, n), rng.uniform(0.5, 30.0, n)
-    j_most = a_most * rng.choice([10.0, 20.0, 50.0, 500.0], n)
-    a_most = usable(a_most, v_most, j_most, upper - lower, dt)
+    v_max, a_max = rng.uniform(0.3, 4.0, n), rng.uniform(0.5, 30.0, n)
+    j_max = a_max * rng.choice([10.0, 20.0, 50.0, 500.0], n)
+    a_max = reduce_acceleration_limits(a_max, v_max, j_max, upper - lower, dt)
     u, v, a, low, high = np.zeros(n), np.zeros(n), np.zeros(n), np.empty(n), np.empty(n)
     t = np.linspace(0.0, dt, 11)[:, None]
     for k in range(round(seconds / dt)):
-        acceleration_bounds(u, v, a, lower, upper, v_most, a_most, j_most, dt, low, high)
+        compute_acceleration_bounds(u, v, a, lower, upper, v_max, a_max, j_max, dt, low, high)
         assert (low <= high).all()
         after = low + share(k * dt, rng, n) * (high - low)
         jerk = (after - a) / dt
         places = u + t * (v + t * (a / 2.0 + t * jerk / 6.0))
         speeds = v + t * (a + 0.5 * t * jerk)
-        assert (np.abs(jerk) <= j_most * (1.0 + 1e-9)).all()
-        assert (np.abs(after) <= a_most + 1e-9).all()
-        assert (np.abs(speeds) <= v_most + 1e-8).all()
+        assert (np.abs(jerk) <= j_max * (1.0 + 1e-9)).all()
+        assert (np.abs(after) <= a_max + 1e-9).all()
+        assert (np.abs(speeds) <= v_max + 1e-8).all()
         assert (places >= lower - 1e-8).all()
         assert (places <= upper + 1e-8).all()
         u, v, a = places[-1], speeds[-1], after
@@ -123,32 +123,32 @@ def test_a_joint_that_is_pushed_against_its_limit_lies_still_there(dt: float) ->
 )
 def test_a_robot_without_limits_is_refused_with_the_joint_named(tmp_path: Path, key: str, text: str) -> None:
     with pytest.raises(BadModel, match=text):
-        load(find_map(str(write_arm(tmp_path, without=key))))
+        load_robot(find_map(str(write_arm(tmp_path, without=key))))
 
 
 def test_limits_are_read_from_the_urdf_itself(tmp_path: Path) -> None:
-    said = urdf_limits(write_arm(tmp_path, continuous="roll", mimic=True))
+    said = read_joint_limits(write_arm(tmp_path, continuous="roll", mimic=True))
     assert said["flexion"] == ("revolute", -3.0, 1.5, 3.0, None)
     assert (said["roll"].lower, said["roll"].upper) == (-np.inf, np.inf)
     assert said["elbow_copy"].mimic == ("elbow", 1.0, 0.0)
 
 
-@pytest.mark.parametrize("spoil", ["position", "velocity", "acceleration", "jerk", "even", "rests"])
+@pytest.mark.parametrize("spoil", ["position", "velocity", "acceleration", "jerk", "consistent", "ends_at_rest"])
 def test_the_check_sees_what_is_not_kept(swung: Trajectory, spoil: str) -> None:
-    whole = table(swung)
-    assert checked(swung).all
+    whole = build_table(swung)
+    assert checked(swung).passed
     row = np.arange(len(whole)) == len(whole) // 2
     changed = {
         "position": ("elbow", 9.0 * row),
         "velocity": ("pitch_velocity", 4.0 * row),
         "acceleration": ("yaw_acceleration", 30.0 * row),
         "jerk": ("flexion_acceleration", 9.0 * row),
-        "even": ("roll", 1e-6 * row),
-        "rests": ("roll_velocity", np.full(len(whole), 1e-6)),
+        "consistent": ("roll", 1e-6 * row),
+        "ends_at_rest": ("roll_velocity", np.full(len(whole), 1e-6)),
     }[spoil]
     name, more = changed
     found = checked(swung, whole.with_columns((pl.col(name) + pl.Series(more)).alias(name)))
-    assert not found.all
+    assert not found.passed
     value = getattr(found, spoil)
     assert value is False or value < 0.0
 
@@ -160,7 +160,7 @@ def test_the_robot_follows_hand_turn_and_elbow(swung: Trajectory) -> None:
     is_sound(swung)
     assert np.median(error(swung)) < 5e-3
     assert np.quantile(error(swung), 0.95) < 0.02
-    found = summary(swung, checked(swung), touching(
+    found = summarize(swung, checked(swung), find_self_collisions(
         swung.robot, swung.time, swung.u))["arms"]["right"]  # fmt: skip
     assert found["hand_error_deg"]["median"] < 3.0
     assert found["swivel_error_deg"]["median"] < 15.0
@@ -168,53 +168,53 @@ def test_the_robot_follows_hand_turn_and_elbow(swung: Trajectory) -> None:
 
 
 def test_what_can_be_reached_is_reached(swung: Trajectory) -> None:
-    frames, reached = possible(swung)
+    frames, reached = assess_reachability(swung)
     assert len(frames) == len(reached) == 40
     assert reached.max() < 5e-3
-    assert sum(causes(swung, 0).values()) == pytest.approx(np.mean(error(swung) > 0.02), abs=1e-3)
+    assert sum(attribute_errors(swung, 0).values()) == pytest.approx(np.mean(error(swung) > 0.02), abs=1e-3)
 
 
 def test_it_begins_and_ends_at_rest_and_shows_the_recording_to_its_end(swung: Trajectory) -> None:
     assert np.array_equal(swung.u[0], swung.robot.rest)
-    assert not swung.v[0].any()
-    assert np.abs(swung.v[-1]).max() < 1e-12
-    assert (np.diff(swung.recorded) >= -1e-12).all()
-    assert swung.recorded[0] == swung.recorded[swung.approach - 1] == 0.0
-    assert swung.recorded[-1] == pytest.approx(7.99, abs=0.02)
+    assert not swung.run.v[0].any()
+    assert np.abs(swung.run.v[-1]).max() < 1e-12
+    assert (np.diff(swung.recorded_time) >= -1e-12).all()
+    assert swung.recorded_time[0] == swung.recorded_time[swung.approach - 1] == 0.0
+    assert swung.recorded_time[-1] == pytest.approx(7.99, abs=0.02)
 
 
 def test_a_small_person_and_a_tall_one_move_the_robot_alike(arm) -> None:
     small, tall = (retarget(person(4.0, size=size), arm) for size in (0.8, 1.2))
-    assert small.wish.scale["right"] == pytest.approx(1.5 * tall.wish.scale["right"])
+    assert small.arm_targets.scale["right"] == pytest.approx(1.5 * tall.arm_targets.scale["right"])
     n = min(len(small.time), len(tall.time))
     assert np.abs(small.u[:n] - tall.u[:n]).max() < 1e-6
 
 
 def test_turned_bases_move_alike(arm, tmp_path: Path) -> None:
     straight = retarget(person(4.0), arm)
-    turned = load(find_map(str(write_arm(tmp_path, turned=(0.5 * np.pi, 0.2, -1.1)))))
+    turned = load_robot(find_map(str(write_arm(tmp_path, turned=(0.5 * np.pi, 0.2, -1.1)))))
     found = retarget(person(4.0), turned)
     assert np.abs(found.u - straight.u).max() < 1e-6
     # Said of the root's axes in place of the base's: y of the root is where z of the base points to −z, z up is +y.
     (tmp_path / "root").mkdir()
-    by_root = load(find_map(str(write_arm(tmp_path / "root", turned=(0.5 * np.pi, 0.0, 0.0), base="", up="-y"))))
+    by_root = load_robot(find_map(str(write_arm(tmp_path / "root", turned=(0.5 * np.pi, 0.0, 0.0), base="", up="-y"))))
     assert np.abs(retarget(person(4.0), by_root).u - straight.u).max() < 1e-6
 
 
 def test_a_joint_without_end_and_one_that_copies_another(tmp_path: Path) -> None:
     (tmp_path / "c").mkdir()
-    endless = load(find_map(str(write_arm(tmp_path / "c", continuous="roll"))))
+    endless = load_robot(find_map(str(write_arm(tmp_path / "c", continuous="roll"))))
     assert endless.model.nq == endless.model.nv + 1
     found = retarget(person(4.0), endless)
     is_sound(found)
     assert np.median(error(found)) < 5e-3
-    copied = load(find_map(str(write_arm(tmp_path, mimic=True))))
+    copied = load_robot(find_map(str(write_arm(tmp_path, mimic=True))))
     assert copied.names == JOINTS
     assert copied.model.nv == len(JOINTS) + 1
     found = retarget(person(4.0), copied)
     is_sound(found)
     assert np.median(error(found)) < 5e-3
-    q = copied.q(found.u[-1])
+    q = copied.configuration(found.u[-1])
     joint = copied.model.names.tolist().index("elbow") - 1
     assert q[joint] == q[joint + 1] == found.u[-1][JOINTS.index("elbow")]
 
@@ -226,7 +226,7 @@ def test_a_task_can_be_left_out(arm, only: str) -> None:
     is_sound(found)
     target, begin = found.targets[0], found.approach
     asked = Rotation.from_matrix(target.rotation[begin:])
-    turn = (Rotation.from_matrix(found.turn["right"][begin:]).inv() * asked).magnitude()
+    turn = (Rotation.from_matrix(found.run.rotation[0, begin:]).inv() * asked).magnitude()
     if only == "position":
         assert np.median(error(found)) < 3e-3
     else:
@@ -239,22 +239,23 @@ def test_the_programme_is_that_of_pink(arm) -> None:
     pink = pytest.importorskip("pink")
     import pinocchio as pin
 
-    free = replace(arm, shapes=pin.GeometryModel(), arms=(replace(arm.arms[0], elbow=-1),))
+    free = replace(arm, geometry=pin.GeometryModel(), arms=(replace(arm.arms[0], elbow=-1),))
     tasks = Tasks(
-        smooth=0.0, straight=0.0, curved=0.0, still=0.0, posture=1e-3, gain=10.0, posture_gain=10.0, brake=1e9
+        joint_acceleration=0.0, singular_below=0.0, curvature=0.0, joint_velocity=0.0, posture=1e-3, gain=10.0,
+        posture_gain=10.0, deceleration=1e9,
     )
-    stepper = Stepper(free, Shapes(free), 0.01, tasks, loose=1e6)
-    state = State(arm.rest + 0.1, np.zeros(7), np.zeros(7))
-    stepper.look(state.u)
-    hand, turn, _ = stepper.place(0)
+    stepper = QpController(free, CollisionModel(free), 0.01, tasks, limit_factor=1e6)
+    state = JointState(arm.rest + 0.1, np.zeros(7), np.zeros(7))
+    stepper.set_joints(state.u)
+    hand, turn, _ = stepper.arm_pose(0)
     goal = pin.SE3(turn @ pin.exp3(np.array([0.02, -0.01, 0.03])), hand + [0.01, -0.02, 0.015])
-    aim = Aim(goal.translation, np.zeros(3), goal.rotation, np.zeros(3), np.zeros(3), 1.0)
+    aim = HandTarget(goal.translation, np.zeros(3), goal.rotation, np.zeros(3), np.zeros(3), 1.0)
     ours = 0.01 * stepper.step(state, (aim,)).a  # the programme's velocity: half a step on, from rest
-    configuration = pink.Configuration(arm.model, arm.model.createData(), arm.q(state.u))
+    configuration = pink.Configuration(arm.model, arm.model.createData(), arm.configuration(state.u))
     task = pink.tasks.FrameTask(arm.model.frames[arm.arms[0].hand].name, 1.0, float(np.sqrt(tasks.orientation)))
     task.set_target(goal)
     posture = pink.tasks.PostureTask(cost=float(np.sqrt(tasks.posture)))
-    posture.set_target(arm.q(arm.rest))
+    posture.set_target(arm.configuration(arm.rest))
     task.gain = posture.gain = tasks.gain * 0.01
     theirs = pink.solve_ik(configuration, [task, posture], 0.01, solver="daqp", limits=[], damping=0.0)
     # Pink's error is the logarithm in SE(3), ours that of place and turn apart: alike to the product of both.
@@ -267,7 +268,7 @@ def test_the_programme_is_that_of_pink(arm) -> None:
 
 def test_the_reach_is_left_smoothly() -> None:
     reach, far = 0.7, np.linspace(0.3, 3.0, 2000)
-    kept_to = np.linalg.norm(drawn_in(far[:, None] * np.array([0.6, 0.0, -0.8]), reach), axis=1)
+    kept_to = np.linalg.norm(clamp_to_reach(far[:, None] * np.array([0.6, 0.0, -0.8]), reach), axis=1)
     inner = far < CLAMP_FROM * reach
     assert np.allclose(kept_to[inner], far[inner])
     assert kept_to.max() <= CLAMP_TO * reach + 1e-12
@@ -287,27 +288,27 @@ def far_away(pose: Pose, span: tuple[float, float], by: float) -> Pose:
 
 def test_five_seconds_out_of_reach(arm, swung: Trajectory) -> None:
     pose = far_away(person(11.0, swing=0.0), (3.0, 8.0), 1.6)
-    found = retarget(pose, arm, scale=swung.wish.scale["right"])
+    found = retarget(pose, arm, scale=swung.arm_targets.scale["right"])
     is_sound(found)
     target = found.targets[0]
-    outside = np.linalg.norm(target.position - target.wish, axis=1) > 1e-3
+    outside = np.linalg.norm(target.position - target.unclamped, axis=1) > 1e-3
     assert outside[found.approach :].mean() > 0.3
-    why = causes(found, 0)
+    why = attribute_errors(found, 0)
     assert why["beyond the reach"] == pytest.approx(outside[found.approach :].mean(), abs=0.1)
-    settled = (found.recorded > 5.5) & (found.recorded < 7.5)
-    assert np.abs(found.v[settled]).max() < 0.02  # still at the reach: it does not shake
-    assert np.abs(np.diff(found.a[settled], axis=0)).max() < 0.05 * 12.0
-    back = found.recorded > 9.5
+    settled = (found.recorded_time > 5.5) & (found.recorded_time < 7.5)
+    assert np.abs(found.run.v[settled]).max() < 0.02  # still at the reach: it does not shake
+    assert np.abs(np.diff(found.run.a[settled], axis=0)).max() < 0.05 * 12.0
+    back = found.recorded_time > 9.5
     assert np.linalg.norm(found.hand["right"] - target.position, axis=1)[back].max() < 0.02
 
 
 def test_no_jerk_where_a_moving_target_passes_the_reach(arm, swung: Trajectory) -> None:
-    inside = retarget(person(6.0, flexion=20.0, swing=15.0), arm, scale=0.9 * swung.wish.scale["right"])
-    across = retarget(person(6.0, flexion=20.0, swing=15.0), arm, scale=1.12 * swung.wish.scale["right"])
-    drawn = np.linalg.norm(across.targets[0].position - across.targets[0].wish, axis=1) > 1e-3
+    inside = retarget(person(6.0, flexion=20.0, swing=15.0), arm, scale=0.9 * swung.arm_targets.scale["right"])
+    across = retarget(person(6.0, flexion=20.0, swing=15.0), arm, scale=1.12 * swung.arm_targets.scale["right"])
+    drawn = np.linalg.norm(across.targets[0].position - across.targets[0].unclamped, axis=1) > 1e-3
     assert drawn[across.approach :].mean() > 0.1
     is_sound(across)
-    jerk = [np.abs(np.diff(found.a[found.approach :], axis=0)).max() * 100.0 for found in (inside, across)]
+    jerk = [np.abs(np.diff(found.run.a[found.approach :], axis=0)).max() * 100.0 for found in (inside, across)]
     assert jerk[1] < 3.0 * max(jerk[0], 100.0)
 
 
@@ -320,7 +321,7 @@ def test_a_jump_of_a_metre_is_no_jump_of_the_robot(arm) -> None:
         points[name] = moved
     found = retarget(replace(pose, points=points), arm)
     is_sound(found)
-    at = np.searchsorted(found.recorded, 4.0)
+    at = np.searchsorted(found.recorded_time, 4.0)
     speed = np.linalg.norm(np.diff(found.hand["right"], axis=0), axis=1) * 100.0
     assert speed[at - 100 : at + 100].max() < 3.0
     assert found.targets[0].lost[found.approach :].any()
@@ -337,14 +338,14 @@ def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
     gone = retarget(replace(pose, gap={"right_forearm": lost}), arm)
     for found in (nan, gone):
         is_sound(found)
-        during = ((found.recorded > 3.1) & (found.recorded < 4.1)).sum()
-        usual = ((swung.recorded > 3.1) & (swung.recorded < 4.1)).sum()
+        during = ((found.recorded_time > 3.1) & (found.recorded_time < 4.1)).sum()
+        usual = ((swung.recorded_time > 3.1) & (swung.recorded_time < 4.1)).sum()
         assert during > 2 * usual
         assert np.quantile(error(found), 0.95) < 0.03
-    assert causes(gone, 0)["not measured"] == pytest.approx(
+    assert attribute_errors(gone, 0)["not measured"] == pytest.approx(
         np.mean((error(gone) > 0.02) & gone.targets[0].lost[gone.approach :]), abs=1e-3
     )
-    assert summary(gone, checked(gone), touching(arm, gone.time, gone.u))[
+    assert summarize(gone, checked(gone), find_self_collisions(arm, gone.time, gone.u))[
         "arms"]["right"]["lost_share"] > 0.1  # fmt: skip
 
 
@@ -352,9 +353,9 @@ def test_uncertain_hands_weigh_less_and_slow_the_robot(arm) -> None:
     pose = person(4.0)
     std = np.where((pose.time > 1.5) & (pose.time < 2.5), 0.2, 0.02)
     unsure = replace(pose, point_cov={"right_hand": std[:, None, None] ** 2 * np.eye(3)})
-    asked = wish(unsure, arm)
-    assert asked.arms[0].weight[200] < 0.2
-    assert asked.arms[0].weight[20] > 0.95
+    asked = compute_arm_targets(unsure, arm)
+    assert asked.hands[0].weight[200] < 0.2
+    assert asked.hands[0].weight[20] > 0.95
     assert len(retarget(unsure, arm).time) > 1.2 * len(retarget(pose, arm).time)
 
 
@@ -378,15 +379,15 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     is_sound(found)
     assert error(found)[-1] > 0.05  # it could not get there
     assert found.counts.near > 0
-    why = causes(found, 0)
-    assert why["own body"] > 0.2
-    assert why["own body"] > 0.9 * sum(why.values())
-    _, reached = possible(found)
+    why = attribute_errors(found, 0)
+    assert why["self-collision"] > 0.2
+    assert why["self-collision"] > 0.9 * sum(why.values())
+    _, reached = assess_reachability(found)
     assert reached[-1, 0] == pytest.approx(error(found)[-1], abs=0.02)  # nor could it with all the time there is
 
 
 def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
-    slow = load(find_map(str(write_arm(tmp_path, acceleration=2.0))))
+    slow = load_robot(find_map(str(write_arm(tmp_path, acceleration=2.0))))
     pose = person(4.0, swing=45.0)
     found = retarget(pose, slow)
     is_sound(found)
@@ -416,7 +417,7 @@ def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
         ("shoulder =", "schoulder =", "'schoulder' is not a key; did you mean 'shoulder'"),
         ("elbow = -1.2", "elbow = 1.2", "rest.elbow = 1.2 is outside its limits, -2.6 to -0.02"),
         ("elbow = -1.2", "elbo = -1.2", "rest.elbo: no joint that moves in arm.urdf; did you mean 'elbow'"),
-        ("at = [0.0, 0.0, -0.1]", "at = [0.0, 0.0]", r"hand.at = \[0.0, 0.0\]; three numbers in metres"),
+        ("offset = [0.0, 0.0, -0.1]", "offset = [0.0, 0.0]", r"hand.offset = \[0.0, 0.0\]; three numbers in metres"),
         ("yaw = 12.0", "yaw = 12.0\n[limits.jerk]\nyaw = -5.0", "limits.jerk: joint 'yaw' is -5"),
         (
             "[limits.acceleration]",
@@ -433,7 +434,7 @@ def test_a_map_that_is_wrong_says_where(tmp_path: Path, old: str, new: str, text
     assert old in said
     urdf.with_suffix(".toml").write_text(said.replace(old, new, 1))
     with pytest.raises(BadModel, match=text):
-        load(find_map(str(urdf)))
+        load_robot(find_map(str(urdf)))
 
 
 def with_gripper(urdf: Path, link: str) -> None:
@@ -455,17 +456,17 @@ def test_a_gripper_is_no_joint_of_the_arm(tmp_path: Path, link: str) -> None:
     urdf = write_arm(tmp_path)
     with_gripper(urdf, link)
     with pytest.raises(BadModel, match=r"arms.right.joints: 'finger_1_joint' is no joint of the arm"):
-        load(find_map(str(urdf)))
+        load_robot(find_map(str(urdf)))
 
 
 @pytest.mark.parametrize(("up", "forward"), [("-z", "+x"), ("+z", "-x"), ("+x", "+y")])
 def test_a_rest_of_another_mount_is_refused(tmp_path: Path, up: str, forward: str) -> None:
     urdf = write_arm(tmp_path, up=up, forward=forward)
     with pytest.raises(BadModel, match=r"arm.toml: rest: the right hand is .* give a rest for this mount"):
-        load(find_map(str(urdf)))
+        load_robot(find_map(str(urdf)))
     text = urdf.with_suffix(".toml").read_text()
     urdf.with_suffix(".toml").write_text(text.replace("[rest]\nelbow = -1.2", ""))
-    load(find_map(str(urdf)))
+    load_robot(find_map(str(urdf)))
 
 
 def test_of_an_arm_that_is_not_there_the_message_says_what_to_do(arm) -> None:
@@ -495,7 +496,7 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(BadModel, match="--robot pandas: not known; did you mean 'panda'"):
         find_map("pandas")
     with pytest.raises(BadOption, match=r"--arm left: arm has no left arm; there is: right"):
-        load(find_map(str(urdf)), ("left",))
+        load_robot(find_map(str(urdf)), ("left",))
     urdf.with_suffix(".toml").unlink()
     with pytest.raises(MissingFile, match=r"no arm.toml beside it; a map says which links"):
         find_map(str(urdf))
@@ -572,8 +573,8 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert made == {"trajectory.parquet", "trajectory.csv", "joint_trajectory.json", "joint_trajectory.yaml",
                     "summary.json", "view.html", "episode"}  # fmt: skip
     found = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert found["limits_kept"] is True
-    assert found["self_collision"]["samples_touching"] == 0
+    assert found["within_limits"] is True
+    assert found["self_collisions"]["samples"] == 0
     assert "Limits kept" in text
     page = (tmp_path / "out" / "view.html").read_text()
     assert '"robot 0"' in page
@@ -587,8 +588,8 @@ def test_the_exit_code_says_that_no_robot_should_run_it(
 ) -> None:
     """What the check of the written trajectory finds decides, not what the solver thinks of it."""
     urdf = write_arm(tmp_path)
-    hit = Touching(3, "hand_0 and base_0 at 2.00 s", 10, {"touch at rest": []})
-    monkeypatch.setattr("wepose_pin.retargeting.touching", lambda *_: hit)
+    hit = SelfCollisions(3, "hand_0 and base_0 at 2.00 s", 10, {AT_REST: []})
+    monkeypatch.setattr("wepose_pin.retargeting.find_self_collisions", lambda *_: hit)
     code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
     assert code == 3
     assert "touches itself in 3 samples, first hand_0 and base_0 at 2.00 s" in " ".join(text.split())

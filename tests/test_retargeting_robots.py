@@ -12,25 +12,26 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import NoSolution
 from wepose_pin.pose import Pose
-from wepose_pin.retargeting import ROBOTS, Trajectory, find_map, kept, load, retarget, table, touching, wish
-from wepose_pin.retargeting.maps import example_data
-from wepose_pin.retargeting.person import robot_reach
+from wepose_pin.retargeting import ROBOTS, Trajectory, find_map, check_limits, load_robot, retarget, build_table, find_self_collisions, compute_arm_targets
+from wepose_pin.retargeting.checks import AT_REST
+from wepose_pin.retargeting.maps import find_example_data
+from wepose_pin.retargeting.targets import compute_target_reach
 
 pytest.importorskip("daqp")
 pytestmark = [
     pytest.mark.robots,
-    pytest.mark.skipif(example_data() is None, reason="example-robot-data is not installed"),
+    pytest.mark.skipif(find_example_data() is None, reason="example-robot-data is not installed"),
 ]
 
 
 def is_sound(found: Trajectory) -> None:
     of = found.robot.map
-    held = kept(table(found), of.urdf, of.acceleration, of.jerk)
-    assert held.all, held
-    touched = touching(found.robot, found.time, found.u)
+    held = check_limits(build_table(found), of.urdf, of.acceleration, of.jerk)
+    assert held.passed, held
+    touched = find_self_collisions(found.robot, found.time, found.u)
     assert touched.samples == 0, touched.first
     assert touched.pairs > 10
-    assert touched.left_out["touch at rest"] == []
+    assert touched.excluded[AT_REST] == []
 
 
 def both_arms(seconds: float, **angles: float) -> Pose:
@@ -40,7 +41,7 @@ def both_arms(seconds: float, **angles: float) -> Pose:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_robot_follows_and_keeps_its_limits(name: str) -> None:
-    robot = load(find_map(name))
+    robot = load_robot(find_map(name))
     found = retarget(both_arms(4.0), robot)
     is_sound(found)
     for arm, target in zip(robot.arms, found.targets, strict=True):
@@ -78,40 +79,40 @@ def violent(hz: float, swing: float, across: float, bend: float, phase: float, s
 )
 def test_violent_arms_do_not_touch(motion: tuple[float, ...]) -> None:
     """Hands that meet, the body, and links of one arm that touch only where its joints end."""
-    is_sound(retarget(violent(*motion), load(find_map("talos"))))
+    is_sound(retarget(violent(*motion), load_robot(find_map("talos"))))
 
 
 def test_what_cannot_stop_in_time_is_slowed_and_strict_refuses_it() -> None:
     rng = np.random.default_rng(4)
     motion = [rng.uniform(*of) for of in ((1.0, 2.5), (20.0, 80.0), (30.0, 100.0), (20.0, 60.0), (0.0, 6.28))]
-    robot = load(find_map("talos"))
+    robot = load_robot(find_map("talos"))
     found = retarget(violent(*motion), robot)
     is_sound(found)
-    assert 0.0 < found.tight[0] < 6.0
+    assert 0.0 < found.contact_times[0] < 6.0
     with pytest.raises(NoSolution, match="too fast at"):
         retarget(violent(*motion), robot, strict=True)
 
 
 def test_python_takes_a_robot_by_its_name() -> None:
     pose = both_arms(2.0)
-    np.testing.assert_array_equal(retarget(pose, "panda").u, retarget(pose, load(find_map("panda"))).u)
+    np.testing.assert_array_equal(retarget(pose, "panda").u, retarget(pose, load_robot(find_map("panda"))).u)
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5", "baxter", "tiago_dual"])
 def test_no_jerk_where_the_reach_ends(name: str) -> None:
     """Arms that stretch beyond the reach and come back: jerk about these moments against that of the rest."""
-    robot = load(find_map(name))
+    robot = load_robot(find_map(name))
     pose = both_arms(8.0, flexion=45.0, swing=40.0, abduction=40.0)
-    whole = max(arm.reach / robot_reach(robot, arm) for arm in robot.arms)
-    found = retarget(pose, robot, scale=whole * min(wish(pose, robot).scale.values()))
+    whole = max(arm.reach / compute_target_reach(robot, arm) for arm in robot.arms)
+    found = retarget(pose, robot, scale=whole * min(compute_arm_targets(pose, robot).scale.values()))
     is_sound(found)
     dt, settled = 0.01, found.approach + 100
     for arm, target in zip(robot.arms, found.targets, strict=True):
-        outside = np.linalg.norm(target.position - target.wish, axis=1) > 1e-3
+        outside = np.linalg.norm(target.position - target.unclamped, axis=1) > 1e-3
         edges = settled + np.flatnonzero(np.diff(outside[settled:]))
         assert len(edges) >= 4
         near = np.abs(found.time[:, None] - found.time[edges]).min(axis=1) < 0.2
-        jerk = np.abs(np.diff(found.a, axis=0))[:, arm.joints] / dt / robot.j_most[arm.joints]
+        jerk = np.abs(np.diff(found.run.a, axis=0))[:, arm.joints] / dt / robot.j_max[arm.joints]
         close, elsewhere = jerk[settled:][near[settled + 1 :]], jerk[settled:][~near[settled + 1 :]]
         assert close.max() < 0.5
         assert np.sqrt(np.mean(close**2)) < 1.5 * np.sqrt(np.mean(elsewhere**2))
@@ -135,7 +136,7 @@ def test_the_real_recording(tracked: Pose, name: str) -> None:
         {point: p[keep] for point, p in tracked.points.items()},
         point_cov={point: cov[keep] for point, cov in tracked.point_cov.items()},
     )
-    robot = load(find_map(name))
+    robot = load_robot(find_map(name))
     found = retarget(pose, robot)
     is_sound(found)
     assert np.isfinite(found.u).all()

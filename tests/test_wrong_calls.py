@@ -113,7 +113,7 @@ def right() -> dict[str, dict[str, Any]]:
         sensors=dict(zip(names, [torso, torso], strict=True)),
         joints={"elbow": -1.0},
     )
-    from wepose_pin.retargeting import find_map, load
+    from wepose_pin.retargeting import find_map, load_robot
 
     return {
         "load_session": {"path": folder, "gaps": False},
@@ -136,7 +136,7 @@ def right() -> dict[str, dict[str, Any]]:
         "evaluate": {"pose": pose, "truth": pose},
         "joint_angles": {"pose": pose},
         "export": {"result": folder, "file": folder / "out.csv"},
-        "retarget": {"pose": moving_arm(2.0), "robot": load(find_map(str(urdf)))},
+        "retarget": {"pose": moving_arm(2.0), "robot": load_robot(find_map(str(urdf)))},
         "simulate": {"lengths": dict(person.lengths), "seed": 1, "clasp_s": 5.0, "circles": 0, "rate_hz": 25.0},
     }
 

@@ -374,11 +374,11 @@ def orientation_values(
 
 def robots() -> list[str]:
     """Robots by name whose models are installed."""
-    from wepose_pin.retargeting import find_map, load
+    from wepose_pin.retargeting import find_map, load_robot
 
     found = []
     for name in ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1"):
         with contextlib.suppress(Exception):
-            load(find_map(name), None)
+            load_robot(find_map(name), None)
             found.append(name)
     return found

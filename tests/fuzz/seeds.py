@@ -84,7 +84,7 @@ j2 = 9.0
 joints = ["j1", "j2", "j3"]
 shoulder = { link = "upper" }
 elbow = { link = "fore" }
-hand = { link = "hand", at = [0.0, 0.0, -0.1], fingers = "-z", thumb = "+x" }
+hand = { link = "hand", offset = [0.0, 0.0, -0.1], fingers = "-z", thumb = "+x" }
 """
 SRDF = b"""<robot name="arm"><disable_collisions link1="base" link2="upper" reason="Adjacent"/></robot>"""
 

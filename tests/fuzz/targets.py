@@ -115,17 +115,17 @@ def _setup(path: Path) -> object:
 
 def _retargeted(path: Path) -> object:
     """The input is the URDF of an arm whose map is well."""
-    from wepose_pin.retargeting import find_map, load
-    from wepose_pin.retargeting.collision import Shapes
+    from wepose_pin.retargeting import find_map, load_robot
+    from wepose_pin.retargeting.collision import CollisionModel
 
     (path.parent / "arm.toml").write_bytes(seeds.ARM_MAP)
-    return Shapes(load(find_map(str(path))))
+    return CollisionModel(load_robot(find_map(str(path))))
 
 
 def _srdf(path: Path) -> object:
-    from wepose_pin.retargeting.collision import _excused
+    from wepose_pin.retargeting.collision import _read_disabled_pairs
 
-    return _excused(path)
+    return _read_disabled_pairs(path)
 
 
 def _protocol(path: Path) -> object:

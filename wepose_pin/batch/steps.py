@@ -90,8 +90,8 @@ class ItemSteps:
         outcome = run_retarget(job, provenance=self._provenance)
         return {
             "trajectory_s": outcome.duration_s,
-            "trajectory_limits_kept": outcome.summary["limits_kept"],
-            "trajectory_touching": outcome.summary["self_collision"]["samples_touching"],
+            "trajectory_within_limits": outcome.summary["within_limits"],
+            "trajectory_self_collisions": outcome.summary["self_collisions"]["samples"],
         }
 
     def _export(self, out: Path, options: Row) -> Row:

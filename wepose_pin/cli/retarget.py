@@ -12,7 +12,7 @@ from .parser import Command
 
 
 def run(job: RetargetJob) -> int:
-    """Compute the trajectory; say how well the hands follow and what it keeps."""
+    """Compute the trajectory; print the errors of the hands and the margins to the limits."""
     with progress_bar() as progress:
         outcome = run_retarget(job, progress)
     print_diagnostics([*map(from_json, outcome.summary["diagnostics"]), *outcome.page_failures])
@@ -26,43 +26,43 @@ def run(job: RetargetJob) -> int:
 
 
 def _print_arms(summary: Mapping[str, Any]) -> None:
-    """How well the hands follow, and why they do not."""
+    """Errors of the hands, and their causes."""
     rows, reasons = [], []
     for side, of in summary["arms"].items():
-        inside, turn, swivel, possible = (
-            of[key] for key in ("hand_error_mm", "hand_error_deg", "swivel_error_deg", "possible")
+        inside, rotation, swivel, reachability = (
+            of[key] for key in ("hand_error_mm", "hand_error_deg", "swivel_error_deg", "reachability")
         )
-        near = possible["hand_error_where_reachable_mm"]
+        near = reachability["hand_error_where_reachable_mm"]
         rows.append(
             (
                 side,
                 f"{of['scale']:.2f}",
                 *((f"{error[key]:.1f}" if error else "") for error in (inside, near) for key in ("median", "p90")),
-                f"{turn['median']:.1f}",
+                f"{rotation['median']:.1f}",
                 f"{swivel['median']:.0f}" if swivel else "",
-                f"{100 * possible['reachable_share']:.0f}",
+                f"{100 * reachability['reachable_share']:.0f}",
             )
         )
-        reasons.append((side, *(f"{100 * share:.1f}" for share in of["causes"].values())))
+        reasons.append((side, *(f"{100 * share:.1f}" for share in of["error_attribution"].values())))
     hand = ("hand [mm] median", "90 %", "where it can: median", "90 %")
     print_table(
         f"{summary['robot']}: {summary['duration_s']:.1f} s for {summary['recorded_s']:.1f} s recorded",
-        ("arm", "scale", *hand, "turn [deg]", "elbow swivel [deg]", "can reach [%]"),
+        ("arm", "scale", *hand, "orientation [deg]", "elbow swivel [deg]", "can reach [%]"),
         rows,
     )
-    print_table("Hand more than 20 mm off [% of the time], for", ("arm", *of["causes"]), reasons)
+    print_table("Hand more than 20 mm off [% of the time], for", ("arm", *of["error_attribution"]), reasons)
 
 
 def _print_checks(summary: Mapping[str, Any]) -> None:
-    """What the trajectory keeps, and how long a step took."""
-    margins, touched = summary["limit_margins"], summary["self_collision"]
+    """Margins to the limits, self-collisions and the time of a step."""
+    margins, collisions = summary["limit_margins"], summary["self_collisions"]
     say(
-        f"Limits {'kept' if summary['limits_kept'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "
+        f"Limits {'kept' if summary['within_limits'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "
         f"velocity {100 * margins['velocity_share']:.1f} %, "
         f"acceleration {100 * margins['acceleration_share']:.1f} %, jerk {100 * margins['jerk_share']:.1f} % to spare"
     )
-    if not touched["samples_touching"]:
-        closest = touched["closest_hulls_mm"]
+    if not collisions["samples"]:
+        closest = collisions["min_hull_distance_mm"]
         say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
     say(f"Solved in {summary['solve_ms']['p50']:.2f} ms (p50), {summary['solve_ms']['p99']:.2f} ms (p99) a step")
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic
-from ..errors import WrongOption
 from . import Arms, Progress, arm_sides, no_progress
 from .fields import field_values
 
@@ -64,14 +63,12 @@ class RetargetJob:
     def check(self) -> None:
         """Raise `WeposeError` where there is no such robot, or a number is out of its range."""
         from ..retargeting import find_map
+        from ..retargeting.targets import check_mapping
+        from ..retargeting.trajectory import check_rate
 
         find_map(self.robot)
-        if not 10.0 <= self.rate_hz <= 2000.0:
-            raise WrongOption("rate-hz", f"{self.rate_hz:g}", "from 10 to 2000 samples a second")
-        if self.scale is not None and not 0.0 < self.scale < float("inf"):
-            raise WrongOption("scale", f"{self.scale:g}", "a number above 0 is needed")
-        if not 0.0 <= self.smoothing_hz < float("inf"):
-            raise WrongOption("smoothing-hz", f"{self.smoothing_hz:g}", "0, which does not smooth, or more is needed")
+        check_rate(self.rate_hz)
+        check_mapping(self.scale, self.smoothing_hz)
 
 
 class RetargetOutcome(NamedTuple):
@@ -83,8 +80,8 @@ class RetargetOutcome(NamedTuple):
 
     @property
     def runnable(self) -> bool:
-        """Whether a robot can run it: within its limits, and it does not touch itself."""
-        return bool(self.summary["limits_kept"]) and not self.summary["self_collision"]["samples_touching"]
+        """Whether a robot can run it: within its limits and without self-collision."""
+        return bool(self.summary["within_limits"]) and not self.summary["self_collisions"]["samples"]
 
 
 def run_retarget(
@@ -118,7 +115,7 @@ def run_retarget(
     with whole_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
         pose, body, about = read_result(job.result)
-        robot = retargeting.load(retargeting.find_map(job.robot), arm_sides(job.arm))
+        robot = retargeting.load_robot(retargeting.find_map(job.robot), arm_sides(job.arm))
         trajectory = retargeting.retarget(
             pose,
             robot,
@@ -130,13 +127,14 @@ def run_retarget(
             progress=lambda text, share: progress(text, 0.48 * share + (0.48 if text == "solving" else 0.0)),
         )
         progress("checking", 0.96)
-        limits = retargeting.kept(retargeting.table(trajectory), robot.map.urdf, robot.map.acceleration, robot.map.jerk)
-        touching = retargeting.touching(robot, trajectory.time, trajectory.u)
+        table, limits = retargeting.build_table(trajectory), robot.map
+        check = retargeting.check_limits(table, limits.urdf, limits.acceleration, limits.jerk)
+        collisions = retargeting.find_self_collisions(robot, trajectory.time, trajectory.u)
         progress("writing", 0.98)
         retargeting.write_trajectory(folder, trajectory)
         if job.episode:
             retargeting.write_episode(folder / "episode", trajectory, f"follow the arms of {job.result.name}")
-        summary = as_json(retargeting.summary(trajectory, limits, touching))
+        summary = as_json(retargeting.summarize(trajectory, check, collisions))
         if provenance is None:
             provenance = collect_provenance("retarget", field_values(job))
         text = json.dumps({**summary, "provenance": provenance}, indent=2)

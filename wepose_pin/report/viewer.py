@@ -96,20 +96,19 @@ def pose_html(
 
 def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "", fps: float = 30.0) -> str:
     """The page on which a person and the robot that does as they do move together, on the robot's time."""
-    from ..retargeting.looks import parts, stands_at
-    from ..retargeting.looks import placements as robot_placements
+    from ..retargeting.visuals import build_parts, compute_placements, place_beside_person
 
     frames = frame_indices(trajectory.time, fps)
-    nearest = np.abs(pose.time[:, None] - trajectory.recorded[frames][None, :]).argmin(axis=0)
+    nearest = np.abs(pose.time[:, None] - trajectory.recorded_time[frames][None, :]).argmin(axis=0)
     q = configuration(model, {segment: quat_WL[nearest] for segment, quat_WL in pose.quat_WL.items()})
     known = set(known_links(model, pose.quat_WL))
     visuals = [visual for visual in model.visuals if visual.link in known]
     placed = placements(model, q, dict.fromkeys(visual.link for visual in visuals))
     robot = trajectory.robot
-    drawn = parts(robot)
+    drawn = build_parts(robot)
     shoulder_z = float(np.nanmedian([pose.points[f"{arm.side}_shoulder"][:, 2] for arm in robot.arms]))
-    R_WB, p_WB = stands_at(robot, drawn, shoulder_z, FLOOR_Z)
-    moved = robot_placements(trajectory, drawn, frames, R_WB, p_WB)
+    R_WB, p_WB = place_beside_person(robot, drawn, shoulder_z, FLOOR_Z)
+    moved = compute_placements(trajectory, drawn, frames, R_WB, p_WB)
     trails = {arm.side: pose.points[f"{arm.side}_hand"][nearest] for arm in robot.arms}  # short: heads are beside them
     trails |= {f"{arm.side}_robot": trajectory.hand[arm.side][frames] @ R_WB.T + p_WB for arm in robot.arms}
     return view_html(

@@ -1,34 +1,35 @@
 """A person's arms to a robot's: targets from a pose, limits, one quadratic programme a step, a trajectory.
 
-Frames: the robot's root is the frame of its URDF; T is the person's torso, x forward, y left, z up. ``R_BT`` turns T's
-coordinates into the root's. Values of joints are `u`, one for each joint that moves by itself; `q` is Pinocchio's.
+Frames: B is the robot's root, the frame of its URDF; T is the person's torso, x forward, y left, z up; ``R_BT`` maps
+coordinates in T to B. `u` holds the values of the independent joints, `q` is Pinocchio's configuration.
 """
 
-from .check import Kept, kept, touching
-from .files import summary, table, write_episode, write_trajectory
+from .checks import LimitCheck, SelfCollisions, check_limits, find_self_collisions
+from .controller import Tasks
+from .files import build_table, summarize, write_episode, write_trajectory
 from .maps import ROBOTS, RobotMap, find_map, read_map
-from .person import Wish, wish
-from .plan import Trajectory, retarget
-from .robot import Robot, load
-from .solver import Tasks
+from .robot import Robot, load_robot
+from .targets import ArmTargets, compute_arm_targets
+from .trajectory import Trajectory, retarget
 
 __all__ = [
     "ROBOTS",
-    "Kept",
+    "ArmTargets",
+    "LimitCheck",
     "Robot",
     "RobotMap",
+    "SelfCollisions",
     "Tasks",
     "Trajectory",
-    "Wish",
+    "build_table",
+    "check_limits",
+    "compute_arm_targets",
     "find_map",
-    "kept",
-    "load",
+    "find_self_collisions",
+    "load_robot",
     "read_map",
     "retarget",
-    "summary",
-    "table",
-    "touching",
-    "wish",
+    "summarize",
     "write_episode",
     "write_trajectory",
 ]

@@ -1,4 +1,4 @@
-"""What is written of a trajectory: tables, ROS 2's message, an episode for learning, the summary."""
+"""Files of a trajectory: tables, ROS 2's message, an episode for learning, the summary."""
 
 from __future__ import annotations
 
@@ -13,46 +13,45 @@ from scipy.spatial.transform import Rotation
 from ..diagnostics import ERROR, INFO, Diagnostic, as_json
 from ..recording import format_time
 from ..writers.result import write_table
-from .causes import DRAWN_IN, FAR, causes, possible
-from .check import Kept, Touching
+from .checks import AT_REST, LimitCheck, SelfCollisions
 from .collision import CLEARANCE
-from .person import robot_reach
-from .plan import Trajectory
+from .error_attribution import CLAMPED, FAR, assess_reachability, attribute_errors
+from .targets import compute_target_reach
+from .trajectory import Trajectory
 
 DIGITS = 8  # of angles in text
-MOST_MOMENTS = 6  # of those at which the motion was slowed
-BENT = 0.03  # [m] from the line shoulder-hand to the elbow: below it the swivel says nothing
+MAX_MOMENTS = 6  # that a diagnostic names
+MIN_SWIVEL = 0.03  # [m] from the line shoulder-hand to the elbow, below which the swivel error is undefined
 
 
-def table(trajectory: Trajectory) -> pl.DataFrame:
+def build_table(trajectory: Trajectory) -> pl.DataFrame:
     """``time``, ``recorded_time`` [s]; then each joint's position, ``_velocity`` and ``_acceleration``."""
-    columns: dict[str, np.ndarray] = {"time": trajectory.time, "recorded_time": trajectory.recorded}
+    run = trajectory.run
+    columns: dict[str, np.ndarray] = {"time": trajectory.time, "recorded_time": trajectory.recorded_time}
     for j, name in enumerate(trajectory.robot.names):
-        columns[name] = trajectory.u[:, j]
-        columns[f"{name}_velocity"] = trajectory.v[:, j]
-        columns[f"{name}_acceleration"] = trajectory.a[:, j]
+        columns |= {name: run.u[:, j], f"{name}_velocity": run.v[:, j], f"{name}_acceleration": run.a[:, j]}
     return pl.DataFrame(columns)
 
 
 def write_trajectory(folder: Path, trajectory: Trajectory) -> None:
-    """``trajectory.parquet``, ``.csv``, and ``joint_trajectory.json`` and ``.yaml``."""
-    whole = table(trajectory)
-    write_table(folder / "trajectory.parquet", whole)
-    whole.write_csv(folder / "trajectory.csv", float_precision=DIGITS)
-    text = joint_trajectory(trajectory)
-    (folder / "joint_trajectory.json").write_text(text, encoding="utf-8")
-    (folder / "joint_trajectory.yaml").write_text(text, encoding="utf-8")  # YAML holds JSON; a point a line
+    """Write ``trajectory.parquet``, ``.csv``, and ``joint_trajectory.json`` and ``.yaml``."""
+    table = build_table(trajectory)
+    write_table(folder / "trajectory.parquet", table)
+    table.write_csv(folder / "trajectory.csv", float_precision=DIGITS)
+    text = _format_joint_trajectory(trajectory)
+    for suffix in ("json", "yaml"):  # JSON is YAML, one point a line
+        (folder / f"joint_trajectory.{suffix}").write_text(text, encoding="utf-8")
 
 
-def joint_trajectory(trajectory: Trajectory) -> str:
-    """ROS 2's trajectory_msgs/msg/JointTrajectory; controllers draw a parabola between its points, as we do."""
-    rows = []
+def _format_joint_trajectory(trajectory: Trajectory) -> str:
+    """ROS 2's trajectory_msgs/msg/JointTrajectory."""
+    rows, run = [], trajectory.run
     for k, time in enumerate(trajectory.time.tolist()):
         seconds, nanoseconds = divmod(round(1e9 * time), 10**9)
         point = {
-            "positions": np.round(trajectory.u[k], DIGITS).tolist(),
-            "velocities": np.round(trajectory.v[k], DIGITS).tolist(),
-            "accelerations": np.round(trajectory.a[k], DIGITS).tolist(),
+            "positions": np.round(run.u[k], DIGITS).tolist(),
+            "velocities": np.round(run.v[k], DIGITS).tolist(),
+            "accelerations": np.round(run.a[k], DIGITS).tolist(),
             "effort": [],
             "time_from_start": {"sec": seconds, "nanosec": nanoseconds},
         }
@@ -66,7 +65,7 @@ def joint_trajectory(trajectory: Trajectory) -> str:
 
 
 def write_episode(folder: Path, trajectory: Trajectory, task: str) -> None:
-    """One episode as LeRobot's data set of version 2.1 holds it: the state, and as action the state one sample on."""
+    """Write a data set of one episode as LeRobot 2.1 reads it: the state, and as action the next state."""
     n, names = len(trajectory.time), list(trajectory.robot.names)
     state = trajectory.u.astype(np.float32)
     action = np.vstack([state[1:], state[-1:]])
@@ -114,111 +113,116 @@ def write_episode(folder: Path, trajectory: Trajectory, task: str) -> None:
         (folder / "meta" / f"{name}.jsonl").write_text(json.dumps(line) + "\n", encoding="utf-8")
 
 
-def summary(trajectory: Trajectory, held: Kept, touched: Touching) -> dict[str, Any]:
-    """Numbers and words for ``summary.json``."""
-    robot, begin = trajectory.robot, trajectory.approach
-    arms: dict[str, Any] = {}
-    frames, reached = possible(trajectory)
-    for i, (arm, target) in enumerate(zip(robot.arms, trajectory.targets, strict=True)):
-        side = arm.side
-        inside = np.linalg.norm(target.position - target.wish, axis=1)[begin:] < DRAWN_IN
-        far = 1e3 * np.linalg.norm(trajectory.hand[side] - target.wish, axis=1)[begin:]
-        turn = Rotation.from_matrix(trajectory.turn[side][begin:]).inv() * Rotation.from_matrix(target.rotation[begin:])
-        bend, asked = trajectory.bend[side][begin:], target.bend[begin:]
-        size, wanted = np.linalg.norm(bend, axis=1), np.linalg.norm(asked, axis=1)
-        bent = (size > BENT) & (wanted > BENT)
-        cosine = np.sum(bend[bent] * asked[bent], axis=1) / (size[bent] * wanted[bent])
-        arms[side] = {
-            "scale": round(trajectory.wish.scale[side], 4),
-            "reach_m": round(robot_reach(robot, arm), 4),
-            "farthest_reach_m": round(arm.reach, 4),
-            "inside_reach_share": _share(inside),
-            "hand_error_mm": _quantiles(far[inside]),
-            "hand_error_everywhere_mm": _quantiles(far),
-            "possible": _possible(far[frames - begin], 1e3 * reached[:, i]),
-            "causes": causes(trajectory, i),
-            "hand_error_deg": _quantiles(np.degrees(turn.magnitude())),
-            "swivel_error_deg": _quantiles(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
-            "lost_share": _share(target.lost[begin:]),
-        }
-    ms, dt = 1e3 * trajectory.solve_s, float(trajectory.time[1] - trajectory.time[0])
+def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:
+    """Contents of ``summary.json``."""
+    robot, begin, run = trajectory.robot, trajectory.approach, trajectory.run
+    frames, reached = assess_reachability(trajectory)
+    arms = {
+        arm.side: _summarize_arm(trajectory, i, frames - begin, 1e3 * reached[:, i]) for i, arm in enumerate(robot.arms)
+    }
+    ms, dt = 1e3 * run.solve_s, float(trajectory.time[1] - trajectory.time[0])
     counts, steps = trajectory.counts, max(trajectory.counts.steps, 1)
-    recorded_s = float(trajectory.recorded[-1] - trajectory.recorded[begin])
-    shown_s = float(trajectory.time[np.argmax(trajectory.recorded)] - trajectory.time[begin])
-    slow = trajectory.slowest
-    nearest = float(trajectory.closest.min())
-    jerk = np.abs(np.diff(trajectory.a, axis=0)) / dt
-    slowed = shown_s / recorded_s if recorded_s else None
+    recorded_time, slowest = trajectory.recorded_time, trajectory.slowest
+    recorded_s = float(recorded_time[-1] - recorded_time[begin])
+    shown_s = float(trajectory.time[np.argmax(recorded_time)] - trajectory.time[begin])
+    slowdown = shown_s / recorded_s if recorded_s else None
+    nearest = float(run.hull_distance.min())
+    jerk = np.abs(np.diff(run.a, axis=0)) / dt
     return {
         "robot": robot.map.name,
         "urdf": robot.map.urdf.name,
         "joints": list(robot.names),
-        "about": robot.map.about,
+        "description": robot.map.description,
         "rate_hz": round(1.0 / dt, 3),
         "duration_s": round(float(trajectory.time[-1]), 3),
         "approach_s": round(float(trajectory.time[begin]), 3),
         "recorded_s": round(recorded_s, 3),
-        "slowed": None if slowed is None else round(slowed, 3),
-        "slowest": None if slow is None else slow._asdict(),
-        "slowed_for_contact_s": list(trajectory.tight),
+        "slowdown": None if slowdown is None else round(slowdown, 3),
+        "slowest": None if slowest is None else slowest._asdict(),
+        "contact_times_s": list(trajectory.contact_times),
         "arms": arms,
-        "limits_kept": held.all,
+        "within_limits": limits.passed,
         "limit_margins": {
-            "position_rad": held.position,
-            "velocity_share": held.velocity,
-            "acceleration_share": held.acceleration,
-            "jerk_share": held.jerk,
+            "position_rad": limits.position,
+            "velocity_share": limits.velocity,
+            "acceleration_share": limits.acceleration,
+            "jerk_share": limits.jerk,
         },
         "jerk_rad_s3": {"rms": round(float(np.sqrt(np.mean(jerk**2))), 2), "largest": round(float(jerk.max()), 1)},
-        "self_collision": {
-            "samples_touching": touched.samples,
-            "first": touched.first or None,
-            "pairs": touched.pairs,
-            "pairs_left_out": {why: len(pairs) for why, pairs in touched.left_out.items()},
-            "touch_at_rest": touched.left_out["touch at rest"],
-            "closest_hulls_mm": round(1e3 * nearest, 1) if np.isfinite(nearest) else None,
-            "kept_clear_mm": 1e3 * CLEARANCE,
+        "self_collisions": {
+            "samples": collisions.samples,
+            "first": collisions.first or None,
+            "pairs": collisions.pairs,
+            "excluded_pairs": {reason: len(pairs) for reason, pairs in collisions.excluded.items()},
+            "pairs_in_collision_at_rest": collisions.excluded[AT_REST],
+            "min_hull_distance_mm": round(1e3 * nearest, 1) if np.isfinite(nearest) else None,
+            "clearance_mm": 1e3 * CLEARANCE,
         },
         "steps": {
             "all": counts.steps,
             "singular_share": round(counts.singular / (steps * len(robot.arms)), 4),
-            "near_itself_share": round(counts.near / steps, 4),
-            "no_solution_share": round(counts.held / steps, 4),
+            "near_clearance_share": round(counts.near / steps, 4),
+            "infeasible_share": round(counts.infeasible / steps, 4),
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
-        "diagnostics": [
-            as_json(diagnostic) for diagnostic in trajectory_diagnostics(trajectory, held, touched, slowed)
-        ],
+        "diagnostics": [as_json(found) for found in diagnose_trajectory(trajectory, limits, collisions, slowdown)],
     }
 
 
-def trajectory_diagnostics(
-    trajectory: Trajectory, held: Kept, touched: Touching, slowed: float | None = None
+def _summarize_arm(trajectory: Trajectory, i: int, frames: np.ndarray, reached: np.ndarray) -> dict[str, Any]:
+    """One arm's errors; `reached` (m,) [mm] is what unlimited time leaves of the hand's error at samples `frames`."""
+    robot, begin, run = trajectory.robot, trajectory.approach, trajectory.run
+    arm, target = robot.arms[i], trajectory.targets[i]
+    inside = np.linalg.norm(target.position - target.unclamped, axis=1)[begin:] < CLAMPED
+    far = 1e3 * np.linalg.norm(run.hand[i] - target.unclamped, axis=1)[begin:]
+    error = Rotation.from_matrix(run.rotation[i, begin:]).inv() * Rotation.from_matrix(target.rotation[begin:])
+    swivel, wanted = run.swivel[i, begin:], target.swivel[begin:]
+    size, wanted_size = np.linalg.norm(swivel, axis=1), np.linalg.norm(wanted, axis=1)
+    flexed = (size > MIN_SWIVEL) & (wanted_size > MIN_SWIVEL)
+    cosine = np.sum(swivel[flexed] * wanted[flexed], axis=1) / (size[flexed] * wanted_size[flexed])
+    return {
+        "scale": round(trajectory.arm_targets.scale[arm.side], 4),
+        "reach_m": round(compute_target_reach(robot, arm), 4),
+        "farthest_reach_m": round(arm.reach, 4),
+        "inside_reach_share": _share(inside),
+        "hand_error_mm": _quantiles(far[inside]),
+        "hand_error_everywhere_mm": _quantiles(far),
+        "reachability": _summarize_reachability(far[frames], reached),
+        "error_attribution": attribute_errors(trajectory, i),
+        "hand_error_deg": _quantiles(np.degrees(error.magnitude())),
+        "swivel_error_deg": _quantiles(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
+        "lost_share": _share(target.lost[begin:]),
+    }
+
+
+def diagnose_trajectory(
+    trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions, slowdown: float | None = None
 ) -> list[Diagnostic]:
-    """What to know before a robot runs the trajectory; `slowed`: how many times as long as the recording it takes."""
+    """Diagnostics of a trajectory; `slowdown`: its duration over that of the recording."""
     name = trajectory.robot.map.name
     found = []
-    margins = {key: getattr(held, key) for key in ("position", "velocity", "acceleration", "jerk")}
-    for quantity, margin in margins.items():
+    for quantity in ("position", "velocity", "acceleration", "jerk"):
+        margin = getattr(limits, quantity)
         if margin < 0.0:
             facts = {"quantity": quantity} | ({"variant": "position"} if quantity == "position" else {})
             found.append(Diagnostic("robot-limits-exceeded", ERROR, name, -margin, 0.0, facts))
-    if not (held.even and held.rests):
+    if not (limits.consistent and limits.ends_at_rest):
         found.append(Diagnostic("robot-limits-exceeded", ERROR, name, facts={"variant": "curve"}))
-    if touched.samples:
-        found.append(Diagnostic("robot-self-collision", ERROR, name, touched.samples, 0.0, {"first": touched.first}))
-    slow = trajectory.slowest
-    if slow is not None and slowed is not None:
-        slowest: dict[str, float | str] = {"joint": slow.joint, "moment": slow.time, "quantity": slow.what}
-        found.append(Diagnostic("trajectory-slowed", INFO, name, slowed, facts=slowest))
-    if trajectory.tight:
-        moments = ", ".join(map(format_time, trajectory.tight[:MOST_MOMENTS]))
+    if collisions.samples:
+        first = {"first": collisions.first}
+        found.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
+    slowest = trajectory.slowest
+    if slowest is not None and slowdown is not None:
+        moment = {"joint": slowest.joint, "moment": slowest.time, "quantity": slowest.quantity}
+        found.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=moment))
+    if trajectory.contact_times:
+        moments = ", ".join(map(format_time, trajectory.contact_times[:MAX_MOMENTS]))
         found.append(Diagnostic("trajectory-slowed-for-contact", INFO, name, facts={"moments": f"{moments} s"}))
     return found
 
 
-def _possible(far: np.ndarray, reached: np.ndarray) -> dict[str, Any]:
-    """How much of the hand's error [mm] is the robot's form, at some of the samples; see `causes.possible`."""
+def _summarize_reachability(far: np.ndarray, reached: np.ndarray) -> dict[str, Any]:
+    """The hand's errors [mm] at some samples beside those of `assess_reachability`."""
     known = np.isfinite(reached)
     far, reached = far[known], reached[known]
     within = reached < 1e3 * FAR
@@ -237,5 +241,5 @@ def _quantiles(values: np.ndarray) -> dict[str, float] | None:
     return {name: round(float(np.percentile(values, q)), 2) for name, q in (("median", 50), ("p90", 90), ("p99", 99))}
 
 
-def _share(which: np.ndarray) -> float:
-    return round(float(np.mean(which)), 4)
+def _share(mask: np.ndarray) -> float:
+    return round(float(np.mean(mask)), 4)

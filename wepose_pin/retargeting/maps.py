@@ -1,4 +1,4 @@
-"""A robot's map: which of its links are shoulder, elbow and hand, how it stands, how fast it may change speed."""
+"""A robot's map (TOML): the links that are shoulder, elbow and hand, its mount, its acceleration and jerk limits."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ ROBOTS = ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1")
 SIDES = ("left", "right")
 AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
-_KEYS = ("format", "urdf", "srdf", "about", "up", "forward", "base", "rest", "limits", "arms")
-RISE_S = 0.02  # [s] in which a joint reaches its full acceleration, where nothing is said of its jerk
+_KEYS = ("format", "urdf", "srdf", "description", "up", "forward", "base", "rest", "limits", "arms")
 _ARM_KEYS = ("joints", "shoulder", "elbow", "hand", "reach")
+RISE_S = 0.02  # [s] to the full acceleration, from which the jerk limit follows where the map has none
 
 
 class LinkPoint(NamedTuple):
-    """A point of the robot: where it lies in a link [m]."""
+    """A point of the robot, at `offset` [m] in the frame of a link."""
 
     link: str
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -36,12 +36,12 @@ class ArmMap:
 
     Parameters
     ----------
-    joints : from the shoulder to the hand; all others stay at rest
-    shoulder : the point that is the person's shoulder; it stays where it is at rest
-    elbow : None for an arm whose elbow is left to the solver
-    hand : the point that is the person's palm
-    fingers, thumb : axes of the hand's link along the fingers, and to the thumb's side
-    reach : [m] what the person's straight arm becomes; None: 95 % of what the joints allow
+    joints : from the shoulder to the hand; all others keep the rest posture
+    shoulder : corresponds to the person's shoulder; does not move
+    elbow : None: the controller is free to choose it
+    hand : corresponds to the person's palm
+    fingers, thumb : axes of the hand's link along the fingers, and to the side of the thumb
+    reach : [m] of the person's straight arm; None: 95 % of what the joints allow
     """
 
     joints: tuple[str, ...]
@@ -55,18 +55,17 @@ class ArmMap:
 
 @dataclass(frozen=True)
 class RobotMap:
-    """All that retargeting has to know of a robot beyond its URDF.
+    """What retargeting needs of a robot beyond its URDF.
 
     Parameters
     ----------
-    name : of the robot
-    where : for error texts
-    urdf, srdf : its files; without an SRDF what touches at rest, or always, is not looked at
+    where : the map's file name, for error messages
+    urdf, srdf : files; without an SRDF pairs in collision in the rest posture, or always, are not checked
     base : link whose axes `up` and `forward` are; empty: the root
-    up, forward : axes of the base that point up, and to where the person faces
-    rest : joint → where it rests [rad or m]; zero where not named
-    acceleration, jerk : joint → most it may have [rad/s²], [rad/s³]
-    about : sources, in words
+    up, forward : axes of the base that point up, and where the person faces
+    rest : joint → value in the rest posture [rad or m]; zero where not named
+    acceleration, jerk : joint → limit [rad/s²], [rad/s³]
+    description : free text, with the sources of the limits
     """
 
     name: str
@@ -80,16 +79,16 @@ class RobotMap:
     acceleration: Mapping[str, float]
     jerk: Mapping[str, float]
     arms: Mapping[str, ArmMap]
-    about: str = ""
+    description: str = ""
 
 
 def find_map(robot: str) -> RobotMap:
-    """The map of a robot by name, of a URDF with a map of the same name beside it, or a map file itself.
+    """The map of a robot by name, by its URDF with a map of the same name beside it, or by the map's file.
 
     Raises
     ------
     MissingFile, BadModel
-        No such robot or file; the map lacks something, or has something that is not known.
+        No such robot or file; the map lacks a key or has an unknown one.
     """
     path = Path(robot)
     if path.suffix.lower() == ".toml":
@@ -97,20 +96,20 @@ def find_map(robot: str) -> RobotMap:
     if path.suffix.lower() in (".urdf", ".xml"):
         if not path.is_file():
             raise MissingFile(f"--robot {robot}: no such file")
-        beside = path.with_suffix(".toml")
-        if not beside.is_file():
+        file = path.with_suffix(".toml")
+        if not file.is_file():
             raise MissingFile(
-                f"--robot {robot}: no {beside.name} beside it; a map says which links are shoulder, elbow and hand"
+                f"--robot {robot}: no {file.name} beside it; a map says which links are shoulder, elbow and hand"
                 " (docs/retargeting.md)"
             )
-        return read_map(beside, urdf=path)
+        return read_map(file, urdf=path)
     if robot not in ROBOTS:
         raise BadModel(f"--robot {robot}: not known; {one_of(ROBOTS, robot)}; or a file, FILE.urdf")
     return read_map(asset("urdf", f"robots/{robot}.toml"))
 
 
 def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
-    """Read a map; `urdf` in place of the file that it names.
+    """The map in a file; `urdf` replaces the URDF that it names.
 
     Raises
     ------
@@ -119,42 +118,49 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     """
     table = read_toml(path, "a robot's map (docs/retargeting.md)", BadModel)
     where = path.name
-    _known(table, _KEYS, where)
+    _check_keys(table, _KEYS, where)
     if table.get("format") != 1:
         raise BadModel(f"{where}: format = {table.get('format')!r}; this version reads format = 1")
-    up, forward = _axis(table, "up", where), _axis(table, "forward", where)
-    _across(up, forward, f"{where}: up, forward")
-    arms = _table(table, "arms", where)
+    up, forward = _read_axis(table, "up", where), _read_axis(table, "forward", where)
+    _check_perpendicular(up, forward, f"{where}: up, forward")
+    arms = _read_table(table, "arms", where)
     if not arms:
         raise BadModel(f"{where}: no arms; at least one of [arms.left] and [arms.right] is needed")
     for side in arms:
         if side not in SIDES:
             raise BadModel(f"{where}: arms.{side} is no side; {one_of(SIDES, side)}")
-    sides = {side: _arm(arms[side], f"{where}: arms.{side}") for side in SIDES if side in arms}
-    limits = _table(table, "limits", where)
-    _known(limits, ("acceleration", "jerk", "source"), f"{where}: limits")
+    sides = {side: _read_arm(arms[side], f"{where}: arms.{side}") for side in SIDES if side in arms}
+    limits = _read_table(table, "limits", where)
+    _check_keys(limits, ("acceleration", "jerk", "source"), f"{where}: limits")
     joints = [name for arm in sides.values() for name in arm.joints]
-    acceleration = _of_joints(limits, "acceleration", joints, f"{where}: limits")
-    jerk = {name: most / RISE_S for name, most in acceleration.items()}
-    jerk |= _of_joints(limits, "jerk", joints, f"{where}: limits")
+    acceleration = _read_joint_values(limits, "acceleration", joints, f"{where}: limits")
+    jerk = {name: limit / RISE_S for name, limit in acceleration.items()}
+    jerk |= _read_joint_values(limits, "jerk", joints, f"{where}: limits")
     return RobotMap(
         name=path.stem,
         where=where,
-        urdf=urdf or _file(path, table.get("urdf"), "urdf"),
-        srdf=_file(path, table["srdf"], "srdf") if "srdf" in table else None,
+        urdf=urdf or _find_file(path, table.get("urdf"), "urdf"),
+        srdf=_find_file(path, table["srdf"], "srdf") if "srdf" in table else None,
         base=str(table.get("base", "")),
         up=up,
         forward=forward,
-        rest=_numbers(_table(table, "rest", where), f"{where}: rest"),
+        rest=_read_numbers(_read_table(table, "rest", where), f"{where}: rest"),
         acceleration=acceleration,
         jerk=jerk,
         arms=sides,
-        about=" ".join(str(text) for text in (table.get("about", ""), limits.get("source", "")) if text),
+        description=" ".join(str(text) for text in (table.get("description", ""), limits.get("source", "")) if text),
     )
 
 
-def example_data() -> Path | None:
-    """The folder with the robots of example-robot-data, None where it is not installed."""
+def package_folders(urdf: Path) -> list[str]:
+    """Folders in which ``package://`` paths of a URDF are looked up."""
+    folders = [str(folder) for folder in urdf.absolute().parents]
+    data = find_example_data()
+    return folders if data is None else [*folders, str(data), str(data.parent), str(data.parent.parent)]
+
+
+def find_example_data() -> Path | None:
+    """The folder with the robots of example-robot-data; None where it is not installed."""
     for root in map(Path, sys.path):
         for prefix in (root / "cmeel.prefix", root.parent.parent.parent):
             if (prefix / EXAMPLE_DATA).is_dir():
@@ -162,13 +168,13 @@ def example_data() -> Path | None:
     return None
 
 
-def _file(path: Path, name: Any, key: str) -> Path:
+def _find_file(path: Path, name: Any, key: str) -> Path:
     if not isinstance(name, str):
         raise BadModel(f"{path.name}: {key} = {name!r}; the path of a file is needed")
-    beside = path.parent / name
-    if beside.is_file():
-        return beside
-    data = example_data()
+    file = path.parent / name
+    if file.is_file():
+        return file
+    data = find_example_data()
     if data is not None and (data / name).is_file():
         return data / name
     if data is None and "/" in name:
@@ -179,85 +185,85 @@ def _file(path: Path, name: Any, key: str) -> Path:
     raise MissingFile(f"{path.name}: {key} = '{name}': no such file beside the map or in example-robot-data")
 
 
-def _arm(table: Any, where: str) -> ArmMap:
+def _read_arm(table: Any, where: str) -> ArmMap:
     if not isinstance(table, dict):
         raise BadModel(f"{where} = {table!r} is not a table")
-    _known(table, _ARM_KEYS, where)
+    _check_keys(table, _ARM_KEYS, where)
     joints = table.get("joints")
     if not isinstance(joints, list) or not joints or not all(isinstance(name, str) for name in joints):
         raise BadModel(f"{where}.joints = {joints!r}; a list of joints from the shoulder to the hand is needed")
     hand = table.get("hand")
     if not isinstance(hand, dict):
-        raise BadModel(f"{where}.hand = {hand!r}; {{ link, at, fingers, thumb }} is needed")
-    fingers, thumb = _axis(hand, "fingers", f"{where}.hand"), _axis(hand, "thumb", f"{where}.hand")
-    _across(fingers, thumb, f"{where}.hand: fingers, thumb")
+        raise BadModel(f"{where}.hand = {hand!r}; {{ link, offset, fingers, thumb }} is needed")
+    fingers, thumb = _read_axis(hand, "fingers", f"{where}.hand"), _read_axis(hand, "thumb", f"{where}.hand")
+    _check_perpendicular(fingers, thumb, f"{where}.hand: fingers, thumb")
     reach = table.get("reach")
     if reach is not None and not (_is_number(reach) and reach > 0.0):
         raise BadModel(f"{where}.reach = {reach!r}; metres above 0 are needed")
     return ArmMap(
         joints=tuple(joints),
-        shoulder=_point(table.get("shoulder"), f"{where}.shoulder"),
-        elbow=_point(table["elbow"], f"{where}.elbow") if "elbow" in table else None,
-        hand=_point({key: hand[key] for key in ("link", "at") if key in hand}, f"{where}.hand"),
+        shoulder=_read_point(table.get("shoulder"), f"{where}.shoulder"),
+        elbow=_read_point(table["elbow"], f"{where}.elbow") if "elbow" in table else None,
+        hand=_read_point({key: hand[key] for key in ("link", "offset") if key in hand}, f"{where}.hand"),
         fingers=fingers,
         thumb=thumb,
         reach=None if reach is None else float(reach),
     )
 
 
-def _point(value: Any, where: str) -> LinkPoint:
+def _read_point(value: Any, where: str) -> LinkPoint:
     if not isinstance(value, dict) or not isinstance(value.get("link"), str):
         raise BadModel(
-            f'{where} = {value!r}; {{ link = "…" }} is needed, and at = [x, y, z] in metres where it is not 0'
+            f'{where} = {value!r}; {{ link = "…" }} is needed, and offset = [x, y, z] in metres where it is not 0'
         )
-    _known(value, ("link", "at"), where)
-    at = value.get("at", [0.0, 0.0, 0.0])
-    if not isinstance(at, list) or len(at) != 3 or not all(_is_number(v) for v in at):
-        raise BadModel(f"{where}.at = {at!r}; three numbers in metres are needed")
-    return LinkPoint(value["link"], (float(at[0]), float(at[1]), float(at[2])))
+    _check_keys(value, ("link", "offset"), where)
+    offset = value.get("offset", [0.0, 0.0, 0.0])
+    if not isinstance(offset, list) or len(offset) != 3 or not all(_is_number(v) for v in offset):
+        raise BadModel(f"{where}.offset = {offset!r}; three numbers in metres are needed")
+    return LinkPoint(value["link"], (float(offset[0]), float(offset[1]), float(offset[2])))
 
 
-def _axis(table: Mapping[str, Any], key: str, where: str) -> str:
+def _read_axis(table: Mapping[str, Any], key: str, where: str) -> str:
     value = table.get(key)
     if not isinstance(value, str) or value not in AXES:
         raise BadModel(f"{where}.{key} = {value!r}; {one_of(AXES)}" if value else f"{where}: no {key}; {one_of(AXES)}")
     return str(value)
 
 
-def _across(a: str, b: str, where: str) -> None:
+def _check_perpendicular(a: str, b: str, where: str) -> None:
     if a[1] == b[1]:
         raise BadModel(f"{where}: {a} and {b} lie on one line; two axes at right angles are needed")
 
 
-def _table(table: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
+def _read_table(table: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
     value = table.get(key, {})
     if not isinstance(value, dict):
         raise BadModel(f"{where}: {key} = {value!r} is not a table")
     return value
 
 
-def _numbers(table: Mapping[str, Any], where: str) -> dict[str, float]:
+def _read_numbers(table: Mapping[str, Any], where: str) -> dict[str, float]:
     for name, value in table.items():
         if not _is_number(value):
             raise BadModel(f"{where}.{name} = {value!r}; a number is needed")
     return {name: float(value) for name, value in table.items()}
 
 
-def _of_joints(table: Mapping[str, Any], key: str, joints: list[str], where: str) -> dict[str, float]:
+def _read_joint_values(table: Mapping[str, Any], key: str, joints: list[str], where: str) -> dict[str, float]:
     """One number for all joints, or a table with a number for each."""
     value = table.get(key, {})
     if _is_number(value):
         return dict.fromkeys(joints, float(value))
     if not isinstance(value, dict):
         raise BadModel(f"{where}.{key} = {value!r}; a number for all joints, or a table with one for each, is needed")
-    return _numbers(value, f"{where}.{key}")
+    return _read_numbers(value, f"{where}.{key}")
 
 
 def _is_number(value: Any) -> bool:
     return is_number(value, 1e6)
 
 
-def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
+def _check_keys(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
     for key in table:
         if key not in keys:
             raise BadModel(f"{where}: '{key}' is not a key; {one_of(keys, key)}")

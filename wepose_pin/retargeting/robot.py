@@ -1,35 +1,36 @@
-"""`Robot`: a URDF with its map as what the solver needs: the arms' joints alone, their points, limits and shapes."""
+"""`Robot`: a URDF and its map, reduced to the joints of the arms, with their points, limits and collision geometry."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
 from ..errors import BadModel, BadOption, native_stderr_muted, one_of
-from .limits import JointLimit, urdf_limits
-from .maps import AXES, ArmMap, LinkPoint, RobotMap, example_data
+from .limits import JointLimit, read_joint_limits
+from .maps import AXES, ArmMap, LinkPoint, RobotMap, package_folders
 
-POSITION_MARGIN = 1e-4  # [rad or m] kept from every limit, so that what is written with fewer digits keeps it too
-SHARE = 0.999  # of velocity and acceleration limits, for the same reason
-REST_OFF_DEG = 60.0  # by which a hand at rest may be off the direction ahead and below, seen from its shoulder
+POSITION_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
+LIMIT_SHARE = 0.999  # of velocity, acceleration and jerk limits, for the same reason
+REST_MARGIN = 0.02  # [rad or m] of the rest posture inside the position limits
+MAX_REST_ANGLE_DEG = 60.0  # between the hand in the rest posture and the direction ahead and below its shoulder
 _REACH_STARTS = 8
 
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm in the reduced model.
+    """One arm of the reduced model.
 
     Parameters
     ----------
-    joints : (n,) int, its joints in the robot's order
-    shoulder : (3,) [m] in the root
-    hand, elbow : Pinocchio's frames; `elbow` −1 without one
-    reach : [m] farthest distance of the hand from the shoulder that the joints allow
+    joints : (n,) int, indices of its joints in `Robot.names`
+    shoulder : (3,) [m] in B
+    hand, elbow : frames of `Robot.model`; `elbow` is -1 for an arm without one
+    reach : [m] largest distance of the hand from the shoulder that the joints allow
     """
 
     side: str
@@ -42,110 +43,133 @@ class Arm:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot as the solver sees it: values `u` (n,) of the joints that move by themselves, in the order of `names`.
+    """A robot as the controller needs it: values `u` (n,) of the independent joints, in the order of `names`.
 
     Parameters
     ----------
-    full, model : Pinocchio's model of the whole robot, and with only the arms' joints
-    shapes : what collides, on `model`
-    coupling, offset : joints of `model` = coupling @ u + offset; more rows than columns where a joint mimics another
-    lower, upper, v_most, a_most, j_most : (n,) limits [rad or m, s], a little inside the URDF's and the map's
-    R_BT : turns coordinates of the person's torso into the root's
+    full, model : Pinocchio's model of the whole robot, and of its arms' joints only
+    geometry : collision geometry on `model`
+    coupling, offset : joints of `model` = coupling @ u + offset; a joint that mimics another has a row of its own
+    lower, upper, v_max, a_max, j_max : (n,) limits [rad or m, s], a little inside those of URDF and map
+    rest, rest_full : (n,) rest posture, and as a configuration of `full`
+    R_BT : maps coordinates in the person's torso to B
     """
 
     map: RobotMap
     names: tuple[str, ...]
     full: Any
     model: Any
-    shapes: Any
+    geometry: Any
     coupling: np.ndarray
     offset: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    v_most: np.ndarray
-    a_most: np.ndarray
-    j_most: np.ndarray
+    v_max: np.ndarray
+    a_max: np.ndarray
+    j_max: np.ndarray
     rest: np.ndarray
     rest_full: np.ndarray
     R_BT: np.ndarray
     arms: tuple[Arm, ...]
 
-    def q(self, u: np.ndarray) -> np.ndarray:
-        """Pinocchio's configuration of `model`."""
+    def configuration(self, u: np.ndarray) -> np.ndarray:
+        """Pinocchio's configuration `q` of `model`."""
         values = self.coupling @ u + self.offset
-        if self._plain:
+        if self.model.nq == self.model.nv:
             return values
         q = pin.neutral(self.model)
-        for k, (at, size) in enumerate(self._places):
-            q[at : at + size] = values[k] if size == 1 else (np.cos(values[k]), np.sin(values[k]))
+        for k, (first, size) in enumerate(self._slots):
+            q[first : first + size] = values[k] if size == 1 else (np.cos(values[k]), np.sin(values[k]))
         return q
 
     @cached_property
-    def _places(self) -> list[tuple[int, int]]:
+    def _slots(self) -> list[tuple[int, int]]:
+        """First index and size of each joint in `q`."""
         return [(self.model.idx_qs[j], self.model.nqs[j]) for j in range(1, self.model.njoints)]
 
-    @cached_property
-    def _plain(self) -> bool:
-        return self.model.nq == self.model.nv
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position limits (n,), (n,) within a turn to each side, for sampling."""
+        return np.clip(self.lower, -np.pi, np.pi), np.clip(self.upper, -np.pi, np.pi)
 
 
-def load(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
-    """The robot of a map, with the arms of `sides`; None: all that it has.
+def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
+    """The robot of a map, with the arms of `sides`; None: all arms of the map.
 
     Raises
     ------
     MissingFile, BadModel, BadOption
-        A file, link or joint that is not there; a joint without limits; an arm that the robot has not.
+        A file, link or joint that does not exist; a joint without limits; an arm that the robot does not have.
     """
     for side in sides or ():
         if side not in robot.arms:
             raise BadOption(f"--arm {side}: {robot.name} has no {side} arm; {one_of(robot.arms)}")
-    chosen = {side: arm for side, arm in robot.arms.items() if sides is None or side in sides}
-    said = urdf_limits(robot.urdf)
+    maps = {side: arm for side, arm in robot.arms.items() if sides is None or side in sides}
+    limits = read_joint_limits(robot.urdf)
     try:
-        with native_stderr_muted():  # urdfdom says the same once more
+        with native_stderr_muted():  # urdfdom repeats the exception's text
             full = pin.buildModelFromUrdf(str(robot.urdf))
     except Exception as error:  # what C++ throws
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BadModel(f"{robot.urdf}: Pinocchio cannot build it: {reason}") from error
-    joints = [name for arm in chosen.values() for name in arm.joints]
-    _check(robot, chosen, full, said)
-    followers = [name for name in full.names[1:] if _driven(said[name], joints)]
-    moving = [name for name in full.names[1:] if name in joints or name in followers]
-    rest_full = _rest(robot, full, said)
-    shapes_full = _shapes(robot, full)
+        raise BadModel(f"{robot.urdf}: Pinocchio cannot build it: {_first_line(error)}") from error
+    joints = [name for arm in maps.values() for name in arm.joints]
+    _check_map(robot, maps, full, limits)
+    rest_full = _rest_configuration(robot, full, limits)
+    geometry = _load_collision_geometry(robot, full)
+    moving = [name for name in full.names[1:] if name in joints or _mimics_any(limits[name], joints)]
     locked = [full.getJointId(name) for name in full.names[1:] if name not in moving]
-    model, shapes = pin.buildReducedModel(full, shapes_full, locked, rest_full)
-    names = [name for name in model.names[1:] if name in joints and not _driven(said[name], joints)]
-    coupling, offset = _coupling(list(model.names[1:]), names, said)
-    lower, upper, v_most = _limits(list(model.names[1:]), coupling, offset, said)
-    data, q = model.createData(), pin.neutral(model)
-    rest = np.clip([robot.rest.get(name, 0.0) for name in names], lower + 0.02, upper - 0.02)
-    a_most, j_most = (SHARE * np.array([of[name] for name in names]) for of in (robot.acceleration, robot.jerk))
-    made = Robot(
-        robot, tuple(names), full, model, shapes, coupling, offset, lower, upper, SHARE * v_most, a_most, j_most, rest,
-        rest_full, _turn(robot, full, rest_full), (),
-    )  # fmt: skip
-    q = made.q(rest)
-    pin.framesForwardKinematics(model, data, q)
-    arms = []
-    for side, arm in chosen.items():
-        shoulder = _frame(model, arm.shoulder, f"{side}_shoulder")
-        hand = _frame(model, arm.hand, f"{side}_palm", _hand_axes(arm))
-        elbow = _frame(model, arm.elbow, f"{side}_elbow") if arm.elbow else -1
-        own = np.array([names.index(name) for name in arm.joints if name in names])
-        data = model.createData()
-        pin.framesForwardKinematics(model, data, q)
-        at = data.oMf[shoulder].translation.copy()
-        arms.append(Arm(side, own, at, hand, elbow, _reach(made, own, at, hand)))
-        if any(name in robot.rest for name in arm.joints):
-            _check_rest(made, arms[-1], data.oMf[hand].translation)
-    return replace(made, arms=tuple(arms))
+    model, geometry = pin.buildReducedModel(full, geometry, locked, rest_full)
+    names = [name for name in model.names[1:] if name in joints and not _mimics_any(limits[name], joints)]
+    coupled = _couple_joints(list(model.names[1:]), names, limits)
+    a_max, j_max = (
+        LIMIT_SHARE * np.array([values[name] for name in names]) for values in (robot.acceleration, robot.jerk)
+    )
+    built = Robot(
+        map=robot,
+        names=tuple(names),
+        full=full,
+        model=model,
+        geometry=geometry,
+        coupling=coupled.coupling,
+        offset=coupled.offset,
+        lower=coupled.lower,
+        upper=coupled.upper,
+        v_max=LIMIT_SHARE * coupled.velocity,
+        a_max=a_max,
+        j_max=j_max,
+        rest=np.clip(
+            [robot.rest.get(name, 0.0) for name in names], coupled.lower + REST_MARGIN, coupled.upper - REST_MARGIN
+        ),
+        rest_full=rest_full,
+        R_BT=_torso_rotation(robot, full, rest_full),
+        arms=(),
+    )
+    return replace(built, arms=tuple(_build_arm(built, side, arm) for side, arm in maps.items()))
 
 
-def _check(robot: RobotMap, arms: dict[str, ArmMap], full: Any, said: dict[str, JointLimit]) -> None:
-    """Names that exist, limits that are there."""
+def _build_arm(robot: Robot, side: str, arm: ArmMap) -> Arm:
+    """An arm, whose points become frames of the robot's model."""
+    model = robot.model
+    shoulder = _add_frame(model, arm.shoulder, f"{side}_shoulder")
+    hand = _add_frame(model, arm.hand, f"{side}_palm", _hand_rotation(arm))
+    elbow = _add_frame(model, arm.elbow, f"{side}_elbow") if arm.elbow else -1
+    joints = np.array([robot.names.index(name) for name in arm.joints if name in robot.names])
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, robot.configuration(robot.rest))
+    p_shoulder = data.oMf[shoulder].translation.copy()
+    built = Arm(side, joints, p_shoulder, hand, elbow, _find_reach(robot, joints, p_shoulder, hand))
+    if any(name in robot.map.rest for name in arm.joints):
+        _check_rest(robot, built, data.oMf[hand].translation)
+    return built
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict[str, JointLimit]) -> None:
+    """Raise `BadModel` for a link or joint that the URDF lacks, and for a joint without limits."""
     links = [frame.name for frame in full.frames if frame.type == pin.FrameType.BODY]
+    joints = [name for arm in arms.values() for name in arm.joints]
     for side, arm in arms.items():
         where = f"{robot.where}: arms.{side}"
         for key, point in (("shoulder", arm.shoulder), ("elbow", arm.elbow), ("hand", arm.hand)):
@@ -154,86 +178,87 @@ def _check(robot: RobotMap, arms: dict[str, ArmMap], full: Any, said: dict[str, 
                     f"{where}.{key}: no link '{point.link}' in {robot.urdf.name}; {one_of(links, point.link)}"
                 )
         for name in arm.joints:
-            if name not in said:
+            if name not in limits:
                 raise BadModel(
-                    f"{where}.joints: no joint '{name}' that moves in {robot.urdf.name}; {one_of(said, name)}"
+                    f"{where}.joints: no joint '{name}' that moves in {robot.urdf.name}; {one_of(limits, name)}"
                 )
-            other = _not_of_the_arm(full, name, arm.hand.link)
-            if other:
+            problem = _find_joint_problem(full, name, arm.hand.link)
+            if problem:
                 raise BadModel(
-                    f"{where}.joints: '{name}' is no joint of the arm: it {other}; leave it out, it stays where `rest` "
-                    f"has it"
+                    f"{where}.joints: '{name}' is no joint of the arm: it {problem}; leave it out, it stays where "
+                    f"`rest` has it"
                 )
-            limit = said[name]
-            if limit.kind != "continuous" and not limit.lower < limit.upper:
-                raise BadModel(
-                    f"{robot.urdf}: joint '{name}' has no position limits (lower {limit.lower:g}, upper "
-                    f'{limit.upper:g}); write <limit lower="…" upper="…" velocity="…"/>'
-                )
-            if not 0.0 < limit.velocity < np.inf:
-                raise BadModel(
-                    f"{robot.urdf}: joint '{name}' has no velocity limit ({limit.velocity:g}); "
-                    'write <limit velocity="…"/>'
-                )
-            if not _driven(limit, [name for arm in arms.values() for name in arm.joints]):
-                for key, values, unit in (
-                    ("acceleration", robot.acceleration, "rad/s²"),
-                    ("jerk", robot.jerk, "rad/s³"),
-                ):
-                    value = values.get(name)
-                    if value is None or not value > 0.0:
-                        said_value = "has none" if value is None else f"is {value:g}"
-                        raise BadModel(
-                            f"{robot.where}: limits.{key}: joint '{name}' {said_value}; no URDF holds it, "
-                            f"a number above 0 is needed [{unit}]"
-                        )
+            _check_limits(robot, name, limits[name], _mimics_any(limits[name], joints))
     for name in robot.rest:
-        if name not in said:
+        if name not in limits:
             raise BadModel(
-                f"{robot.where}: rest.{name}: no joint that moves in {robot.urdf.name}; {one_of(said, name)}"
+                f"{robot.where}: rest.{name}: no joint that moves in {robot.urdf.name}; {one_of(limits, name)}"
             )
     if robot.base and robot.base not in links:
         raise BadModel(f"{robot.where}: base: no link '{robot.base}' in {robot.urdf.name}; {one_of(links, robot.base)}")
 
 
-def _not_of_the_arm(full: Any, name: str, hand: str) -> str:
-    """Why a joint is none between the root and the hand's link; empty where it is one."""
+def _check_limits(robot: RobotMap, name: str, limit: JointLimit, mimics: bool) -> None:
+    """Raise `BadModel` where the URDF or the map lacks a limit of a joint."""
+    if limit.kind != "continuous" and not limit.lower < limit.upper:
+        raise BadModel(
+            f"{robot.urdf}: joint '{name}' has no position limits (lower {limit.lower:g}, upper "
+            f'{limit.upper:g}); write <limit lower="…" upper="…" velocity="…"/>'
+        )
+    if not 0.0 < limit.velocity < np.inf:
+        raise BadModel(
+            f"{robot.urdf}: joint '{name}' has no velocity limit ({limit.velocity:g}); write <limit velocity=\"…\"/>"
+        )
+    if mimics:
+        return
+    for key, values, unit in (("acceleration", robot.acceleration, "rad/s²"), ("jerk", robot.jerk, "rad/s³")):
+        value = values.get(name)
+        if value is None or not value > 0.0:
+            state = "has none" if value is None else f"is {value:g}"
+            raise BadModel(
+                f"{robot.where}: limits.{key}: joint '{name}' {state}; no URDF holds it, "
+                f"a number above 0 is needed [{unit}]"
+            )
+
+
+def _find_joint_problem(full: Any, name: str, hand: str) -> str:
+    """Why a joint is not between the root and the hand's link; empty where it is."""
     joint = full.getJointId(name)
-    above = full.frames[full.getFrameId(hand)].parentJoint
-    while above > joint:
-        above = full.parents[above]
-    if above != joint:
+    ancestor = full.frames[full.getFrameId(hand)].parentJoint
+    while ancestor > joint:
+        ancestor = full.parents[ancestor]
+    if ancestor != joint:
         return f"does not move the hand's link '{hand}'"
-    beside = [k for k in range(1, full.njoints) if k != joint and full.parents[k] == full.parents[joint]]
-    slides = [full.joints[k].shortname().startswith("JointModelP") for k in (joint, *beside)]
+    siblings = [k for k in range(1, full.njoints) if k != joint and full.parents[k] == full.parents[joint]]
+    slides = [full.joints[k].shortname().startswith("JointModelP") for k in (joint, *siblings)]
     if slides[0] and any(slides[1:]):
-        return f"slides beside '{full.names[beside[slides.index(True, 1) - 1]]}' as a gripper's fingers do"
+        return f"slides beside '{full.names[siblings[slides.index(True, 1) - 1]]}' as a gripper's fingers do"
     return ""
 
 
 def _check_rest(robot: Robot, arm: Arm, hand: np.ndarray) -> None:
-    """The stated rest is one for this mount: the hand, at `hand` (3,) [m] in the root, is below or ahead."""
+    """Raise `BadModel` where the hand, at `hand` (3,) [m] in B, is neither below nor ahead in the rest posture."""
     offset = robot.R_BT.T @ (hand - arm.shoulder)
-    off = np.degrees(np.arccos((offset[0] - offset[2]) / np.sqrt(2.0) / max(np.linalg.norm(offset), 1e-9)))
-    if off > REST_OFF_DEG:
+    angle = np.degrees(np.arccos((offset[0] - offset[2]) / np.sqrt(2.0) / max(np.linalg.norm(offset), 1e-9)))
+    if angle > MAX_REST_ANGLE_DEG:
         x, y, z = offset
         raise BadModel(
             f"{robot.map.where}: rest: the {arm.side} hand is {x:+.2f} m ahead of its shoulder, {y:+.2f} m to the left "
-            f"and {z:+.2f} m up, with base, up and forward as they are: {off:.0f} deg off ahead and below, at most "
-            f"{REST_OFF_DEG:g}; give a rest for this mount, the arm hanging, the forearm ahead, or none"
+            f"and {z:+.2f} m up, with base, up and forward as they are: {angle:.0f} deg off ahead and below, at most "
+            f"{MAX_REST_ANGLE_DEG:g}; give a rest for this mount, the arm hanging, the forearm ahead, or none"
         )
 
 
-def _driven(limit: JointLimit, joints: list[str]) -> bool:
+def _mimics_any(limit: JointLimit, joints: list[str]) -> bool:
     return limit.mimic is not None and limit.mimic[0] in joints
 
 
-def _rest(robot: RobotMap, full: Any, said: dict[str, JointLimit]) -> np.ndarray:
+def _rest_configuration(robot: RobotMap, full: Any, limits: dict[str, JointLimit]) -> np.ndarray:
     q = pin.neutral(full)
     for name in full.names[1:]:
         joint = full.getJointId(name)
         value = robot.rest.get(name, 0.0)
-        limit = said.get(name)
+        limit = limits.get(name)
         if limit is None or full.nvs[joint] != 1:
             continue
         if limit.mimic is not None:
@@ -244,57 +269,55 @@ def _rest(robot: RobotMap, full: Any, said: dict[str, JointLimit]) -> np.ndarray
             )
         elif limit.lower <= limit.upper:
             value = float(np.clip(value, limit.lower, limit.upper))
-        at = full.idx_qs[joint]
-        q[at : at + full.nqs[joint]] = value if full.nqs[joint] == 1 else (np.cos(value), np.sin(value))
+        first, size = full.idx_qs[joint], full.nqs[joint]
+        q[first : first + size] = value if size == 1 else (np.cos(value), np.sin(value))
     return q
 
 
-def _shapes(robot: RobotMap, full: Any) -> Any:
-    """What collides; none where the URDF has none."""
-    data = example_data()
-    folders = [str(folder) for folder in robot.urdf.absolute().parents]
-    if data is not None:
-        folders += [str(data), str(data.parent), str(data.parent.parent)]
+def _load_collision_geometry(robot: RobotMap, full: Any) -> Any:
+    """Pinocchio's geometry model; empty where the URDF has no collision shapes."""
     try:
-        return pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=folders)
+        return pin.buildGeomFromUrdf(
+            full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=package_folders(robot.urdf)
+        )
     except Exception as error:  # what C++ throws
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {reason}") from error
+        raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {_first_line(error)}") from error
 
 
-def _coupling(of: list[str], free: list[str], said: dict[str, JointLimit]) -> tuple[np.ndarray, np.ndarray]:
-    coupling, offset = np.zeros((len(of), len(free))), np.zeros(len(of))
-    for k, name in enumerate(of):
-        mimic = said[name].mimic
-        if name in free:
-            coupling[k, free.index(name)] = 1.0
-        else:
-            assert mimic is not None
-            coupling[k, free.index(mimic[0])], offset[k] = mimic[1], mimic[2]
-    return coupling, offset
+class _CoupledJoints(NamedTuple):
+    """`Robot.coupling` and `.offset`, and the independent joints' limits, which keep those of joints that mimic."""
+
+    coupling: np.ndarray
+    offset: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    velocity: np.ndarray
 
 
-def _limits(
-    of: list[str], coupling: np.ndarray, offset: np.ndarray, said: dict[str, JointLimit]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Limits of the free joints, those of what mimics them kept too."""
-    n = coupling.shape[1]
+def _couple_joints(names: list[str], independent: list[str], limits: dict[str, JointLimit]) -> _CoupledJoints:
+    n = len(independent)
+    coupling, offset = np.zeros((len(names), n)), np.zeros(len(names))
     lower, upper, velocity = np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf)
-    for k, name in enumerate(of):
-        j = int(np.argmax(np.abs(coupling[k])))
-        factor = coupling[k, j]
+    for k, name in enumerate(names):
+        limit, factor, j = limits[name], 1.0, 0
+        if name not in independent and limit.mimic is not None:
+            source, factor, offset[k] = limit.mimic
+            j = independent.index(source)
+        else:
+            j = independent.index(name)
+        coupling[k, j] = factor
         if factor == 0.0:
             continue
-        ends = sorted((value - offset[k]) / factor for value in (said[name].lower, said[name].upper))
+        ends = sorted((value - offset[k]) / factor for value in (limit.lower, limit.upper))
         lower[j], upper[j] = max(lower[j], ends[0] + POSITION_MARGIN), min(upper[j], ends[1] - POSITION_MARGIN)
-        if said[name].velocity > 0.0:
-            velocity[j] = min(velocity[j], said[name].velocity / abs(factor))
-    return lower, upper, velocity
+        if limit.velocity > 0.0:
+            velocity[j] = min(velocity[j], limit.velocity / abs(factor))
+    return _CoupledJoints(coupling, offset, lower, upper, velocity)
 
 
-def _turn(robot: RobotMap, full: Any, rest_full: np.ndarray) -> np.ndarray:
-    up, forward = AXES[robot.up], AXES[robot.forward]
-    R_LT = np.column_stack([forward, np.cross(up, forward), up])
+def _torso_rotation(robot: RobotMap, full: Any, rest_full: np.ndarray) -> np.ndarray:
+    """R_BT."""
+    R_LT = _rotation_of(AXES[robot.forward], AXES[robot.up])
     if not robot.base:
         return R_LT
     data = full.createData()
@@ -302,36 +325,36 @@ def _turn(robot: RobotMap, full: Any, rest_full: np.ndarray) -> np.ndarray:
     return data.oMf[full.getFrameId(robot.base)].rotation @ R_LT
 
 
-def _hand_axes(arm: ArmMap) -> np.ndarray:
-    """R_LH: the hand as a person's, x to the thumb's side and −z along the fingers when it hangs."""
-    up, thumb = -AXES[arm.fingers], AXES[arm.thumb]
-    return np.column_stack([thumb, np.cross(up, thumb), up])
+def _hand_rotation(arm: ArmMap) -> np.ndarray:
+    """R_LH: the hand's frame as a person's, x to the side of the thumb and -z along the fingers."""
+    return _rotation_of(AXES[arm.thumb], -AXES[arm.fingers])
 
 
-def _frame(model: Any, point: LinkPoint, name: str, R: np.ndarray | None = None) -> int:
+def _rotation_of(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The rotation with these first and third columns."""
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _add_frame(model: Any, point: LinkPoint, name: str, R: np.ndarray | None = None) -> int:
     link = model.frames[model.getFrameId(point.link)]
-    inside = pin.SE3(np.eye(3) if R is None else R, np.array(point.at))
-    return int(
-        model.addFrame(pin.Frame(f"wepose_{name}", link.parentJoint, link.placement * inside, pin.FrameType.OP_FRAME))
-    )
+    placement = link.placement * pin.SE3(np.eye(3) if R is None else R, np.array(point.offset))
+    return int(model.addFrame(pin.Frame(f"wepose_{name}", link.parentJoint, placement, pin.FrameType.OP_FRAME)))
 
 
-def _reach(robot: Robot, own: np.ndarray, shoulder: np.ndarray, hand: int) -> float:
-    """Farthest of many climbs from random places: the arm need not be straight where its joints stop before."""
+def _find_reach(robot: Robot, joints: np.ndarray, shoulder: np.ndarray, hand: int) -> float:
+    """[m] largest of several local maxima from random postures: joint limits may keep an arm from being straight."""
     rng, data = np.random.default_rng(0), robot.model.createData()
-    low, high = (np.clip(limit[own], -np.pi, np.pi) for limit in (robot.lower, robot.upper))
+    low, high = (limit[joints] for limit in robot.bounds)
     u = robot.rest.copy()
 
-    def distance(part: np.ndarray) -> tuple[float, np.ndarray]:
-        u[own] = part
-        pin.computeJointJacobians(robot.model, data, robot.q(u))
+    def distance(values: np.ndarray) -> tuple[float, np.ndarray]:
+        u[joints] = values
+        pin.computeJointJacobians(robot.model, data, robot.configuration(u))
         p = pin.updateFramePlacement(robot.model, data, hand).translation - shoulder
         far = float(np.linalg.norm(p))
         J = pin.getFrameJacobian(robot.model, data, hand, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:3]
-        return -far, -(p / far) @ J @ robot.coupling[:, own]
+        return -far, -(p / far) @ J @ robot.coupling[:, joints]
 
-    starts = rng.uniform(low, high, (_REACH_STARTS, len(own)))
-    best = [
-        minimize(distance, x, jac=True, bounds=list(zip(low, high, strict=True)), method="L-BFGS-B") for x in starts
-    ]
-    return -min(float(found.fun) for found in best)
+    starts = rng.uniform(low, high, (_REACH_STARTS, len(joints)))
+    bounds = list(zip(low, high, strict=True))
+    return -min(float(minimize(distance, x, jac=True, bounds=bounds, method="L-BFGS-B").fun) for x in starts)

@@ -1,9 +1,9 @@
-"""One command after another while the person moves: aims that look at nothing ahead, a careful way to them, the step.
+"""Robot commands while the person moves: causal targets, a limited approach to them, the control step.
 
-Three things lie between a pose and the robot. A low-pass without a look ahead makes aims of what was seen
-(`_Smoothed`). From where the robot's hand is, a reference goes to its aim no faster than trust allows (`_Reference`):
-that is the approach, and that is how poor tracking slows the robot and a jump does not move it. The step keeps the
-limits (`Stepper`), also where it brakes. Time is an argument: nothing here looks at a clock.
+Three stages lie between a pose and the robot. A causal low-pass smooths the targets (`_LowPass`). A reference moves
+from the robot's hand to its target no faster than the tracking's quality allows (`_Reference`): it makes the approach,
+slows the robot where tracking is poor, and keeps jumps from it. The control step keeps the limits (`QpController`), also
+while braking. Time is an argument: nothing here reads a clock.
 """
 
 from __future__ import annotations
@@ -18,153 +18,180 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, BadOption
 from ..subject import LENGTHS
-from .collision import Shapes
-from .person import JUMP_SPEED, STD_GOOD, STD_POOR, WEIGHT_POOR, bend_of, drawn_in, robot_reach
+from .collision import CollisionModel
+from .controller import HandTarget, JointState, QpController, StepCounts, Tasks
 from .robot import Arm, Robot
-from .solver import Aim, Counts, State, Stepper, Tasks
+from .targets import (
+    ARM_POINTS,
+    JUMP_SPEED,
+    STD_GOOD,
+    STD_POOR,
+    WEIGHT_POOR,
+    clamp_to_reach,
+    compute_swivel,
+    compute_target_reach,
+)
 
-SMOOTHING_HZ = 6.0  # natural frequency of the low-pass: at 6 Hz it halves, as the one that looks ahead does
-AHEAD_S = 0.03  # [s] for which a pose is drawn on while the next has not come
-HOLD_AFTER_S, STOP_AFTER_S = 0.1, 1.0  # [s] without a pose: brake; stop for good
-JUMP_RATE = 40.0  # [rad/s] faster than any hand turns: a jump of the tracking
-APPROACH_SPEED = 0.25  # [m/s] of the reference that has yet to find its aim
-GROWTH = 0.1  # [m/s²] by which it becomes faster, so that it also finds one that moves
-FREE_SPEED = 12.0  # [m/s] of the reference that is with its aim and trusted: no limit of ours, the robot's alone
-TURN = 2.4  # [rad/m] how much faster it may turn than move
-CLOSING = 5.0  # [1/s] at which the reference makes good what it is away from its aim
-FOUND_M, FOUND_RAD = 0.02, 0.1  # so near it has found its aim
-LOOSEN_S, TIGHTEN_S = 0.2, 0.1  # [s] in which the speed allowed grows, or falls, e-fold
-TRUST_S, DOUBT_S = 0.5, 0.1  # [s] in which trust comes back, or goes, e-fold
-TRUSTED = 0.9  # below it, "slow"
-BRAKE_S = 0.06  # [s] in which the last of a velocity fades e-fold; what is faster brakes at the limits
-FADES = 0.02  # share of what one step can brake: below it the velocity goes to zero at once
-STANDS = 1e-9  # [rad/s or m/s] what is slower stands
+SMOOTHING_HZ = 6.0  # natural frequency of the low-pass, which halves the amplitude there as the zero-phase one does
+EXTRAPOLATE_S = 0.03  # [s] for which a pose is extrapolated until the next comes
+HOLD_AFTER_S, STOP_AFTER_S = 0.1, 1.0  # [s] without a pose: brake; stop until `resume`
+JUMP_RATE = 40.0  # [rad/s] no hand rotates faster, so the tracking has jumped
+APPROACH_SPEED = 0.25  # [m/s] of a reference that has not reached its target yet
+APPROACH_GROWTH = 0.1  # [m/s²] of that speed, so that it also reaches a target that moves
+FREE_SPEED = 12.0  # [m/s] of a reference at a trusted target: only the robot's limits count
+TURN_RATIO = 2.4  # [rad/m] of the reference's angular speed to its speed
+CLOSING_GAIN = 5.0  # [1/s] at which the reference closes the distance to its target
+REACHED_M, REACHED_RAD = 0.02, 0.1  # distance at which it has reached its target
+SPEED_UP_S, SPEED_DOWN_S = 0.2, 0.1  # [s] time constants of the speed allowed
+TRUST_UP_S, TRUST_DOWN_S = 0.5, 0.1  # [s] time constants of the trust
+TRUSTED = 0.9  # below it the state is "slow"
+BRAKE_S = 0.06  # [s] time constant of the last of a velocity; above, the robot brakes at its limits
+STOP_SHARE = 0.02  # of what one step can brake: below it the velocity goes to zero at once
+STATIC_SPEED = 1e-9  # [rad/s or m/s] below it a joint is at rest
 
 
-class Seen(NamedTuple):
-    """One arm of the person at one moment, in the robot's frame and size."""
+class ArmObservation(NamedTuple):
+    """One arm of the person at one moment, in B, scaled."""
 
     offset: np.ndarray  # (3,) [m] shoulder to hand
-    bend: np.ndarray  # (3,) [m] from the line shoulder-hand to the elbow
-    rotation: np.ndarray  # (3, 3)
-    std: float  # [m] of the hand against the shoulder, in the person's size; NaN where the filter has no covariance
-    lost: tuple[str, ...]  # segments of it without a sensor now
-    scale: float = 1.0  # robot's metres for one of the person's
+    swivel: np.ndarray  # (3,) [m] elbow swivel direction
+    rotation: np.ndarray  # (3, 3) of the hand
+    std: float  # [m] of the hand against the shoulder, not scaled; NaN where the filter has no covariance
+    lost: tuple[str, ...]  # segments of the arm whose sensor is lost
+    scale: float = 1.0  # metres of the robot for one of the person
 
 
 class Command(NamedTuple):
-    """What the robot is to do now: position, velocity and acceleration of one motion, sampled at `clock`."""
+    """Position, velocity and acceleration of the robot at `clock`."""
 
     number: int
-    time: float  # [s] tick of the newest pose in it; NaN before the first
-    clock: float  # [s] since command 0, even
+    time: float  # [s] of the newest pose; NaN before the first
+    clock: float  # [s] since command 0
     state: str  # "approach", "follow", "slow", "hold", "stopped"
-    reason: str  # why it does not follow; empty where it does
+    reason: str  # why the robot does not follow; empty where it does
     u: np.ndarray  # (n,) [rad or m]
     v: np.ndarray
     a: np.ndarray
-    error: np.ndarray  # (arms, 2) [m], [rad] of the hands against their aims; NaN where there is none now
-    std: np.ndarray  # (arms,) [m], NaN where not known
+    error: np.ndarray  # (arms, 2) [m], [rad] of the hands against their targets; NaN where there is none
+    std: np.ndarray  # (arms,) [m]; NaN where not known
 
 
 @dataclass
-class _Smoothed:
-    """A critically damped low-pass of one arm: 2/ω late, exactly so on what moves evenly, whose rate it knows."""
+class _LowPass:
+    """A critically damped low-pass of one arm; its delay on constant motion is exactly 2/ω, its rates are exact."""
 
-    seen: Seen  # the newest
+    newest: ArmObservation
     offset: np.ndarray
-    bend: np.ndarray
-    R: np.ndarray
+    swivel: np.ndarray
+    rotation: np.ndarray
     offset_rate: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    bend_rate: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    rate: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [rad/s] in the root
+    swivel_rate: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    angular_velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [rad/s] in B
 
     @classmethod
-    def at(cls, seen: Seen) -> _Smoothed:
-        return cls(seen, seen.offset, seen.bend, seen.rotation)
+    def start(cls, observation: ArmObservation) -> _LowPass:
+        return cls(observation, observation.offset, observation.swivel, observation.rotation)
 
-    def push(self, seen: Seen, dt: float, omega: float) -> None:
-        for name in ("offset", "bend"):
-            before, now = getattr(self.seen, name), getattr(seen, name)
-            away, rate = getattr(self, name) - before, getattr(self, f"{name}_rate")
-            away, rate = _settled(away, rate, (now - before) / dt, omega, dt)
-            setattr(self, name, now + away)
-            setattr(self, f"{name}_rate", rate)
-        turned = pin.log3(seen.rotation @ self.seen.rotation.T) / dt
-        away, self.rate = _settled(pin.log3(self.R @ self.seen.rotation.T), self.rate, turned, omega, dt)
-        self.R = pin.exp3(away) @ seen.rotation
-        self.seen = seen
+    def push(self, observation: ArmObservation, dt: float, omega: float) -> None:
+        last = self.newest
+        self.offset, self.offset_rate = _track(
+            self.offset, self.offset_rate, last.offset, observation.offset, omega, dt
+        )
+        self.swivel, self.swivel_rate = _track(
+            self.swivel, self.swivel_rate, last.swivel, observation.swivel, omega, dt
+        )
+        rate = pin.log3(observation.rotation @ last.rotation.T) / dt
+        away = pin.log3(self.rotation @ last.rotation.T)
+        away, self.angular_velocity = _relax(away, self.angular_velocity, rate, omega, dt)
+        self.rotation = pin.exp3(away) @ observation.rotation
+        self.newest = observation
 
 
-def _settled(
-    away: np.ndarray, rate: np.ndarray, moves: np.ndarray, omega: float, dt: float
+def _track(
+    value: np.ndarray, rate: np.ndarray, before: np.ndarray, now: np.ndarray, omega: float, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """x - r and ẋ after `dt` of ẍ = -ω² (x - r) - 2 ω ẋ, where r moves evenly at `moves`; exactly."""
-    behind = 2.0 / omega * moves
+    """Low-passed value and rate after an input that went from `before` to `now`."""
+    away, rate = _relax(value - before, rate, (now - before) / dt, omega, dt)
+    return now + away, rate
+
+
+def _relax(
+    away: np.ndarray, rate: np.ndarray, input_rate: np.ndarray, omega: float, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """x - r and ẋ after `dt` of ẍ = -ω² (x - r) - 2 ω ẋ with ṙ = `input_rate` constant; exact."""
+    behind = 2.0 / omega * input_rate
     d, decay = away + behind, np.exp(-omega * dt)
-    c = rate - moves + omega * d
-    return (d + c * dt) * decay - behind, moves + (rate - moves - omega * c * dt) * decay
+    c = rate - input_rate + omega * d
+    return (d + c * dt) * decay - behind, input_rate + (rate - input_rate - omega * c * dt) * decay
 
 
 @dataclass
 class _Reference:
-    """Where one hand is asked to be: it goes from where the hand is to its aim, and then with it.
+    """Reference of one hand: it moves from the hand to its target, and then with it.
 
-    It changes its velocity no faster than the robot's joints can: a robot that is asked for more shakes, and comes so
-    near to itself that its limits leave it no way out.
+    Its acceleration is limited to what the joints can do: a robot that is asked for more shakes, and comes so near to
+    itself that its limits leave no way out.
     """
 
     position: np.ndarray
-    R: np.ndarray
-    brisk: float  # [m/s²]
+    rotation: np.ndarray
+    max_acceleration: float  # [m/s²]
     speed: float = APPROACH_SPEED  # [m/s] allowed now
-    found: bool = False
+    reached: bool = False
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    rate: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    angular_velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
-    def step(self, aim: Aim, dt: float) -> Aim:
-        """What the hand is to do in this step, on the way to `aim`."""
-        away, turned = aim.position - self.position, pin.log3(aim.rotation @ self.R.T)
-        self.found = self.found or bool(np.linalg.norm(away) < FOUND_M and np.linalg.norm(turned) < FOUND_RAD)
-        if self.found:
-            free = (aim.weight - WEIGHT_POOR) / (1.0 - WEIGHT_POOR)
-            wanted = APPROACH_SPEED * (FREE_SPEED / APPROACH_SPEED) ** free
-            up, down = np.exp(dt / LOOSEN_S), np.exp(-dt / TIGHTEN_S)
+    def step(self, target: HandTarget, dt: float) -> HandTarget:
+        """Target of the hand in this step, on the way to `target`."""
+        away, turn = target.position - self.position, pin.log3(target.rotation @ self.rotation.T)
+        near = np.linalg.norm(away) < REACHED_M and np.linalg.norm(turn) < REACHED_RAD
+        self.reached = self.reached or bool(near)
+        if self.reached:
+            trust = (target.weight - WEIGHT_POOR) / (1.0 - WEIGHT_POOR)
+            wanted = APPROACH_SPEED * (FREE_SPEED / APPROACH_SPEED) ** trust
+            up, down = np.exp(dt / SPEED_UP_S), np.exp(-dt / SPEED_DOWN_S)
             self.speed = float(np.clip(wanted, down * self.speed, up * self.speed))
         else:
-            self.speed += GROWTH * dt * aim.weight
-        self.velocity = _towards(self.velocity, aim.velocity, away, self.speed, self.brisk, dt)
-        self.rate = _towards(self.rate, aim.rate, turned, TURN * self.speed, TURN * self.brisk, dt)
-        middle, R_middle = self.position + 0.5 * dt * self.velocity, pin.exp3(0.5 * dt * self.rate) @ self.R
-        self.position, self.R = self.position + dt * self.velocity, pin.exp3(dt * self.rate) @ self.R
-        return Aim(middle, self.velocity, R_middle, self.rate, aim.bend, aim.weight)
+            self.speed += APPROACH_GROWTH * dt * target.weight
+        speed, limit = self.speed, self.max_acceleration
+        self.velocity = _approach_velocity(self.velocity, target.velocity, away, speed, limit, dt)
+        self.angular_velocity = _approach_velocity(
+            self.angular_velocity, target.angular_velocity, turn, TURN_RATIO * speed, TURN_RATIO * limit, dt
+        )
+        position = self.position + 0.5 * dt * self.velocity
+        rotation = pin.exp3(0.5 * dt * self.angular_velocity) @ self.rotation
+        self.position = self.position + dt * self.velocity
+        self.rotation = pin.exp3(dt * self.angular_velocity) @ self.rotation
+        return HandTarget(position, self.velocity, rotation, self.angular_velocity, target.swivel, target.weight)
 
 
-def _towards(v: np.ndarray, aim: np.ndarray, away: np.ndarray, speed: float, brisk: float, dt: float) -> np.ndarray:
-    """The next velocity: the aim's, and what closes in on it as fast as half of `brisk` stops again."""
+def _approach_velocity(
+    v: np.ndarray, target: np.ndarray, away: np.ndarray, speed: float, max_acceleration: float, dt: float
+) -> np.ndarray:
+    """Next velocity: the target's, and what closes the distance and stops with half of `max_acceleration`."""
     far = float(np.linalg.norm(away))
-    closing = min(CLOSING, np.sqrt(brisk / far)) if far > 0.0 else CLOSING
-    return v + _at_most(_at_most(aim + closing * away, speed) - v, brisk * dt)
+    gain = min(CLOSING_GAIN, np.sqrt(max_acceleration / far)) if far > 0.0 else CLOSING_GAIN
+    return v + _limit_norm(_limit_norm(target + gain * away, speed) - v, max_acceleration * dt)
 
 
-def _at_most(v: np.ndarray, most: float) -> np.ndarray:
+def _limit_norm(v: np.ndarray, limit: float) -> np.ndarray:
     size = float(np.linalg.norm(v))
-    return v if size <= most else v * (most / size)
+    return v if size <= limit else v * (limit / size)
 
 
-class Person:
-    """Reads the arms that a robot needs out of a live pose.
+class ArmObserver:
+    """Takes the arms that a robot needs from a live pose.
 
     Parameters
     ----------
-    segments, points : what the rows of a pose are
+    segments, points : rows of a live pose
     lengths_cov : (8, 8) [m²] of the person's lengths in the order of `LENGTHS`; None: exact
-    scale : robot's metres for one of the person's; None: a straight arm becomes `robot_reach`
+    scale : metres of the robot for one of the person; None: a straight arm becomes `compute_target_reach`
 
     Raises
     ------
     BadData
-        The pose has not the arms that the robot needs.
+        The pose lacks an arm of the robot.
     """
 
     def __init__(
@@ -175,65 +202,71 @@ class Person:
         lengths_cov: np.ndarray | None = None,
         scale: float | None = None,
     ) -> None:
-        needed(robot, segments)
+        check_segments(robot, segments)
         self._robot, self._scale = robot, scale
         self._lengths_cov = np.zeros((len(LENGTHS), len(LENGTHS))) if lengths_cov is None else lengths_cov
         self._segments = tuple(segments)
-        self._points, self._rows, self._lengths = [], [], []
+        self._points, self._rows, self._lengths = [], [], []  # of each arm, into points, segments, lengths
         for arm in robot.arms:
-            self._points.append([points.index(f"{arm.side}_{p}") for p in ("shoulder", "elbow", "wrist", "hand")])
+            self._points.append([points.index(f"{arm.side}_{name}") for name in ARM_POINTS])
             hand = f"{arm.side}_hand" if f"{arm.side}_hand" in segments else f"{arm.side}_forearm"
-            of = ("torso", f"{arm.side}_upper_arm", f"{arm.side}_forearm", hand)
-            self._rows.append([self._segments.index(name) for name in of])
+            chain = ("torso", f"{arm.side}_upper_arm", f"{arm.side}_forearm", hand)
+            self._rows.append([self._segments.index(name) for name in chain])
             names = (f"{arm.side}_{part}" for part in ("upper_arm", "forearm", "hand"))
             self._lengths.append([LENGTHS.index(name) for name in names])
         self.scales: list[float] = []
 
-    def look(self, quat_WL: np.ndarray, points: np.ndarray, std: np.ndarray, lost: np.ndarray) -> list[Seen] | None:
-        """The arms at one moment; None where something of them is not a number."""
-        for rows, at in zip(self._rows, self._points, strict=True):
+    def observe(
+        self, quat_WL: np.ndarray, points: np.ndarray, std: np.ndarray, lost: np.ndarray
+    ) -> list[ArmObservation] | None:
+        """The arms at one moment; None where a value of them is NaN."""
+        for rows, own in zip(self._rows, self._points, strict=True):
             quat = quat_WL[rows]
-            if not (np.isfinite(points[at]).all() and np.isfinite(quat).all() and quat.any(axis=1).all()):
+            if not (np.isfinite(points[own]).all() and np.isfinite(quat).all() and quat.any(axis=1).all()):
                 return None
         if not self.scales:
-            self.scales = [self._scale_of(i, arm, points) for i, arm in enumerate(self._robot.arms)]
-        return [self._seen(i, quat_WL[rows], points[self._points[i]], std, lost) for i, rows in enumerate(self._rows)]
+            self.scales = [self._compute_scale(arm, points[self._points[i]]) for i, arm in enumerate(self._robot.arms)]
+        return [
+            self._observe_arm(i, quat_WL[rows], points[self._points[i]], std, lost) for i, rows in enumerate(self._rows)
+        ]
 
-    def _seen(self, i: int, quat: np.ndarray, p: np.ndarray, std: np.ndarray, lost: np.ndarray) -> Seen:
-        by, R_WL = self.scales[i], Rotation.from_quat(quat).as_matrix()
+    def _observe_arm(
+        self, i: int, quat: np.ndarray, p: np.ndarray, std: np.ndarray, lost: np.ndarray
+    ) -> ArmObservation:
+        scale, R_WL = self.scales[i], Rotation.from_quat(quat).as_matrix()
         R_BW = self._robot.R_BT @ R_WL[0].T
-        offset, upper = by * R_BW @ (p[3] - p[0]), by * R_BW @ (p[1] - p[0])
-        gone = tuple(self._segments[row] for row in dict.fromkeys(self._rows[i]) if lost[row])
-        return Seen(offset, bend_of(upper, offset), R_BW @ R_WL[3], self._std(i, p, std), gone, by)
+        offset, upper = scale * R_BW @ (p[3] - p[0]), scale * R_BW @ (p[1] - p[0])
+        lost_segments = tuple(self._segments[row] for row in dict.fromkeys(self._rows[i]) if lost[row])
+        swivel = compute_swivel(upper, offset)
+        return ArmObservation(offset, swivel, R_BW @ R_WL[3], self._hand_std(i, p, std), lost_segments, scale)
 
-    def _scale_of(self, i: int, arm: Arm, points: np.ndarray) -> float:
+    def _compute_scale(self, arm: Arm, p: np.ndarray) -> float:
         if self._scale is not None:
             return self._scale
-        length = float(np.linalg.norm(np.diff(points[self._points[i]], axis=0), axis=1).sum())
-        return robot_reach(self._robot, arm) / length
+        return compute_target_reach(self._robot, arm) / float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum())
 
-    def _std(self, i: int, p: np.ndarray, std: np.ndarray) -> float:
-        """[m] of the hand against the shoulder: each segment's error turns what hangs on it, each length's is along.
+    def _hand_std(self, i: int, p: np.ndarray, std: np.ndarray) -> float:
+        """[m] of the hand against the shoulder: an error of a segment rotates what it carries, one of a length shifts.
 
-        As `pose.point_covariance`, whose hand is against the root: a robot's shoulder does not hang on a trunk. A
-        segment's covariance is known here as its mean over the axes.
+        As `pose.point_covariance`, whose hand is against the root: a robot's shoulder does not depend on the trunk. The
+        covariance of a segment is known here only as its mean over the axes.
         """
         torso, upper, fore, hand = self._rows[i]
-        parts = np.diff(p, axis=0)
-        moved = {torso: p[3] - p[0], upper: p[1] - p[0], fore: p[2] - p[1] if hand != fore else p[3] - p[1]}
-        moved |= {} if hand == fore else {hand: p[3] - p[2]}
-        turned = sum(2.0 * std[row] ** 2 * float(v @ v) for row, v in moved.items())
-        along = (parts / np.linalg.norm(parts, axis=1, keepdims=True)).T
-        at = self._lengths[i]
-        lengths = float(np.trace(along @ self._lengths_cov[np.ix_(at, at)] @ along.T))
-        return float(np.sqrt((turned + lengths) / 3.0))
+        links = np.diff(p, axis=0)
+        levers = {torso: p[3] - p[0], upper: p[1] - p[0], fore: p[2] - p[1] if hand != fore else p[3] - p[1]}
+        levers |= {} if hand == fore else {hand: p[3] - p[2]}
+        rotated = sum(2.0 * std[row] ** 2 * float(lever @ lever) for row, lever in levers.items())
+        along = (links / np.linalg.norm(links, axis=1, keepdims=True)).T
+        own = self._lengths[i]
+        lengths = float(np.trace(along @ self._lengths_cov[np.ix_(own, own)] @ along.T))
+        return float(np.sqrt((rotated + lengths) / 3.0))
 
 
-def needed(robot: Robot, segments: Sequence[str]) -> None:
-    """Raises `BadData` where an arm of the robot's has no sensors to follow."""
+def check_segments(robot: Robot, segments: Sequence[str]) -> None:
+    """Raise `BadData` where an arm of the robot has no sensors to follow."""
     for arm in robot.arms:
-        need = ("torso", f"{arm.side}_upper_arm", f"{arm.side}_forearm")
-        missing = [name for name in need if name not in segments]
+        needed = ("torso", f"{arm.side}_upper_arm", f"{arm.side}_forearm")
+        missing = [name for name in needed if name not in segments]
         if missing:
             raise BadData(
                 f"--robot {robot.map.name}: no sensor on {', '.join(missing)}, which its {arm.side} arm follows; "
@@ -241,198 +274,213 @@ def needed(robot: Robot, segments: Sequence[str]) -> None:
             )
 
 
-class CommandStream:
-    """A robot that follows a live pose: poses go in as they come, commands come out at an even rate.
-
-    It begins at rest in the robot's rest posture. Without a pose for `hold_after` [s] it brakes; without one for
-    `stop_after` it stops, and then stays so until `resume`.
+@dataclass(frozen=True)
+class StreamOptions:
+    """Timing of a `CommandStream`.
 
     Parameters
     ----------
     rate_hz : commands a second
-    smoothing_hz : of the low-pass on the aims, which is ``1 / (π smoothing_hz)`` seconds late
-    hold_after, stop_after : [s]
-
-    Attributes
-    ----------
-    delay_s : [s] by which the low-pass is late
-    state : the robot's, of the last command
+    hold_after, stop_after : [s] without a pose, after which the robot brakes, and stops until `resume`
+    smoothing_hz : of the low-pass, whose delay is ``1 / (π smoothing_hz)`` seconds
 
     Raises
     ------
     BadOption
-        A rate or a time that is none.
+        A value out of range.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        rate_hz: float = 100.0,
-        smoothing_hz: float = SMOOTHING_HZ,
-        hold_after: float = HOLD_AFTER_S,
-        stop_after: float = STOP_AFTER_S,
-        tasks: Tasks | None = None,
-    ) -> None:
-        if not 10.0 <= rate_hz <= 1000.0:
-            raise BadOption(f"--robot-hz {rate_hz:g}: from 10 to 1000 commands a second")
-        if not 0.0 < hold_after < stop_after < np.inf:
-            raise BadOption(f"--hold-after {hold_after:g}, --stop-after {stop_after:g}: seconds, the second longer")
-        self.robot, self.dt = robot, 1.0 / rate_hz
-        self._omega = 2.0 * np.pi * smoothing_hz
+    rate_hz: float = 100.0
+    hold_after: float = HOLD_AFTER_S
+    stop_after: float = STOP_AFTER_S
+    smoothing_hz: float = SMOOTHING_HZ
+
+    def __post_init__(self) -> None:
+        if not 10.0 <= self.rate_hz <= 1000.0:
+            raise BadOption(f"--robot-hz {self.rate_hz:g}: from 10 to 1000 commands a second")
+        if not 0.0 < self.hold_after < self.stop_after < np.inf:
+            raise BadOption(
+                f"--hold-after {self.hold_after:g}, --stop-after {self.stop_after:g}: seconds, the second longer"
+            )
+
+
+class CommandStream:
+    """Commands at a constant rate for a robot that follows a live pose.
+
+    It begins at rest in the robot's rest posture. Without a pose for `hold_after` it brakes, and goes on when one comes;
+    without one for `stop_after` it stops until `resume`.
+
+    Attributes
+    ----------
+    delay_s : [s] of the low-pass
+    state : of the robot at the last command
+    """
+
+    def __init__(self, robot: Robot, options: StreamOptions | None = None) -> None:
+        self.robot, self.options = robot, options or StreamOptions()
+        self.dt = 1.0 / self.options.rate_hz
+        self._omega = 2.0 * np.pi * self.options.smoothing_hz
         self.delay_s = 2.0 / self._omega
-        self._hold_after, self._stop_after = hold_after, stop_after
-        shapes = Shapes(robot)
-        self._stepper = Stepper(robot, shapes, self.dt, tasks or Tasks())
-        braking = Tasks(posture=1.0, still=0.0, smooth=0.0, damping=0.0)
-        self._brake = Stepper(robot, shapes, self.dt, braking)
-        nowhere = Aim(np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), 0.0)
-        self._nowhere = tuple(nowhere for _ in robot.arms)
-        n = len(robot.names)
-        self.state = State(robot.rest.copy(), np.zeros(n), np.zeros(n))
-        for stepper in (self._stepper, self._brake):  # what is compiled or read from disk then is there when it moves
-            stepper.step(self.state, self._nowhere)
-            stepper.counts = Counts()
+        collision = CollisionModel(robot)
+        self._controller = QpController(robot, collision, self.dt)
+        braking = Tasks(posture=1.0, joint_velocity=0.0, joint_acceleration=0.0, damping=0.0)
+        self._brake = QpController(robot, collision, self.dt, braking)
+        no_target = HandTarget(np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), 0.0)
+        self._no_targets = (no_target,) * len(robot.arms)
+        self.state = JointState.at_rest(robot.rest)
+        for controller in (self._controller, self._brake):  # compiles, and reads from disk, before the robot moves
+            controller.step(self.state, self._no_targets)
+            controller.counts = StepCounts()
         self._number = 0
         self._time = np.nan
-        self._seen: list[Seen] = []
-        self._smoothed: list[_Smoothed] = []
+        self._observed: list[ArmObservation] = []
+        self._low_passes: list[_LowPass] = []
         self._trust = np.ones(len(robot.arms))
         self._references: list[_Reference] | None = None
-        self._why = ""  # of the approach
-        self._stopped = ""  # why it stopped for good
-        self._ending = ""
+        self._approach_reason = ""
+        self._stop_reason = ""
+        self._end_reason = ""
 
     @property
-    def held(self) -> int:
-        """Steps in which what is near left the programme no solution: the joints' limits were kept."""
-        return self._stepper.counts.held + self._brake.counts.held
+    def infeasible(self) -> int:
+        """Steps in which near shapes left the programme no solution: only the joints' limits were kept."""
+        return self._controller.counts.infeasible + self._brake.counts.infeasible
 
     @property
     def stopped(self) -> bool:
-        return bool(self._stopped)
+        return bool(self._stop_reason)
 
-    def push(self, time: float, seen: list[Seen] | None) -> bool:
-        """The newest pose's tick [s] and its arms; False, and forgotten, where it is none."""
-        if seen is None or not np.isfinite(time):
+    def push(self, time: float, observed: list[ArmObservation] | None) -> bool:
+        """Take the newest pose: its time [s] and its arms. False for none or NaN, which are ignored."""
+        if observed is None or not np.isfinite(time):
             return False
-        dt, before = time - self._time, self._seen
-        self._time, self._seen = time, seen
-        if not before or not 0.0 < dt <= self._hold_after or self._jumped(before, seen, dt):
-            if before and 0.0 < dt <= self._hold_after:
-                self._approach("the pose jumped")
-            self._smoothed = [_Smoothed.at(one) for one in seen]
+        dt, before = time - self._time, self._observed
+        self._time, self._observed = time, observed
+        continues = bool(before) and 0.0 < dt <= self.options.hold_after
+        if continues and not _jumps(before, observed, dt):
+            for low_pass, observation in zip(self._low_passes, observed, strict=True):
+                low_pass.push(observation, dt, self._omega)
             return True
-        for smoothed, one in zip(self._smoothed, seen, strict=True):
-            smoothed.push(one, dt, self._omega)
+        if continues:
+            self._restart_approach("the pose jumped")
+        self._low_passes = [_LowPass.start(observation) for observation in observed]
         return True
 
     def step(self, now: float, age: float) -> Command:
         """The next command; `now` [s] on the poses' clock, `age` [s] since a pose came."""
-        if self._seen and age > self._stop_after and not self._stopped:
-            self._stopped = f"no sound pose for {self._stop_after:g} s"
-        if self._ending or self._stopped:
-            return self._braked(self._ending or self._stopped, final=True)
-        if not self._seen:
-            return self._braked("waiting for a pose")
-        if age > self._hold_after:
-            return self._braked(f"no sound pose for {self._hold_after:g} s")
-        return self._moved(now)
+        hold_after, stop_after = self.options.hold_after, self.options.stop_after
+        if self._observed and age > stop_after and not self._stop_reason:
+            self._stop_reason = f"no sound pose for {stop_after:g} s"
+        if self._end_reason or self._stop_reason:
+            return self._brake_to_rest(self._end_reason or self._stop_reason, final=True)
+        if not self._observed:
+            return self._brake_to_rest("waiting for a pose")
+        if age > hold_after:
+            return self._brake_to_rest(f"no sound pose for {hold_after:g} s")
+        return self._follow(now)
 
     def end(self, reason: str) -> None:
-        """From now on brake, and stop for good."""
-        self._ending = reason
+        """From now on brake, and stop."""
+        self._end_reason = reason
 
     def resume(self) -> None:
-        """Go on after a stop, by an approach, as soon as a pose comes; and approach anew where it follows."""
-        if self._stopped:
-            self._stopped, self._seen = "", []
-        self._approach("set anew")
+        """Continue after a stop as soon as a pose comes, by an approach; approach anew where the robot follows."""
+        if self._stop_reason:
+            self._stop_reason, self._observed = "", []
+        self._restart_approach("set anew")
 
-    def _jumped(self, before: list[Seen], seen: list[Seen], dt: float) -> bool:
-        return any(
-            float(np.linalg.norm(b.offset - a.offset)) > JUMP_SPEED * b.scale * dt
-            or float(np.linalg.norm(pin.log3(b.rotation @ a.rotation.T))) > JUMP_RATE * dt
-            for a, b in zip(before, seen, strict=True)
-        )
+    def _restart_approach(self, reason: str) -> None:
+        self._references, self._approach_reason = None, reason
 
-    def _approach(self, why: str) -> None:
-        self._references, self._why = None, why
+    def _start_references(self) -> list[_Reference]:
+        """References at the robot's hands."""
+        self._controller.set_joints(self.state.u)
+        references = []
+        for i, arm in enumerate(self.robot.arms):
+            pose = self._controller.arm_pose(i)
+            max_acceleration = arm.reach * float(np.median(self.robot.a_max[arm.joints]))
+            references.append(_Reference(pose.hand, pose.rotation, max_acceleration))
+        return references
 
-    def _moved(self, now: float) -> Command:
-        """Towards the newest pose."""
+    def _follow(self, now: float) -> Command:
+        """A step towards the newest pose."""
         dt = self.dt
         if self._references is None:
-            self._stepper.look(self.state.u)
-            self._references = []
-            for i, arm in enumerate(self.robot.arms):
-                hand, turn, _ = self._stepper.place(i)
-                brisk = arm.reach * float(np.median(self.robot.a_most[arm.joints]))
-                self._references.append(_Reference(hand, turn, brisk))
-            self._smoothed = self._smoothed or [_Smoothed.at(one) for one in self._seen]
-        for i, seen in enumerate(self._seen):
-            wanted = trust_in(seen)
-            self._trust[i] += (wanted - self._trust[i]) * -np.expm1(
-                -dt / (TRUST_S if wanted > self._trust[i] else DOUBT_S)
-            )
-        ahead = float(np.clip(now - self._time, -dt, AHEAD_S))
-        aims = [self._aim(i, ahead, moving=now - self._time <= AHEAD_S) for i in range(len(self._seen))]
-        asked = tuple(reference.step(aim, dt) for reference, aim in zip(self._references, aims, strict=True))
-        self.state = self._stepper.step(self.state, asked)
-        error = np.empty((len(aims), 2))
-        for i, aim in enumerate(aims):
-            hand, turn, _ = self._stepper.place(i)
-            error[i] = np.linalg.norm(hand - aim.position), np.linalg.norm(pin.log3(aim.rotation @ turn.T))
-        if not all(reference.found for reference in self._references):
-            return self._command("approach", self._why, error)
-        self._why = ""
-        poor = [(arm.side, seen) for arm, seen, trust in zip(self.robot.arms, self._seen, self._trust, strict=True)
-                if trust < TRUSTED]  # fmt: skip
-        return self._command("slow" if poor else "follow", "; ".join(_doubt(*one) for one in poor), error)
+            self._references = self._start_references()
+        for i, observation in enumerate(self._observed):
+            wanted = _compute_trust(observation)
+            time_constant = TRUST_UP_S if wanted > self._trust[i] else TRUST_DOWN_S
+            self._trust[i] += (wanted - self._trust[i]) * -np.expm1(-dt / time_constant)
+        ahead = float(np.clip(now - self._time, -dt, EXTRAPOLATE_S))
+        moving = now - self._time <= EXTRAPOLATE_S
+        targets = [self._extrapolate(i, ahead, moving) for i in range(len(self._observed))]
+        limited = tuple(reference.step(target, dt) for reference, target in zip(self._references, targets, strict=True))
+        self.state = self._controller.step(self.state, limited)
+        error = np.empty((len(targets), 2))
+        for i, target in enumerate(targets):
+            pose = self._controller.arm_pose(i)
+            turn = pin.log3(target.rotation @ pose.rotation.T)
+            error[i] = np.linalg.norm(pose.hand - target.position), np.linalg.norm(turn)
+        if not all(reference.reached for reference in self._references):
+            return self._command("approach", self._approach_reason, error)
+        self._approach_reason = ""
+        arms = zip(self.robot.arms, self._observed, self._trust, strict=True)
+        poor = [_describe_doubt(arm.side, observation) for arm, observation, trust in arms if trust < TRUSTED]
+        return self._command("slow" if poor else "follow", "; ".join(poor), error)
 
-    def _aim(self, i: int, ahead: float, moving: bool) -> Aim:
-        """Of arm `i`, `ahead` [s] of its newest pose; it stands where the next one is overdue."""
-        smoothed, arm, go = self._smoothed[i], self.robot.arms[i], float(moving)
-        offset = smoothed.offset + ahead * smoothed.offset_rate
-        here, next_ = drawn_in(np.stack([offset, offset + self.dt * smoothed.offset_rate]), arm.reach)
-        return Aim(
+    def _extrapolate(self, i: int, ahead: float, moving: bool) -> HandTarget:
+        """Target of arm `i`, `ahead` [s] of its newest pose; without velocity where the next pose is overdue."""
+        low_pass, arm, factor = self._low_passes[i], self.robot.arms[i], float(moving)
+        offset = low_pass.offset + ahead * low_pass.offset_rate
+        here, next_ = clamp_to_reach(np.stack([offset, offset + self.dt * low_pass.offset_rate]), arm.reach)
+        return HandTarget(
             arm.shoulder + here,
-            go * (next_ - here) / self.dt,
-            pin.exp3(ahead * smoothed.rate) @ smoothed.R,
-            go * smoothed.rate,
-            smoothed.bend + ahead * smoothed.bend_rate,
+            factor * (next_ - here) / self.dt,
+            pin.exp3(ahead * low_pass.angular_velocity) @ low_pass.rotation,
+            factor * low_pass.angular_velocity,
+            low_pass.swivel + ahead * low_pass.swivel_rate,
             float(self._trust[i]),
         )
 
-    def _braked(self, reason: str, final: bool = False) -> Command:
-        """To rest, within the limits."""
-        self._approach(reason)
+    def _brake_to_rest(self, reason: str, final: bool = False) -> Command:
+        """A step to rest, within the limits."""
+        self._restart_approach(reason)
         state, dt = self.state, self.dt
-        if (np.abs(state.v) > STANDS).any() or (np.abs(state.a) > STANDS / dt).any():
-            fades = (np.abs(state.v) > FADES * self.robot.a_most * dt).any()
-            self._brake.lean = (state.u, max(0.0, 1.0 - dt / BRAKE_S) * state.v if fades else np.zeros_like(state.v))
-            self.state = self._brake.step(state, self._nowhere)
+        if (np.abs(state.v) > STATIC_SPEED).any() or (np.abs(state.a) > STATIC_SPEED / dt).any():
+            fades = (np.abs(state.v) > STOP_SHARE * self.robot.a_max * dt).any()
+            velocity = max(0.0, 1.0 - dt / BRAKE_S) * state.v if fades else np.zeros_like(state.v)
+            self._brake.posture = (state.u, velocity)
+            self.state = self._brake.step(state, self._no_targets)
         else:
-            self.state = State(state.u, np.zeros_like(state.v), np.zeros_like(state.a))
+            self.state = JointState.at_rest(state.u)
         error = np.full((len(self.robot.arms), 2), np.nan)
-        resting = not (self.state.v.any() or self.state.a.any())
-        return self._command("stopped" if final and resting else "hold", reason, error)
+        at_rest = not (self.state.v.any() or self.state.a.any())
+        return self._command("stopped" if final and at_rest else "hold", reason, error)
 
     def _command(self, state: str, reason: str, error: np.ndarray) -> Command:
         number, self._number = self._number, self._number + 1
-        std = np.array([seen.std for seen in self._seen]) if self._seen else np.full(len(self.robot.arms), np.nan)
+        std = np.array([arm.std for arm in self._observed] or [np.nan] * len(self.robot.arms))
         u, v, a = self.state.u, self.state.v, self.state.a
         return Command(number, self._time, number * self.dt, state, reason, u, v, a, error, std)
 
 
-def trust_in(seen: Seen) -> float:
-    """`WEIGHT_POOR` to 1: as the trajectory of a recording weighs its hands (`person`)."""
-    std = STD_POOR if seen.lost else np.nan_to_num(seen.std, nan=0.0)
-    grade = float(np.clip((std - STD_GOOD) / (STD_POOR - STD_GOOD), 0.0, 1.0))
-    return 1.0 - (1.0 - WEIGHT_POOR) * grade**2 * (3.0 - 2.0 * grade)
+def _jumps(before: list[ArmObservation], now: list[ArmObservation], dt: float) -> bool:
+    """Whether a hand moved or rotated faster than any can."""
+    return any(
+        float(np.linalg.norm(b.offset - a.offset)) > JUMP_SPEED * b.scale * dt
+        or float(np.linalg.norm(pin.log3(b.rotation @ a.rotation.T))) > JUMP_RATE * dt
+        for a, b in zip(before, now, strict=True)
+    )
 
 
-def _doubt(side: str, seen: Seen) -> str:
-    if seen.lost:
-        return f"no samples from {', '.join(name.replace('_', ' ') for name in seen.lost)}"
-    return f"the {side} hand is uncertain by {1e3 * seen.std:.0f} mm"
+def _compute_trust(observation: ArmObservation) -> float:
+    """`WEIGHT_POOR` to 1, as `HandPath.weight`."""
+    std = STD_POOR if observation.lost else np.nan_to_num(observation.std, nan=0.0)
+    poorness = float(np.clip((std - STD_GOOD) / (STD_POOR - STD_GOOD), 0.0, 1.0))
+    return 1.0 - (1.0 - WEIGHT_POOR) * poorness**2 * (3.0 - 2.0 * poorness)
+
+
+def _describe_doubt(side: str, observation: ArmObservation) -> str:
+    if observation.lost:
+        return f"no samples from {', '.join(name.replace('_', ' ') for name in observation.lost)}"
+    return f"the {side} hand is uncertain by {1e3 * observation.std:.0f} mm"

@@ -1,0 +1,135 @@
+"""Checks of a written trajectory that share no code with the controller: the table, the URDF's limits, coal's shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+import polars as pl
+from scipy.interpolate import CubicHermiteSpline
+
+from .limits import read_joint_limits
+from .robot import Robot
+
+DISABLED, ADJACENT, AT_REST = "disabled in the SRDF", "adjacent", "in collision at rest"
+
+
+class LimitCheck(NamedTuple):
+    """Margins of a trajectory to its limits; negative: a limit is exceeded."""
+
+    position: float  # [rad or m] to the nearest position limit
+    velocity: float  # share of the velocity limits that is never used
+    acceleration: float  # of the acceleration limits
+    jerk: float  # of the jerk limits
+    consistent: bool  # velocities and accelerations are those of one curve through the positions, cubic in each step
+    ends_at_rest: bool  # it begins and ends without velocity and acceleration
+
+    @property
+    def passed(self) -> bool:
+        """Whether every limit is kept."""
+        margins = self.position, self.velocity, self.acceleration, self.jerk
+        return min(margins) >= 0.0 and self.consistent and self.ends_at_rest
+
+
+def check_limits(
+    table: pl.DataFrame, urdf: Path, acceleration: Mapping[str, float], jerk: Mapping[str, float] | None = None
+) -> LimitCheck:
+    """Compare a table as in ``trajectory.parquet`` with the URDF's limits and the map's accelerations and jerks.
+
+    Checked at the samples and at ten points between each two, on the cubics through positions and velocities.
+    """
+    limits, time = read_joint_limits(urdf), table["time"].to_numpy()
+    joints = [name for name in table.columns if name in limits]
+    q, v, a = (table.select([f"{j}{suffix}" for j in joints]).to_numpy() for suffix in ("", "_velocity", "_acceleration"))
+    low, high, v_max = (np.array([getattr(limits[j], key) for j in joints]) for key in ("lower", "upper", "velocity"))
+    a_max = np.array([acceleration[j] for j in joints])
+    j_max = np.array([jerk[j] if jerk else np.inf for j in joints])
+    dt = np.diff(time)[:, None]
+    curve = CubicHermiteSpline(time, q, v)
+    dense = np.unique(np.concatenate([time, (time[:-1, None] + dt * np.arange(0.1, 1.0, 0.1)).ravel()]))
+    q_between, v_between = curve(dense), curve(dense, 1)
+    jerks, left = 6.0 * curve.c[0], 2.0 * curve.c[1]  # of each step, and the acceleration at its beginning
+    right = left + jerks * dt
+    steps = np.abs(np.diff(a, axis=0)) / dt
+    return LimitCheck(
+        position=float(min((q_between - low).min(), (high - q_between).min())),
+        velocity=float(1.0 - max((np.abs(v) / v_max).max(), (np.abs(v_between) / v_max).max())),
+        acceleration=float(1.0 - max((np.abs(x) / a_max).max() for x in (a, left, right))),
+        jerk=float(1.0 - max((np.abs(x) / j_max).max() for x in (jerks, steps))),
+        consistent=bool(np.allclose(left, a[:-1], atol=1e-4) and np.allclose(right, a[1:], atol=1e-4)),
+        ends_at_rest=bool(np.abs(np.concatenate([v[[0, -1]], a[[0, -1]]])).max() < 1e-9),
+    )
+
+
+class SelfCollisions(NamedTuple):
+    """Samples of a trajectory at which the robot collides with itself."""
+
+    samples: int
+    first: str  # the first pair, and when; empty without a collision
+    pairs: int  # of shapes that were checked
+    excluded: dict[str, list[str]]  # reason → pairs that were not
+
+
+def find_self_collisions(robot: Robot, time: np.ndarray, u: np.ndarray) -> SelfCollisions:
+    """Check every sample with the robot's own shapes, not their hulls, and with a pair rule of its own.
+
+    Excluded are shapes of one part or of adjacent parts, pairs that the SRDF disables, and pairs in collision in the
+    rest posture. The controller's rule, by which pairs can collide at all, has no part in it.
+    """
+    shapes, excluded = _select_pairs(robot)
+    data, geometry = robot.model.createData(), shapes.createData()
+    boxes = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(robot.model, shapes, geometry)
+    hits = [
+        k for k in range(len(u)) if pin.computeCollisions(robot.model, data, boxes, robot.configuration(u[k]), True)
+    ]
+    first = ""
+    if hits:
+        pin.computeCollisions(robot.model, data, shapes, geometry, robot.configuration(u[hits[0]]), True)
+        first = f"{_name_collision(shapes, geometry)} at {float(time[hits[0]]):.2f} s"
+    return SelfCollisions(len(hits), first, len(shapes.collisionPairs), excluded)
+
+
+def _select_pairs(robot: Robot) -> tuple[Any, dict[str, list[str]]]:
+    """The shapes with the pairs to check, and the excluded pairs by reason."""
+    shapes, parents = pin.GeometryModel(robot.geometry), robot.model.parents
+    shapes.addAllCollisionPairs()  # of different parts
+    excluded: dict[str, list[str]] = {DISABLED: [], ADJACENT: [], AT_REST: []}
+
+    def list_pairs() -> list[tuple[int, int]]:
+        return [(pair.first, pair.second) for pair in shapes.collisionPairs]
+
+    def exclude(reason: str, pairs: list[tuple[int, int]]) -> None:
+        for a, b in pairs:
+            excluded[reason].append(" - ".join(shapes.geometryObjects[i].name for i in (a, b)))
+            if shapes.existCollisionPair(pin.CollisionPair(a, b)):
+                shapes.removeCollisionPair(pin.CollisionPair(a, b))
+
+    if robot.map.srdf is not None:
+        before = list_pairs()
+        pin.removeCollisionPairs(robot.model, shapes, str(robot.map.srdf))
+        exclude(DISABLED, sorted(set(before) - set(list_pairs())))
+    joints = [shape.parentJoint for shape in shapes.geometryObjects]
+    parent = {}
+    for joint in joints:
+        parent[joint] = parents[joint]
+        while parent[joint] > 0 and parent[joint] not in joints:  # a part without a shape
+            parent[joint] = parents[parent[joint]]
+    exclude(
+        ADJACENT, [(a, b) for a, b in list_pairs() if joints[a] == parent[joints[b]] or joints[b] == parent[joints[a]]]
+    )
+    geometry = shapes.createData()
+    q = robot.configuration(robot.rest)
+    pin.computeCollisions(robot.model, robot.model.createData(), shapes, geometry, q, False)
+    hits = [result.isCollision() for result in geometry.collisionResults]
+    exclude(AT_REST, [pair for pair, hit in zip(list_pairs(), hits, strict=True) if hit])
+    return shapes, excluded
+
+
+def _name_collision(shapes: Any, geometry: Any) -> str:
+    """The first pair that collides."""
+    k = next(k for k, result in enumerate(geometry.collisionResults) if result.isCollision())
+    pair = shapes.collisionPairs[k]
+    return " and ".join(shapes.geometryObjects[i].name for i in (pair.first, pair.second))

@@ -1,0 +1,85 @@
+"""Why a hand is off its target: the constraints that were active, and what the robot could have reached."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+from scipy.spatial.transform import Rotation
+
+from .controller import HandTarget, JointState, QpController
+from .trajectory import Trajectory
+
+FAR = 0.02  # [m] off the target: above it the error is attributed
+CLAMPED = 1e-3  # [m] by which a target was moved: it was outside the reach
+AT_LIMIT = 0.01  # [rad or m] from a position limit: there an active joint is at its position limit
+CATCH_UP_S = 0.3  # [s] after a joint was too slow in which its error is attributed to that
+CAUSES = ("not measured", "beyond the reach", "self-collision", "joint limit", "too fast", "conflicting tasks")
+_FRAMES, _STARTS, _STEPS = 40, 3, 25
+_PENETRATION = 4e-3  # [m] into the clearance, above which a posture does not count as reached
+
+
+def attribute_errors(trajectory: Trajectory, arm: int) -> dict[str, float]:
+    """Cause → share of the motion's samples at which the hand is more than `FAR` off for it; the first that holds.
+
+    `CAUSES` in their order: a sensor was lost; the target is beyond the reach; near shapes stop the arm; a joint is at
+    its position limit; a joint is at a limit of velocity, acceleration or jerk, or was so shortly before; none of
+    these: position, orientation and swivel cannot be met together.
+    """
+    robot, begin, run = trajectory.robot, trajectory.approach, trajectory.run
+    joints, target = robot.arms[arm].joints, trajectory.targets[arm]
+    u = run.u[:, joints]
+    at_limit = (u - robot.lower[joints] < AT_LIMIT) | (robot.upper[joints] - u < AT_LIMIT)
+    active, half = run.active.joints[:, joints], round(0.5 * CATCH_UP_S / float(trajectory.time[1]))
+    holds = np.stack(
+        [
+            target.lost,
+            np.linalg.norm(target.position - target.unclamped, axis=1) > CLAMPED,
+            run.active.shapes[:, arm],
+            (active & at_limit).any(axis=1),
+            maximum_filter1d(active.any(axis=1), 2 * half + 1, origin=half),
+            np.ones(len(u), dtype=bool),
+        ]
+    )
+    far = np.linalg.norm(run.hand[arm] - target.unclamped, axis=1)[begin:] > FAR
+    cause = np.argmax(holds, axis=0)[begin:][far]
+    return {name: round(float(np.sum(cause == k)) / len(far), 4) for k, name in enumerate(CAUSES)}
+
+
+def assess_reachability(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Samples (m,), and the distance (m, arms) [m] of each hand from its target that unlimited time would leave.
+
+    The same tasks, joint limits and clearances, without limits of velocity, acceleration and jerk, are solved to rest
+    from several postures: the robot's own, the rest posture, random ones. The search is local: it is an upper bound.
+    """
+    robot = trajectory.robot
+    n, rng = len(robot.names), np.random.default_rng(0)
+    tasks = replace(
+        trajectory.tasks, gain=40.0, deceleration=1e9, joint_acceleration=0.0, posture=1e-5, joint_velocity=1e-4
+    )
+    controller = QpController(robot, trajectory.collision, 0.01, tasks, limit_factor=1e4)
+    frames = np.linspace(trajectory.approach, len(trajectory.time) - 1, _FRAMES).astype(int)
+    distance = np.full((len(frames), len(robot.arms)), np.inf)
+    for k, frame in enumerate(frames.tolist()):
+        targets = tuple(
+            HandTarget(path.position[frame], np.zeros(3), path.rotation[frame], np.zeros(3), path.swivel[frame], 1.0)
+            for path in trajectory.targets
+        )
+        best = np.full(len(robot.arms), np.inf)
+        for u in (trajectory.u[frame], robot.rest, *rng.uniform(*robot.bounds, (_STARTS, n))):
+            state = JointState.at_rest(u)
+            for _ in range(_STEPS):
+                state = controller.step(state, targets)
+            controller.set_joints(state.u)
+            near = trajectory.collision.find_near_pairs(controller.data)
+            if (near.distance < near.clearance - _PENETRATION).any():
+                continue
+            for i, target in enumerate(targets):
+                pose = controller.arm_pose(i)
+                far = float(np.linalg.norm(pose.hand - target.position))
+                angle = Rotation.from_matrix(pose.rotation.T @ target.rotation).magnitude()
+                cost = tasks.position * far**2 + tasks.orientation * angle**2
+                if cost < best[i]:
+                    best[i], distance[k, i] = cost, far
+    return frames, distance

@@ -1,0 +1,137 @@
+"""Visual meshes of a robot: triangles for each moving part, few enough for a page."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from .maps import package_folders
+from .robot import Robot
+from .trajectory import Trajectory
+
+MAX_TRIANGLES = 30_000  # of the whole robot
+FINEST_CELL, CELL_GROWTH = 0.003, 1.4  # [m] size of the cells in which vertices are merged; factor until they suffice
+BODY, LEFT, RIGHT = (0.80, 0.82, 0.85, 1.0), (0.93, 0.66, 0.50, 1.0), (0.52, 0.70, 0.85, 1.0)
+SIDE_DISTANCE = 1.35  # [m] of the robot to the left of the person
+STANDING_HEIGHT = 0.75  # [m] of the shoulders above the lowest point, from which on the robot stands on the floor
+
+
+class MeshPart(NamedTuple):
+    """One rigid part; vertices (n, 3) [m] in its joint's frame, triangles (m, 3)."""
+
+    joint: int
+    vertices: np.ndarray
+    triangles: np.ndarray
+    rgba: tuple[float, float, float, float]
+
+
+def build_parts(robot: Robot) -> list[MeshPart]:
+    """Parts to draw; empty where the URDF has no visual shapes."""
+    folders = package_folders(robot.map.urdf)
+    whole = pin.buildGeomFromUrdf(robot.full, str(robot.map.urdf), pin.GeometryType.VISUAL, package_dirs=folders)
+    moving = set(robot.model.names[1:])
+    locked = [robot.full.getJointId(name) for name in robot.full.names[1:] if name not in moving]
+    _, shapes = pin.buildReducedModel(robot.full, whole, locked, robot.rest_full)
+    meshes: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for shape in shapes.geometryObjects:
+        vertices, triangles = _triangulate(shape.geometry)
+        if len(triangles):
+            placed = vertices @ shape.placement.rotation.T + shape.placement.translation
+            meshes.setdefault(int(shape.parentJoint), []).append((placed, triangles))
+    cell = FINEST_CELL
+    while True:
+        parts = [
+            MeshPart(joint, *_join([_simplify(*mesh, cell) for mesh in own]), _choose_colour(robot, joint))
+            for joint, own in sorted(meshes.items())
+        ]
+        if sum(len(part.triangles) for part in parts) <= MAX_TRIANGLES:
+            return parts
+        cell *= CELL_GROWTH
+
+
+def place_beside_person(
+    robot: Robot, parts: list[MeshPart], shoulder_z: float, floor_z: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """R_WB (3, 3) and p_WB (3,) [m]: the root in W, beside the person and facing the same way."""
+    R = robot.R_BT.T
+    shoulder = R @ np.mean([arm.shoulder for arm in robot.arms], axis=0)
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, robot.configuration(robot.rest))
+    lowest = 0.0
+    roots = [part for part in parts if part.joint == 0]
+    if roots:
+        root = data.oMi[0]
+        lowest = min(((part.vertices @ root.rotation.T + root.translation) @ R.T)[:, 2].min() for part in roots)
+    standing = shoulder[2] - lowest > STANDING_HEIGHT
+    z = floor_z - lowest if standing else shoulder_z - shoulder[2]
+    return R, np.array([-shoulder[0], SIDE_DISTANCE - shoulder[1], z])
+
+
+def compute_placements(
+    trajectory: Trajectory, parts: list[MeshPart], frames: np.ndarray, R: np.ndarray, p: np.ndarray
+) -> dict[int, Any]:
+    """Joint → (quat_WJ (m, 4) xyzw, p_WJ (m, 3)) at samples `frames`, with the root at `R`, `p` in W."""
+    robot, joints = trajectory.robot, sorted({part.joint for part in parts})
+    data = robot.model.createData()
+    root = pin.SE3(R, p)
+    placements = {joint: (np.empty((len(frames), 4)), np.empty((len(frames), 3))) for joint in joints}
+    for k, frame in enumerate(frames.tolist()):
+        pin.forwardKinematics(robot.model, data, robot.configuration(trajectory.u[frame]))
+        for joint, (quat, position) in placements.items():
+            p_quat = pin.SE3ToXYZQUAT(root * data.oMi[joint])
+            quat[k], position[k] = p_quat[3:], p_quat[:3]
+    return placements
+
+
+def _choose_colour(robot: Robot, joint: int) -> tuple[float, float, float, float]:
+    """The colour of the arm that moves a joint."""
+    while joint > 0:
+        for arm in robot.arms:
+            if any(robot.names[j] == robot.model.names[joint] for j in arm.joints):
+                return LEFT if arm.side == "left" else RIGHT
+        joint = robot.model.parents[joint]
+    return BODY
+
+
+def _triangulate(geometry: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a mesh, box, cylinder or sphere."""
+    import trimesh
+
+    kind = type(geometry).__name__
+    if hasattr(geometry, "num_tris") and hasattr(geometry, "tri_indices"):
+        triangles = np.array(
+            [[t[0], t[1], t[2]] for t in map(geometry.tri_indices, range(geometry.num_tris))], dtype=int
+        )
+        return np.asarray(geometry.vertices(), dtype=float), triangles.reshape(-1, 3)
+    if kind == "Box":
+        mesh = trimesh.creation.box(2.0 * np.asarray(geometry.halfSide).ravel())
+    elif kind == "Cylinder":
+        mesh = trimesh.creation.cylinder(geometry.radius, 2.0 * geometry.halfLength, sections=24)
+    elif kind == "Sphere":
+        mesh = trimesh.creation.icosphere(2, geometry.radius)
+    else:
+        return np.empty((0, 3)), np.empty((0, 3), dtype=int)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def _simplify(vertices: np.ndarray, triangles: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
+    """Merge the vertices of one cell into their mean; drop triangles that lose a corner."""
+    _, index, count = np.unique(
+        np.round(vertices / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    index = index.ravel()
+    mean = np.stack([np.bincount(index, vertices[:, k]) for k in range(3)], axis=1) / count[:, None]
+    corners = index[triangles]
+    whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+    corners = corners[whole]
+    _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
+    return mean, corners[np.sort(first)]
+
+
+def _join(meshes: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Several meshes as one."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
+    triangles = [triangles + start for (_, triangles), start in zip(meshes, starts, strict=False)]
+    return np.vstack([vertices for vertices, _ in meshes]), np.vstack(triangles)
