@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wepose_pin.live import LivePose, Output, SensorSetup, Stage, Status, run_session
+from wepose_pin.live import Output, SensorSetup, Status, run_session
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import simulate, simulated_person
@@ -50,18 +50,12 @@ def _reader(url: str) -> Iterator[None]:
         process.wait()
 
 
-class _Meter:
-    """An output that notes processor time and memory at the first pose and at the end."""
+class _Meter(Output):
+    """Notes processor time and memory at the first pose and at the end."""
 
     def __init__(self) -> None:
         self.before: tuple[float, float, float] | None = None
         self.after: tuple[float, float, float] | None = None
-
-    def start(self, stage: Stage) -> None:
-        pass
-
-    def show(self, pose: LivePose) -> None:
-        pass
 
     def status(self, status: Status) -> None:
         now = time.perf_counter(), time.process_time(), _resident()
@@ -69,12 +63,6 @@ class _Meter:
             gc.collect()
             self.before = now
         self.after = now
-
-    def take_keys(self) -> list[str]:
-        return []
-
-    def close(self) -> None:
-        pass
 
 
 def sections(quick: bool) -> dict[str, Section]:

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from test_causal import first
 
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
-from wepose_pin.live.loop import Ended, Latencies, LiveLoop
+from wepose_pin.live.loop import Latencies, LiveLoop, SessionSummary
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
-from wepose_pin.live.state import LivePose, Stage, Status
+from wepose_pin.live.state import LivePose, Status, StreamInfo
 from wepose_pin.readers.live_log import SAMPLES, blocks, read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
@@ -38,14 +38,14 @@ class Watcher:
     """An output that keeps what it was shown, and presses keys when the time has come."""
 
     def __init__(self, keys: Sequence[tuple[float, str]] = ()) -> None:
-        self.stage: Stage | None = None
+        self.info: StreamInfo | None = None
         self.poses: list[LivePose] = []
         self.statuses: list[Status] = []
         self.closed = False
         self._keys = list(keys)
 
-    def start(self, stage: Stage) -> None:
-        self.stage = stage
+    def start(self, info: StreamInfo) -> None:
+        self.info = info
 
     def show(self, pose: LivePose) -> None:
         self.poses.append(pose)
@@ -104,7 +104,7 @@ def live(
     source: Source | None = None,
     watcher: Watcher | None = None,
     method: str = "amekf",
-) -> Ended:
+) -> SessionSummary:
     setup = SensorSetup.from_recording(recording)
     log = LiveLog(file, setup.header(tuple(recording.sensors)) | {"method": method})
     source = source or ReplaySource(recording, math.inf)
@@ -202,14 +202,14 @@ def test_outputs_get_the_newest_pose_with_its_points(recording: Recording, tmp_p
     watcher = Watcher()
     live(recording, tmp_path / "a.wepose", watcher=watcher)
     causal = track(recording, causal=True)
-    assert watcher.stage is not None
-    assert watcher.stage.segments == tuple(recording.sensors)
+    assert watcher.info is not None
+    assert watcher.info.segments == tuple(recording.sensors)
     for pose in watcher.poses[:: len(watcher.poses) // 10]:
         k = int(np.argmin(np.abs(causal.time - pose.time)))
         assert abs(causal.time[k] - pose.time) < 1e-6
-        for i, name in enumerate(watcher.stage.segments):
+        for i, name in enumerate(watcher.info.segments):
             assert np.array_equal(pose.quat_WL[i], causal.quat_WL[name][k])
-        for i, name in enumerate(watcher.stage.points):
+        for i, name in enumerate(watcher.info.points):
             np.testing.assert_allclose(pose.points[i], causal.points[name][k], atol=1e-12)
 
 
@@ -391,7 +391,7 @@ def test_the_person_is_told_what_to_do(recording: Recording, tmp_path: Path) -> 
     states = [status.state for status in watcher.statuses]
     assert states[0] == "waiting"
     assert states[-1] == "ended"
-    assert watcher.stage is not None
+    assert watcher.info is not None
     assert "right forearm" in watcher.statuses[0].message
     found = read_live_log(tmp_path / "a.wepose")
     again = track(found.recording, causal=True)

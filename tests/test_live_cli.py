@@ -98,7 +98,7 @@ def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest
         (["--source", replay, "--record", str(file)], "there.wepose: exists; --force replaces it"),
         (["--source", replay, "--record", str(tmp_path / "no" / "a.wepose")], "a.wepose: cannot be written"),
         (["--source", replay, "--subject", str(tmp_path / "none")], "none: no such file"),
-        (["--source", replay, "--udp", "somewhere"], "UDP out: 'somewhere'; a port or HOST:PORT"),
+        (["--source", replay, "--udp", "somewhere"], "--udp somewhere: a port or HOST:PORT is needed"),
         (["--source", replay, "--port", "70000"], "the live page: port 70000; a number from 1 to 65535"),
         (["--source", replay, "--method", "smoother"], "smoother"),
     ):

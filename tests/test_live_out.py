@@ -17,11 +17,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption
-from wepose_pin.live.out import LslOut, Pace, UdpOut, channels_of, pose_json, udp_out
-from wepose_pin.live.state import LivePose, Stage
+from wepose_pin.live.outputs import LslOutput, RateLimiter, UdpOutput, list_channels, pose_json
+from wepose_pin.live.state import LivePose, StreamInfo
 
 ROOT = Path(__file__).resolve().parent.parent
-STAGE = Stage(("torso", "right_forearm"), ("right_wrist", "right_hand"), 100.0)
+INFO = StreamInfo(("torso", "right_forearm"), ("right_wrist", "right_hand"), 100.0)
 
 
 def pose(time_s: float = 1.25, seed: int = 0, **other: Any) -> LivePose:
@@ -41,24 +41,24 @@ def receiver() -> Iterator[socket.socket]:
 
 def test_json_keeps_micrometres_and_says_what_is_not_known() -> None:
     one = pose()
-    said = json.loads(pose_json(STAGE, one))
+    said = json.loads(pose_json(INFO, one))
     assert list(said) == ["format", "t", "segments", "points", "std", "lost"]
     assert said["format"] == 1
     assert said["t"] == one.time
-    for names, key, values in ((STAGE.segments, "segments", one.quat_WL), (STAGE.points, "points", one.points)):
+    for names, key, values in ((INFO.segments, "segments", one.quat_WL), (INFO.points, "points", one.points)):
         assert list(said[key]) == list(names)
         np.testing.assert_allclose([said[key][name] for name in names], values, atol=5.1e-7)
     assert said["std"] == {"torso": 0.02, "right_forearm": None}
     assert said["lost"] == ["right_forearm"]
     unknown = pose(points=np.array([[np.nan, 0.0, 0.0], [1.0, 2.0, 3.0]]))
-    assert json.loads(pose_json(STAGE, unknown))["points"] == {"right_wrist": None, "right_hand": [1.0, 2.0, 3.0]}
+    assert json.loads(pose_json(INFO, unknown))["points"] == {"right_wrist": None, "right_hand": [1.0, 2.0, 3.0]}
 
 
 def test_json_of_the_document() -> None:
     """docs/live-page.md shows a message; it has the keys and the shapes of one."""
     shown = re.search(r"```json\n(.*?)```", (ROOT / "docs" / "live-page.md").read_text(encoding="utf-8"), re.DOTALL)
     assert shown is not None
-    documented, real = json.loads(shown[1]), json.loads(pose_json(STAGE, pose()))
+    documented, real = json.loads(shown[1]), json.loads(pose_json(INFO, pose()))
     assert list(documented) == list(real)
     assert documented["format"] == real["format"]
     assert len(documented["segments"]["torso"]) == 4
@@ -66,13 +66,13 @@ def test_json_of_the_document() -> None:
 
 
 def test_a_datagram_a_pose(receiver: socket.socket) -> None:
-    out = UdpOut("127.0.0.1", receiver.getsockname()[1])
+    out = UdpOutput(str(receiver.getsockname()[1]))
     out.show(pose())  # before the start: there are no names yet
-    out.start(STAGE)
+    out.start(INFO)
     for k in range(3):
         out.show(pose(k * 0.01, seed=k))
     for k in range(3):
-        assert receiver.recv(65535) == pose_json(STAGE, pose(k * 0.01, seed=k))
+        assert receiver.recv(65535) == pose_json(INFO, pose(k * 0.01, seed=k))
     out.close()
     out.close()
     out.show(pose(9.0))
@@ -83,8 +83,8 @@ def test_a_datagram_a_pose(receiver: socket.socket) -> None:
 
 def test_a_receiver_that_never_reads_holds_nobody_up(receiver: socket.socket) -> None:
     """More than its buffer holds: a blocking socket, or one that queues here, would stand or grow."""
-    out = UdpOut("127.0.0.1", receiver.getsockname()[1], rate_hz=None)
-    out.start(STAGE)
+    out = UdpOutput(str(receiver.getsockname()[1]), rate_hz=None)
+    out.start(INFO)
     one = pose()
     for _ in range(20_000):
         out.show(one)
@@ -103,8 +103,8 @@ def test_nobody_listens_and_no_network() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-    out = UdpOut("127.0.0.1", port, rate_hz=None)
-    out.start(STAGE)
+    out = UdpOutput(str(port), rate_hz=None)
+    out.start(INFO)
     for k in range(50):  # "connection refused" must not come back to the loop
         out.show(pose(k * 0.01))
     out.close()
@@ -114,28 +114,28 @@ def test_nobody_listens_and_no_network() -> None:
     ("rate_hz", "of_hz", "share"), [(100.0, 1000.0, 0.1), (100.0, 60.0, 1.0), (100.0, 120.0, 5 / 6)]
 )
 def test_pace_on_average(rate_hz: float, of_hz: float, share: float) -> None:
-    pace = Pace(rate_hz)
+    pace = RateLimiter(rate_hz)
     jitter = np.random.default_rng(1).uniform(-0.1, 0.1, 6000)
-    taken = sum(pace.takes((k + jitter[k]) / of_hz + 1.7e9) for k in range(6000))
+    taken = sum(pace.accepts((k + jitter[k]) / of_hz + 1.7e9) for k in range(6000))
     assert abs(taken / 6000 - share) < 0.01
 
 
 def test_pace_after_a_gap_and_when_time_begins_anew() -> None:
-    pace = Pace(10.0)
-    assert [pace.takes(t) for t in (0.0, 0.05, 0.1, 5.0, 5.05, 5.1)] == [True, False, True, True, False, True]
-    assert [pace.takes(t) for t in (0.0, 0.05, 0.1)] == [True, False, True]
-    assert all(Pace(None).takes(1.0) for _ in range(3))
+    pace = RateLimiter(10.0)
+    assert [pace.accepts(t) for t in (0.0, 0.05, 0.1, 5.0, 5.05, 5.1)] == [True, False, True, True, False, True]
+    assert [pace.accepts(t) for t in (0.0, 0.05, 0.1)] == [True, False, True]
+    assert all(RateLimiter(None).accepts(1.0) for _ in range(3))
 
 
 @pytest.mark.parametrize("to", ["here", "127.0.0.1:", "127.0.0.1:http", "0", "70000", "no such host:9001", ":-1"])
 def test_wrong_addresses(to: str) -> None:
-    with pytest.raises(BadOption, match=r"UDP out: .*; "):
-        udp_out(to)
+    with pytest.raises(BadOption, match=r"--udp .*: (no host|a port or HOST:PORT)"):
+        UdpOutput(to)
 
 
 def test_a_port_alone_is_this_machine(receiver: socket.socket) -> None:
-    out = udp_out(str(receiver.getsockname()[1]))
-    out.start(STAGE)
+    out = UdpOutput(str(receiver.getsockname()[1]))
+    out.start(INFO)
     out.show(pose())
     assert receiver.recvfrom(65535)[1][0] == "127.0.0.1"
     out.close()
@@ -144,7 +144,7 @@ def test_a_port_alone_is_this_machine(receiver: socket.socket) -> None:
 def test_wrong_rates() -> None:
     for rate_hz in (0.0, -1.0, float("nan")):
         with pytest.raises(BadOption, match="poses a second"):
-            Pace(rate_hz)
+            RateLimiter(rate_hz)
 
 
 def test_the_example_reads_it() -> None:
@@ -159,10 +159,10 @@ def test_the_example_reads_it() -> None:
         [sys.executable, "-W", "error", "-c", script.replace("9001))", f"{port}))")], stdout=subprocess.PIPE, text=True
     )
     assert run.stdout is not None
-    out = UdpOut("127.0.0.1", port)
-    out.start(STAGE)
+    out = UdpOutput(f"127.0.0.1:{port}")
+    out.start(INFO)
     until = time.monotonic() + 30.0
-    where = json.loads(pose_json(STAGE, pose()))["points"]["right_hand"]
+    where = json.loads(pose_json(INFO, pose()))["points"]["right_hand"]
     for k in range(100_000):
         out.show(pose(k * 0.01))
         time.sleep(0.01)
@@ -178,13 +178,13 @@ def test_the_example_reads_it() -> None:
 def test_lsl_stream(monkeypatch: pytest.MonkeyPatch) -> None:
     pylsl = pytest.importorskip("pylsl")
     monkeypatch.delenv("LSLAPICFG", raising=False)
-    out = LslOut("OutTest")
+    out = LslOutput("OutTest")
     out.show(pose())  # before the start
-    out.start(STAGE)
+    out.start(INFO)
     info = pylsl.resolve_byprop("name", "OutTest", timeout=10.0)[0]
     inlet = pylsl.StreamInlet(info, recover=False)
     described = inlet.info(timeout=10.0)
-    assert described.get_channel_labels() == [label for label, _ in channels_of(STAGE)]
+    assert described.get_channel_labels() == [label for label, _ in list_channels(INFO)]
     assert (described.type(), described.nominal_srate()) == ("Pose", 100.0)
     inlet.open_stream(timeout=10.0)
     one = pose()
@@ -206,4 +206,4 @@ def test_lsl_stream(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_lsl_without_a_name() -> None:
     pytest.importorskip("pylsl")
     with pytest.raises(BadOption, match="needs a name"):
-        LslOut("")
+        LslOutput("")

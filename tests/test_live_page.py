@@ -26,10 +26,10 @@ from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from wepose_pin.errors import BadOption
-from wepose_pin.live.figure import Figure
+from wepose_pin.live.encoder import PoseEncoder
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.server import status_json
-from wepose_pin.live.state import LivePose, SensorStatus, Stage, Status
+from wepose_pin.live.state import LivePose, SensorStatus, Status, StreamInfo
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.pose import LiveKinematics, configuration, placements
 
@@ -47,21 +47,21 @@ class Person:
 
     def __init__(self, model: BodyModel, segments: tuple[str, ...] = SEGMENTS) -> None:
         self._kinematics = LiveKinematics(model, segments)
-        self.stage = Stage(segments, self._kinematics.points, 100.0)
+        self.info = StreamInfo(segments, self._kinematics.points, 100.0)
 
     def pose(self, t: float, lost: tuple[str, ...] = ()) -> LivePose:
         swing = {"torso": [0, 0, 0.2], "left_forearm": [0, -1.5, 0], "right_forearm": [0, -1.2 - 0.3 * math.sin(t), 0]}
         quat_WL = np.array(
-            [Rotation.from_rotvec(swing.get(s, [0, -0.8 * math.sin(2 * t), 0])).as_quat() for s in self.stage.segments]
+            [Rotation.from_rotvec(swing.get(s, [0, -0.8 * math.sin(2 * t), 0])).as_quat() for s in self.info.segments]
         )
         points = self._kinematics.points_of(quat_WL)
-        gone = np.array([segment in lost for segment in self.stage.segments])
+        gone = np.array([segment in lost for segment in self.info.segments])
         return LivePose(t, quat_WL, points, np.full(len(gone), 0.02), gone, 0.003)
 
     def status(self, state: str = "ready", message: str = "Tracking.", lost: tuple[str, ...] = ()) -> Status:
         sensors = tuple(
             SensorStatus(s, 99.8, s in lost, s == "torso", (0.002, -0.005, 0.0), math.nan, 3.0, 1, 2, 3, False)
-            for s in self.stage.segments
+            for s in self.info.segments
         )
         return Status(state, message, 0.4, 12.0, sensors, (3.2, 8.4), 7.0, {"bad checksums": 3})
 
@@ -79,7 +79,7 @@ def page(model: BodyModel) -> Iterator[LivePage]:
 
 def unpacked(model: BodyModel, frame: bytes) -> tuple[float, dict[str, np.ndarray], np.ndarray, dict[str, bool]]:
     """Time, link → (12,), hands (2, 3), link → lost."""
-    links = Figure(model).links
+    links = PoseEncoder(model).links
     n = len(links)
     assert len(frame) == 8 + 4 * (12 * n + 6) + n
     placed = np.frombuffer(frame, "<f4", 12 * n, 8).reshape(n, 12)
@@ -98,36 +98,36 @@ def unpacked(model: BodyModel, frame: bytes) -> tuple[float, dict[str, np.ndarra
 
 
 def test_a_frame_places_every_link_as_the_kinematics_do(model: BodyModel, person: Person) -> None:
-    figure = Figure(model)
-    figure.begin(person.stage)
+    encoder = PoseEncoder(model)
+    encoder.start(person.info)
     pose = person.pose(0.7, lost=("left_forearm",))
-    time_s, placed, hands, lost = unpacked(model, figure.frame(pose))
+    time_s, placed, hands, lost = unpacked(model, encoder.encode(pose))
     assert time_s == 0.7
     q = configuration(model, {s: pose.quat_WL[k : k + 1] for k, s in enumerate(SEGMENTS)})
-    for link, (quat_WL, p_WL) in placements(model, q, figure.links).items():
+    for link, (quat_WL, p_WL) in placements(model, q, encoder.links).items():
         np.testing.assert_allclose(placed[link][:9], Rotation.from_quat(quat_WL[0]).as_matrix().ravel(), atol=1e-6)
         np.testing.assert_allclose(placed[link][9:], p_WL[0], atol=1e-6)
     for k, hand in enumerate(("left_hand", "right_hand")):
-        np.testing.assert_allclose(hands[k], pose.points[person.stage.points.index(hand)], atol=1e-6)
+        np.testing.assert_allclose(hands[k], pose.points[person.info.points.index(hand)], atol=1e-6)
     assert {link for link, gone in lost.items() if gone} == {"left_forearm", "left_hand"}  # rigid with its forearm
 
 
 def test_the_n_pose_before_the_start_and_only_what_is_measured_after(model: BodyModel) -> None:
-    figure = Figure(model)
-    time_s, placed, hands, lost = unpacked(model, figure.frame(None))
+    encoder = PoseEncoder(model)
+    time_s, placed, hands, lost = unpacked(model, encoder.encode(None))
     assert math.isnan(time_s)
     assert np.isnan(hands).all()
     assert not any(lost.values())
     for row in placed.values():
         np.testing.assert_allclose(row[:9], np.eye(3).ravel(), atol=1e-6)
     one_arm = Person(model, ("torso", "right_upper_arm"))
-    figure.begin(one_arm.stage)
-    for frame in (figure.frame(None), figure.frame(one_arm.pose(0.3))):
+    encoder.start(one_arm.info)
+    for frame in (encoder.encode(None), encoder.encode(one_arm.pose(0.3))):
         placed = unpacked(model, frame)[1]
         seen = {link for link, row in placed.items() if np.isfinite(row).all()}
         assert seen == {"torso", "pelvis", "head", "right_upper_arm"}
         assert all(np.isnan(row).all() for link, row in placed.items() if link not in seen)
-    assert np.isnan(unpacked(model, figure.frame(one_arm.pose(0.3)))[2]).all()
+    assert np.isnan(unpacked(model, encoder.encode(one_arm.pose(0.3)))[2]).all()
 
 
 def test_status_is_json_whatever_is_not_known(person: Person) -> None:
@@ -169,9 +169,9 @@ def listening(pid: int) -> set[str]:
 def test_nothing_listens_but_on_loopback() -> None:
     """In a process of its own: other tests' sockets are not this page's."""
     code = (
-        "import sys\nfrom wepose_pin.live.page import LivePage\nfrom wepose_pin.live.out import UdpOut\n"
+        "import sys\nfrom wepose_pin.live.page import LivePage\nfrom wepose_pin.live.outputs import UdpOutput\n"
         "from wepose_pin.live.terminal import TerminalView\nfrom wepose_pin.model import load_model\n"
-        "page, out, view = LivePage(load_model()), UdpOut('127.0.0.1', 9), TerminalView()\n"
+        "page, out, view = LivePage(load_model()), UdpOutput('127.0.0.1:9'), TerminalView()\n"
         "page.open(); view.open()\nprint(page.url, flush=True)\nsys.stdin.read()\npage.close()\nout.close()\n"
     )
     run = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -261,7 +261,7 @@ def test_a_foreign_origin_gets_no_poses(page: LivePage) -> None:
 
 
 def test_who_does_not_take_gets_no_more_and_then_the_newest(page: LivePage, person: Person, model: BodyModel) -> None:
-    page.start(person.stage)
+    page.start(person.info)
 
     async def slow(connection: WebSocketClientConnection) -> None:
         assert "id" in json.loads(await taken(connection))
@@ -290,7 +290,7 @@ def test_who_does_not_take_gets_no_more_and_then_the_newest(page: LivePage, pers
 
 
 def test_who_takes_at_once_gets_no_more_than_sixty_a_second(page: LivePage, person: Person, model: BodyModel) -> None:
-    page.start(person.stage)
+    page.start(person.info)
     poses = [person.pose(0.01 * k) for k in range(100)]
 
     async def fast(connection: WebSocketClientConnection) -> list[float]:
@@ -333,7 +333,7 @@ def test_keys_and_nonsense(page: LivePage) -> None:
 
 
 def test_the_end_reaches_the_browser(model: BodyModel, person: Person) -> None:
-    page = LivePage(model, person.stage)
+    page = LivePage(model, person.info)
     page.open()
 
     async def wait(connection: WebSocketClientConnection) -> list[Any]:
@@ -400,7 +400,7 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         browser.wait("document.querySelector('#say.moved span')?.textContent.includes('Once more')")
 
         assert browser.run("document.querySelector('#rows tr').innerText").split()[1:4] == ["there", "100", "–"]
-        page.start(person.stage)
+        page.start(person.info)
         page.status(person.status(lost=("left_forearm",), message="No samples from left forearm."))
         page.show(person.pose(0.2, lost=("left_forearm",)))
         browser.wait("window.wepose.time() === 0.2 && window.wepose.state() === 'ready'")
@@ -408,7 +408,7 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         rows = browser.run(
             "[...document.querySelectorAll('#rows tr')].map((row) => row.innerText.replace(/\\s+/g, ' '))"
         )
-        assert rows[0] == "torso at rest 100 0.11 −0.29 0.00 – 3 s 6"
+        assert rows[0] == "torso static 100 0.11 −0.29 0.00 – 3 s 6"
         assert rows[2].startswith("left forearm lost")
         assert "bad checksums: 3" in browser.run("document.body.innerText")
         stage = box_of(browser, "#stage canvas")
@@ -442,7 +442,7 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
 
 
 def test_dark_prints_light(model: BodyModel, person: Person, browser: Browser) -> None:
-    with LivePage(model, person.stage) as page:
+    with LivePage(model, person.info) as page:
         browser.emulate(prefers_color_scheme="dark")
         browser.go(page.url)
         page.status(person.status())
@@ -463,7 +463,7 @@ def test_dark_prints_light(model: BodyModel, person: Person, browser: Browser) -
 
 def test_it_says_that_the_connection_is_lost_and_comes_back(model: BodyModel, person: Person, browser: Browser) -> None:
     browser.emulate(prefers_color_scheme="light")
-    page = LivePage(model, person.stage)
+    page = LivePage(model, person.info)
     page.open()
     port = int(page.url.split(":")[2].strip("/"))
     browser.go(page.url)
@@ -472,7 +472,7 @@ def test_it_says_that_the_connection_is_lost_and_comes_back(model: BodyModel, pe
     browser.wait("window.wepose.time() === 1 && window.wepose.state() === 'ready'")
     page.close()
     assert "Connection lost" in browser.wait("document.querySelector('#offline:not([hidden])')?.textContent")
-    with LivePage(model, person.stage, port=port) as again:
+    with LivePage(model, person.info, port=port) as again:
         again.show(person.pose(2.0))
         again.status(person.status("ended", "The session has ended."))
         browser.wait("window.wepose.time() === 2 && document.querySelector('#offline').hidden")
@@ -483,7 +483,7 @@ def test_it_says_that_the_connection_is_lost_and_comes_back(model: BodyModel, pe
 def test_a_colour_blind_reader_can_tell_the_hands_and_the_states(
     model: BodyModel, person: Person, browser: Browser
 ) -> None:
-    with LivePage(model, person.stage) as page:
+    with LivePage(model, person.info) as page:
         browser.emulate(prefers_color_scheme="light")
         browser.go(page.url)
         page.status(person.status(lost=("left_forearm",)))

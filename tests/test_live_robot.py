@@ -26,21 +26,22 @@ from test_retargeting import far_away
 
 from wepose_pin import cli
 from wepose_pin.errors import BadData, BadOption
-from wepose_pin.live.robot import LAST, RobotOut, TickReplay, Watched, command_json
+from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, RobotStatusView, TickReplay, command_json
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
-from wepose_pin.live.state import LivePose, Stage, Status
+from wepose_pin.live.state import LivePose, Status, StreamInfo
 from wepose_pin.pose import Pose, point_covariance, spread
 from wepose_pin.readers import load_session
-from wepose_pin.retargeting import Robot, find_map, load, wish
-from wepose_pin.retargeting.limits import urdf_limits
+from wepose_pin.retargeting import Robot, compute_arm_targets, find_map, load_robot
+from wepose_pin.retargeting.limits import read_joint_limits
 from wepose_pin.retargeting.stream import (
     APPROACH_SPEED,
+    ArmObservation,
+    ArmObserver,
     Command,
     CommandStream,
-    Person,
-    Seen,
-    _Smoothed,
+    StreamOptions,
+    _LowPass,
 )
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import LENGTHS, average_subject
@@ -53,11 +54,11 @@ DT = 0.01
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Robot:
-    return load(find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
+    return load_robot(find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
 
 
-def stage_of(pose: Pose) -> Stage:
-    return Stage(tuple(pose.quat_WL), tuple(pose.points), 100.0)
+def stream_info(pose: Pose) -> StreamInfo:
+    return StreamInfo(tuple(pose.quat_WL), tuple(pose.points), 100.0)
 
 
 def live_poses(pose: Pose, std: float = 0.005) -> list[LivePose]:
@@ -71,28 +72,28 @@ def live_poses(pose: Pose, std: float = 0.005) -> list[LivePose]:
     ]
 
 
-class Driven:
+class Session:
     """A stream under a clock of our own, and all that it said."""
 
-    def __init__(self, robot: Robot, stage: Stage, **options: Any) -> None:
-        self.robot, self.stream = robot, CommandStream(robot, rate_hz=1.0 / DT, **options)
-        self.person = Person(robot, stage.segments, stage.points)
+    def __init__(self, robot: Robot, info: StreamInfo, **options: Any) -> None:
+        self.robot, self.stream = robot, CommandStream(robot, StreamOptions(rate_hz=1.0 / DT, **options))
+        self.observer = ArmObserver(robot, info.segments, info.points)
         self.commands: list[Command] = []
         self.hand: list[np.ndarray] = []
         self._came = 0.0
 
-    def run(self, poses: Sequence[LivePose | None], resume_at: int = -1) -> Driven:
+    def run(self, poses: Sequence[LivePose | None], resume_at: int = -1) -> Session:
         """A command a tick; None: no pose came."""
         for pose in poses:
             if len(self.commands) == resume_at:
                 self.stream.resume()
             now = len(self.commands) * DT
             if pose is not None:
-                looked = self.person.look(pose.quat_WL, pose.points, pose.std, pose.lost)
-                self._came = now if self.stream.push(pose.time, looked) else self._came
+                observed = self.observer.observe(pose.quat_WL, pose.points, pose.std, pose.lost)
+                self._came = now if self.stream.push(pose.time, observed) else self._came
             self.commands.append(self.stream.step(now, now - self._came))
-            self.stream._stepper.look(self.commands[-1].u)
-            self.hand.append(self.stream._stepper.place(0)[0])
+            self.stream._controller.set_joints(self.commands[-1].u)
+            self.hand.append(self.stream._controller.arm_pose(0).hand)
         return self
 
     def states(self, begin: float = 0.0, end: float = math.inf) -> list[str]:
@@ -110,7 +111,7 @@ class Driven:
 
 def keeps_its_limits(messages: Sequence[dict[str, Any]], robot: Robot) -> None:
     """What was sent, by differences of its positions against the URDF's own text and the map's numbers."""
-    said = urdf_limits(robot.map.urdf)
+    said = read_joint_limits(robot.map.urdf)
     joints = messages[0]["joints"]
     q, v, a = (np.array([message[key] for message in messages]) for key in ("position", "velocity", "acceleration"))
     clock = np.array([message["clock"] for message in messages])
@@ -137,7 +138,7 @@ def keeps_its_limits(messages: Sequence[dict[str, Any]], robot: Robot) -> None:
 
 def test_it_approaches_then_follows(arm: Robot) -> None:
     pose = person(12.0)
-    found = Driven(arm, stage_of(pose)).run(live_poses(pose))
+    found = Session(arm, stream_info(pose)).run(live_poses(pose))
     assert found.states() == ["approach", "follow"]
     began = next(c.clock for c in found.commands if c.state == "follow")
     assert 0.5 < began < 5.0
@@ -152,16 +153,16 @@ def test_it_approaches_then_follows(arm: Robot) -> None:
 def test_the_aims_are_those_of_a_recording(arm: Robot) -> None:
     """Of a person who stands both ways to a target, which share little, agree; of one who moves, but for the delay."""
     still = person(3.0, swing=0.0)
-    target = wish(still, arm).arms[0]
-    found = Driven(arm, stage_of(still)).run(live_poses(still)[:5])
-    aim = found.stream._aim(0, 0.0, True)
+    target = compute_arm_targets(still, arm).hands[0]
+    found = Session(arm, stream_info(still)).run(live_poses(still)[:5])
+    aim = found.stream._extrapolate(0, 0.0, True)
     assert np.allclose(aim.position, target.position[5], atol=1e-9)
     assert np.allclose(aim.rotation, target.rotation[5], atol=1e-9)
-    assert np.allclose(aim.bend, target.bend[5], atol=1e-9)
+    assert np.allclose(aim.swivel, target.swivel[5], atol=1e-9)
     pose = person(8.0)
-    target = wish(pose, arm).arms[0]
-    found = Driven(arm, stage_of(pose))
-    aims = np.array([(found.run([p]), found.stream._aim(0, 0.0, True).position)[1] for p in live_poses(pose)])
+    target = compute_arm_targets(pose, arm).hands[0]
+    found = Session(arm, stream_info(pose))
+    aims = np.array([(found.run([p]), found.stream._extrapolate(0, 0.0, True).position)[1] for p in live_poses(pose)])
     behind = [np.linalg.norm(aims[100 + d : 700 + d] - target.position[100:700], axis=1).mean() for d in range(12)]
     assert abs(DT * int(np.argmin(behind)) - found.stream.delay_s) < DT
     assert min(behind) < 0.003
@@ -171,18 +172,18 @@ def test_the_low_pass_is_as_late_as_it_says_and_knows_the_rate() -> None:
     omega, dt = 2.0 * np.pi * 6.0, 0.002
     rate, turn = np.array([0.3, -0.2, 0.5]), np.array([0.4, 0.9, -0.7])
 
-    def seen(t: float) -> Seen:
-        return Seen(rate * t, -rate * t, Rotation.from_rotvec(turn * t).as_matrix(), 0.0, ())
+    def seen(t: float) -> ArmObservation:
+        return ArmObservation(rate * t, -rate * t, Rotation.from_rotvec(turn * t).as_matrix(), 0.0, ())
 
-    smoothed = _Smoothed.at(seen(0.0))
+    smoothed = _LowPass.start(seen(0.0))
     for k in range(1, 1000):
         smoothed.push(seen(k * dt), dt, omega)
     t = 999 * dt
     late = 2.0 / omega
     assert np.allclose(smoothed.offset, rate * (t - late), atol=1e-9)
-    assert np.allclose(smoothed.bend, -rate * (t - late), atol=1e-9)
-    assert np.allclose(smoothed.R, seen(t - late).rotation, atol=1e-9)
-    for known, true in ((smoothed.offset_rate, rate), (smoothed.bend_rate, -rate), (smoothed.rate, turn)):
+    assert np.allclose(smoothed.swivel, -rate * (t - late), atol=1e-9)
+    assert np.allclose(smoothed.rotation, seen(t - late).rotation, atol=1e-9)
+    for known, true in ((smoothed.offset_rate, rate), (smoothed.swivel_rate, -rate), (smoothed.angular_velocity, turn)):
         assert np.allclose(known, true, atol=1e-9)
 
 
@@ -195,9 +196,9 @@ def test_the_hands_uncertainty_is_that_of_the_pose(arm: Robot) -> None:
     cov[np.ix_(at, at)] = average_subject().lengths_covariance()[np.ix_(at, at)]
     segment_cov = {name: np.tile(s**2 * np.eye(3), (50, 1, 1)) for name, s in zip(pose.quat_WL, std, strict=True)}
     true = spread(point_covariance(pose.points, pose.quat_WL, segment_cov, cov)["right_hand"])
-    seer = Person(arm, stage_of(pose).segments, stage_of(pose).points, cov)
+    seer = ArmObserver(arm, stream_info(pose).segments, stream_info(pose).points, cov)
     for k, one in enumerate(live_poses(pose)):
-        seen = seer.look(one.quat_WL, one.points, std, one.lost)
+        seen = seer.observe(one.quat_WL, one.points, std, one.lost)
         assert seen is not None
         assert math.isclose(seen[0].std, true[k], rel_tol=1e-9)
 
@@ -207,7 +208,7 @@ def test_a_jump_of_a_metre_is_gone_after_slowly(arm: Robot) -> None:
     points = dict(pose.points)
     for name in ("right_elbow", "right_wrist", "right_hand"):
         points[name] = points[name] + np.where(pose.time > 6.0, 1.0, 0.0)[:, None] * [0.0, 0.0, 1.0]
-    found = Driven(arm, stage_of(pose)).run(live_poses(replace(pose, points=points)))
+    found = Session(arm, stream_info(pose)).run(live_poses(replace(pose, points=points)))
     assert found.states(5.0, 6.0) == ["follow"]
     assert found.states(6.02, 6.5) == ["approach"]
     assert "jumped" in found.commands[610].reason
@@ -218,10 +219,7 @@ def test_a_jump_of_a_metre_is_gone_after_slowly(arm: Robot) -> None:
 
 def test_five_seconds_out_of_reach(arm: Robot) -> None:
     pose = far_away(person(14.0, swing=0.0), (4.0, 9.0), 1.6)
-    stage = stage_of(pose)
-    found = Driven(arm, stage)
-    found.person = Person(arm, stage.segments, stage.points)
-    found.run(live_poses(pose))
+    found = Session(arm, stream_info(pose)).run(live_poses(pose))
     reach = arm.arms[0].reach
     far = np.linalg.norm(np.array(found.hand) - arm.arms[0].shoulder, axis=1)
     assert 0.9 * reach < far[700:890].max() <= reach
@@ -238,7 +236,7 @@ def test_a_pose_that_is_no_number_stops_the_robot(arm: Robot) -> None:
         poses[k] = poses[k]._replace(points=np.full_like(poses[k].points, np.nan))
     poses[560] = poses[560]._replace(quat_WL=np.full_like(poses[560].quat_WL, np.nan))
     poses[570] = poses[570]._replace(quat_WL=np.zeros_like(poses[570].quat_WL))
-    found = Driven(arm, stage_of(pose)).run(poses)
+    found = Session(arm, stream_info(pose)).run(poses)
     assert found.states(4.0) == ["follow", "hold", "approach", "follow"]
     assert found.commands[515].reason == "no sound pose for 0.1 s"
     keeps_its_limits(found.messages(), arm)
@@ -257,8 +255,8 @@ def test_a_lost_sensor_slows_it_and_its_return_is_no_jump(arm: Robot) -> None:
             points[at] = points[elbow] + last.points[at] - last.points[elbow]
         quat[row] = last.quat_WL[row]
         poses[k] = poses[k]._replace(points=points, quat_WL=quat, lost=np.arange(3) == row)
-    found = Driven(arm, stage_of(pose)).run(poses)
-    usual = Driven(arm, stage_of(pose)).run(live_poses(pose))
+    found = Session(arm, stream_info(pose)).run(poses)
+    usual = Session(arm, stream_info(pose)).run(live_poses(pose))
     assert found.states(4.9, 5.3) == ["follow", "slow"]
     assert found.commands[550].reason == "no samples from right forearm"
     assert usual.hand_speed(5.0, 7.0) > 0.8
@@ -272,7 +270,7 @@ def test_an_uncertain_hand_is_slow(arm: Robot) -> None:
     pose = person(10.0, swing=45.0)
     poses = live_poses(pose)
     poses[500:800] = live_poses(pose, std=0.3)[500:800]
-    found = Driven(arm, stage_of(pose)).run(poses)
+    found = Session(arm, stream_info(pose)).run(poses)
     assert found.states(4.9, 7.9) == ["follow", "slow"]
     assert re.fullmatch(r"the right hand is uncertain by \d{3} mm", found.commands[600].reason)
     assert found.hand_speed(6.0, 8.0) < 1.3 * APPROACH_SPEED
@@ -284,7 +282,7 @@ def test_a_pause_of_half_a_second_holds_and_goes_on_by_itself(arm: Robot) -> Non
     pose = person(9.0, swing=45.0)
     poses: list[LivePose | None] = [*live_poses(pose)]
     poses[500:550] = [None] * 50
-    found = Driven(arm, stage_of(pose)).run(poses)
+    found = Session(arm, stream_info(pose)).run(poses)
     assert found.states(4.9) == ["follow", "hold", "approach", "follow"]
     first_hold = next(c.clock for c in found.commands if c.clock > 4.0 and c.state == "hold")
     assert abs(first_hold - 5.1) < 0.015
@@ -298,7 +296,7 @@ def test_a_pause_of_three_seconds_stops_it_until_somebody_says_so(arm: Robot) ->
     pose = person(16.0, swing=45.0)
     poses: list[LivePose | None] = [*live_poses(pose)]
     poses[500:800] = [None] * 300
-    found = Driven(arm, stage_of(pose)).run(poses, resume_at=1100)
+    found = Session(arm, stream_info(pose)).run(poses, resume_at=1100)
     assert found.states(4.9) == ["follow", "hold", "stopped", "approach", "follow"]
     halted = [c for c in found.commands if c.state == "stopped"]
     assert 5.99 < halted[0].clock < 6.5
@@ -310,7 +308,7 @@ def test_a_pause_of_three_seconds_stops_it_until_somebody_says_so(arm: Robot) ->
         assert c.reason == "no sound pose for 1 s"
     keeps_its_limits(found.messages(), arm)
     # Said while nothing comes it is not forgotten: the next pose goes on.
-    early = Driven(arm, stage_of(pose)).run(poses, resume_at=750)
+    early = Session(arm, stream_info(pose)).run(poses, resume_at=750)
     assert early.states(7.4, 8.3) == ["stopped", "hold", "approach"]
     keeps_its_limits(early.messages(), arm)
 
@@ -321,15 +319,15 @@ def test_braking_from_any_moment_keeps_the_limits(arm: Robot) -> None:
     poses: list[LivePose | None] = [*live_poses(pose)]
     for begin in range(150, 1900, 61):
         poses[begin : begin + 12 + begin % 37] = [None] * (12 + begin % 37)
-    found = Driven(arm, stage_of(pose)).run(poses[: len(pose.time)])
+    found = Session(arm, stream_info(pose)).run(poses[: len(pose.time)])
     assert found.states().count("hold") > 20
     keeps_its_limits(found.messages(), arm)
 
 
 def test_a_turned_base_is_the_same_motion(arm: Robot, tmp_path: Path) -> None:
-    turned = load(find_map(str(write_arm(tmp_path, turned=(0.4, -0.7, 2.0)))))
+    turned = load_robot(find_map(str(write_arm(tmp_path, turned=(0.4, -0.7, 2.0)))))
     pose = person(6.0)
-    straight, other = (Driven(robot, stage_of(pose)).run(live_poses(pose)) for robot in (arm, turned))
+    straight, other = (Session(robot, stream_info(pose)).run(live_poses(pose)) for robot in (arm, turned))
     u, w = (np.array([c.u for c in found.commands]) for found in (straight, other))
     assert np.abs(u - w).max() < 1e-3
     assert np.ptp(u, axis=0).max() > 0.5
@@ -341,25 +339,25 @@ def test_an_arm_without_sensors_is_refused(arm: Robot) -> None:
     with pytest.raises(
         BadData, match=r"no sensor on right_forearm, which its right arm follows; --arm names the other"
     ):
-        Person(arm, ("torso", "right_upper_arm"), ("right_shoulder",))
+        ArmObserver(arm, ("torso", "right_upper_arm"), ("right_shoulder",))
 
 
 @pytest.mark.parametrize("options", [{"rate_hz": 5.0}, {"hold_after": 0.0}, {"hold_after": 1.0, "stop_after": 0.5}])
-def test_wrong_times(arm: Robot, options: dict[str, float]) -> None:
+def test_wrong_times(options: dict[str, float]) -> None:
     with pytest.raises(BadOption, match="--"):
-        CommandStream(arm, **options)
+        StreamOptions(**options)
 
 
 # The output ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def robot_out() -> Iterator[Callable[..., RobotOut]]:
+def robot_out() -> Iterator[Callable[..., RobotOutput]]:
     """Makes one, and ends its thread whatever becomes of the test."""
-    made: list[RobotOut] = []
+    made: list[RobotOutput] = []
 
-    def make(stream: CommandStream, to: str, **options: Any) -> RobotOut:
-        made.append(RobotOut(stream, to, **options))
+    def make(stream: CommandStream, to: str, **options: Any) -> RobotOutput:
+        made.append(RobotOutput(stream, to, **options))
         return made[-1]
 
     yield make
@@ -412,11 +410,11 @@ def receiver() -> Iterator[Receiver]:
 
 def ended(messages: list[dict[str, Any]]) -> bool:
     """Whether the last of them tell that the robot stands."""
-    last = messages[-LAST:]
+    last = messages[-LAST_COMMANDS:]
     return all(m["state"] == "stopped" and not any(m["velocity"]) and not any(m["acceleration"]) for m in last)
 
 
-def play(out: RobotOut, poses: Sequence[LivePose], shift: float = 0.0) -> None:
+def play(out: RobotOutput, poses: Sequence[LivePose], shift: float = 0.0) -> None:
     """At their own pace."""
     begin = time.monotonic() - poses[0].time
     for pose in poses:
@@ -429,7 +427,7 @@ def test_a_source_that_dies_stops_the_robot_by_the_wall_clock(robot_out, arm: Ro
     out = robot_out(CommandStream(arm), receiver.port)
     out.open()
     time.sleep(0.1)
-    out.start(stage_of(pose))
+    out.start(stream_info(pose))
     play(out, live_poses(pose)[:150], shift=1e4)
     time.sleep(1.8)  # nobody calls it any more
     messages = receiver.messages
@@ -453,7 +451,7 @@ def test_it_comes_evenly_though_poses_do_not(robot_out, arm: Robot, receiver: Re
     pose = person(5.0, swing=20.0)
     poses = live_poses(pose)
     out = robot_out(CommandStream(arm), receiver.port)
-    out.start(stage_of(pose))
+    out.start(stream_info(pose))
     begin, jitter = time.monotonic(), np.random.default_rng(0).uniform(0.0, 0.02, len(poses))
     for one, late in zip(poses, np.maximum.accumulate(pose.time + jitter), strict=True):
         time.sleep(max(0.0, begin + late - time.monotonic()))
@@ -480,7 +478,7 @@ def test_the_loop_never_waits_for_the_solver(robot_out, arm: Robot, receiver: Re
     monkeypatch.setattr(stream, "step", slow)
     pose = person(1.0)
     out = robot_out(stream, receiver.port)
-    out.start(stage_of(pose))
+    out.start(stream_info(pose))
     took = []
     for one in live_poses(pose):
         time.sleep(DT)
@@ -505,7 +503,7 @@ def test_an_error_of_the_thread_is_the_loops(robot_out, arm: Robot, receiver: Re
     monkeypatch.setattr(stream, "step", broken)
     pose = person(1.0)
     out = robot_out(stream, receiver.port)
-    out.start(stage_of(pose))
+    out.start(stream_info(pose))
     time.sleep(0.1)
     with pytest.raises(ValueError, match="broken"):
         out.show(live_poses(pose)[0])
@@ -518,7 +516,7 @@ def test_nobody_receives(robot_out, arm: Robot) -> None:
         free = taken.getsockname()[1]
     pose = person(1.0)
     out = robot_out(CommandStream(arm), f"127.0.0.1:{free}")
-    out.start(stage_of(pose))
+    out.start(stream_info(pose))
     play(out, live_poses(pose)[:50])
     out.close()
     out.close()
@@ -531,7 +529,7 @@ def test_the_document_shows_a_message_and_the_example(arm: Robot) -> None:
     text = (ROOT / "docs" / "live-robot.md").read_text(encoding="utf-8")
     shown = re.search(r"```json\n(.*?)```", text, re.DOTALL)
     assert shown is not None
-    real = Driven(arm, stage_of(person(0.5))).run(live_poses(person(0.5))[:3]).messages()[-1]
+    real = Session(arm, stream_info(person(0.5))).run(live_poses(person(0.5))[:3]).messages()[-1]
     documented = json.loads(shown[1])
     assert list(documented) == list(real)
     assert list(documented["arms"]["right"]) == list(real["arms"]["right"])
@@ -562,7 +560,7 @@ def test_the_example_reads_it_and_notices_the_end(robot_out, arm: Robot) -> None
 @pytest.mark.parametrize("to", ["", "here", "127.0.0.1:", "0", "70000", "no such host:9002"])
 def test_wrong_addresses(arm: Robot, to: str) -> None:
     with pytest.raises(BadOption, match="--to"):
-        RobotOut(CommandStream(arm), to)
+        RobotOutput(CommandStream(arm), to)
 
 
 def test_r_goes_on_and_the_person_is_told(robot_out, arm: Robot, receiver: Receiver) -> None:
@@ -581,8 +579,8 @@ def test_r_goes_on_and_the_person_is_told(robot_out, arm: Robot, receiver: Recei
     poses = live_poses(pose)
     out = robot_out(CommandStream(arm), receiver.port, speed=math.inf)
     view = View()
-    watched = Watched(view, out)
-    out.start(stage_of(pose))
+    watched = RobotStatusView(view, out)
+    out.start(stream_info(pose))
     for one in [*poses[:50], poses[200]]:  # a second and a half of nothing, by the ticks' clock
         out.show(one)
     ready = Status("ready", "Tracking.", 1.0, 0.0, (), (0.0, 0.0), 0.0, {})
@@ -607,14 +605,14 @@ def test_r_goes_on_and_the_person_is_told(robot_out, arm: Robot, receiver: Recei
 def test_the_same_recording_gives_the_same_commands(
     simulation: Simulation, arm: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A session as fast as it is read, and what it recorded: to the bit, without this machine's clock."""
+    """A session as fast as possible and what it recorded: bit-identical, without this machine's clock."""
     sent: list[bytes] = []
     monkeypatch.setattr("wepose_pin.live.robot._Wire.send", lambda _, data: sent.append(data))
     recording = first(simulation.recording("bits"), 1500)
 
     def commands(recording: Any, record: Path | None = None) -> list[bytes]:
         sent.clear()
-        out = RobotOut(CommandStream(arm), speed=math.inf)
+        out = RobotOutput(CommandStream(arm), speed=math.inf)
         source = TickReplay(recording, math.inf)
         run_session(source, SensorSetup.from_recording(recording), method=METHOD, record=record, outputs=[out])
         return list(sent)
@@ -658,7 +656,7 @@ def test_stopped_amid_a_motion_the_robot_stands(session: Path, tmp_path: Path, r
     assert ended(messages)
     assert messages[-1]["reason"] == "the session has ended"
     assert "arm: " in out
-    keeps_its_limits(messages, load(find_map(str(urdf))))
+    keeps_its_limits(messages, load_robot(find_map(str(urdf))))
 
 
 def test_wrong_robots_are_one_line_before_the_source_opens(
@@ -683,7 +681,7 @@ def test_wrong_robots_are_one_line_before_the_source_opens(
         (["--robot", str(alone / "arm.urdf")], "no arm.toml beside it"),
         (["--robot", str(bare / "arm.urdf")], "joint 'elbow' has no velocity limit"),
         (["--robot", str(whole), "--arm", "left"], "--arm left: arm has no left arm"),
-        (["--robot", str(whole), "--to", "there"], "--to there: a port or HOST:PORT"),
+        (["--robot", str(whole), "--to", "there"], "--to there: a port or HOST:PORT is needed"),
         (["--robot", str(whole), "--robot-hz", "5"], "--robot-hz 5: from 10 to 1000"),
         (["--robot", str(whole), "--hold-after", "2"], "--hold-after 2, --stop-after 1: seconds, the second longer"),
         (["--robot", "panda", "--map", str(alone / "other.toml")], "a map goes with a URDF"),

@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 from wepose_pin.live.state import SensorStatus, Status
-from wepose_pin.live.terminal import TerminalView, table
+from wepose_pin.live.terminal import TerminalView, build_table
 
 
 def sensor(segment: str = "torso", **other: object) -> SensorStatus:
@@ -40,7 +40,7 @@ def status(state: str = "ready", message: str = "Tracking.", sensors: tuple = ()
 
 def printed(one: Status) -> str:
     console = Console(file=io.StringIO(), width=120)
-    console.print(table(one))
+    console.print(build_table(one))
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -60,9 +60,9 @@ def test_a_row_a_sensor() -> None:
     )
     assert "✕ frozen" in pelvis
     assert torso.split() == "torso ▶ moving 100 0.11 −0.29 0.00 1.3 34 3".split()
-    assert "■ at rest" in forearm
+    assert "■ static" in forearm
     assert "✕ lost" in head
-    assert any("latency 3.2 ms median, 8.4 ms in 99 of 100" in line for line in lines)
+    assert any("latency 3.2 ms (p50), 8.4 ms (p99)" in line for line in lines)
 
 
 def test_what_is_not_known_is_a_dash() -> None:
@@ -88,7 +88,7 @@ def test_before_the_start_nothing_is_said_of_what_is_not_estimated() -> None:
 def test_a_narrow_terminal_shows_fewer_columns_and_those_whole(width: int) -> None:
     console = Console(file=io.StringIO(), width=width)
     many = sensor("right_upper_arm", rate_hz=1000.0, heading_age=1000.0, missing=1203, late=0, duplicate=0, lost=True)
-    console.print(table(status(sensors=(many,)), width=width))
+    console.print(build_table(status(sensors=(many,)), width=width))
     lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
     assert not any("…" in line for line in lines)
     row = next(line for line in lines if line.startswith("right upper arm"))

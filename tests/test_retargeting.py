@@ -18,23 +18,23 @@ from wepose_pin.pose import Pose
 from wepose_pin.retargeting import (
     LimitCheck,
     Trajectory,
-    find_map,
+    build_table,
     check_limits,
+    compute_arm_targets,
+    find_map,
+    find_self_collisions,
     load_robot,
     retarget,
     summarize,
-    build_table,
-    find_self_collisions,
-    compute_arm_targets,
     write_episode,
     write_trajectory,
 )
-from wepose_pin.retargeting.error_attribution import attribute_errors, assess_reachability
 from wepose_pin.retargeting.checks import AT_REST, SelfCollisions
 from wepose_pin.retargeting.collision import CollisionModel
+from wepose_pin.retargeting.controller import HandTarget, JointState, QpController, Tasks
+from wepose_pin.retargeting.error_attribution import assess_reachability, attribute_errors
 from wepose_pin.retargeting.limits import compute_acceleration_bounds, read_joint_limits, reduce_acceleration_limits
 from wepose_pin.retargeting.targets import CLAMP_FROM, CLAMP_TO, clamp_to_reach
-from wepose_pin.retargeting.controller import HandTarget, JointState, QpController, Tasks
 
 pytest.importorskip("daqp")
 
@@ -241,8 +241,14 @@ def test_the_programme_is_that_of_pink(arm) -> None:
 
     free = replace(arm, geometry=pin.GeometryModel(), arms=(replace(arm.arms[0], elbow=-1),))
     tasks = Tasks(
-        joint_acceleration=0.0, singular_below=0.0, curvature=0.0, joint_velocity=0.0, posture=1e-3, gain=10.0,
-        posture_gain=10.0, deceleration=1e9,
+        joint_acceleration=0.0,
+        singular_below=0.0,
+        curvature=0.0,
+        joint_velocity=0.0,
+        posture=1e-3,
+        gain=10.0,
+        posture_gain=10.0,
+        deceleration=1e9,
     )
     stepper = QpController(free, CollisionModel(free), 0.01, tasks, limit_factor=1e6)
     state = JointState(arm.rest + 0.1, np.zeros(7), np.zeros(7))

@@ -12,7 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import NoSolution
 from wepose_pin.pose import Pose
-from wepose_pin.retargeting import ROBOTS, Trajectory, find_map, check_limits, load_robot, retarget, build_table, find_self_collisions, compute_arm_targets
+from wepose_pin.retargeting import (
+    ROBOTS,
+    Trajectory,
+    build_table,
+    check_limits,
+    compute_arm_targets,
+    find_map,
+    find_self_collisions,
+    load_robot,
+    retarget,
+)
 from wepose_pin.retargeting.checks import AT_REST
 from wepose_pin.retargeting.maps import find_example_data
 from wepose_pin.retargeting.targets import compute_target_reach

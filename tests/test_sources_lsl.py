@@ -27,7 +27,7 @@ Outlet = Callable[..., Any]
 def pylsl(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     pytest.importorskip("pylsl")
     monkeypatch.delenv("LSLAPICFG", raising=False)
-    return lsl.pylsl_within(None)[0]
+    return lsl.configure_pylsl(None)[0]
 
 
 @pytest.fixture
@@ -183,14 +183,14 @@ def test_wrong_channels_say_what_is_right(
     stream: str, labels: list[str], units: list[str], count: int, words: str
 ) -> None:
     with pytest.raises(BadSource) as error:
-        lsl.layout(stream, "x", labels, units, count)
+        lsl.find_channels(stream, "x", labels, units, count)
     assert words in str(error.value)
 
 
 SENDER = """
 import sys, time
 from wepose_pin.live.sources import lsl
-pylsl = lsl.pylsl_within("machine")[0]
+pylsl = lsl.configure_pylsl("machine")[0]
 out = pylsl.StreamOutlet(pylsl.StreamInfo("far-torso", "IMU", 6, 100.0, "float32", ""))
 print("ready", flush=True)
 while True:

@@ -18,7 +18,7 @@ import pytest
 
 from wepose_pin.errors import BadSource
 from wepose_pin.live.sources import open_source, packets
-from wepose_pin.live.sources.udp import MOST_KINDS, UdpSource
+from wepose_pin.live.sources.udp import MAX_KINDS, UdpSource
 from wepose_pin.recording import SEGMENTS
 from wepose_pin.recording.arrivals import Samples
 
@@ -187,11 +187,11 @@ def test_a_sensor_that_is_not_tracked_is_counted(sender: socket.socket) -> None:
 
 
 def test_kinds_of_problems_are_bounded(source: UdpSource, sender: socket.socket) -> None:
-    for k in range(3 * MOST_KINDS):
+    for k in range(3 * MAX_KINDS):
         sender.sendto(json.dumps({**GOOD, "sensor": f"sensor {k}"}).encode(), source.address)
     source.read(0.2)
-    assert len(source.problems) == MOST_KINDS + 1
-    assert sum(source.problems.values()) == 3 * MOST_KINDS
+    assert len(source.problems) == MAX_KINDS + 1
+    assert sum(source.problems.values()) == 3 * MAX_KINDS
 
 
 def test_sensors_are_found_where_they_are_not_given(sender: socket.socket) -> None:

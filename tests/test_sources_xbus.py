@@ -52,7 +52,7 @@ def mtdata2(ticks: int | None, *vectors: tuple[int, list[float]], form: str = "f
 def joined(packets: list[bytes]) -> tuple[np.ndarray, np.ndarray, xbus.Joiner]:
     joiner = xbus.Joiner()
     for data in packets:
-        joiner.add(xbus.packet(data))
+        joiner.add(xbus.parse_packet(data))
     return *joiner.take(), joiner
 
 
@@ -61,9 +61,9 @@ def joined(packets: list[bytes]) -> tuple[np.ndarray, np.ndarray, xbus.Joiner]:
 
 def test_commands_are_the_bytes_that_are_known() -> None:
     """As MT Manager sends them."""
-    assert xbus.frame(xbus.GO_TO_CONFIG) == bytes.fromhex("FAFF3000D1")
-    assert xbus.frame(xbus.GO_TO_MEASUREMENT) == bytes.fromhex("FAFF1000F1")
-    assert xbus.frame(xbus.SET_OUTPUT, bytes.fromhex("1020FFFF1060FFFF"))[:4] == bytes.fromhex("FAFFC008")
+    assert xbus.build_frame(xbus.GO_TO_CONFIG) == bytes.fromhex("FAFF3000D1")
+    assert xbus.build_frame(xbus.GO_TO_MEASUREMENT) == bytes.fromhex("FAFF1000F1")
+    assert xbus.build_frame(xbus.SET_OUTPUT, bytes.fromhex("1020FFFF1060FFFF"))[:4] == bytes.fromhex("FAFFC008")
     assert xbus.Frames().feed(bytes.fromhex("FAFFC1081020FFFF1060FFFF9C")) == [
         xbus.Frame(0xC1, bytes.fromhex("1020FFFF1060FFFF"))
     ]
@@ -74,7 +74,7 @@ def test_commands_are_the_bytes_that_are_known() -> None:
 def test_frames_of_any_length_in_any_pieces(length: int, piece: int) -> None:
     data = random.Random(length).randbytes(length)
     stream = whole(0x36, data) * 2 + whole(0x42, b"\x04")
-    assert xbus.frame(0x36, data) == whole(0x36, data)
+    assert xbus.build_frame(0x36, data) == whole(0x36, data)
     frames = xbus.Frames()
     found = [f for k in range(0, len(stream), piece) for f in frames.feed(stream[k : k + piece])]
     assert found == [(0x36, data), (0x36, data), (0x42, b"\x04")]
@@ -123,7 +123,7 @@ def test_random_bytes_raise_nothing_and_end() -> None:
         for found in frames.feed(bytes(piece)):
             taken += len(found.data) + (5 if len(found.data) < 255 else 7)
             try:
-                xbus.packet(found.data)
+                xbus.parse_packet(found.data)
                 packets += 1
             except xbus.Malformed:
                 pass
@@ -140,7 +140,7 @@ def test_random_data_of_packets_raise_only_malformed() -> None:
         damaged = bytearray(data[: rng.randrange(1, len(data) + 1)])
         damaged[rng.randrange(len(damaged))] = rng.randrange(256)
         try:
-            joiner.add(xbus.packet(bytes(damaged)))
+            joiner.add(xbus.parse_packet(bytes(damaged)))
             outcomes[0] += 1
         except xbus.Malformed:
             outcomes[1] += 1
@@ -155,9 +155,9 @@ def test_random_data_of_packets_raise_only_malformed() -> None:
 @pytest.mark.parametrize("axes", [0x0, 0x4, 0x8])  # ENU, NED, NWU: of the world, not of the sensor
 def test_every_way_to_write_numbers(form: str, axes: int) -> None:
     data = mtdata2(77, (0x8020 | axes, GYRO), (0x4020 | axes, ACCEL), form=form)
-    assert xbus.packet(data) == (77, tuple(GYRO), tuple(ACCEL), None, None)
+    assert xbus.parse_packet(data) == (77, tuple(GYRO), tuple(ACCEL), None, None)
     data = mtdata2(77, (0x8040 | axes, GYRO), (0x4040 | axes, ACCEL), form=form)
-    assert xbus.packet(data) == (77, None, None, tuple(GYRO), tuple(ACCEL))
+    assert xbus.parse_packet(data) == (77, None, None, tuple(GYRO), tuple(ACCEL))
 
 
 def test_a_packet_of_a_device() -> None:
@@ -168,7 +168,7 @@ def test_a_packet_of_a_device() -> None:
         "8030103F80000037DF8801B6898000B608C000C0200CBEFBFBF23F33C485BFA0A2C108100442168000"
         "301004000186E1E0200400400003"
     )
-    found = xbus.packet(data)
+    found = xbus.parse_packet(data)
     assert found.ticks == 20332454
     assert found.accel == pytest.approx((-0.05550629, 9.81465530, 0.21842313), abs=1e-8)
     assert found.gyro == pytest.approx((0.02131760, -0.00327826, -0.00163019), abs=1e-8)
@@ -187,7 +187,7 @@ def test_a_packet_of_a_device() -> None:
 )
 def test_malformed_packets(data: bytes) -> None:
     with pytest.raises(xbus.Malformed):
-        xbus.packet(data)
+        xbus.parse_packet(data)
 
 
 # Samples -------------------------------------------------------------------------------------------------------------
@@ -220,7 +220,7 @@ def test_rates_and_accelerations_of_different_packets_are_paired_by_time(gyro_st
     np.testing.assert_allclose(time, np.arange(0, 2001, gyro_step) / 1e4)
     np.testing.assert_allclose(values[:, 0], time, atol=1e-7)
     np.testing.assert_allclose(values[:, 3], time * 100.0, atol=1e-5)
-    assert (joiner.alone, joiner.untimed) == (0, 0)
+    assert (joiner.unpaired, joiner.untimed) == (0, 0)
 
 
 def test_high_rate_is_taken_where_both_kinds_come() -> None:
@@ -237,11 +237,11 @@ def test_high_rate_is_taken_where_both_kinds_come() -> None:
 def test_rates_without_an_acceleration_are_counted_and_do_not_wait_for_ever() -> None:
     time, _, joiner = joined([mtdata2(100 * k, (0x8020, GYRO)) for k in range(100)])
     assert len(time) == 0
-    assert joiner.alone == pytest.approx(90, abs=2)
+    assert joiner.unpaired == pytest.approx(90, abs=2)
     lost = [mtdata2(100 * k, (0x8020, GYRO), *([(0x4020, ACCEL)] if not 20 < k < 60 else [])) for k in range(100)]
     time, _, joiner = joined(lost)
     assert len(time) == 100 - 39
-    assert joiner.alone == 39
+    assert joiner.unpaired == 39
 
 
 def test_packets_without_a_time_are_counted() -> None:
@@ -251,9 +251,9 @@ def test_packets_without_a_time_are_counted() -> None:
 
 
 def test_what_is_asked_of_a_device() -> None:
-    assert xbus.output_items(100, hr=False) == bytes.fromhex("1020FFFF 1060FFFF 40200064 80200064")
-    assert xbus.output_items(1000, hr=True) == bytes.fromhex("1020FFFF 1060FFFF 404003E8 804003E8")
-    assert xbus.granted(bytes.fromhex("1060FFFF 40230190 80")) == {0x1060: 0xFFFF, 0x4020: 400}
-    assert xbus.error_words(b"\x21") == "a parameter is not one it knows"
-    assert xbus.error_words(b"\x77") == "error 0x77"
-    assert xbus.error_words(b"") == "an error without a number"
+    assert xbus.build_output_items(100, hr=False) == bytes.fromhex("1020FFFF 1060FFFF 40200064 80200064")
+    assert xbus.build_output_items(1000, hr=True) == bytes.fromhex("1020FFFF 1060FFFF 404003E8 804003E8")
+    assert xbus.read_rates(bytes.fromhex("1060FFFF 40230190 80")) == {0x1060: 0xFFFF, 0x4020: 400}
+    assert xbus.describe_error(b"\x21") == "a parameter is not one it knows"
+    assert xbus.describe_error(b"\x77") == "error 0x77"
+    assert xbus.describe_error(b"") == "an error without a number"

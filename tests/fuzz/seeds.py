@@ -258,8 +258,8 @@ def serial() -> bytes:
         data = struct.pack(">HBHHBI", 0x1020, 2, k, 0x1060, 4, 100 * k)
         data += struct.pack(">HB3f", xbus.RATE_OF_TURN, 12, 0.1, 0.2, 0.3)
         data += struct.pack(">HB3d", xbus.ACCELERATION | 3, 24, 0.0, 0.0, 9.8)
-        found += xbus.frame(xbus.DATA, data)
-    return found + xbus.frame(xbus.SET_OUTPUT + 1, xbus.output_items(100, False))
+        found += xbus.build_frame(xbus.DATA, data)
+    return found + xbus.build_frame(xbus.SET_OUTPUT + 1, xbus.build_output_items(100, False))
 
 
 def pose() -> bytes:
@@ -403,9 +403,9 @@ def pose_csv() -> bytes:
 
 def device() -> list[bytes]:
     """An MTi that is set up at 100 Hz, then sends; and one that is left as it is. Answers are apart by empty lines."""
-    plain = xbus.output_items(100, False)
+    plain = xbus.build_output_items(100, False)
     answers = (xbus.GO_TO_CONFIG, b""), (xbus.SET_OUTPUT, plain), (xbus.GO_TO_MEASUREMENT, b"")
-    set_up = [xbus.frame(mid + 1, data) for mid, data in answers]
+    set_up = [xbus.build_frame(mid + 1, data) for mid, data in answers]
     return [b"\x00" + b"\n\n".join([b"", *set_up, serial()]), b"\x80" + b"\n\n".join([serial(), b"", serial()])]
 
 

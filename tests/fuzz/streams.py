@@ -79,10 +79,10 @@ def serial(_folder: Path, data: bytes) -> object:
     stream, joiner = xbus.Frames(), xbus.Joiner()
     half = len(data) // 2
     for frame in stream.feed(data[:half]) + stream.feed(data[half:]):
-        xbus.granted(frame.data)
-        xbus.error_words(frame.data)
+        xbus.read_rates(frame.data)
+        xbus.describe_error(frame.data)
         try:
-            joiner.add(xbus.packet(frame.data))
+            joiner.add(xbus.parse_packet(frame.data))
         except xbus.Malformed:
             continue
     return joiner.take()
@@ -132,21 +132,24 @@ def mti(_folder: Path, data: bytes) -> object:
 
 def lsl(_folder: Path, data: bytes) -> object:
     """Labels and units of a stream's channels, a line each."""
-    from wepose_pin.live.sources.lsl import layout
+    from wepose_pin.live.sources.lsl import find_channels
 
     stream, *rest = data.decode("utf-8", errors="replace").split("\n")
     labels, units = rest[::2], rest[1::2]
-    return layout(stream, "imu", labels, units, len(labels))
+    return find_channels(stream, "imu", labels, units, len(labels))
 
 
 def lsl_samples(_folder: Path, data: bytes) -> object:
     """Numbers of a stream: rows of a time and six channels, eight bytes each."""
-    from wepose_pin.live.sources.lsl import LslSource, Part, _Stream
+    from wepose_pin.live.sources.lsl import LslSource, SensorChannels, _Stream
 
     table = np.frombuffer(data[: len(data) // 56 * 56], "<f8").reshape(-1, 7)
     inlet = SimpleNamespace(pull_chunk=lambda **_: (table[:, 1:].tolist(), table[:, 0].tolist()))
     source = LslSource("imu", TORSO_HEAD)
-    parts = [Part("torso", list(range(6)), np.ones(6)), Part("head", [5, 4, 3, 2, 1, 0], np.full(6, 9.80665))]
+    parts = [
+        SensorChannels("torso", list(range(6)), np.ones(6)),
+        SensorChannels("head", [5, 4, 3, 2, 1, 0], np.full(6, 9.80665)),
+    ]
     with np.errstate(all="ignore"):
         found = source._pull(_Stream("imu", inlet, parts, 100.0))
     _sound(found)
@@ -176,7 +179,7 @@ class _Wild:
         return STEP * self._at
 
     def read(self, _timeout_s: float) -> list[Any] | None:
-        from wepose_pin.live.sources.checks import sound
+        from wepose_pin.live.sources.checks import find_plausible
         from wepose_pin.recording.arrivals import Samples
 
         self._at += 1
@@ -188,7 +191,7 @@ class _Wild:
             return None
         row = self._rows[k]
         time, values = np.array([float(row["time"])]), np.hstack([row["gyro"], row["accel"]])[None].astype(float)
-        if not sound(time, values).all():
+        if not find_plausible(time, values).all():
             return []
         return [Samples(self.sensors[int(row["which"]) % 2], time, values[:, :3], values[:, 3:])]
 
@@ -244,7 +247,7 @@ def _page() -> tuple[Any, _Heard]:
 
 def page(_folder: Path, data: bytes) -> object:
     """Bytes to the page's port: it answers or hangs up, no handler of ours fails, and it serves the next one."""
-    from wepose_pin.live.page import MOST_KEYS
+    from wepose_pin.live.page import MAX_KEYS
 
     live, heard = _page()
     with contextlib.suppress(ConnectionError), _connected(live) as line:
@@ -259,7 +262,7 @@ def page(_folder: Path, data: bytes) -> object:
         line.sendall(b"GET /nothing HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
         assert line.recv(64).startswith(b"HTTP/1.1 404"), "the page serves no more"
     keys = live.take_keys()
-    assert len(keys) <= MOST_KEYS
+    assert len(keys) <= MAX_KEYS
     assert set(keys) <= {"r"}
     if heard.records:
         raise AssertionError("; ".join(heard.records))

@@ -1,4 +1,4 @@
-"""``wepose live``: the pose while it happens."""
+"""``wepose live``: track a stream while the person moves."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ..errors import BadOption
 from . import Arms, LiveMethod, arm_sides
 
 if TYPE_CHECKING:
-    from ..live import Ended, Output
-    from ..live.robot import Driven, RobotOut
+    from ..live import Output, SessionSummary
+    from ..live.robot import RobotOutput, RobotSummary
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,10 @@ class LiveJob:
 
 
 class LiveOutcome(NamedTuple):
-    """What came of a `LiveJob`."""
+    """Outcome of a `LiveJob`."""
 
-    session: Ended
-    robot: Driven | None
+    session: SessionSummary
+    robot: RobotSummary | None
 
 
 def run_live(
@@ -117,13 +117,13 @@ def run_live(
     say: Callable[[str], None] = lambda _: None,
     tell: Callable[[Sequence[Diagnostic]], None] = lambda _: None,
 ) -> LiveOutcome:
-    """Follow a stream to its end.
+    """Track a stream to its end.
 
     Parameters
     ----------
-    views : outputs that show the person to the user, and the robot's state beside it
-    stop : gives what is asked again and again whether to stop, while the stream is followed
-    say, tell : told where the page is, and what the user should know, before the stream begins
+    views : outputs that show the user the person and the state of the robot
+    stop : context of a function that returns True to stop
+    say, tell : called with the page's address, and with diagnostics, before the stream begins
 
     Raises
     ------
@@ -131,61 +131,54 @@ def run_live(
         What the source, the subject, the robot or an option lacks.
     """
     from ..live import find_setup, open_source, run_session
-    from ..live.loop import warm, wearer_model
+    from ..live.loop import build_subject_model, warm_up
     from ..model import load_model
 
     job.check()
     stated = None if job.session is None else find_setup(None, job.subject, job.session)
-    named = None if stated is None or job.replays else list(stated.mounts)
-    source = open_source(job.source, sensors=named or None, speed=job.speed)
+    sensors = None if stated is None or job.replays else list(stated.mounts)
+    source = open_source(job.source, sensors=sensors or None, speed=job.speed)
     setup = stated or find_setup(source, job.subject, None)
-    model = wearer_model(setup.subject, load_model(job.model) if job.model else None)
+    model = build_subject_model(setup.subject, load_model(job.model) if job.model else None)
     tell(model.diagnostics)
     outputs: list[Output] = []
-    robot: RobotOut | None = None
+    robot: RobotOutput | None = None
     try:
         if job.robot is not None:
-            from ..live.robot import follower_of
+            from ..live.robot import PORT, RobotOptions, connect_robot
+            from ..retargeting.stream import StreamOptions
 
-            robot, source = follower_of(
-                job.robot,
-                source,
-                setup,
-                arms=arm_sides(job.arm),
-                map_file=job.map,
-                to=job.to,
-                speed=float(job.speed.replace("max", "inf")) if job.replays else 1.0,
-                rate_hz=job.robot_hz,
-                hold_after=job.hold_after,
-                stop_after=job.stop_after,
-            )
+            timing = StreamOptions(job.robot_hz, job.hold_after, job.stop_after)
+            options = RobotOptions(job.robot, arm_sides(job.arm), job.map, job.to or str(PORT), timing)
+            speed = float(job.speed.replace("max", "inf")) if job.replays else 1.0
+            robot, source = connect_robot(options, source, setup, speed)
             outputs.append(robot)
         if job.udp is not None:
-            from ..live.out import udp_out
+            from ..live.outputs import UdpOutput
 
-            outputs.append(udp_out(job.udp))
+            outputs.append(UdpOutput(job.udp))
         if job.lsl is not None:
-            from ..live.out import LslOut
+            from ..live.outputs import LslOutput
 
-            outputs.append(LslOut(job.lsl))
+            outputs.append(LslOutput(job.lsl))
         if job.page:
             from ..live.page import LivePage
 
             page = LivePage(model, port=job.port, title=setup.name)
             page.open()
-            outputs.append(_with_robot(page, robot))
+            outputs.append(_add_robot_status(page, robot))
             say(f"Page: {page.url}  (this machine only)")
             if job.open:
                 import webbrowser
 
                 if not webbrowser.open(page.url):
                     tell([Diagnostic("browser-not-started", INFO)])
-        outputs += [_with_robot(view, robot) for view in views]
+        outputs += [_add_robot_status(view, robot) for view in views]
         if robot is not None:
-            warm(job.method)  # what is compiled then does not hold up commands
+            warm_up(job.method)  # compiles before commands are due
             robot.open()
         with stop or contextlib.nullcontext(lambda: False) as until:
-            ended = run_session(
+            summary = run_session(
                 source,
                 setup,
                 method=job.method,
@@ -198,12 +191,12 @@ def run_live(
     finally:
         for output in outputs:
             output.close()
-    return LiveOutcome(ended, None if robot is None else robot.summary())
+    return LiveOutcome(summary, None if robot is None else robot.summary())
 
 
-def _with_robot(view: Output, robot: RobotOut | None) -> Output:
+def _add_robot_status(view: Output, robot: RobotOutput | None) -> Output:
     if robot is None:
         return view
-    from ..live.robot import Watched
+    from ..live.robot import RobotStatusView
 
-    return Watched(view, robot)
+    return RobotStatusView(view, robot)

@@ -1,25 +1,25 @@
-"""Live: samples from a stream → the loop → pose, page, terminal, streams and a recording.
+"""Live tracking: samples of a source → the loop → pose, page, terminal, other programs and a recording.
 
-Only what is asked for is loaded: `sources` one file a kind, `page` the browser, `terminal`, `out` other programs.
+Outputs load when they are used: `page` for the browser, `terminal`, `outputs` for other programs, `robot`.
 """
 
 from __future__ import annotations
 
-from .loop import Ended, LiveLoop, Output
+from .loop import LiveLoop, SessionSummary
 from .session import find_setup, run_session
 from .setup import SensorSetup, read_setup
 from .sources import open_source
-from .state import LivePose, SensorStatus, Stage, Status
+from .state import LivePose, Output, SensorStatus, Status, StreamInfo
 
 __all__ = [
-    "Ended",
     "LiveLoop",
     "LivePose",
     "Output",
     "SensorSetup",
     "SensorStatus",
-    "Stage",
+    "SessionSummary",
     "Status",
+    "StreamInfo",
     "find_setup",
     "open_source",
     "read_setup",

@@ -1,8 +1,8 @@
-"""The live page: the body in the browser while it moves, served to this machine only.
+"""The live page: the body in the browser while the person moves, served to this machine only.
 
-meshcat's own server listens on every interface and keeps what a slow browser has not taken, so the page is fed another
-way: it carries meshcat's viewer inside and gets frames through a WebSocket of ours. A browser that has not drawn the
-last frame gets none; when it asks again it gets the newest. `docs/live-page.md` says what goes over the line.
+meshcat's own server listens on every interface and queues what a slow browser has not taken. So the page carries
+meshcat's viewer inside and gets frames through a WebSocket of ours: a browser that has not drawn its last frame gets
+none, and then the newest. `docs/live-page.md` documents the protocol.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from ..model import POINTS, BodyModel
 from ..model.chains import chains
 from ..pose import known_points
 from ..report.viewer import DARK, LIGHT, backdrop, filled, scene, trail_colour, view
-from .figure import HANDS, Figure
-from .server import Server
-from .state import LivePose, Stage, Status
+from .addresses import LOOPBACK
+from .encoder import HANDS, PoseEncoder
+from .server import Server, ServerOptions
+from .state import LivePose, Output, Status, StreamInfo
 
-LOOPBACK = "127.0.0.1"
 FINGERS = 0.1  # [m] from the middle of the palm
-MOST_KEYS = 16  # not yet taken; more are thrown away
+MAX_KEYS = 16  # not yet taken; more are dropped
 
 
-class LivePage:
-    """An `Output` that browsers look at; `open` begins to serve it, `close` ends that.
+class LivePage(Output):
+    """Serves the page from `open` to `close`.
 
     Parameters
     ----------
     model : the body, with its lengths
-    stage : where it is known before the loop's `start`: what no sensor measures is then left out from the beginning
-    host : address to listen on; another than loopback lets others in the network look on and press keys
+    info : where it is known before the start: what no sensor determines is then hidden from the beginning
+    host : address to listen on; another than loopback lets others in the network watch and press keys
     port : 0 for any free one
     title : shown above the body
     """
 
     def __init__(
-        self, model: BodyModel, stage: Stage | None = None, host: str = LOOPBACK, port: int = 0, title: str = ""
+        self, model: BodyModel, info: StreamInfo | None = None, host: str = LOOPBACK, port: int = 0, title: str = ""
     ) -> None:
-        self._figure = Figure(model)
-        if stage is not None:
-            self._figure.begin(stage)
-        self._host, self._port = host, port
-        self._id = secrets.token_hex(8)
-        self._page = _html(model, self._figure, title, self._id)
+        self._encoder = PoseEncoder(model)
+        if info is not None:
+            self._encoder.start(info)
+        identity = secrets.token_hex(8)
+        self._options = ServerOptions(_fill_page(model, self._encoder, title, identity), identity, host, port)
         self._server: Server | None = None
-        self._keys: deque[str] = deque(maxlen=MOST_KEYS)
+        self._keys: deque[str] = deque(maxlen=MAX_KEYS)
+        self.url = ""  # of an open page
 
     def open(self) -> None:
         """Serve the page from a thread of its own.
@@ -59,34 +59,28 @@ class LivePage:
             The address is not this machine's, or the port is taken.
         """
         if self._server is None:
-            self._server = Server(self._page, self._id, self._figure, self._keys, self._host, self._port)
+            self._server = Server(self._options, self._encoder, self._keys)
             self._server.start()
+            self.url = self._server.url
 
-    @property
-    def url(self) -> str:
-        """Where the page is; of an open one."""
-        assert self._server is not None
-        return self._server.url
-
-    def start(self, stage: Stage) -> None:
-        """From now on only what is measured is drawn."""
-        self._figure.begin(stage)
+    def start(self, info: StreamInfo) -> None:
+        """From now on draw only what is measured."""
+        self._encoder.start(info)
 
     def show(self, pose: LivePose) -> None:
-        """The newest pose; it is drawn when a browser is ready for one. Costs less than a microsecond."""
-        self._figure.newest = pose
+        """Take the newest pose; it is drawn when a browser is ready for it. Costs less than a microsecond."""
+        self._encoder.newest = pose
 
     def status(self, status: Status) -> None:
-        """The newest status."""
         if self._server is not None:
             self._server.status = status
 
     def take_keys(self) -> list[str]:
-        """What was pressed in the page since the last call: "r" for headings anew."""
+        """Keys pressed in the page since the last call: "r" to reset the headings."""
         return [self._keys.popleft() for _ in range(len(self._keys))]
 
     def close(self) -> None:
-        """Tell the browsers, and listen no more. May be called twice."""
+        """Tell the browsers, and stop listening. May be called twice."""
         if self._server is not None:
             self._server.close()
             self._server = None
@@ -99,32 +93,33 @@ class LivePage:
         self.close()
 
 
-def _html(model: BodyModel, figure: Figure, title: str, identity: str) -> str:
+def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str) -> str:
     """The page; its scene is the body in the N-pose, its camera sees all that the hands can reach."""
-    neutral = np.frombuffer(figure.frame(None), "<f4", 12 * len(figure.links), offset=8).reshape(-1, 12)
-    motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(figure.links), 1, 1)).astype("<f4")
+    links = encoder.links
+    neutral = np.frombuffer(encoder.encode(None), "<f4", 12 * len(links), offset=8).reshape(-1, 12)
+    motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(links), 1, 1)).astype("<f4")
     motion[:, 0, 4:] = neutral[:, 9:]
     data = {
         "id": identity,
-        "links": list(figure.links),
-        "scene": scene(figure.visuals, figure.links),
+        "links": list(links),
+        "scene": scene(encoder.visuals, links),
         "backdrops": {"light": backdrop(LIGHT), "dark": backdrop(DARK)},
-        "view": view(figure.visuals, figure.links, motion, [_reach(model)]),
-        "trails": [{"name": hand, "colour": trail_colour(hand, figure.visuals)} for hand in HANDS],
+        "view": view(encoder.visuals, links, motion, [_find_reach(model)]),
+        "trails": [{"name": hand, "colour": trail_colour(hand, encoder.visuals)} for hand in HANDS],
     }
     return filled("live/templates/live.html.j2", data, title or "wepose live")
 
 
-def _reach(model: BodyModel) -> np.ndarray:
-    """(n, 3) [m]: where the hands come to in front, at the sides and above the head."""
+def _find_reach(model: BodyModel) -> np.ndarray:
+    """Points (n, 3) [m] that the hands reach in front, at the sides and above the head."""
     data = pin.Data(model.pin)
     pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
     known = [point for point in known_points(chains(model.pin)) if model.pin.existFrame(POINTS[point])]
     p_W = {point: data.oMf[model.pin.getFrameId(POINTS[point])].translation for point in known}
     ends = [np.zeros(3)]
-    for side, left in (("left", 1.0), ("right", -1.0)):
-        if f"{side}_hand" in p_W:
-            p_shoulder = p_W[f"{side}_shoulder"]
-            ways = np.array([[1.0, 0.0, 0.0], [0.7, 0.7 * left, 0.0], [0.0, left, 0.0], [0.0, 0.6 * left, 0.8]])
-            ends += list(p_shoulder + (np.linalg.norm(p_W[f"{side}_hand"] - p_shoulder) + FINGERS) * ways)
+    for hand, left in zip(HANDS, (1.0, -1.0), strict=True):
+        if hand in p_W:
+            p_shoulder = p_W[f"{hand.split('_')[0]}_shoulder"]
+            directions = np.array([[1.0, 0.0, 0.0], [0.7, 0.7 * left, 0.0], [0.0, left, 0.0], [0.0, 0.6 * left, 0.8]])
+            ends += list(p_shoulder + (np.linalg.norm(p_W[hand] - p_shoulder) + FINGERS) * directions)
     return np.array(ends)

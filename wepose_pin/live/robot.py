@@ -1,75 +1,75 @@
-"""A robot that follows the live pose: commands at an even rate as UDP with JSON. See docs/live-robot.md."""
+"""A robot that follows the live pose: commands at a constant rate, JSON over UDP. See docs/live-robot.md."""
 
 from __future__ import annotations
 
 import json
 import math
-import socket
 import threading
 import time
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption
-from ..retargeting import Robot, find_map, load, read_map
-from ..retargeting.stream import HOLD_AFTER_S, STOP_AFTER_S, Command, CommandStream, Person, needed
+from ..retargeting import Robot, find_map, load_robot, read_map
+from ..retargeting.stream import ArmObserver, Command, CommandStream, StreamOptions, check_segments
 from ..subject import average_subject
-from .loop import Latencies, Output
-from .out import LOOPBACK
+from .loop import Latencies
+from .outputs import UdpSender
 from .setup import SensorSetup
 from .sources.base import Source
 from .sources.replay import ReplaySource
-from .state import LivePose, Stage, Status
+from .state import LivePose, Output, Status, StreamInfo, round_finite
 
 FORMAT = 1
 PORT = 9002
-DIGITS = 9  # after the point: third differences of what is written still keep the limits
-LAST = 3  # times that the end is told: a datagram may be lost
-CLOCKS_S = 0.5  # [s] over which what the poses' clock is ahead of this machine's is averaged
-NEW_CLOCK_S = 0.25  # [s] from which on it is another
-PATIENCE_S = 10.0  # [s] for which the end waits for the robot to stand
+DIGITS = 9  # after the point: third differences of rounded positions still keep the limits
+LAST_COMMANDS = 3  # commands that report the end: a datagram may be lost
+CLOCK_S = 0.5  # [s] over which the offset of the poses' clock is averaged
+CLOCK_JUMP_S = 0.25  # [s] of that offset, from which on the clock is a new one
+PATIENCE_S = 10.0  # [s] for which the end waits until the robot is at rest
 
 
-class Driven(NamedTuple):
-    """What came of a robot's session."""
+class RobotSummary(NamedTuple):
+    """Outcome of a robot's session."""
 
     robot: str
     commands: int
     skipped: int  # commands that were due while one took too long
-    dropped: int  # that the system would not send
-    held: int  # steps without a solution
-    share: Mapping[str, float]  # of the commands that had a pose, state → share
-    step: Latencies  # [s] from the newest pose to its command
+    dropped: int  # that the system did not send
+    infeasible: int  # steps without a solution
+    share: Mapping[str, float]  # state → share of the commands that had a pose
+    step: Latencies  # [s] of computing a command
     error: Mapping[str, Latencies]  # side → [m] of the hand while it followed
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """Commands that the robot did not get, and steps in which it could not move."""
+        """Commands that did not reach the robot, and steps in which it could not move."""
         found = [
             Diagnostic("robot-commands-skipped", WARNING, self.robot, self.skipped),
-            Diagnostic("robot-blocked", WARNING, self.robot, self.held),
+            Diagnostic("robot-blocked", WARNING, self.robot, self.infeasible),
             Diagnostic("robot-commands-dropped", WARNING, self.robot, self.dropped),
         ]
         return [diagnostic for diagnostic in found if diagnostic.value]
 
 
-class RobotOut:
-    """An `Output`: the robot's commands, each as JSON in a datagram of its own.
+class RobotOutput(Output):
+    """Sends the robot's commands, each as JSON in a datagram of its own.
 
-    They come from a thread of their own at the stream's rate, by this machine's clock: the loop never waits for the
-    solver, and the robot is stopped also when the loop stands. Of a replay as fast as it is read, time is the ticks'
-    own instead: what is due is made in `show`, without a thread or a clock, and the same poses give the same bits.
+    A thread of its own makes them at the stream's rate, by this machine's clock: the loop never waits for the solver,
+    and the robot stops also when the loop hangs. In a replay as fast as possible time is that of the ticks instead:
+    `show` makes all commands that are due, without thread or clock, and equal poses give equal bits.
 
     Parameters
     ----------
     to : ``PORT`` of this machine, or ``HOST:PORT``
     lengths_cov : (8, 8) [m²] of the person's lengths; None: exact
-    speed : of a replay; infinite: time is the ticks' own
+    speed : of a replay; infinite: time is that of the ticks
 
     Raises
     ------
@@ -81,14 +81,14 @@ class RobotOut:
         self, stream: CommandStream, to: str = str(PORT), *, lengths_cov: np.ndarray | None = None, speed: float = 1.0
     ) -> None:
         self.stream, self.robot = stream, stream.robot
-        self._wire = _Wire(to)
-        self._lengths_cov, self._ticks = lengths_cov, math.isinf(speed)
-        self._speed = 1.0 if self._ticks else speed
-        self._person: Person | None = None
-        self._newest: tuple[float, LivePose] | None = None
+        self._sender = UdpSender(to, "--to", PORT)
+        self._lengths_cov, self._by_ticks = lengths_cov, math.isinf(speed)
+        self._speed = 1.0 if self._by_ticks else speed
+        self._observer: ArmObserver | None = None
+        self._newest: tuple[float, LivePose] | None = None  # with its time of arrival [s]
         self._taken: LivePose | None = None
         self._came = 0.0  # [s] when the newest sound pose came
-        self._ahead = math.nan  # [s] what the poses' clock is ahead of this machine's
+        self._clock_offset = math.nan  # [s] from this machine's clock to the poses'
         self._due = math.nan  # [s] on the ticks' clock
         self._resume = self._closing = self._closed = False
         self._thread: threading.Thread | None = None
@@ -100,54 +100,50 @@ class RobotOut:
         self._error = {arm.side: Latencies() for arm in self.robot.arms}
 
     def open(self) -> None:
-        """Begin to send: the robot holds its rest posture until the start pose has been held."""
-        if not self._ticks and self._thread is None:
+        """Begin to send: the robot keeps its rest posture until tracking starts."""
+        if not self._by_ticks and self._thread is None:
             self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
             self._thread.start()
 
-    def start(self, stage: Stage) -> None:
-        """Who moves is known; raises `BadData` where an arm has no sensors."""
-        self._person = Person(self.robot, stage.segments, stage.points, self._lengths_cov)
+    def start(self, info: StreamInfo) -> None:
+        """Tracking starts; raises `BadData` where an arm has no sensors."""
+        self._observer = ArmObserver(self.robot, info.segments, info.points, self._lengths_cov)
         self.open()
 
     def show(self, pose: LivePose) -> None:
-        """The newest pose: never waits, unless time is the ticks' own."""
-        self._raise()
-        if self._ticks:
-            self._tick(pose)
+        """Take the newest pose; waits only where time is that of the ticks."""
+        self._raise_failure()
+        if self._by_ticks:
+            self._process_tick(pose)
         else:
             self._newest = (time.monotonic(), pose)
 
     def status(self, status: Status) -> None:  # noqa: ARG002
-        """Only commands go out."""
-        self._raise()
-
-    def take_keys(self) -> list[str]:
-        return []
+        self._raise_failure()
 
     def resume(self) -> None:
-        """After a stop: go on, by an approach."""
+        """Continue after a stop, by an approach."""
         self._resume = True
 
     def close(self) -> None:
-        """Brake within the limits, say that the robot is stopped, and end. May be called twice."""
+        """Brake within the limits, report that the robot is stopped, and end. May be called twice."""
         if self._closed:
             return
         self._closing = self._closed = True
         if self._thread is not None:
             self._thread.join(PATIENCE_S)
-        elif self._ticks and self._failure is None:
+        elif self._by_ticks and self._failure is None:
             self._finish()
-        self._wire.close()
+        self._sender.close()
 
-    def summary(self) -> Driven:
+    def summary(self) -> RobotSummary:
         posed = sum(self._states.values())
-        return Driven(
+        return RobotSummary(
             self.robot.map.name,
             0 if self.newest is None else self.newest.number + 1,
             self._skipped,
-            self._wire.dropped,
-            self.stream.held,
+            self._sender.dropped,
+            self.stream.infeasible,
             {state: count / posed for state, count in self._states.most_common()},
             self._step,
             self._error,
@@ -156,61 +152,61 @@ class RobotOut:
     # By this machine's clock -----------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        due, dt, told = time.monotonic(), self.stream.dt, 0
+        due, dt, reported = time.monotonic(), self.stream.dt, 0
         try:
-            while told < LAST:
+            while reported < LAST_COMMANDS:
                 time.sleep(max(0.0, due - time.monotonic()))
                 late = int((time.monotonic() - due) / dt)
                 self._skipped += late if self._taken is not None else 0  # before, the sources warm up
                 due += (late + 1) * dt
-                command = self._commanded(*self._now())
-                told += self._closing and command.state == "stopped"
-        except BaseException as error:  # a thread has nobody to tell: the loop raises it
+                command = self._send_command(*self._take_newest())
+                reported += self._closing and command.state == "stopped"
+        except BaseException as error:  # the loop raises it
             self._failure = error
 
-    def _now(self) -> tuple[float, float]:
-        """Take the newest pose; now [s] on the poses' clock, and since when there is none [s]."""
-        self._asked()
+    def _take_newest(self) -> tuple[float, float]:
+        """Take the newest pose; return now [s] on the poses' clock, and the age of the newest sound pose [s]."""
+        self._handle_requests()
         newest, wall = self._newest, time.monotonic()
         if newest is not None and newest[1] is not self._taken:
             came, self._taken = newest
-            ahead = self._taken.time / self._speed - came
+            offset = self._taken.time / self._speed - came
             if self._push(self._taken):
                 self._came = came
-                if abs(ahead - self._ahead) < NEW_CLOCK_S:
-                    ahead = self._ahead + (ahead - self._ahead) * self.stream.dt / CLOCKS_S
-                self._ahead = ahead
-        return wall + self._ahead, wall - self._came
+                if abs(offset - self._clock_offset) < CLOCK_JUMP_S:
+                    offset = self._clock_offset + (offset - self._clock_offset) * self.stream.dt / CLOCK_S
+                self._clock_offset = offset
+        return wall + self._clock_offset, wall - self._came
 
-    # By the ticks' ---------------------------------------------------------------------------------------------------
+    # By the clock of the ticks ---------------------------------------------------------------------------------------
 
-    def _tick(self, pose: LivePose) -> None:
-        """Commands that are due by the tick of `pose`."""
-        self._asked()
+    def _process_tick(self, pose: LivePose) -> None:
+        """Send the commands that are due by the tick of `pose`."""
+        self._handle_requests()
         dt = self.stream.dt
         if not abs(pose.time - self._due) < PATIENCE_S:  # the first, or another clock
             self._due = self._came = pose.time
         while self._due < pose.time - 1e-3 * dt:
-            self._commanded(self._due, self._due - self._came)
+            self._send_command(self._due, self._due - self._came)
             self._due += dt
         if self._push(pose):
             self._came = pose.time
         if self._due < pose.time + 1e-3 * dt:
-            self._commanded(self._due, max(0.0, self._due - self._came))
+            self._send_command(self._due, max(0.0, self._due - self._came))
             self._due += dt
 
     def _finish(self) -> None:
-        self._asked()
-        told = 0
+        self._handle_requests()
+        reported = 0
         for _ in range(int(PATIENCE_S / self.stream.dt)):
-            told += self._commanded(self._due, 0.0).state == "stopped"
-            if told == LAST:
+            reported += self._send_command(self._due, 0.0).state == "stopped"
+            if reported == LAST_COMMANDS:
                 return
 
-    # Either ----------------------------------------------------------------------------------------------------------
+    # By either clock -------------------------------------------------------------------------------------------------
 
-    def _asked(self) -> None:
-        """Do what other threads want."""
+    def _handle_requests(self) -> None:
+        """Do what other threads asked for."""
         if self._closing:
             self.stream.end("the session has ended")
         if self._resume:
@@ -218,14 +214,16 @@ class RobotOut:
             self.stream.resume()
 
     def _push(self, pose: LivePose) -> bool:
-        assert self._person is not None
-        seen = self._person.look(pose.quat_WL, pose.points, pose.std, pose.lost)
-        return self.stream.push(pose.time / self._speed, seen)
+        """Hand a pose to the stream; False where it is not sound, or came before `start`."""
+        if self._observer is None:
+            return False
+        observed = self._observer.observe(pose.quat_WL, pose.points, pose.std, pose.lost)
+        return self.stream.push(pose.time / self._speed, observed)
 
-    def _commanded(self, now: float, age: float) -> Command:
+    def _send_command(self, now: float, age: float) -> Command:
         begin = time.perf_counter()
         command = self.stream.step(now, age)
-        self._wire.send(command_json(self.robot, command, self._speed))
+        self._sender.send(command_json(self.robot, command, self._speed))
         self.newest = command
         if not math.isnan(command.time):
             self._step.add(time.perf_counter() - begin)
@@ -235,19 +233,19 @@ class RobotOut:
                 self._error[arm.side].add(error)
         return command
 
-    def _raise(self) -> None:
+    def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
 
 
-class Watched:
-    """An `Output` that is another, with the robot's state in its message; its key "r" is told to the robot too."""
+class RobotStatusView(Output):
+    """A view whose message also gives the state of the robot, and whose key "r" resumes the robot too."""
 
-    def __init__(self, view: Output, robot: RobotOut) -> None:
+    def __init__(self, view: Output, robot: RobotOutput) -> None:
         self._view, self._robot = view, robot
 
-    def start(self, stage: Stage) -> None:
-        self._view.start(stage)
+    def start(self, info: StreamInfo) -> None:
+        self._view.start(info)
 
     def show(self, pose: LivePose) -> None:
         self._view.show(pose)
@@ -255,9 +253,9 @@ class Watched:
     def status(self, status: Status) -> None:
         command = self._robot.newest
         if command is not None and status.state == "ready":
-            told = f"{command.state} ({command.reason})" if command.reason else command.state
-            how = "; r, in the start pose, goes on" if self._robot.stream.stopped else ""
-            status = status._replace(message=f"{status.message} {self._robot.robot.map.name}: {told}{how}.")
+            state = f"{command.state} ({command.reason})" if command.reason else command.state
+            hint = "; r, in the start pose, goes on" if self._robot.stream.stopped else ""
+            status = status._replace(message=f"{status.message} {self._robot.robot.map.name}: {state}{hint}.")
         self._view.status(status)
 
     def take_keys(self) -> list[str]:
@@ -271,58 +269,66 @@ class Watched:
 
 
 class TickReplay(ReplaySource):
-    """A replay as fast as it is read, of which each read gives one tick: whoever follows it sees every pose."""
+    """A replay as fast as possible, one tick a read: the robot gets every pose."""
 
-    def _due(self) -> int:
+    def _count_due(self) -> int:
         return min(self._next + 1, len(self.recording))
 
 
-def follower_of(
-    robot: str,
-    source: Source,
-    setup: SensorSetup,
-    *,
-    arms: tuple[str, ...] | None = None,
-    map_file: Path | None = None,
-    to: str | None = None,
-    speed: float = 1.0,
-    rate_hz: float = 100.0,
-    hold_after: float = HOLD_AFTER_S,
-    stop_after: float = STOP_AFTER_S,
-) -> tuple[RobotOut, Source]:
-    """A robot by name or file that follows who wears the sensors, and the source as it needs it, not opened yet.
+@dataclass(frozen=True)
+class RobotOptions:
+    """A robot that follows.
 
     Parameters
     ----------
+    robot : name or file, as for `find_map`
     arms : sides; None: all that the robot has
     map_file : of a URDF in `robot` that has none beside it
-    speed : of a replay; infinite: as fast as it is read
-    rate_hz, hold_after, stop_after : as `CommandStream`
+    to : ``PORT`` or ``HOST:PORT`` of the receiver
+    """
+
+    robot: str
+    arms: tuple[str, ...] | None = None
+    map_file: Path | None = None
+    to: str = str(PORT)
+    stream: StreamOptions = field(default_factory=StreamOptions)
+
+
+def connect_robot(
+    options: RobotOptions, source: Source, setup: SensorSetup, speed: float = 1.0
+) -> tuple[RobotOutput, Source]:
+    """The robot's output, and the source as it needs it; neither is opened.
+
+    Parameters
+    ----------
+    speed : of a replay; infinite: as fast as possible
 
     Raises
     ------
     WeposeError
         What is wrong with robot, map or options; an arm without sensors.
     """
-    if map_file is not None and Path(robot).suffix.lower() not in (".urdf", ".xml"):
-        raise BadOption(f"--map {map_file}: --robot {robot} has its own; a map goes with a URDF")
-    loaded = load(find_map(robot) if map_file is None else read_map(map_file, urdf=Path(robot)), arms)
+    path = Path(options.robot)
+    if options.map_file is not None and path.suffix.lower() not in (".urdf", ".xml"):
+        raise BadOption(f"--map {options.map_file}: --robot {options.robot} has its own; a map goes with a URDF")
+    robot_map = find_map(options.robot) if options.map_file is None else read_map(options.map_file, urdf=path)
+    robot = load_robot(robot_map, options.arms)
     if source.sensors:
-        needed(loaded, source.sensors)
+        check_segments(robot, source.sensors)
     if isinstance(source, ReplaySource) and math.isinf(speed):
         source = TickReplay(source.recording, speed)
     lengths_cov = (setup.subject or average_subject()).lengths_covariance()
-    stream = CommandStream(loaded, rate_hz=rate_hz, hold_after=hold_after, stop_after=stop_after)
-    return RobotOut(stream, to or str(PORT), lengths_cov=lengths_cov, speed=speed), source
+    stream = CommandStream(robot, options.stream)
+    return RobotOutput(stream, options.to, lengths_cov=lengths_cov, speed=speed), source
 
 
 def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:
     """One command as a line of JSON; null for what is not known."""
     arms = {
         arm.side: {
-            "error_mm": _known(1e3 * command.error[i, 0]),
-            "error_deg": _known(math.degrees(command.error[i, 1])),
-            "std_mm": _known(1e3 * command.std[i]),
+            "error_mm": round_finite(1e3 * command.error[i, 0], 2),
+            "error_deg": round_finite(math.degrees(command.error[i, 1]), 2),
+            "std_mm": round_finite(1e3 * command.std[i], 2),
         }
         for i, arm in enumerate(robot.arms)
     }
@@ -330,7 +336,7 @@ def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:
         "format": FORMAT,
         "n": command.number,
         "clock": round(command.clock, DIGITS),
-        "t": _known(command.time * speed, 6),
+        "t": round_finite(command.time * speed, 6),
         "robot": robot.map.name,
         "state": command.state,
         "reason": command.reason,
@@ -341,34 +347,3 @@ def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:
         "arms": arms,
     }
     return json.dumps(message, separators=(",", ":"), allow_nan=False).encode("utf-8") + b"\n"
-
-
-def _known(value: float, digits: int = 2) -> float | None:
-    return round(float(value), digits) if math.isfinite(value) else None
-
-
-class _Wire:
-    """Datagrams to one receiver, now or never."""
-
-    def __init__(self, to: str) -> None:
-        host, _, port = to.rpartition(":")
-        if not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
-            raise BadOption(f"--to {to}: a port or HOST:PORT, as {PORT} or 192.168.1.20:{PORT}")
-        host = host.removeprefix("[").removesuffix("]") or LOOPBACK
-        try:
-            family, kind, _, _, address = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
-        except (OSError, UnicodeError) as error:
-            raise BadOption(f"--to {to}: no host '{host}' ({error}); a name or an address, as 127.0.0.1") from None
-        self._to: Any = address
-        self._socket = socket.socket(family, kind)
-        self._socket.setblocking(False)
-        self.dropped = 0
-
-    def send(self, data: bytes) -> None:
-        try:
-            self._socket.sendto(data, self._to)
-        except OSError:  # no room, nobody there, or no network for now
-            self.dropped += 1
-
-    def close(self) -> None:
-        self._socket.close()

@@ -1,4 +1,4 @@
-"""Serves the live page: HTTP and a WebSocket, to this machine only unless told otherwise."""
+"""The server of the live page: HTTP and a WebSocket."""
 
 from __future__ import annotations
 
@@ -11,19 +11,36 @@ import re
 import socket
 import threading
 from collections import deque
+from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Any
 
 from ..errors import BadOption
-from .figure import Figure
-from .state import Status
+from .encoder import PoseEncoder
+from .state import Status, round_finite
 
 FRAME_S = 1.0 / 60.0
 KEYS = ("r",)
-MOST_CLIENTS = 16
-MOST_BYTES = 256  # of a message from the page
+MAX_CLIENTS = 16
+MAX_BYTES = 256  # of a message from the page
 PING_S, PONG_S = 5.0, 4.0
 GOODBYE_S = 0.5  # that a browser has to answer when the page ends
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """A page and its address.
+
+    Parameters
+    ----------
+    page : HTML
+    identity : of this page; a browser that reconnects with another one reloads
+    """
+
+    page: str
+    identity: str
+    host: str
+    port: int
 
 
 class Server:
@@ -31,9 +48,7 @@ class Server:
 
     Parameters
     ----------
-    page : the whole page
-    identity : of this page; a browser that comes back with another one loads anew
-    keys : where keys pressed in the page go
+    keys : receives the keys pressed in the page
 
     Raises
     ------
@@ -41,13 +56,14 @@ class Server:
         The address is not this machine's, or the port is taken.
     """
 
-    def __init__(self, page: str, identity: str, figure: Figure, keys: deque[str], host: str, port: int) -> None:
+    def __init__(self, options: ServerOptions, encoder: PoseEncoder, keys: deque[str]) -> None:
+        host, port = options.host, options.port
         self.status: Status | None = None
-        self._figure, self._keys, self._host = figure, keys, host
+        self._encoder, self._keys, self._host = encoder, keys, host
         self._clients: set[Any] = set()
-        self.page = page.encode("utf-8")
-        self.hello = json.dumps({"id": identity})
-        scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
+        self.page = options.page.encode("utf-8")
+        self.hello = json.dumps({"id": options.identity})
+        scripts = re.findall(r"<script>(.*?)</script>", options.page, flags=re.DOTALL)
         digests = [hashlib.sha256(script.encode("utf-8")).digest() for script in scripts]
         self._scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
         if not host:  # to the system that would be every interface
@@ -89,11 +105,11 @@ class Server:
     async def _serve(self) -> None:
         from tornado.httpserver import HTTPServer
 
-        server = HTTPServer(_application(self), max_header_size=16384)
+        server = HTTPServer(_build_application(self), max_header_size=16384)
         server.add_socket(self._socket)
         due = self._loop.time()
         while not self._end.is_set():
-            self._feed()
+            self._send_newest()
             due = max(due + FRAME_S, self._loop.time())
             try:
                 await asyncio.wait_for(self._end.wait(), max(due - self._loop.time(), 0.001))
@@ -107,40 +123,41 @@ class Server:
             await asyncio.sleep(0.01)
         await server.close_all_connections()
 
-    def _feed(self) -> None:
-        """To every browser that has taken what it got the newest that it has not."""
-        ready = [client for client in self._clients if client.awaited == 0]
+    def _send_newest(self) -> None:
+        """Send what is new to every browser that has drawn what it got."""
+        ready = [client for client in self._clients if client.pending == 0]
         if not ready:
             return
-        status, pose, staged = self.status, self._figure.newest, self._figure.staged
-        words = frame = None
+        status, pose, measured = self.status, self._encoder.newest, self._encoder.measured
+        text = frame = None
         for client in ready:
             if status is not None and client.status is not status:
-                words = words or status_json(status)
-                client.give(words)
+                text = text or status_json(status)
+                client.send(text)
                 client.status = status
-            if client.pose is not pose or client.staged is not staged:
-                frame = frame or self._figure.frame(pose)
-                client.give(frame)
-                client.pose, client.staged = pose, staged
+            if client.pose is not pose or client.measured is not measured:
+                frame = frame or self._encoder.encode(pose)
+                client.send(frame)
+                client.pose, client.measured = pose, measured
 
-    def joined(self, client: Any) -> bool:
-        if len(self._clients) >= MOST_CLIENTS:
+    def add_client(self, client: Any) -> bool:
+        """Add a browser; False where there are too many."""
+        if len(self._clients) >= MAX_CLIENTS:
             return False
         self._clients.add(client)
         return True
 
-    def left(self, client: Any) -> None:
+    def remove_client(self, client: Any) -> None:
         self._clients.discard(client)
 
-    def pressed(self, key: str) -> None:
+    def press_key(self, key: str) -> None:
         if key in KEYS:
             self._keys.append(key)
 
-    def knows(self, host: str) -> bool:
-        """Whether a request's Host is an address, this machine by name, or what the page was told to listen on.
+    def accepts_host(self, host: str) -> bool:
+        """Whether the Host of a request is an address, localhost, or the host of the options.
 
-        A foreign page can have its own name resolve to 127.0.0.1, and its scripts would then be of our origin.
+        The name of a foreign page may resolve to 127.0.0.1, and its scripts would then be of our origin.
         """
         parts = re.fullmatch(r"(?:\[([0-9a-f:.]+)\]|([\w.-]+))(?::\d{1,5})?", host.lower(), flags=re.ASCII)
         if parts is None:
@@ -154,22 +171,22 @@ class Server:
             return False
         return True
 
-    def policy(self, host: str) -> str:
-        """The page may run its own scripts and talk to its own server."""
-        # meshcat's viewer makes style elements as it starts and fails without them.
+    def content_policy(self, host: str) -> str:
+        """Content-Security-Policy: the page's own scripts, connections to its own server."""
+        # meshcat's viewer creates style elements when it starts and fails without them.
         return (
             f"default-src 'none'; script-src {self._scripts}; style-src 'unsafe-inline'; img-src data:; "
             f"connect-src ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
 
 
-def _application(server: Server) -> Any:
+def _build_application(server: Server) -> Any:
     from tornado.web import Application, RequestHandler
     from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
     def refuse(handler: RequestHandler) -> None:
         host, origin = handler.request.host, handler.request.headers.get("Origin")
-        if not server.knows(host):
+        if not server.accepts_host(host):
             handler.set_status(403)
             handler.finish("This page is known by address, or as localhost.")
         elif origin is not None and origin != f"http://{host}":
@@ -185,7 +202,7 @@ def _application(server: Server) -> Any:
 
         def get(self) -> None:
             for name, value in (
-                ("Content-Security-Policy", server.policy(self.request.host)),
+                ("Content-Security-Policy", server.content_policy(self.request.host)),
                 ("Cache-Control", "no-store"),
                 ("Cross-Origin-Opener-Policy", "same-origin"),
                 ("Cross-Origin-Resource-Policy", "same-origin"),
@@ -197,41 +214,41 @@ def _application(server: Server) -> Any:
             self.finish(server.page)
 
     class Stream(WebSocketHandler):  # type: ignore[misc]
-        awaited = 0  # messages that the browser has not drawn yet
+        pending = 0  # messages that the browser has not drawn yet
         status: Status | None = None
-        pose: Any = ()  # what was sent; () until something was
-        staged: Any = ()
+        pose: Any = ()  # that was sent; () before the first
+        measured: Any = ()
 
         def prepare(self) -> None:
             refuse(self)
 
         def open(self) -> None:
-            if not server.joined(self):
+            if not server.add_client(self):
                 self.close(1013, "too many pages are open")
                 return
-            self.give(server.hello)
+            self.send(server.hello)
 
         def on_message(self, message: str | bytes) -> None:
             if message == "taken":
-                self.awaited = max(0, self.awaited - 1)
+                self.pending = max(0, self.pending - 1)
             elif isinstance(message, str) and message.startswith("key "):
-                server.pressed(message.removeprefix("key "))
+                server.press_key(message.removeprefix("key "))
 
         def on_close(self) -> None:
-            server.left(self)
+            server.remove_client(self)
 
-        def give(self, message: str | bytes) -> None:
-            self.awaited += 1
+        def send(self, message: str | bytes) -> None:
+            self.pending += 1
             try:
                 sent = self.write_message(message, binary=isinstance(message, bytes))
             except WebSocketClosedError:
-                server.left(self)
-            else:  # a browser that goes away while it is sent is no error
+                server.remove_client(self)
+            else:  # a browser that leaves during the transfer is no error
                 sent.add_done_callback(lambda done: done.cancelled() or done.exception())
 
         def say_goodbye(self, status: Status | None) -> None:
             if status is not None:
-                self.give(status_json(status))
+                self.send(status_json(status))
             self.close(1001, "ended")
 
     return Application(
@@ -239,7 +256,7 @@ def _application(server: Server) -> Any:
         log_function=lambda _handler: None,
         websocket_ping_interval=PING_S,
         websocket_ping_timeout=PONG_S,
-        websocket_max_message_size=MOST_BYTES,
+        websocket_max_message_size=MAX_BYTES,
     )
 
 
@@ -249,17 +266,17 @@ def status_json(status: Status) -> str:
         {
             "state": status.state,
             "message": status.message,
-            "progress": _rounded(status.progress, 3),
-            "time": _rounded(status.time, 3),
+            "progress": round_finite(status.progress, 3),
+            "time": round_finite(status.time, 3),
             "sensors": [
                 {
                     "segment": sensor.segment,
-                    "rate_hz": _rounded(sensor.rate_hz, 1),
+                    "rate_hz": round_finite(sensor.rate_hz, 1),
                     "lost": bool(sensor.lost),
                     "static": bool(sensor.static),
-                    "bias_deg_s": [_rounded(math.degrees(axis), 5) for axis in sensor.gyro_bias],
-                    "heading_std_deg": _rounded(math.degrees(sensor.heading_std), 2),
-                    "heading_age_s": _rounded(sensor.heading_age, 1),
+                    "bias_deg_s": [round_finite(math.degrees(axis), 5) for axis in sensor.gyro_bias],
+                    "heading_std_deg": round_finite(math.degrees(sensor.heading_std), 2),
+                    "heading_age_s": round_finite(sensor.heading_age, 1),
                     "missing": sensor.missing,
                     "late": sensor.late,
                     "duplicate": sensor.duplicate,
@@ -267,13 +284,9 @@ def status_json(status: Status) -> str:
                 }
                 for sensor in status.sensors
             ],
-            "latency_ms": [_rounded(latency, 2) for latency in status.latency_ms],
-            "recorded_s": _rounded(status.recorded_s, 1),
+            "latency_ms": [round_finite(latency, 2) for latency in status.latency_ms],
+            "recorded_s": round_finite(status.recorded_s, 1),
             "problems": dict(status.problems),
         },
         allow_nan=False,
     )
-
-
-def _rounded(value: float, digits: int) -> float | None:
-    return round(float(value), digits) if math.isfinite(value) else None

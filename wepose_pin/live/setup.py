@@ -1,4 +1,4 @@
-"""`SensorSetup`: the subject and how the sensors sit on it, as far as it is known before the first sample."""
+"""`SensorSetup`: the subject and the mounts of the sensors, as far as known before the first sample."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from ..subject import Subject, subject_of, subject_toml
 
 @dataclass(frozen=True)
 class SensorSetup:
-    """A subject and how the sensors sit on it.
+    """A subject and the mounts of the sensors.
 
     Parameters
     ----------
-    subject : lengths and calibrated mounts; None: the average person and stated mounts
+    subject : lengths and calibrated mounts; None: the population prior and stated mounts
     subject_text : the ``subject.toml`` it was read from, if any
     mounts : segment → stated `quat_LS` (4,) xyzw
-    phases : of a replay: `start` and `static` [s], else the start pose is found
+    phases : of a replay: `start` and `static` [s]; without `start` the loop searches the start pose
     """
 
     name: str = "live"
@@ -50,14 +50,14 @@ class SensorSetup:
         )
 
     def as_recorded(self) -> SensorSetup:
-        """With the subject as who reads the session's recording will have it: decimals of a text are not all."""
+        """With the subject as a reader of the recording gets it: rounded to the decimals of its text."""
         if self.subject is None or self.subject_text:
             return self
         text = subject_toml(self.subject)
         return replace(self, subject=subject_of(text, Path("subject.toml")), subject_text=text)
 
     def header(self, sensors: Sequence[str]) -> dict[str, Any]:
-        """What the recording of a live session begins with, the method apart."""
+        """Header of the recording of a live session, without the method."""
         return {
             "name": self.name,
             "sensors": list(sensors),
@@ -70,7 +70,7 @@ class SensorSetup:
 
 
 def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "") -> SensorSetup:
-    """What a session file says of the sensors' mounts; what it says of data and phases is of another recording.
+    """The setup that a session file states; its data and phases belong to another recording and are ignored.
 
     Raises
     ------

@@ -1,33 +1,34 @@
-"""What the loop hands to whoever shows or sends it: the newest pose, and how each sensor is."""
+"""What the loop hands to its outputs: what the stream holds, the newest pose, the state of each sensor."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 
-class LivePose(NamedTuple):
-    """One moment of the person; arrays belong to the receiver."""
-
-    time: float  # [s] on the source's clock
-    quat_WL: np.ndarray  # (k, 4) xyzw, in the order of `Stage.segments`
-    points: np.ndarray  # (p, 3) [m] in W, in the order of `Stage.points`
-    std: np.ndarray  # (k,) [rad] one standard deviation of an axis; NaN where the filter has none
-    lost: np.ndarray  # (k,) bool: its sensor has been silent for longer than the loop waits, or is frozen
-    latency: float  # [s] from the newest sample's time to this pose
-
-
-class Stage(NamedTuple):
-    """What stays the same from the start on."""
+class StreamInfo(NamedTuple):
+    """What stays the same from the start of tracking on."""
 
     segments: tuple[str, ...]
     points: tuple[str, ...]
     rate_hz: float
 
 
+class LivePose(NamedTuple):
+    """Pose of the person at one moment; the arrays belong to the receiver."""
+
+    time: float  # [s] on the source's clock
+    quat_WL: np.ndarray  # (k, 4) xyzw, in the order of `StreamInfo.segments`
+    points: np.ndarray  # (p, 3) [m] in W, in the order of `StreamInfo.points`
+    std: np.ndarray  # (k,) [rad] one standard deviation of an axis; NaN where the filter has none
+    lost: np.ndarray  # (k,) bool: the sensor is silent for longer than the loop waits, or frozen
+    latency: float  # [s] from the time of the newest sample to this pose
+
+
 class SensorStatus(NamedTuple):
-    """How one sensor is, a few times a second."""
+    """State of one sensor."""
 
     segment: str
     rate_hz: float  # samples a second over the last second, on the source's clock
@@ -35,21 +36,51 @@ class SensorStatus(NamedTuple):
     static: bool
     gyro_bias: tuple[float, float, float]  # [rad/s]
     heading_std: float  # [rad]; NaN where the filter has no covariance
-    heading_age: float  # [s] since its heading was last set: at the start, or by a reset
-    missing: int  # ticks that it had no sample for
-    late: int  # samples that came after their tick had gone
+    heading_age: float  # [s] since the start, or the last reset of the headings
+    missing: int  # ticks without a sample of it
+    late: int  # samples that came after their tick
     duplicate: int
-    frozen: bool  # it repeats itself bit for bit, and has noise
+    frozen: bool  # its values repeat bit for bit, though it has noise
 
 
 class Status(NamedTuple):
-    """What the person and who stands beside should read, a few times a second."""
+    """State of the session, a few times a second."""
 
-    state: str  # "waiting" for sensors, "hold" the start pose, "moved" in it and must hold again, "ready", "ended"
-    message: str  # the same in a sentence, for the person
+    state: str  # "waiting" for sensors, "hold" the start pose, "moved" in it, "ready", "ended"
+    message: str  # the state as a sentence to the person
     progress: float  # 0 to 1 of the start pose; 1 when ready
     time: float  # [s] on the source's clock
     sensors: tuple[SensorStatus, ...]
-    latency_ms: tuple[float, float]  # p50, p99 of the last seconds, from the newest sample to the pose
+    latency_ms: tuple[float, float]  # p50, p99 of the last poses
     recorded_s: float  # [s] in the file of --record; 0 without one
-    problems: dict[str, int]  # what the source counted: bytes skipped, packets that were none, …
+    problems: dict[str, int]  # problem → count: of the source, the sensors, the recording
+
+
+class Output:
+    """Base of what receives the poses. No method may take long: the loop waits for it."""
+
+    def start(self, info: StreamInfo) -> None:
+        """Tracking starts: from now on poses come, of these segments and points."""
+
+    def show(self, pose: LivePose) -> None:
+        """Take the newest pose. Of poses that became due together, only the last comes."""
+
+    def status(self, status: Status) -> None:
+        """Take the status, a few times a second from the first sample on."""
+
+    def take_keys(self) -> list[str]:
+        """Keys since the last call: "r" to reset the headings, "q" to end."""
+        return []
+
+    def close(self) -> None:
+        """End; may be called twice."""
+
+
+def round_finite(value: float, digits: int) -> float | None:
+    """A number for JSON; None for NaN and infinity."""
+    return round(float(value), digits) if math.isfinite(value) else None
+
+
+def join_names(segments: list[str]) -> str:
+    """Segments as words: "torso, left upper arm"."""
+    return ", ".join(segment.replace("_", " ") for segment in segments)

@@ -1,4 +1,4 @@
-"""Checks of a written trajectory that share no code with the controller: the table, the URDF's limits, coal's shapes."""
+"""Checks of a written trajectory that share no code with the controller: the URDF's limits, coal's shapes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ def check_limits(
     """
     limits, time = read_joint_limits(urdf), table["time"].to_numpy()
     joints = [name for name in table.columns if name in limits]
-    q, v, a = (table.select([f"{j}{suffix}" for j in joints]).to_numpy() for suffix in ("", "_velocity", "_acceleration"))
+    q, v, a = (
+        table.select([f"{j}{suffix}" for j in joints]).to_numpy() for suffix in ("", "_velocity", "_acceleration")
+    )
     low, high, v_max = (np.array([getattr(limits[j], key) for j in joints]) for key in ("lower", "upper", "velocity"))
     a_max = np.array([acceleration[j] for j in joints])
     j_max = np.array([jerk[j] if jerk else np.inf for j in joints])

@@ -213,7 +213,7 @@ def diagnose_trajectory(
         found.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
     slowest = trajectory.slowest
     if slowest is not None and slowdown is not None:
-        moment = {"joint": slowest.joint, "moment": slowest.time, "quantity": slowest.quantity}
+        moment: dict[str, float | str] = {"joint": slowest.joint, "moment": slowest.time, "quantity": slowest.quantity}
         found.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=moment))
     if trajectory.contact_times:
         moments = ", ".join(map(format_time, trajectory.contact_times[:MAX_MOMENTS]))

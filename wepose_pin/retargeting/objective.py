@@ -14,10 +14,10 @@ _LEVER = 0.2  # [m] from a joint to the hand, for the curvature of the hand's pa
 
 
 @compiled
-def add_arm_tasks(
+def add_arm_tasks(  # type: ignore[no-untyped-def]
     H, f, J_hand, J_elbow, hand, elbow, shoulder, rotation_error, position, velocity, angular_velocity, swivel, weight,
     v, dt, tasks, joints,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Add one arm's tasks to ½ wᵀ H w − fᵀ w; return whether the arm is close to a singularity.
 
     Parameters

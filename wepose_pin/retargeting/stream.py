@@ -2,8 +2,8 @@
 
 Three stages lie between a pose and the robot. A causal low-pass smooths the targets (`_LowPass`). A reference moves
 from the robot's hand to its target no faster than the tracking's quality allows (`_Reference`): it makes the approach,
-slows the robot where tracking is poor, and keeps jumps from it. The control step keeps the limits (`QpController`), also
-while braking. Time is an argument: nothing here reads a clock.
+slows the robot where tracking is poor, and keeps jumps from it. The control step (`QpController`) keeps the limits,
+also while braking. Time is an argument: nothing here reads a clock.
 """
 
 from __future__ import annotations
@@ -307,8 +307,8 @@ class StreamOptions:
 class CommandStream:
     """Commands at a constant rate for a robot that follows a live pose.
 
-    It begins at rest in the robot's rest posture. Without a pose for `hold_after` it brakes, and goes on when one comes;
-    without one for `stop_after` it stops until `resume`.
+    It begins at rest in the robot's rest posture. Without a pose for `hold_after` it brakes, and continues when one
+    comes; without one for `stop_after` it stops until `resume`.
 
     Attributes
     ----------

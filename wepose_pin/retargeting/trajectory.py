@@ -332,8 +332,7 @@ def _fade_out(clock: np.ndarray) -> np.ndarray:
 
 
 def _resample_at(motion: ArmTargets, index: np.ndarray, clock: np.ndarray, dt: float) -> ArmTargets:
-    """The motion at fractional samples `index`, which the robot passes at `clock` [s]; its time stays the recording's.
-    """
+    """The motion at fractional samples `index`, passed at `clock` [s] of the robot; its time stays the recording's."""
     even = np.arange(len(motion.time)) * dt
     recorded_time = np.interp(index * dt, even, motion.time)
     return replace(resample_targets(replace(motion, time=even), index * dt, clock), time=recorded_time)

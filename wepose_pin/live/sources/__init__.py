@@ -1,4 +1,4 @@
-"""Where samples come from, live: one file a kind, one protocol (`base.Source`)."""
+"""Sources of live samples: one file a kind, one protocol (`base.Source`)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ...errors import BadOption, one_of
 from ...recording import SEGMENTS
+from ..addresses import parse_address
 from .base import Source
 
 FORMS = {
@@ -16,7 +17,6 @@ FORMS = {
     "udp": "udp:[HOST:]PORT",
     "mti": "mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]",
 }
-LOOPBACK = "127.0.0.1"
 
 
 def open_source(
@@ -33,15 +33,15 @@ def open_source(
     ----------
     spec : ``replay:PATH`` (a session.toml or its folder), ``lsl:NAME``, ``udp:PORT``, ``udp:HOST:PORT`` or
         ``mti:DEVICE=SEGMENT,…@RATE``; docs/live-sources.md says what each takes
-    sensors : those that are wanted; None: all that the source has. A UDP or LSL source waits for its sensors in `open`
-    speed : of a replay: 1.0 its own, 4.0 four times that, "max" as fast as it is read
+    sensors : to take; None: all that the source has. A UDP or LSL source waits for its sensors in `open`
+    speed : of a replay: 1.0 its own, 4.0 four times that, "max" as fast as possible
     baud : of serial ports
     wait_s : how long `open` waits for streams or senders [s]
 
     Raises
     ------
     BadOption
-        The spec is none, or names what does not exist; WeposeErrors of the recording that is replayed.
+        No such kind of source, or it names what does not exist; WeposeErrors of the recording that is replayed.
     """
     kind, colon, rest = spec.partition(":")
     if kind not in FORMS or not colon or not rest:
@@ -50,25 +50,25 @@ def open_source(
     if unknown:
         raise BadOption(f"source '{spec}': '{unknown[0]}' is not a segment; {one_of(SEGMENTS, unknown[0])}")
     if kind == "replay":
-        return _replay(spec, rest, sensors, speed)
+        return _open_replay(spec, rest, sensors, speed)
     if kind == "lsl":
-        return _lsl(spec, rest, sensors, wait_s)
+        return _open_lsl(spec, rest, sensors, wait_s)
     if kind == "udp":
-        return _udp(spec, rest, sensors, wait_s)
-    return _mti(spec, rest, sensors, baud)
+        return _open_udp(spec, rest, sensors, wait_s)
+    return _open_mti(spec, rest, sensors, baud)
 
 
-def _replay(spec: str, path: str, sensors: Sequence[str] | None, speed: float | str) -> Source:
+def _open_replay(spec: str, path: str, sensors: Sequence[str] | None, speed: float | str) -> Source:
     from dataclasses import replace
 
     from ...readers import load_session
     from .replay import ReplaySource
 
     try:
-        times = math.inf if speed == "max" else float(speed)
+        factor = math.inf if speed == "max" else float(speed)
     except ValueError:
-        times = math.nan
-    if not times > 0.0:
+        factor = math.nan
+    if not factor > 0.0:
         raise BadOption(f"speed: '{speed}'; a positive number, 1.0 is the recording's own, or max")
     recording = load_session(Path(path), gaps=True)
     if sensors is not None:
@@ -76,41 +76,38 @@ def _replay(spec: str, path: str, sensors: Sequence[str] | None, speed: float | 
         if missing:
             raise BadOption(f"source '{spec}': no sensor {missing[0]}; {one_of(recording.sensors, missing[0])}")
         recording = replace(recording, sensors={name: recording.sensors[name] for name in sensors})
-    return ReplaySource(recording, times)
+    return ReplaySource(recording, factor)
 
 
-def _lsl(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float) -> Source:
+def _open_lsl(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float) -> Source:
     from .lsl import SCOPES, LslSource
 
-    name, at, scope = rest.rpartition("@")
-    if not at:
+    name, separator, scope = rest.rpartition("@")
+    if not separator:
         return LslSource(rest, sensors, None, wait_s)
     if scope not in SCOPES:
         raise BadOption(f"source '{spec}': '{scope}' is no reach of a search; {one_of(SCOPES, scope)}")
     return LslSource(name, sensors, scope, wait_s)
 
 
-def _udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float) -> Source:
+def _open_udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float) -> Source:
     from .udp import UdpSource
 
-    host, _, port = rest.rpartition(":")
-    if not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
-        raise BadOption(f"source '{spec}': '{port}' is no port; a number from 1 to 65535, as udp:9000")
-    host = host.removeprefix("[").removesuffix("]")
-    return UdpSource(host or LOOPBACK, int(port), sensors, wait_s)
+    host, port = parse_address(rest, f"source '{spec}':", 9000)
+    return UdpSource(host, port, sensors, wait_s)
 
 
-def _mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int) -> Source:
+def _open_mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int) -> Source:
     from .mti import MTiSource
 
-    listed, at, rate = rest.rpartition("@")
+    pairs, separator, rate = rest.rpartition("@")
     rate_hz = None
-    if at:
+    if separator:
         if not (rate.isascii() and rate.isdigit() and 0 < int(rate) <= 2000):
             raise BadOption(f"source '{spec}': rate '{rate}'; whole samples a second from 1 to 2000, as @100")
         rate_hz = int(rate)
     devices: dict[str, str] = {}
-    for pair in (listed if at else rest).split(","):
+    for pair in (pairs if separator else rest).split(","):
         device, equals, segment = pair.rpartition("=")
         if not equals or not device:
             raise BadOption(f"source '{spec}': '{pair}' is no DEVICE=SEGMENT, as /dev/ttyUSB0=torso")

@@ -1,4 +1,4 @@
-"""What every source is: something that is opened, read in the order of arrival, and closed."""
+"""The protocol of a source: it is opened, read in the order of arrival, and closed."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class Source(Protocol):
     Attributes
     ----------
     sensors : segments, in the order in which results name them
-    rate_hz : nominal samples a second of each; None where only the samples will tell
-    problems : what was thrown away so far, by a name for people ("bad checksums": 3)
+    rate_hz : nominal samples a second of each; None where it has to be measured
+    problems : problem → count of what was dropped so far ("bad checksums": 3)
     """
 
     sensors: tuple[str, ...]
@@ -26,7 +26,7 @@ class Source(Protocol):
         ...
 
     def read(self, timeout_s: float) -> list[Samples] | None:
-        """What came since the last call, in the order of arrival; [] after `timeout_s` without any; None at the end."""
+        """Samples since the last call, in the order of arrival; [] after `timeout_s` without any; None at the end."""
         ...
 
     def clock(self) -> float:
@@ -34,5 +34,5 @@ class Source(Protocol):
         ...
 
     def close(self) -> None:
-        """Disconnect; what `open` took is free again. May be called twice."""
+        """Disconnect and free what `open` took. May be called twice."""
         ...

@@ -1,9 +1,9 @@
-"""A sender's clock on ours: the sample that came fastest tells how far the two are apart.
+"""The offset of a sender's clock from ours, from the samples with the smallest delay.
 
 A sample's arrival minus its time is the clocks' offset plus the sample's delay, and a delay is never negative: the
-smallest of the last ten seconds is the best guess of the offset (the minimum filter of NTP, RFC 5905, section 10, kept
-over a window so that drift is followed). What is applied follows that guess smoothly, so that even steps of a sensor
-stay even.
+smallest of the last ten seconds is the best estimate of the offset (the minimum filter of NTP, RFC 5905, section 10,
+over a window that follows drift). The applied offset follows that estimate smoothly, so that regular samples stay
+regular.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import numpy as np
 
 BUCKET_S = 1.0
 WINDOW_S = 10.0
-# The applied offset nears the guess with this time constant, and never faster than this share of time.
+# Time constant of the applied offset, and its largest rate.
 SETTLE_S = 2.0
-MOST_SLEW = 0.01
-# A sample this much faster than any before it: the sender's clock was set, or the first samples came late.
+MAX_SLEW = 0.01
+# [s] by which a sample is faster than all before: the sender's clock was set, or the first samples came late.
 JUMP_S = 0.05
-# Time that goes back by this much: the sender started anew. Less is a datagram that was overtaken.
+# [s] by which time goes back: the sender has restarted. Less: a datagram was overtaken.
 BACK_S = 1.0
 
 
 class HostClock:
-    """The clock of one sender, learnt from what arrives."""
+    """Estimates the clock of one sender from its samples."""
 
     def __init__(self) -> None:
         self._buckets: deque[tuple[float, float]] = deque()  # (begin [s] of arrival, smallest arrival − time [s])
@@ -35,27 +35,27 @@ class HostClock:
     def to_host(self, time: np.ndarray, arrival: float) -> np.ndarray:
         """Times (m,) [s] on our clock of samples that came together, at `arrival` [s] on it."""
         newest = float(time.max())
-        seen = arrival - newest
-        if newest < self._newest - BACK_S or seen < self._offset - JUMP_S or not math.isfinite(self._newest):
+        delay = arrival - newest  # with the offset
+        if newest < self._newest - BACK_S or delay < self._offset - JUMP_S or not math.isfinite(self._newest):
             self._buckets.clear()
-            self._newest, self._offset = newest, seen
-        guess = self._smallest(seen, arrival)
+            self._newest, self._offset = newest, delay
+        estimate = self._find_smallest(delay, arrival)
         passed = newest - self._newest
         if passed <= 0.0:
             return time + self._offset
-        change = (guess - self._offset) * -math.expm1(-passed / SETTLE_S)
-        offset = self._offset + min(max(change, -MOST_SLEW * passed), MOST_SLEW * passed)
+        change = (estimate - self._offset) * -math.expm1(-passed / SETTLE_S)
+        offset = self._offset + min(max(change, -MAX_SLEW * passed), MAX_SLEW * passed)
         host = time + (offset if len(time) == 1 else np.interp(time, [self._newest, newest], [self._offset, offset]))
         self._newest, self._offset = newest, offset
         return host
 
-    def _smallest(self, seen: float, arrival: float) -> float:
-        """The smallest of the window, this one included."""
+    def _find_smallest(self, delay: float, arrival: float) -> float:
+        """The smallest of the window, with this one."""
         buckets = self._buckets
         if buckets and arrival - buckets[-1][0] < BUCKET_S:
-            buckets[-1] = (buckets[-1][0], min(seen, buckets[-1][1]))
+            buckets[-1] = (buckets[-1][0], min(delay, buckets[-1][1]))
         else:
-            buckets.append((arrival, seen))
+            buckets.append((arrival, delay))
         while arrival - buckets[0][0] > WINDOW_S:
             buckets.popleft()
         return min(smallest for _, smallest in buckets)

@@ -1,9 +1,9 @@
 """Samples from the Lab Streaming Layer: one stream a sensor, or one for all.
 
-Streams are looked for on this machine only, unless a wider scope is asked for. A stream that is lost is looked for
-again here and not by liblsl: it finds only streams that have a `source_id`, and holds sockets open for that. Its
-dejittering is not used: it takes every sample for the next one of an even row, and after a loss its times are off for
-long (seen with liblsl 1.18, 1 s lost at 100 Hz: by −1.0 s at first, by +0.3 s 7 s later).
+Streams are searched on this machine only, unless a wider scope is asked for. A lost stream is searched again here and
+not by liblsl, which finds only streams with a `source_id` and keeps sockets open for that. liblsl's dejittering is not
+used: it assumes that no sample is missing, and after a loss its times are wrong for long (liblsl 1.18, 1 s lost at
+100 Hz: by −1.0 s at first, by +0.3 s 7 s later).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -20,9 +21,9 @@ from ...errors import BadOption, BadSource, one_of
 from ...recording import SEGMENTS
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
-from .checks import UNSOUND, sound
+from .checks import IMPLAUSIBLE, keep_plausible
 
-# What liblsl calls the reach of its search → its configuration. On one machine there is one clock and one loopback.
+# Scope of the search → configuration of liblsl. On one machine there is one clock and one loopback.
 _QUIET = "[log]\nlevel = -3\n"
 SCOPES = {
     "machine": _QUIET + "[ports]\nIPv6 = disable\n[multicast]\nResolveScope = machine\nListenAddress = 127.0.0.1\n",
@@ -32,32 +33,30 @@ SCOPES = {
 SIGNALS = ("gyr_x", "gyr_y", "gyr_z", "acc_x", "acc_y", "acc_z")
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "": 1.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "m/s²": 1.0, "m/s2": 1.0, "g": STANDARD_GRAVITY, "": 1.0}
-# The inlet keeps this much [s] while nobody reads.
-BUFFER_S = 10
-MOST_SAMPLES = 4096
-# liblsl cannot wait for several inlets at once: they are asked this often [s].
-POLL_S = 0.002
-# How long streams have to answer [s]; more than so many never do, so that none answers too late.
-COLLECT_S = 1.0
-MOST_STREAMS = 99
-# A stream that is silent for this long [s], or lost, is looked for this often [s].
-SILENT_S = 3.0
-RETRY_S = 1.0
+BUFFER_S = 10  # [s] that the inlet keeps while nobody reads
+MAX_SAMPLES = 4096
+POLL_S = 0.002  # [s] between two polls: liblsl cannot wait for several inlets at once
+COLLECT_S = 1.0  # [s] for which streams may answer
+MAX_STREAMS = 99  # more than ever answer, so that the search takes all that time
+SILENT_S = 3.0  # [s] without a sample, after which a stream is searched again
+RETRY_S = 1.0  # [s] between two such searches
 ANSWER_S = 3.0
 
 _scope: str | None = None  # liblsl reads its configuration once in a process
 
 
-class Part(NamedTuple):
-    """Where one sensor stands in a stream's channels."""
+class SensorChannels(NamedTuple):
+    """Channels of one sensor in a stream."""
 
     sensor: str
     channels: list[int]  # six: gyro xyz, accel xyz
     scale: np.ndarray  # (6,) to rad/s and m/s²
 
 
-def layout(stream: str, name: str, labels: Sequence[str], units: Sequence[str], count: int) -> list[Part]:
-    """Which sensors a stream holds, where.
+def find_channels(
+    stream: str, name: str, labels: Sequence[str], units: Sequence[str], count: int
+) -> list[SensorChannels]:
+    """The sensors of a stream and their channels.
 
     `<name>-<segment>` or `<name>_<segment>` is one sensor: six channels gyro xyz, accel xyz, or any number with labels
     `gyr_x` … `acc_z`. `<name>` itself is one for all, with labels `<segment>_gyr_x` … `<segment>_acc_z`.
@@ -65,7 +64,7 @@ def layout(stream: str, name: str, labels: Sequence[str], units: Sequence[str], 
     Raises
     ------
     BadSource
-        A segment, label or unit that is none, or channels that are missing.
+        An unknown segment, label or unit, or missing channels.
     """
     where = f"lsl:{name}: stream '{stream}'"
     if stream != name:
@@ -100,23 +99,23 @@ def layout(stream: str, name: str, labels: Sequence[str], units: Sequence[str], 
             if unit not in known:
                 raise BadSource(f"{where}: channel '{names[k]}': unit '{unit}'; {one_of(filter(None, known), unit)}")
             scale.append(known[unit])
-        parts.append(Part(segment, channels, np.array(scale)))
+        parts.append(SensorChannels(segment, channels, np.array(scale)))
     return parts
 
 
 class LslSource:
-    """Streams called `name`, `name`-segment or `name`_segment; a lost one is taken up again when it is back.
+    """Streams called `name`, `name`-segment or `name`_segment; lost ones are reconnected.
 
     Parameters
     ----------
-    sensors : those that are waited for; None: those that are found
+    sensors : to wait for; None: all that are found
     scope : "machine", "link" or "site"; None: this machine, or as the user's own ``LSLAPICFG`` says where it is set
-    wait_s : how long `open` looks for the streams [s]
+    wait_s : [s] for which `open` searches the streams
 
     Notes
     -----
     Times are liblsl's `local_clock`, monotonic; in a wider scope than the machine it corrects them for the sender's
-    clock. Looking for streams opens UDP sockets for the replies, and liblsl knows no way to bind these to loopback.
+    clock. The search opens UDP sockets for the replies, which liblsl cannot bind to loopback.
     """
 
     def __init__(
@@ -126,12 +125,12 @@ class LslSource:
             raise BadOption(f"lsl:{name}: a stream's name has at least one letter and no quote, as lsl:wepose")
         self.sensors = tuple(sensors or ())
         self.rate_hz: float | None = None
-        self.problems: dict[str, int] = {}
+        self.problems: dict[str, int] = Counter()
         self._name, self._scope, self._wait_s = name, scope, wait_s
         self._streams: dict[str, _Stream] = {}
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._keeper: threading.Thread | None = None
+        self._reconnector: threading.Thread | None = None
 
     def open(self) -> None:
         """Find the streams and subscribe.
@@ -141,39 +140,39 @@ class LslSource:
         BadSource
             liblsl is missing, no such stream is found, or one has other channels than it should.
         """
-        self._lsl, scope = pylsl_within(self._scope)
+        self._lsl, scope = configure_pylsl(self._scope)
         self._flags = 0 if scope == "machine" else int(self._lsl.proc_clocksync)
         self._stop.clear()
-        there: list[str] = []
+        present: list[str] = []
         deadline = time.monotonic() + self._wait_s
-        while not there or any(segment not in there for segment in self.sensors):
+        while not present or any(segment not in present for segment in self.sensors):
             left = deadline - time.monotonic()
             if left <= 0.0:
                 break
             for stream, info in self._resolve(min(COLLECT_S, left)).items():
                 if stream not in self._streams:
                     self._streams[stream] = self._subscribe(stream, info)
-            there = [part.sensor for stream in self._streams.values() for part in stream.parts]
-        twice = {segment for segment in there if there.count(segment) > 1}
-        missing = [segment for segment in self.sensors if segment not in there]
-        if not there or twice or missing:
+            present = [part.sensor for stream in self._streams.values() for part in stream.parts]
+        twice = {segment for segment in present if present.count(segment) > 1}
+        missing = [segment for segment in self.sensors if segment not in present]
+        if not present or twice or missing:
             self.close()
             reach = f"on this {scope}" if scope in SCOPES else "where LSLAPICFG looks"
             if twice:
                 raise BadSource(f"lsl:{self._name}: {min(twice)} is in two streams; stop one of them")
-            found = f"{', '.join(missing)} is in none of the streams {reach}" if there else f"no such stream {reach}"
+            found = f"{', '.join(missing)} is in none of the streams {reach}" if present else f"no such stream {reach}"
             raise BadSource(
                 f"lsl:{self._name}: {found}, within {self._wait_s:g} s; name streams {self._name}-<segment>, or look "
                 f"further with lsl:{self._name}@site"
             )
-        self.sensors = self.sensors or tuple(segment for segment in SEGMENTS if segment in there)
+        self.sensors = self.sensors or tuple(segment for segment in SEGMENTS if segment in present)
         rates = {stream.rate_hz for stream in self._streams.values()}
         self.rate_hz = rates.pop() if len(rates) == 1 and min(rates) > 0.0 else None
-        self._keeper = threading.Thread(target=self._keep, name=f"lsl {self._name}", daemon=True)
-        self._keeper.start()
+        self._reconnector = threading.Thread(target=self._reconnect, name=f"lsl {self._name}", daemon=True)
+        self._reconnector.start()
 
     def read(self, timeout_s: float) -> list[Samples]:
-        """What came, one `Samples` a sensor."""
+        """Samples since the last call, one `Samples` a sensor."""
         samples: list[Samples] = []
         deadline = time.monotonic() + timeout_s
         while True:
@@ -193,45 +192,38 @@ class LslSource:
     def close(self) -> None:
         """Unsubscribe."""
         self._stop.set()
-        if self._keeper is not None:
-            self._keeper.join()
-            self._keeper = None
+        if self._reconnector is not None:
+            self._reconnector.join()
+            self._reconnector = None
         self._streams.clear()
 
     def _pull(self, stream: _Stream) -> list[Samples]:
         if stream.lost:
             return []
         try:
-            rows, times = stream.inlet.pull_chunk(timeout=0.0, max_samples=MOST_SAMPLES)
+            rows, times = stream.inlet.pull_chunk(timeout=0.0, max_samples=MAX_SAMPLES)
         except RuntimeError:  # pylsl's LostError is one
             stream.lost = True
-            self._count(f"streams lost: {stream.name}")
+            self.problems[f"streams lost: {stream.name}"] += 1
             return []
         if not len(times):
             return []
-        stream.heard = time.monotonic()
+        stream.last_sample = time.monotonic()
         stamps, table = np.array(times), np.array(rows, dtype=float)
         samples = []
         for part in stream.parts:
-            if part.sensor not in self.sensors:
-                continue
-            own, values = stamps, table[:, part.channels] * part.scale
-            good = sound(own, values)
-            if not good.all():
-                self._count(UNSOUND, int((~good).sum()))
-                own, values = own[good], values[good]
-            if len(own):
-                samples.append(Samples(part.sensor, own, values[:, :3], values[:, 3:]))
+            if part.sensor in self.sensors:
+                plausible, dropped = keep_plausible(part.sensor, stamps, table[:, part.channels] * part.scale)
+                samples += plausible
+                if dropped:
+                    self.problems[IMPLAUSIBLE] += dropped
         return samples
 
-    def _count(self, problem: str, number: int = 1) -> None:
-        self.problems[problem] = self.problems.get(problem, 0) + number
-
     def _resolve(self, timeout_s: float) -> dict[str, Any]:
-        """Stream's name → description, of those that answer in this time; of two with one name the newer."""
+        """Name → description of the streams that answer in this time; of two with one name the newer."""
         name = self._name
         query = f"name='{name}' or starts-with(name,'{name}-') or starts-with(name,'{name}_')"
-        found = self._lsl.resolve_bypred(query, minimum=MOST_STREAMS, timeout=timeout_s)
+        found = self._lsl.resolve_bypred(query, minimum=MAX_STREAMS, timeout=timeout_s)
         return {info.name(): info for info in sorted(found, key=lambda info: info.created_at())}
 
     def _subscribe(self, stream: str, info: Any) -> _Stream:
@@ -244,15 +236,17 @@ class LslSource:
             raise BadSource(f"lsl:{self._name}: stream '{stream}' does not answer: {error}") from None
         if full.channel_format() == lsl.cf_string:
             raise BadSource(f"lsl:{self._name}: stream '{stream}' holds text; six channels of numbers a sensor")
-        labels, units = _described(full)
-        parts = layout(stream, self._name, labels, units, full.channel_count())
+        labels, units = _read_channels(full)
+        parts = find_channels(stream, self._name, labels, units, full.channel_count())
         return _Stream(stream, inlet, parts, float(full.nominal_srate()))
 
-    def _keep(self) -> None:
-        """Take up streams again that were lost or are silent."""
+    def _reconnect(self) -> None:
+        """Reconnect streams that are lost or silent."""
         while not self._stop.wait(RETRY_S):
             now = time.monotonic()
-            gone = [name for name, stream in self._streams.items() if stream.lost or now - stream.heard > SILENT_S]
+            gone = [
+                name for name, stream in self._streams.items() if stream.lost or now - stream.last_sample > SILENT_S
+            ]
             if not gone:
                 continue
             infos = self._resolve(0.5 * RETRY_S)
@@ -267,16 +261,16 @@ class LslSource:
 
 
 class _Stream:
-    """An inlet and what is in it."""
+    """An inlet and its sensors."""
 
-    def __init__(self, name: str, inlet: Any, parts: Sequence[Part], rate_hz: float) -> None:
+    def __init__(self, name: str, inlet: Any, parts: Sequence[SensorChannels], rate_hz: float) -> None:
         self.name, self.inlet, self.parts, self.rate_hz = name, inlet, parts, rate_hz
-        self.heard = time.monotonic()
+        self.last_sample = time.monotonic()
         self.lost = False
 
 
-def _described(info: Any) -> tuple[list[str], list[str]]:
-    """Labels and units of the channels, as far as the description goes."""
+def _read_channels(info: Any) -> tuple[list[str], list[str]]:
+    """Labels and units of the channels in the description."""
     labels: list[str] = []
     units: list[str] = []
     channel = info.desc().child("channels").child("channel")
@@ -287,8 +281,8 @@ def _described(info: Any) -> tuple[list[str], list[str]]:
     return labels, units
 
 
-def pylsl_within(scope: str | None) -> tuple[Any, str]:
-    """The module, set to look as far as `scope`; and how far that is."""
+def configure_pylsl(scope: str | None) -> tuple[Any, str]:
+    """The module, configured to search in `scope`; and the scope."""
     global _scope
     try:
         import pylsl

@@ -1,4 +1,4 @@
-"""A recording, delivered as its sensors would."""
+"""A recording, replayed as its sensors would deliver it."""
 
 from __future__ import annotations
 
@@ -11,25 +11,23 @@ from ...errors import BadOption
 from ...recording import Recording
 from ...recording.arrivals import Samples
 
-# As fast as possible: so many samples of every sensor at once.
-BLOCK = 64
-# No shorter sleep [s]: up to 1 kHz every sample comes when it is due, faster ones come together.
-SHORTEST_SLEEP_S = 0.0005
+BLOCK = 64  # samples of every sensor at once, as fast as possible
+# Up to 1 kHz every sample comes when it is due, faster ones come together.
+MIN_SLEEP_S = 0.0005
 
 
 class ReplaySource:
-    """A recording at `speed` times its own pace, or as fast as it is read.
+    """A recording at `speed` times its own pace.
 
-    Samples in marked gaps are left out: the sensor was silent there. What fell due while nobody read comes at the next
-    `read`, at once and whole.
+    Samples in marked gaps are left out, as of a silent sensor. Samples that become due between two reads come together.
 
     Parameters
     ----------
-    speed : 1.0 its own, 4.0 faster, ``math.inf`` as fast as possible
+    speed : 1.0 its own, ``math.inf`` as fast as possible
 
     Attributes
     ----------
-    recording : what is replayed
+    recording : that is replayed
 
     Raises
     ------
@@ -49,7 +47,7 @@ class ReplaySource:
         self.rate_hz: float | None = recording.rate_hz
         self.problems: dict[str, int] = {}
         self.recording = recording
-        # The recording counts as even: what its clock jittered is no motion, and every sample has its own tick.
+        # Samples are taken as evenly spaced: the jitter of the clock is no motion, and every sample has its own tick.
         self._time = recording.time[0] + np.arange(len(recording)) / recording.rate_hz
         self._speed = speed
         self._next = 0
@@ -67,32 +65,32 @@ class ReplaySource:
         return float(self._time[0]) + (time.monotonic() - self._begin) * self._speed
 
     def read(self, timeout_s: float) -> list[Samples] | None:
-        """Everything that fell due since the last call, one `Samples` a sensor; None after the last sample."""
+        """Samples that became due since the last call, one `Samples` a sensor; None after the last."""
         recording, time_s, first = self.recording, self._time, self._next
         if first >= len(recording):
             return None
         deadline = time.monotonic() + timeout_s
-        while (last := self._due()) <= first:
+        while (last := self._count_due()) <= first:
             wait = (float(time_s[first]) - self.clock()) / self._speed
             left = deadline - time.monotonic()
             if left <= 0.0:
                 return []
-            time.sleep(min(max(wait, SHORTEST_SLEEP_S), left))
+            time.sleep(min(max(wait, MIN_SLEEP_S), left))
         self._next = last
         samples = []
         for segment, sensor in recording.imus.items():
-            kept: slice | np.ndarray = slice(first, last)
-            if sensor.gap is not None and sensor.gap[kept].any():
-                kept = first + np.flatnonzero(~sensor.gap[first:last])
-                if not kept.size:
+            rows: slice | np.ndarray = slice(first, last)
+            if sensor.gap is not None and sensor.gap[rows].any():
+                rows = first + np.flatnonzero(~sensor.gap[first:last])
+                if not rows.size:
                     continue
-            samples.append(Samples(segment, time_s[kept], sensor.gyro_S[kept], sensor.accel_S[kept]))
+            samples.append(Samples(segment, time_s[rows], sensor.gyro_S[rows], sensor.accel_S[rows]))
         return samples
 
     def close(self) -> None:
-        """Nothing was taken."""
+        """Nothing to free."""
 
-    def _due(self) -> int:
+    def _count_due(self) -> int:
         """One past the last sample that is due."""
         if math.isinf(self._speed):
             return min(self._next + BLOCK, len(self.recording))

@@ -1,11 +1,11 @@
-"""Samples that come as UDP datagrams, JSON or binary; formats in `packets`."""
+"""Samples from UDP datagrams, JSON or binary (`packets`)."""
 
 from __future__ import annotations
 
 import select
 import socket
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,38 +13,34 @@ import numpy as np
 from ...errors import BadSource
 from ...recording import SEGMENTS
 from ...recording.arrivals import Samples
-from .checks import MOST_TIME, UNSOUND, sound
+from .checks import IMPLAUSIBLE, MAX_TIME, keep_plausible
 from .clocks import HostClock
 from .packets import Batch, decode
 
-LARGEST = 65536  # no datagram is larger
-# No `read` takes more datagrams: a flood delays nobody for long.
-MOST_DATAGRAMS = 2000
-# The system keeps this much [bytes] while nobody reads: some seconds of five sensors at 1 kHz.
-BUFFER = 4 << 20
-# So many senders' clocks are remembered, and so many kinds of problems told apart.
-MOST_CLOCKS = 64
-MOST_KINDS = 24
-# After the first datagram, how long the other sensors have to show themselves [s].
-COLLECT_S = 1.0
+MAX_SIZE = 65536  # [bytes] of a datagram
+MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
+BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
+MAX_CLOCKS = 64  # of senders
+MAX_KINDS = 24  # of problems
+COLLECT_S = 1.0  # [s] after the first datagram in which the other sensors may appear
 
 
 class UdpSource:
-    """A socket on `host` and `port` that takes datagrams from anybody who can reach it.
+    """A socket on `host` and `port` that takes datagrams from any sender.
 
-    Times of each sender are mapped to ours (`HostClock`); a sender is an address and port.
+    Times of each sender, an address and port, are mapped to our clock (`HostClock`).
 
     Parameters
     ----------
-    port : 0 takes a free one; `address` says which
-    sensors : those that are taken; None: those that send while `open` waits
-    wait_s : how long `open` waits for the first datagram where `sensors` are not given [s]
+    port : 0 for any free one; then see `address`
+    sensors : to take; None: those that send while `open` waits
+    wait_s : [s] for which `open` waits for the first datagram where `sensors` are not given
     """
 
     def __init__(self, host: str, port: int, sensors: Sequence[str] | None = None, wait_s: float = 10.0) -> None:
         self.sensors = tuple(sensors or ())
         self.rate_hz: float | None = None
-        self.problems: dict[str, int] = {}
+        self.problems: dict[str, int] = Counter()
         self.address = (host, port)
         self._wait_s = wait_s
         self._socket: socket.socket | None = None
@@ -57,7 +53,7 @@ class UdpSource:
         Raises
         ------
         BadSource
-            The address cannot be bound, or nobody sends.
+            The address cannot be bound, or no samples come.
         """
         host, port = self.address
         try:
@@ -84,37 +80,38 @@ class UdpSource:
             self._waiting = self._receive(0.1)
         if not self._waiting:
             self.close()
-            seen = "; thrown away: " + ", ".join(f"{n} {what}" for what, n in self.problems.items())
+            dropped = "; dropped: " + ", ".join(f"{n} {problem}" for problem, n in self.problems.items())
             raise BadSource(
-                f"udp:{host}:{port}: no samples within {self._wait_s:g} s{seen if self.problems else ''}; "
+                f"udp:{host}:{port}: no samples within {self._wait_s:g} s{dropped if self.problems else ''}; "
                 f"send to this address, in a format of docs/live-sources.md"
             )
         deadline = time.monotonic() + COLLECT_S
         while time.monotonic() < deadline:
             self._waiting += self._receive(0.1)
-        there = {samples.sensor for samples in self._waiting}
-        self.sensors = tuple(segment for segment in SEGMENTS if segment in there)
+        present = {samples.sensor for samples in self._waiting}
+        self.sensors = tuple(segment for segment in SEGMENTS if segment in present)
 
     def read(self, timeout_s: float) -> list[Samples]:
-        """What came, one `Samples` a sensor and sender."""
+        """Samples since the last call, one `Samples` a sensor."""
         if self._waiting:
             waiting, self._waiting = self._waiting, []
             return waiting
         return self._receive(timeout_s)
 
     def _receive(self, timeout_s: float) -> list[Samples]:
-        """What the socket holds, or what comes within `timeout_s`."""
-        assert self._socket is not None, "open() first"
+        """Samples in the socket, or the first that come within `timeout_s`."""
+        if self._socket is None:
+            return []
         parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
         deadline = time.monotonic() + timeout_s
         while not parts:
             left = deadline - time.monotonic()
             ready, _, _ = select.select([self._socket], [], [], max(left, 0.0))
             if ready:
-                self._drain(parts)
+                self._drain(self._socket, parts)
             if left <= 0.0:
                 break
-        return [samples for sensor, of in parts.items() for samples in self._sound(sensor, of)]
+        return [samples for sensor, own in parts.items() for samples in self._join(sensor, own)]
 
     def clock(self) -> float:
         """Now [s], monotonic."""
@@ -126,19 +123,23 @@ class UdpSource:
             self._socket.close()
             self._socket = None
 
-    def _drain(self, parts: dict[str, list[tuple[np.ndarray, np.ndarray]]]) -> None:
-        """Take what is there, by sensor; of each sender together, as its newest sample tells its clock best."""
+    def _drain(self, udp: socket.socket, parts: dict[str, list[tuple[np.ndarray, np.ndarray]]]) -> None:
+        """Take what has come, by sensor; each sender's together, since its newest sample determines its clock best."""
         came: dict[tuple[str, int], list[Batch]] = {}
-        for _ in range(MOST_DATAGRAMS):
-            found = self._datagram()
-            if found is None:
+        for _ in range(MAX_DATAGRAMS):
+            try:
+                datagram, sender = udp.recvfrom(MAX_SIZE)
+            except BlockingIOError:
                 break
-            batches, problems = decode(found[0])
+            except OSError:  # an ICMP reply to another datagram
+                self._count("errors of the socket")
+                break
+            batches, problems = decode(datagram)
             for problem in problems:
                 self._count(problem)
-            batches = [batch for batch in batches if self._taken(batch)]
+            batches = [batch for batch in batches if self._accepts(batch)]
             if batches:
-                came.setdefault(found[1], []).extend(batches)
+                came.setdefault(sender[:2], []).extend(batches)
         now = time.monotonic()
         for sender, batches in came.items():
             times = self._clock_of(sender).to_host(np.concatenate([batch.time for batch in batches]), now)
@@ -146,47 +147,34 @@ class UdpSource:
                 own, times = times[: len(batch.time)], times[len(batch.time) :]
                 parts.setdefault(batch.sensor, []).append((own, batch.values))
 
-    def _datagram(self) -> tuple[bytes, tuple[str, int]] | None:
-        """The next one and its sender's address and port; None where none waits."""
-        assert self._socket is not None
-        try:
-            datagram, sender = self._socket.recvfrom(LARGEST)
-        except BlockingIOError:
-            return None
-        except OSError:  # an ICMP message that came back for another datagram
-            self._count("errors of the socket")
-            return None
-        return datagram, sender[:2]
-
-    def _taken(self, batch: Batch) -> bool:
-        """The batch is of a sensor that is wanted, and its times can teach the sender's clock."""
+    def _accepts(self, batch: Batch) -> bool:
+        """Whether the batch is of a tracked sensor, with times that fit a clock."""
         if batch.sensor not in self.sensors:
             self._count(f"samples of {batch.sensor}, which is not tracked", len(batch.time))
             return False
-        if not float(np.abs(batch.time).max()) < MOST_TIME:
-            self._count(UNSOUND, len(batch.time))
+        if not float(np.abs(batch.time).max()) < MAX_TIME:
+            self._count(IMPLAUSIBLE, len(batch.time))
             return False
         return True
 
-    def _sound(self, sensor: str, parts: list[tuple[np.ndarray, np.ndarray]]) -> list[Samples]:
-        """The parts as one, without samples that cannot be; none where nothing is left."""
+    def _join(self, sensor: str, parts: list[tuple[np.ndarray, np.ndarray]]) -> list[Samples]:
+        """The plausible samples of the parts as one; none where nothing is left."""
         times, values = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-        good = sound(times, values)
-        if not good.all():
-            self._count(UNSOUND, int((~good).sum()))
-            times, values = times[good], values[good]
-        return [Samples(sensor, times, values[:, :3], values[:, 3:])] if len(times) else []
+        samples, dropped = keep_plausible(sensor, times, values)
+        if dropped:
+            self._count(IMPLAUSIBLE, dropped)
+        return samples
 
     def _clock_of(self, sender: tuple[str, int]) -> HostClock:
         clock = self._clocks.get(sender)
         if clock is None:
             clock = self._clocks[sender] = HostClock()
-            if len(self._clocks) > MOST_CLOCKS:
+            if len(self._clocks) > MAX_CLOCKS:
                 self._clocks.popitem(last=False)
         self._clocks.move_to_end(sender)
         return clock
 
     def _count(self, problem: str, number: int = 1) -> None:
-        if problem not in self.problems and len(self.problems) >= MOST_KINDS:
+        if problem not in self.problems and len(self.problems) >= MAX_KINDS:
             problem = "other problems"
-        self.problems[problem] = self.problems.get(problem, 0) + number
+        self.problems[problem] += number

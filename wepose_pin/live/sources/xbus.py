@@ -1,6 +1,6 @@
-"""Xbus, the protocol of Xsens MTi sensors, by hand: two kinds of message are needed, and every byte of them is fuzzed.
+"""Xbus, the protocol of Xsens MTi sensors, written here: two kinds of message are needed, and all of it is fuzzed.
 
-Bytes → frames → packets → samples; no port in here.
+Bytes → frames → packets → samples, without a port.
 
 A frame is ``FA FF MID LEN data checksum``; LEN ``FF`` is followed by the length in two bytes. All bytes but the first
 add up to zero in the low byte. Numbers are big endian. An MTData2 frame (MID 36) is a row of items ``id id length
@@ -17,14 +17,14 @@ from typing import NamedTuple
 import numpy as np
 
 PREAMBLE, BID = 0xFA, 0xFF
-LONGEST = 2048  # [bytes] of data in a frame
+MAX_LENGTH = 2048  # [bytes] of data in a frame
 GO_TO_MEASUREMENT, GO_TO_CONFIG, DATA, ERROR, SET_OUTPUT = 0x10, 0x30, 0x36, 0x42, 0xC0
 
 PACKET_COUNTER, SAMPLE_TIME_FINE = 0x1020, 0x1060
 ACCELERATION, ACCELERATION_HR = 0x4020, 0x4040
 RATE_OF_TURN, RATE_OF_TURN_HR = 0x8020, 0x8040
 TICKS_HZ = 10_000.0  # SampleTimeFine
-WITH_EVERY_PACKET = 0xFFFF  # the rate of items that have none of their own
+WITH_EVERY_PACKET = 0xFFFF  # the rate of items that come with every packet
 
 # Results that an Error message carries.
 ERRORS = {
@@ -47,7 +47,7 @@ class Frame(NamedTuple):
 
 
 class Packet(NamedTuple):
-    """What a sample needs of one MTData2 frame; None where it is not in it. In the sensor's axes."""
+    """Items of one MTData2 frame, in the sensor's axes; None where it lacks one."""
 
     ticks: int | None  # SampleTimeFine
     gyro: tuple[float, float, float] | None  # [rad/s]
@@ -57,10 +57,10 @@ class Packet(NamedTuple):
 
 
 class Malformed(ValueError):
-    """The data of a frame with a good checksum are no MTData2."""
+    """Data of a frame with a good checksum that are no MTData2."""
 
 
-def frame(mid: int, data: bytes = b"") -> bytes:
+def build_frame(mid: int, data: bytes = b"") -> bytes:
     """The bytes of one message to a device."""
     length = bytes([len(data)]) if len(data) < 0xFF else b"\xff" + struct.pack(">H", len(data))
     body = bytes([BID, mid]) + length + data
@@ -68,12 +68,12 @@ def frame(mid: int, data: bytes = b"") -> bytes:
 
 
 class Frames:
-    """Takes bytes as they come, gives whole frames; after noise it starts again at the next one with a good checksum.
+    """Splits a stream of bytes into frames; after noise it resumes at the next frame with a good checksum.
 
     Attributes
     ----------
     skipped : bytes that were in no frame
-    bad_checksums : of these, how often what began like a frame was none
+    bad_checksums : of these, beginnings of a frame with a bad checksum
     """
 
     def __init__(self) -> None:
@@ -103,7 +103,7 @@ class Frames:
                     break
                 head, length = 6, buffer[at + 4] << 8 | buffer[at + 5]
             end = at + head + length + 1
-            if buffer[at + 1] != BID or length > LONGEST:
+            if buffer[at + 1] != BID or length > MAX_LENGTH:
                 self.skipped += 1
                 at += 1
             elif end > len(buffer):
@@ -119,8 +119,8 @@ class Frames:
         return frames
 
 
-def packet(data: bytes) -> Packet:
-    """The items of an MTData2 frame that a sample needs; others are passed over.
+def parse_packet(data: bytes) -> Packet:
+    """The items of an MTData2 frame that a sample needs; others are ignored.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def packet(data: bytes) -> Packet:
                 raise Malformed("SampleTimeFine is not of four bytes")
             ticks = int.from_bytes(content, "big")
         elif item in (ACCELERATION, ACCELERATION_HR, RATE_OF_TURN, RATE_OF_TURN_HR):
-            vectors[item] = _vector(kind & 0x3, content)
+            vectors[item] = _parse_vector(kind & 0x3, content)
     return Packet(
         ticks,
         vectors.get(RATE_OF_TURN),
@@ -152,41 +152,39 @@ def packet(data: bytes) -> Packet:
     )
 
 
-def _vector(written: int, content: bytes) -> tuple[float, float, float]:
-    """Three numbers; `written` is 0 float32, 1 fixed 12.20, 2 fixed 16.32 (fraction first), 3 float64."""
+def _parse_vector(encoding: int, content: bytes) -> tuple[float, float, float]:
+    """Three numbers; `encoding` is 0 float32, 1 fixed 12.20, 2 fixed 16.32 (fraction first), 3 float64."""
     try:
-        if written == 2:
+        if encoding == 2:
             x0, x1, y0, y1, z0, z1 = struct.unpack(">IhIhIh", content)
             return x1 + x0 / 2**32, y1 + y0 / 2**32, z1 + z0 / 2**32
-        x, y, z = struct.unpack((">3f", ">3i", "", ">3d")[written], content)
+        x, y, z = struct.unpack((">3f", ">3i", "", ">3d")[encoding], content)
     except struct.error:
         raise Malformed(f"three numbers in {len(content)} bytes") from None
-    return (x / 2**20, y / 2**20, z / 2**20) if written == 1 else (x, y, z)
+    return (x / 2**20, y / 2**20, z / 2**20) if encoding == 1 else (x, y, z)
 
 
 # Samples -------------------------------------------------------------------------------------------------------------
 
-# Between accelerations further apart than this [s] none is interpolated, and no rate waits longer for one.
-LONGEST_STEP_S = 0.1
-# A device's time that goes back by more than this [s] is that of a device that started anew.
-RESTART_S = 1.0
+MAX_STEP_S = 0.1  # [s] between two accelerations that are interpolated, and for which a rate waits for one
+RESTART_S = 1.0  # [s] by which time goes back when a device restarts
 
 
 class Joiner:
-    """Rates and accelerations of one device, which may come in packets and at rates of their own → samples of both.
+    """Joins rates and accelerations of one device, which may come in separate packets and at different rates.
 
-    A sample is made for each rate; its acceleration is of the same time, or interpolated linearly. Where a device sends
-    the high-rate (HR) kind of either, that is taken and the plain kind is passed over.
+    Each rate gives a sample; its acceleration is of the same time, or interpolated linearly. Where a device sends the
+    high-rate (HR) kind of either, the plain kind is ignored.
 
     Attributes
     ----------
     untimed : packets without SampleTimeFine
-    alone : rates for which there was no acceleration
+    unpaired : rates without an acceleration
     """
 
     def __init__(self) -> None:
         self.untimed = 0
-        self.alone = 0
+        self.unpaired = 0
         self._ticks: int | None = None
         self._hr = [False, False]
         self._rates: deque[tuple[float, tuple[float, float, float]]] = deque()
@@ -194,16 +192,16 @@ class Joiner:
         self._time: list[float] = []
         self._values: list[tuple[float, ...]] = []
 
-    def add(self, found: Packet) -> None:
-        """Take a packet."""
-        gyro = self._chosen(0, found.gyro, found.gyro_hr)
-        accel = self._chosen(1, found.accel, found.accel_hr)
+    def add(self, packet: Packet) -> None:
+        """Add a packet."""
+        gyro = self._choose(0, packet.gyro, packet.gyro_hr)
+        accel = self._choose(1, packet.accel, packet.accel_hr)
         if gyro is None and accel is None:
             return
-        if found.ticks is None:
+        if packet.ticks is None:
             self.untimed += 1
             return
-        time = self._seconds(found.ticks)
+        time = self._seconds(packet.ticks)
         if accel is not None:
             self._accels.append((time, accel))
         if gyro is not None:
@@ -211,16 +209,16 @@ class Joiner:
         self._join()
 
     def take(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the samples since the last call, device times (m,) [s] and values (m, 6): gyro [rad/s], accel [m/s²]."""
+        """Device times (m,) [s] and values (m, 6) of the samples since the last call: gyro [rad/s], accel [m/s²]."""
         time, values = np.array(self._time), np.array(self._values).reshape(-1, 6)
         self._time, self._values = [], []
         return time, values
 
-    def _chosen(
-        self, which: int, plain: tuple[float, float, float] | None, hr: tuple[float, float, float] | None
+    def _choose(
+        self, kind: int, plain: tuple[float, float, float] | None, hr: tuple[float, float, float] | None
     ) -> tuple[float, float, float] | None:
-        self._hr[which] = self._hr[which] or hr is not None
-        return hr if self._hr[which] else plain
+        self._hr[kind] = self._hr[kind] or hr is not None
+        return hr if self._hr[kind] else plain
 
     def _seconds(self, ticks: int) -> float:
         """Device time [s] that does not wrap at 2³² ticks."""
@@ -245,9 +243,9 @@ class Joiner:
                 accel = accels[0][1]
             elif accels and accels[0][0] < time:
                 if len(accels) < 2:
-                    if rates[-1][0] - time <= LONGEST_STEP_S:
-                        return  # the acceleration after it is still to come
-                elif accels[1][0] - accels[0][0] <= LONGEST_STEP_S:
+                    if rates[-1][0] - time <= MAX_STEP_S:
+                        return  # the next acceleration is still to come
+                elif accels[1][0] - accels[0][0] <= MAX_STEP_S:
                     (t0, before), (t1, after) = accels[0], accels[1]
                     part = (time - t0) / (t1 - t0)
                     accel = (
@@ -255,11 +253,11 @@ class Joiner:
                         before[1] + part * (after[1] - before[1]),
                         before[2] + part * (after[2] - before[2]),
                     )
-            elif not accels and rates[-1][0] - time <= LONGEST_STEP_S:
+            elif not accels and rates[-1][0] - time <= MAX_STEP_S:
                 return
             rates.popleft()
             if accel is None:
-                self.alone += 1
+                self.unpaired += 1
             else:
                 self._time.append(time)
                 self._values.append((*gyro, *accel))
@@ -268,28 +266,19 @@ class Joiner:
 # Configuration -------------------------------------------------------------------------------------------------------
 
 
-def output_items(rate_hz: int, hr: bool) -> bytes:
+def build_output_items(rate_hz: int, hr: bool) -> bytes:
     """Data of SetOutputConfiguration: counter, time, rate of turn and acceleration in float32, at `rate_hz`."""
-    items = ACCELERATION_HR if hr else ACCELERATION, RATE_OF_TURN_HR if hr else RATE_OF_TURN
-    return struct.pack(
-        ">8H",
-        PACKET_COUNTER,
-        WITH_EVERY_PACKET,
-        SAMPLE_TIME_FINE,
-        WITH_EVERY_PACKET,
-        items[0],
-        rate_hz,
-        items[1],
-        rate_hz,
-    )
+    accel, gyro = (ACCELERATION_HR, RATE_OF_TURN_HR) if hr else (ACCELERATION, RATE_OF_TURN)
+    every = WITH_EVERY_PACKET
+    return struct.pack(">8H", PACKET_COUNTER, every, SAMPLE_TIME_FINE, every, accel, rate_hz, gyro, rate_hz)
 
 
-def granted(data: bytes) -> dict[int, int]:
+def read_rates(data: bytes) -> dict[int, int]:
     """Item → rate [Hz] of a device's answer to SetOutputConfiguration."""
     pairs = struct.iter_unpack(">2H", data[: len(data) // 4 * 4])
     return {item & 0xFFF0: rate for item, rate in pairs}
 
 
-def error_words(data: bytes) -> str:
-    """What an Error message says."""
+def describe_error(data: bytes) -> str:
+    """The text of an Error message."""
     return ERRORS.get(data[0], f"error {data[0]:#04x}") if data else "an error without a number"

@@ -66,7 +66,7 @@ viewer.controls.addEventListener("start", () => { moved = true; });
 new ResizeObserver(() => { viewer.set_3d_pane_size(); if (!moved) fit(); }).observe(stage);
 
 // ---- words
-const SHAPES = { there: "M5 1a4 4 0 1 0 .01 0z", moving: "M1 0l9 5-9 5z", "at rest": "M1 1h8v8H1z", lost: "M0 2l2-2 3 3 3-3 2 2-3 3 3 3-2 2-3-3-3 3-2-2 3-3z" };
+const SHAPES = { there: "M5 1a4 4 0 1 0 .01 0z", moving: "M1 0l9 5-9 5z", static: "M1 1h8v8H1z", lost: "M0 2l2-2 3 3 3-3 2 2-3 3 3 3-2 2-3-3-3 3-2-2 3-3z" };
 const SAYS = { waiting: "Waiting", hold: "Stand still", moved: "Moved – again", ready: "Live", ended: "Ended" };
 const known = (value, digits) => (value === null ? "–" : value.toFixed(digits).replace("-", "−"));
 const words = (name) => name.replaceAll("_", " ");
@@ -106,7 +106,7 @@ function show(status) {
   $("progress").hidden = state === "waiting";
   $("rows").replaceChildren(...status.sensors.map((sensor) => {
     const row = document.createElement("tr");
-    const is = sensor.lost ? "lost" : !begun ? "there" : sensor.static ? "at rest" : "moving";
+    const is = sensor.lost ? "lost" : !begun ? "there" : sensor.static ? "static" : "moving";
     if (sensor.lost) row.className = "lost";
     text(row, "td", words(sensor.segment));
     text(row, "td", sensor.frozen ? "frozen" : is).prepend(shape(is));

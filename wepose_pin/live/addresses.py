@@ -1,0 +1,17 @@
+"""Network addresses that a user gives: ``[HOST:]PORT``."""
+
+from __future__ import annotations
+
+from ..errors import BadOption
+
+LOOPBACK = "127.0.0.1"
+
+
+def parse_address(text: str, option: str, example_port: int) -> tuple[str, int]:
+    """Host and port of ``PORT``, of this machine, or ``HOST:PORT``; raises `BadOption` for anything else."""
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise BadOption(
+            f"{option} {text}: a port or HOST:PORT is needed, as {example_port} or 192.168.1.20:{example_port}"
+        )
+    return host.removeprefix("[").removesuffix("]") or LOOPBACK, int(port)

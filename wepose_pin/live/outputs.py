@@ -1,0 +1,193 @@
+"""The live pose for other programs: JSON over UDP, and a stream of the Lab Streaming Layer. See docs/live-page.md."""
+
+from __future__ import annotations
+
+import json
+import socket
+from typing import Any
+
+import numpy as np
+
+from ..errors import BadOption
+from .addresses import parse_address
+from .state import LivePose, Output, StreamInfo
+
+FORMAT = 1
+PORT = 9001  # in examples
+RATE_HZ = 100.0
+DIGITS = 6  # after the point: micrometres, and less than an arc second
+BUFFER_S = 1  # [s] of an LSL stream that liblsl keeps for a slow receiver
+
+
+class RateLimiter:
+    """Accepts no more than `rate_hz` poses a second on average; None: all.
+
+    Measured on the poses' own time: a replay at ten times its speed sends ten times as many.
+    """
+
+    def __init__(self, rate_hz: float | None) -> None:
+        if rate_hz is not None and not rate_hz > 0.0:
+            raise BadOption(f"rate: {rate_hz:g} poses a second; a positive number, or none for every pose")
+        self._step = 0.0 if rate_hz is None else 1.0 / rate_hz
+        self._due = -np.inf
+
+    def accepts(self, time: float) -> bool:
+        if self._step == 0.0:
+            return True
+        if self._due - 2.0 * self._step < time < self._due - 1e-6:
+            return False
+        on_time = 0.0 <= time - self._due + 1e-6 < self._step
+        self._due = (self._due if on_time else time) + self._step
+        return True
+
+
+class UdpSender:
+    """Sends datagrams to one receiver without ever waiting.
+
+    Parameters
+    ----------
+    to : ``PORT`` of this machine, or ``HOST:PORT``
+    option, example_port : for the error message
+
+    Attributes
+    ----------
+    dropped : datagrams that the system did not take at once; they are not sent again
+
+    Raises
+    ------
+    BadOption
+        No such host or port.
+    """
+
+    def __init__(self, to: str, option: str, example_port: int) -> None:
+        host, port = parse_address(to, option, example_port)
+        try:
+            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        except (OSError, UnicodeError) as error:
+            raise BadOption(f"{option} {to}: no host '{host}' ({error}); a name or an address, as 127.0.0.1") from None
+        self._address: Any = address
+        self._socket: socket.socket | None = socket.socket(family, kind)
+        self._socket.setblocking(False)
+        self.dropped = 0
+
+    def send(self, data: bytes) -> None:
+        if self._socket is None:
+            return
+        try:
+            self._socket.sendto(data, self._address)
+        except OSError:  # BlockingIOError: no room; else no receiver, or no network for now
+            self.dropped += 1
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+class UdpOutput(Output):
+    """Sends each pose as JSON in a datagram of its own.
+
+    Parameters
+    ----------
+    to : ``PORT`` of this machine, or ``HOST:PORT``
+    rate_hz : poses a second at most; None: every pose
+
+    Raises
+    ------
+    BadOption
+        No such host, port or rate.
+    """
+
+    def __init__(self, to: str, rate_hz: float | None = RATE_HZ) -> None:
+        self._limiter, self._sender = RateLimiter(rate_hz), UdpSender(to, "--udp", PORT)
+        self._info: StreamInfo | None = None
+
+    def start(self, info: StreamInfo) -> None:
+        self._info = info
+
+    def show(self, pose: LivePose) -> None:
+        if self._info is not None and self._limiter.accepts(pose.time):
+            self._sender.send(pose_json(self._info, pose))
+
+    def close(self) -> None:
+        self._sender.close()
+
+
+def pose_json(info: StreamInfo, pose: LivePose) -> bytes:
+    """One pose as a line of JSON; null for what is not known."""
+    quat, points, std = (_rounded_rows(values) for values in (pose.quat_WL, pose.points, pose.std))
+    message = {
+        "format": FORMAT,
+        "t": round(float(pose.time), DIGITS),
+        "segments": dict(zip(info.segments, quat, strict=True)),
+        "points": dict(zip(info.points, points, strict=True)),
+        "std": dict(zip(info.segments, std, strict=True)),
+        "lost": [name for name, lost in zip(info.segments, pose.lost, strict=True) if lost],
+    }
+    return json.dumps(message, separators=(",", ":"), allow_nan=False).encode("ascii") + b"\n"
+
+
+def _rounded_rows(values: np.ndarray) -> list[Any]:
+    """Rows as lists of numbers; None for one that is not finite."""
+    rows = np.round(values, DIGITS)
+    unknown = set(np.argwhere(~np.isfinite(rows))[:, 0].tolist())
+    return [None if k in unknown else row for k, row in enumerate(rows.tolist())]
+
+
+class LslOutput(Output):
+    """Sends the pose as one LSL stream of type "Pose", which other programs find by its name.
+
+    It is announced on this machine only, or as far as the user's own ``LSLAPICFG`` says where that is set. liblsl has
+    no setting for the address of its data ports: they listen on every interface for as long as the stream exists.
+
+    Parameters
+    ----------
+    name : of the stream
+    rate_hz : poses a second at most; None: every pose
+
+    Raises
+    ------
+    WeposeError
+        pylsl is missing, or already searches a wider network.
+    """
+
+    def __init__(self, name: str = "WeposePose", rate_hz: float | None = RATE_HZ) -> None:
+        from .sources.lsl import configure_pylsl
+
+        if not name:
+            raise BadOption("LSL out: a stream needs a name, as WeposePose")
+        self._name, self._rate, self._limiter = name, rate_hz, RateLimiter(rate_hz)
+        self._lsl, _ = configure_pylsl(None)
+        self._outlet: Any = None
+
+    def start(self, info: StreamInfo) -> None:
+        """Announce the stream, with a label for each channel."""
+        channels = list_channels(info)
+        rate = info.rate_hz if self._rate is None else min(info.rate_hz, self._rate)
+        stream = self._lsl.StreamInfo(
+            self._name, "Pose", len(channels), rate, self._lsl.cf_float32, f"wepose-pin {self._name}"
+        )
+        description = stream.desc().append_child("channels")
+        for label, unit in channels:
+            channel = description.append_child("channel")
+            channel.append_child_value("label", label)
+            channel.append_child_value("unit", unit)
+        self._outlet = self._lsl.StreamOutlet(stream, max_buffered=BUFFER_S)
+
+    def show(self, pose: LivePose) -> None:
+        """Hand the pose to liblsl, which sends in a thread of its own; stamped with the time of its newest sample."""
+        if self._outlet is None or not self._limiter.accepts(pose.time):
+            return
+        rows = np.column_stack([pose.quat_WL, pose.std, pose.lost]).ravel()
+        stamp = self._lsl.local_clock() - (pose.latency if np.isfinite(pose.latency) else 0.0)
+        self._outlet.push_sample([*rows.tolist(), *pose.points.ravel().tolist()], stamp)
+
+    def close(self) -> None:
+        self._outlet = None
+
+
+def list_channels(info: StreamInfo) -> list[tuple[str, str]]:
+    """Label and unit of each channel of the LSL stream."""
+    parts = (("qx", ""), ("qy", ""), ("qz", ""), ("qw", ""), ("std", "rad"), ("lost", ""))
+    channels = [(f"{segment}_{part}", unit) for segment in info.segments for part, unit in parts]
+    return channels + [(f"{point}_{axis}", "m") for point in info.points for axis in "xyz"]
