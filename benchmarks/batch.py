@@ -21,8 +21,8 @@ from typing import NamedTuple
 import polars as pl
 
 from wepose_pin.batch import run_batch
-from wepose_pin.batch.cluster import TASK_S, connected
-from wepose_pin.batch.storage import only_one, write_bytes
+from wepose_pin.batch.cluster import TASK_S, connect
+from wepose_pin.batch.storage import lock_folder, write_bytes
 from wepose_pin.errors import ExistingOutput, NoSolution
 from wepose_pin.jobs.batch import BatchJob
 from wepose_pin.simulation import simulate, simulated_person
@@ -63,7 +63,7 @@ def _scheduler(tasks: int) -> Table:
         "Dask's own cost: tasks that do nothing, two workers of this machine",
         (Column("tasks", "tasks", 0), Column("rate", "tasks a second", 0), Column("each", "each [ms]", 2)),
     )
-    with connected(workers=2) as client:
+    with connect(workers=2) as client:
         client.gather(client.map(abs, range(10), pure=False))
         begun = time.perf_counter()
         client.gather(client.map(abs, range(tasks), pure=False))
@@ -99,7 +99,7 @@ def _study(sessions: int) -> Table:
         table.rows = {name: _figures(run, first, workers) for name, (run, workers) in runs.items()}
         table.rows["two apart, one killed half-way"]["efficiency"] = float("nan")
         table.rows["the first once more, all is done"] = {
-            "done": again.kept,
+            "done": again.reused,
             "whole": again.seconds,
             "rate": 60.0 * again.rate,
         }
@@ -124,7 +124,7 @@ def _folder(sessions: int) -> Iterator[Path]:
     folder.mkdir(mode=0o700, exist_ok=True)
     if folder.is_symlink() or folder.stat().st_uid != os.getuid():
         raise ExistingOutput(f"{folder}: is somebody else's; TMPDIR names another place for it")
-    with only_one(str(folder)):
+    with lock_folder(str(folder)):
         yield folder
         shutil.rmtree(folder)
 
@@ -134,7 +134,7 @@ def _data(folder: Path, sessions: int) -> float:
     write_bytes(str(folder / "plan.toml"), _PLAN.encode())
     missing = [seed for seed in range(1, sessions + 1) if not (folder / "data" / f"{seed:04d}").is_dir()]
     if missing:
-        with connected(workers=2) as client:
+        with connect(workers=2) as client:
             client.gather(client.map(_session, [str(folder)] * len(missing), missing))
     time = pl.read_parquet(folder / "data" / "0001" / "recording.parquet", columns=["time"])["time"]
     return float(time[-1] - time[0])
@@ -153,7 +153,7 @@ class _Run(NamedTuple):
     """One run of the study."""
 
     table: pl.DataFrame
-    kept: int
+    reused: int
     seconds: float  # of the whole run
     rate: float  # items a second from the first to the last
 
@@ -195,7 +195,7 @@ def _run(
     begun = time.perf_counter()
     study = run_batch(BatchJob(folder / "plan.toml", str(out), scheduler, workers), progress)
     (last, total), (first, before) = told[-1], next((entry for entry in told if entry[1]), told[-1])
-    return _Run(study.table, study.kept, last - begun, (total - before) / max(last - first, 1e-9))
+    return _Run(study.table, study.reused, last - begun, (total - before) / max(last - first, 1e-9))
 
 
 def _again(folder: Path, _: Path) -> _Run:

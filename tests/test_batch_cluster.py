@@ -23,10 +23,10 @@ from studies import PLAN, files, item, sessions_and_plan, three_sessions  # noqa
 
 from benchmarks.batch import separate_cluster
 from wepose_pin.batch import cluster, run_batch
-from wepose_pin.batch.apart import make_apart
-from wepose_pin.batch.cluster import connected, made
-from wepose_pin.batch.compare import differences
-from wepose_pin.batch.storage import DONE
+from wepose_pin.batch.cluster import connect, run_on_cluster
+from wepose_pin.batch.comparison import find_differences
+from wepose_pin.batch.isolation import run_isolated
+from wepose_pin.batch.storage import DONE_FILE
 from wepose_pin.errors import BadData, BadOption, LostWorker
 from wepose_pin.jobs.batch import BatchJob
 
@@ -59,7 +59,7 @@ def test_a_study_on_this_machine(study: Path) -> None:
         assert word in page
     assert (study / "out" / "items" / "data-one" / "track" / "report.html").is_file()
     before = files(study / "out" / "items")
-    assert run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1)).kept == 4
+    assert run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1)).reused == 4
     assert files(study / "out" / "items") == before
 
     (study / "data" / "three" / "session.toml").write_text("")
@@ -86,7 +86,7 @@ def test_workers_listen_on_this_machine_only() -> None:
                 inodes.add(os.readlink(link).removeprefix("socket:[").removesuffix("]"))
         return inodes
 
-    with connected(workers=1) as client:
+    with connect(workers=1) as client:
         assert client.scheduler.address.startswith("tls://127.0.0.1:")
         pids = [os.getpid(), *client.run(os.getpid).values()]
         found = listening()
@@ -112,13 +112,17 @@ def killing(client: Any) -> Thread:
 
 
 def test_an_item_runs_again_when_its_worker_dies(study: Path) -> None:
-    with connected(workers=1) as client:
+    with connect(workers=1) as client:
         (before,) = client.run(os.getpid).values()
         killer = killing(client)
-        found = [row for some in made(client, [item(study), item(study, "two")], str(study / "items")) for row in some]
+        found = [
+            row
+            for some in run_on_cluster(client, [item(study), item(study, "two")], str(study / "items"))
+            for row in some
+        ]
         killer.join()
         (after,) = client.run(os.getpid).values()
-    assert sorted((row["item"], row["status"], row["kept"]) for row in found) == [
+    assert sorted((row["item"], row["status"], row["reused"]) for row in found) == [
         ("one", "done", False),
         ("two", "done", False),
     ]
@@ -130,9 +134,9 @@ def test_who_lay_beside_a_worker_that_died_is_not_to_blame(study: Path, monkeypa
     """Dask gives up both tasks of the worker, each of two items; all four are made, in processes of their own."""
     monkeypatch.setitem(cluster.SETTINGS, "distributed.scheduler.allowed-failures", 0)
     some = [item(study, name) for name in ("one", "two", "three")]
-    with connected(workers=1) as client:
+    with connect(workers=1) as client:
         killer = killing(client)
-        found = [row for rows in made(client, some, str(study / "items")) for row in rows]
+        found = [row for rows in run_on_cluster(client, some, str(study / "items")) for row in rows]
         killer.join()
     assert sorted((row["item"], row["status"]) for row in found) == [(n, "done") for n in ("one", "three", "two")]
 
@@ -155,20 +159,20 @@ def test_an_item_that_is_too_much_for_a_worker_is_given_up_by_name(
 
 
 def test_an_item_in_a_process_of_its_own(study: Path) -> None:
-    row = make_apart(item(study), str(study / "items"))
-    assert (row["status"], (study / "items" / "one" / DONE).is_file()) == ("done", True)
-    assert make_apart(item(study, "nobody"), str(study / "items"))["error"] == "MissingFile"
+    row = run_isolated(item(study), str(study / "items"))
+    assert (row["status"], (study / "items" / "one" / DONE_FILE).is_file()) == ("done", True)
+    assert run_isolated(item(study, "nobody"), str(study / "items"))["error"] == "MissingFile"
     with pytest.raises(BadData, match="another wepose-pin"):
-        make_apart(item(study), str(study / "items"), same_code="0" * 64)
+        run_isolated(item(study), str(study / "items"), same_code="0" * 64)
 
 
 def test_without_any_worker_the_run_ends(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "WAIT_S", 1.0)
-    monkeypatch.setattr(cluster, "LOOK_S", 0.2)
-    with connected(workers=1) as client:
+    monkeypatch.setattr(cluster, "POLL_S", 0.2)
+    with connect(workers=1) as client:
         client.cluster.scale(0)
         with pytest.raises(LostWorker, match="has had no worker for 1 s; start one"):
-            list(made(client, [item(study)], str(study / "items")))
+            list(run_on_cluster(client, [item(study)], str(study / "items")))
 
 
 @pytest.mark.kill
@@ -177,13 +181,13 @@ def test_a_run_that_was_killed_goes_on_where_it_stopped(study: Path) -> None:
     command += ["--workers", "1"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     until = time.monotonic() + 120.0
-    while not list((study / "out" / "items").glob(f"[!.]*/{DONE}")) and time.monotonic() < until:
+    while not list((study / "out" / "items").glob(f"[!.]*/{DONE_FILE}")) and time.monotonic() < until:
         time.sleep(0.01)
     process.kill()
     process.wait()
     time.sleep(1.0)  # its worker notices
     before = {path: time for path, time in files(study / "out" / "items").items() if "/." not in path}
-    done = sum(path.endswith(DONE) for path in before)
+    done = sum(path.endswith(DONE_FILE) for path in before)
     assert 1 <= done < 3
     assert not (study / "out" / "results.parquet").exists()
     run = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -201,7 +205,7 @@ def test_a_run_that_was_killed_goes_on_where_it_stopped(study: Path) -> None:
 
 def test_no_scheduler_at_an_address() -> None:
     for address in ("tcp://127.0.0.1:9", "nonsense"):
-        with pytest.raises(BadOption, match=f"--scheduler {address}: no scheduler there"), connected(address):
+        with pytest.raises(BadOption, match=f"--scheduler {address}: no scheduler there"), connect(address):
             pass
 
 
@@ -233,7 +237,7 @@ def test_killed_at_random_moments_nothing_is_lost_and_nothing_half_written(study
         assert before.items() <= after.items(), "what was done is neither lost nor made again"
         done = [place for place in (out / "items").glob("[!.]*") if (out / "items").exists()]
         for place in done:
-            assert differences(study / "undisturbed" / "items" / place.name, place) == []
+            assert find_differences(study / "undisturbed" / "items" / place.name, place) == []
         before = {str(file): after[str(file)] for place in done for file in place.rglob("*") if file.is_file()}
         if process.returncode == 0:
             assert pl.read_parquet(out / "results.parquet").drop(*APART).equals(right)
@@ -250,7 +254,7 @@ def test_stopped_by_ctrl_c_it_ends_at_once_and_goes_on_later(study: Path) -> Non
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
     until = time.monotonic() + 120.0
-    while not list((study / "out" / "items").glob(f"[!.]*/{DONE}")) and time.monotonic() < until:
+    while not list((study / "out" / "items").glob(f"[!.]*/{DONE_FILE}")) and time.monotonic() < until:
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=30.0)
@@ -283,15 +287,15 @@ def test_a_cluster_of_ones_own_one_of_whose_workers_is_killed(study: Path) -> No
         assert killed
         assert found.table.drop(*APART).equals(alone)
         assert found.table["item"].n_unique() == 3
-        assert run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler=address)).kept == 3
+        assert run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler=address)).reused == 3
 
 
 @pytest.mark.parametrize("when", ["before", "meanwhile"])
 def test_a_scheduler_that_goes_ends_the_run_by_name(study: Path, when: str) -> None:
     with contextlib.ExitStack() as stack:
         address, _ = stack.enter_context(separate_cluster(study))
-        with connected(address) as client:
-            rows = made(client, [item(study, name) for name in ("one", "two", "three")], str(study / "items"))
+        with connect(address) as client:
+            rows = run_on_cluster(client, [item(study, name) for name in ("one", "two", "three")], str(study / "items"))
             if when == "meanwhile":
                 next(rows)
             stack.close()

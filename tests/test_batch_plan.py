@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 from wepose_pin.batch import Plan, read_plan
-from wepose_pin.batch.plan import Body
+from wepose_pin.batch.plan import Anthropometrics
 from wepose_pin.errors import BadPlan, MissingFile, WeposeError
 
 STEPS = "[steps.calibrate]\n[steps.track]\n"
@@ -34,7 +34,7 @@ def test_globs_give_items_named_by_their_folders(folder: Path) -> None:
     assert list(plan.items[0].steps) == ["calibrate", "track"]
     assert plan.items[0].steps["calibrate"]["method"] == "amekf"
     assert plan.name == "plan"
-    assert plan.first == ()
+    assert plan.calibrations == ()
 
 
 def test_steps_run_in_their_order_however_they_are_written(folder: Path) -> None:
@@ -67,17 +67,17 @@ def test_a_subject_calibrated_once_goes_first_and_its_sessions_are_not_calibrate
         sex = "m"
         {STEPS}""",
     )
-    (first,) = plan.first
-    assert (first.name, list(first.steps), first.body) == (
+    (first,) = plan.calibrations
+    assert (first.name, list(first.steps), first.anthropometrics) == (
         "subject-anna",
         ["calibrate"],
-        Body(1.7, None, {"shoulder_width": 0.36}),
+        Anthropometrics(1.7, None, {"shoulder_width": 0.36}),
     )
     anna, ben = plan.items
     assert list(anna.steps) == ["track"]
     assert anna.subject_file == "OUT/items/subject-anna/calibrate/subject.toml"
     assert list(ben.steps) == ["calibrate", "track"]
-    assert (ben.subject_file, ben.body) == (None, Body(sex="m"))
+    assert (ben.subject_file, ben.anthropometrics) == (None, Anthropometrics(sex="m"))
 
 
 def test_a_table_ties_sessions_to_subjects_and_lengths(folder: Path) -> None:
@@ -86,7 +86,7 @@ def test_a_table_ties_sessions_to_subjects_and_lengths(folder: Path) -> None:
     pl.DataFrame(table).write_csv(folder / "sessions.csv")
     plan = planned(folder, f'[sessions]\ntable = "sessions.csv"\n{STEPS}')
     assert [item.name for item in plan.items] == ["a", "ben-one"]
-    assert plan.items[0].body == Body(1.7, "f", {"trunk": 0.5})
+    assert plan.items[0].anthropometrics == Anthropometrics(1.7, "f", {"trunk": 0.5})
     assert plan.items[1].truth == str(folder / "t.parquet")
 
 
@@ -158,7 +158,7 @@ def test_a_mistake_gets_one_line_that_names_it(folder: Path, text: str, said: st
 def test_the_distance_that_a_protocol_needs_may_be_measured(folder: Path) -> None:
     subject = '[subjects.a]\nmeasured = { handle = 0.42 }\n[steps.calibrate]\nprotocol = "handle"\n'
     plan = planned(folder, f'[sessions]\nfiles = "ben/one"\nsubject = "a"\n{subject}')
-    assert plan.items[0].body.measured == {"handle": 0.42}
+    assert plan.items[0].anthropometrics.measured == {"handle": 0.42}
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from wepose_pin.batch.plan import STEPS, step_options
-from wepose_pin.batch.reproduce import REPRODUCIBLE
+from wepose_pin.batch.reproduction import REPRODUCIBLE
 from wepose_pin.cli import COMMANDS, find_command
 from wepose_pin.cli.parser import parse
 from wepose_pin.errors import BadOption

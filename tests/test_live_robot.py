@@ -607,7 +607,7 @@ def test_the_same_recording_gives_the_same_commands(
 ) -> None:
     """A session as fast as possible and what it recorded: bit-identical, without this machine's clock."""
     sent: list[bytes] = []
-    monkeypatch.setattr("wepose_pin.live.robot._Wire.send", lambda _, data: sent.append(data))
+    monkeypatch.setattr("wepose_pin.live.robot.UdpSender.send", lambda _, data: sent.append(data))
     recording = first(simulation.recording("bits"), 1500)
 
     def commands(recording: Any, record: Path | None = None) -> list[bytes]:

@@ -12,8 +12,8 @@ import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.batch.items import make_items
-from wepose_pin.batch.page import study_page
+from wepose_pin.batch.items import run_items
+from wepose_pin.batch.page import build_study_page
 from wepose_pin.batch.plan import Item, Plan, step_options
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import as_json
@@ -134,7 +134,7 @@ def test_a_study_whose_figures_are_all_one_up_to_rounding() -> None:
     table = pl.DataFrame([{**row, **dict.fromkeys(("subject", "error", "message", "page"), None)} for row in rows])
     table = table.with_columns(pl.col("subject", "error", "message", "page").cast(pl.String))
     failures: list[str] = []
-    study_page(Plan("p", (), ()), table, failures)
+    build_study_page(Plan("p", (), ()), table, failures)
     assert failures == []
 
 
@@ -232,6 +232,6 @@ def test_a_calibration_outlasts_its_report(
 def test_an_item_of_a_batch_outlasts_its_pages(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wepose_pin.report.pages.pose_html", fails)
     steps = {"track": {**step_options("track"), "method": "ncf"}}
-    (row,) = make_items([Item(name="one", session=str(session), steps=steps)], str(tmp_path))
+    (row,) = run_items([Item(name="one", session=str(session), steps=steps)], str(tmp_path))
     assert row["status"] == "done", row
     assert names(tmp_path / "one" / "track") == RESULT | {"report.html"}

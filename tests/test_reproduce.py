@@ -15,8 +15,8 @@ import pytest
 from arms import write_arm
 
 from wepose_pin import __version__
-from wepose_pin.batch.compare import differences
-from wepose_pin.batch.items import make_items
+from wepose_pin.batch.comparison import find_differences
+from wepose_pin.batch.items import run_items
 from wepose_pin.batch.plan import Item, step_options
 from wepose_pin.cli import main
 from wepose_pin.simulation import simulate, simulated_person
@@ -216,8 +216,8 @@ def test_an_item_of_a_batch_and_its_parts(session: Path, tmp_path: Path) -> None
     }
     steps |= {"evaluate": {"interval": None}}
     script = (
-        "import sys; from wepose_pin.batch.items import make_items; from wepose_pin.batch.plan import Item\n"
-        f"row, = make_items([Item('one', sys.argv[1], {steps!r})], sys.argv[2]); print(row['status'])"
+        "import sys; from wepose_pin.batch.items import run_items; from wepose_pin.batch.plan import Item\n"
+        f"row, = run_items([Item('one', sys.argv[1], {steps!r})], sys.argv[2]); print(row['status'])"
     )
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     made = subprocess.run(
@@ -237,7 +237,7 @@ def test_an_item_of_a_batch_and_its_parts(session: Path, tmp_path: Path) -> None
 
 def test_an_item_whose_truth_has_changed(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     steps = {"track": step_options("track") | {"report": False, "view": False}, "evaluate": {"interval": None}}
-    make_items([Item("one", str(session), steps)], str(tmp_path / "items"))
+    run_items([Item("one", str(session), steps)], str(tmp_path / "items"))
     (session / "truth.parquet").unlink()
     assert run("reproduce", tmp_path / "items" / "one") == 2
     assert "of its session, truth.parquet is gone" in capsys.readouterr().err
@@ -249,11 +249,11 @@ def test_what_counts_as_a_difference(tmp_path: Path) -> None:
         pl.DataFrame({"x": [1.0, float("nan"), None]}).write_parquet(tmp_path / name / "t.parquet", compression="lz4")
         (tmp_path / name / "view.html").write_text(name)
         (tmp_path / name / "s.json").write_text(json.dumps({"v": 1, "provenance": name}))
-    assert differences(tmp_path / "a", tmp_path / "b") == []
+    assert find_differences(tmp_path / "a", tmp_path / "b") == []
     pl.DataFrame({"x": [1.0, None, None]}).write_parquet(tmp_path / "b" / "t.parquet")
-    assert differences(tmp_path / "a", tmp_path / "b")[0].startswith("t.parquet: column x differs in 1 of 3 rows")
+    assert find_differences(tmp_path / "a", tmp_path / "b")[0].startswith("t.parquet: column x differs in 1 of 3 rows")
     pl.DataFrame({"x": [1.0]}).write_parquet(tmp_path / "b" / "t.parquet")
-    assert differences(tmp_path / "a", tmp_path / "b") == ["t.parquet: 3 rows before, 1 now"]
+    assert find_differences(tmp_path / "a", tmp_path / "b") == ["t.parquet: 3 rows before, 1 now"]
 
 
 def test_files_that_options_name_are_inputs(tmp_path: Path) -> None:

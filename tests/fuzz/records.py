@@ -18,18 +18,18 @@ REPRODUCED = ("track", "calibrate", "simulate", "retarget", "demo", "export")
 
 def plan(folder: Path, data: bytes) -> object:
     """The input is the plan; two sessions and a table lie beside it."""
-    from wepose_pin.batch.items import key_of
+    from wepose_pin.batch.items import compute_key
     from wepose_pin.batch.plan import read_plan
 
     _beside_a_plan(folder)
     (folder / "list.csv").write_bytes(seeds.PLAN_TABLE)
     (folder / "plan.toml").write_bytes(data)
     found = read_plan(folder / "plan.toml", "out/items")
-    names = [item.name for item in (*found.first, *found.items)]
+    names = [item.name for item in (*found.calibrations, *found.items)]
     assert len(set(names)) == len(names)
     assert all(name and "/" not in name and name not in (".", "..") for name in names), names
     for item in found.items:
-        key_of(item)
+        compute_key(item)
     return found
 
 
@@ -73,7 +73,7 @@ validation = file("validation.json", _validation)
 
 def provenance(folder: Path, data: bytes) -> object:
     """The input is what a result says made it; what would make it again copies another."""
-    from wepose_pin.batch import reproduce
+    from wepose_pin.batch import reproduction
     from wepose_pin.jobs.reproduce import ReproduceJob
 
     result, made = folder / "result", folder / "made"
@@ -84,12 +84,12 @@ def provenance(folder: Path, data: bytes) -> object:
     (folder / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
     (result / "provenance.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
     copies = {name: (kind, lambda job: shutil.copytree(made, job.out)) for name, (kind, _) in _reproducible().items()}
-    with mock.patch.dict(reproduce.REPRODUCIBLE, copies):
-        return reproduce.run_reproduce(ReproduceJob(result))
+    with mock.patch.dict(reproduction.REPRODUCIBLE, copies):
+        return reproduction.run_reproduce(ReproduceJob(result))
 
 
 def _reproducible() -> dict[str, tuple[type, Callable[..., object]]]:
-    from wepose_pin.batch.reproduce import REPRODUCIBLE
+    from wepose_pin.batch.reproduction import REPRODUCIBLE
 
     assert set(REPRODUCIBLE) == set(REPRODUCED), "a stranger's record runs only what makes a result"
     return REPRODUCIBLE
@@ -97,15 +97,15 @@ def _reproducible() -> dict[str, tuple[type, Callable[..., object]]]:
 
 def done(folder: Path, data: bytes) -> object:
     """The input is what an item of a batch says made it; read as batch does before it makes it again."""
-    from wepose_pin.batch.items import _changed, _done, item_of
-    from wepose_pin.batch.reproduce import _item_provenance
+    from wepose_pin.batch.items import _find_change, _read_done, read_item
+    from wepose_pin.batch.reproduction import _read_item_provenance
 
     (folder / "item").mkdir(exist_ok=True)
     (folder / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
     (folder / "item" / "done.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
-    found = _done(str(folder / "item"))
-    item = item_of(_item_provenance(folder / "item"))
-    return None if found is None else _changed(item, "", found)
+    found = _read_done(str(folder / "item"))
+    item = read_item(_read_item_provenance(folder / "item"))
+    return None if found is None else _find_change(item, "", found)
 
 
 # Recordings with a truth, for `wepose validate --data` ------------------------------------------------------------

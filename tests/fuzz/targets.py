@@ -309,7 +309,7 @@ TARGETS = (
     Target("pose", lambda: [seeds.pose()], file("pose.parquet", _pose), (), "pose"),
     Target("result", lambda: [seeds.pose_csv()], records.result, LINES, "writers.motion"),
     Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON, "writers.result"),
-    Target("provenance", lambda: [seeds.provenance()], records.provenance, JSON, "batch.reproduce"),
+    Target("provenance", lambda: [seeds.provenance()], records.provenance, JSON, "batch.reproduction"),
     Target("done", lambda: [seeds.done()], records.done, JSON, "batch.items"),
     Target("validation", lambda: [seeds.validation()], records.validation, JSON, "validation.document"),
     Target("broad", lambda: [seeds.broad(False), seeds.broad(True)], records.broad, (), "readers.trials"),

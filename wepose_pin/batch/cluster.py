@@ -1,4 +1,4 @@
-"""Items over Dask's workers: a cluster of this machine, or any that runs elsewhere; one module that knows of Dask."""
+"""Items on Dask's workers: a cluster on this machine, or a running one."""
 
 from __future__ import annotations
 
@@ -13,40 +13,41 @@ from typing import Any
 
 from ..errors import BadOption, LostWorker
 from ..filters.base import processors
-from .apart import make_apart
-from .items import Row, failed, make_items
+from .isolation import run_isolated
+from .items import build_failed_row, run_items
 from .plan import Item
+from .steps import Row
 
-# A task costs Dask some milliseconds (`python -m benchmarks batch` measures it): one that takes half a second keeps
-# that under a hundredth. Items that take less go together.
+# [s] of a task: Dask needs some milliseconds for each (`python -m benchmarks batch` measures it), which is then less
+# than a hundredth. Short items share a task.
 TASK_S = 0.5
-MOST = 500  # items a task
-AHEAD = 2  # tasks a worker: one runs, one waits
-DEATHS = 1  # of workers at one task, after which each of its items is made in a process of its own
+MAX_ITEMS = 500  # a task
+TASKS_PER_THREAD = 2  # one runs, one waits
+MAX_DEATHS = 1  # of workers at one task, after which each of its items runs in a process of its own
 WAIT_S = 60.0  # without any worker, after which the run ends
+POLL_S = 2.0  # between two looks at the workers
 GONE = "the scheduler is gone; the same command goes on where it stopped"
-LOOK_S = 2.0  # between two looks at which workers there are
 # Workers share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
 _THREADED = "WEPOSE_THREADS NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
 _ONE_THREAD = dict.fromkeys(_THREADED.split(), "1")
 SETTINGS: dict[str, Any] = {
-    "distributed.scheduler.allowed-failures": DEATHS,
+    "distributed.scheduler.allowed-failures": MAX_DEATHS,
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
-    # Nothing lies on workers that could be spilled, and one that has paused for want of memory would never go on: at
-    # 95 % of its share of the machine's memory it is ended and replaced, and its items run again.
+    # Workers hold nothing that could be spilled, and one that pauses for lack of memory would never resume: at 95 % of
+    # its share of the machine's memory it is replaced, and its items run again.
     **dict.fromkeys((f"distributed.worker.memory.{word}" for word in ("target", "spill", "pause")), False),
-    # A terminal's Ctrl-C is for us, who end them.
+    # Ctrl-C in the terminal is for this process, which ends the workers.
     "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
     "distributed.nanny.pre-spawn-environ": _ONE_THREAD | {"DASK_LOGGING__DISTRIBUTED": "critical"},
 }
 
 
 @contextlib.contextmanager
-def connected(scheduler: str | None = None, workers: int | None = None) -> Iterator[Any]:
+def connect(scheduler: str | None = None, workers: int | None = None) -> Iterator[Any]:
     """A client of the scheduler at an address; without one, of workers started here, one a processor.
 
-    Those listen on 127.0.0.1 only, and talk by TLS with a certificate made for the run, which lets no one else in.
+    These listen on 127.0.0.1 only, and talk by TLS with a certificate made for the run.
 
     Raises
     ------
@@ -61,7 +62,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
         raise BadOption(f"{error}; pip install 'wepose-pin[batch]' brings what wepose batch needs") from None
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(SETTINGS))
-        stack.callback(_leave_environment, dict(os.environ))
+        stack.callback(_restore_environment, dict(os.environ))
         if scheduler is None:
             cluster = stack.enter_context(
                 LocalCluster(
@@ -77,7 +78,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
             )
             yield stack.enter_context(Client(cluster))
             return
-        for name in ("distributed", "distributed.client"):  # which say by tracebacks what we say by a line
+        for name in ("distributed", "distributed.client"):  # they log tracebacks where we give one line
             logger = logging.getLogger(name)
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
@@ -95,8 +96,8 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
         yield client
 
 
-def _leave_environment(before: dict[str, str]) -> None:
-    """As it was: Dask gives its workers theirs by way of this process's."""
+def _restore_environment(before: dict[str, str]) -> None:
+    """Undo Dask's changes: it passes variables to its workers through this process."""
     for name in (*_ONE_THREAD, *SETTINGS["distributed.nanny.pre-spawn-environ"]):
         if name in before:
             os.environ[name] = before[name]
@@ -104,14 +105,14 @@ def _leave_environment(before: dict[str, str]) -> None:
             os.environ.pop(name, None)
 
 
-def made(
+def run_on_cluster(
     client: Any, items: Sequence[Item], place: str, *, force: bool = False, code: str | None = None
 ) -> Iterator[list[Row]]:
-    """Rows of the items as they are made, some at a time, in the order in which they are done.
+    """Rows of the items, some at a time, in the order in which they are done.
 
-    A worker that dies is replaced by Dask and its tasks run again, which leaves what they had done. Dask blames its
-    death on all tasks that lay there: after `DEATHS` each of their items is made in a process of its own, and only one
-    that kills this one too is given up, by the name of `LostWorker`.
+    Dask replaces a worker that dies and runs its tasks again; items that were done stay. Dask blames the death on all
+    tasks of the worker: after `MAX_DEATHS` each of their items runs in a process of its own, and only one that kills
+    this process too fails, with `LostWorker`.
 
     Raises
     ------
@@ -124,82 +125,79 @@ def made(
 
     todo, suspects = deque(items), deque[Item]()
     running: dict[Any, list[Item]] = {}
-    apart: set[Any] = set()
-    each, seen = TASK_S, _Workers(client)
+    isolated: set[Any] = set()
+    item_s, workers = TASK_S, _Workers(client)
     while todo or suspects or running:
-        seen.look()
-        while (todo or suspects) and len(running) < AHEAD * seen.threads:
+        workers.check()
+        while (todo or suspects) and len(running) < TASKS_PER_THREAD * workers.threads:
             if suspects:
-                some = [suspects.popleft()]
-                future = client.submit(make_apart, some[0], place, force, code, pure=False)
-                apart.add(future)
+                task = [suspects.popleft()]
+                future = client.submit(run_isolated, task[0], place, force, code, pure=False)
+                isolated.add(future)
             else:
-                size = max(1, min(MOST, int(TASK_S / each), len(todo) // (AHEAD * seen.threads)))
-                some = [todo.popleft() for _ in range(size)]
-                future = client.submit(_timed, some, place, force, code, pure=False)
-            running[future] = some
-        for future in _ended(running):
-            some, alone = running.pop(future), future in apart
-            apart.discard(future)
+                size = max(1, min(MAX_ITEMS, int(TASK_S / item_s), len(todo) // (TASKS_PER_THREAD * workers.threads)))
+                task = [todo.popleft() for _ in range(size)]
+                future = client.submit(_run_timed, task, place, force, code, pure=False)
+            running[future] = task
+        for future in _wait_for_any(running):
+            task, alone = running.pop(future), future in isolated
+            isolated.discard(future)
             if future.status == "finished" and alone:
                 yield [future.result()]
             elif future.status == "finished":
                 seconds, rows = future.result()
-                each = 0.5 * each + 0.5 * max(seconds / len(rows), 1e-4)
-                todo.extendleft(reversed(some[len(rows) :]))
+                item_s = 0.5 * item_s + 0.5 * max(seconds / len(rows), 1e-4)
+                todo.extendleft(reversed(task[len(rows) :]))
                 yield rows
             elif future.status != "error":
                 raise LostWorker(GONE)
             elif not isinstance(error := future.exception(), KilledWorker):
                 raise error
             elif alone:
-                yield [
-                    failed(some[0], LostWorker.__name__, f"workers died at it, the last {error.last_worker.address}")
-                ]
+                message = f"workers died at it, the last {error.last_worker.address}"
+                yield [build_failed_row(task[0], LostWorker.__name__, message)]
             else:
-                suspects.extend(some)
+                suspects.extend(task)
             future.release()
 
 
 class _Workers:
-    """How many threads the workers have together, looked up now and then."""
+    """Number of threads of the workers, updated now and then."""
 
     def __init__(self, client: Any) -> None:
         self.client = client
         self.threads = 1
-        self._looked = self._there = 0.0
+        self._checked = self._present = 0.0
 
-    def look(self) -> None:
-        """Raise LostWorker where the scheduler is gone, or there has been no worker for long."""
+    def check(self) -> None:
+        """Raise LostWorker where the scheduler is gone, or has had no worker for long."""
         now = time.monotonic()
-        if self._looked and now < self._looked + LOOK_S:
+        if self._checked and now < self._checked + POLL_S:
             return
         try:
-            found = sum(self.client.nthreads().values())
+            threads = sum(self.client.nthreads().values())
         except OSError:
             raise LostWorker(GONE) from None
-        self._there = now if found or not self._looked else self._there
-        self._looked, self.threads = now, max(1, found)
-        if now > self._there + WAIT_S:
+        self._present = now if threads or not self._checked else self._present
+        self._checked, self.threads = now, max(1, threads)
+        if now > self._present + WAIT_S:
             raise LostWorker(
                 f"{self.client.scheduler.address}: has had no worker for {WAIT_S:g} s; start one, and the same command "
                 "goes on where it stopped"
             )
 
 
-def _ended(running: dict[Any, list[Item]]) -> list[Any]:
-    """Tasks that have ended; none after a while in which none has."""
+def _wait_for_any(running: dict[Any, list[Item]]) -> list[Any]:
+    """Tasks that have ended; none after `POLL_S` in which none has."""
     from distributed import wait
 
-    with contextlib.suppress(
-        TimeoutError, concurrent.futures.CancelledError
-    ):  # the latter where one of them is cancelled
-        wait(list(running), timeout=LOOK_S, return_when="FIRST_COMPLETED")
+    with contextlib.suppress(TimeoutError, concurrent.futures.CancelledError):  # the latter: one of them is cancelled
+        wait(list(running), timeout=POLL_S, return_when="FIRST_COMPLETED")
     return [future for future in running if future.status != "pending"]
 
 
-def _timed(items: list[Item], place: str, force: bool, code: str | None) -> tuple[float, list[Row]]:
-    """Rows of as many items as are made in twice the time that a task should take, and the time they took."""
-    begun = time.perf_counter()
-    rows = make_items(items, place, force, code, until=begun + 2.0 * TASK_S)
-    return time.perf_counter() - begun, rows
+def _run_timed(items: list[Item], place: str, force: bool, code: str | None) -> tuple[float, list[Row]]:
+    """Rows of as many items as begin within twice the time of a task, and the time they took."""
+    begin = time.perf_counter()
+    rows = run_items(items, place, force, code, until=begin + 2.0 * TASK_S)
+    return time.perf_counter() - begin, rows

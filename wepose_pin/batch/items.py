@@ -1,4 +1,4 @@
-"""One item, made whole or not at all: its steps in a new folder, `done.json` last, what is done left as it is."""
+"""One item of a study: its steps run in a new folder, which appears whole or not at all; what is done stays."""
 
 from __future__ import annotations
 
@@ -14,78 +14,80 @@ import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import BadData, ExistingOutput, WeposeError
 from ..writers.provenance import code, collect_provenance, file_hashes
-from .plan import Item
-from .steps import ItemFiles, ItemSteps
-from .storage import DONE, fetch, is_remote, new_folder, read_bytes, stamps
+from .plan import Anthropometrics, Item
+from .steps import ItemFiles, ItemSteps, Row
+from .storage import DONE_FILE, create_folder, fetch, is_remote, read_bytes, read_stamps
 
 COMMAND = "batch item"
-MADE, FAILED, CHANGED = "done", "failed", "changed"  # what an item's status may be
-PAGES = ("report.html", "view.html")  # what a row of the study leads to
-Row = dict[str, Any]
+DONE, FAILED, CHANGED = "done", "failed", "changed"  # status of an item
+PAGES = ("report.html", "view.html")  # to which a row of the study links
 
 
-def make_items(
+def run_items(
     items: Sequence[Item], place: str, force: bool = False, same_code: str | None = None, until: float = math.inf
 ) -> list[Row]:
-    """A row an item, in their order; errors become rows too. What a worker is asked for.
+    """A row an item, in their order, errors included; runs on a worker.
 
     Parameters
     ----------
-    place : folder or URL that holds the items' folders
-    force : make what was made from other inputs, options or version again; without it such an item is `CHANGED`
-    same_code : the hash of the code that asks; a worker with another refuses
-    until : of `time.perf_counter`: no item is begun after that but the first; rows are then fewer than items
+    place : folder or URL of the items' folders
+    force : run items again whose inputs, options or code have changed; otherwise they are `CHANGED`
+    same_code : hash of the caller's code; a worker with other code refuses
+    until : of `time.perf_counter`, after which no further item begins; rows are then fewer than items
 
     Raises
     ------
     BadData
-        This is not the code that asks.
+        This worker has other code than the caller.
     """
-    # Workers share the machine: a second thread in one would take the processor of the other.
+    # Workers share the machine: a second thread would take the processor of another worker.
     os.environ.setdefault("WEPOSE_THREADS", "1")
-    mine = code()["code"]
-    if same_code not in (None, mine):
+    own = code()
+    if same_code not in (None, own["code"]):
         raise BadData(
-            f"a worker has another wepose-pin than this one: version {code()['version']}, commit "
-            f"{code()['commit'] or 'not known'}; install the same everywhere"
+            f"a worker has another wepose-pin than this one: version {own['version']}, commit "
+            f"{own['commit'] or 'not known'}; install the same everywhere"
         )
     rows: list[Row] = []
     for item in items:
         if rows and time.perf_counter() > until:
             break
-        rows.append(_row(item, place, force))
+        rows.append(_run_caught(item, place, force))
     return rows
 
 
-def failed(item: Item, error: str, message: str) -> Row:
-    """The row of an item that has failed, and why."""
-    row: Row = {"item": item.name, "session": item.session, "subject": item.subject, "status": FAILED}
-    return row | {"error": error, "message": message}
+def build_failed_row(item: Item, error: str, message: str) -> Row:
+    """The row of an item that has failed."""
+    return _describe_item(item) | {"status": FAILED, "error": error, "message": message}
 
 
-def _row(item: Item, place: str, force: bool) -> Row:
-    begun = time.perf_counter()
+def _describe_item(item: Item) -> Row:
+    return {"item": item.name, "session": item.session, "subject": item.subject}
+
+
+def _run_caught(item: Item, place: str, force: bool) -> Row:
+    begin = time.perf_counter()
     try:
-        return {"item": item.name, "session": item.session, "subject": item.subject} | make_item(item, place, force)
+        return _describe_item(item) | run_item(item, place, force)
     except WeposeError as error:
-        row = failed(item, type(error).__name__, " ".join(str(error).split()))
+        row = build_failed_row(item, type(error).__name__, " ".join(str(error).split()))
     except MemoryError:
-        row = failed(item, "MemoryError", f"{item.session}: not enough memory for it on this worker")
-    except Exception as error:  # ours to mend: the others go on, and the table says where it was
+        row = build_failed_row(item, "MemoryError", f"{item.session}: not enough memory for it on this worker")
+    except Exception as error:  # a bug of ours: other items continue, and the table says where it is
         last = traceback.extract_tb(error.__traceback__)[-1]
-        what = " ".join(str(error).split())
-        row = failed(item, type(error).__name__, f"{what} ({Path(last.filename).name}:{last.lineno})")
-    return row | {"seconds": time.perf_counter() - begun}
+        text = " ".join(str(error).split())
+        row = build_failed_row(item, type(error).__name__, f"{text} ({Path(last.filename).name}:{last.lineno})")
+    return row | {"seconds": time.perf_counter() - begin}
 
 
-def make_item(item: Item, place: str, force: bool = False) -> Row:
-    """Make an item's folder, unless it is there already, and give its columns of the table.
+def run_item(item: Item, place: str, force: bool = False) -> Row:
+    """Make an item's folder, unless it is done, and return its columns of the table.
 
-    One that was made from other inputs, options or version is left and keeps its figures, as `CHANGED`, unless `force`.
+    An item that was made from other inputs, options or code stays as it is, `CHANGED`, unless `force`.
 
     Raises
     ------
@@ -93,27 +95,28 @@ def make_item(item: Item, place: str, force: bool = False) -> Row:
         Of any of its steps.
     """
     target = f"{place}/{item.name}"
-    key = key_of(item)
-    done = _done(target)
+    key = compute_key(item)
+    done = _read_done(target)
     if done is not None:
-        changed = _changed(item, key, done)
-        if changed is None:
-            return done["row"] | {"status": MADE, "kept": True}
+        change = _find_change(item, key, done)
+        if change is None:
+            return done["row"] | {"status": DONE, "reused": True}
         if not force:
-            message = f"{target}: was made from {changed}; --force makes it again, -o names another folder"
-            return done["row"] | {"status": CHANGED, "error": ExistingOutput.__name__, "message": message, "kept": True}
-    begun = time.perf_counter()
-    with new_folder(target) as folder:
-        stamped = _stamps(item)  # before anything is read: what changes meanwhile is seen the next time
-        row, provenance = make_into(folder, item)
-        row |= {"seconds": time.perf_counter() - begun, "memory_mb": _most_memory()}
-        content = {"key": key, "provenance": provenance, "stamps": stamped, "row": row}
-        (folder / DONE).write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
-    return row | {"status": MADE, "kept": False}
+            message = f"{target}: was made from {change}; --force makes it again, -o names another folder"
+            changed = {"status": CHANGED, "error": ExistingOutput.__name__, "message": message, "reused": True}
+            return done["row"] | changed
+    begin = time.perf_counter()
+    with create_folder(target) as folder:
+        stamps = _read_all_stamps(item)  # before the inputs are read: the next run sees what changes meanwhile
+        row, provenance = run_steps(folder, item)
+        row |= {"seconds": time.perf_counter() - begin, "memory_mb": _measure_peak_memory()}
+        content = {"key": key, "provenance": provenance, "stamps": stamps, "row": row}
+        (folder / DONE_FILE).write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+    return row | {"status": DONE, "reused": False}
 
 
-def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
-    """The item's steps into an existing folder: its columns of the table, and its provenance.
+def run_steps(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
+    """Run the item's steps into an existing folder; its columns of the table, and its provenance.
 
     Raises
     ------
@@ -121,95 +124,99 @@ def make_into(folder: Path, item: Item) -> tuple[Row, dict[str, Any]]:
         Of any of its steps.
     """
     with tempfile.TemporaryDirectory(prefix="wepose-") as fetched:
-        local = {
-            name: fetch(url, Path(fetched), name == "session" and "evaluate" in item.steps)
-            for name, url in _inputs(item).items()
-        }
-        provenance = _provenance(item, local)
+        local = {source.name: source.fetch(Path(fetched)) for source in _list_inputs(item)}
+        provenance = _collect_provenance(item, local)
         files = ItemFiles(folder, local["session"], local.get("subject_file"), local.get("truth"))
-        steps, row, took = ItemSteps(files, item.body, provenance), Row(), Row()
+        steps, row, durations = ItemSteps(files, item.anthropometrics, provenance), Row(), Row()
         for step, options in item.steps.items():
-            begun = time.perf_counter()
+            begin = time.perf_counter()
             row |= steps.run(step, options)
-            took[f"{step}_s"] = time.perf_counter() - begun
+            durations[f"{step}_s"] = time.perf_counter() - begin
     pages = [f"{step}/{page}" for step in reversed(list(item.steps)) for page in PAGES]
-    return row | {"page": next((page for page in pages if (folder / page).is_file()), None)} | took, provenance
+    page = next((page for page in pages if (folder / page).is_file()), None)
+    return row | {"page": page} | durations, provenance
 
 
-def _most_memory() -> float:
-    """Most memory [MB] that this process ever had."""
-    with contextlib.suppress(
-        OSError, StopIteration, ValueError
-    ):  # Linux's rusage counts that of whoever started us, too
+def _measure_peak_memory() -> float:
+    """Largest memory [MB] that this process has had."""
+    with contextlib.suppress(OSError, StopIteration, ValueError):  # Linux's rusage includes the parent's, too
         lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e6
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
-def key_of(item: Item) -> str:
-    """Hash of what makes an item but its inputs' contents: steps, options, person, code."""
-    told = {"steps": list(item.steps.items()), "body": asdict(item.body), **code()}
-    told.pop("commit")  # says less than the hash of the code
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+def compute_key(item: Item) -> str:
+    """Hash of the steps, options, anthropometrics and code of an item; its inputs have their own hashes."""
+    content = {"steps": list(item.steps.items()), "body": asdict(item.anthropometrics), **code()}
+    content.pop("commit")  # the hash of the code says more
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def item_of(provenance: Mapping[str, Any]) -> Item:
-    """The item that a provenance tells of.
+def read_item(provenance: Mapping[str, Any]) -> Item:
+    """The item that a provenance describes.
 
     Raises
     ------
     BadData
-        It is of something else, or damaged.
+        It describes something else, or is damaged.
     """
-    from .plan import Body
-
     try:
-        about = provenance["options"]
+        options = provenance["options"]
         paths = {name: entry["path"] for name, entry in provenance["inputs"].items()}
         steps = {
-            step: {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
-            for step, options in about["steps"].items()
+            step: {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
+            for step, own in options["steps"].items()
         }
         known = {name: paths.get(name) for name in ("subject_file", "truth")}
-        return Item(about["name"], paths["session"], steps, about["subject"], **known, body=Body(**about["body"]))
+        person = Anthropometrics(**options["body"])
+        return Item(options["name"], paths["session"], steps, options["subject"], **known, anthropometrics=person)
     except (KeyError, TypeError, AttributeError) as error:
         raise BadData(f"provenance: not that of a batch's item: {type(error).__name__} {error}") from None
 
 
-def _inputs(item: Item) -> dict[str, str]:
-    """Name → path or URL of what the item is made from."""
+class _Input(NamedTuple):
+    """A file or folder from which an item is made; `truth`: with the reference that a session names."""
+
+    name: str
+    url: str
+    truth: bool
+
+    def fetch(self, folder: Path) -> Path:
+        return fetch(self.url, folder, self.truth)
+
+
+def _list_inputs(item: Item) -> list[_Input]:
     named = {"session": item.session, "subject_file": item.subject_file, "truth": item.truth}
     for step, options in item.steps.items():
         for name in ("model", "protocol", "robot"):
             value = options.get(name)
             if isinstance(value, str) and Path(value).is_file():
                 named[f"{step}.{name}"] = value
-    return {name: url for name, url in named.items() if url is not None}
+    evaluated = "evaluate" in item.steps
+    return [_Input(name, url, evaluated and name == "session") for name, url in named.items() if url is not None]
 
 
-def _provenance(item: Item, local: Mapping[str, Path]) -> dict[str, Any]:
-    """Inputs are named by where they lie, not by where they were fetched to."""
-    truth = "evaluate" in item.steps
-    options = {"name": item.name, "subject": item.subject, "body": asdict(item.body), "steps": dict(item.steps)}
-    provenance = collect_provenance(COMMAND, options)
+def _collect_provenance(item: Item, local: Mapping[str, Path]) -> dict[str, Any]:
+    """Provenance with the places of the inputs themselves, not of local copies."""
+    options = {"name": item.name, "subject": item.subject, "body": asdict(item.anthropometrics)}
+    provenance = collect_provenance(COMMAND, options | {"steps": dict(item.steps)})
     provenance["inputs"] = {
-        name: {
-            "path": url if is_remote(url) else str(Path(url).absolute()),
-            "files": file_hashes(local[name], truth and name == "session"),
+        source.name: {
+            "path": source.url if is_remote(source.url) else str(Path(source.url).absolute()),
+            "files": file_hashes(local[source.name], source.truth),
         }
-        for name, url in _inputs(item).items()
+        for source in _list_inputs(item)
     }
     return provenance
 
 
-def _stamps(item: Item) -> dict[str, Any]:
-    truth = "evaluate" in item.steps
-    return {name: stamps(url, truth and name == "session") for name, url in _inputs(item).items()}
+def _read_all_stamps(item: Item) -> dict[str, Any]:
+    return {source.name: read_stamps(source.url, source.truth) for source in _list_inputs(item)}
 
 
-def _done(target: str) -> dict[str, Any] | None:
-    """What `done.json` says; None where the folder is not whole."""
-    content = read_bytes(f"{target}/{DONE}")
+def _read_done(target: str) -> dict[str, Any] | None:
+    """Contents of `done.json`; None where the folder is not complete."""
+    content = read_bytes(f"{target}/{DONE_FILE}")
     if content is None:
         return None
     try:
@@ -220,23 +227,21 @@ def _done(target: str) -> dict[str, Any] | None:
     return done if whole else None
 
 
-def _changed(item: Item, key: str, done: Mapping[str, Any]) -> str | None:
+def _find_change(item: Item, key: str, done: Mapping[str, Any]) -> str | None:
     """What has changed since an item was done; None: nothing."""
     was, now = done["provenance"], code()
     if was.get("code") != now["code"]:
         return f"other code, version {was.get('version')}" + (f" ({was['commit']})" if was.get("commit") else "")
     if done.get("key") != key:
         return "other options"
-    inputs = _inputs(item)
-    if inputs != {name: entry["path"] for name, entry in was["inputs"].items()}:
+    inputs = _list_inputs(item)
+    if {source.name: source.url for source in inputs} != {name: was["inputs"][name]["path"] for name in was["inputs"]}:
         return "other inputs"
-    found = json.loads(json.dumps(_stamps(item)))
-    if found == done["stamps"] and None not in found.values():
+    stamps = json.loads(json.dumps(_read_all_stamps(item)))
+    if stamps == done["stamps"] and None not in stamps.values():
         return None
     with tempfile.TemporaryDirectory(prefix="wepose-") as fetched:
-        truth = "evaluate" in item.steps
-        for name, url in inputs.items():
-            of_session = truth and name == "session"
-            if file_hashes(fetch(url, Path(fetched), of_session), of_session) != was["inputs"][name]["files"]:
-                return f"another {name.replace('_', ' ')}: {url} has changed since"
+        for source in inputs:
+            if file_hashes(source.fetch(Path(fetched)), source.truth) != was["inputs"][source.name]["files"]:
+                return f"another {source.name.replace('_', ' ')}: {source.url} has changed since"
     return None

@@ -1,4 +1,4 @@
-"""The steps of an item: each builds the job of the command of its name, runs it, and gives figures for the table."""
+"""Steps of an item: each runs the job of the command of its name and returns columns of the table."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ..jobs.retarget import RetargetJob, run_retarget
 from ..jobs.track import TrackJob, run_track
 from ..tracking import TrackedRecording
 from ..writers.result import as_json
-from .plan import Body
+from .plan import Anthropometrics
 
 Row = dict[str, Any]
 
 
 class ItemFiles(NamedTuple):
-    """What an item's steps read, as local files, and where they write."""
+    """Local files that an item's steps read, and the folder that they write to."""
 
     folder: Path
     session: Path
@@ -33,20 +33,20 @@ class ItemFiles(NamedTuple):
 
 
 class ItemSteps:
-    """The steps of one item, in order; what one finds the next ones use.
+    """The steps of one item, in order; each uses the results of those before.
 
     Parameters
     ----------
-    provenance : what its results say made them
+    provenance : of the results
     """
 
-    def __init__(self, files: ItemFiles, body: Body, provenance: Mapping[str, Any]) -> None:
-        self._files, self._body, self._provenance = files, body, provenance
+    def __init__(self, files: ItemFiles, person: Anthropometrics, provenance: Mapping[str, Any]) -> None:
+        self._files, self._person, self._provenance = files, asdict(person), provenance
         self._subject = files.subject
         self._tracked: TrackedRecording | None = None
 
     def run(self, step: str, options: Mapping[str, Any]) -> Row:
-        """Run a step into the folder of its name; its figures, by column of the study's table.
+        """Run a step into the folder of its name; column → value of the table.
 
         Raises
         ------
@@ -57,15 +57,14 @@ class ItemSteps:
         return row
 
     def _calibrate(self, out: Path, options: Row) -> Row:
-        person = {"measured": dict(self._body.measured), "stature": self._body.stature, "sex": self._body.sex}
-        job = build_job(CalibrateJob, options | person | {"session": self._files.session, "out": out})
+        job = build_job(CalibrateJob, options | self._person | {"session": self._files.session, "out": out})
         outcome = run_calibrate(job, provenance=self._provenance)
         self._subject = out
         calibration = outcome.calibration
         row = {
             "quality": outcome.quality.quality,
             "gap_mm": _finite(1e3 * calibration.rms_gap),
-            "independent": calibration.independent,
+            "effective_sample_size": calibration.independent,
         }
         for name, value in calibration.subject.lengths.items():
             row |= {f"{name}_mm": 1e3 * value, f"{name}_std_mm": _finite(1e3 * calibration.subject.std(name))}
@@ -75,7 +74,7 @@ class ItemSteps:
         job = build_job(TrackJob, options | {"session": self._files.session, "out": out, "subject": self._subject})
         outcome = run_track(job, provenance=self._provenance)
         self._tracked, summary = outcome.tracked, outcome.summary
-        static = [of["static_share"] for of in summary.get("sensors", {}).values() if "static_share" in of]
+        static = [own["static_share"] for own in summary.get("sensors", {}).values() if "static_share" in own]
         return {
             "samples": summary["samples"],
             "rate_hz": summary["rate_hz"],
@@ -101,19 +100,18 @@ class ItemSteps:
         formats, diagnostics = options.pop("formats"), 0
         for format in formats:
             file = out / (f"placement{SUFFIXES[format]}" if format in SUFFIXES else f"motion.{format}")
-            without = {} if format == "mot" else {"names": None}
-            without |= {"rate_hz": None} if format in ("urdf", "placement") else {}
+            unused = {} if format == "mot" else {"names": None}
+            unused |= {"rate_hz": None} if format in ("urdf", "placement") else {}
             result = {"result": self._files.folder / "track", "out": file, "format": format}
-            written = run_export(build_job(ExportJob, options | without | result), provenance={})
+            written = run_export(build_job(ExportJob, options | unused | result), provenance={})
             diagnostics += len(written.diagnostics)
         return {"export_diagnostics": diagnostics}
 
     def _evaluate(self, out: Path, options: Row) -> Row:
-        recording = None if self._tracked is None else self._tracked.recording
-        stated = recording.truth if recording is not None else None
-        truth = self._files.truth or stated or self._files.session
+        tracked = self._tracked
+        truth = self._files.truth or (tracked.recording.truth if tracked is not None else None) or self._files.session
         job = build_job(EvaluateJob, options | {"result": self._files.folder / "track", "truth": truth})
-        errors = run_evaluate(job, pose=None if self._tracked is None else self._tracked.pose)
+        errors = run_evaluate(job, pose=None if tracked is None else tracked.pose)
         out.mkdir()
         text = json.dumps(as_json(asdict(errors)), indent=2)
         (out / "errors.json").write_text(text + "\n", encoding="utf-8")

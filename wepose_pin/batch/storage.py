@@ -1,4 +1,4 @@
-"""Local folders and, by fsspec, remote ones (``s3://``…): found, fetched, written whole."""
+"""Local folders and, by fsspec, remote ones (``s3://``…): searched, fetched, written whole."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 from ..errors import BadData, BadOption, ExistingOutput, MissingFile
 from ..writers.provenance import named_in
 
-DONE = "done.json"  # written last: a folder without it is not whole
+DONE_FILE = "done.json"  # written last: a folder without it is not complete
 
 
 def is_remote(url: str) -> bool:
@@ -32,7 +32,7 @@ def _filesystem(url: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        # Listings are not kept: a worker lives longer than what it has listed stays true.
+        # No cache of listings: a worker lives longer than they stay true.
         return fsspec.core.url_to_fs(url, use_listings_cache=False)
     except ImportError as error:
         raise BadOption(f"{url}: {error}; pip install 'wepose-pin[batch,s3]' brings fsspec and s3fs") from None
@@ -41,11 +41,8 @@ def _filesystem(url: str) -> tuple[Any, str]:
 
 
 @contextlib.contextmanager
-def _named(url: str) -> Iterator[None]:
-    """What goes wrong on the way to a remote place, as one line of ours.
-
-    Clients of such stores have errors of many kinds of their own; none of them is in what we compute.
-    """
+def _translate_errors(url: str) -> Iterator[None]:
+    """Errors of a remote store, which has many kinds of its own, as one line."""
     try:
         yield
     except (MissingFile, BadData, BadOption, ExistingOutput):
@@ -57,22 +54,22 @@ def _named(url: str) -> Iterator[None]:
         raise MissingFile(f"{url}: cannot be reached: {reason[:300]}") from error
 
 
-def find(pattern: str) -> list[str]:
-    """Files or folders that a path or glob names, sorted."""
+def find_urls(pattern: str) -> list[str]:
+    """Files or folders that match a path or glob, sorted."""
     if not is_remote(pattern):
         return sorted(glob.glob(pattern, recursive=True))
-    with _named(pattern):
+    with _translate_errors(pattern):
         system, path = _filesystem(pattern)
         return sorted(system.unstrip_protocol(found) for found in system.glob(path))
 
 
 def read_bytes(url: str) -> bytes | None:
-    """A file's contents; None where there is none."""
+    """Contents of a file; None where there is none."""
     if not is_remote(url):
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             return Path(url).read_bytes()
         return None
-    with _named(url):
+    with _translate_errors(url):
         system, path = _filesystem(url)
         with contextlib.suppress(FileNotFoundError):
             return bytes(system.cat_file(path))
@@ -80,9 +77,9 @@ def read_bytes(url: str) -> bytes | None:
 
 
 def write_bytes(url: str, content: bytes) -> None:
-    """A file, whole or not at all."""
+    """Write a file whole or not at all."""
     if is_remote(url):
-        with _named(url):
+        with _translate_errors(url):
             system, path = _filesystem(url)
             system.pipe_file(path, content)
         return
@@ -97,20 +94,20 @@ def write_bytes(url: str, content: bytes) -> None:
 
 
 def fetch(url: str, into: Path, truth: bool = False) -> Path:
-    """A session, subject, model or table as a local path: where it lies or, from elsewhere, `into` a folder.
+    """Local path of a session, subject, model or table; a remote one is copied `into` a folder.
 
-    With a session or model's table come the files that it names, which have to lie below its folder.
+    Files that a session or a model's table names are copied too; they have to lie below its folder.
 
     Raises
     ------
     MissingFile
         A file is not there, or cannot be reached.
     BadData
-        A file is named that lies outside.
+        It names a file outside its folder.
     """
     if not is_remote(url):
         return Path(url)
-    with _named(url):
+    with _translate_errors(url):
         system, path = _filesystem(url)
         if system.isdir(path):
             path = f"{path.rstrip('/')}/session.toml"
@@ -122,20 +119,20 @@ def fetch(url: str, into: Path, truth: bool = False) -> Path:
             raise BadData(f"{url}: names '{name}', outside its own folder; only files below it are fetched")
         target = into / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        with _named(f"{url}: {name}"):
+        with _translate_errors(f"{url}: {name}"):
             system.get(f"{top}/{name}", str(target), recursive=system.isdir(f"{top}/{name}"))
     return local
 
 
-def stamps(url: str, truth: bool = False) -> dict[str, list[Any]] | None:
-    """What tells without reading whether the files of an input were touched: sizes and times, or the store's tags.
+def read_stamps(url: str, truth: bool = False) -> dict[str, list[Any]] | None:
+    """Sizes and times, or the store's tags, of an input's files: equal stamps mean that nothing has changed.
 
-    None where something is missing, or more than its first file would have to be read to know.
+    None where a file is missing, or the store has no tags.
     """
     if is_remote(url):
         system, path = _filesystem(url)
         try:
-            with _named(url), tempfile.TemporaryDirectory() as folder:
+            with _translate_errors(url), tempfile.TemporaryDirectory() as folder:
                 if system.isdir(path):
                     path = f"{path.rstrip('/')}/session.toml"
                 local = Path(folder) / path.rpartition("/")[2]
@@ -148,23 +145,23 @@ def stamps(url: str, truth: bool = False) -> dict[str, list[Any]] | None:
             return None
     place = Path(url)
     place = place / "session.toml" if place.is_dir() else place
-    found = {}
+    stamps = {}
     try:
         for file in (place, *(place.parent / name for name in named_in(place, truth))):
             for each in sorted(path for path in file.rglob("*") if path.is_file()) if file.is_dir() else [file]:
-                about = each.stat()
-                found[str(each)] = [about.st_size, about.st_mtime_ns]
+                status = each.stat()
+                stamps[str(each)] = [status.st_size, status.st_mtime_ns]
     except OSError:
         return None
-    return found
+    return stamps
 
 
 @contextlib.contextmanager
-def new_folder(url: str) -> Iterator[Path]:
-    """A folder to write into, which becomes `url` as a whole when the block ends well, and vanishes when it does not.
+def create_folder(url: str) -> Iterator[Path]:
+    """A temporary folder that becomes `url` when the block succeeds, and vanishes otherwise.
 
-    `DONE` in it must be the last that is written. Locally the folder is renamed into place; elsewhere files are sent,
-    `DONE` last. What was there before goes.
+    `DONE_FILE` must be written last. A local folder is renamed into place; to a remote one files are copied, with
+    `DONE_FILE` last. What was there before is removed.
 
     Raises
     ------
@@ -181,16 +178,16 @@ def new_folder(url: str) -> Iterator[Path]:
     try:
         yield folder
         if is_remote(url):
-            _send(folder, url)
+            _upload(folder, url)
         else:
-            folder.chmod(0o777 & ~_umask())  # mkdtemp's is for its owner alone
-            _lasting(folder)
-            _swap(folder, place)
+            folder.chmod(0o777 & ~_get_umask())  # mkdtemp's is for its owner alone
+            _sync(folder)
+            _replace(folder, place)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _swap(folder: Path, place: Path) -> None:
+def _replace(folder: Path, place: Path) -> None:
     if place.exists():
         old = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
         try:
@@ -200,34 +197,34 @@ def _swap(folder: Path, place: Path) -> None:
     try:
         folder.rename(place)
     except OSError:
-        if not (place / DONE).is_file():  # else a worker that was given up was faster, with the same
+        if not (place / DONE_FILE).is_file():  # else another worker has finished the same item
             raise
 
 
-def _lasting(folder: Path) -> None:
-    """What is in a folder outlives a power cut, before the folder gets the name by which it counts as done."""
+def _sync(folder: Path) -> None:
+    """Write a folder to the disk, so that it outlives a power cut, before it gets its final name."""
     for path in (*folder.rglob("*"), folder):
-        about = os.open(path, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDONLY)
         try:
-            os.fsync(about)
+            os.fsync(descriptor)
         finally:
-            os.close(about)
+            os.close(descriptor)
 
 
-def _send(folder: Path, url: str) -> None:
-    with _named(url):
+def _upload(folder: Path, url: str) -> None:
+    with _translate_errors(url):
         system, path = _filesystem(url)
         if system.exists(path):
             with contextlib.suppress(FileNotFoundError):
-                system.rm_file(f"{path}/{DONE}")  # first: what follows is not whole
+                system.rm_file(f"{path}/{DONE_FILE}")  # first: the rest is then not complete
             system.rm(path, recursive=True)
         files = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-        for name in sorted(files, key=lambda name: name == DONE):
+        for name in sorted(files, key=lambda name: name == DONE_FILE):
             system.put_file(str(folder / name), f"{path}/{name}")
 
 
-def sweep(url: str, names: Sequence[str]) -> None:
-    """Remove what killed runs left of these folders."""
+def remove_leftovers(url: str, names: Sequence[str]) -> None:
+    """Remove temporary folders that killed runs left."""
     if is_remote(url) or not Path(url).is_dir():
         return
     prefixes = {f".{name}" for name in names}
@@ -237,8 +234,8 @@ def sweep(url: str, names: Sequence[str]) -> None:
 
 
 @contextlib.contextmanager
-def only_one(folder: str) -> Iterator[None]:
-    """Hold a local folder for this process; the system lets go of it however the process ends.
+def lock_folder(folder: str) -> Iterator[None]:
+    """Lock a local folder for this process; the system releases it however the process ends.
 
     Raises
     ------
@@ -258,7 +255,7 @@ def only_one(folder: str) -> Iterator[None]:
         yield
 
 
-def _umask() -> int:
+def _get_umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask

@@ -10,7 +10,7 @@ from .parser import Command
 
 
 def run(job: BatchJob) -> int:
-    """Work through the plan; say what is not done and why, and where the table lies."""
+    """Run the plan; print what is not done and why, and the place of the table."""
     from ..batch import run_batch
 
     try:
@@ -32,8 +32,8 @@ def run(job: BatchJob) -> int:
         for item, message in first.select("item", "message").iter_rows():
             say(f"  {item}: {message}")
     print_diagnostics(study.diagnostics)
-    kept = f", {study.kept} of them before" if study.kept else ""
-    say(f"{study.table.height - failed.height} of {study.table.height} items done{kept}")
+    reused = f", {study.reused} of them before" if study.reused else ""
+    say(f"{study.table.height - failed.height} of {study.table.height} items done{reused}")
     place = job.out.rstrip("/")
     say(f"Report to look at:  {place}/report.html")
     say(f"Table: {place}/results.parquet")

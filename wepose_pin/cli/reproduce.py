@@ -8,17 +8,17 @@ from .parser import Command
 
 
 def run(job: ReproduceJob) -> int:
-    """Make the result again; say what differs."""
+    """Make the result again; print what differs."""
     from ..batch import run_reproduce
 
     with progress_bar() as progress:
-        found = run_reproduce(job, progress)
-    print_diagnostics(found.diagnostics)
-    same = "different" if found.differences else "the same"
-    say(f"{job.result}: {same}, made again by wepose {found.command}" + ":" * bool(found.differences))
-    for line in found.differences:
+        outcome = run_reproduce(job, progress)
+    print_diagnostics(outcome.diagnostics)
+    result = "different" if outcome.differences else "the same"
+    say(f"{job.result}: {result}, made again by wepose {outcome.command}" + ":" * bool(outcome.differences))
+    for line in outcome.differences:
         say(f"  {line}")
-    return 3 if found.differences else 0
+    return 3 if outcome.differences else 0
 
 
 COMMAND = Command(

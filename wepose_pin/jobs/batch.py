@@ -1,4 +1,4 @@
-"""``wepose batch``: the options; what does the job is `batch.run_batch`, which builds the jobs of the other modules."""
+"""``wepose batch``: the options; `batch.run_batch` does the job."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ..errors import BadOption
 class BatchJob:
     """Work through many recordings by a plan, on all processors or on a Dask cluster.
 
-    Each item is made by itself: one that fails leaves its error in the table, the others go on. The same command goes
-    on where it was stopped and repeats nothing that is done. Sessions and DIR may lie on s3:// (docs/batch.md).
+    An item that fails leaves its error in the table, and the others continue. The same command continues a run that was
+    stopped and repeats nothing that is done. Sessions and DIR may lie on s3:// (docs/batch.md).
 
     Parameters
     ----------

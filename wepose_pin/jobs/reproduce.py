@@ -1,4 +1,4 @@
-"""``wepose reproduce``: the options; what does the job is `batch.run_reproduce`, which knows the items of a study."""
+"""``wepose reproduce``: the options; `batch.run_reproduce` does the job."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A result made again from its provenance, and compared with what it was."""
+"""`wepose reproduce`: make a result again from its provenance, and compare."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from ..jobs.track import TrackJob, run_track
 from ..readers.tables import read_table
 from ..writers.provenance import code, file_hash, machine, read_provenance
 from ..writers.result import versions
-from .compare import differences
-from .items import COMMAND, FAILED, item_of, make_into
-from .storage import DONE, fetch
+from .comparison import find_differences
+from .items import COMMAND, FAILED, read_item, run_steps
+from .storage import DONE_FILE, fetch
 from .study import ITEMS, RESULTS, STUDY
 
-# What is run because a provenance says so: commands that make a result and talk to nobody. It may be a stranger's.
+# Commands that a provenance, which may be a stranger's, can run: they make a result and use no network.
 REPRODUCIBLE: dict[str, tuple[type, Callable[[Any], Any]]] = {
     "track": (TrackJob, run_track),
     "calibrate": (CalibrateJob, run_calibrate),
@@ -38,26 +38,26 @@ REPRODUCIBLE: dict[str, tuple[type, Callable[[Any], Any]]] = {
     "demo": (DemoJob, run_demo),
     "export": (ExportJob, run_export),
 }
-_PAGES = ("report", "view")  # fields that ask for pages, which are not compared
+_PAGES = ("report", "view")  # options that write pages, which are not compared
 
 
 class Reproduction(NamedTuple):
-    """What came of making a result again."""
+    """Outcome of a reproduction."""
 
     command: str
-    differences: list[str]  # a line each; empty: the same
-    diagnostics: list[Diagnostic]  # what else is not as it was: code, packages, machine
+    differences: list[str]  # a line each; empty: the results are equal
+    diagnostics: list[Diagnostic]  # changes of code, packages and machine
 
 
 def run_reproduce(job: ReproduceJob, progress: Progress = no_progress) -> Reproduction:
-    """Make a result, or each item of a study, again in a place that is removed afterwards, and compare.
+    """Make a result, or each item of a study, again in a temporary folder, and compare.
 
     Raises
     ------
     MissingFile
         The result, or an input, is not there.
     BadData
-        It does not say what made it, or an input has changed; or the command now refuses.
+        Its provenance is missing or damaged, an input has changed, or the command now refuses.
     """
     if (job.result / STUDY).is_file():
         return _reproduce_study(job.result, progress)
@@ -66,32 +66,32 @@ def run_reproduce(job: ReproduceJob, progress: Progress = no_progress) -> Reprod
 
 
 def _reproduce(result: Path) -> Reproduction:
-    item = next((folder for folder in (result, *result.parents[:2]) if (folder / DONE).is_file()), None)
-    provenance = _item_provenance(item) if item is not None else read_provenance(result)
+    item = next((folder for folder in (result, *result.parents[:2]) if (folder / DONE_FILE).is_file()), None)
+    provenance = _read_item_provenance(item) if item is not None else read_provenance(result)
     command = str(provenance.get("command"))
     with tempfile.TemporaryDirectory(prefix="wepose-") as place:
         out = Path(place) / "made" / result.name
         out.parent.mkdir()
         if command == COMMAND:
             if item is None:
-                raise BadData(f"{result}: is of an item of wepose batch, whose {DONE} is missing; name its folder")
+                raise BadData(f"{result}: is of an item of wepose batch, whose {DONE_FILE} is missing; name its folder")
             _check_inputs(item, provenance, Path(place))
             out = Path(place) / "item"
             out.mkdir()
-            make_into(out, item_of(provenance))
+            run_steps(out, read_item(provenance))
             out /= result.relative_to(item)
         elif command in REPRODUCIBLE:
             _check_inputs(result, provenance, Path(place))
             kind, run = REPRODUCIBLE[command]
-            run(_job_of(result, kind, provenance, out))
+            run(_build_job(result, kind, provenance, out))
         else:
             raise BadData(f"{result}: made by '{command}', which cannot be made again one by one")
-        return Reproduction(command, differences(result, out), _changes(provenance))
+        return Reproduction(command, find_differences(result, out), _diagnose_changes(provenance))
 
 
-def _job_of(result: Path, kind: type, provenance: Mapping[str, Any], out: Path) -> Any:
-    """The job that made a result, to be done into `out`, without pages."""
-    inputs = {name: about["path"] for name, about in provenance["inputs"].items()}
+def _build_job(result: Path, kind: type, provenance: Mapping[str, Any], out: Path) -> Any:
+    """The job that made a result, with output `out` and without pages."""
+    inputs = {name: entry["path"] for name, entry in provenance["inputs"].items()}
     values = {**provenance["options"], **inputs, "out": out}
     values |= {name: False for name in _PAGES if name in field_types(kind)}
     try:
@@ -101,8 +101,8 @@ def _job_of(result: Path, kind: type, provenance: Mapping[str, Any], out: Path) 
 
 
 def _reproduce_study(study: Path, progress: Progress) -> Reproduction:
-    """All items of a study that were done, one by one; one that cannot be made again is a difference."""
-    names, failed = _done_items(study)
+    """All items of a study that were done; one that cannot be made again is a difference."""
+    names, failed = _list_done_items(study)
     lines, diagnostics = list[str](), list[Diagnostic]()
     for k, name in enumerate(names):
         progress(f"making {name} again", k / len(names))
@@ -117,8 +117,8 @@ def _reproduce_study(study: Path, progress: Progress) -> Reproduction:
     return Reproduction("batch", lines, diagnostics)
 
 
-def _done_items(study: Path) -> tuple[list[str], int]:
-    """Names of a study's items that are there, and how many are not."""
+def _list_done_items(study: Path) -> tuple[list[str], int]:
+    """Names of the items of a study that were done, and the number of the others."""
     try:
         table = read_table(study / RESULTS).select("item", "status")
     except (WeposeError, pl.exceptions.PolarsError):
@@ -127,21 +127,21 @@ def _done_items(study: Path) -> tuple[list[str], int]:
     return names, table.height - len(names)
 
 
-def _item_provenance(folder: Path) -> dict[str, Any]:
+def _read_item_provenance(folder: Path) -> dict[str, Any]:
     try:
-        provenance = json.loads((folder / DONE).read_text(encoding="utf-8"))["provenance"]
+        provenance = json.loads((folder / DONE_FILE).read_text(encoding="utf-8"))["provenance"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise BadData(f"{folder / DONE}: is damaged: {error}") from None
+        raise BadData(f"{folder / DONE_FILE}: is damaged: {error}") from None
     if not isinstance(provenance, dict) or not isinstance(provenance.get("inputs"), dict):
-        raise BadData(f"{folder / DONE}: provenance is damaged: a table with inputs is needed")
+        raise BadData(f"{folder / DONE_FILE}: provenance is damaged: a table with inputs is needed")
     return provenance
 
 
 def _check_inputs(result: Path, provenance: Mapping[str, Any], place: Path) -> None:
-    """Raise `WeposeError` where inputs are gone or not what they were."""
-    for name, about in provenance["inputs"].items():
+    """Raise `WeposeError` where inputs are gone or have changed."""
+    for name, entry in provenance["inputs"].items():
         try:
-            url, before = str(about["path"]), dict(about["files"])
+            url, before = str(entry["path"]), dict(entry["files"])
         except (KeyError, TypeError, ValueError):
             raise BadData(f"{result}: provenance is damaged: inputs.{name} needs path and files") from None
         truth = name == "session" and "evaluate" in provenance["options"].get("steps", ())
@@ -159,21 +159,22 @@ def _check_inputs(result: Path, provenance: Mapping[str, Any], place: Path) -> N
                 )
 
 
-def _changes(provenance: Mapping[str, Any]) -> list[Diagnostic]:
-    """What is not as it was: code, machine, packages."""
+def _diagnose_changes(provenance: Mapping[str, Any]) -> list[Diagnostic]:
+    """Changes of code, machine and packages."""
     now, found = code(), []
     if provenance.get("code") != now["code"]:
-        versions_of_code = {
+        codes = {
             "before": f"{provenance.get('version')} ({provenance.get('commit') or 'commit not known'})",
             "now": f"{now['version']} ({now['commit'] or 'commit not known'})",
         }
-        found.append(Diagnostic("reproduce-version-differs", WARNING, facts=versions_of_code))
+        found.append(Diagnostic("reproduce-version-differs", WARNING, facts=codes))
     if provenance.get("machine") not in (None, machine()):
         machines = {"before": str(provenance["machine"]), "now": machine()}
         found.append(Diagnostic("reproduce-machine-differs", INFO, facts=machines))
     packages = provenance.get("packages")
-    changed = {name: of for name, of in versions().items() if isinstance(packages, dict) and packages.get(name) != of}
+    packages = packages if isinstance(packages, dict) else versions()
+    changed = [f"{name} {version}" for name, version in versions().items() if packages.get(name) != version]
     if changed:
-        installed = {"packages": ", ".join(f"{name} {of}" for name, of in changed.items())}
+        installed = {"packages": ", ".join(changed)}
         found.append(Diagnostic("reproduce-packages-differ", WARNING, facts=installed))
     return found
