@@ -6,12 +6,12 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..assets import asset
-from ..documents import is_number, read_toml
+from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadModel, MissingFile, one_of
 
 ROBOTS = ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1")
@@ -19,7 +19,7 @@ SIDES = ("left", "right")
 AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
 _KEYS = ("format", "urdf", "srdf", "description", "up", "forward", "base", "rest", "limits", "arms")
-_ARM_KEYS = ("joints", "shoulder", "elbow", "hand", "reach")
+MAX_VALUE = 1e6  # of a number in a map
 RISE_S = 0.02  # [s] to the full acceleration, from which the jerk limit follows where the map has none
 
 
@@ -116,39 +116,34 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     MissingFile, BadModel
         As `find_map`.
     """
-    table = read_toml(path, "a robot's map (docs/retargeting.md)", BadModel)
-    where = path.name
-    _check_keys(table, _KEYS, where)
-    if table.get("format") != 1:
-        raise BadModel(f"{where}: format = {table.get('format')!r}; this version reads format = 1")
-    up, forward = _read_axis(table, "up", where), _read_axis(table, "forward", where)
-    _check_perpendicular(up, forward, f"{where}: up, forward")
-    arms = _read_table(table, "arms", where)
-    if not arms:
-        raise BadModel(f"{where}: no arms; at least one of [arms.left] and [arms.right] is needed")
-    for side in arms:
-        if side not in SIDES:
-            raise BadModel(f"{where}: arms.{side} is no side; {one_of(SIDES, side)}")
-    sides = {side: _read_arm(arms[side], f"{where}: arms.{side}") for side in SIDES if side in arms}
-    limits = _read_table(table, "limits", where)
-    _check_keys(limits, ("acceleration", "jerk", "source"), f"{where}: limits")
-    joints = [name for arm in sides.values() for name in arm.joints]
-    acceleration = _read_joint_values(limits, "acceleration", joints, f"{where}: limits")
+    top = TomlTable(read_toml(path, "a robot's map (docs/retargeting.md)", BadModel), path.name, error=BadModel)
+    top.allow(*_KEYS)
+    if top.values.get("format") != 1:
+        raise BadModel(f"{top.at('format')} = {top.values.get('format')!r}; this version reads format = 1")
+    up, forward = _read_axes(top, "up", "forward")
+    tables = top.table("arms").tables(SIDES, "side")
+    if not tables:
+        raise BadModel(f"{top.at('arms')}: at least one of [arms.left] and [arms.right] is needed")
+    arms = {side: _read_arm(tables[side]) for side in SIDES if side in tables}
+    limits = top.table("limits", {})
+    limits.allow("acceleration", "jerk", "source")
+    joints = [name for arm in arms.values() for name in arm.joints]
+    acceleration = _read_joint_values(limits, "acceleration", joints)
     jerk = {name: limit / RISE_S for name, limit in acceleration.items()}
-    jerk |= _read_joint_values(limits, "jerk", joints, f"{where}: limits")
+    rest = top.table("rest", {})
     return RobotMap(
         name=path.stem,
-        where=where,
-        urdf=urdf or _find_file(path, table.get("urdf"), "urdf"),
-        srdf=_find_file(path, table["srdf"], "srdf") if "srdf" in table else None,
-        base=str(table.get("base", "")),
+        where=path.name,
+        urdf=urdf or _find_file(path, top, "urdf"),
+        srdf=_find_file(path, top, "srdf") if "srdf" in top else None,
+        base=top.text("base", None) or "",
         up=up,
         forward=forward,
-        rest=_read_numbers(_read_table(table, "rest", where), f"{where}: rest"),
+        rest=dict(zip(rest.values, rest.numbers(*rest.values), strict=True)),
         acceleration=acceleration,
-        jerk=jerk,
-        arms=sides,
-        description=" ".join(str(text) for text in (table.get("description", ""), limits.get("source", "")) if text),
+        jerk=jerk | _read_joint_values(limits, "jerk", joints),
+        arms=arms,
+        description=" ".join(filter(None, (top.text("description", None), limits.text("source", None)))),
     )
 
 
@@ -168,102 +163,67 @@ def find_example_data() -> Path | None:
     return None
 
 
-def _find_file(path: Path, name: Any, key: str) -> Path:
-    if not isinstance(name, str):
-        raise BadModel(f"{path.name}: {key} = {name!r}; the path of a file is needed")
-    file = path.parent / name
-    if file.is_file():
-        return file
+def _find_file(path: Path, top: TomlTable, key: str) -> Path:
+    """The file that a map names: beside the map, or in example-robot-data."""
+    name = top.text(key, None)
+    if name is None:
+        raise BadModel(f"{top.at(key)} is missing; the path of a file is needed")
     data = find_example_data()
-    if data is not None and (data / name).is_file():
-        return data / name
+    for folder in (path.parent, data):
+        if folder is not None and (folder / name).is_file():
+            return folder / name
     if data is None and "/" in name:
         raise MissingFile(
-            f"{path.name}: {key} = '{name}' is in example-robot-data, which is not installed; "
+            f"{top.at(key)} = '{name}' is in example-robot-data, which is not installed; "
             "pip install --no-deps example-robot-data"
         )
-    raise MissingFile(f"{path.name}: {key} = '{name}': no such file beside the map or in example-robot-data")
+    raise MissingFile(f"{top.at(key)} = '{name}': no such file beside the map or in example-robot-data")
 
 
-def _read_arm(table: Any, where: str) -> ArmMap:
-    if not isinstance(table, dict):
-        raise BadModel(f"{where} = {table!r} is not a table")
-    _check_keys(table, _ARM_KEYS, where)
-    joints = table.get("joints")
+def _read_arm(table: TomlTable) -> ArmMap:
+    table.allow("joints", "shoulder", "elbow", "hand", "reach")
+    joints = table.values.get("joints")
     if not isinstance(joints, list) or not joints or not all(isinstance(name, str) for name in joints):
-        raise BadModel(f"{where}.joints = {joints!r}; a list of joints from the shoulder to the hand is needed")
-    hand = table.get("hand")
-    if not isinstance(hand, dict):
-        raise BadModel(f"{where}.hand = {hand!r}; {{ link, offset, fingers, thumb }} is needed")
-    fingers, thumb = _read_axis(hand, "fingers", f"{where}.hand"), _read_axis(hand, "thumb", f"{where}.hand")
-    _check_perpendicular(fingers, thumb, f"{where}.hand: fingers, thumb")
-    reach = table.get("reach")
-    if reach is not None and not (_is_number(reach) and reach > 0.0):
-        raise BadModel(f"{where}.reach = {reach!r}; metres above 0 are needed")
+        raise BadModel(f"{table.at('joints')} = {joints!r}; a list of joints from the shoulder to the hand is needed")
+    fingers, thumb = _read_axes(table.table("hand"), "fingers", "thumb")
     return ArmMap(
         joints=tuple(joints),
-        shoulder=_read_point(table.get("shoulder"), f"{where}.shoulder"),
-        elbow=_read_point(table["elbow"], f"{where}.elbow") if "elbow" in table else None,
-        hand=_read_point({key: hand[key] for key in ("link", "offset") if key in hand}, f"{where}.hand"),
+        shoulder=_read_point(table.table("shoulder")),
+        elbow=_read_point(table.table("elbow")) if "elbow" in table else None,
+        hand=_read_point(table.table("hand"), "fingers", "thumb"),
         fingers=fingers,
         thumb=thumb,
-        reach=None if reach is None else float(reach),
+        reach=table.number("reach", None, positive=True),
     )
 
 
-def _read_point(value: Any, where: str) -> LinkPoint:
-    if not isinstance(value, dict) or not isinstance(value.get("link"), str):
-        raise BadModel(
-            f'{where} = {value!r}; {{ link = "…" }} is needed, and offset = [x, y, z] in metres where it is not 0'
-        )
-    _check_keys(value, ("link", "offset"), where)
-    offset = value.get("offset", [0.0, 0.0, 0.0])
-    if not isinstance(offset, list) or len(offset) != 3 or not all(_is_number(v) for v in offset):
-        raise BadModel(f"{where}.offset = {offset!r}; three numbers in metres are needed")
-    return LinkPoint(value["link"], (float(offset[0]), float(offset[1]), float(offset[2])))
+def _read_point(table: TomlTable, *more: str) -> LinkPoint:
+    """A point; `more` are other keys of its table."""
+    table.allow("link", "offset", *more)
+    link, offset = table.text("link", None), table.values.get("offset", [0.0, 0.0, 0.0])
+    if link is None:
+        raise BadModel(f"{table.at('link')} is missing; the name of a link is needed")
+    if not isinstance(offset, list) or len(offset) != 3 or not all(is_number(value, MAX_VALUE) for value in offset):
+        raise BadModel(f"{table.at('offset')} = {offset!r}; three numbers in metres are needed")
+    return LinkPoint(link, (float(offset[0]), float(offset[1]), float(offset[2])))
 
 
-def _read_axis(table: Mapping[str, Any], key: str, where: str) -> str:
-    value = table.get(key)
-    if not isinstance(value, str) or value not in AXES:
-        raise BadModel(f"{where}.{key} = {value!r}; {one_of(AXES)}" if value else f"{where}: no {key}; {one_of(AXES)}")
-    return str(value)
-
-
-def _check_perpendicular(a: str, b: str, where: str) -> None:
+def _read_axes(table: TomlTable, first: str, second: str) -> tuple[str, str]:
+    """Two axes at right angles."""
+    a, b = table.choice(first, AXES), table.choice(second, AXES)
     if a[1] == b[1]:
-        raise BadModel(f"{where}: {a} and {b} lie on one line; two axes at right angles are needed")
+        raise BadModel(f"{table.at(first)}, {second}: {a} and {b} lie on one line; axes at right angles are needed")
+    return a, b
 
 
-def _read_table(table: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
-    value = table.get(key, {})
-    if not isinstance(value, dict):
-        raise BadModel(f"{where}: {key} = {value!r} is not a table")
-    return value
-
-
-def _read_numbers(table: Mapping[str, Any], where: str) -> dict[str, float]:
-    for name, value in table.items():
-        if not _is_number(value):
-            raise BadModel(f"{where}.{name} = {value!r}; a number is needed")
-    return {name: float(value) for name, value in table.items()}
-
-
-def _read_joint_values(table: Mapping[str, Any], key: str, joints: list[str], where: str) -> dict[str, float]:
+def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[str, float]:
     """One number for all joints, or a table with a number for each."""
-    value = table.get(key, {})
-    if _is_number(value):
+    value = limits.values.get(key, {})
+    if is_number(value, MAX_VALUE):
         return dict.fromkeys(joints, float(value))
-    if not isinstance(value, dict):
-        raise BadModel(f"{where}.{key} = {value!r}; a number for all joints, or a table with one for each, is needed")
-    return _read_numbers(value, f"{where}.{key}")
-
-
-def _is_number(value: Any) -> bool:
-    return is_number(value, 1e6)
-
-
-def _check_keys(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
-    for key in table:
-        if key not in keys:
-            raise BadModel(f"{where}: '{key}' is not a key; {one_of(keys, key)}")
+    if not isinstance(value, Mapping):
+        raise BadModel(
+            f"{limits.at(key)} = {value!r}; a number for all joints, or a table with one for each, is needed"
+        )
+    table = limits.table(key, {})
+    return dict(zip(table.values, table.numbers(*table.values), strict=True))

@@ -163,9 +163,7 @@ def retarget(
     factor, slowest = _compute_slowdown(path, robot, dt, motion, approach)
     if strict and slowest is not None and slowest.factor > STRICT_FACTOR:
         raise _too_fast(
-            robot,
-            slowest.time,
-            f"{slowest.joint} would need {slowest.factor:.1f} times its {slowest.quantity} limit",
+            robot, slowest.time, f"{slowest.joint} would need {slowest.factor:.1f} times its {slowest.quantity} limit"
         )
     posture_at = CubicSpline(np.arange(n) * dt, path)
     contact_times: tuple[float, ...] = ()
