@@ -286,10 +286,10 @@ def _read_sessions(place: str, keys: TomlTable, path: Path, lengths: Sequence[st
         raise BadPlan(f'{keys.at("files")} = {patterns!r} is not a list of globs, such as ["data/*/session.toml"]')
     urls: dict[str, None] = {}
     for pattern in patterns:
-        found = find_urls(str(_resolve(pattern, path)))
-        if not found:
+        matches = find_urls(str(_resolve(pattern, path)))
+        if not matches:
             raise BadPlan(f"{keys.at('files')}: '{pattern}' finds nothing; it is a path or glob from the plan's folder")
-        urls |= dict.fromkeys(found)
+        urls |= dict.fromkeys(matches)
     return [_Entry(url, f"{path}: {place}: {url}", subject=subject) for url in urls]
 
 

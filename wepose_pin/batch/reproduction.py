@@ -161,20 +161,20 @@ def _check_inputs(result: Path, provenance: Mapping[str, Any], place: Path) -> N
 
 def _diagnose_changes(provenance: Mapping[str, Any]) -> list[Diagnostic]:
     """Changes of code, machine and packages."""
-    now, found = code(), []
+    now, diagnostics = code(), []
     if provenance.get("code") != now["code"]:
         codes = {
             "before": f"{provenance.get('version')} ({provenance.get('commit') or 'commit not known'})",
             "now": f"{now['version']} ({now['commit'] or 'commit not known'})",
         }
-        found.append(Diagnostic("reproduce-version-differs", WARNING, facts=codes))
+        diagnostics.append(Diagnostic("reproduce-version-differs", WARNING, facts=codes))
     if provenance.get("machine") not in (None, machine()):
         machines = {"before": str(provenance["machine"]), "now": machine()}
-        found.append(Diagnostic("reproduce-machine-differs", INFO, facts=machines))
+        diagnostics.append(Diagnostic("reproduce-machine-differs", INFO, facts=machines))
     packages = provenance.get("packages")
     packages = packages if isinstance(packages, dict) else versions()
     changed = [f"{name} {version}" for name, version in versions().items() if packages.get(name) != version]
     if changed:
         installed = {"packages": ", ".join(changed)}
-        found.append(Diagnostic("reproduce-packages-differ", WARNING, facts=installed))
-    return found
+        diagnostics.append(Diagnostic("reproduce-packages-differ", WARNING, facts=installed))
+    return diagnostics

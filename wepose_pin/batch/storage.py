@@ -60,7 +60,7 @@ def find_urls(pattern: str) -> list[str]:
         return sorted(glob.glob(pattern, recursive=True))
     with _translate_errors(pattern):
         system, path = _filesystem(pattern)
-        return sorted(system.unstrip_protocol(found) for found in system.glob(path))
+        return sorted(system.unstrip_protocol(match) for match in system.glob(path))
 
 
 def read_bytes(url: str) -> bytes | None:

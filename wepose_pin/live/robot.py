@@ -50,12 +50,12 @@ class RobotSummary(NamedTuple):
     @property
     def diagnostics(self) -> list[Diagnostic]:
         """Commands that did not reach the robot, and steps in which it could not move."""
-        found = [
+        diagnostics = [
             Diagnostic("robot-commands-skipped", WARNING, self.robot, self.skipped),
             Diagnostic("robot-blocked", WARNING, self.robot, self.infeasible),
             Diagnostic("robot-commands-dropped", WARNING, self.robot, self.dropped),
         ]
-        return [diagnostic for diagnostic in found if diagnostic.value]
+        return [diagnostic for diagnostic in diagnostics if diagnostic.value]
 
 
 class RobotOutput(Output):

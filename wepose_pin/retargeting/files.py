@@ -165,7 +165,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
             "infeasible_share": round(counts.infeasible / steps, 4),
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
-        "diagnostics": [as_json(found) for found in diagnose_trajectory(trajectory, limits, collisions, slowdown)],
+        "diagnostics": [as_json(diagnostic) for diagnostic in diagnose_trajectory(trajectory, limits, collisions, slowdown)],
     }
 
 
@@ -200,25 +200,25 @@ def diagnose_trajectory(
 ) -> list[Diagnostic]:
     """Diagnostics of a trajectory; `slowdown`: its duration over that of the recording."""
     name = trajectory.robot.map.name
-    found = []
+    diagnostics = []
     for quantity in ("position", "velocity", "acceleration", "jerk"):
         margin = getattr(limits, quantity)
         if margin < 0.0:
             facts = {"quantity": quantity} | ({"variant": "position"} if quantity == "position" else {})
-            found.append(Diagnostic("robot-limits-exceeded", ERROR, name, -margin, 0.0, facts))
+            diagnostics.append(Diagnostic("robot-limits-exceeded", ERROR, name, -margin, 0.0, facts))
     if not (limits.consistent and limits.ends_at_rest):
-        found.append(Diagnostic("robot-limits-exceeded", ERROR, name, facts={"variant": "curve"}))
+        diagnostics.append(Diagnostic("robot-limits-exceeded", ERROR, name, facts={"variant": "curve"}))
     if collisions.samples:
         first = {"first": collisions.first}
-        found.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
+        diagnostics.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
     slowest = trajectory.slowest
     if slowest is not None and slowdown is not None:
         moment: dict[str, float | str] = {"joint": slowest.joint, "moment": slowest.time, "quantity": slowest.quantity}
-        found.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=moment))
+        diagnostics.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=moment))
     if trajectory.contact_times:
         moments = ", ".join(map(format_time, trajectory.contact_times[:MAX_MOMENTS]))
-        found.append(Diagnostic("trajectory-slowed-for-contact", INFO, name, facts={"moments": f"{moments} s"}))
-    return found
+        diagnostics.append(Diagnostic("trajectory-slowed-for-contact", INFO, name, facts={"moments": f"{moments} s"}))
+    return diagnostics
 
 
 def _summarize_reachability(far: np.ndarray, reached: np.ndarray) -> dict[str, Any]:

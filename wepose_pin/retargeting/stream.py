@@ -387,7 +387,7 @@ class CommandStream:
         """Continue after a stop as soon as a pose comes, by an approach; approach anew where the robot follows."""
         if self._stop_reason:
             self._stop_reason, self._observed = "", []
-        self._restart_approach("set anew")
+        self._restart_approach("reset")
 
     def _restart_approach(self, reason: str) -> None:
         self._references, self._approach_reason = None, reason

@@ -160,9 +160,9 @@ class LslSource:
             reach = f"on this {scope}" if scope in SCOPES else "where LSLAPICFG looks"
             if twice:
                 raise BadSource(f"lsl:{self._name}: {min(twice)} is in two streams; stop one of them")
-            found = f"{', '.join(missing)} is in none of the streams {reach}" if present else f"no such stream {reach}"
+            problem = f"{', '.join(missing)} is in none of the streams {reach}" if present else f"no such stream {reach}"
             raise BadSource(
-                f"lsl:{self._name}: {found}, within {self._wait_s:g} s; name streams {self._name}-<segment>, or look "
+                f"lsl:{self._name}: {problem}, within {self._wait_s:g} s; name streams {self._name}-<segment>, or look "
                 f"further with lsl:{self._name}@site"
             )
         self.sensors = self.sensors or tuple(segment for segment in SEGMENTS if segment in present)
@@ -223,8 +223,8 @@ class LslSource:
         """Name → description of the streams that answer in this time; of two with one name the newer."""
         name = self._name
         query = f"name='{name}' or starts-with(name,'{name}-') or starts-with(name,'{name}_')"
-        found = self._lsl.resolve_bypred(query, minimum=MAX_STREAMS, timeout=timeout_s)
-        return {info.name(): info for info in sorted(found, key=lambda info: info.created_at())}
+        streams = self._lsl.resolve_bypred(query, minimum=MAX_STREAMS, timeout=timeout_s)
+        return {info.name(): info for info in sorted(streams, key=lambda info: info.created_at())}
 
     def _subscribe(self, stream: str, info: Any) -> _Stream:
         lsl = self._lsl
