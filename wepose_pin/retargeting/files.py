@@ -165,7 +165,9 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
             "infeasible_share": round(counts.infeasible / steps, 4),
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
-        "diagnostics": [as_json(diagnostic) for diagnostic in diagnose_trajectory(trajectory, limits, collisions, slowdown)],
+        "diagnostics": [
+            as_json(diagnostic) for diagnostic in diagnose_trajectory(trajectory, limits, collisions, slowdown)
+        ],
     }
 
 

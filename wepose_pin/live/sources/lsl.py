@@ -160,7 +160,9 @@ class LslSource:
             reach = f"on this {scope}" if scope in SCOPES else "where LSLAPICFG looks"
             if twice:
                 raise BadSource(f"lsl:{self._name}: {min(twice)} is in two streams; stop one of them")
-            problem = f"{', '.join(missing)} is in none of the streams {reach}" if present else f"no such stream {reach}"
+            problem = (
+                f"{', '.join(missing)} is in none of the streams {reach}" if present else f"no such stream {reach}"
+            )
             raise BadSource(
                 f"lsl:{self._name}: {problem}, within {self._wait_s:g} s; name streams {self._name}-<segment>, or look "
                 f"further with lsl:{self._name}@site"
