@@ -136,14 +136,14 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         where=path.name,
         urdf=urdf or _find_file(path, top, "urdf"),
         srdf=_find_file(path, top, "srdf") if "srdf" in top else None,
-        base=top.text("base", None) or "",
+        base=_read_text(top, "base"),
         up=up,
         forward=forward,
         rest=dict(zip(rest.values, rest.numbers(*rest.values), strict=True)),
         acceleration=acceleration,
         jerk=jerk | _read_joint_values(limits, "jerk", joints),
         arms=arms,
-        description=" ".join(filter(None, (top.text("description", None), limits.text("source", None)))),
+        description=" ".join(filter(None, (_read_text(top, "description"), _read_text(limits, "source")))),
     )
 
 
@@ -178,6 +178,11 @@ def _find_file(path: Path, top: TomlTable, key: str) -> Path:
             "pip install --no-deps example-robot-data"
         )
     raise MissingFile(f"{top.at(key)} = '{name}': no such file beside the map or in example-robot-data")
+
+
+def _read_text(table: TomlTable, key: str) -> str:
+    """A text, which may be empty or missing."""
+    return (table.text(key, None) or "") if table.values.get(key) else ""
 
 
 def _read_arm(table: TomlTable) -> ArmMap:
