@@ -32,7 +32,7 @@ class LiveJob:
         Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
         Without it lengths are those of the population prior, and mounts those that --session states.
     session : SESSION
-        Take the sensors' mounts from this session file; what it says of data is not read.
+        Take the mounts of the sensors from this session file; its data are not read.
     record : FILE
         Write all that is received and the poses to this file; `wepose track FILE` gives the same poses again.
     method
@@ -40,7 +40,7 @@ class LiveJob:
     model : URDF|TOML
         Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md).
     speed : FACTOR
-        Replay at this speed: 1 its own, 4 four times that, max as fast as it is read.
+        Replay at this speed: 1 its own, 4 four times that, max as fast as possible.
     page
         Serve the page that shows the pose, to this machine only.
     open

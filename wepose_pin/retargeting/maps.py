@@ -130,7 +130,6 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     joints = [name for arm in arms.values() for name in arm.joints]
     acceleration = _read_joint_values(limits, "acceleration", joints)
     jerk = {name: limit / RISE_S for name, limit in acceleration.items()}
-    rest = top.table("rest", {})
     return RobotMap(
         name=path.stem,
         where=path.name,
@@ -139,7 +138,7 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         base=_read_text(top, "base"),
         up=up,
         forward=forward,
-        rest=dict(zip(rest.values, rest.numbers(*rest.values), strict=True)),
+        rest=_read_numbers(top.table("rest", {})),
         acceleration=acceleration,
         jerk=jerk | _read_joint_values(limits, "jerk", joints),
         arms=arms,
@@ -230,5 +229,12 @@ def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[s
         raise BadModel(
             f"{limits.at(key)} = {value!r}; a number for all joints, or a table with one for each, is needed"
         )
-    table = limits.table(key, {})
-    return dict(zip(table.values, table.numbers(*table.values), strict=True))
+    return _read_numbers(limits.table(key, {}))
+
+
+def _read_numbers(table: TomlTable) -> dict[str, float]:
+    """Name → number of a table whose keys are names of joints."""
+    for name, value in table.values.items():
+        if not is_number(value, MAX_VALUE):
+            raise BadModel(f"{table.at(name)} = {value!r}; a number is needed")
+    return {name: float(value) for name, value in table.values.items()}
