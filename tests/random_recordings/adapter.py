@@ -41,7 +41,7 @@ HAND_POINTS = {"left_palm": "left_hand", "right_palm": "right_hand"}  # our poin
 # case has them.
 CAUSES = {
     "range": {"signal-saturated"},
-    "fault": {"sensor-frozen", "orientation-constant", "long-gaps-bridged"},
+    "fault": {"sensor-frozen", "sensor-repeats", "orientation-constant", "long-gaps-bridged"},
     "identical": {"orientations-copied"},
     "swapped": {"sensors-exchanged"},
     "gap": {"long-gaps-bridged"},

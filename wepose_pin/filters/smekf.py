@@ -26,6 +26,7 @@ from .noise import SWAY_CORRELATION_S, SensorNoise
 from .start import ACCEL_BIAS_STD
 from .static import static_step
 
+GYRO_SCALE_STD = 0.002  # of a calibrated MEMS gyroscope, as in `amekf.AmekfParams.gyro_matrix_std`
 HEADING_FLOOR = 1e-5  # [rad] keeps P₀ positive definite about the vertical
 
 
@@ -50,6 +51,7 @@ class SmekfParams:
     static_accel_cov: np.ndarray | None = None  # (3, 3) of static accel/g about the vertical; None: Σ_g
     static_turn_noise: float = 0.0  # [rad/√s] by which a static sensor may turn about the vertical unseen; the paper: 0
     first_order: bool = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
+    gyro_scale_std: float = 0.0  # of the gyroscope's scale, which no rest shows; the paper: 0
     gyro_range: float = np.inf  # [rad/s]; a sample at it is cut off: turned by it, but what is beyond went unseen
 
 
@@ -72,6 +74,7 @@ def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, til
         static_gyro_cov=noise.gyro_cov + noise.sway_density(rate_hz) * rate_hz * np.eye(3),
         static_accel_cov=noise.accel_cov + ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz * np.eye(3),
         static_turn_noise=STATIC_TURN_NOISE,
+        gyro_scale_std=GYRO_SCALE_STD,
     )
 
 
@@ -85,7 +88,9 @@ STATE = np.dtype(
     [
         ("quat_WS", float, 4),  # xyzw
         ("gyro_bias", float, 3),  # [rad/s]
-        ("attitude_cov", float, 6),  # [rad²] upper triangle of P_aa
+        ("attitude_cov", float, 6),  # [rad²] upper triangle: P_aa, and what the gyroscope's scale adds to the heading
+        ("turned", float),  # [rad] about the vertical, less what was turned back
+        ("P_aa", float, 6),  # [rad²] upper triangle
         ("P_ab", float, (3, 3)),
         ("P_bb", float, 6),  # [rad²/s²] upper triangle
         ("held_rate", float, 3),  # [rad/s] the last that was measured
@@ -104,6 +109,7 @@ MODEL = np.dtype(
         ("fade", float),  # what a sample leaves of a held rate
         ("first_order", np.bool_),
         ("static_turn", float),  # [rad²] variance of an unseen turn in a static sample
+        ("scale_var", float),  # of the gyroscope's scale
         ("gyro_range", float),  # [rad/s]
     ],
     align=True,
@@ -123,7 +129,7 @@ class SmekfState:
     def P(self) -> np.ndarray:
         """Covariance (6, 6) of [a; b]; a copy."""
         record = self.record[0]
-        aa, bb = symmetric(record["attitude_cov"]), symmetric(record["P_bb"])
+        aa, bb = symmetric(record["P_aa"]), symmetric(record["P_bb"])
         return np.block([[aa, record["P_ab"]], [record["P_ab"].T, bb]])
 
 
@@ -143,7 +149,7 @@ class Smekf:
         self.model = _model(noise, 1.0 / rate_hz, self.params)
         record = np.zeros(1, STATE)
         record["quat_WS"], record["gyro_bias"] = quat_WS, noise.gyro_bias
-        record["attitude_cov"] = _matrix(self.params.attitude_cov0)[_UPPER]
+        record["P_aa"] = record["attitude_cov"] = _matrix(self.params.attitude_cov0)[_UPPER]
         record["P_bb"] = _matrix(self.params.bias_cov0)[_UPPER]
         self.state = SmekfState(record)
         self._one = OneSample()
@@ -189,6 +195,7 @@ def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
     model["static_accel_cov"] = chosen(params.static_accel_cov, noise.accel_cov)
     model["fade"], model["first_order"] = np.exp(-dt / HOLD_S), params.first_order
     model["static_turn"], model["gyro_range"] = params.static_turn_noise**2 * dt, params.gyro_range
+    model["scale_var"] = params.gyro_scale_std**2
     return model
 
 
@@ -214,6 +221,26 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
     predict(state, model, wx * dt, wy * dt, wz * dt, unseen_cov)
     if static and seen and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
         correct(state, model, gx, gy, gz, ax, ay, az)
+    state_covariance(state, model, wx * dt, wy * dt, wz * dt)
+
+
+@inlined
+def state_covariance(state, model, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """The attitude's stated covariance after the rotation w [rad]: P_aa and the error of the gyroscope's scale.
+
+    A scale that is wrong by s turns the heading by s times the rotation about the vertical, and tilts, which static
+    phases correct, by as much. It is no part of the state: the paper's corrections are as they were.
+    """
+    ux, uy, uz = up_in_sensor(state.quat_WS)
+    state.turned += wx * ux + wy * uy + wz * uz
+    heading_var = model.scale_var * state.turned * state.turned
+    cov, P_aa = state.attitude_cov, state.P_aa
+    cov[0] = P_aa[0] + heading_var * ux * ux
+    cov[1] = P_aa[1] + heading_var * ux * uy
+    cov[2] = P_aa[2] + heading_var * ux * uz
+    cov[3] = P_aa[3] + heading_var * uy * uy
+    cov[4] = P_aa[4] + heading_var * uy * uz
+    cov[5] = P_aa[5] + heading_var * uz * uz
 
 
 @inlined
@@ -224,7 +251,7 @@ def predict(state, model, wx, wy, wz, unseen_cov):  # type: ignore[no-untyped-de
     """
     rotate_by_vector(state.quat_WS, wx, wy, wz)
     propagate(state, wx, wy, wz, model.dt, model.first_order)
-    P_aa, P_bb = state.attitude_cov, state.P_bb
+    P_aa, P_bb = state.P_aa, state.P_bb
     for i in range(6):
         diagonal = i == 0 or i == 3 or i == 5
         P_aa[i] += model.attitude_step[i] + unseen_cov if diagonal else model.attitude_step[i]
@@ -302,10 +329,10 @@ def transition(wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
 def propagate(state, wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
     """P ← F P Fᵀ over the turn w [rad] in δt [s], block by block."""
     A, B = transition(wx, wy, wz, dt, first_order)
-    P_aa, P_ab, P_bb = full(state.attitude_cov), nine(state.P_ab), full(state.P_bb)
+    P_aa, P_ab, P_bb = full(state.P_aa), nine(state.P_ab), full(state.P_bb)
     new_ab = products(A, P_ab, B, P_bb)
     new_aa = products(products(A, P_aa, B, transposed(P_ab)), transposed(A), new_ab, transposed(B))
-    upper, ab = state.attitude_cov, state.P_ab
+    upper, ab = state.P_aa, state.P_ab
     upper[0], upper[1], upper[2], upper[3], upper[4], upper[5] = (
         new_aa[0], new_aa[1], new_aa[2], new_aa[4], new_aa[5], new_aa[8],
     )  # fmt: skip
@@ -323,7 +350,7 @@ def correct(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-de
     The noises of the two are independent, so gyro is taken first and accel after it, which is the same correction with
     two S of (3, 3) in place of one of (6, 6).
     """
-    bias, P_aa, P_bb = state.gyro_bias, state.attitude_cov, state.P_bb
+    bias, P_aa, P_bb = state.gyro_bias, state.P_aa, state.P_bb
     ux, uy, uz = up_in_sensor(state.quat_WS)
     # gyro: H P = [P_ba, P_bb], S = P_bb + Σ_ω
     R = model.static_gyro_cov
@@ -402,7 +429,7 @@ def fuse(state, rows, S, innovation):  # type: ignore[no-untyped-def]
     a = rows[0]
     b = difference(1.0, rows[1], l10, a)
     c = difference(1.0, difference(1.0, rows[2], l20, a), l21, b)
-    P_aa, P_ab, P_bb = state.attitude_cov, state.P_ab, state.P_bb
+    P_aa, P_ab, P_bb = state.P_aa, state.P_ab, state.P_bb
 
     p, q, r = i0 * a[0], i1 * b[0], i2 * c[0]
     P_aa[0] -= p * a[0] + q * b[0] + r * c[0]

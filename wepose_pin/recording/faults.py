@@ -58,6 +58,9 @@ ENOUGH_NOISE_S = 30.0  # [s] of it that are looked at
 UP_S, UP_OFF = 2.0, 0.8  # [s], [rad]
 UP_FORCE = 0.3  # share by which its norm may be off gravity
 
+# Rows that repeat for so long [s], so many times as long as any others, are reported though no noise shows a fault.
+REPEATED_S, REPEATED_TIMES = 2.0, 10
+
 ROWS = 1 << 16  # that are looked at together
 SAME_RANGE = 0.1  # share by which the ranges of a sensor's axes may differ: each has its own scale
 COPIED = 0.5  # share of a sensor's rows, those that repeat aside, that another has as well only if it is a copy
@@ -258,6 +261,15 @@ class SensorScan:
         longer = int(short[2 * usual + 1 :].sum()) - long_
         return longer <= 2 * long_ + COARSE * short.sum()
 
+    def long_repeats(self) -> list[_Run]:
+        """Runs of equal rows that are far longer than all others of the sensor."""
+        counts = self._lengths.copy()
+        runs_ = [run for run in self.long_runs("gyro and accel") if run.seconds >= REPEATED_S]
+        for run in runs_:
+            counts[min(run.rows, _LONGEST)] -= 1
+        usual = int(np.flatnonzero(counts > 0).max(initial=1))
+        return [run for run in runs_ if run.rows > REPEATED_TIMES * usual]
+
     def constant(self, name: str) -> bool:
         """Whether the signal has one value in all rows."""
         return any(run.rows == self.rows for run in self.long_runs(name))
@@ -426,11 +438,29 @@ class Scan:
             facts: dict[str, float | str] = {"signals": faults[0].signals, "intervals": len(faults)}
             facts |= {"start": begin, "end": faults[0].last}
             found.append(Diagnostic("sensor-frozen", WARNING, name, lost_s, facts=facts))
+        found += self._repeats()
         for name, scan in self.orientations.items():
             if scan.rows >= FROZEN_SAMPLES and scan.constant:
                 found.append(Diagnostic("orientation-constant", WARNING, name, scan.rows))
         for name, other in self._copies(self.orientations):
             found.append(Diagnostic("orientations-copied", WARNING, name, facts={"other": other}))
+        return found
+
+    def _repeats(self) -> list[Diagnostic]:
+        """Sensors that repeat their values for seconds while others change: at rest on a table, or not measuring."""
+        repeats = {name: scan.long_runs("gyro and accel") for name, scan in self.sensors.items()}
+        found = []
+        for name, scan in self.sensors.items():
+            faults = [(fault.first, fault.last) for fault in self.faults.get(name, [])]
+            for run in scan.long_repeats():
+                moving = [
+                    other
+                    for other, runs_ in repeats.items()
+                    if sum(max(0.0, min(run.last, r.last) - max(run.first, r.first)) for r in runs_) < 0.5 * run.seconds
+                ]
+                if moving and not _within(run, faults):
+                    facts: dict[str, float | str] = {"start": run.first, "end": run.last}
+                    found.append(Diagnostic("sensor-repeats", WARNING, name, run.seconds, facts=facts))
         return found
 
 
