@@ -174,6 +174,23 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
 # One axis alone ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("name", "named"), [(BROKEN, [BROKEN]), ("", [])])
+def test_a_clean_sensor_that_repeats_its_values_while_others_change_is_named(
+    name: str, named: list[str], clean: Simulation, tmp_path: Path
+) -> None:
+    """Without noise nothing shows that it does not measure: it may lie still. The user is told."""
+    recording = clean.recording()
+    if name:
+        recording = stopped(recording, "gyro accel", 10.0)
+        at_rest = np.nonzero(recording.time >= 10.0)[0]  # no gyroscope tips gravity there
+        sensor = recording.imus[name]
+        gyro_S = sensor.gyro_S.copy()
+        gyro_S[at_rest] = 0.01
+        recording = with_sensor(recording, name, gyro_S=gyro_S)
+    read = load_session(written(tmp_path, recording) / "session.toml")
+    assert [d.place for d in read.diagnostics if d.code == "sensor-repeats"] == named
+
+
 def axis_stopped(recording: Recording, axis: str, first: float, value: float | None = None) -> Recording:
     """The recording with one axis, as "gyro x", that stays at its value, or at this one, from these seconds on."""
     signal, letter = axis.split()

@@ -40,8 +40,9 @@ class SmekfParams:
 
     By how much, over two minutes of simulated motion with rests (`tests/test_filters.py` measures it; a NEES of 3 is
     right, below is a covariance too large): NEES 1.9 and 0.57 deg of heading (rms) with the paper's P₀, Σ_b and first
-    order, 0.5 and 0.10 deg exact and with `starting_params`, 0.8 and 0.08 deg with the Σ_b of a bias that drifts by
-    10 deg/h as well. The simulated accelerometer has no bias, which `starting_params` allows for.
+    order, 0.5 and 0.10 deg exact and with `starting_params`, 0.7 and 0.08 deg with the Σ_b of a bias that drifts by
+    10 deg/h as well. The simulated accelerometer has no bias and the gyroscope no wrong scale, which `starting_params`
+    allows for.
     """
 
     attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
