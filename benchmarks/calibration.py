@@ -13,15 +13,15 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import least_squares
+from scipy import optimize
 
-from wepose_pin.calibration import problem
-from wepose_pin.calibration.known import known_before
-from wepose_pin.calibration.lengths import LOOK_RATE_HZ, _looks
-from wepose_pin.calibration.problem import Looks, filled, residuals, solve
+from wepose_pin.calibration import least_squares
+from wepose_pin.calibration.contact import find_contact_start
+from wepose_pin.calibration.least_squares import Gaussian, Observations, evaluate_into, residuals, solve
+from wepose_pin.calibration.priors import build_prior
+from wepose_pin.calibration.problem import SAMPLE_RATE_HZ, CalibrationProblem
 from wepose_pin.calibration.protocols import load_protocol
-from wepose_pin.calibration.touching import touching_start
-from wepose_pin.calibration.weighing import weighed
+from wepose_pin.calibration.weights import solve_reweighted
 from wepose_pin.filters.sensors import filter_recording
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import REALISTIC, Person, simulate, simulated_person
@@ -32,19 +32,18 @@ OURS = "Gauss-Newton, ours"
 _STATUS = Path("/proc/self/status")
 
 
-class Problem(NamedTuple):
+class LeastSquares(NamedTuple):
     """Σ w r² + (x − c)ᵀ Λ (x − c), to be made least from a start."""
 
-    looks: Looks
-    center: np.ndarray  # c (m,)
-    prior: np.ndarray  # Λ (m, m)
+    observations: Observations
+    prior: Gaussian  # c, Λ
     weights: np.ndarray  # (n, 5)
     start: np.ndarray  # (m,)
 
 
 def sections(quick: bool) -> dict[str, Section]:
     """Name → a function that measures it; a full run solves at 100 samples a second too."""
-    rates_hz = (LOOK_RATE_HZ,) if quick else (LOOK_RATE_HZ, 100.0)
+    rates_hz = (SAMPLE_RATE_HZ,) if quick else (SAMPLE_RATE_HZ, 100.0)
     return {"calibration": partial(calibration, 60.0, rates_hz, 3)}
 
 
@@ -88,68 +87,67 @@ def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Tab
 
 def pose_problems(
     recording: Recording, person: Person, rates_hz: tuple[float, ...]
-) -> list[tuple[Problem, Callable[[], Problem]]]:
+) -> list[tuple[LeastSquares, Callable[[], LeastSquares]]]:
     """The last problem of a hands-together calibration at each rate of samples, and the calibration without filters."""
-    found, protocol = filter_recording(recording), load_protocol("clasp")
-    known = person.average, person.taped, person.taped_std
-    posed: list[tuple[Problem, Callable[[], Problem]]] = []
+    measured = {name: (metres, person.measured_std) for name, metres in person.measured.items()}
+    filtered, protocol = filter_recording(recording), load_protocol("clasp")
+    problem = CalibrationProblem(recording, filtered, protocol, person.prior, measured)
+    posed: list[tuple[LeastSquares, Callable[[], LeastSquares]]] = []
     for rate_hz in rates_hz:
-        looks, _ = _looks(recording, found, protocol, rate_hz)
+        observations, _ = problem.observe(rate_hz)
 
-        def calibrate(looks: Looks = looks) -> Problem:
-            def place(some: Looks) -> np.ndarray:
-                return known_before(recording, found, some, *known)[0]
-
-            center, information = known_before(recording, found, looks, *known)
-            start, touching = touching_start(looks, place)
-            _, weights, _, _ = weighed(looks, center, information, start, touching, quick=False)
-            weights = np.broadcast_to(weights, (looks.data.shape[1], 5)).copy()
-            return Problem(looks, center, information, weights, start)
+        def calibrate(observations: Observations = observations) -> LeastSquares:
+            prior = build_prior(problem, observations)
+            start, contact = find_contact_start(observations, lambda some: build_prior(problem, some).mean)
+            weights = solve_reweighted(observations, prior, start, contact).weights
+            return LeastSquares(observations, prior, weights, start)
 
         posed.append((calibrate(), calibrate))
     return posed
 
 
-def building(posed: Problem) -> float:
+def building(posed: LeastSquares) -> float:
     """Seconds that CasADi's functions take to build, once for a number of samples."""
-    problem._look.cache_clear()
-    problem._mapped.cache_clear()
+    least_squares._residual_function.cache_clear()
+    least_squares._mapped_residuals.cache_clear()
     begin = time.perf_counter()
-    problem._mapped(posed.looks.layout, posed.looks.conditions[0], 0, posed.looks.data.shape[1])
+    least_squares._mapped_residuals(
+        posed.observations.layout, posed.observations.conditions[0], 0, len(posed.observations)
+    )
     return time.perf_counter() - begin
 
 
-def solvers(posed: Problem) -> dict[str, Callable[[], float]]:
+def solvers(posed: LeastSquares) -> dict[str, Callable[[], float]]:
     """Name → a function that solves it and gives the cost."""
-    looks, center, prior, weights, start = posed
-    root_w, root_prior = np.sqrt(weights), np.linalg.cholesky(prior).T
-    n, m = len(weights), len(center)
-    look = problem._look(looks.layout, looks.conditions[0], 0)
-    one = [ca.SX.sym("x", m), ca.SX.sym("data", looks.data.shape[0])]
-    alone = ca.Function("alone", one, look(*one)[:1])  # without the Jacobian that `residuals` gives as well
-    x, data = ca.MX.sym("x", m), ca.MX.sym("data", *looks.data.shape)
+    observations, prior, weights, start = posed
+    root_w, root_prior = np.sqrt(weights), np.linalg.cholesky(prior.information).T
+    n, m = len(weights), len(prior.mean)
+    sample = least_squares._residual_function(observations.layout, observations.conditions[0], 0)
+    one = [ca.SX.sym("x", m), ca.SX.sym("data", observations.data.shape[0])]
+    alone = ca.Function("alone", one, sample(*one)[:1])  # without the Jacobian that `residuals` gives as well
+    x, data = ca.MX.sym("x", m), ca.MX.sym("data", *observations.data.shape)
     every = ca.Function("all", [x, data], [alone.map(n)(ca.repmat(x, 1, n), data)])
-    columns, r = np.ascontiguousarray(looks.data.T), np.empty((n, 5))
+    columns, r = np.ascontiguousarray(observations.data.T), np.empty((n, 5))
 
     def value(x: np.ndarray) -> np.ndarray:
-        filled(every, (np.ascontiguousarray(x), columns), (r,))
-        return np.concatenate(((root_w * r).ravel(), root_prior @ (x - center)))
+        evaluate_into(every, (np.ascontiguousarray(x), columns), (r,))
+        return np.concatenate(((root_w * r).ravel(), root_prior @ (x - prior.mean)))
 
     def slope(x: np.ndarray) -> np.ndarray:
-        J = root_w[:, :, None] * residuals(x, looks)[1]
+        J = root_w[:, :, None] * residuals(x, observations)[1]
         return np.concatenate((J.reshape(-1, m), root_prior))
 
     def by_scipy(jacobian: Callable[[np.ndarray], np.ndarray] | str) -> float:
-        return 2.0 * float(least_squares(value, start, jacobian, method="trf", x_scale="jac").cost)
+        return 2.0 * float(optimize.least_squares(value, start, jacobian, method="trf", x_scale="jac").cost)
 
     return {
-        OURS: lambda: solve(looks, center, prior, weights, start).cost,
+        OURS: lambda: solve(observations, prior, weights, start).cost,
         "least_squares, our Jacobian": lambda: by_scipy(slope),
         "least_squares, 2-point": lambda: by_scipy("2-point"),
     }
 
 
-def peak_memory(posed: Problem, name: str) -> float:
+def peak_memory(posed: LeastSquares, name: str) -> float:
     """By how much solving it raises a new process's resident memory at its highest [bytes]; NaN but on Linux."""
     if not _STATUS.exists():
         return float("nan")
@@ -164,7 +162,7 @@ def peak_memory(posed: Problem, name: str) -> float:
 def _peak(file: object, name: str) -> None:
     posed = pickle.load(file)  # type: ignore[arg-type]
     run = solvers(posed)[name]
-    residuals(posed.start, posed.looks.take(np.arange(10)))  # libraries have loaded what they load
+    residuals(posed.start, posed.observations.take(np.arange(10)))  # libraries have loaded what they load
     before = _resident("VmRSS")
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the highest so far is forgotten
     run()

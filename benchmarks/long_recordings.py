@@ -82,7 +82,7 @@ def _write(folder: Path, hours: float) -> None:
     person = simulated_person(1)
     made = simulate(person.lengths, seed=1)
     recording = made.recording("day")
-    found = calibrate_lengths(recording, gauge=person.taped, prior=person.average, gauge_std=person.taped_std)
+    found = calibrate_lengths(recording, measured=person.measured, prior=person.prior, measured_std=person.measured_std)
     folder.mkdir()
     write_session(folder, there_and_back(recording, recording.span(recording.phases["start"][0])))
     repeated = pl.read_parquet(folder / "recording.parquet").drop("time")

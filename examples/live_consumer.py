@@ -10,5 +10,5 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as incoming:
         while select.select([incoming], [], [], 0.0)[0]:  # whoever is slow goes on with the newest pose
             line = incoming.recv(65535)
         pose = json.loads(line)
-        print(f"{pose['t']:.3f} s  right hand {pose['points'].get('right_hand')} m", flush=True)
+        print(f"{pose['t']:.3f} s  right hand {pose['points'].get('right_palm')} m", flush=True)
 print("no pose for 3 s")

@@ -15,12 +15,12 @@ if len(sys.argv) > 1:
     recording = wp.load_session(sys.argv[1])
     subject = wp.load_subject(sys.argv[2]) if len(sys.argv) > 2 else None
 else:
-    simulation = wp.simulate(wp.average_subject(1.75, "f").lengths, seed=1, clasp_s=10.0, circles=2)
-    recording, subject = simulation.recording(), wp.average_subject(1.75, "f")
+    simulation = wp.simulate(wp.population_subject(1.75, "f").lengths, seed=1, clasp_s=10.0, circles=2)
+    recording, subject = simulation.recording(), wp.population_subject(1.75, "f")
 
 pose = wp.track(recording, subject)
 
-reach = np.linalg.norm(pose.points["right_hand"] - pose.points["right_shoulder"], axis=1)
+reach = np.linalg.norm(pose.points["right_palm"] - pose.points["right_shoulder"], axis=1)
 print(f"{recording.name}: {pose.time[-1] - pose.time[0]:.1f} s, segments: {', '.join(pose.quat_WL)}")
 print(f"right hand from its shoulder: {reach.min():.3f} to {reach.max():.3f} m")
 print(f"configuration of the Pinocchio model: {pose.q.shape}, quaternions xyzw at the spherical joints")

@@ -143,7 +143,7 @@ def person(
         f"{side}_upper_arm": R_upper.as_quat(),
         f"{side}_forearm": R_fore.as_quat(),
     }
-    points = dict(zip(("shoulder", "elbow", "wrist", "hand"), (shoulder, elbow, wrist, hand), strict=True))
+    points = dict(zip(("shoulder", "elbow", "wrist", "palm"), (shoulder, elbow, wrist, hand), strict=True))
     return Pose(time, quat, {f"{side}_{name}": p for name, p in points.items()})
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import MOVED_MOUNT, check_mounts, heading_to, mount_advice
+from wepose_pin.alignment import MOVED_MOUNT, check_mounts, compute_heading, mount_advice
 from wepose_pin.calibration import load_protocol
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
@@ -22,7 +22,7 @@ from wepose_pin.recording import (
     mount_from_axes,
 )
 from wepose_pin.simulation import Simulation, paper_dynamic
-from wepose_pin.subject import StartPoseOffset, Subject, average_subject, mount_rows
+from wepose_pin.subject import StartPoseOffset, Subject, mount_rows, population_subject
 from wepose_pin.tracking.segments import estimate_segments
 
 
@@ -75,7 +75,7 @@ def test_calibrated_mounts_give_headings_of_any_size() -> None:
     headings = {"torso": 2.9, "left_upper_arm": -1.7, "left_forearm": 0.4}
     mounts = {name: Rotation.random(random_state=rng) for name in headings}
     recording, true = ready_recording(headings, mounts)
-    subject = replace(average_subject(), mounts={name: mount.as_quat() for name, mount in mounts.items()})
+    subject = replace(population_subject(), mounts={name: mount.as_quat() for name, mount in mounts.items()})
     segments = estimate_segments(recording, subject)
     for name, psi in headings.items():
         assert segments.heading[name] == pytest.approx(psi, abs=1e-9)
@@ -92,7 +92,7 @@ def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
     for std_deg, share in ((0.0, 0.0), (4.0, 0.5), (400.0, 1.0)):
         rows = mount_rows("left_forearm")
         subject = replace(
-            average_subject(),
+            population_subject(),
             mounts={"left_forearm": mount.as_quat()},
             order=tuple(rows),
             covariance=np.deg2rad(std_deg) ** 2 * np.eye(3),
@@ -110,7 +110,7 @@ def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
     recording, _ = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * mount})
     known = np.deg2rad(4.0) ** 2 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.9], [0.0, 0.9, 1.0]])
     subject = replace(
-        average_subject(),
+        population_subject(),
         mounts={"left_forearm": mount.as_quat()},
         order=tuple(mount_rows("left_forearm")),
         covariance=known,
@@ -120,7 +120,7 @@ def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
     # Half of the 5 deg is the mount's, and with it 0.9 as much of its heading.
     np.testing.assert_allclose(np.abs(moved), [0.0, 2.5, 2.25], atol=0.06)
     start = Rotation.from_quat(segments.quat_WL["left_forearm"][:100]).mean()
-    assert abs(np.degrees(heading_to(Rotation.identity(), start))) < 0.01
+    assert abs(np.degrees(compute_heading(Rotation.identity(), start))) < 0.01
 
 
 def test_a_calibrated_mount_that_has_moved_is_said() -> None:
@@ -128,7 +128,7 @@ def test_a_calibrated_mount_that_has_moved_is_said() -> None:
     moved = Rotation.from_rotvec([0.0, np.deg2rad(20.0), 0.0])
     recording, _ = ready_recording({"torso": 0.0}, {"torso": moved * mount})
     subject = replace(
-        average_subject(),
+        population_subject(),
         mounts={"torso": mount.as_quat()},
         order=tuple(mount_rows("torso")),
         covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
@@ -149,7 +149,7 @@ def test_a_person_stands_as_in_the_calibration() -> None:
     mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
     lean = np.array([0.0, np.deg2rad(20.0)])
     subject = replace(
-        average_subject(),
+        population_subject(),
         mounts={"torso": mount.as_quat()},
         order=tuple(mount_rows("torso")),
         covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
@@ -166,7 +166,7 @@ def test_a_calibrated_mount_that_cannot_be_names_the_strapping() -> None:
     mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
     over = Rotation.from_rotvec([0.0, np.pi, 0.0])
     recording, _ = ready_recording({"torso": 0.0}, {"torso": over * mount})
-    subject = replace(average_subject(), mounts={"torso": mount.as_quat()})
+    subject = replace(population_subject(), mounts={"torso": mount.as_quat()})
     with pytest.raises(BadSession, match=r"sensors\.torso: its calibrated mount is 180 deg off .* remounted = true"):
         estimate_segments(recording, subject)
 
@@ -177,7 +177,7 @@ def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
     recording, _ = ready_recording(headings, dict.fromkeys(headings, stated))
     sensors = {name: replace(s, stated_quat_LS=stated.as_quat()) for name, s in recording.sensors.items()}
     wrong = (Rotation.from_rotvec([0, 0, 1.0]) * stated).as_quat()
-    subject: Subject = replace(average_subject(), mounts=dict.fromkeys(headings, wrong))
+    subject: Subject = replace(population_subject(), mounts=dict.fromkeys(headings, wrong))
     kept = estimate_segments(replace(recording, sensors=sensors), subject)
     new = estimate_segments(replace(recording, sensors=sensors, remounted=True), subject)
     for name in headings:
@@ -198,7 +198,7 @@ def test_heading_is_the_nearest_turn() -> None:
     for _ in range(10):
         R_WS = Rotation.random(random_state=rng)
         tilted = Rotation.from_rotvec([0.1, -0.2, 0.0]) * R_WS
-        psi = heading_to(Rotation.from_rotvec([0, 0, -0.7]) * tilted, R_WS)
+        psi = compute_heading(Rotation.from_rotvec([0, 0, -0.7]) * tilted, R_WS)
         others = [
             (Rotation.from_rotvec([0, 0, p - 0.7]) * tilted * R_WS.inv()).magnitude() for p in np.arange(0, 6.28, 0.01)
         ]
@@ -268,7 +268,7 @@ def test_an_unknown_mount_beside_a_subject_that_has_none_for_it(simulation: Simu
     bare = replace(recording.sensors["torso"], stated_quat_LS=None)
     recording = replace(recording, sensors={**recording.sensors, segment: bare})
     known = {name: quat for name, quat in simulation.quat_LS.items() if name != segment}
-    subject = replace(average_subject(), name="anna", mounts=known)
+    subject = replace(population_subject(), name="anna", mounts=known)
     with pytest.raises(BadSession, match=rf"sensors\.{segment}\.mount is not known.*'anna' has none for it") as told:
         check_mounts(recording, subject)
     assert ("no calibration finds" in str(told.value)) == (segment in ("head", "pelvis"))

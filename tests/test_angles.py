@@ -28,7 +28,7 @@ from wepose_pin.angles.euler import UNKNOWN, decompose, follow, wrap
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.pose import Pose
 from wepose_pin.simulation import Person, Simulation
-from wepose_pin.subject import average_subject
+from wepose_pin.subject import population_subject
 
 ARM = ("upper_arm", "forearm", "hand")
 SEGMENTS = ["torso", *(f"{side}_{part}" for side in ("left", "right") for part in ARM)]
@@ -478,7 +478,7 @@ def test_the_axes_of_a_segment_are_right_handed() -> None:
 
 
 def test_of_a_tracked_person_the_angles_are_within_their_deviations(simulation: Simulation, person: Person) -> None:
-    pose = wp.track(simulation.recording(), replace(average_subject(), lengths=person.lengths)).pose
+    pose = wp.track(simulation.recording(), replace(population_subject(), lengths=person.lengths)).pose
     found, true = wp.joint_angles(pose), wp.joint_angles(simulation.truth())
     for joint in ("right_elbow", "left_elbow", "thorax"):
         assert found[joint].std is not None

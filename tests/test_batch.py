@@ -36,7 +36,7 @@ def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_item_is_made_once_and_kept(study: Path) -> None:
     (row,) = run_items([item(study)], str(study / "items"))
     assert (row["status"], row["reused"]) == ("done", False)
-    assert row["right_hand_error_mm"] < 100.0
+    assert row["right_palm_error_mm"] < 100.0
     before = files(study / "items")
     (again,) = run_items([item(study)], str(study / "items"))
     assert again["reused"] is True

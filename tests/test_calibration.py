@@ -1,4 +1,4 @@
-"""Closed-chain calibration: the CasADi chain against Pinocchio, the physics of the gauge, honest deviations."""
+"""Closed-chain calibration: the physics of the scale, honest deviations."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import ARMS, CHAIN, Calibration, calibrate, calibrate_lengths, palm_gap, rotate
+from wepose_pin.calibration import Calibration, calibrate, calibrate_lengths
+from wepose_pin.calibration.chain import ARMS, rotate
 from wepose_pin.calibration.quality import assess
 from wepose_pin.errors import BadOption, BadPhase, BadSession
-from wepose_pin.model import load_model
-from wepose_pin.pose import pose_of
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import PERFECT, PERFECT_WORLD, Person, Simulation, simulate, simulated_person
 from wepose_pin.simulation.motion import Motion, Wander
-from wepose_pin.subject import LENGTHS, average_subject, mount_rows
+from wepose_pin.subject import LENGTHS, mount_rows, population_subject
 
 
 def codes(found: Calibration) -> set[str]:
@@ -37,20 +36,6 @@ def exact() -> tuple[Person, Recording]:
     return person, ready(simulate(person.lengths, seed=11, noise=PERFECT, clasp_s=30.0, circles=0))
 
 
-def test_the_casadi_chain_is_pinocchios() -> None:
-    rng = np.random.default_rng(0)
-    values = np.array([0.5, 0.4, 0.3, 0.25, 0.07, 0.31, 0.24, 0.08]) * rng.uniform(0.9, 1.1, 8)
-    model = load_model(lengths=dict(zip(LENGTHS, values, strict=True)))
-    lengths = ca.SX.sym("l", len(LENGTHS))
-    quats = {segment: ca.SX.sym(segment, 4) for segment in CHAIN}
-    gap = ca.Function("gap", [lengths, *quats.values()], [palm_gap(lengths, quats)])
-    drawn = {segment: Rotation.random(20, random_state=rng).as_quat() for segment in CHAIN}
-    points = pose_of(model, np.arange(20.0), drawn).points
-    for k in range(20):
-        found = np.asarray(gap(values, *(drawn[segment][k] for segment in CHAIN))).ravel()
-        np.testing.assert_allclose(found, (points["left_hand"] - points["right_hand"])[k], atol=1e-14)
-
-
 def test_rotate_in_casadi_is_scipys() -> None:
     rotation = Rotation.random(random_state=1)
     v = np.array([0.2, -1.0, 0.7])
@@ -62,7 +47,7 @@ def test_rotate_in_casadi_is_scipys() -> None:
 def test_a_known_mount_is_known_better_after_and_a_new_strapping_not(exact: tuple[Person, Recording]) -> None:
     _, recording = exact
     rows = mount_rows("torso")
-    prior = average_subject()
+    prior = population_subject()
     before = np.diag([1e-4, 2e-4, 3e-4])
     prior = replace(
         prior,
@@ -86,7 +71,7 @@ def test_mounts_at_any_rotation_come_from_the_closure_alone() -> None:
     )
     recording = simulation.recording()
     assert all(sensor.stated_quat_LS is None for sensor in recording.sensors.values())
-    found = calibrate(recording, gauge=person.taped, prior=person.average)
+    found = calibrate(recording, measured=person.measured, prior=person.prior)
     for segment, quat_LS in simulation.quat_LS.items():
         off = Rotation.from_quat(found.mounts[segment]) * Rotation.from_quat(quat_LS).inv()
         assert np.degrees(off.magnitude()) < 0.3, segment
@@ -94,8 +79,8 @@ def test_mounts_at_any_rotation_come_from_the_closure_alone() -> None:
 
 def test_exact_orientations_and_a_gauge_give_the_lengths_back(exact: tuple[Person, Recording]) -> None:
     person, recording = exact
-    gauge = {"shoulder_width": person.lengths["shoulder_width"]}
-    found = calibrate_lengths(recording, gauge=gauge, gauge_std=1e-5)
+    measured = {"shoulder_width": person.lengths["shoulder_width"]}
+    found = calibrate_lengths(recording, measured=measured, measured_std=1e-5)
     for name in ("shoulder_width", "left_upper_arm", "right_upper_arm"):
         assert found.subject.lengths[name] == pytest.approx(person.lengths[name], abs=2e-4)
     for side in ("left", "right"):
@@ -116,10 +101,10 @@ def test_without_a_gauge_the_proportions_are_right_and_the_scale_is_the_priors(e
     assert np.ptp(ratio) < 2e-3
     assert abs(np.mean(ratio) - 1) < 4 * found.scale_std
     assert 0.02 < found.scale_std < 0.1
-    assert found.gauge == {}
+    assert found.measured == {}
     assert "scale-from-prior" in codes(found)
     # Nothing drifts to zero: another prior, ten per cent larger, gives everything ten per cent larger.
-    average = average_subject()
+    average = population_subject()
     larger = replace(
         average, lengths={k: 1.1 * v for k, v in average.lengths.items()}, covariance=1.21 * average.covariance
     )
@@ -143,7 +128,7 @@ def test_noise_in_the_orientations_does_not_shrink_the_person(exact: tuple[Perso
         for name, s in recording.sensors.items()
     }
     tight = {"shoulder_width": person.lengths["shoulder_width"]}
-    found = calibrate_lengths(replace(recording, sensors=noisy), gauge=tight, gauge_std=1e-4)
+    found = calibrate_lengths(replace(recording, sensors=noisy), measured=tight, measured_std=1e-4)
     arm = np.mean([found.subject.lengths[n] / person.lengths[n] for n in ("left_upper_arm", "right_upper_arm")])
     assert arm == pytest.approx(1.0, abs=0.02)
 
@@ -173,20 +158,20 @@ def test_a_hand_with_a_sensor_is_seen_by_itself(exact: tuple[Person, Recording])
     bent_recording = replace(
         recording, sensors=sensors, phases={"start": recording.phases["start"], "clasp": tuple(clasp)}
     )
-    without = calibrate_lengths(recording, gauge={"shoulder_width": length["shoulder_width"]})
-    found = calibrate_lengths(bent_recording, gauge={"shoulder_width": length["shoulder_width"]})
+    without = calibrate_lengths(recording, measured={"shoulder_width": length["shoulder_width"]})
+    found = calibrate_lengths(bent_recording, measured={"shoulder_width": length["shoulder_width"]})
     assert found.subject.std("left_hand") < 0.5 * without.subject.std("left_hand")
 
 
 @pytest.mark.monte_carlo
 def test_the_standard_deviations_are_honest() -> None:
-    """MTi-3 noise, real filtering, a taped shoulder width: errors over their standard deviations, 12 people."""
+    """MTi-3 noise, real filtering, a measured shoulder width: errors over their standard deviations, 12 people."""
     z, chi2 = [], []
     for seed in range(12):
         person = simulated_person(100 + seed)
         simulation = simulate(person.lengths, seed=seed, circles=0)
         subject = calibrate(
-            simulation.recording(), gauge=person.taped, prior=person.average, gauge_std=person.taped_std
+            simulation.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std
         )
         names = [name for name in LENGTHS if name != "trunk"]
         error = np.array([subject.lengths[name] - person.lengths[name] for name in names])
@@ -211,31 +196,31 @@ def test_hands_that_do_not_move_say_so(exact: tuple[Person, Recording]) -> None:
         frozen[name] = OrientationSensor(quat_WS=quat)
     clasp = ((float(recording.time[held]), recording.phases["clasp"][0][1]),)
     still = replace(recording, sensors=frozen, phases={**recording.phases, "clasp": clasp})
-    gauge = {"shoulder_width": 0.38}
-    assert "lengths-mostly-prior" in codes(calibrate_lengths(still, gauge=gauge))
-    assert "lengths-mostly-prior" not in codes(calibrate_lengths(recording, gauge=gauge))
+    measured = {"shoulder_width": 0.38}
+    assert "lengths-mostly-prior" in codes(calibrate_lengths(still, measured=measured))
+    assert "lengths-mostly-prior" not in codes(calibrate_lengths(recording, measured=measured))
 
 
 def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     person, recording = exact
-    found = calibrate_lengths(recording, prior=person.average).subject
-    assert found.lengths["trunk"] == pytest.approx(person.average.lengths["trunk"], rel=1e-6)
-    assert found.std("trunk") == pytest.approx(person.average.std("trunk"), rel=1e-3)
-    # A taped trunk is kept, and is no gauge of the arms.
-    alone = calibrate_lengths(recording, prior=person.average, gauge={"trunk": 0.5})
+    found = calibrate_lengths(recording, prior=person.prior).subject
+    assert found.lengths["trunk"] == pytest.approx(person.prior.lengths["trunk"], rel=1e-6)
+    assert found.std("trunk") == pytest.approx(person.prior.std("trunk"), rel=1e-3)
+    # A measured trunk is kept, and does not scale the arms.
+    alone = calibrate_lengths(recording, prior=person.prior, measured={"trunk": 0.5})
     assert alone.subject.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
     assert "scale-from-prior" in codes(alone)
-    assert alone.subject.note.endswith("of the anthropometric prior")
-    taped = calibrate(recording, prior=person.average, gauge={"trunk": 0.5, "shoulder_width": 0.38})
-    assert taped.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
+    assert alone.subject.note.endswith("of the population prior")
+    measured = calibrate(recording, prior=person.prior, measured={"trunk": 0.5, "shoulder_width": 0.38})
+    assert measured.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
 
 
 def test_wrong_requests_are_named(exact: tuple[Person, Recording]) -> None:
     _, recording = exact
-    with pytest.raises(BadOption, match="gauge sholder_width: not a length; did you mean 'shoulder_width'"):
-        calibrate(recording, gauge={"sholder_width": 0.38})
-    with pytest.raises(BadOption, match=r"gauge shoulder_width=38: a length in metres"):
-        calibrate(recording, gauge={"shoulder_width": 38.0})
+    with pytest.raises(BadOption, match="measured sholder_width: not a length; did you mean 'shoulder_width'"):
+        calibrate(recording, measured={"sholder_width": 0.38})
+    with pytest.raises(BadOption, match=r"measured shoulder_width=38: a length in metres"):
+        calibrate(recording, measured={"shoulder_width": 38.0})
     with pytest.raises(BadOption, match="protocol 'bow' is not known"):
         calibrate(recording, protocol="bow")
     with pytest.raises(BadPhase, match=r"phases\.clasp is needed"):
@@ -262,7 +247,7 @@ def test_hands_that_hardly_move_leave_the_headings_open(
     made = simulate(
         person.lengths, seed=seed, clasp_s=30.0, circles=0, imperfections=replace(PERFECT_WORLD, mount="any")
     )
-    found = calibrate_lengths(made.recording(), gauge=person.taped, prior=person.average)
+    found = calibrate_lengths(made.recording(), measured=person.measured, prior=person.prior)
     for name, quat in found.subject.mounts.items():
         off = (Rotation.from_quat(quat) * Rotation.from_quat(made.quat_LS[name]).inv()).as_rotvec()
         assert abs(off[2]) < 4.0 * found.subject.std(f"mounts.{name}.z"), name
@@ -271,5 +256,5 @@ def test_hands_that_hardly_move_leave_the_headings_open(
 
 
 def test_a_motion_that_tells_the_headings_has_no_other(simulation: Simulation, person: Person) -> None:
-    found = calibrate_lengths(simulation.recording(), gauge=person.taped, prior=person.average)
+    found = calibrate_lengths(simulation.recording(), measured=person.measured, prior=person.prior)
     assert "headings-ambiguous" not in codes(found)

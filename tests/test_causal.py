@@ -14,7 +14,7 @@ from wepose_pin.errors import BadOption, BadPhase
 from wepose_pin.pose import pose_table
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import LENGTHS, Subject, average_subject, mount_rows
+from wepose_pin.subject import LENGTHS, Subject, mount_rows, population_subject
 from wepose_pin.tracking import Tracker, TrackOptions, track
 from wepose_pin.tracking.causal import SegmentFollower
 from wepose_pin.tracking.start_pose import HOLD_S, StartGuide
@@ -147,7 +147,7 @@ def test_a_heading_is_stated_as_track_states_it(recording: Recording, simulation
     """With what the mounts' uncertainty turns a segment by as it moves, not the filter's part alone."""
     order = tuple(row for name in recording.sensors for row in mount_rows(name))
     covariance = np.diag(np.tile(np.deg2rad([2.0, 2.0, 4.0]) ** 2, len(recording.sensors)))
-    average = average_subject()
+    average = population_subject()
     subject = replace(average, mounts=simulation.quat_LS, order=(*LENGTHS, *order),
                       covariance=block_diag(average.covariance, covariance))  # fmt: skip
     tracker, begin = started(recording, subject)

@@ -85,7 +85,7 @@ def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     for about in report["lengths"].values():
         assert abs(about["estimated"] - about["true"]) < 4 * about["std"]
     for method in ("smekf", "ncf", "gdc"):
-        assert report["errors"][method]["position_from_shoulders"]["right_hand"]["mean"] < 25.0
+        assert report["errors"][method]["position_from_shoulders"]["right_palm"]["mean"] < 25.0
 
 
 def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -136,7 +136,7 @@ def test_simulate_with_mounts_anywhere_is_tracked_with_its_subject(tmp_path: Pat
     assert run(*track_it) == 2
     assert run(*track_it, "--subject", made / "subject.toml") == 0
     pose, truth = (pl.read_parquet(p) for p in (tmp_path / "result" / "pose.parquet", made / "truth.parquet"))
-    off = np.sqrt(sum((pose[c] - truth[c]) ** 2 for c in ("right_hand_x", "right_hand_y", "right_hand_z")))
+    off = np.sqrt(sum((pose[c] - truth[c]) ** 2 for c in ("right_palm_x", "right_palm_y", "right_palm_z")))
     assert off.mean() < 0.03
 
 
@@ -158,7 +158,7 @@ def test_gauges_add_up_and_none_is_given_twice(
     two = ["--measured", "shoulder_width=0.39", "--measured", "trunk=0.51"]
     assert run("calibrate", session, *two, "-o", tmp_path / "subject") == 0
     subject = (tmp_path / "subject" / "subject.toml").read_text()
-    assert "taped: shoulder_width" in subject
+    assert "measured: shoulder_width" in subject
     assert "trunk = 0.510" in subject  # the prior gives way to the tape
     assert run("calibrate", session, *two, "--measured", "trunk=0.6", "-o", tmp_path / "again") == 2
     assert "'trunk' is given twice" in capsys.readouterr().err
@@ -185,7 +185,7 @@ def test_a_session_that_lacks_sensors_says_what_is_not_known(
     assert run("track", tmp_path, "-o", tmp_path / "result") == 0
     summary = json.loads((tmp_path / "result" / "summary.json").read_text())
     (unknown,) = [each for each in summary["diagnostics"] if each["code"] == "points-unknown"]
-    assert unknown["facts"] == {"segments": "right_forearm", "points": "right_wrist, right_hand"}
+    assert unknown["facts"] == {"segments": "right_forearm", "points": "right_wrist, right_palm"}
     assert unknown["text"]["what"] in capsys.readouterr().err
 
 

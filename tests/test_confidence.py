@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
 from wepose_pin.model import load_model
-from wepose_pin.pose import point_covariance, pose_of, pose_table, spread
+from wepose_pin.pose import axis_std, compute_pose, point_covariance, pose_table
 from wepose_pin.simulation import REALISTIC, simulate, simulated_person
-from wepose_pin.subject import LENGTHS, average_subject
+from wepose_pin.subject import LENGTHS, population_subject
 from wepose_pin.tracking import track
 
 ARMS = [f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")]
@@ -27,11 +27,11 @@ def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None
     names = ["torso", *ARMS, *(["left_hand", "right_hand"] if with_hands else [])]
     mean = {name: Rotation.random(random_state=rng) for name in names}
     cov = {name: np.diag(rng.uniform(0.5, 2.0, 3) * 4e-4) for name in names}
-    body = average_subject()
+    body = population_subject()
     lengths_cov = 0.04 * body.lengths_covariance()
     still = {name: rotation.as_quat()[None] for name, rotation in mean.items()}
     model = load_model(lengths=body.lengths)
-    points = pose_of(model, np.zeros(1), still).points
+    points = compute_pose(model, np.zeros(1), still).points
     found = point_covariance(points, still, {name: c[None] for name, c in cov.items()}, lengths_cov)
     assert set(found) == set(points)
 
@@ -39,20 +39,20 @@ def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None
         name: (Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), cov[name], n)) * mean[name]).as_quat()
         for name in names
     }
-    for name, p in pose_of(model, np.zeros(n), drawn).points.items():
+    for name, p in compute_pose(model, np.zeros(n), drawn).points.items():
         turned = np.cov(p.T)
         # The lengths' share is linear: by finite differences of Pinocchio's points.
         J = np.empty((3, len(LENGTHS)))
         for k, length in enumerate(LENGTHS):
             longer = model.with_lengths({length: body.lengths[length] + 1e-3})
-            J[:, k] = (pose_of(longer, np.zeros(1), still).points[name] - points[name])[0] / 1e-3
+            J[:, k] = (compute_pose(longer, np.zeros(1), still).points[name] - points[name])[0] / 1e-3
         expected = turned + J @ lengths_cov @ J.T
         np.testing.assert_allclose(found[name][0], expected, atol=0.04 * np.trace(expected))
 
 
 def test_points_beyond_a_segment_without_covariance_have_none() -> None:
     still = {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in ("torso", *ARMS)}
-    points = pose_of(load_model(), np.zeros(1), still).points
+    points = compute_pose(load_model(), np.zeros(1), still).points
     cov = {name: np.eye(3)[None] * 1e-4 for name in ("torso", "left_upper_arm", "right_forearm")}
     found = point_covariance(points, still, cov, np.zeros((8, 8)))
     assert set(found) == {"left_shoulder", "left_elbow", "right_shoulder"}
@@ -72,14 +72,14 @@ def test_the_whole_chain_is_honest() -> None:
         person = simulated_person(200 + seed)
         simulation = simulate(person.lengths, seed=seed, imperfections=REALISTIC)
         recording = simulation.recording()
-        pose = track(recording, calibrate(recording, gauge=person.taped, prior=person.average)).pose
+        pose = track(recording, calibrate(recording, measured=person.measured, prior=person.prior)).pose
         during = recording.span(simulation.phases["circles"][0])
         for name in simulation.quat_WL:
             true, found = (Rotation.from_quat(p.quat_WL[name][during]) for p in (simulation.truth(), pose))
             turn = (true * found.inv()).as_rotvec()
             segments.append(np.einsum("ni,nij,nj->n", turn, np.linalg.inv(pose.segment_cov[name][during]), turn).mean())
-        error = (simulation.points["right_hand"] - pose.points["right_hand"])[during]
-        hand.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(pose.point_cov["right_hand"][during]), error).mean())
+        error = (simulation.points["right_palm"] - pose.points["right_palm"])[during]
+        hand.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(pose.point_cov["right_palm"][during]), error).mean())
     print("NEES of the right hand, 5 people:", np.round(hand, 2), "mean", np.mean(hand).round(2))
     print("NEES of the segments, 5 people:", np.round(segments, 2), "mean", np.mean(segments).round(2))
     assert 0.8 < np.mean(hand) < 6.0
@@ -97,23 +97,23 @@ def test_the_columns_of_the_result(tmp_path: Path) -> None:
             main(["track", str(tmp_path), *[str(tmp_path / w) if w in "abc" else w for w in words]])
         assert not stop.value.code
     plain, full, without = (pl.read_parquet(tmp_path / name / "pose.parquet") for name in "abc")
-    assert {"torso_std", "left_hand_std", "right_elbow_std"} <= set(plain.columns)
+    assert {"torso_std", "left_palm_std", "right_elbow_std"} <= set(plain.columns)
     assert not [name for name in plain.columns if "_cov_" in name]
     entries = ["xx", "xy", "xz", "yy", "yz", "zz"]
-    assert {f"torso_cov_{e}" for e in entries} | {f"left_hand_cov_{e}" for e in entries} <= set(full.columns)
-    trace = full["left_hand_cov_xx"] + full["left_hand_cov_yy"] + full["left_hand_cov_zz"]
-    np.testing.assert_allclose(np.sqrt(trace / 3), full["left_hand_std"])
+    assert {f"torso_cov_{e}" for e in entries} | {f"left_palm_cov_{e}" for e in entries} <= set(full.columns)
+    trace = full["left_palm_cov_xx"] + full["left_palm_cov_yy"] + full["left_palm_cov_zz"]
+    np.testing.assert_allclose(np.sqrt(trace / 3), full["left_palm_std"])
     assert not [name for name in without.columns if name.endswith("_std")]  # NCF has no covariance
     assert plain["torso_std"].is_finite().all()
 
 
 def test_a_hand_that_is_segment_and_point_has_a_column_each() -> None:
     still = {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in ("torso", *ARMS, "left_hand")}
-    pose = pose_of(load_model(), np.zeros(1), still)
+    pose = compute_pose(load_model(), np.zeros(1), still)
     cov = {name: np.eye(3)[None] * 1e-4 for name in still}
     from dataclasses import replace
 
     points = point_covariance(pose.points, still, cov, np.zeros((8, 8)))
     table = pose_table(replace(pose, segment_cov=cov, point_cov=points))
-    assert table["left_hand_q_std"][0] == pytest.approx(0.01)
-    assert table["left_hand_std"][0] == pytest.approx(spread(points["left_hand"])[0])
+    assert table["left_hand_std"][0] == pytest.approx(0.01)
+    assert table["left_palm_std"][0] == pytest.approx(axis_std(points["left_palm"])[0])

@@ -17,7 +17,7 @@ from wepose_pin.filters.noise import noise_of
 from wepose_pin.simulation import SingleSensor, paper_dynamic
 from wepose_pin.validation import gains as tuning
 from wepose_pin.validation.contenders import DEFAULT_GAINS, Contender, contenders
-from wepose_pin.validation.gains import STATED, gains_of, total_rmse, trials
+from wepose_pin.validation.gains import STATED, make_gains, total_rmse, trials
 from wepose_pin.validation.series import aligned
 
 SETTING = "simulated 100 Hz"
@@ -89,7 +89,7 @@ def test_a_tuning_trial_is_scored_as_the_experiments_do() -> None:
             quat = contender.orient(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, trial.noise)
             R_WS = aligned(Rotation.from_quat(quat), true, rest)
             expected = attitude_error(R_WS[moving], true[moving], sensor.time[moving]).total_rmse
-            params = getattr(gains_of(SETTING), contender.label)
+            params = getattr(make_gains(SETTING), contender.label)
             assert total_rmse(trial, params) == pytest.approx(expected, rel=0.02)
 
 
@@ -97,9 +97,9 @@ def test_tuning_trials_are_scored_nowhere_else() -> None:
     assert min(tuning.DYNAMIC_SEEDS) > 11
     assert min(tuning.PERSON_SEEDS) > 9
     assert not tuning.HALVES[0] & tuning.HALVES[1]
-    assert gains_of("real", "01_undisturbed_slow_rotation_A") is STATED["BROAD, second half"]
-    assert gains_of("real", "03_undisturbed_slow_rotation_C") is STATED["BROAD, first half"]
-    assert gains_of("real", "prova_HR") is gains_of("real") is STATED["BROAD"]
+    assert make_gains("real", "01_undisturbed_slow_rotation_A") is STATED["BROAD, second half"]
+    assert make_gains("real", "03_undisturbed_slow_rotation_C") is STATED["BROAD, first half"]
+    assert make_gains("real", "prova_HR") is make_gains("real") is STATED["BROAD"]
 
 
 @pytest.mark.peer

@@ -23,7 +23,7 @@ def pose(turn_deg: tuple[float, float, float] = (0, 0, 0), shift: tuple[float, f
     points = {
         "left_shoulder": np.tile([0.0, 0.2, 0.5], (101, 1)),
         "right_shoulder": np.tile([0.0, -0.2, 0.5], (101, 1)),
-        "left_hand": hand,
+        "left_palm": hand,
     }
     return Pose(TIME, {"torso": (off * torso).as_quat()}, points)
 
@@ -37,15 +37,15 @@ def test_a_known_turn_and_shift_come_out() -> None:
     assert attitude.total_rmse == pytest.approx(
         np.degrees(Rotation.from_euler("ZYX", [3, -2, 1], degrees=True).magnitude())
     )
-    assert errors.position["left_hand"] == pytest.approx((5.0, 0.0, 5.0, 5.0), abs=1e-9)
+    assert errors.position["left_palm"] == pytest.approx((5.0, 0.0, 5.0, 5.0), abs=1e-9)
     assert errors.samples == 101
 
 
 def test_mean_and_std_are_of_the_absolute() -> None:
     off = pose()
     sign = np.where(np.arange(101) % 2, 1.0, -1.0)
-    off.points["left_hand"][:, 0] += 0.01 * sign + 0.002  # type: ignore[index]
-    error = evaluate(off, pose()).position["left_hand"]
+    off.points["left_palm"][:, 0] += 0.01 * sign + 0.002  # type: ignore[index]
+    error = evaluate(off, pose()).position["left_palm"]
     distance = 1e3 * np.abs(0.01 * sign + 0.002)
     assert error == pytest.approx((distance.mean(), distance.std(), np.sqrt((distance**2).mean()), distance.max()))
 
@@ -55,8 +55,8 @@ def test_a_trunk_of_another_length_is_not_seen_from_the_shoulders() -> None:
     for points in off.points.values():
         points[:, 2] += 0.02
     errors = evaluate(off, pose())
-    assert errors.position["left_hand"].mean == pytest.approx(20.0)
-    assert errors.position_from_shoulders["left_hand"].mean == pytest.approx(0.0, abs=1e-9)
+    assert errors.position["left_palm"].mean == pytest.approx(20.0)
+    assert errors.position_from_shoulders["left_palm"].mean == pytest.approx(0.0, abs=1e-9)
     assert "left_shoulder" not in errors.position_from_shoulders
 
 
@@ -75,16 +75,16 @@ def test_the_reference_is_brought_to_the_poses_times_on_the_rotation() -> None:
 
 def test_only_the_interval_counts() -> None:
     off = pose()
-    off.points["left_hand"][:50] += 1.0  # type: ignore[index]
-    assert evaluate(off, pose(), (5.0, 10.0)).position["left_hand"].mean == pytest.approx(0.0, abs=1e-9)
-    assert evaluate(off, pose(), (0.0, 4.0)).position["left_hand"].mean == pytest.approx(1e3 * np.sqrt(3))
+    off.points["left_palm"][:50] += 1.0  # type: ignore[index]
+    assert evaluate(off, pose(), (5.0, 10.0)).position["left_palm"].mean == pytest.approx(0.0, abs=1e-9)
+    assert evaluate(off, pose(), (0.0, 4.0)).position["left_palm"].mean == pytest.approx(1e3 * np.sqrt(3))
 
 
 def test_no_error_is_taken_within_a_gap_of_the_truth() -> None:
     truth, off = pose(), pose()
-    off.points["left_hand"][40:60] += 1.0  # type: ignore[index]
-    truth.points["left_hand"][38:62] = np.nan  # type: ignore[index]
-    assert evaluate(off, truth).position["left_hand"].worst == pytest.approx(0.0, abs=1e-9)
+    off.points["left_palm"][40:60] += 1.0  # type: ignore[index]
+    truth.points["left_palm"][38:62] = np.nan  # type: ignore[index]
+    assert evaluate(off, truth).position["left_palm"].worst == pytest.approx(0.0, abs=1e-9)
 
 
 def test_heading_inclination_and_drift() -> None:
@@ -113,13 +113,13 @@ def test_stated_uncertainty_is_judged() -> None:
 
 def test_uncertainty_goes_through_the_table() -> None:
     cov = np.tile(np.diag([1e-4, 4e-4, 9e-4]), (101, 1, 1))
-    stated = replace(pose((0.5, 0.5, 0.5), (0.01, 0.0, 0.0)), segment_cov={"torso": cov}, point_cov={"left_hand": cov})
+    stated = replace(pose((0.5, 0.5, 0.5), (0.01, 0.0, 0.0)), segment_cov={"torso": cov}, point_cov={"left_palm": cov})
     whole = evaluate(pose_from_table(pose_table(stated, covariance=True), "t"), pose())
-    assert whole.position_uncertainty["left_hand"].nees == pytest.approx(1.0)
+    assert whole.position_uncertainty["left_palm"].nees == pytest.approx(1.0)
     direct = evaluate(stated, pose()).attitude_uncertainty["torso"]
     assert whole.attitude_uncertainty["torso"] == pytest.approx(direct)
     rough = evaluate(pose_from_table(pose_table(stated), "t"), pose())
-    assert rough.position_uncertainty["left_hand"].nees == pytest.approx(1e-4 / (14e-4 / 3))
+    assert rough.position_uncertainty["left_palm"].nees == pytest.approx(1e-4 / (14e-4 / 3))
     assert evaluate(pose(), pose()).position_uncertainty == {}
 
 

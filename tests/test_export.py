@@ -15,7 +15,7 @@ from wepose_pin import cli
 from wepose_pin.angles import joint_angles
 from wepose_pin.errors import BadData, BadOption, ExistingOutput, MissingFile
 from wepose_pin.model import load_model
-from wepose_pin.pose import Pose, pose_from_table, pose_of, pose_table
+from wepose_pin.pose import Pose, compute_pose, pose_from_table, pose_table
 from wepose_pin.recording import SEGMENTS
 from wepose_pin.writers import export as writers
 from wepose_pin.writers.export import export
@@ -23,7 +23,7 @@ from wepose_pin.writers.motion import Motion, resampled
 from wepose_pin.writers.result import write_table
 
 LENGTHS = {"shoulder_width": 0.41, "left_upper_arm": 0.29, "right_forearm": 0.25, "right_hand": 0.07}
-POINTS = [f"{side}_{part}" for side in ("left", "right") for part in ("shoulder", "elbow", "wrist", "hand")]
+POINTS = [f"{side}_{part}" for side in ("left", "right") for part in ("shoulder", "elbow", "wrist", "palm")]
 
 
 def smooth(n: int, seed: int, size: float) -> np.ndarray:
@@ -39,7 +39,7 @@ def a_pose(segments: tuple[str, ...] = SEGMENTS, n: int = 301, rate_hz: float = 
         name: Rotation.from_rotvec(smooth(n, k, 0.2 if name in ("torso", "pelvis") else 0.7)).as_quat()
         for k, name in enumerate(segments)
     }
-    pose = pose_of(load_model(lengths=LENGTHS), 2.0 + np.arange(n) / rate_hz, quat_WL)
+    pose = compute_pose(load_model(lengths=LENGTHS), 2.0 + np.arange(n) / rate_hz, quat_WL)
     spread = np.linspace(1.0, 2.0, n)[:, None, None] * np.diag([1.0, 2.0, 3.0])
     return replace(
         pose,
@@ -96,7 +96,7 @@ def test_tables_hold_pose_and_angles(result: Path, pose: Pose, tmp_path: Path, f
     np.testing.assert_allclose(table["right_elbow_flexion_deg"], np.degrees(elbow.values[:, 0]), atol=1e-9)
     np.testing.assert_allclose(table["right_elbow_pronation_std_deg"], np.degrees(elbow.std[:, 2]), rtol=1e-9)
     again = pose_from_table(table, str(file))
-    np.testing.assert_array_equal(again.points["left_hand"], pose.points["left_hand"])
+    np.testing.assert_array_equal(again.points["left_palm"], pose.points["left_palm"])
 
 
 def test_csv_leaves_empty_what_is_not_known(tmp_path: Path, pose: Pose) -> None:
@@ -144,17 +144,17 @@ def test_c3d_marks_what_hangs_on_a_gap(tmp_path: Path, pose: Pose) -> None:
     data = ezc3d.c3d(str(tmp_path / "x.c3d"))["data"]
     lost = data["meta_points"]["residuals"][0] == -1.0
     hit = {POINTS[k]: np.flatnonzero(row).tolist() for k, row in enumerate(lost) if row.any()}
-    assert hit == {name: list(range(10, 20)) for name in ("right_wrist", "right_hand")}  # a hand hangs on its wrist
+    assert hit == {name: list(range(10, 20)) for name in ("right_wrist", "right_palm")}  # a hand hangs on its wrist
     assert np.isnan(data["points"][0, POINTS.index("right_wrist"), 10:20]).all()
 
 
 def test_c3d_with_more_frames_than_it_counts(tmp_path: Path) -> None:
     pytest.importorskip("ezc3d")
     n = 65536
-    long = Pose(0.01 * np.arange(n), {}, {"left_hand": np.zeros((n, 3))})
+    long = Pose(0.01 * np.arange(n), {}, {"left_palm": np.zeros((n, 3))})
     with pytest.raises(BadData, match=r"65536 samples; a \.c3d holds 65535, which --rate-hz 99 makes fewer than"):
         writers.write_c3d(tmp_path / "x.c3d", Motion(long, load_model(), "x", "x"))
-    short = replace(long, time=long.time[:-1], points={"left_hand": np.zeros((n - 1, 3))})
+    short = replace(long, time=long.time[:-1], points={"left_palm": np.zeros((n - 1, 3))})
     assert writers.write_c3d(tmp_path / "x.c3d", Motion(short, load_model(), "x", "x")) == []
 
 
@@ -209,7 +209,7 @@ def test_bvh_puts_every_joint_where_it_was(result: Path, pose: Pose, tmp_path: P
     for joint, point in BVH_POINTS.items():
         np.testing.assert_allclose(positions[:, names.index(joint)], in_bvh(pose.points[point]), atol=5e-6)
     ends = [k for k, name in enumerate(names) if k and names[k - 1] == "RightHand"]
-    np.testing.assert_allclose(positions[:, ends[0]], in_bvh(pose.points["right_hand"]), atol=5e-6)
+    np.testing.assert_allclose(positions[:, ends[0]], in_bvh(pose.points["right_palm"]), atol=5e-6)
 
 
 def test_bvh_turns_every_joint_as_it_was(result: Path, pose: Pose, tmp_path: Path) -> None:
@@ -251,7 +251,7 @@ def test_bvh_of_a_body_with_a_spine(tmp_path: Path, data: Path) -> None:
     pybvh = pytest.importorskip("pybvh")
     model = load_model(data / "human_urdf" / "humanSubject01_66dof.urdf")
     upright = a_pose(n=40)
-    pose = pose_of(model, upright.time, upright.quat_WL)
+    pose = compute_pose(model, upright.time, upright.quat_WL)
     writers.write_bvh(tmp_path / "x.bvh", Motion(pose, model, "x", "x"))
     read = pybvh.read_bvh_file(tmp_path / "x.bvh")
     names = [node.name for node in read.nodes]
@@ -276,7 +276,7 @@ def test_resampling_goes_through_the_body(pose: Pose) -> None:
     new = resampled(Motion(with_gap(pose), model, "x", "x"), 250.0).pose
     np.testing.assert_allclose(np.diff(new.time), 0.004, atol=1e-12)
     assert (new.time[0], new.time[-1]) == (2.0, pytest.approx(5.0))
-    np.testing.assert_allclose(new.points["left_hand"][::5], pose.points["left_hand"][::2], atol=1e-12)
+    np.testing.assert_allclose(new.points["left_palm"][::5], pose.points["left_palm"][::2], atol=1e-12)
     arm = np.linalg.norm(new.points["left_elbow"] - new.points["left_shoulder"], axis=1)
     np.testing.assert_allclose(arm, 0.29, atol=1e-12)  # a chord between two points would be shorter
     truth = Rotation.from_rotvec(smooth(3001, 1, 0.7)).as_quat()[4::4][: len(new.time) - 1]
@@ -285,7 +285,7 @@ def test_resampling_goes_through_the_body(pose: Pose) -> None:
     assert off.max() < 1e-3
     lost = new.time[new.gap["right_forearm"]]
     assert (lost[0], lost[-1]) == (pytest.approx(2.092), pytest.approx(2.196))
-    np.testing.assert_allclose(new.point_cov["left_hand"][::5], pose.point_cov["left_hand"][::2], rtol=1e-12)
+    np.testing.assert_allclose(new.point_cov["left_palm"][::5], pose.point_cov["left_palm"][::2], rtol=1e-12)
 
 
 def test_uneven_times_are_made_even_where_the_format_has_only_a_rate(tmp_path: Path, pose: Pose) -> None:
@@ -323,7 +323,7 @@ def test_a_sample_without_orientation_is_named(tmp_path: Path, pose: Pose) -> No
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["-o", "x.dat"], "-o x.dat: '.dat' is no format's suffix; --format says which; there is: csv, parquet, mot"),
+        (["-o", "x.dat"], "-o x.dat: '.dat' is no format's suffix; state it by --format; there is: csv, parquet, mot"),
         (["-o", "x.trc", "--format", "tcr"], "--format tcr: not known; did you mean 'trc'?"),
         (["-o", "x.dat", "--format", "c3d"], "name it x.c3d"),
         (["-o", "x.txt", "--format", "placement"], "name it x.sto"),

@@ -20,7 +20,7 @@ from test_export import LENGTHS, POINTS, a_pose, smooth, with_gap, write_folder
 
 from wepose_pin.angles import joint_angles
 from wepose_pin.model import load_model
-from wepose_pin.pose import Pose, pose_of
+from wepose_pin.pose import Pose, compute_pose
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe
 from wepose_pin.writers.export import export
@@ -182,7 +182,7 @@ def pose_by_opensim(peer: Callable[..., Any], values: Mapping[str, np.ndarray], 
     for k, (body, segment) in enumerate(SEGMENT_OF.items()):
         R_WL = Rotation.from_matrix(R_GW.T @ moves[body] @ stands[body][0].T @ R_GW)
         quat_WL[segment] = (R_WL * Rotation.from_rotvec(noise * smooth(n, 200 + k, 1.0))).as_quat()
-    return pose_of(load_model(lengths=LENGTHS), 0.01 * np.arange(n), quat_WL)
+    return compute_pose(load_model(lengths=LENGTHS), 0.01 * np.arange(n), quat_WL)
 
 
 @pytest.mark.peer
@@ -224,7 +224,7 @@ def test_trc_by_opensim(peer: Callable[..., Any], tmp_path: Path) -> None:
     for k, point in enumerate(POINTS):
         x, y, z = pose.points[point].T
         wanted = 1e3 * np.column_stack([x, z, -y])
-        if point in ("right_wrist", "right_hand"):  # the last of a row among them
+        if point in ("right_wrist", "right_palm"):  # the last of a row among them
             wanted[10:20] = np.nan
         np.testing.assert_allclose(table["values"][:, k], wanted, atol=1e-6)
     assert peer("frames_of_marker_data", tmp_path / "x.trc") == 301

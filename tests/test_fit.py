@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.angles.torques import pose_torques
 from wepose_pin.model import BodyModel, load_model
-from wepose_pin.model.fit import fit, limits_of, unseen
-from wepose_pin.pose import configuration, deviation, forward_kinematics, placements
+from wepose_pin.model.fit import find_undetermined_joints, fit, joint_limits
+from wepose_pin.pose import configuration, forward_kinematics, orientation_residuals, placements
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track
@@ -88,10 +88,12 @@ def test_nothing_is_nearer_by_another_minimiser(body: BodyModel, limits: bool, w
 def test_limits_are_kept_and_the_rest_of_the_arm_takes_its_share(body: BodyModel) -> None:
     quat_WL = motion(body, 200, 2, 5.0, reach=1.5)
     kept, passed = configuration(body, quat_WL), configuration(body, quat_WL, limits=False)
-    at, lower, upper = limits_of(body.pin, [body.pin.getJointId(name) for name in HINGES])
+    at, lower, upper = joint_limits(body.pin, [body.pin.getJointId(name) for name in HINGES])
     assert np.all((kept[:, at] >= lower) & (kept[:, at] <= upper))
     assert np.any((passed[:, at] < lower - 0.1) | (passed[:, at] > upper + 0.1))
-    free, bound = ({k: np.sqrt(np.mean(v**2)) for k, v in deviation(body, q, quat_WL).items()} for q in (passed, kept))
+    free, bound = (
+        {k: np.sqrt(np.mean(v**2)) for k, v in orientation_residuals(body, q, quat_WL).items()} for q in (passed, kept)
+    )
     assert set(bound) == set(ARM)
     assert all(np.rad2deg(bound[name]) > 2.0 for name in ARM)
     assert sum(v**2 for v in bound.values()) > sum(v**2 for v in free.values())
@@ -99,15 +101,17 @@ def test_limits_are_kept_and_the_rest_of_the_arm_takes_its_share(body: BodyModel
 
 def test_a_heavy_segment_is_missed_by_less(body: BodyModel) -> None:
     quat_WL = motion(body, 60, 3, 10.0)
-    even = deviation(body, configuration(body, quat_WL), quat_WL)["left_forearm"]
-    heavy = deviation(body, configuration(body, quat_WL, weights={"left_forearm": 100.0}), quat_WL)["left_forearm"]
+    even = orientation_residuals(body, configuration(body, quat_WL), quat_WL)["left_forearm"]
+    heavy = orientation_residuals(body, configuration(body, quat_WL, weights={"left_forearm": 100.0}), quat_WL)[
+        "left_forearm"
+    ]
     assert heavy.mean() < 0.1 * even.mean()
 
 
 def test_what_can_be_followed_within_limits_is_followed_exactly(body: BodyModel) -> None:
     quat_WL = motion(body, 200, 4, 0.0, reach=0.9)
     q = configuration(body, quat_WL)
-    assert max(angle.max() for angle in deviation(body, q, quat_WL).values()) < 1e-7
+    assert max(angle.max() for angle in orientation_residuals(body, q, quat_WL).values()) < 1e-7
     assert np.abs(np.diff(q, axis=0)).max() < 0.2  # it does not jump
 
 
@@ -117,11 +121,11 @@ def test_a_fit_of_its_own_finds_the_configuration_that_made_the_orientations(bod
     joints = [body.joints["LeftUpperArm"], *(body.pin.getJointId(name) for name in HINGES)]
     arm = {name: quat_WL[name] for name in ARM}
     q = fit(body.pin, arm, joints, pin.neutral(body.pin)[None])
-    assert max(angle.max() for angle in deviation(body, q, arm).values()) < 1e-6
+    assert max(angle.max() for angle in orientation_residuals(body, q, arm).values()) < 1e-6
 
 
 def test_which_joints_the_known_links_leave_open(body: BodyModel) -> None:
-    open_ones = unseen(body.pin, ["LeftUpperArm", "LeftForeArm"], pin.neutral(body.pin))
+    open_ones = find_undetermined_joints(body.pin, ["LeftUpperArm", "LeftForeArm"], pin.neutral(body.pin))
     assert {"jLeftWrist_rotx", "jLeftC7Shoulder_rotx", "LeftUpperArm", "RightUpperArm"} <= set(open_ones)
     assert not {"jLeftElbow_roty", "jLeftElbow_rotz"} & set(open_ones)
 
@@ -142,7 +146,7 @@ def test_a_person_on_48_degrees_of_freedom(data: Path, body: BodyModel) -> None:
         down = np.degrees(np.arccos(np.clip(R[:, :, 2, 2].mean(axis=0), -1.0, 1.0)))
         print(interval, dict(zip(arms, down.round(1).tolist(), strict=True)))
         assert np.all(down < most)
-    at, lower, upper = limits_of(body.pin, [body.pin.getJointId(name) for name in HINGES])
+    at, lower, upper = joint_limits(body.pin, [body.pin.getJointId(name) for name in HINGES])
     assert np.all((pose.q[:, at] >= lower) & (pose.q[:, at] <= upper))
 
 
@@ -151,7 +155,7 @@ def test_limits_can_be_let_go_and_torques_are_written_as_estimates(
 ) -> None:
     pose = track(simulation.recording(), model=body, limits=False)
     assert pose.q is not None
-    at, lower, upper = limits_of(body.pin, [body.pin.getJointId(name) for name in HINGES])
+    at, lower, upper = joint_limits(body.pin, [body.pin.getJointId(name) for name in HINGES])
     assert np.any((pose.q[:, at] < lower - 0.01) | (pose.q[:, at] > upper + 0.01))
     write_result(tmp_path, pose, torques=pose_torques(pose))
     table = pl.read_parquet(tmp_path / "torques.parquet")

@@ -16,7 +16,7 @@ from wepose_pin.simulation import MTI_3, PERFECT, Simulation, simulate, simulate
 from wepose_pin.subject import LENGTHS, Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.tracking import track
 
-HINGES = {side: Hinge(np.array([0.0, 1.0, 0.0]), np.deg2rad(2.0)) for side in ("left", "right")}
+HINGES = {joint: Hinge(np.array([0.0, 1.0, 0.0]), np.deg2rad(2.0)) for joint in ("left_elbow", "right_elbow")}
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def made() -> tuple[Simulation, Subject]:
     person = simulated_person(4)
     simulation = simulate(person.lengths, seed=4, noise=PERFECT, clasp_s=40.0, circles=4)
     mounts = dict.fromkeys(simulation.quat_WL, np.array([0.0, 0.0, 0.0, 1.0]))
-    return simulation, replace(person.average, lengths=person.lengths, mounts=mounts, hinges=HINGES)
+    return simulation, replace(person.prior, lengths=person.lengths, mounts=mounts, hinges=HINGES)
 
 
 def drifting(simulation: Simulation, deg_min: dict[str, float]) -> Recording:
@@ -45,13 +45,13 @@ def test_a_forearm_that_drifts_is_brought_back(made: tuple[Simulation, Subject])
     for hold in (False, True):
         pose = track(recording, subject, correct_headings=hold)
         errors[hold] = (
-            evaluate(pose.pose, simulation.truth(), simulation.phases["circles"][0]).position["right_hand"].mean
+            evaluate(pose.pose, simulation.truth(), simulation.phases["circles"][0]).position["right_palm"].mean
         )
     assert errors[True] < 0.7 * errors[False]
     assert pose.correction is not None
     assert pose.correction.clasp_mm is not None
     assert pose.correction.clasp_mm[1] < 0.6 * pose.correction.clasp_mm[0]
-    assert pose.correction.hinge_deg["right"][1] < pose.correction.hinge_deg["right"][0]
+    assert pose.correction.hinge_deg["right_elbow"][1] < pose.correction.hinge_deg["right_elbow"][0]
     summary = pose.summary()["heading_correction"]
     assert (
         summary["largest_correction_deg"]["right_forearm"] > 4.0 > summary["largest_correction_deg"]["left_upper_arm"]
@@ -100,7 +100,7 @@ def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     noise = replace(MTI_3, gyro_density=40.0 * MTI_3.gyro_density)
     simulation = simulate(simulated_person(4).lengths, seed=4, noise=noise, clasp_s=40.0, circles=2)
     recording = simulation.recording()
-    average = simulated_person(4).average
+    average = simulated_person(4).prior
     order = (*LENGTHS, *mount_rows("torso"), *mount_rows("right_forearm"))
     covariance = np.zeros((len(order), len(order)))
     covariance[:8, :8] = average.covariance
@@ -125,14 +125,14 @@ def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tm
     path = tmp_path / "subject.toml"
     path.write_text(subject_toml(subject))
     again = load_subject(path)
-    for side, hinge in subject.hinges.items():
-        np.testing.assert_allclose(again.hinges[side].axis, hinge.axis, atol=1e-9)
-        assert again.hinges[side].std == pytest.approx(hinge.std, rel=1e-3)
-    path.write_text(subject_toml(subject).replace("[hinges.left]", "[hinges.middle]"))
-    with pytest.raises(BadSubject, match=r"hinges\.middle is not a side; there is: left, right"):
+    for joint, hinge in subject.hinges.items():
+        np.testing.assert_allclose(again.hinges[joint].axis, hinge.axis, atol=1e-9)
+        assert again.hinges[joint].std == pytest.approx(hinge.std, rel=1e-3)
+    path.write_text(subject_toml(subject).replace("[hinges.left_elbow]", "[hinges.middle_elbow]"))
+    with pytest.raises(BadSubject, match=r"hinges\.middle_elbow is not a joint; did you mean"):
         load_subject(path)
     path.write_text(subject_toml(subject).replace("y = 1.0", "y = 2.0"))
-    with pytest.raises(BadSubject, match=r"hinges\.left: x, y, z must be of length 1"):
+    with pytest.raises(BadSubject, match=r"hinges\.left_elbow: x, y, z must be of length 1"):
         load_subject(path)
 
 

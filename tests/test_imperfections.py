@@ -32,7 +32,7 @@ from wepose_pin.simulation import (
 from wepose_pin.simulation.imu import lost
 from wepose_pin.simulation.motion import Flaws, Sway
 from wepose_pin.simulation.subject import _STREAMS
-from wepose_pin.subject import average_subject
+from wepose_pin.subject import population_subject
 from wepose_pin.tracking import track
 from wepose_pin.writers import write_session
 
@@ -125,7 +125,7 @@ def test_the_perfect_world_is_the_default_and_what_it_was() -> None:
         one.accel_S["left_forearm"][1000], [-9.588895243009967, 1.2926217306950627, -0.23232891197459637], rtol=1e-8
     )
     np.testing.assert_allclose(
-        one.points["right_hand"][1000], [0.22785801289839924, 0.12204711584032252, 0.6425385723237393], rtol=1e-12
+        one.points["right_palm"][1000], [0.22785801289839924, 0.12204711584032252, 0.6425385723237393], rtol=1e-12
     )
 
 
@@ -185,7 +185,7 @@ def test_segments_keep_their_length(body: Simulation) -> None:
         for part, a, b in (
             ("upper_arm", "shoulder", "elbow"),
             ("forearm", "elbow", "wrist"),
-            ("hand", "wrist", "hand"),
+            ("hand", "wrist", "palm"),
         ):
             p_W = body.points[f"{side}_{b}"] - body.points[f"{side}_{a}"]
             segment = f"{side}_{'forearm' if part == 'hand' else part}"
@@ -244,7 +244,7 @@ def test_soft_tissue_follows_the_movement_and_is_still_at_rest() -> None:
 
 def test_palms_slip_by_as_much_as_stated(body: Simulation) -> None:
     clasp = within(body, "clasp")
-    slip_mm = 1e3 * in_torso(body, body.points["left_hand"] - body.points["right_hand"])[clasp]
+    slip_mm = 1e3 * in_torso(body, body.points["left_palm"] - body.points["right_palm"])[clasp]
     assert rms(slip_mm) == pytest.approx(8.0, rel=0.1)
     np.testing.assert_allclose(np.sqrt(np.mean(slip_mm**2, axis=0)), 8.0 / np.sqrt(3.0), rtol=0.1)
     assert np.linalg.norm(np.diff(slip_mm, axis=0), axis=1).max() * body.rate_hz < 60.0  # [mm/s]
@@ -314,7 +314,7 @@ def test_a_standing_person_sways() -> None:
 
 def test_devices_err_as_stated() -> None:
     rng = np.random.default_rng(0)
-    devices = [Device.draw(rng, REALISTIC) for _ in range(400)]
+    devices = [Device.sample(rng, REALISTIC) for _ in range(400)]
     gyro, accel = (
         np.stack([getattr(d, name) for d in devices]) - np.eye(3) for name in ("gyro_matrix", "accel_matrix")
     )
@@ -359,7 +359,7 @@ def test_quantisation_and_range() -> None:
             assert np.array_equal(getattr(cut, name)[segment], expected)
     assert np.sum(np.abs(cut.gyro_S["left_forearm"]) == np.deg2rad(90.0)) > 10
     # the largest number of 16 bits is one step below the full scale
-    device = Device.draw(np.random.default_rng(0), PERFECT_WORLD)
+    device = Device.sample(np.random.default_rng(0), PERFECT_WORLD)
     full = np.array([[1e3, -1e3, 0.0]])
     readings = device.measure(full, full, 100.0, PERFECT, digital.imperfections, np.random.default_rng(0))
     np.testing.assert_allclose(readings.gyro_S, [[(2**15 - 1) * gyro_step, -np.deg2rad(2000.0), 0.0]])
@@ -431,8 +431,8 @@ def test_mounts_at_any_rotation_need_a_subject() -> None:
     with pytest.raises(BadSession, match="mount is not known"):
         track(sim.recording())
     sim = simulate(LENGTHS, seed=1, imperfections=sizes, clasp_s=5.0, circles=1)
-    pose = track(sim.recording(), replace(average_subject(), lengths=LENGTHS, mounts=sim.quat_LS))
-    assert np.linalg.norm(pose.points["right_hand"] - sim.points["right_hand"], axis=1).mean() < 0.02
+    pose = track(sim.recording(), replace(population_subject(), lengths=LENGTHS, mounts=sim.quat_LS))
+    assert np.linalg.norm(pose.points["right_palm"] - sim.points["right_palm"], axis=1).mean() < 0.02
 
 
 # Noise -----------------------------------------------------------------------------------------------------------
@@ -507,10 +507,10 @@ def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, 
     if name not in IN_BODY:
         for segment in SEGMENTS:
             assert np.array_equal(without.quat_WL[segment], realistic.quat_WL[segment])
-        assert np.array_equal(without.points["right_hand"], realistic.points["right_hand"])
+        assert np.array_equal(without.points["right_palm"], realistic.points["right_palm"])
     # What is seen of the others does not change either.
     clasp = within(realistic, "clasp")
-    slip, less_slip = (in_torso(s, s.points["left_hand"] - s.points["right_hand"])[clasp] for s in (realistic, without))
+    slip, less_slip = (in_torso(s, s.points["left_palm"] - s.points["right_palm"])[clasp] for s in (realistic, without))
     if name == "palm_slip":
         assert np.abs(less_slip).max() < 1e-9
     else:
@@ -526,7 +526,7 @@ def test_mount_is_a_stream_of_its_own(realistic: Simulation) -> None:
     loose = simulate(LENGTHS, seed=5, imperfections=replace(REALISTIC, mount="any"), clasp_s=20.0, circles=2)
     for name, values in sensor_draws(loose).items():
         assert np.array_equal(values, sensor_draws(realistic)[name]) == (name != "mount")
-    assert np.array_equal(loose.points["left_hand"], realistic.points["left_hand"])
+    assert np.array_equal(loose.points["left_palm"], realistic.points["left_palm"])
 
 
 # One sensor ------------------------------------------------------------------------------------------------------
@@ -575,6 +575,6 @@ def test_single_sensor_at_both_rates_and_with_a_real_device() -> None:
 def test_realistic_people_are_tracked() -> None:
     person = simulated_person(1)
     sim = simulate(person.lengths, seed=1, imperfections=REALISTIC, clasp_s=5.0, circles=1)
-    pose = track(sim.recording(), replace(person.average, lengths=person.lengths))
-    error = np.linalg.norm(pose.points["right_hand"] - sim.points["right_hand"], axis=1)
+    pose = track(sim.recording(), replace(person.prior, lengths=person.lengths))
+    error = np.linalg.norm(pose.points["right_palm"] - sim.points["right_palm"], axis=1)
     assert 0.005 < error.mean() < 0.12

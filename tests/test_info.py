@@ -295,12 +295,12 @@ def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simul
     text = info(capsys, tmp_path / "session")
     assert "a session, 'made'" in text
     assert "phase start [s]" in text
-    (tmp_path / "subject.toml").write_text(subject_toml(person.average), encoding="utf-8")
+    (tmp_path / "subject.toml").write_text(subject_toml(person.prior), encoding="utf-8")
     text = info(capsys, tmp_path / "subject.toml")
     assert "a subject, '" in text
     assert "left_upper_arm" in text
     (tmp_path / "result").mkdir()
-    write_result(tmp_path / "result", wp.track(recording, person.average), phases=recording.phases)
+    write_result(tmp_path / "result", wp.track(recording, person.prior), phases=recording.phases)
     text = info(capsys, tmp_path / "result")
     assert "a result of `wepose track`" in text
     assert json.loads((tmp_path / "result" / "summary.json").read_text())["recording"] in text

@@ -11,10 +11,17 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from wepose_pin import rotations
-from wepose_pin.alignment import heading_to
+from wepose_pin.alignment import compute_heading
 from wepose_pin.calibration import calibrate_lengths, lengths
-from wepose_pin.calibration.joints import SYSTEMATIC_STD, Coupling, _felt, _turn, coupled, couplings
-from wepose_pin.calibration.problem import Layout
+from wepose_pin.calibration.joints import (
+    SYSTEMATIC_STD,
+    Coupling,
+    _estimate_heading,
+    _joint_forces,
+    add_couplings,
+    estimate_couplings,
+)
+from wepose_pin.calibration.least_squares import Gaussian, Layout
 from wepose_pin.filters import run_filter
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
 from wepose_pin.recording import ImuSensor, Recording
@@ -32,38 +39,38 @@ def exact() -> tuple[Simulation, Recording, FilteredRecording]:
 
 
 def true_turn(simulation: Simulation, found: FilteredRecording, near: str, far: str) -> float:
-    psi = [heading_to(found.at_start[name], Rotation.from_quat(simulation.quat_LS[name])) for name in (near, far)]
+    psi = [compute_heading(found.at_start[name], Rotation.from_quat(simulation.quat_LS[name])) for name in (near, far)]
     return psi[0] - psi[1]
 
 
 def test_exact_motion_gives_the_turn_between_the_worlds(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
     simulation, recording, found = exact
-    told = couplings(recording, found, NAMES, recording.phases["clasp"])
-    assert [(c.near, c.far) for c in told] == [
+    couplings = estimate_couplings(recording, found, NAMES, recording.phases["clasp"])
+    assert [(c.near, c.far) for c in couplings] == [
         ("torso", "left_upper_arm"),
         ("left_upper_arm", "left_forearm"),
         ("torso", "right_upper_arm"),
         ("right_upper_arm", "right_forearm"),
     ]
-    for coupling in told:
-        off = coupling.turn - true_turn(simulation, found, coupling.near, coupling.far)
+    for coupling in couplings:
+        off = coupling.heading - true_turn(simulation, found, coupling.near, coupling.far)
         assert abs(np.degrees(np.angle(np.exp(1j * off)))) < 0.5, coupling
         assert SYSTEMATIC_STD < coupling.std < np.deg2rad(2.0)
-        assert coupling.since == pytest.approx(np.mean(recording.phases["clasp"][0]) - found.start[1], abs=0.1)
+        assert coupling.elapsed_s == pytest.approx(np.mean(recording.phases["clasp"][0]) - found.start[1], abs=0.1)
 
 
 def test_too_little_motion_rate_or_time_tells_nothing(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
     _, recording, found = exact
     clasp = recording.phases["clasp"]
-    assert couplings(recording, found, NAMES, ((clasp[0][0], clasp[0][0] + 10.0),)) == []
-    assert couplings(replace(recording, rate_hz=10.0), found, NAMES, clasp) == []
-    assert couplings(recording, found, ("torso", "left_forearm"), clasp) == []
+    assert estimate_couplings(recording, found, NAMES, ((clasp[0][0], clasp[0][0] + 10.0),)) == []
+    assert estimate_couplings(replace(recording, rate_hz=10.0), found, NAMES, clasp) == []
+    assert estimate_couplings(recording, found, ("torso", "left_forearm"), clasp) == []
     still = {
         name: replace(s, gyro_S=0.0 * s.gyro_S, accel_S=s.accel_S[:1] + 0.0 * s.accel_S)
         for name, s in recording.imus.items()
     }
     R_VS = {name: Rotation.concatenate([R[0]] * len(recording)) for name, R in found.R_VS.items()}
-    assert couplings(replace(recording, sensors=still), found._replace(R_VS=R_VS), NAMES, clasp) == []
+    assert estimate_couplings(replace(recording, sensors=still), found._replace(R_VS=R_VS), NAMES, clasp) == []
 
 
 def test_samples_that_are_missing_are_bridged(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
@@ -72,9 +79,11 @@ def test_samples_that_are_missing_are_bridged(exact: tuple[Simulation, Recording
     gyro_S = np.array(sensors["torso"].gyro_S)
     gyro_S[2000:2004] = np.nan
     sensors["torso"] = replace(sensors["torso"], gyro_S=gyro_S)
-    whole = couplings(recording, found, NAMES, clasp)
-    for ours, theirs in zip(couplings(replace(recording, sensors=sensors), found, NAMES, clasp), whole, strict=True):
-        assert ours.turn == pytest.approx(theirs.turn, abs=np.deg2rad(0.2))
+    whole = estimate_couplings(recording, found, NAMES, clasp)
+    for ours, theirs in zip(
+        estimate_couplings(replace(recording, sensors=sensors), found, NAMES, clasp), whole, strict=True
+    ):
+        assert ours.heading == pytest.approx(theirs.heading, abs=np.deg2rad(0.2))
 
 
 def test_a_coupling_keeps_whole_turns_and_shares_with_the_drift() -> None:
@@ -82,14 +91,15 @@ def test_a_coupling_keeps_whole_turns_and_shares_with_the_drift() -> None:
     center, start = np.zeros(layout.size), np.zeros(layout.size)
     start[layout.heading] = [7.0, 0.3]  # the torso more than a turn on
     information = np.eye(layout.size) * 1e-6
-    said = Coupling("torso", "left_upper_arm", 0.5, 0.01, 30.0)
-    moved, after = coupled(center, information, layout, [said], start)
+    coupling = Coupling("torso", "left_upper_arm", 0.5, 0.01, 30.0)
+    prior = Gaussian(center, information)
+    moved, after = add_couplings(prior, layout, [coupling], start)
     psi, drift = moved[layout.heading], moved[layout.drift]
     assert psi[0] - psi[1] + 30.0 * (drift[0] - drift[1]) == pytest.approx(0.5 + 2.0 * np.pi, abs=1e-3)
     H = np.zeros(layout.size)
     H[layout.heading], H[layout.drift] = [1.0, -1.0], [30.0, -30.0]
-    assert H @ np.linalg.solve(after, H) == pytest.approx(said.std**2, rel=1e-2)
-    assert np.array_equal(coupled(center, information, layout, [], start)[1], information)
+    assert H @ np.linalg.solve(after, H) == pytest.approx(coupling.std**2, rel=1e-2)
+    assert add_couplings(prior, layout, [], start) is prior
 
 
 def test_soft_tissue_of_the_torso_is_no_heading(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,15 +108,15 @@ def test_soft_tissue_of_the_torso_is_no_heading(monkeypatch: pytest.MonkeyPatch)
     for seed in (0, 6):
         person = simulated_person(seed)
         simulation = simulate(person.lengths, seed=seed, imperfections=replace(REALISTIC, mount="any"), circles=0)
-        gauge = {"shoulder_width": person.taped["shoulder_width"]}
-        for felt in (True, False):
+        measured = {"shoulder_width": person.measured["shoulder_width"]}
+        for coupled in (True, False):
             with monkeypatch.context() as patch:
-                if not felt:
-                    patch.setattr(lengths, "couplings", lambda *_: [])
-                found = calibrate_lengths(simulation.recording(), gauge=gauge, prior=person.average).subject
+                if not coupled:
+                    patch.setattr(lengths, "estimate_couplings", lambda *_: [])
+                found = calibrate_lengths(simulation.recording(), measured=measured, prior=person.prior).subject
             error = Rotation.from_quat(found.mounts["torso"]) * Rotation.from_quat(simulation.quat_LS["torso"]).inv()
-            off[felt].append(abs(float(np.degrees(error.as_rotvec()[2]))))
-            assert off[felt][-1] < 2.0 * np.degrees(found.std("mounts.torso.z"))
+            off[coupled].append(abs(float(np.degrees(error.as_rotvec()[2]))))
+            assert off[coupled][-1] < 2.0 * np.degrees(found.std("mounts.torso.z"))
     print(off)
     assert min(off[False]) > 3.0
     assert max(off[True]) < 2.5
@@ -139,9 +149,9 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
         recording = Recording("ring", clock, sensor.rate_hz, sensors)
         filtered = FilteredRecording(R_VS, {}, {}, (0.0, 0.0), (0.0, 0.0), [])
         at = np.arange(0, round(60.0 * sensor.rate_hz), 4)
-        felt = {name: _felt(recording, filtered, name, at) for name in RING_SEGMENTS}
+        forces = {name: _joint_forces(recording, filtered, name, at) for name in RING_SEGMENTS}
         for near, far in pairwise(RING_SEGMENTS):
-            turn, std = _turn(felt[near], felt[far])
+            turn, std = _estimate_heading(forces[near], forces[far])
             off = np.degrees(np.angle(np.exp(1j * (turn - psi[near] + psi[far]))))
             assert abs(off) < 2.5, (mount, near, far)
             assert abs(off) < 2.0 * np.degrees(np.hypot(std, SYSTEMATIC_STD))

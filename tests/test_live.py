@@ -23,7 +23,7 @@ from wepose_pin.readers.live_log import SAMPLES, blocks, read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import LENGTHS, average_subject, mount_rows, subject_of
+from wepose_pin.subject import LENGTHS, mount_rows, parse_subject, population_subject
 from wepose_pin.tracking import track
 from wepose_pin.writers.live_log import LiveLog
 
@@ -141,7 +141,7 @@ def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: S
     """Mounts and their covariance decide the headings: all of their bits count."""
     order = tuple(row for segment in simulation.quat_LS for row in mount_rows(segment))
     subject = replace(
-        average_subject(),
+        population_subject(),
         mounts={name: Rotation.from_quat(quat).as_quat() for name, quat in simulation.quat_LS.items()},
         order=(*LENGTHS, *order),
         covariance=np.diag([1e-4 / 3.0] * len(LENGTHS) + [np.deg2rad(1.0 / 3.0) ** 2] * len(order)),
@@ -149,7 +149,7 @@ def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: S
     source = ReplaySource(recording, math.inf)
     run_session(source, SensorSetup.from_recording(recording, subject), record=tmp_path / "a.wepose")
     found = read_live_log(tmp_path / "a.wepose")
-    again = track(found.recording, subject_of(found.header["subject"], tmp_path), causal=True)
+    again = track(found.recording, parse_subject(found.header["subject"], tmp_path), causal=True)
     assert all(np.array_equal(found.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
     assert len(found.quat_WL) > 2000
 

@@ -21,7 +21,7 @@ from wepose_pin.live.outputs import LslOutput, RateLimiter, UdpOutput, list_chan
 from wepose_pin.live.state import LivePose, StreamInfo
 
 ROOT = Path(__file__).resolve().parent.parent
-INFO = StreamInfo(("torso", "right_forearm"), ("right_wrist", "right_hand"), 100.0)
+INFO = StreamInfo(("torso", "right_forearm"), ("right_wrist", "right_palm"), 100.0)
 
 
 def pose(time_s: float = 1.25, seed: int = 0, **other: Any) -> LivePose:
@@ -51,7 +51,7 @@ def test_json_keeps_micrometres_and_says_what_is_not_known() -> None:
     assert said["std"] == {"torso": 0.02, "right_forearm": None}
     assert said["lost"] == ["right_forearm"]
     unknown = pose(points=np.array([[np.nan, 0.0, 0.0], [1.0, 2.0, 3.0]]))
-    assert json.loads(pose_json(INFO, unknown))["points"] == {"right_wrist": None, "right_hand": [1.0, 2.0, 3.0]}
+    assert json.loads(pose_json(INFO, unknown))["points"] == {"right_wrist": None, "right_palm": [1.0, 2.0, 3.0]}
 
 
 def test_json_of_the_document() -> None:
@@ -62,7 +62,7 @@ def test_json_of_the_document() -> None:
     assert list(documented) == list(real)
     assert documented["format"] == real["format"]
     assert len(documented["segments"]["torso"]) == 4
-    assert len(documented["points"]["right_hand"]) == 3
+    assert len(documented["points"]["right_palm"]) == 3
 
 
 def test_a_datagram_a_pose(receiver: socket.socket) -> None:
@@ -162,7 +162,7 @@ def test_the_example_reads_it() -> None:
     out = UdpOutput(f"127.0.0.1:{port}")
     out.start(INFO)
     until = time.monotonic() + 30.0
-    where = json.loads(pose_json(INFO, pose()))["points"]["right_hand"]
+    where = json.loads(pose_json(INFO, pose()))["points"]["right_palm"]
     for k in range(100_000):
         out.show(pose(k * 0.01))
         time.sleep(0.01)
@@ -192,7 +192,7 @@ def test_lsl_stream(monkeypatch: pytest.MonkeyPatch) -> None:
     out.show(one)
     values, stamp = inlet.pull_sample(timeout=10.0)
     found = dict(zip(described.get_channel_labels(), values, strict=True))
-    np.testing.assert_allclose([found[f"right_hand_{axis}"] for axis in "xyz"], one.points[1], atol=1e-6)
+    np.testing.assert_allclose([found[f"right_palm_{axis}"] for axis in "xyz"], one.points[1], atol=1e-6)
     np.testing.assert_allclose([found[f"torso_{part}"] for part in ("qx", "qy", "qz", "qw")], one.quat_WL[0], atol=1e-6)
     assert (found["torso_lost"], found["right_forearm_lost"]) == (0.0, 1.0)
     assert np.isnan(found["right_forearm_std"])

@@ -107,7 +107,7 @@ def test_a_frame_places_every_link_as_the_kinematics_do(model: BodyModel, person
     for link, (quat_WL, p_WL) in placements(model, q, encoder.links).items():
         np.testing.assert_allclose(placed[link][:9], Rotation.from_quat(quat_WL[0]).as_matrix().ravel(), atol=1e-6)
         np.testing.assert_allclose(placed[link][9:], p_WL[0], atol=1e-6)
-    for k, hand in enumerate(("left_hand", "right_hand")):
+    for k, hand in enumerate(("left_palm", "right_palm")):
         np.testing.assert_allclose(hands[k], pose.points[person.info.points.index(hand)], atol=1e-6)
     assert {link for link, gone in lost.items() if gone} == {"left_forearm", "left_hand"}  # rigid with its forearm
 

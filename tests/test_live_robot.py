@@ -30,7 +30,7 @@ from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, RobotStatusView, T
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.state import LivePose, Status, StreamInfo
-from wepose_pin.pose import Pose, point_covariance, spread
+from wepose_pin.pose import Pose, axis_std, point_covariance
 from wepose_pin.readers import load_session
 from wepose_pin.retargeting import Robot, compute_arm_targets, find_map, load_robot
 from wepose_pin.retargeting.limits import read_joint_limits
@@ -44,7 +44,7 @@ from wepose_pin.retargeting.stream import (
     _LowPass,
 )
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import LENGTHS, average_subject
+from wepose_pin.subject import LENGTHS, population_subject
 from wepose_pin.writers import write_session
 
 pytest.importorskip("daqp")
@@ -193,9 +193,9 @@ def test_the_hands_uncertainty_is_that_of_the_pose(arm: Robot) -> None:
     std = np.array([0.0, 0.02, 0.05])
     cov = np.zeros((len(LENGTHS), len(LENGTHS)))
     at = [LENGTHS.index(f"right_{name}") for name in ("upper_arm", "forearm", "hand")]
-    cov[np.ix_(at, at)] = average_subject().lengths_covariance()[np.ix_(at, at)]
+    cov[np.ix_(at, at)] = population_subject().lengths_covariance()[np.ix_(at, at)]
     segment_cov = {name: np.tile(s**2 * np.eye(3), (50, 1, 1)) for name, s in zip(pose.quat_WL, std, strict=True)}
-    true = spread(point_covariance(pose.points, pose.quat_WL, segment_cov, cov)["right_hand"])
+    true = axis_std(point_covariance(pose.points, pose.quat_WL, segment_cov, cov)["right_palm"])
     seer = ArmObserver(arm, stream_info(pose).segments, stream_info(pose).points, cov)
     for k, one in enumerate(live_poses(pose)):
         seen = seer.observe(one.quat_WL, one.points, std, one.lost)
@@ -206,7 +206,7 @@ def test_the_hands_uncertainty_is_that_of_the_pose(arm: Robot) -> None:
 def test_a_jump_of_a_metre_is_gone_after_slowly(arm: Robot) -> None:
     pose = person(14.0)
     points = dict(pose.points)
-    for name in ("right_elbow", "right_wrist", "right_hand"):
+    for name in ("right_elbow", "right_wrist", "right_palm"):
         points[name] = points[name] + np.where(pose.time > 6.0, 1.0, 0.0)[:, None] * [0.0, 0.0, 1.0]
     found = Session(arm, stream_info(pose)).run(live_poses(replace(pose, points=points)))
     assert found.states(5.0, 6.0) == ["follow"]
@@ -248,7 +248,7 @@ def test_a_lost_sensor_slows_it_and_its_return_is_no_jump(arm: Robot) -> None:
     poses = live_poses(pose)
     row = list(pose.quat_WL).index("right_forearm")
     names = list(pose.points)
-    elbow, wrist, hand = (names.index(f"right_{name}") for name in ("elbow", "wrist", "hand"))
+    elbow, wrist, hand = (names.index(f"right_{name}") for name in ("elbow", "wrist", "palm"))
     for k in range(500, 700):
         last, points, quat = poses[499], poses[k].points.copy(), poses[k].quat_WL.copy()
         for at in (wrist, hand):

@@ -16,7 +16,7 @@ from wepose_pin.assets import asset
 from wepose_pin.diagnostics import from_json, render
 from wepose_pin.errors import BadModel, BadOption, MissingFile
 from wepose_pin.model import POINTS, BodyModel, SegmentLink, chains, load_model
-from wepose_pin.pose import forward_kinematics, pose_of
+from wepose_pin.pose import compute_pose, forward_kinematics
 from wepose_pin.tracking import track
 
 OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"
@@ -533,7 +533,7 @@ def test_a_torso_on_light_links_follows_exactly(data: Path) -> None:
     assert chains(body.pin)["torso"].exact
     assert body.diagnostics == ()
     quat = {"torso": Rotation.from_euler("ZYX", [[170.0, 0.0, 0.0], [60.0, 20.0, -30.0]], degrees=True).as_quat()}
-    pose = pose_of(body, np.arange(2) / 100.0, quat)
+    pose = compute_pose(body, np.arange(2) / 100.0, quat)
     stands, _ = forward_kinematics(body, pose.q, ["torso"])
     missed = Rotation.from_matrix(stands[:, 0]).inv() * Rotation.from_quat(quat["torso"])
     assert np.degrees(missed.magnitude()).max() < 1e-6
@@ -620,7 +620,7 @@ HINGE = triple("left_upper_arm", "left_forearm", "0 0 -0.3", ("0 1 0",), ("0 0 0
 MIMIC_HINGE = HINGE.replace("</joint>", '<mimic joint="finger_j"/></joint>')
 A = "left_upper_arm"
 WRONG = {
-    "no xml": ("no robot", "is no whole XML file"),
+    "no xml": ("no robot", "is no complete XML file"),
     "loop": (small(more=fixed("left_palm", "right_palm", "0 0 0", "floating")), "right_palm' hangs on two joints"),
     "ring": (
         small(more='<link name="a"/><link name="b"/>' + fixed("a", "b", "0 0 0") + fixed("b", "a", "0 0 0")),
@@ -699,12 +699,12 @@ def table_toml(up: str = "+z", forward: str = "+x", more: str = "") -> str:
     return f'urdf = "small.urdf"\nup = "{up}"\nforward = "{forward}"\n[segments]\n{rows}\n{more}'
 
 
-PALMS = '[points]\nleft_hand = "left_palm"\nright_hand = {link = "L_right_hand", at = [0, 0, -0.07]}'
+PALMS = '[points]\nleft_palm = "left_palm"\nright_palm = {link = "L_right_hand", at = [0, 0, -0.07]}'
 
 
 def test_the_table_as_keywords_and_as_files(tmp_path: Path) -> None:
     file = written(tmp_path, other_names(small()))
-    points = {"left_hand": "left_palm", "right_hand": {"link": "L_right_hand", "at": [0.0, 0.0, -0.07]}}
+    points = {"left_palm": "left_palm", "right_palm": {"link": "L_right_hand", "at": [0.0, 0.0, -0.07]}}
     by_keywords = load_model(file, segments=OTHER | {"torso": SegmentLink("L_torso")}, points=points)
     by_table = load_model(written(tmp_path, table_toml(more=PALMS), "any.toml"))
     written(tmp_path, table_toml(more=PALMS), "model.toml")
@@ -765,8 +765,8 @@ BAD_TABLES = {
     "unknown point": (table_toml(more='[points]\nleft_thumb = "torso"'), "points.left_thumb is not a point"),
     "unknown axis": (table_toml(up="z"), "up = 'z'"),
     "parallel axes": (table_toml(up="+x"), "is parallel to up"),
-    "no number": (table_toml(more='[points]\nleft_hand = {link = "torso", at = [1, 2]}'), "three numbers [m]"),
-    "no name": (table_toml(more="[points]\nleft_hand = 3"), "a link's name is wanted"),
+    "no number": (table_toml(more='[points]\nleft_palm = {link = "torso", at = [1, 2]}'), "three numbers [m]"),
+    "no name": (table_toml(more="[points]\nleft_palm = 3"), "a link's name is wanted"),
     "missing": (table_toml().replace('left_forearm = "L_left_forearm"', ""), "no link for segment 'left_forearm'"),
     "no wrist": (table_toml().replace('left_hand = "L_left_hand"', ""), "no wrist"),
     "half": (table_toml().replace('"L_torso"', '{link = "L_torso", up = "+z"}'), "up and forward go together"),
@@ -808,5 +808,5 @@ def test_half_a_file_is_no_body(tmp_path: Path) -> None:
     """The parser behind yourdfpy mends broken XML in silence."""
     text = asset("urdf", "upper_body.urdf").read_bytes()
     (tmp_path / "half.urdf").write_bytes(text[: int(0.9 * len(text))])
-    with pytest.raises(BadModel, match="is no whole XML file"):
+    with pytest.raises(BadModel, match="is no complete XML file"):
         load_model(tmp_path / "half.urdf")

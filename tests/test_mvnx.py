@@ -105,7 +105,7 @@ def tracked(
         lengths[f"{side}_upper_arm"] = np.linalg.norm(still[f"{name}ForeArm"] - still[f"{name}UpperArm"])
         lengths[f"{side}_forearm"] = np.linalg.norm(still[f"{name}Hand"] - still[f"{name}ForeArm"])
     lengths["shoulder_width"] = np.linalg.norm(still["LeftUpperArm"] - still["RightUpperArm"])
-    subject = wp.average_subject()
+    subject = wp.population_subject()
     subject = replace(subject, lengths={**subject.lengths, **{name: float(v) for name, v in lengths.items()}})
     pose = wp.track(wp.load_session(session(tmp_path_factory.mktemp("mvnx"), path, OURS)), subject)
     turn = Rotation.from_rotvec([0.0, 0.0, pose.segments.heading["torso"]])
@@ -170,7 +170,10 @@ def test_the_torso_faces_x_and_arms_keep_what_they_had_to_it(tracked) -> None:
 def test_a_subjects_mounts_and_hinges_do_not_touch_aligned_orientations(tracked) -> None:
     pose, _ = tracked
     mounts = {name: Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat() for name in OURS}
-    hinges = {"left": Hinge(np.array([0.6, 0.8, 0.0]), 0.02), "right": Hinge(np.array([0.6, 0.8, 0.0]), 0.02)}
+    hinges = {
+        "left_elbow": Hinge(np.array([0.6, 0.8, 0.0]), 0.02),
+        "right_elbow": Hinge(np.array([0.6, 0.8, 0.0]), 0.02),
+    }
     again = wp.track(pose.recording, replace(pose.subject, mounts=mounts, hinges=hinges))
     assert again.correction is None
     for name in OURS:

@@ -142,7 +142,7 @@ def test_a_study_whose_figures_are_all_one_up_to_rounding() -> None:
 
 BROKEN = {
     "wepose_pin.report.track.timeline_picture": ("report.html", {"view.html", "report.html"}),
-    "wepose_pin.report.track.pose_diagnostics": ("report.html", {"view.html", "report.html"}),
+    "wepose_pin.report.track.diagnose_pose": ("report.html", {"view.html", "report.html"}),
     "wepose_pin.report.pages.track_report": ("report.html", {"view.html"}),
     "wepose_pin.report.pages.pose_html": ("view.html", {"report.html"}),
 }

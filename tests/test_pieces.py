@@ -26,7 +26,7 @@ from wepose_pin.pose import pose_table
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.report import track_report
-from wepose_pin.report.decimation import Decimator, totals_of
+from wepose_pin.report.decimation import Decimator, compute_totals
 from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.subject import Subject
 from wepose_pin.tracking import SummaryAccumulator, TrackedRecording, TrackOptions, track, track_session
@@ -45,8 +45,10 @@ def made(person: Person) -> Simulation:
 @pytest.fixture(scope="module")
 def subject(made: Simulation, person: Person) -> Subject:
     """Calibrated, with hinges: headings are held together by them and by the hands."""
-    found = calibrate_lengths(made.recording(), gauge=person.taped, prior=person.average, gauge_std=person.taped_std)
-    assert set(found.subject.hinges) == {"left", "right"}
+    found = calibrate_lengths(
+        made.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std
+    )
+    assert set(found.subject.hinges) == {"left_elbow", "right_elbow"}
     return found.subject
 
 
@@ -265,7 +267,7 @@ def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monk
     thin, totals = decimator.decimated(
         pose.recording.phases, [from_json(each) for each in pose.summary()["diagnostics"]]
     )
-    wanted = totals_of(pose)
+    wanted = compute_totals(pose)
     assert totals.samples == len(pose.time) == 5698
     assert len(thin.time) == 317
     np.testing.assert_array_equal(thin.time, pose.time[::18])
@@ -275,12 +277,12 @@ def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monk
         bins = [signal.rate[first : first + 18].max() for first in range(0, 5698, 18)]
         np.testing.assert_allclose(ours.rate, bins, rtol=1e-12)
         assert ours.peak_accel == signal.peak_accel
-        assert ours.rest is not None
-        assert signal.rest is not None
-        np.testing.assert_array_equal(ours.rest, [signal.rest[k : k + 18].all() for k in range(0, 5698, 18)])
+        assert ours.static is not None
+        assert signal.static is not None
+        np.testing.assert_array_equal(ours.static, [signal.static[k : k + 18].all() for k in range(0, 5698, 18)])
         np.testing.assert_array_equal(ours.bias, signal.bias)
     for name, speed in wanted.peak_speed.items():
         assert 0.8 * speed < totals.peak_speed[name] <= speed
     page = track_report(thin, totals=totals)
     assert "5698 samples at 100 Hz" in text_of(page)
-    assert "of 317 samples, one in 18" in text_of(page)
+    assert "for 317 samples, one in 18" in text_of(page)

@@ -12,16 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadModel
 from wepose_pin.model import POINTS, BodyModel, chains, load_model
-from wepose_pin.model.follow import Follower
+from wepose_pin.model.orientation_ik import OrientationIk
 from wepose_pin.pose import (
     LiveKinematics,
+    compute_pose,
     configuration,
-    deviation,
+    find_known_links,
+    find_known_points,
     forward_kinematics,
-    known_links,
-    known_points,
+    orientation_residuals,
     placements,
-    pose_of,
 )
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track
@@ -54,12 +54,12 @@ def test_points_are_the_sum_of_turned_lengths(hands: bool) -> None:
     body = load_model(lengths=lengths)
     L = body.lengths
     quat_WL = orientations(SEGMENTS if hands else CORE)
-    pose = pose_of(body, np.arange(N) / 100.0, quat_WL)
+    pose = compute_pose(body, np.arange(N) / 100.0, quat_WL)
     R = {segment: Rotation.from_quat(quat) for segment, quat in quat_WL.items()}
     for side, sign in (("left", 1.0), ("right", -1.0)):
         p = R["torso"].apply([0.0, sign * L["shoulder_width"] / 2.0, L["trunk"]])
         np.testing.assert_allclose(pose.points[f"{side}_shoulder"], p, atol=1e-12)
-        for segment, point in (("upper_arm", "elbow"), ("forearm", "wrist"), ("hand", "hand")):
+        for segment, point in (("upper_arm", "elbow"), ("forearm", "wrist"), ("hand", "palm")):
             turned = R.get(f"{side}_{segment}", R[f"{side}_forearm"])  # a hand without a sensor is rigid
             p = p + turned.apply([0.0, 0.0, -L[f"{side}_{segment}"]])
             np.testing.assert_allclose(pose.points[f"{side}_{point}"], p, atol=1e-12)
@@ -75,7 +75,7 @@ def test_links_have_the_orientations_given() -> None:
     R, _ = forward_kinematics(body, q, SEGMENTS)
     for k, segment in enumerate(SEGMENTS):
         np.testing.assert_allclose(R[:, k], Rotation.from_quat(quat_WL[segment]).as_matrix(), atol=1e-12)
-    assert deviation(body, q, quat_WL) == {}
+    assert orientation_residuals(body, q, quat_WL) == {}
 
 
 def test_the_configuration_does_not_jump() -> None:
@@ -97,23 +97,23 @@ def test_the_unmeasured_is_rigid_with_what_is_above() -> None:
 
 
 def test_a_single_frame_and_one_segment() -> None:
-    pose = pose_of(load_model(), np.zeros(1), {"torso": np.array([[0.0, 0.0, 1.0, 0.0]])})
+    pose = compute_pose(load_model(), np.zeros(1), {"torso": np.array([[0.0, 0.0, 1.0, 0.0]])})
     assert set(pose.points) == {"left_shoulder", "right_shoulder"}
     assert pose.points["left_shoulder"][0, 1] < 0.0  # turned round
 
 
 def test_what_is_known() -> None:
-    every = [f"{side}_{p}" for side in ("left", "right") for p in ("shoulder", "elbow", "wrist", "hand")]
-    assert known_points(CORE) == known_points(SEGMENTS) == every
-    assert known_points(["torso", "left_upper_arm"]) == ["left_shoulder", "left_elbow", "right_shoulder"]
-    assert known_points(["left_upper_arm", "left_forearm"]) == []
+    every = [f"{side}_{p}" for side in ("left", "right") for p in ("shoulder", "elbow", "wrist", "palm")]
+    assert find_known_points(CORE) == find_known_points(SEGMENTS) == every
+    assert find_known_points(["torso", "left_upper_arm"]) == ["left_shoulder", "left_elbow", "right_shoulder"]
+    assert find_known_points(["left_upper_arm", "left_forearm"]) == []
 
     body = load_model()
-    assert {"head", "pelvis", "left_palm", "right_hand"} <= set(known_links(body, CORE))
-    known = set(known_links(body, ["torso", "left_upper_arm", "right_forearm"]))
+    assert {"head", "pelvis", "left_palm", "right_hand"} <= set(find_known_links(body, CORE))
+    known = set(find_known_links(body, ["torso", "left_upper_arm", "right_forearm"]))
     assert {"root", "torso", "head", "left_upper_arm"} <= known
     assert not known & {"left_forearm", "left_hand", "left_palm", "right_upper_arm", "right_forearm", "right_hand"}
-    assert known_links(body, []) == ["root"]
+    assert find_known_links(body, []) == ["root"]
 
 
 def test_a_segment_that_the_model_lacks() -> None:
@@ -131,7 +131,7 @@ def test_ten_minutes_at_100_hz_take_less_than_a_second() -> None:
     forward_kinematics(body, q, links)
     assert time.process_time() - start < 1.0
     start = time.process_time()
-    pose_of(body, np.arange(60_000) / 100.0, quat_WL)
+    compute_pose(body, np.arange(60_000) / 100.0, quat_WL)
     assert time.process_time() - start < 1.0
 
 
@@ -149,7 +149,7 @@ def test_what_hangs_on_spherical_joints_follows_exactly(data: Path, dof: int) ->
     R, _ = forward_kinematics(body, q, exact)
     for k, segment in enumerate(exact):
         np.testing.assert_allclose(R[:, k], Rotation.from_quat(quat_WL[segment]).as_matrix(), atol=1e-12)
-    assert set(deviation(body, q, quat_WL)) == set(SEGMENTS) - set(exact)
+    assert set(orientation_residuals(body, q, quat_WL)) == set(SEGMENTS) - set(exact)
     for k in body.joints.values():
         first = body.pin.idx_qs[k]
         np.testing.assert_allclose(np.linalg.norm(q[:, first : first + 4], axis=1), 1.0, atol=1e-14)
@@ -158,9 +158,9 @@ def test_what_hangs_on_spherical_joints_follows_exactly(data: Path, dof: int) ->
 def test_arms_on_66_degrees_of_freedom_are_the_sum_of_turned_lengths(data: Path) -> None:
     body = gazebo(data, 66).with_lengths({"left_upper_arm": 0.31, "left_forearm": 0.25, "left_hand": 0.07})
     quat_WL = orientations([*CORE, "left_hand"])
-    points = pose_of(body, np.arange(N) / 100.0, quat_WL).points
+    points = compute_pose(body, np.arange(N) / 100.0, quat_WL).points
     p = points["left_shoulder"]
-    for segment, point, length in (("upper_arm", "elbow", 0.31), ("forearm", "wrist", 0.25), ("hand", "hand", 0.07)):
+    for segment, point, length in (("upper_arm", "elbow", 0.31), ("forearm", "wrist", 0.25), ("hand", "palm", 0.07)):
         p = p + Rotation.from_quat(quat_WL[f"left_{segment}"]).apply([0.0, 0.0, -length])
         np.testing.assert_allclose(points[f"left_{point}"], p, atol=1e-12)
 
@@ -168,7 +168,7 @@ def test_arms_on_66_degrees_of_freedom_are_the_sum_of_turned_lengths(data: Path)
 @pytest.mark.parametrize("dof", [48, 66])
 def test_our_n_pose_hangs_its_arms(data: Path, dof: int) -> None:
     body = gazebo(data, dof)
-    pose = pose_of(body, np.zeros(1), {segment: np.array([[0.0, 0.0, 0.0, 1.0]]) for segment in CORE})
+    pose = compute_pose(body, np.zeros(1), {segment: np.array([[0.0, 0.0, 0.0, 1.0]]) for segment in CORE})
     for side in ("left", "right"):
         drop = pose.points[f"{side}_wrist"] - pose.points[f"{side}_shoulder"]
         length = body.lengths[f"{side}_upper_arm"] + body.lengths[f"{side}_forearm"]
@@ -180,8 +180,8 @@ def test_two_axes_come_as_near_as_they_can(data: Path) -> None:
     body = gazebo(data, 48)
     rng = np.random.default_rng(5)
     quat_WL = orientations(SEGMENTS, 5, n=12)
-    q, _ = Follower(body, chains(body.pin), quat_WL).stepwise(quat_WL, {})
-    missed = deviation(body, q, quat_WL)
+    q, _ = OrientationIk(body, chains(body.pin), quat_WL).stepwise(quat_WL, {})
+    missed = orientation_residuals(body, q, quat_WL)
     grid = np.linspace(-np.pi, np.pi, 61)
     for segment, joints in (
         ("left_forearm", ("jLeftElbow_roty", "jLeftElbow_rotz")),
@@ -208,7 +208,7 @@ def test_what_two_axes_can_do_they_do_exactly(data: Path) -> None:
     at = placements(body, q, SEGMENTS)
     quat_WL = {segment: at[segment][0] for segment in SEGMENTS}
     found = configuration(body, quat_WL, limits=False)
-    assert max(missed.max() for missed in deviation(body, found, quat_WL).values()) < 1e-7
+    assert max(missed.max() for missed in orientation_residuals(body, found, quat_WL).values()) < 1e-7
     at_hinges = [body.pin.idx_qs[body.pin.getJointId(name)] for name in names]
     np.testing.assert_allclose(found[:, at_hinges], q[:, at_hinges], atol=1e-7)
 
@@ -235,7 +235,7 @@ def test_clavicles_rest(data: Path) -> None:
     q = configuration(body, orientations(CORE))
     for name in ("jLeftC7Shoulder_rotx", "jRightC7Shoulder_rotx"):
         np.testing.assert_array_equal(q[:, body.pin.idx_qs[body.pin.getJointId(name)]], 0.0)
-    known = set(known_links(body, ["torso", "left_upper_arm"]))
+    known = set(find_known_links(body, ["torso", "left_upper_arm"]))
     assert {"T8", "L5", "LeftShoulder", "RightShoulder", "LeftUpperArm", "LeftToe", "Head"} <= known
     assert not known & {"LeftForeArm", "LeftHand", "RightUpperArm", "RightHandCOM"}
 
@@ -243,7 +243,7 @@ def test_clavicles_rest(data: Path) -> None:
 def test_a_pelvis_that_cannot_move_says_by_how_much(data: Path) -> None:
     body = gazebo(data, 66)
     quat_WL = orientations(CORE) | {"pelvis": np.tile(Rotation.from_euler("z", 0.3).as_quat(), (N, 1))}
-    missed = deviation(body, configuration(body, quat_WL), quat_WL)
+    missed = orientation_residuals(body, configuration(body, quat_WL), quat_WL)
     assert set(missed) == {"pelvis"}
     np.testing.assert_allclose(missed["pelvis"], 0.3)
 
@@ -299,10 +299,10 @@ def test_three_hinges_follow_what_they_reach(apart: str, tmp_path: Path) -> None
     quat_WL = orientations(CORE, 8, n=300)
     bent = Rotation.from_euler("XYZ", rng.uniform([-2.5, -1.4, -2.5], [2.5, 1.4, 2.5], (300, 3)))
     quat_WL["left_forearm"] = (Rotation.from_quat(quat_WL["left_upper_arm"]) * bent).as_quat()
-    missed = deviation(body, configuration(body, quat_WL, limits=False), quat_WL)
+    missed = orientation_residuals(body, configuration(body, quat_WL, limits=False), quat_WL)
     assert missed["left_forearm"].max() < 1e-7
     quat_WL = orientations(CORE, 9, n=300)  # anything
-    missed = deviation(body, configuration(body, quat_WL, limits=False), quat_WL)
+    missed = orientation_residuals(body, configuration(body, quat_WL, limits=False), quat_WL)
     assert missed["left_forearm"].max() < 1e-3
 
 
@@ -328,7 +328,7 @@ def test_one_hinge_takes_its_twist_and_a_continuous_one_has_no_end(tmp_path: Pat
     hand = forearm * Rotation.from_rotvec(np.outer(2.0 * turned, [1.0, 0.0, 0.0]))
     quat_WL |= {"left_forearm": forearm.as_quat(), "left_hand": hand.as_quat()}
     q = configuration(body, quat_WL)
-    missed = deviation(body, q, quat_WL)
+    missed = orientation_residuals(body, q, quat_WL)
     assert missed["left_forearm"].max() < 1e-7
     assert missed["left_hand"].max() < 1e-7
     np.testing.assert_allclose(q[:, body.pin.idx_qs[body.pin.getJointId("left_e0")]], turned, atol=1e-9)

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate_lengths, load_protocol
 from wepose_pin.calibration.chain import CHAIN, REACHES, links
-from wepose_pin.calibration.problem import Layout, Looks, residuals
+from wepose_pin.calibration.least_squares import Layout, Observations, residuals
 from wepose_pin.calibration.protocols import Closure
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, render, render_all
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
 from wepose_pin.model import load_model
-from wepose_pin.pose import pose_of
+from wepose_pin.pose import compute_pose
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (
@@ -64,7 +64,7 @@ def made(protocol: str, seed: int, real: bool) -> tuple[Person, Simulation]:
 def mount_errors(found: Calibration, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the mounts (sensors, 3) [deg] in L, the last of them the heading's, and their standard deviations."""
     error, std = [], []
-    for name in found.drift:
+    for name in found.heading_drift:
         off = Rotation.from_quat(found.subject.mounts[name]) * Rotation.from_quat(simulation.quat_LS[name]).inv()
         error.append(off.as_rotvec(degrees=True))
         std.append([np.degrees(found.subject.std(f"mounts.{name}.{axis}")) for axis in "xyz"])
@@ -112,7 +112,7 @@ def test_what_is_in_the_chain_follows_from_the_points() -> None:
         "left_hand",
     )
     assert load_protocol("poses").chain == ()
-    assert load_protocol("handle").gauges == ("handle",)
+    assert load_protocol("handle").distances == ("handle",)
 
 
 def test_every_point_is_pinocchios() -> None:
@@ -120,7 +120,7 @@ def test_every_point_is_pinocchios() -> None:
     values = np.array([0.5, 0.4, 0.3, 0.25, 0.07, 0.31, 0.24, 0.08])
     model = load_model(lengths=dict(zip(LENGTHS, values, strict=True)))
     drawn = {segment: Rotation.random(3, random_state=rng).as_quat() for segment in CHAIN}
-    points = pose_of(model, np.arange(3.0), drawn).points
+    points = compute_pose(model, np.arange(3.0), drawn).points
     lengths, quats = ca.SX.sym("l", 8), {segment: ca.SX.sym(segment, 4) for segment in CHAIN}
     for name, way in REACHES.items():
         place = sum(links(lengths, quats, way).values(), start=ca.SX.zeros(3))
@@ -136,20 +136,22 @@ def test_jacobians_are_those_of_differences(name: str) -> None:
     rng = np.random.default_rng(1)
     sensors = tuple(s for s in CHAIN if s in protocol.needs)
     closures = protocol.closures
-    layout = Layout(sensors, sum(c.kind == "fixed_point" for c in closures), protocol.gauges)
+    layout = Layout(sensors, sum(c.kind == "fixed_point" for c in closures), protocol.distances)
     n = 2 * len(protocol.conditions)
     turns = [Rotation.random(n, random_state=rng).as_quat().T for _ in sensors]
-    looks = Looks(layout, np.vstack([*turns, rng.uniform(0, 60, n)]), protocol.conditions, np.arange(n) // 2)
+    observations = Observations(
+        layout, np.vstack([*turns, rng.uniform(0, 60, n)]), protocol.conditions, np.arange(n) // 2
+    )
     x = rng.normal(scale=0.1, size=layout.size)
     x[:8] = rng.uniform(0.1, 0.5, 8)
     x[layout.heading] = rng.uniform(-3, 3, len(sensors))
     x[layout.drift] = rng.normal(scale=1e-3, size=len(sensors))
-    _, J, gap = residuals(x, looks)
+    _, J, gap = residuals(x, observations)
     assert J.shape == (n, 5, layout.size)
     for k in range(layout.size):
         step = np.zeros(layout.size)
         step[k] = 1e-6
-        slope = (residuals(x + step, looks)[0] - residuals(x - step, looks)[0]) / 2e-6
+        slope = (residuals(x + step, observations)[0] - residuals(x - step, observations)[0]) / 2e-6
         np.testing.assert_allclose(J[:, :, k], slope, atol=1e-5 * max(1.0, np.abs(slope).max()))
     assert np.all((np.abs(gap).max(axis=1) > 0) == [isinstance(c, Closure) for c in protocol.conditions for _ in "ab"])
 
@@ -163,14 +165,14 @@ GAUGE = {"handle": None, "touch_left": "left_upper_arm", "touch_right": "right_u
 @pytest.mark.parametrize("protocol", list(GAUGE))
 def test_exact_motion_gives_headings_and_lengths_back(protocol: str, seed: int) -> None:
     person, simulation = made(protocol, seed, real=False)
-    gauge = {name: person.lengths[name] for name in (GAUGE[protocol],) if name}
+    measured = {name: person.lengths[name] for name in (GAUGE[protocol],) if name}
     found = calibrate_lengths(
-        simulation.recording(), gauge=gauge, prior=person.average, protocol=protocol, gauge_std=1e-4
+        simulation.recording(), measured=measured, prior=person.prior, protocol=protocol, measured_std=1e-4
     )
     error, _ = mount_errors(found, simulation)
     assert np.abs(error[:, 2]).max() < 0.3
     if protocol == "poses":
-        assert found.subject.lengths == pytest.approx(person.average.lengths, rel=1e-9)
+        assert found.subject.lengths == pytest.approx(person.prior.lengths, rel=1e-9)
         return
     assert found.rms_gap < min(1e-3, 0.2 * found.prior_rms_gap)
     for side in ("left", "right"):
@@ -194,8 +196,8 @@ def test_usual_imperfections_stay_within_the_stated_deviations(protocol: str) ->
     for seed in (4, 5, 6):
         person, simulation = made(protocol, seed, real=True)
         rng = np.random.default_rng(seed)
-        gauge = {name: person.lengths[name] + rng.normal(0.0, 0.003) for name in TAPED[protocol]}
-        found = calibrate_lengths(simulation.recording(), gauge=gauge, prior=person.average, protocol=protocol)
+        measured = {name: person.lengths[name] + rng.normal(0.0, 0.003) for name in TAPED[protocol]}
+        found = calibrate_lengths(simulation.recording(), measured=measured, prior=person.prior, protocol=protocol)
         error, std = mount_errors(found, simulation)
         off, off_std = length_errors(found, person, LENGTHS)
         z_lengths.append(off / off_std)
@@ -213,22 +215,22 @@ def test_usual_imperfections_stay_within_the_stated_deviations(protocol: str) ->
 def test_a_handle_fixes_the_scale_by_itself() -> None:
     person, simulation = made("handle", 4, real=True)
     recording = simulation.recording()
-    found = calibrate_lengths(recording, prior=person.average, protocol="handle")
-    given = calibrate_lengths(recording, prior=person.average, protocol="handle", gauge={"handle": 0.40})
+    found = calibrate_lengths(recording, prior=person.prior, protocol="handle")
+    given = calibrate_lengths(recording, prior=person.prior, protocol="handle", measured={"handle": 0.40})
     (assumed,) = [d for d in found.diagnostics if d.code == "protocol-distance-assumed"]
     assert (assumed.place, assumed.value) == ("handle", 0.4)
     assert not {"protocol-distance-assumed", "scale-from-prior"} & codes(given)
     assert given.subject.lengths == pytest.approx(found.subject.lengths)
-    assert found.subject.note == "hands on a handle; scale taped: handle"
-    # The scale is the bar's more than the average person's.
+    assert found.subject.note == "hands on a handle; scale measured: handle"
+    # The bar fixes the scale better than the population prior.
     arms = [name for name in LENGTHS if name.endswith("upper_arm")]
-    assert np.mean([found.subject.std(n) / person.average.std(n) for n in arms]) < 0.8
+    assert np.mean([found.subject.std(n) / person.prior.std(n) for n in arms]) < 0.8
     # Of exact motion alone: another bar, five per cent longer, gives everything five per cent longer.
     person, simulation = made("handle", 1, real=False)
     scale = []
     for bar in (0.40, 0.42):
         exact = calibrate_lengths(
-            simulation.recording(), prior=person.average, protocol="handle", gauge={"handle": bar}, gauge_std=1e-4
+            simulation.recording(), prior=person.prior, protocol="handle", measured={"handle": bar}, measured_std=1e-4
         )
         scale.append(np.mean([exact.subject.lengths[name] / person.lengths[name] for name in arms]))
     assert scale[0] == pytest.approx(1.0, abs=0.01)
@@ -238,32 +240,33 @@ def test_a_handle_fixes_the_scale_by_itself() -> None:
 def test_one_arm_needs_three_sensors_and_leaves_the_other_arm_to_the_prior() -> None:
     person, simulation = made("touch_right", 4, real=True)
     recording = simulation.recording()
+    measured = {"right_upper_arm": person.lengths["right_upper_arm"]}
     three = {name: recording.sensors[name] for name in ("torso", "right_upper_arm", "right_forearm")}
     alone = calibrate_lengths(
-        replace(recording, sensors=three), gauge=(gauge := {"right_upper_arm": person.lengths["right_upper_arm"]}),
-        prior=person.average, protocol="touch_right",
+        replace(recording, sensors=three), measured=measured,
+        prior=person.prior, protocol="touch_right",
     )  # fmt: skip
-    whole = calibrate_lengths(recording, gauge=gauge, prior=person.average, protocol="touch_right")
+    whole = calibrate_lengths(recording, measured=measured, prior=person.prior, protocol="touch_right")
     assert alone.subject.lengths == pytest.approx(whole.subject.lengths, abs=1e-6)
     assert set(alone.subject.mounts) == set(three)
-    assert set(alone.hinge) == {"right"}
+    assert set(alone.hinge_axes) == {"right_elbow"}
     # The other arm is like this one to within a per cent, and that is all that is known of it.
     assert alone.subject.std("left_upper_arm") > alone.subject.std("right_upper_arm")
-    assert alone.subject.std("left_forearm") < 1.1 * person.average.std("left_forearm")
+    assert alone.subject.std("left_forearm") < 1.1 * person.prior.std("left_forearm")
 
 
 def test_a_fixed_point_says_that_it_has_no_scale_and_which_gauge_would_serve() -> None:
     person, simulation = made("touch_right", 4, real=True)
     recording = simulation.recording()
-    free = calibrate_lengths(recording, prior=person.average, protocol="touch_right")
+    free = calibrate_lengths(recording, prior=person.prior, protocol="touch_right")
     assert ("scale-from-prior", "right_upper_arm") in measured_instead(free)
     width = {"shoulder_width": person.lengths["shoulder_width"]}
-    loose = calibrate_lengths(recording, gauge=width, prior=person.average, protocol="touch_right")
+    loose = calibrate_lengths(recording, measured=width, prior=person.prior, protocol="touch_right")
     assert ("scale-uncertain", "right_upper_arm") in measured_instead(loose)
     upper = {"right_upper_arm": person.lengths["right_upper_arm"]}
-    good = calibrate_lengths(recording, gauge=upper, prior=person.average, protocol="touch_right")
+    good = calibrate_lengths(recording, measured=upper, prior=person.prior, protocol="touch_right")
     assert not measured_instead(good)
-    assert good.subject.std("trunk") < 0.7 * person.average.std("trunk")  # seen beside the arm
+    assert good.subject.std("trunk") < 0.7 * person.prior.std("trunk")  # seen beside the arm
 
 
 class StillTrunk(Touch):
@@ -277,14 +280,14 @@ def test_a_trunk_that_keeps_still_leaves_headings_unknown_and_says_so(monkeypatc
     monkeypatch.setitem(TASKS, "touch_right", StillTrunk)
     monkeypatch.delitem(MADE, ("touch_right", 9, False), raising=False)
     person, simulation = made("touch_right", 9, real=False)
-    found = calibrate_lengths(simulation.recording(), prior=person.average, protocol="touch_right")
+    found = calibrate_lengths(simulation.recording(), prior=person.prior, protocol="touch_right")
     error, std = mount_errors(found, simulation)
     quality = assess(found)
     print(quality.reasons, error[:, 2], std[:, 2])
     assert ("mount-heading-uncertain", "torso", ERROR) in {(d.code, d.place, d.severity) for d in quality.reasons}
     assert std[0, 2] > 50.0
     # The swivel's radius tells upper arm against forearm; of the trunk nothing is seen.
-    assert found.subject.std("trunk") > 0.95 * person.average.std("trunk")
+    assert found.subject.std("trunk") > 0.95 * person.prior.std("trunk")
 
 
 def test_a_palm_off_its_point_is_found_and_left_out() -> None:
@@ -292,12 +295,12 @@ def test_a_palm_off_its_point_is_found_and_left_out() -> None:
     recording = simulation.recording()
     first, last = recording.phases["touch"][0]
     early = replace(recording, phases={**recording.phases, "touch": ((first - 2.3, last),)})  # the way to the table
-    found = calibrate_lengths(early, prior=person.average, protocol="touch_right")
+    found = calibrate_lengths(early, prior=person.prior, protocol="touch_right")
     (off,) = [d for d in found.diagnostics if d.code == "closure-open"]
     assert (off.place, off.facts["variant"]) == ("touch", "fixed_point")
     assert render(off).what.startswith("The palm was off its point for ")
-    assert found.kept[:8].max() < 0.1
-    whole = calibrate_lengths(recording, prior=person.average, protocol="touch_right")
+    assert found.contact[:8].max() < 0.1
+    whole = calibrate_lengths(recording, prior=person.prior, protocol="touch_right")
     error, std = length_errors(found, person, load_protocol("touch_right").chain)
     assert np.abs(error / std).max() < 3.5
     assert found.rms_gap < 1.3 * whole.rms_gap
@@ -310,15 +313,15 @@ def test_advice_is_of_what_was_done(name: str, closed: str) -> None:
     recording = simulation.recording()
     phase, (begin, _) = next((n, spans[0]) for n, spans in recording.phases.items() if n in ("touch", "handle"))
     short = replace(recording, phases={**recording.phases, phase: ((begin, begin + 9.0),)})
-    found = calibrate_lengths(short, prior=person.average, protocol=name)
+    found = calibrate_lengths(short, prior=person.prior, protocol=name)
     quality = assess(found)
     assert "motion-too-short" in {d.code for d in quality.reasons}
     words = " ".join(text.line() for _, text in render_all(quality.reasons))
     assert closed in words
     assert "joined" not in words
     assert "palms together" not in words
-    assert found.tape == load_protocol(name).tape
-    assert ("scale-uncertain" if found.scaling else "scale-from-prior", found.tape) in {
+    assert found.measured_example == load_protocol(name).measured_example
+    assert ("scale-uncertain" if found.scale_lengths else "scale-from-prior", found.measured_example) in {
         (c.diagnostic.code, c.diagnostic.facts.get("measured")) for c in quality.checks
     }
 
@@ -326,15 +329,15 @@ def test_advice_is_of_what_was_done(name: str, closed: str) -> None:
 def test_poses_tell_headings_and_no_length() -> None:
     person, simulation = made("poses", 4, real=True)
     recording = simulation.recording()
-    found = calibrate_lengths(recording, prior=person.average, protocol="poses")
-    assert found.subject.lengths == pytest.approx(person.average.lengths)
+    found = calibrate_lengths(recording, prior=person.prior, protocol="poses")
+    assert found.subject.lengths == pytest.approx(person.prior.lengths)
     for name in LENGTHS:
-        assert found.subject.std(name) == pytest.approx(person.average.std(name))
+        assert found.subject.std(name) == pytest.approx(person.prior.std(name))
     assert "lengths-not-observed" in codes(found)
     _, std = mount_errors(found, simulation)
     assert np.all((std[:, 2] > 5.0) & (std[:, 2] < 9.0))  # as well as the poses are held
-    taped = calibrate_lengths(recording, prior=person.average, protocol="poses", gauge={"trunk": 0.47})
-    assert taped.subject.lengths["trunk"] == pytest.approx(0.47, abs=2e-3)
+    measured = calibrate_lengths(recording, prior=person.prior, protocol="poses", measured={"trunk": 0.47})
+    assert measured.subject.lengths["trunk"] == pytest.approx(0.47, abs=2e-3)
 
 
 def test_a_longer_phase_makes_no_better_pose() -> None:
@@ -346,16 +349,18 @@ def test_a_longer_phase_makes_no_better_pose() -> None:
     np.testing.assert_allclose(both[0], both[1], rtol=0.05)
 
 
-def test_clasp_with_a_taped_length_is_clasp_with_a_gauge() -> None:
+def test_clasp_measured_is_clasp_with_a_measured_length() -> None:
     person, simulation = made("clasp", 4, real=False)
     recording = simulation.recording()
-    with pytest.raises(BadOption, match=r"needs 1 taped length of its chain, as in --measured shoulder_width=0\.385"):
-        calibrate_lengths(recording, protocol="clasp_taped")
-    with pytest.raises(BadOption, match="needs 1 taped length"):
-        calibrate_lengths(recording, protocol="clasp_taped", gauge={"trunk": 0.5})
+    with pytest.raises(
+        BadOption, match=r"needs 1 measured length of its chain, as in --measured shoulder_width=0\.385"
+    ):
+        calibrate_lengths(recording, protocol="clasp_measured")
+    with pytest.raises(BadOption, match="needs 1 measured length"):
+        calibrate_lengths(recording, protocol="clasp_measured", measured={"trunk": 0.5})
     both = [
-        calibrate_lengths(recording, prior=person.average, gauge=person.taped, protocol=name)
-        for name in ("clasp", "clasp_taped")
+        calibrate_lengths(recording, prior=person.prior, measured=person.measured, protocol=name)
+        for name in ("clasp", "clasp_measured")
     ]
     assert both[0].subject.lengths == both[1].subject.lengths
 
@@ -376,16 +381,20 @@ def test_wrong_requests_are_one_line_that_names_them() -> None:
         (BadPhase, r"phases\.handle is needed here", lambda: run(without(recording, "handle"), "handle")),
         (BadPhase, r"phases\.t_pose is needed here", lambda: run(recording, "poses")),
         (BadSession, "no sensor on torso; protocol 'touch_left' needs one", lambda: run(fewer, "touch_left")),
-        (BadOption, "gauge handle: not a length", lambda: run(recording, "clasp", handle=0.4)),
-        (BadOption, "gauge handel: not a length; did you mean 'handle'", lambda: run(recording, "handle", handel=0.4)),
+        (BadOption, "measured handle: not a length", lambda: run(recording, "clasp", handle=0.4)),
+        (
+            BadOption,
+            "measured handel: not a length; did you mean 'handle'",
+            lambda: run(recording, "handle", handel=0.4),
+        ),
     ):
         with pytest.raises(error, match=match) as caught:
             asked()
         assert "\n" not in str(caught.value)
 
 
-def run(recording: Recording, protocol: str, **gauge: float) -> Calibration:
-    return calibrate_lengths(recording, protocol=protocol, gauge=gauge)
+def run(recording: Recording, protocol: str, **measured: float) -> Calibration:
+    return calibrate_lengths(recording, protocol=protocol, measured=measured)
 
 
 OWN = """
@@ -394,7 +403,7 @@ needs = ["torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_fo
 phase = "handle"
 kind = "distance"
 points = ["left_wrist", "right_wrist"]
-gauge = "rope"
+distance = "rope"
 metres = 0.5
 """
 POSE = "[[pose]]\nphase = 'static'\nstd_deg = 5\ndirections = {}\n[[closure]]"
@@ -407,14 +416,14 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
     assert protocol.name == "rope"
     assert "left_hand" not in protocol.chain
     person, simulation = made("handle", 1, real=False)
-    found = calibrate_lengths(simulation.recording(), prior=person.average, protocol=protocol)
+    found = calibrate_lengths(simulation.recording(), prior=person.prior, protocol=protocol)
     assert "rope" in found.subject.note
     for old, new, match in (
         ('"left_wrist"', '"left_wirst"', r"closure 1: points: 'left_wirst' is not known; did you mean 'left_wrist'"),
         (', "right_wrist"', "", r"points = \['left_wrist'\]; kind 'distance' takes 2"),
         ('"distance"', '"near"', r"closure 1: kind: 'near' is not known"),
         ("metres = 0.5", 'metres = "half"', r"metres = 'half'; a number between"),
-        ("gauge =", "guage =", r"closure 1: no 'gauge'"),
+        ("distance =", "distanze =", r"closure 1: no 'distance'"),
         ("[[closure]]", "[[closures]]", r"'closures' is no key of a protocol; did you mean 'closure'"),
         ("needs =", "# needs =", r"no 'needs'"),
         ("needs =", "needs = ['torso'] #", r"lacks left_forearm, left_upper_arm, right_"),
@@ -453,7 +462,7 @@ def test_the_command_takes_protocols(tmp_path: Path, capsys: pytest.CaptureFixtu
     write_session(tmp_path, made("handle", 1, real=False)[1].recording())
     asked = ["calibrate", str(tmp_path / "session.toml"), "--protocol", "handle", "-o", str(tmp_path / "out")]
     assert command(*asked, "--measured", "handle=0.4") in (0, 3)  # pass or poor
-    assert "scale taped: handle" in (tmp_path / "out" / "subject.toml").read_text()
+    assert "scale measured: handle" in (tmp_path / "out" / "subject.toml").read_text()
     assert command(*asked, "--force", "--measured", "bar=0.4") == 2
     assert "'bar' is not a length" in capsys.readouterr().err
     asked[3] = "hande"

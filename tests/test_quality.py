@@ -14,8 +14,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, calibrate_lengths
-from wepose_pin.calibration.anatomy import Arms, check_labels
-from wepose_pin.calibration.quality import APART, QUALITIES
+from wepose_pin.calibration.anatomy import ArmMotion, check_labels
+from wepose_pin.calibration.quality import OPEN_SHARE, QUALITIES
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, INFO, WARNING, from_json, render
 from wepose_pin.errors import CalibrationFailed, WeposeWarning
@@ -66,9 +66,9 @@ def moved_otherwise(person: Person, share: Mapping[str, float], imperfections: I
         return simulate(person.lengths, seed=SEED, imperfections=imperfections, circles=0)
 
 
-def solved(recording: Recording, person: Person, gauge: bool = True) -> Calibration:
-    taped = {"shoulder_width": person.taped["shoulder_width"]} if gauge else {}
-    return calibrate_lengths(recording, gauge=taped, prior=person.average, gauge_std=person.taped_std)
+def solved(recording: Recording, person: Person, measured: bool = True) -> Calibration:
+    lengths = {"shoulder_width": person.measured["shoulder_width"]} if measured else {}
+    return calibrate_lengths(recording, measured=lengths, prior=person.prior, measured_std=person.measured_std)
 
 
 def exchanged(recording: Recording, *pairs: tuple[str, str]) -> Recording:
@@ -158,7 +158,7 @@ def test_what_goes_wrong_is_diagnosed(case: str, anywhere: Simulation, person: P
 
 
 def test_without_a_measured_length_the_scale_is_the_priors(anywhere: Simulation, person: Person) -> None:
-    quality = assess(solved(anywhere.recording(), person, gauge=False))
+    quality = assess(solved(anywhere.recording(), person, measured=False))
     assert quality.quality == "poor"
     assert codes(quality) == ["scale-from-prior"]
     assert "--measured shoulder_width" in render(quality.reasons[0]).do
@@ -168,16 +168,16 @@ def test_without_a_measured_length_the_scale_is_the_priors(anywhere: Simulation,
 def test_a_measured_length_that_contradicts_all_else_is_named_once(anywhere: Simulation, person: Person) -> None:
     recording = anywhere.recording()
     good = solved(recording, person)
-    assert good.tapes["shoulder_width"].off < 2.0
-    assert good.tapes["shoulder_width"].expected == pytest.approx(person.lengths["shoulder_width"], rel=0.1)
-    wrong = calibrate_lengths(recording, gauge={"shoulder_width": 0.20}, prior=person.average)
+    assert good.measured_lengths["shoulder_width"].deviation < 2.0
+    assert good.measured_lengths["shoulder_width"].expected == pytest.approx(person.lengths["shoulder_width"], rel=0.1)
+    wrong = calibrate_lengths(recording, measured={"shoulder_width": 0.20}, prior=person.prior)
     quality = assess(wrong)
     assert quality.quality == "fail"
     (contradicted,) = quality.diagnostics
     assert (contradicted.code, contradicted.place) == ("measured-length-contradicted", "shoulder_width")
     assert "Shoulder width was measured as 200 mm." in render(contradicted).what
     # Without the tape the solution finds what it said that it would; palms that slip tell a smaller person less.
-    tape, free = wrong.tapes["shoulder_width"], solved(recording, person, gauge=False).subject
+    tape, free = wrong.measured_lengths["shoulder_width"], solved(recording, person, measured=False).subject
     assert tape.expected == pytest.approx(free.lengths["shoulder_width"], abs=1.5 * free.std("shoulder_width"))
     assert tape.std == pytest.approx(free.std("shoulder_width"), rel=0.3)
 
@@ -186,22 +186,22 @@ def test_of_sensors_that_sit_elsewhere_nothing_is_learned(anywhere: Simulation, 
     found = solved(exchanged(anywhere.recording(), ("left_upper_arm", "left_forearm")), person)
     assert found.labels.moved
     for name in LENGTHS:
-        assert found.subject.std(name) >= 0.5 * person.average.std(name) or name == "shoulder_width"
-    assert found.subject.std("left_upper_arm") > 0.8 * person.average.std("left_upper_arm")
-    assert found.subject.lengths["shoulder_width"] == pytest.approx(person.taped["shoulder_width"], abs=1e-3)
+        assert found.subject.std(name) >= 0.5 * person.prior.std(name) or name == "shoulder_width"
+    assert found.subject.std("left_upper_arm") > 0.8 * person.prior.std("left_upper_arm")
+    assert found.subject.lengths["shoulder_width"] == pytest.approx(person.measured["shoulder_width"], abs=1e-3)
     assert found.subject.std("mounts.left_forearm.z") > 1.5
     assert not found.subject.hinges
     assert not found.subject.start_pose_offset
 
 
 def test_python_hands_out_no_subject_of_a_failed_calibration_in_silence(anywhere: Simulation, person: Person) -> None:
-    taped = {"gauge": {"shoulder_width": person.taped["shoulder_width"]}, "prior": person.average}
+    known = {"measured": {"shoulder_width": person.measured["shoulder_width"]}, "prior": person.prior}
     recording = anywhere.recording()
     with warnings.catch_warnings():
         warnings.simplefilter("error", WeposeWarning)
-        assert calibrate(recording, **taped, gauge_std=person.taped_std).mounts
+        assert calibrate(recording, **known, measured_std=person.measured_std).mounts
     with pytest.raises(CalibrationFailed, match="left upper arm and left forearm look exchanged") as failed:
-        calibrate(exchanged(recording, ("left_upper_arm", "left_forearm")), **taped)
+        calibrate(exchanged(recording, ("left_upper_arm", "left_forearm")), **known)
     assert failed.value.quality.quality == "fail"
     assert failed.value.calibration.subject.lengths
     with pytest.warns(WeposeWarning, match="No length was measured"):
@@ -233,14 +233,14 @@ def test_hands_apart_for_half_of_the_time_are_found_and_left_out(person: Person,
     assert quality.quality == "poor"
     (apart,) = [d for d in quality.diagnostics if d.code == "closure-open"]
     assert apart.value is not None
-    assert APART.passes < apart.value < 0.6
+    assert OPEN_SHARE.passes < apart.value < 0.6
     assert "Keep the palms together" in render(apart).do
     assert np.abs(arm_errors(found, person)).max() < 0.025
     assert np.abs(heading_errors(found, simulation.quat_LS)[1:]).max() < 8.0
-    gap = np.linalg.norm(simulation.points["left_hand"] - simulation.points["right_hand"], axis=1)
+    gap = np.linalg.norm(simulation.points["left_palm"] - simulation.points["right_palm"], axis=1)
     at = np.searchsorted(simulation.time, found.time - 1e-6)
-    assert np.mean(found.kept[gap[at] > 0.2]) < 0.1
-    assert np.mean(found.kept[gap[at] < 0.02]) > 0.8
+    assert np.mean(found.contact[gap[at] > 0.2]) < 0.1
+    assert np.mean(found.contact[gap[at] < 0.02]) > 0.8
 
 
 def test_a_sensor_upside_down_is_another_mount_or_said_and_solved(
@@ -255,7 +255,7 @@ def test_a_sensor_upside_down_is_another_mount_or_said_and_solved(
     found = solved(turned(stated.recording(), "left_forearm", over), person)
     quality = assess(found)
     assert quality.quality == "poor"
-    (unused,) = found.contradicted
+    (unused,) = found.unused_mounts
     assert (unused.code, unused.place, unused.facts) == ("mount-not-used", "left_forearm", {})
     assert unused.value == pytest.approx(np.pi, abs=0.6)
     assert unused in quality.reasons
@@ -269,19 +269,19 @@ def test_a_mount_that_faces_elsewhere_is_said_and_solved(person: Person, stated:
     quarter = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])  # about the axis that points up
     found = solved(turned(stated.recording(), "right_upper_arm", quarter), person)
     assert assess(found).quality == "poor"
-    (unused,) = found.contradicted
+    (unused,) = found.unused_mounts
     assert (unused.code, unused.place) == ("mount-not-used", "right_upper_arm")
     assert unused.facts == {"variant": "motion"}
     assert assess(solved(stated.recording(), person)).quality == "pass"
 
 
 def test_labels_are_searched_only_where_a_person_cannot_move_so() -> None:
-    def arms(doubt: float) -> Arms:
-        return Arms({}, {"left": 0.15 * doubt}, {"left": 0.0}, 0.0, 0.01)
+    def arms(doubt: float) -> ArmMotion:
+        return ArmMotion({}, {"left": 0.15 * doubt}, {"left": 0.0}, 0.0, 0.01)
 
     tried: list[Mapping[str, str]] = []
 
-    def solve(moved: Mapping[str, str]) -> Arms:
+    def solve(moved: Mapping[str, str]) -> ArmMotion:
         tried.append(moved)
         return arms(0.2 if moved == {"torso": "left_forearm", "left_forearm": "torso"} else 3.0)
 
@@ -305,9 +305,9 @@ def test_exit_code_and_file_carry_the_quality(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_session(tmp_path, anywhere.recording("made"))
-    taped = f"shoulder_width={person.taped['shoulder_width']:.4f}"
+    width = f"shoulder_width={person.measured['shoulder_width']:.4f}"
     words = ["--stature", f"{person.stature:.3f}", "--sex", person.sex]
-    for options, wanted, code in ((["--measured", taped], "pass", 0), ([], "poor", 3)):
+    for options, wanted, code in ((["--measured", width], "pass", 0), ([], "poor", 3)):
         with pytest.raises(SystemExit) as stop:
             main(["calibrate", "session.toml", "-o", wanted, *words, *options])
         assert int(stop.value.code or 0) == code

@@ -95,7 +95,7 @@ def test_links_are_fitted_from_orientations_and_tip() -> None:
     R_W3 = R_W2 * Rotation.from_rotvec(np.linspace(0.0, 2.0, 50)[:, None] * [1.0, 0.0, 0.0])  # about the link itself
     along = np.array([1.0, 0.0, 0.0])
     tip_W = 0.5 * R_W2.apply(along) + 0.3 * R_W4.apply(along)
-    np.testing.assert_allclose(real.fitted_links(tip_W, R_W2, R_W3, R_W4), (0.5, 0.3), atol=1e-12)
+    np.testing.assert_allclose(real.fit_links(tip_W, R_W2, R_W3, R_W4), (0.5, 0.3), atol=1e-12)
 
 
 def test_ring_is_read_as_it_is(data: Path) -> None:
@@ -107,20 +107,20 @@ def test_ring_is_read_as_it_is(data: Path) -> None:
     for sensor in chain.sensors.values():
         assert sensor.rate_hz == 40.0
         assert np.median(np.linalg.norm(sensor.accel_S, axis=1)) == pytest.approx(9.9, abs=0.3)
-    lengths = real.optical_links(chain).lengths
+    lengths = real.fit_optical_links(chain).lengths
     assert lengths["seg2"] == pytest.approx(0.289, abs=1.5e-3)
     assert lengths["seg3"] == pytest.approx(0.289, abs=1.5e-3)
     assert lengths["seg4"] == pytest.approx(0.2705, abs=1e-3)
 
 
 def test_optical_orientations_give_the_optical_lengths(data: Path) -> None:
-    """Shares with `optical_links` only the tip: what is left is play in the joints."""
+    """Shares with `fit_optical_links` only the tip: what is left is play in the joints."""
     chain = read_ring(ring_files(data / "ring" / "trial1"))
-    links = real.optical_links(chain)
+    links = real.fit_optical_links(chain)
     seen = np.isfinite(links.tip_V).all(axis=1)
     R = [Rotation.from_quat(chain.quat_VB[segment][seen]) for segment in ("seg2", "seg3", "seg4")]
     optical = links.lengths["seg2"] + links.lengths["seg3"], links.lengths["seg4"]
-    np.testing.assert_allclose(real.fitted_links(links.tip_V[seen], *R), optical, atol=1e-3)
+    np.testing.assert_allclose(real.fit_links(links.tip_V[seen], *R), optical, atol=1e-3)
 
 
 def test_ring_registration_is_consistent(data: Path) -> None:

@@ -30,7 +30,7 @@ def made() -> Made:
     person = simulated_person(3)
     world = replace(REALISTIC, mount="any")
     recording = simulate(person.lengths, seed=3, imperfections=world, clasp_s=30.0, circles=0).recording("anna <3")
-    found = calibrate_lengths(recording, gauge=person.taped, prior=person.average)
+    found = calibrate_lengths(recording, measured=person.measured, prior=person.prior)
     return found, recording, track(recording, found.subject)
 
 
@@ -40,7 +40,7 @@ def poor(found: Calibration) -> CalibrationQuality:
 
 @pytest.fixture(scope="module")
 def page(made: Made) -> str:
-    return calibration_report(made[0], made[1], quality=poor(made[0]), pose=made[2])
+    return calibration_report(made[0], made[1], quality=poor(made[0]), tracked=made[2])
 
 
 def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) -> None:
@@ -66,7 +66,7 @@ def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) 
 
 
 def test_the_quality_comes_first_with_its_reasons(made: Made, page: str) -> None:
-    failed = calibration_report(made[0], made[1], quality=replace(poor(made[0]), quality="fail"), pose=made[2])
+    failed = calibration_report(made[0], made[1], quality=replace(poor(made[0]), quality="fail"), tracked=made[2])
     for text, word, said in ((page, "poor", "Poor:"), (failed, "fail", "Fail:")):
         text = without_frame(text)
         assert text.index(f'<section class="banner {word}">') < text.index(said)
@@ -75,7 +75,7 @@ def test_the_quality_comes_first_with_its_reasons(made: Made, page: str) -> None
 
 def test_the_quality_with_its_checks(made: Made) -> None:
     quality = assess(made[0])
-    page = without_frame(calibration_report(made[0], made[1], quality=quality, pose=made[2]))
+    page = without_frame(calibration_report(made[0], made[1], quality=quality, tracked=made[2]))
     assert f'<section class="banner {quality.quality}">' in page
     assert "Behind the quality" in headings(page)
     for diagnostic in quality.reasons:
@@ -87,14 +87,14 @@ def test_the_quality_with_its_checks(made: Made) -> None:
 def test_diagnostics_stand_above_the_figures_in_words(made: Made) -> None:
     facts = {"intervals": "12 to 14 s", "variant": "coincide"}
     warned = replace(made[0], diagnostics=(Diagnostic("closure-open", INFO, "clasp", 0.12, 0.1, facts),))
-    page = without_frame(calibration_report(warned, made[1], pose=made[2]))
+    page = without_frame(calibration_report(warned, made[1], tracked=made[2]))
     assert page.index("The palms were apart for 12 % of the phase") < page.index("<figure")
     assert 'class="banner p' not in page  # nobody assessed it
 
 
 def test_what_keeps_it_from_passing_is_not_said_twice(made: Made) -> None:
     twice = replace(made[0], diagnostics=(Diagnostic("scale-from-prior", INFO, value=0.05), *made[0].diagnostics))
-    quality = assess(replace(twice, scaling=(), scale_std=0.05))
+    quality = assess(replace(twice, scale_lengths=(), scale_std=0.05))
     assert [d.code for d in quality.diagnostics].count("scale-from-prior") == 1
 
 
@@ -125,16 +125,16 @@ def test_it_prints(page: str) -> None:
 
 
 def test_equal_arguments_give_equal_text(made: Made, page: str) -> None:
-    assert calibration_report(made[0], made[1], quality=poor(made[0]), pose=made[2]) == page
+    assert calibration_report(made[0], made[1], quality=poor(made[0]), tracked=made[2]) == page
 
 
 def test_hands_that_came_apart_are_shown(made: Made) -> None:
     found = made[0]
-    kept, gap = found.kept.copy(), found.gap.copy()
+    kept, gap = found.contact.copy(), found.gap.copy()
     kept[40:60], gap[40:60] = 0.01, 0.3
-    page = calibration_report(replace(found, kept=kept, gap=gap), made[1], pose=made[2])
+    page = calibration_report(replace(found, contact=kept, gap=gap), made[1], tracked=made[2])
     assert "Crosses: apart." in page
-    nowhere = calibration_report(replace(found, kept=np.zeros_like(kept)), made[1], pose=made[2])
+    nowhere = calibration_report(replace(found, contact=np.zeros_like(kept)), made[1], tracked=made[2])
     assert "Palm to palm over time" in headings(nowhere)
     assert "Where the motion was informative" not in headings(nowhere)
 
@@ -147,20 +147,26 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
         gap=np.full_like(found.gap, np.nan),
         prior_gap=np.full_like(found.gap, np.nan),
         rms_gap=float("nan"),
-        gauge={},
-        start_tilt={"torso": np.array([np.nan, 0.0])},
-        drift={},
-        hinge={},
+        measured={},
+        start_pose_offset={"torso": np.array([np.nan, 0.0])},
+        heading_drift={},
+        hinge_axes={},
         hinge_rms={},
-        learned={},
+        information_shares={},
     )
-    page = calibration_report(bare, made[1], pose=made[2])
+    page = calibration_report(bare, made[1], tracked=made[2])
     assert headings(page) == ["Lengths", "Sensors", "The motion in 3D", "What was run"]
     assert "± not known" in page
     assert "nan" not in re.sub(r'"data:[^"]*"', "", without_frame(page)).split("</style>")[1]
-    few = replace(found, time=found.time[:1], gap=found.gap[:1], prior_gap=found.prior_gap[:1], kept=found.kept[:1])
-    few = replace(few, learned={name: share[:1] for name, share in found.learned.items()}, start_tilt={})
-    assert "Palm to palm over time" not in headings(calibration_report(few, made[1], pose=made[2]))
+    few = replace(
+        found, time=found.time[:1], gap=found.gap[:1], prior_gap=found.prior_gap[:1], contact=found.contact[:1]
+    )
+    few = replace(
+        few,
+        information_shares={name: share[:1] for name, share in found.information_shares.items()},
+        start_pose_offset={},
+    )
+    assert "Palm to palm over time" not in headings(calibration_report(few, made[1], tracked=made[2]))
 
 
 def test_without_a_mount_it_says_why_there_is_no_motion(made: Made) -> None:
@@ -178,21 +184,21 @@ def test_without_a_mount_it_says_why_there_is_no_motion(made: Made) -> None:
 
 
 def test_one_hand_at_a_point(made: Made) -> None:
-    page = calibration_report(made[0], made[1], pose=made[2], protocol="touch_left")
+    page = calibration_report(made[0], made[1], tracked=made[2], protocol="touch_left")
     assert "Palm to its point over time" in headings(page)
-    assert "The left hand went from" in text_of(page)
+    assert "The left palm went from" in text_of(page)
     assert "Not in the chain, known by the population prior's proportions" in text_of(page)
     assert "joined" not in without_frame(page)
 
 
 def test_what_each_look_told_and_what_was_known_before_make_one(made: Made) -> None:
-    for name, share in made[0].learned.items():
+    for name, share in made[0].information_shares.items():
         assert np.all(share >= 0.0)
         assert 0.0 <= share.sum() <= 1.0 + 1e-9, name
-    assert made[0].learned["trunk"].sum() == pytest.approx(0.0, abs=1e-9)  # it cancels in the closure
-    smooth = smoothed(made[0].time, made[0].learned["left_upper_arm"])
+    assert made[0].information_shares["trunk"].sum() == pytest.approx(0.0, abs=1e-9)  # it cancels in the closure
+    smooth = smoothed(made[0].time, made[0].information_shares["left_upper_arm"])
     step = np.median(np.diff(made[0].time))
-    assert smooth.sum() * step / 100 == pytest.approx(made[0].learned["left_upper_arm"].sum(), rel=0.1)
+    assert smooth.sum() * step / 100 == pytest.approx(made[0].information_shares["left_upper_arm"].sum(), rel=0.1)
 
 
 WHERE: Mapping[str, tuple[int, int]] = {
@@ -221,11 +227,11 @@ def test_a_line_breaks_where_time_jumps() -> None:
 
 
 def test_the_effective_sample_size_stands_as_itself_beside_its_limits(made: Made) -> None:
-    found = replace(made[0], independent=18.2)
-    page = calibration_report(found, made[1], quality=assess(found), pose=made[2])
+    found = replace(made[0], effective_sample_size=18.2)
+    page = calibration_report(found, made[1], quality=assess(found), tracked=made[2])
     text = re.sub(r"<[^>]+>", "|", without_frame(page))
     assert re.search(r"effective sample size[^|]*\|+18\|+at least 6\|+at least 2\|+pass", text)
     for size, wanted in ((6.0, "pass"), (5.9, "poor"), (2.0, "poor"), (1.9, "fail")):
-        checks = assess(replace(found, independent=size)).checks
+        checks = assess(replace(found, effective_sample_size=size)).checks
         (check,) = [each for each in checks if each.diagnostic.code == "motion-too-short"]
         assert (check.value, check.quality) == (size, wanted)

@@ -159,7 +159,7 @@ def test_a_whole_study_again(session: Path, tmp_path: Path, capsys: pytest.Captu
 
 def test_differences_are_named(result: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = pl.read_parquet(result / "pose.parquet")
-    changed = pl.when(pl.int_range(pl.len()) == 3).then(pl.col("left_hand_x") + 0.25).otherwise(pl.col("left_hand_x"))
+    changed = pl.when(pl.int_range(pl.len()) == 3).then(pl.col("left_palm_x") + 0.25).otherwise(pl.col("left_palm_x"))
     table.with_columns(changed).write_parquet(result / "pose.parquet")
     summary = json.loads((result / "summary.json").read_text())
     (result / "summary.json").write_text(json.dumps(summary | {"rate_hz": 99.0}))
@@ -167,7 +167,7 @@ def test_differences_are_named(result: Path, capsys: pytest.CaptureFixture[str])
     capsys.readouterr()
     assert run("reproduce", result) == 3
     said = capsys.readouterr().out
-    assert f"pose.parquet: column left_hand_x differs in 1 of {table.height} rows, by 0.25 at most" in said
+    assert f"pose.parquet: column left_palm_x differs in 1 of {table.height} rows, by 0.25 at most" in said
     assert "summary.json: rate_hz was 99.0, is 100.0" in said
     assert "subject.urdf: is missing, or new" in said
 

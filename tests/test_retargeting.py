@@ -287,9 +287,9 @@ def far_away(pose: Pose, span: tuple[float, float], by: float) -> Pose:
     """The arm stretched out `by` times its length, forward and up, over a span."""
     inside = (pose.time >= span[0]) & (pose.time < span[1])
     points = dict(pose.points)
-    hand = points["right_hand"].copy()
+    hand = points["right_palm"].copy()
     hand[inside] = points["right_shoulder"][inside] + by * (UPPER + 0.27 + HAND) * np.array([0.8, -0.3, 0.2])
-    return replace(pose, points=points | {"right_hand": hand})
+    return replace(pose, points=points | {"right_palm": hand})
 
 
 def test_five_seconds_out_of_reach(arm, swung: Trajectory) -> None:
@@ -321,7 +321,7 @@ def test_no_jerk_where_a_moving_target_passes_the_reach(arm, swung: Trajectory) 
 def test_a_jump_of_a_metre_is_no_jump_of_the_robot(arm) -> None:
     pose = person(8.0)
     points = dict(pose.points)
-    for name in ("right_elbow", "right_wrist", "right_hand"):
+    for name in ("right_elbow", "right_wrist", "right_palm"):
         moved = points[name].copy()
         moved[400:] += [0.0, 0.0, 1.0]
         points[name] = moved
@@ -336,7 +336,7 @@ def test_a_jump_of_a_metre_is_no_jump_of_the_robot(arm) -> None:
 def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
     pose = person(8.0)
     points = {name: p.copy() for name, p in pose.points.items()}
-    for name in ("right_elbow", "right_wrist", "right_hand"):
+    for name in ("right_elbow", "right_wrist", "right_palm"):
         points[name][300:420] = np.nan
     nan = retarget(replace(pose, points=points), arm)
     lost = np.zeros(len(pose.time), dtype=bool)
@@ -358,7 +358,7 @@ def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
 def test_uncertain_hands_weigh_less_and_slow_the_robot(arm) -> None:
     pose = person(4.0)
     std = np.where((pose.time > 1.5) & (pose.time < 2.5), 0.2, 0.02)
-    unsure = replace(pose, point_cov={"right_hand": std[:, None, None] ** 2 * np.eye(3)})
+    unsure = replace(pose, point_cov={"right_palm": std[:, None, None] ** 2 * np.eye(3)})
     asked = compute_arm_targets(unsure, arm)
     assert asked.hands[0].weight[200] < 0.2
     assert asked.hands[0].weight[20] > 0.95
@@ -377,10 +377,10 @@ def test_an_arm_that_is_never_known_is_refused(arm) -> None:
 def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     pose = person(6.0, flexion=80.0, swing=10.0)
     points = dict(pose.points)
-    hand = points["right_hand"].copy()
+    hand = points["right_palm"].copy()
     inside = np.array([0.0, 0.0, 0.20])
     blend = np.clip((pose.time - 2.0) / 1.5, 0.0, 1.0)[:, None]
-    points["right_hand"] = hand + blend * (inside - hand)
+    points["right_palm"] = hand + blend * (inside - hand)
     found = retarget(replace(pose, points=points), arm)
     is_sound(found)
     assert error(found)[-1] > 0.05  # it could not get there

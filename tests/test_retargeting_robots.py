@@ -78,7 +78,7 @@ def violent(hz: float, swing: float, across: float, bend: float, phase: float, s
         for turn, length in ((upper, UPPER), (fore, FORE), (fore, HAND)):
             places.append(places[-1] + turn.apply([0.0, 0.0, -length]))
         quat |= {f"{side}_upper_arm": upper.as_quat(), f"{side}_forearm": fore.as_quat()}
-        points |= {f"{side}_{n}": p for n, p in zip(("shoulder", "elbow", "wrist", "hand"), places, strict=True)}
+        points |= {f"{side}_{n}": p for n, p in zip(("shoulder", "elbow", "wrist", "palm"), places, strict=True)}
     return Pose(time, quat, points)
 
 

@@ -97,7 +97,7 @@ def test_accel_is_the_second_derivative_of_the_position(fast: Simulation, segmen
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize(
     ("part", "start", "end"),
-    [("upper_arm", "shoulder", "elbow"), ("forearm", "elbow", "wrist"), ("hand", "wrist", "hand")],
+    [("upper_arm", "shoulder", "elbow"), ("forearm", "elbow", "wrist"), ("hand", "wrist", "palm")],
 )
 def test_segments_keep_their_length(perfect: Simulation, side: str, part: str, start: str, end: str) -> None:
     p_W = perfect.points[f"{side}_{end}"] - perfect.points[f"{side}_{start}"]
@@ -122,14 +122,14 @@ def test_n_pose(perfect: Simulation) -> None:
         assert np.array_equal(perfect.quat_WL[segment][start], np.tile([0.0, 0.0, 0.0, 1.0], (start.sum(), 1)))
     arm = sum(SUBJECT[f"left_{part}"] for part in ("upper_arm", "forearm", "hand"))
     hand = [0.0, SUBJECT["shoulder_width"] / 2, SUBJECT["trunk"] - arm]
-    np.testing.assert_allclose(perfect.points["left_hand"][0], hand, atol=1e-15)
+    np.testing.assert_allclose(perfect.points["left_palm"][0], hand, atol=1e-15)
     assert perfect.phases["start"] == [(0.5, 4.5)]
 
 
 def test_palms_coincide_in_the_clasp(perfect: Simulation) -> None:
     clasp = within(perfect, "clasp")
-    palm = perfect.points["left_hand"][clasp]
-    assert np.abs(palm - perfect.points["right_hand"][clasp]).max() < 1e-9
+    palm = perfect.points["left_palm"][clasp]
+    assert np.abs(palm - perfect.points["right_palm"][clasp]).max() < 1e-9
     assert clasp.sum() > 5900
     # a large region before the body: belly to above the head, in and out, left and right
     p_T = Rotation.from_quat(perfect.quat_WL["torso"][clasp]).inv().apply(palm) - [0.0, 0.0, SUBJECT["trunk"]]
@@ -165,7 +165,7 @@ def test_elbows_point_down_and_outwards(perfect: Simulation) -> None:
     clasp = within(perfect, "clasp")
     R_TW = Rotation.from_quat(perfect.quat_WL["torso"][clasp]).inv()
     for side, y in (("left", 1.0), ("right", -1.0)):
-        shoulder, elbow, hand = (perfect.points[f"{side}_{p}"][clasp] for p in ("shoulder", "elbow", "hand"))
+        shoulder, elbow, hand = (perfect.points[f"{side}_{p}"][clasp] for p in ("shoulder", "elbow", "palm"))
         line = hand - shoulder
         along = np.sum((elbow - shoulder) * line, axis=1) / np.sum(line * line, axis=1)
         off_T = R_TW.apply(elbow - shoulder - along[:, None] * line)
@@ -179,21 +179,21 @@ def test_rests_and_start_are_exactly_still(perfect: Simulation) -> None:
     for segment in SEGMENTS:
         assert np.abs(perfect.gyro_S[segment][still]).max() < 1e-12
         np.testing.assert_allclose(np.linalg.norm(perfect.accel_S[segment][still], axis=1), G, rtol=0, atol=1e-12)
-    hand = perfect.points["right_hand"][within(perfect, "rest")]
+    hand = perfect.points["right_palm"][within(perfect, "rest")]
     assert np.abs(hand - hand[0]).max() < 1e-12  # always the same point of the table
 
 
 def test_six_circles_between_the_rests(perfect: Simulation) -> None:
     (lift, back), rests = perfect.phases["circles"][0], perfect.phases["rest"]
-    table = perfect.points["right_hand"][within(perfect, "rest")][0]
-    away = np.linalg.norm(perfect.points["right_hand"] - table, axis=1)
+    table = perfect.points["right_palm"][within(perfect, "rest")][0]
+    away = np.linalg.norm(perfect.points["right_palm"] - table, axis=1)
     t = perfect.time
     assert away[(t > rests[0][0]) & (t <= lift)].max() < 1e-12
     assert away[t >= back].max() < 1e-12
     for (_, a), (b, _) in pairwise(rests):
         assert away[(t > a) & (t < b)].max() > 0.2
         # The turn itself lies in a plane and at one distance from its centre.
-        turn = perfect.points["right_hand"][(t > a + 1.7) & (t < b - 1.7)]
+        turn = perfect.points["right_palm"][(t > a + 1.7) & (t < b - 1.7)]
         centre = turn.mean(axis=0)
         assert np.linalg.svd(turn - centre)[1][2] < 1e-9
         fit = np.linalg.lstsq(
@@ -313,7 +313,7 @@ def test_fields_and_phases() -> None:
     assert sim.time[0] == 0.0
     np.testing.assert_allclose(np.diff(sim.time), 0.01)
     assert set(sim.quat_WL) == set(sim.gyro_S) == set(sim.accel_S) == set(sim.stated_mount) == set(SEGMENTS)
-    assert set(sim.points) == {f"{s}_{p}" for s in SIDES for p in ("shoulder", "elbow", "wrist", "hand")}
+    assert set(sim.points) == {f"{s}_{p}" for s in SIDES for p in ("shoulder", "elbow", "wrist", "palm")}
     for segment in SEGMENTS:
         assert sim.quat_WL[segment].shape == (n, 4)
         assert sim.gyro_S[segment].shape == sim.accel_S[segment].shape == sim.gyro_bias[segment].shape == (n, 3)
@@ -329,7 +329,7 @@ def test_fields_and_phases() -> None:
 def test_bodies_of_other_sizes(scale: float) -> None:
     sim = simulate({k: scale * v for k, v in SUBJECT.items()}, seed=6, rate_hz=50.0, clasp_s=20.0)
     clasp = within(sim, "clasp")
-    assert np.abs(sim.points["left_hand"] - sim.points["right_hand"])[clasp].max() < 1e-9
+    assert np.abs(sim.points["left_palm"] - sim.points["right_palm"])[clasp].max() < 1e-9
 
 
 def test_wrong_input_is_named() -> None:

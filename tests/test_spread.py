@@ -11,18 +11,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.alignment import ATTITUDE_STD, START_POSE_STD
-from wepose_pin.calibration import load_protocol, weighing
-from wepose_pin.calibration.known import (
+from wepose_pin.calibration import load_protocol, weights
+from wepose_pin.calibration.lengths import Calibration, solve_calibration
+from wepose_pin.calibration.priors import (
     DRIFT_STD,
     HINGE_COMMON_STD,
     HINGE_MIRROR_STD,
     HINGE_TILT_STD,
-    SAG_STD,
     SHOULDERS_STD,
-    TORSO_SAG_STD,
+    SOFT_TISSUE_STD,
+    TORSO_SOFT_TISSUE_STD,
 )
-from wepose_pin.calibration.lengths import Calibration, _solve
-from wepose_pin.calibration.weighing import LEAST_CORRELATION_S
+from wepose_pin.calibration.problem import CalibrationProblem
+from wepose_pin.calibration.weights import LEAST_CORRELATION_S
 from wepose_pin.filters.sensors import FilteredRecording
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import PERFECT, Person, simulate, simulated_person
@@ -31,7 +32,7 @@ from wepose_pin.subject import LENGTHS, mount_rows
 UP = np.array([0.0, 0.0, 1.0])
 SENSORS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 START = (0.5, 4.5)
-RATE_HZ = 4.0  # of the recording and its looks: half of the usual, in half of the time
+RATE_HZ = 4.0  # of the recording and its observations: half of the usual, in half of the time
 DRAWS = 100
 # What of the covariance is compared: name → the rows whose sum it is. Forearm and hand are seen as one.
 GROUPS: dict[str, list[tuple[str, ...]]] = {
@@ -48,7 +49,7 @@ GROUPS: dict[str, list[tuple[str, ...]]] = {
 
 
 class Motion(NamedTuple):
-    """Of one person, exact, at the looks."""
+    """Of one person, exact, at the observations."""
 
     person: Person
     time: np.ndarray  # (n,) [s]
@@ -97,10 +98,11 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
 
     mean = np.array([person.lengths[name] for name in LENGTHS])
     for _ in range(count):
-        # The person stays, and the average is drawn: the same difference.
-        average = rng.multivariate_normal(mean, person.average.lengths_covariance())
-        prior = replace(person.average, lengths=dict(zip(LENGTHS, average.tolist(), strict=True)))
-        taped = {"shoulder_width": person.lengths["shoulder_width"] + rng.normal(scale=person.taped_std)}
+        # The person stays and the prior is drawn: the same difference.
+        drawn = rng.multivariate_normal(mean, person.prior.lengths_covariance())
+        prior = replace(person.prior, lengths=dict(zip(LENGTHS, drawn.tolist(), strict=True)))
+        width = person.lengths["shoulder_width"] + rng.normal(scale=person.measured_std)
+        measured = {"shoulder_width": (width, person.measured_std)}
         R_WL = _slipped(motion, slow(slip))
         common = rng.normal(scale=HINGE_COMMON_STD)
         mirrored = rng.normal(scale=HINGE_MIRROR_STD)
@@ -111,23 +113,17 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
         for name in SENSORS:
             psi, drift = rng.uniform(-np.pi, np.pi), rng.normal(scale=DRIFT_STD)
             tilt = Rotation.from_rotvec([*rng.normal(scale=START_POSE_STD, size=2), 0.0])
-            sag = rng.normal(scale=TORSO_SAG_STD if name == "torso" else SAG_STD, size=(3, 3))
+            tissue = rng.normal(scale=TORSO_SOFT_TISSUE_STD if name == "torso" else SOFT_TISSUE_STD, size=(3, 3))
             turned = R_WL[name]
             for _ in range(8):
-                turned = R_WL[name] * Rotation.from_rotvec((turned.inv().apply(UP) - UP) @ sag.T).inv()
+                turned = R_WL[name] * Rotation.from_rotvec((turned.inv().apply(UP) - UP) @ tissue.T).inv()
             turned = turned * Rotation.from_rotvec(slow(ATTITUDE_STD))
             Q = _about_z(-psi - drift * (time - START[1])) * turned * tilt.inv() * _about_z(psi)
             mounts[name] = Rotation.random(random_state=rng)
             at_start[name] = _about_z(-psi) * tilt * mounts[name]
             R_VS[name] = Rotation.concatenate([*[at_start[name]] * len(start_time), Q * at_start[name]])
-        found = _solve(
-            recording,
-            FilteredRecording(R_VS, at_start, {}, START, START, []),
-            protocol,
-            prior,
-            taped,
-            person.taped_std,
-        )
+        filtered = FilteredRecording(R_VS, at_start, {}, START, START, [])
+        found = solve_calibration(CalibrationProblem(recording, filtered, protocol, prior, measured))
         error = dict(zip(LENGTHS, np.array([found.subject.lengths[s] for s in LENGTHS]) - mean, strict=True))
         for name in SENSORS:
             off = (Rotation.from_quat(found.subject.mounts[name]) * mounts[name].inv()).as_rotvec()
@@ -195,9 +191,9 @@ def test_the_spread_is_what_is_stated(motion: Motion) -> None:
     assert all(0.7 < value < 1.3 for value in found.values()), found
 
 
-def test_many_looks_are_solved_by_way_of_few(motion: Motion, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_samples_start_from_few(motion: Motion, monkeypatch: pytest.MonkeyPatch) -> None:
     at_once = next(draws(motion, 1)).found.subject
-    monkeypatch.setattr(weighing, "MANY_LOOKS", len(motion.time) // 2)
+    monkeypatch.setattr(weights, "MANY_SAMPLES", len(motion.time) // 2)
     found = next(draws(motion, 1)).found.subject
     for name in LENGTHS:
         assert found.lengths[name] == pytest.approx(at_once.lengths[name], abs=0.15 * at_once.std(name))

@@ -17,27 +17,27 @@ from wepose_pin.subject import (
     Hinge,
     StartPoseOffset,
     Subject,
-    average_subject,
     load_subject,
     mount_rows,
+    population_subject,
     subject_toml,
 )
 
 
 def test_the_average_man_of_de_leva() -> None:
     """Joint to joint, male, 1.741 m (de Leva 1996, Table 4)."""
-    lengths = average_subject(1.741, "m").lengths
+    lengths = population_subject(1.741, "m").lengths
     expected = {"trunk": 0.5155, "left_upper_arm": 0.2817, "right_forearm": 0.2689, "left_hand": 0.0681}
     for name, value in expected.items():
         assert lengths[name] == pytest.approx(value, abs=5e-4)
-    woman = average_subject(1.735, "f").lengths
+    woman = population_subject(1.735, "f").lengths
     assert woman["left_upper_arm"] == pytest.approx(0.2751, abs=5e-4)
-    between = average_subject(1.74).lengths["left_upper_arm"]
+    between = population_subject(1.74).lengths["left_upper_arm"]
     assert woman["left_upper_arm"] < between < lengths["left_upper_arm"]
 
 
 def test_stature_narrows_the_prior_and_left_follows_right() -> None:
-    wide, narrow = average_subject(), average_subject(1.75)
+    wide, narrow = population_subject(), population_subject(1.75)
     assert wide.std("left_upper_arm") > 1.3 * narrow.std("left_upper_arm")
     cov = wide.lengths_covariance(("left_upper_arm", "right_upper_arm"))
     difference = np.sqrt(cov[0, 0] + cov[1, 1] - 2 * cov[0, 1])
@@ -46,15 +46,15 @@ def test_stature_narrows_the_prior_and_left_follows_right() -> None:
 
 
 def test_people_drawn_have_the_priors_spread() -> None:
-    average, rng = average_subject(), np.random.default_rng(0)
-    drawn = np.array([[average.draw(rng).lengths[name] for name in LENGTHS] for _ in range(2000)])
+    average, rng = population_subject(), np.random.default_rng(0)
+    drawn = np.array([[average.sample(rng).lengths[name] for name in LENGTHS] for _ in range(2000)])
     np.testing.assert_allclose(drawn.mean(axis=0), [average.lengths[name] for name in LENGTHS], rtol=0.01)
     np.testing.assert_allclose(drawn.std(axis=0), [average.std(name) for name in LENGTHS], rtol=0.06)
 
 
 def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
-    average = average_subject(1.8, "f")
+    average = population_subject(1.8, "f")
     order = (*LENGTHS, "mounts.torso.x", "mounts.torso.y", "mounts.torso.z")
     root = rng.normal(scale=0.01, size=(len(order), len(order)))
     subject = Subject(
@@ -104,7 +104,7 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
             "mounts.torso: qx, qy, qz, qw must be of length 1; it is 1.4",
         ),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [[1.0, 2.0]]", "covariance.matrix is (1, 2)"),
-        ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [['a']]", "holds something that is no number"),
+        ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [['a']]", "holds NaN or text"),
         ("ALL\n[start_pose_offset.tors]\nx_deg = 1", "start_pose_offset.tors is not a segment; did you mean 'torso'"),
         ("ALL\n[start_pose_offset.torso]\nx_deg = 1", "it needs x_deg, y_deg, std_deg"),
         ("ALL\n[heading_drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1", "it needs rate_deg_min, std_deg_min"),
@@ -128,9 +128,9 @@ def test_missing_files_and_people_that_are_none() -> None:
     with pytest.raises(MissingFile, match="no such file"):
         load_subject("nowhere/subject.toml")
     with pytest.raises(BadOption, match="stature 175 is not a body height in metres"):
-        average_subject(175.0)
+        population_subject(175.0)
     with pytest.raises(BadOption, match="sex 'x' is not known"):
-        average_subject(1.7, "x")
+        population_subject(1.7, "x")
 
 
 EXTREME: dict[str, dict[str, Any]] = {
@@ -139,7 +139,7 @@ EXTREME: dict[str, dict[str, Any]] = {
     },
     "a start tilt of half a turn": {"start_pose_offset": {"left_hand": StartPoseOffset(np.array([0.0, np.pi]), np.pi)}},
     "a drift of tens of degrees a second": {"heading_drift": {"head": HeadingDrift(-1.5, 1.5)}},
-    "a hinge that is hardly one": {"hinges": {"left": Hinge(np.array([0.6, 0.0, -0.8]), 0.999)}},
+    "a hinge that is hardly one": {"hinges": {"left_elbow": Hinge(np.array([0.6, 0.0, -0.8]), 0.999)}},
     "a name that TOML wants escaped": {"name": 'a\x7f\x00\n"\\\u2028é\ud800', "note": "\x7f"},
     "headings that may be anywhere": {
         "order": (*LENGTHS, *(row for s in SEGMENTS for row in mount_rows(s))),
@@ -151,7 +151,7 @@ EXTREME: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("case", EXTREME)
 def test_what_is_written_can_be_read(case: str, tmp_path: Path) -> None:
     """Whether it is plausible the quality of the calibration says; a subject that cannot be read helps nobody."""
-    subject = replace(average_subject(), **EXTREME[case])
+    subject = replace(population_subject(), **EXTREME[case])
     (tmp_path / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
     again = load_subject(tmp_path)
     assert again.name.replace("?", "") == subject.name.replace("\ud800", "")

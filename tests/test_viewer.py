@@ -152,7 +152,7 @@ def test_trails_keep_gaps_and_take_the_colour_of_the_arm(recording):
     time, placements = recording
     hand = np.ones((len(time), 3))
     hand[50:60] = np.nan
-    trails = {"left_hand": hand, "right_hand": hand, "nose": hand}
+    trails = {"left_palm": hand, "right_palm": hand, "nose": hand}
     left, right, nose = data_of(view_html(VISUALS, time, placements, trails=trails, fps=200.0))["trails"]
     np.testing.assert_array_equal(floats(left["points"], -1, 3), hand)
     assert (left["colour"], right["colour"]) == ("#ff8000", "#0033ff")

@@ -16,7 +16,7 @@ from wepose_pin.model import load_model
 from wepose_pin.pose import pose_from_table, pose_table
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import average_subject
+from wepose_pin.subject import population_subject
 from wepose_pin.tracking import track
 from wepose_pin.writers import read_result, write_result, write_session
 from wepose_pin.writers.result import write_subject
@@ -87,7 +87,7 @@ def test_a_session_reads_back_to_the_bit(simulation: Simulation, tmp_path: Path)
         np.testing.assert_allclose(again.phases[name], spans, atol=1e-3)
     assert again.truth == tmp_path / "truth.parquet"
     truth = pose_from_table(pl.read_parquet(again.truth), "truth.parquet")
-    np.testing.assert_array_equal(truth.points["left_hand"], simulation.points["left_hand"])
+    np.testing.assert_array_equal(truth.points["left_palm"], simulation.points["left_palm"])
 
 
 def test_ready_orientations_are_written_too(simulation: Simulation, tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_a_result_reads_back(simulation: Simulation, tmp_path: Path) -> None:
         "summary.json",
     ]
     again, model, summary = read_result(tmp_path)
-    np.testing.assert_array_equal(again.points["right_hand"], pose.points["right_hand"])
+    np.testing.assert_array_equal(again.points["right_palm"], pose.points["right_palm"])
     np.testing.assert_allclose(again.quat_WL["torso"], pose.quat_WL["torso"], atol=1e-15)
     assert model.lengths == pytest.approx(dict(pose.subject.lengths), abs=1e-12)
     assert summary == json.loads((tmp_path / "summary.json").read_text())
@@ -123,7 +123,7 @@ def test_the_subjects_urdf_opens_in_other_tools_and_says_how_sure_it_is(tmp_path
     import pinocchio as pin
     import yourdfpy
 
-    person = replace(average_subject(1.7, "f"), name="Anna --> <test>")
+    person = replace(population_subject(1.7, "f"), name="Anna --> <test>")
     write_subject(tmp_path, person, load_model(lengths=person.lengths))
     path = tmp_path / "subject.urdf"
     assert f"left_forearm {person.lengths['left_forearm']:.4f} ± {person.std('left_forearm'):.4f}" in path.read_text()

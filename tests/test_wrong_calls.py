@@ -97,7 +97,7 @@ class Wrong(NamedTuple):
 def right() -> dict[str, dict[str, Any]]:
     """The arguments of a right call of each function; positional ones by their names."""
     folder = Path(mkdtemp())
-    person = wp.average_subject(1.75)
+    person = wp.population_subject(1.75)
     simulation = wp.simulate(dict(person.lengths), seed=1, clasp_s=8.0, circles=1)
     recording = simulation.recording("by hand")
     pose = simulation.truth()
@@ -120,7 +120,7 @@ def right() -> dict[str, dict[str, Any]]:
         "load_subject": {"path": folder},
         "load_model": {"path": None, "lengths": None},
         "load_robot": {"path": urdf},
-        "average_subject": {"stature": 1.7, "sex": "f"},
+        "population_subject": {"stature": 1.7, "sex": "f"},
         "estimate_orientation": {
             "gyro_S": torso.gyro_S[:600],
             "accel_S": torso.accel_S[:600],
@@ -132,7 +132,7 @@ def right() -> dict[str, dict[str, Any]]:
         },
         "track": {"recording": recording, "subject": subject},
         "track_chain": {"recording": chain, "model": arm},
-        "calibrate": {"recording": recording, "gauge": {"shoulder_width": person.lengths["shoulder_width"]}},
+        "calibrate": {"recording": recording, "measured": {"shoulder_width": person.lengths["shoulder_width"]}},
         "evaluate": {"pose": pose, "truth": pose},
         "joint_angles": {"pose": pose},
         "export": {"result": folder, "file": folder / "out.csv"},
@@ -155,7 +155,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "root": (3, 1.5, True),
     },
     "load_robot": {"path": (*PATH, None)},
-    "average_subject": {"stature": (*POSITIVE, 175.0, 0.3), "sex": NAME},
+    "population_subject": {"stature": (*POSITIVE, 175.0, 0.3), "sex": NAME},
     "estimate_orientation": {
         "gyro_S": SAMPLES,
         "accel_S": SAMPLES,
@@ -184,11 +184,11 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
     },
     "calibrate": {
         "recording": (*THING, None),
-        "gauge": LENGTHS,
+        "measured": LENGTHS,
         "prior": THING,
         "protocol": (*NAME, None),
         "method": (*NAME, None),
-        "gauge_std": (*POSITIVE, None),
+        "measured_std": (*POSITIVE, None),
     },
     "evaluate": {
         "pose": (*THING, None),
@@ -365,11 +365,11 @@ def wrong_subjects(subject: wp.Subject) -> Iterator[tuple[str, wp.Subject]]:
     for mounts in (None, "x", {"arm": good}):
         yield "mounts", replace(subject, mounts=mounts)
     for hinges in (
-        {"middle": Hinge(np.array([0.0, 1.0, 0.0]), 0.1)},
-        {"left": Hinge(np.array([0.0, 2.0, 0.0]), 0.1)},
-        {"left": Hinge(np.array([0.0, 1.0, 0.0]), -0.1)},
-        {"left": Hinge(np.array([0.0, 1.0, 0.0]), NAN)},
-        {"left": "x"},
+        {"middle_elbow": Hinge(np.array([0.0, 1.0, 0.0]), 0.1)},
+        {"left_elbow": Hinge(np.array([0.0, 2.0, 0.0]), 0.1)},
+        {"left_elbow": Hinge(np.array([0.0, 1.0, 0.0]), -0.1)},
+        {"left_elbow": Hinge(np.array([0.0, 1.0, 0.0]), NAN)},
+        {"left_elbow": "x"},
         None,
     ):
         yield "hinges", replace(subject, hinges=hinges)

@@ -5,7 +5,7 @@ Conventions, everywhere:
 - SI inside; a value in another unit carries a suffix (`angle_deg`, `rate_hz`).
 - World W: z up, x forward (where the torso faces in the start pose), y left, origin midway between the hips.
   Segment L, sensor S, robot base B. `R_WS = R_WL @ R_LS`: inner letters cancel.
-- `gyro_S` [rad/s] is the rate over the interval that ends at the sample; `accel_S` [m/s²] is +g up at rest.
+- `gyro_S` [rad/s] is the rate over the interval that ends at the sample; `accel_S` [m/s²] is +g up while static.
 - Every segment frame equals W in the N-pose.
 - Quaternions are xyzw, unit norm, named `quat_WS`; `q` is a Pinocchio configuration and nothing else.
 - Perturbations stand on the right: `R_WS @ exp(dtheta_S)`.
@@ -28,7 +28,7 @@ _WHERE = {
     "Subject": "subject",
     "WeposeError": "errors",
     "WeposeWarning": "errors",
-    "average_subject": "subject",
+    "population_subject": "subject",
     "calibrate": "calibration",
     "estimate_orientation": "filters",
     "evaluate": "evaluation",

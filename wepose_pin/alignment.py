@@ -23,7 +23,7 @@ from .filters.start import ACCEL_BIAS_STD
 from .recording import SEGMENTS, Recording, span_text
 from .subject import Subject
 
-# The stated axes are by hand; further off than this they are no longer what was meant.
+# Angles [deg] between a stated mount and gravity or motion, above which it is an error or a warning.
 STATED_LIMIT_DEG = 60.0
 STATED_WARNING_DEG = 35.0
 
@@ -53,7 +53,7 @@ class Segments:
     covariance_W : segment → (n, 3, 3) [rad²], of the error on the left of `quat_WL`, in W: the filter's, the
         accelerometer's bias, and the heading of a calibrated mount. A stated mount counts as
         exact. Only where the filter has a covariance
-    start, still : intervals [s] used for headings, and for noise and bias
+    start, static_phase : intervals [s] used for headings, and for noise and bias
     diagnostics : of the recording, its start pose and its mounts
     """
 
@@ -64,7 +64,7 @@ class Segments:
     orientation: Mapping[str, Orientation]
     covariance_W: Mapping[str, np.ndarray]
     start: tuple[float, float]
-    still: tuple[float, float]
+    static_phase: tuple[float, float]
     diagnostics: tuple[Diagnostic, ...]
 
 
@@ -77,7 +77,7 @@ class Alignment:
     mount : segment → R_LS, sensor to segment
     turn : segment → Rz(ψ), the sensor's world to W
     heading : segment → ψ [rad]
-    start, still : intervals [s] used for headings, and for noise and bias
+    start, static_phase : intervals [s] used for headings, and for noise and bias
     diagnostics : of the recording, its start pose and its mounts
     """
 
@@ -85,7 +85,7 @@ class Alignment:
     turn: Mapping[str, Rotation]
     heading: Mapping[str, float]
     start: tuple[float, float]
-    still: tuple[float, float]
+    static_phase: tuple[float, float]
     diagnostics: tuple[Diagnostic, ...]
 
 
@@ -106,7 +106,7 @@ def check_mounts(recording: Recording, subject: Subject | None) -> None:
         if len(missing) > 1:
             of += f", nor that of {', '.join(missing[1:])}"
         if subject is not None and recording.remounted and set(missing) & set(subject.mounts):
-            of += " (remounted = true: the subject's are of another strapping)"
+            of += " (remounted = true: the subject's are of another mounting)"
         elif subject is not None and subject.mounts:
             of += f"; the subject '{subject.name}' has none for it"
         raise BadSession(f"{recording.where()}: {of}: {mount_advice(missing)}")
@@ -144,7 +144,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
     if aligned:
         # The torso faces x; where it is not among them the most central of the others does.
         facing = min(aligned, key=SEGMENTS.index)
-        psi_aligned = heading_to(filtered.at_start[facing], Rotation.identity())
+        psi_aligned = compute_heading(filtered.at_start[facing], Rotation.identity())
     for segment, at_start in filtered.at_start.items():
         if recording.sensors[segment].aligned:
             turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi_aligned])
@@ -153,7 +153,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
         stated = nominal_mount(recording, segment, subject)
         assert stated is not None
         R_stated = Rotation.from_quat(stated)
-        psi = heading_to(at_start, R_stated)
+        psi = compute_heading(at_start, R_stated)
         R_LS = Rotation.from_rotvec([0.0, 0.0, psi]) * at_start
         off = np.degrees((R_LS * R_stated.inv()).magnitude())
         if off > STATED_LIMIT_DEG:
@@ -180,7 +180,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
             misfit = (R_LS * R_stated.inv()).as_rotvec()[:2]
             both = known[:2, :2] + START_POSE_STD**2 * np.eye(2)
             R_LS = Rotation.from_rotvec(known[:, :2] @ np.linalg.solve(both, misfit)) * R_stated
-            psi = heading_to(at_start, R_LS)
+            psi = compute_heading(at_start, R_LS)
             stood = subject.start_pose_offset.get(segment) if subject is not None else None
             if stood is not None:
                 # Tilt and mount of the calibration come from one start pose: what one is off by, the other is too.
@@ -190,7 +190,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
                 diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOVED_MOUNT, facts))
         mount[segment], heading[segment] = R_LS, psi
         turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi])
-    return Alignment(mount, turn, heading, start, filtered.still, tuple(diagnostics))
+    return Alignment(mount, turn, heading, start, filtered.static_phase, tuple(diagnostics))
 
 
 def orient_segments(
@@ -206,7 +206,7 @@ def orient_segments(
         quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
         ours = orientation.get(segment)
         if ours is not None and ours.attitude_cov is not None:
-            covariance_W[segment] = covariance_of(chunk, segment, subject, turn * R_VS, R_LS, ours)
+            covariance_W[segment] = compute_segment_covariance(chunk, segment, subject, turn * R_VS, R_LS, ours)
     return Segments(
         chunk.time,
         quat_WL,
@@ -215,12 +215,12 @@ def orient_segments(
         orientation,
         covariance_W,
         alignment.start,
-        alignment.still,
+        alignment.static_phase,
         alignment.diagnostics,
     )
 
 
-def heading_to(R_VS: Rotation, R_WS: Rotation) -> float:
+def compute_heading(R_VS: Rotation, R_WS: Rotation) -> float:
     """ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
     return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
 
@@ -235,13 +235,13 @@ def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -
     return stated
 
 
-def vertical_var(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
+def heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
     """(n,) [rad²]: variance about the vertical of errors on the right (n, 3, 3), in S."""
     up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
     return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
 
 
-def covariance_of(
+def compute_segment_covariance(
     recording: Recording,
     segment: str,
     subject: Subject | None,
@@ -279,5 +279,5 @@ def start_heading_var(recording: Recording, segment: str, subject: Subject | Non
 
 
 def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
-    """Covariance (3, 3) [rad²] of a calibrated mount's error in L, where it holds for this strapping and is known."""
+    """Covariance (3, 3) [rad²] of a calibrated mount's error in L, where it holds for this mounting and is known."""
     return None if subject is None or recording.remounted else subject.mount_covariance(segment)

@@ -41,14 +41,14 @@ class PositionError(NamedTuple):
 
 
 class Uncertainty(NamedTuple):
-    """How far stated standard deviations are right, over time and axes of W.
+    """The consistency of stated standard deviations, over time and axes of W.
 
     The errors of one recording are slow: over a minute they are a few draws, not thousands. Judge many recordings.
     """
 
     nees: float  # mean normalised squared error; 3 is right, above it the deviations are too small
-    within_1: float  # share of errors within one standard deviation; 0.683 is right
-    within_2: float  # 0.954 is right
+    within_1: float  # share of errors within one standard deviation; 0.683 is consistent
+    within_2: float  # 0.954 is consistent
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         finite = np.isfinite(truth.quat_WL[segment]).all(axis=1)
         if finite.sum() < 2:
             continue
-        known = _near(time, truth.time[finite])
+        known = _is_near(time, truth.time[finite])
         reference = Slerp(truth.time[finite], Rotation.from_quat(truth.quat_WL[segment][finite]))
         clipped = np.clip(time[known], truth.time[finite][0], truth.time[finite][-1])
         if known.any():
@@ -109,17 +109,19 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
     from_shoulders = {}
     for point in [p for p in pose.points if p in truth.points]:
         finite = np.isfinite(truth.points[point]).all(axis=1)
-        known = _near(time, truth.time[finite])
+        known = _is_near(time, truth.time[finite])
         if not known.any():
             continue
-        difference = pose.points[point][inside][known] - _at(time[known], truth.time, truth.points[point], finite)
+        difference = pose.points[point][inside][known] - _interpolate(
+            time[known], truth.time, truth.points[point], finite
+        )
         position[point] = position_error(difference)
         if point in pose.point_cov:
             position_uncertainty[point] = uncertainty(difference, pose.point_cov[point][inside][known])
         if middle[0] is not None and middle[1] is not None and "shoulder" not in point:
-            there = np.isfinite(middle[1]).all(axis=1)
-            both = _near(time[known], truth.time[there])
-            shift = middle[0][inside][known] - _at(time[known], truth.time, middle[1], there)
+            known_shoulders = np.isfinite(middle[1]).all(axis=1)
+            both = _is_near(time[known], truth.time[known_shoulders])
+            shift = middle[0][inside][known] - _interpolate(time[known], truth.time, middle[1], known_shoulders)
             if both.any():
                 from_shoulders[point] = position_error((difference - shift)[both])
     if not attitude and not position:
@@ -143,12 +145,12 @@ def _shoulders(pose: Pose) -> np.ndarray | None:
     return None if ends[0] is None or ends[1] is None else (ends[0] + ends[1]) / 2.0
 
 
-def _at(time: np.ndarray, known: np.ndarray, points: np.ndarray, finite: np.ndarray) -> np.ndarray:
+def _interpolate(time: np.ndarray, known: np.ndarray, points: np.ndarray, finite: np.ndarray) -> np.ndarray:
     return np.column_stack([np.interp(time, known[finite], axis) for axis in points[finite].T])
 
 
-def _near(time: np.ndarray, known: np.ndarray, reach_s: float = 0.1) -> np.ndarray:
-    """Which times lie between two known ones not further apart than `reach_s`, or on one: no error within a gap."""
+def _is_near(time: np.ndarray, known: np.ndarray, reach_s: float = 0.1) -> np.ndarray:
+    """Mask of the times between two known ones at most `reach_s` apart, or on one: no error within a gap."""
     if len(known) < 2:
         return np.zeros(len(time), dtype=bool)
     after = np.clip(np.searchsorted(known, time - 1e-9), 0, len(known) - 1)
@@ -180,7 +182,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
-    """Errors (n, 3) against their stated covariances (n, 3, 3); what states none is left out. NaN where all do."""
+    """Errors (n, 3) against their stated covariances (n, 3, 3); samples without one are left out. NaN where all are."""
     stated = np.isfinite(cov).all(axis=(1, 2))
     stated[stated] = np.linalg.eigvalsh(cov[stated])[:, 0] > 0.0
     error, cov = error[stated], cov[stated]

@@ -15,12 +15,12 @@ from .arguments import check_array, check_covariance, check_fields, check_finite
 from .compilation import kernel
 from .errors import BadData, BadModel, one_of
 from .model import POINTS, BodyModel, chains
-from .model.follow import Follower, groups
+from .model.orientation_ik import OrientationIk, groups
 from .recording import EACH_TIME, SEGMENTS, check_time
 from .rotations import product
 from .subject import LENGTHS
 
-_WILD = 1e12  # beyond this a number in a table is no time [s] and no place [m]
+_LARGEST_NUMBER = 1e12  # beyond this a number in a table is no time [s] and no place [m]
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Pose:
     gap: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def check(self) -> Pose:
-        """The same pose, if it can be one: made by hand it may be anything. NaN stands for what is missing.
+        """The same pose, if all its fields are valid. NaN stands for missing values.
 
         Raises
         ------
@@ -85,13 +85,13 @@ class Pose:
         return self
 
 
-def pose_of(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:
+def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:
     """The pose of `model` with measured segment orientations `quat_WL`, segment → (n, 4) xyzw; see `configuration`."""
-    return Poser(model, quat_WL, limits=limits).pose(time, quat_WL)
+    return KinematicsSolver(model, quat_WL, limits=limits).pose(time, quat_WL)
 
 
-class Poser:
-    """`pose_of` for what comes in pieces: each begins where the one before ended.
+class KinematicsSolver:
+    """`compute_pose` chunk by chunk: each begins where the one before ended.
 
     Raises
     ------
@@ -101,14 +101,14 @@ class Poser:
 
     def __init__(self, model: BodyModel, segments: Collection[str], *, limits: bool = True) -> None:
         if not segments:
-            raise BadData("no segment has an orientation: there is nothing to pose")
-        self._model, self._follower = model, _follower(model, segments, limits)
-        self._points = [point for point in known_points(segments) if model.pin.existFrame(POINTS[point])]
+            raise BadData("no segment has an orientation: a pose needs one")
+        self._model, self._ik = model, _make_ik(model, segments, limits)
+        self._points = [point for point in find_known_points(segments) if model.pin.existFrame(POINTS[point])]
         self._last: dict[str, np.ndarray] = {}
 
     def pose(self, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
-        """The next piece: `time` (n,) [s], segment → (n, 4) xyzw."""
-        q = self._follower.run(quat_WL, go_on=True)
+        """The pose of the next chunk: `time` (n,) [s], segment → (n, 4) xyzw."""
+        q = self._ik.run(quat_WL, go_on=True)
         _, p_W = forward_kinematics(self._model, q, [POINTS[point] for point in self._points], rotations=False)
         points = {point: p_W[:, k] for k, point in enumerate(self._points)}
         quats = {name: rotations.unwrap_signs(quat, self._last.get(name)) for name, quat in quat_WL.items()}
@@ -116,7 +116,7 @@ class Poser:
         return Pose(time, quats, points, q)
 
 
-def known_points(segments: Iterable[str]) -> list[str]:
+def find_known_points(segments: Iterable[str]) -> list[str]:
     """Points that follow from the measured segments; a hand without a sensor is rigid with its forearm."""
     have = set(segments)
     known = []
@@ -126,18 +126,18 @@ def known_points(segments: Iterable[str]) -> list[str]:
             "shoulder": ["torso"],
             "elbow": ["torso", f"{side}_upper_arm"],
             "wrist": ["torso", f"{side}_upper_arm", f"{side}_forearm"],
-            "hand": ["torso", f"{side}_upper_arm", f"{side}_forearm"],
+            "palm": ["torso", f"{side}_upper_arm", f"{side}_forearm"],
         }[part]
         if have.issuperset(needs):
             known.append(point)
     return known
 
 
-def known_links(model: BodyModel, segments: Iterable[str]) -> list[str]:
-    """Links whose place follows from the measured segments: those, and what is rigid with them.
+def find_known_links(model: BodyModel, segments: Iterable[str]) -> list[str]:
+    """Links whose place follows from the measured segments: those, and links that are rigid with them.
 
-    Without its sensor a hand is rigid with the forearm, head and pelvis with the torso; an upper arm or forearm
-    without one is not known, and what hangs on it neither.
+    A hand without a sensor is rigid with the forearm, head and pelvis with the torso. An upper arm or forearm without
+    a sensor is unknown, with all links below it.
     """
     have = set(segments)
     guessed = {
@@ -161,9 +161,9 @@ def configuration(
 ) -> np.ndarray:
     """Configuration `q` (n, nq) in which the segments have their measured orientations, or come nearest to them.
 
-    What hangs on spherical joints only has its orientations exactly. An arm with fewer axes somewhere has the least sum
-    of its segments' squared angles to what was measured, which `deviation` gives one by one. Segments without an
-    orientation are rigid with the one above. `wepose_pin.model.chains` says which joints move.
+    Segments on spherical joints have their orientations exactly. In an arm with fewer axes the sum of the segments'
+    squared angles to their measured orientations is least; `orientation_residuals` gives these angles. Segments without
+    an orientation are rigid with the one above. `wepose_pin.model.chains` says which joints move.
 
     Parameters
     ----------
@@ -176,38 +176,38 @@ def configuration(
         The model has no link for a measured segment.
     """
     if not quat_WL:
-        raise BadData("no segment has an orientation: there is nothing to pose")
-    return _follower(model, quat_WL, limits, weights).run(quat_WL)
+        raise BadData("no segment has an orientation: a pose needs one")
+    return _make_ik(model, quat_WL, limits, weights).run(quat_WL)
 
 
-def _follower(
+def _make_ik(
     model: BodyModel, segments: Collection[str], limits: bool = True, weights: Mapping[str, float] | None = None
-) -> Follower:
+) -> OrientationIk:
     """Raises `BadModel` where the model has no link for a segment."""
-    found = chains(model.pin)
+    links = chains(model.pin)
     for segment in segments:
-        if segment not in found:
-            raise BadModel(f"{model.pin.name}: the model has no link for segment '{segment}'; {one_of(found, segment)}")
-    return Follower(model, found, segments, limits=limits, weights=weights)
+        if segment not in links:
+            raise BadModel(f"{model.pin.name}: the model has no link for segment '{segment}'; {one_of(links, segment)}")
+    return OrientationIk(model, links, segments, limits=limits, weights=weights)
 
 
-def deviation(model: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Segment → angle (n,) [rad] by which the model in `q` misses its measured orientation.
+def orientation_residuals(model: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Segment → angle (n,) [rad] between its measured orientation and that of the model in `q`.
 
-    Only segments that may miss one: behind one or two axes, in an arm with such, or rigid with another.
+    Only segments that the joints may not reach: behind one or two axes, in an arm with such, or rigid with another.
     """
-    found = chains(model.pin)
-    fitted = {segment for group in groups(found, quat_WL) for segment in group.segments}
-    lame = [name for name, chain in found.items() if name in quat_WL and (name in fitted or not chain.exact)]
-    R_WL, _ = forward_kinematics(model, q, lame)
-    is_at = {segment: Rotation.from_matrix(R_WL[:, k]) for k, segment in enumerate(lame)}
-    return {segment: (is_at[segment].inv() * Rotation.from_quat(quat_WL[segment])).magnitude() for segment in lame}
+    links = chains(model.pin)
+    fitted = {segment for group in groups(links, quat_WL) for segment in group.segments}
+    limited = [name for name, chain in links.items() if name in quat_WL and (name in fitted or not chain.exact)]
+    R_WL, _ = forward_kinematics(model, q, limited)
+    is_at = {segment: Rotation.from_matrix(R_WL[:, k]) for k, segment in enumerate(limited)}
+    return {segment: (is_at[segment].inv() * Rotation.from_quat(quat_WL[segment])).magnitude() for segment in limited}
 
 
 def forward_kinematics(
     model: BodyModel, q: np.ndarray, links: list[str], *, rotations: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (n, m, 3, 3) and positions (n, m, 3) [m] of links in W, by Pinocchio; rotations empty if not wanted."""
+    """Rotations (n, m, 3, 3), empty without `rotations`, and positions (n, m, 3) [m] of links in W, by Pinocchio."""
     data = model.pin.createData()
     frames = [model.pin.getFrameId(link) for link in links]
     # Views into Pinocchio's memory: reading data.oMf[f] anew costs more than the kinematics.
@@ -245,16 +245,16 @@ class LiveKinematics:
 
     def __init__(self, model: BodyModel, segments: Sequence[str]) -> None:
         self.segments = tuple(segments)
-        self.points = tuple(p for p in known_points(self.segments) if model.pin.existFrame(POINTS[p]))
+        self.points = tuple(p for p in find_known_points(self.segments) if model.pin.existFrame(POINTS[p]))
         self._model, self.data, self._q = model, model.pin.createData(), pin.neutral(model.pin)
         self._views = [self.data.oMf[model.pin.getFrameId(POINTS[point])].translation for point in self.points]
         self._joints = self._spherical()
-        self._follower = None if self._joints is not None else _follower(model, self.segments)
+        self._ik = None if self._joints is not None else _make_ik(model, self.segments)
         self._before: np.ndarray | None = None
 
     def _spherical(self) -> list[tuple[int, int, int]] | None:
         """Of each measured segment its place in q, its row and that of the one above (−1: W); None: not so simple."""
-        found, joints = chains(self._model.pin), []
+        links, joints = chains(self._model.pin), []
         rows: dict[int, int] = {}  # Pinocchio joint → row of the segment whose orientation its frame has
         identity = np.array([0.0, 0.0, 0.0, 1.0])
         for joint in range(1, self._model.pin.njoints):
@@ -262,7 +262,7 @@ class LiveKinematics:
             rows[joint] = above
             if not np.allclose(self._model.pin.jointPlacements[joint].rotation, np.eye(3), atol=1e-15):
                 return None
-            for segment, chain in found.items():
+            for segment, chain in links.items():
                 if segment not in self.segments or joint not in chain.joints:
                     continue
                 spherical = len(chain.axes) == 1 and chain.axes[0] is None
@@ -275,9 +275,9 @@ class LiveKinematics:
 
     def points_of(self, quat_WL: np.ndarray) -> np.ndarray:
         """(p, 3) [m] in W, of `quat_WL` (k, 4) xyzw."""
-        if self._follower is not None:
+        if self._ik is not None:
             rows = {segment: quat_WL[i : i + 1] for i, segment in enumerate(self.segments)}
-            self._q = self._before = self._follower.run(rows, self._before)[0]
+            self._q = self._before = self._ik.run(rows, self._before)[0]
         for at, row, above in self._joints or ():
             relative(quat_WL, row, above, self._q, at)
         pin.framesForwardKinematics(self._model.pin, self.data, self._q)
@@ -297,7 +297,7 @@ def relative(quat, row, above, q, at):  # type: ignore[no-untyped-def]
 
 
 def placements(model: BodyModel, q: np.ndarray, links: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Link → (`quat_WL` (n, 4) xyzw, `p_WL` (n, 3) [m]), for whoever draws the body."""
+    """Link → (`quat_WL` (n, 4) xyzw, `p_WL` (n, 3) [m]), for drawing the body."""
     links = list(links)
     R, p = forward_kinematics(model, q, links)
     quat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat().reshape(len(q), len(links), 4)
@@ -324,9 +324,9 @@ def point_covariance(
     segment_cov : segment → (n, 3, 3) [rad²] in W
     lengths_cov : (8, 8) [m²] in the order of `LENGTHS`; zeros: known exactly
     """
-    found: dict[str, np.ndarray] = {}
+    covariances: dict[str, np.ndarray] = {}
     if "torso" not in segment_cov:
-        return found
+        return covariances
     R_torso = Rotation.from_quat(quat_WL["torso"]).as_matrix()
     for side, sign in (("left", 0.5), ("right", -0.5)):
         hand = f"{side}_hand" if f"{side}_hand" in quat_WL else f"{side}_forearm"
@@ -334,7 +334,7 @@ def point_covariance(
             ("shoulder", "torso", ""),
             ("elbow", f"{side}_upper_arm", f"{side}_upper_arm"),
             ("wrist", f"{side}_forearm", f"{side}_forearm"),
-            ("hand", hand, f"{side}_hand"),
+            ("palm", hand, f"{side}_hand"),
         )
         vectors: dict[str, np.ndarray] = {}
         along = np.zeros((len(R_torso), 3, len(LENGTHS)))
@@ -354,9 +354,9 @@ def point_covariance(
             for mover, vector in vectors.items():
                 lever = _hats(vector)
                 cov = cov + lever @ segment_cov[mover] @ lever.swapaxes(1, 2)
-            found[f"{side}_{point}"] = cov
+            covariances[f"{side}_{point}"] = cov
             before = p
-    return found
+    return covariances
 
 
 def _hats(v: np.ndarray) -> np.ndarray:
@@ -366,7 +366,7 @@ def _hats(v: np.ndarray) -> np.ndarray:
     return out - out.swapaxes(1, 2)
 
 
-def spread(cov: np.ndarray) -> np.ndarray:
+def axis_std(cov: np.ndarray) -> np.ndarray:
     """One standard deviation (n,) of covariances (n, 3, 3): the root of the mean variance of the three axes."""
     return np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3.0)
 
@@ -379,15 +379,13 @@ def pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
 
     ``time``; ``<segment>_qx,_qy,_qz,_qw`` (`quat_WL`) and ``<segment>_std`` [rad]; ``<point>_x,_y,_z`` [m] in W and
     ``<point>_std`` [m]; with `covariance` ``<name>_cov_xx,_xy,_xz,_yy,_yz,_zz`` of each as well; ``<segment>_gap``.
-    The hands are segments and points of one name: as segments they have ``left_hand_q_std``, ``left_hand_q_cov_xx``.
-    A standard deviation is that of one axis, the mean over the three (`spread`).
+    A standard deviation is that of one axis, the mean over the three (`axis_std`).
     """
     table = {"time": pose.time}
     for segment, quat in pose.quat_WL.items():
         table |= {f"{segment}_{c}": quat[:, k] for k, c in enumerate(("qx", "qy", "qz", "qw"))}
         if segment in pose.segment_cov:
-            name = f"{segment}_q" if segment in POINTS else segment
-            table |= _confidence_columns(name, pose.segment_cov[segment], covariance)
+            table |= _confidence_columns(segment, pose.segment_cov[segment], covariance)
     for point, p in pose.points.items():
         table |= {f"{point}_{c}": p[:, k] for k, c in enumerate("xyz")}
         if point in pose.point_cov:
@@ -397,7 +395,7 @@ def pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
 
 
 def _confidence_columns(name: str, cov: np.ndarray, entries: bool) -> dict[str, np.ndarray]:
-    columns = {f"{name}_std": spread(cov)}
+    columns = {f"{name}_std": axis_std(cov)}
     if entries:
         columns |= {f"{name}_cov_{'xyz'[i]}{'xyz'[j]}": cov[:, i, j] for i in range(3) for j in range(i, 3)}
     return columns
@@ -432,8 +430,8 @@ def pose_from_table(table: pl.DataFrame, file: str) -> Pose:
         if all(name in numbers for name in names):
             points[point] = np.column_stack([numbers[name] for name in names])
     if not quat_WL and not points:
-        raise BadData(f"{file}: neither orientations nor points; columns as torso_qx … or left_hand_x … are needed")
-    segment_cov = {name: _covariances(numbers, f"{name}_q" if name in POINTS else name) for name in quat_WL}
+        raise BadData(f"{file}: neither orientations nor points; columns as torso_qx … or left_palm_x … are needed")
+    segment_cov = {name: _covariances(numbers, name) for name in quat_WL}
     point_cov = {name: _covariances(numbers, name) for name in points}
     gap = {name: numbers[f"{name}_gap"] > 0.0 for name in SEGMENTS if f"{name}_gap" in numbers}
     return Pose(
@@ -456,9 +454,9 @@ def _check_numbers(numbers: Mapping[str, np.ndarray], file: str) -> None:
     for name, values in numbers.items():
         if name != "time" and not name.startswith((*SEGMENTS, *POINTS)):
             continue
-        wild = np.abs(values) > _WILD
-        if wild.any():
-            row = int(np.argmax(wild))
+        too_large = np.abs(values) > _LARGEST_NUMBER
+        if too_large.any():
+            row = int(np.argmax(too_large))
             raise BadData(f"{file}: {name} is {values[row]:g} in row {row + 1}; no pose has such a number")
 
 

@@ -34,11 +34,12 @@ LENGTHS = (
     "right_forearm",
     "right_hand",
 )
-LONGEST = 3.0  # [m] longer is no part of a person
+LONGEST = 3.0  # [m] of a plausible length
+HINGES = ("left_elbow", "right_elbow")  # joints whose axis a calibration estimates
 SEXES = ("f", "m")
 _TABLES = ("lengths", "lengths_std", "mounts", "hinges", "start_pose_offset", "heading_drift", "covariance")
 FORMAT = 2
-MOST_OFFSET_DEG = 180.0  # off the start pose: all that a turn can be; whether it is plausible, the calibration says
+MOST_OFFSET_DEG = 180.0  # of a file; the calibration checks whether it is plausible
 MOST_DRIFT_DEG_MIN = 6000.0  # of a heading: 100 deg/s, beyond any gyroscope's bias
 
 
@@ -46,18 +47,18 @@ class Hinge(NamedTuple):
     """An elbow's axis."""
 
     axis: np.ndarray  # (3,) unit, in the upper arm's frame, y towards the left
-    std: NonNegative  # [rad] by which the forearm leaves the plane across it, soft tissue included
+    std: NonNegative  # [rad] by which the forearm leaves the plane across it, with soft tissue
 
 
 class StartPoseOffset(NamedTuple):
-    """How far a segment was off the start pose when its mount was calibrated."""
+    """The offset of a segment from the start pose in the calibration."""
 
     tilt: np.ndarray  # (2,) [rad] about x and y of W
     std: NonNegative  # [rad] of each
 
 
 class HeadingDrift(NamedTuple):
-    """How fast a sensor's heading drifted in the calibration, which is its gyroscope's bias as far as it was left."""
+    """The drift of a sensor's heading in the calibration, from the remaining bias of its gyroscope."""
 
     rate: float  # [rad/s]
     std: NonNegative  # [rad/s]
@@ -65,19 +66,19 @@ class HeadingDrift(NamedTuple):
 
 @dataclass(frozen=True)
 class Subject:
-    """A person as far as known.
+    """A person's lengths, mounts and what else a calibration estimates.
 
     Parameters
     ----------
     lengths : name → [m], every one of `LENGTHS`
-    order : what the rows of `covariance` are: names of lengths [m], then ``mounts.<segment>.x``, ``.y``, ``.z``
+    order : the rows of `covariance`: names of lengths [m], then ``mounts.<segment>.x``, ``.y``, ``.z``
         [rad], the error of a mount as a small turn about the segment's axes
     covariance : (k, k)
     mounts : segment → `quat_LS` (4,) xyzw, the calibrated mounts; empty where none are calibrated
     note : where the numbers come from, in a few words
-    hinges : side → its elbow's axis, where a calibration found it
-    start_pose_offset : segment → how it was off the start pose in the calibration; a person stands so again, nearly
-    heading_drift : segment → that of its sensor in the calibration; its spread is what another day's may have
+    hinges : joint of `HINGES` → its axis, where a calibration estimated it
+    start_pose_offset : segment → its offset from the start pose in the calibration, which a person nearly repeats
+    heading_drift : segment → that of its sensor in the calibration; on another day it has a similar size
     """
 
     name: str
@@ -91,7 +92,7 @@ class Subject:
     heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
 
     def check(self) -> Subject:
-        """The same subject, if it can be one: made by hand it may be anything.
+        """The same subject, if all its fields are valid.
 
         Raises
         ------
@@ -113,9 +114,9 @@ class Subject:
             check_covariance(f"{where}covariance", self.covariance)
             for name in ("mounts", "start_pose_offset", "heading_drift"):
                 check_names(f"{where}{name}", getattr(self, name), SEGMENTS)
-            check_names(f"{where}hinges", self.hinges, ("left", "right"))
+            check_names(f"{where}hinges", self.hinges, HINGES)
             arrays = [(f"mounts.{s}", quat, (4,)) for s, quat in self.mounts.items()]
-            arrays += [(f"hinges.{side}.axis", hinge.axis, (3,)) for side, hinge in self.hinges.items()]
+            arrays += [(f"hinges.{joint}.axis", hinge.axis, (3,)) for joint, hinge in self.hinges.items()]
             arrays += [(f"start_pose_offset.{s}.tilt", start.tilt, (2,)) for s, start in self.start_pose_offset.items()]
             for name, values, shape in arrays:
                 check_array(f"{where}{name}", values, shape)
@@ -138,9 +139,9 @@ class Subject:
         names = list(names)
         known = [k for k, name in enumerate(names) if name in self.order]
         rows = [self.order.index(names[k]) for k in known]
-        found = np.zeros((len(names), len(names)))
-        found[np.ix_(known, known)] = self.covariance[np.ix_(rows, rows)]
-        return found
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(known, known)] = self.covariance[np.ix_(rows, rows)]
+        return covariance
 
     def mount_covariance(self, segment: str) -> np.ndarray | None:
         """Covariance (3, 3) [rad²] of a calibrated mount's error in L; None where nothing is known of it."""
@@ -150,36 +151,36 @@ class Subject:
         at = [self.order.index(row) for row in rows]
         return self.covariance[np.ix_(at, at)]
 
-    def draw(self, rng: np.random.Generator) -> Subject:
+    def sample(self, rng: np.random.Generator) -> Subject:
         """A random person from this one's distribution of lengths, for simulation."""
         mean = np.array([self.lengths[name] for name in LENGTHS])
         drawn = rng.multivariate_normal(mean, self.lengths_covariance())
-        # A length three times off is no person; this only guards the far tails.
+        # Guards the far tails of the distribution.
         drawn = np.clip(drawn, 0.7 * mean, 1.3 * mean)
         return replace(
             self,
-            name="drawn",
+            name="sampled",
             lengths=dict(zip(LENGTHS, drawn.tolist(), strict=True)),
             covariance=np.zeros_like(self.covariance),
-            note="drawn at random",
+            note="a random person of the population",
         )
 
 
 def mount_rows(segment: str) -> list[str]:
-    """What the rows of a subject's covariance that belong to a mount are called."""
+    """The names of a mount's rows in a subject's covariance."""
     return [f"mounts.{segment}.{axis}" for axis in "xyz"]
 
 
-_ROWS = (*LENGTHS, *(row for segment in SEGMENTS for row in mount_rows(segment)))  # what a covariance may be of
+_ROWS = (*LENGTHS, *(row for segment in SEGMENTS for row in mount_rows(segment)))  # rows that a covariance may have
 
 
 def check_lengths(place: str, lengths: Mapping[str, float], names: Collection[str]) -> None:
-    """Each length [m] has one of the names and is that of a person's part.
+    """Check that each length [m] has one of the names and a possible value.
 
     Raises
     ------
     BadOption
-        One has, or is, not.
+        An unknown name, or an impossible value.
     """
     check_names(place, lengths, names)
     for name, value in lengths.items():
@@ -187,7 +188,7 @@ def check_lengths(place: str, lengths: Mapping[str, float], names: Collection[st
             raise BadOption(f"{place}.{name} = {value:g}: a length in metres is needed, above 0 and below {LONGEST:g}")
 
 
-def average_subject(stature: float | None = None, sex: str | None = None) -> Subject:
+def population_subject(stature: float | None = None, sex: str | None = None) -> Subject:
     """The anthropometric prior: mean lengths and their covariance over people.
 
     Lengths share the stature's spread where it is not given, left and right share the person's shape; numbers and
@@ -203,7 +204,7 @@ def average_subject(stature: float | None = None, sex: str | None = None) -> Sub
     BadOption
         A stature outside 1.0 to 2.5 m, or another sex.
     """
-    check_arguments(average_subject, locals())
+    check_arguments(population_subject, locals())
     if stature is not None and not 1.0 <= stature <= 2.5:
         raise BadOption(f"stature {stature:g} is not a body height in metres; between 1.0 and 2.5")
     if sex is not None and sex not in SEXES:
@@ -222,11 +223,11 @@ def average_subject(stature: float | None = None, sex: str | None = None) -> Sub
     relative = height_std**2 + same * np.outer(shape, shape) + np.diag(sided * table["asymmetry_std"]["all"] ** 2)
     known = ", ".join([f"stature {height:g} m" + ("" if stature else " assumed"), f"sex {sex or 'not given'}"])
     return Subject(
-        name="average",
+        name="population",
         lengths=dict(zip(LENGTHS, mean.tolist(), strict=True)),
         order=LENGTHS,
         covariance=np.outer(mean, mean) * relative,
-        note=f"anthropometric average ({known})",
+        note=f"population prior ({known})",
     )
 
 
@@ -244,8 +245,8 @@ def subject_toml(subject: Subject) -> str:
         std = [subject.std(row) for row in mount_rows(segment)]
         if np.isfinite(std).all():
             lines.append(f"std_deg = {np.degrees(np.sqrt(np.mean(np.square(std)))):.3f}")
-    for side, hinge in subject.hinges.items():
-        lines += ["", f"[hinges.{side}]   # the elbow's axis in the upper arm's frame"]
+    for joint, hinge in subject.hinges.items():
+        lines += ["", f"[hinges.{joint}]   # the axis in the upper arm's frame"]
         lines += [f"{key} = {value:.9f}" for key, value in zip("xyz", hinge.axis, strict=True)]
         lines.append(f"std_deg = {np.degrees(hinge.std):.3f}")
     for segment, start in subject.start_pose_offset.items():
@@ -280,8 +281,8 @@ def load_subject(path: str | Path) -> Subject:
     return _subject(read_toml(path, "a subject, as `wepose calibrate` writes one,", BadSubject), path)
 
 
-def subject_of(text: str, path: Path) -> Subject:
-    """The subject that ``subject.toml`` says; `path` is where it stands, for messages.
+def parse_subject(text: str, path: Path) -> Subject:
+    """The subject of the text of ``subject.toml``; `path` is for messages.
 
     Raises
     ------
@@ -297,7 +298,7 @@ def subject_of(text: str, path: Path) -> Subject:
 def _subject(values: Mapping[str, Any], path: Path) -> Subject:
     top = TomlTable(values, str(path), error=BadSubject)
     if "sensors" in top:
-        raise BadSubject(f"{path}: is a session; a subject is wanted here, as `wepose calibrate` writes one")
+        raise BadSubject(f"{path}: is a session; a subject is needed here, as `wepose calibrate` writes one")
     if values.get("format") != FORMAT:
         raise BadSubject(f"{path}: format = {values.get('format')!r}; this version reads format = {FORMAT}")
     top.allow("format", "name", "note", *_TABLES)
@@ -313,7 +314,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         segment: np.radians(entry.numbers("rate_deg_min", "std_deg_min", most=MOST_DRIFT_DEG_MIN)) / 60.0
         for segment, entry in of_segments["heading_drift"].items()
     }
-    hinges = tables["hinges"].tables(("left", "right"), "side")
+    hinges = tables["hinges"].tables(HINGES, "joint")
     lengths = _read_lengths(tables["lengths"])
     order, matrix = _read_covariance(tables["covariance"], tables["lengths_std"])
     return Subject(
@@ -325,7 +326,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
             segment: _read_unit(entry, ("qx", "qy", "qz", "qw")) for segment, entry in of_segments["mounts"].items()
         },
         note=str(values.get("note", "")),
-        hinges={side: _read_hinge(entry) for side, entry in hinges.items()},
+        hinges={joint: _read_hinge(entry) for joint, entry in hinges.items()},
         start_pose_offset={segment: StartPoseOffset(v[:2], float(v[2])) for segment, v in offset.items()},
         heading_drift={segment: HeadingDrift(float(rate), float(std)) for segment, (rate, std) in drift.items()},
     )
@@ -361,7 +362,7 @@ def _read_covariance(table: TomlTable, std: TomlTable) -> tuple[tuple[str, ...],
     try:
         matrix = np.array(table.values.get("matrix"), dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise BadSubject(f"{place} holds something that is no number, or rows that differ") from None
+        raise BadSubject(f"{place} holds NaN or text, or rows of different lengths") from None
     if matrix.shape != (len(order), len(order)):
         raise BadSubject(f"{place} is {matrix.shape}; {len(order)} names in order need as many rows")
     least = -1e-9 * max(1.0, float(np.trace(matrix)))  # what rounding to the file's digits may do

@@ -129,7 +129,7 @@ def simulated(
     phases = {name: spans for name, spans in made.phases.items() if spans}
     session = Session(f"{preset}-{seed}", (Table(made.time, signals),), phases, truth=truth)
     measured = {"handle": {"handle": 0.4}, "poses": {}}.get(protocol, {"shoulder_width": 0.0})
-    measured = {name: value or person.taped["shoulder_width"] for name, value in measured.items()}
+    measured = {name: value or person.measured["shoulder_width"] for name, value in measured.items()}
     return Simulated(session, made.quat_WS, measured, round(person.stature, 2), person.sex)
 
 
@@ -348,7 +348,7 @@ def calibration_values(session: Path, measured: Mapping[str, float]) -> dict[str
     """What the function `calibrate` gives, in full precision."""
     import wepose_pin as wp
 
-    subject = wp.calibrate(wp.load_session(session), gauge=dict(measured))
+    subject = wp.calibrate(wp.load_session(session), measured=dict(measured))
     return {"lengths": subject.lengths, "mounts": subject.mounts, "covariance": subject.covariance}
 
 

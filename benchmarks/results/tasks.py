@@ -85,7 +85,7 @@ class Person:
     recording: str
     method: str = "amekf"
     calibrated: bool = True
-    subject_of: str = ""  # the input that calibrates, where it is another one
+    subject_from: str = ""  # the input that calibrates, where it is another one
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"whole": ()})  # name → options of `track`
     exports: tuple[str, ...] = ()  # variants whose results are exported in all formats
     functions: bool = False  # what the Python functions give too
@@ -97,7 +97,7 @@ class Person:
         found: Arrays = {}
         subject = None
         if self.calibrated:
-            by, subject = places.session(self.subject_of or self.recording), places.work / "subject"
+            by, subject = places.session(self.subject_from or self.recording), places.work / "subject"
             argv = adapter.calibrate(by, subject, method=self.method, protocol=known["protocol"], known=known)
             found |= _under(f"calibrate/{where}", command(argv)) | folder_values(subject, f"calibrate/{where}")
         for name, options in self.variants.items():
@@ -284,7 +284,7 @@ def tasks() -> list[Task]:
         Task("two_rates", Person("two_rates", variants=plain)),
         Task("measured_orientations", Person("measured_orientations", calibrated=False)),
         Task("no_phases", Person("no_phases", calibrated=False)),
-        Task("remounted", Person("remounted", subject_of="mild")),
+        Task("remounted", Person("remounted", subject_from="mild")),
         *(Task(f"{REAL}/{method}", Person(REAL, method, False, variants=real)) for method in ("amekf", "smekf")),
         Task(f"{REAL}/smoother", Person(REAL, "smoother", False, exports=("whole",))),
         Task("48dof", _model),

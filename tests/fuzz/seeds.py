@@ -18,7 +18,7 @@ from wepose_pin.live.sources import xbus
 from wepose_pin.live.sources.packets import CRC, HEADER, MAGIC, SAMPLE
 from wepose_pin.readers.live_log import BLOCK, EVENT, HEAD, POSES, SAMPLES
 from wepose_pin.readers.live_log import MAGIC as LIVE_MAGIC
-from wepose_pin.subject import average_subject, subject_toml
+from wepose_pin.subject import population_subject, subject_toml
 
 N = 12
 TIME = np.arange(N) / 100.0
@@ -265,8 +265,8 @@ def serial() -> bytes:
 def pose() -> bytes:
     names = [f"torso_q{axis}" for axis in "xyzw"] + [
         "torso_std",
-        *(f"left_hand_{axis}" for axis in "xyz"),
-        "left_hand_std",
+        *(f"left_palm_{axis}" for axis in "xyz"),
+        "left_palm_std",
     ]
     values = np.column_stack([QUAT, np.full(N, 0.01), ACCEL / 10, np.full(N, 0.02)])
     out = io.BytesIO()
@@ -275,9 +275,9 @@ def pose() -> bytes:
 
 
 def subject() -> bytes:
-    return subject_toml(average_subject()).encode() + (
+    return subject_toml(population_subject()).encode() + (
         b"[mounts.torso]\nqx = 0.0\nqy = 0.0\nqz = 0.0\nqw = 1.0\n"
-        b"[hinges.left]\nx = 0.0\ny = 1.0\nz = 0.0\nstd_deg = 5.0\n"
+        b"[hinges.left_elbow]\nx = 0.0\ny = 1.0\nz = 0.0\nstd_deg = 5.0\n"
         b"[start_pose_offset.torso]\nx_deg = 1.0\ny_deg = 2.0\nstd_deg = 1.0\n"
         b"[heading_drift.torso]\nrate_deg_min = 1.0\nstd_deg_min = 2.0\n"
     )
@@ -388,7 +388,7 @@ def ur5() -> bytes:
 def pose_csv() -> bytes:
     """A whole body's pose: both arms, as `wepose track` writes it."""
     segments = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
-    points = [f"{side}_{point}" for side in ("left", "right") for point in ("shoulder", "elbow", "wrist", "hand")]
+    points = [f"{side}_{point}" for side in ("left", "right") for point in ("shoulder", "elbow", "wrist", "palm")]
     columns: dict[str, np.ndarray] = {"time": TIME}
     for segment in segments:
         columns |= {f"{segment}_q{axis}": QUAT[:, j] for j, axis in enumerate("xyzw")}

@@ -149,12 +149,12 @@ def _robot(path: Path) -> object:
 def _live(path: Path) -> object:
     """With checksums that are right: else nothing but checksums would be tested."""
     from wepose_pin.readers import read_live_log
-    from wepose_pin.subject import subject_of
+    from wepose_pin.subject import parse_subject
 
     path.write_bytes(_checked(path.read_bytes()))
     found = read_live_log(path)
     if found.header["subject"]:
-        subject_of(found.header["subject"], path)
+        parse_subject(found.header["subject"], path)
     return found
 
 
@@ -252,7 +252,7 @@ left_hand = "left_hand"
 right_wrist = { link = "right_hand", at = [0.0, 0.0, 0.0] }
 """
 LSL = b"imu-torso\n" + b"".join(b"gyr_%s\nrad/s\n" % a for a in (b"x", b"y", b"z")) + b"acc_x\ng\nacc_y\ng\nacc_z\ng"
-SUMMARY = b'{"recording": "a", "sensors": {"torso": {}}, "points": ["left_hand"], "warnings": ["b"]}'
+SUMMARY = b'{"recording": "a", "sensors": {"torso": {}}, "points": ["left_palm"], "warnings": ["b"]}'
 _PROTOCOLS = ("calibration/clasp.toml", "calibration/poses.toml", "calibration/handle.toml")
 
 

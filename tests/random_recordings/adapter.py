@@ -34,7 +34,6 @@ ACCEPTED = {"calibrate": {0, 3, 4}}
 COMMANDS: dict[str, str] = {}  # ours → the project's, where they differ
 NO_COVARIANCE = ("ncf", "gdc")  # methods that state no uncertainty
 EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet", "out.urdf")
-HAND_POINTS = {"left_palm": "left_hand", "right_palm": "right_hand"}  # our point → the project's
 
 # Codes of diagnostics that say why a segment is not to be believed, by cause; each counts for the segment that it is
 # about, or for all where it is about none. Causes of ALWAYS may be there in any recording, the others only where the
@@ -168,12 +167,12 @@ def rounded(values: np.ndarray, digits: int) -> np.ndarray:
 
 
 def calibrate(session: Path, out: Path, case: Case) -> list[str]:
-    lengths = {name: value for name, value in case.taped.items() if name != "stature"}
-    taped = [part for name, value in lengths.items() for part in ("--measured", f"{name}={value}")]
-    if "stature" in case.taped:
-        taped += ["--stature", str(case.taped["stature"]), "--sex", case.person.sex]
+    lengths = {name: value for name, value in case.measured.items() if name != "stature"}
+    options = [part for name, value in lengths.items() for part in ("--measured", f"{name}={value}")]
+    if "stature" in case.measured:
+        options += ["--stature", str(case.measured["stature"]), "--sex", case.person.sex]
     method = [] if case.method == "amekf" else ["--method", case.method]
-    return ["calibrate", str(session), "-o", str(out), *taped, *method, *_gaps(case.options)]
+    return ["calibrate", str(session), "-o", str(out), *options, *method, *_gaps(case.options)]
 
 
 def track(
@@ -282,18 +281,17 @@ def read_result(folder: Path) -> Result:
     table = pl.read_parquet(folder / "pose.parquet")
     values = {name: table[name].to_numpy() for name in table.columns}
     segments = [name[:-3] for name in values if name.endswith("_qx")]
-    ours = {of: name for name, of in HAND_POINTS.items()}
-    points = {ours.get(name[:-2], name[:-2]): name[:-2] for name in values if name.endswith("_x")}
+    points = [name[:-2] for name in values if name.endswith("_x")]
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     subject = (folder / "subject.toml").read_text(encoding="utf-8")
     lengths = dict(re.findall(r"^(\w+) = ([-0-9.e]+)", subject.split("[lengths]")[1].split("\n[")[0], re.MULTILINE))
-    std = {name: values.get(f"{name}_q_std", values.get(f"{name}_std")) for name in segments}
+    std = {name: values.get(f"{name}_std") for name in segments}
     return Result(
         time=values["time"],
         quat={name: np.column_stack([values[f"{name}_q{c}"] for c in "xyzw"]) for name in segments},
         quat_std={name: v for name, v in std.items() if v is not None},
-        points={name: np.column_stack([values[f"{of}_{c}"] for c in "xyz"]) for name, of in points.items()},
-        points_std={name: values[f"{of}_std"] for name, of in points.items() if f"{of}_std" in values},
+        points={name: np.column_stack([values[f"{name}_{c}"] for c in "xyz"]) for name in points},
+        points_std={name: values[f"{name}_std"] for name in points if f"{name}_std" in values},
         gap={name[:-4]: values[name] for name in values if name.endswith("_gap")},
         table=table,
         lengths={name: float(value) for name, value in lengths.items()},
@@ -330,7 +328,7 @@ def write_truth(
     for name, values in quat.items():
         columns |= {f"{name}_q{c}": values[:, k] for k, c in enumerate("xyzw")}
     for name, values in points.items():
-        columns |= {f"{HAND_POINTS.get(name, name)}_{c}": values[:, k] for k, c in enumerate("xyz")}
+        columns |= {f"{name}_{c}": values[:, k] for k, c in enumerate("xyz")}
     pl.DataFrame(columns).write_parquet(path)
 
 

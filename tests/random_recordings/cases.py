@@ -91,7 +91,7 @@ class Case:
     method: str
     options: set[str]
     steps: list[str]
-    taped: dict[str, float]
+    measured: dict[str, float]
     refusal: str = ""
     suspects: dict[str, str] = field(default_factory=dict)
     shared_columns: dict[str, str] = field(default_factory=dict)  # segment → whose columns the file gives it
@@ -301,6 +301,6 @@ def _commands(case: Case, rng: np.random.Generator) -> None:
     case.steps = steps
     if case.clasp:
         if rng.random() < 0.6:
-            case.taped["shoulder_width"] = round(case.person.lengths["shoulder_width"] + rng.normal(0.0, 0.004), 3)
+            case.measured["shoulder_width"] = round(case.person.lengths["shoulder_width"] + rng.normal(0.0, 0.004), 3)
         if rng.random() < 0.5:
-            case.taped["stature"] = round(case.person.stature + rng.normal(0.0, 0.01), 2)
+            case.measured["stature"] = round(case.person.stature + rng.normal(0.0, 0.01), 2)

@@ -20,14 +20,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-# The standard deviation [rad] of an angle of which nothing is known: even over the circle.
+# The standard deviation [rad] of an unknown angle: uniform over the circle.
 UNKNOWN = np.pi / np.sqrt(3.0)
 # Below this sine or cosine of half the tip the first angle is rounding error.
 _LOCKED = 1e-13
 
 
 class Sequence(NamedTuple):
-    """The axes of a sequence as indices, and what of it the formulas need."""
+    """The axes of a sequence as indices, and its constants in the formulas."""
 
     name: str
     i: int
@@ -75,7 +75,7 @@ def decompose(quat: np.ndarray, name: str) -> Angles3:
     first, third = half_sum + half_difference, half_sum - half_difference
     free = np.minimum(cosine, sine) < _LOCKED
     if free.any():
-        first = _held(first, free)
+        first = _fill_free(first, free)
         third = np.where(free, np.where(sine < cosine, 2.0 * half_sum - first, first - 2.0 * half_difference), third)
     if not s.offset or s.eps > 0.0:  # the other of the two solutions is the one in the principal range
         first, tip, third = first + np.pi, -tip, third + np.pi
@@ -83,8 +83,8 @@ def decompose(quat: np.ndarray, name: str) -> Angles3:
     return Angles3(np.column_stack([wrap(first), tip + s.offset, wrap(third)]), gimbal)
 
 
-def _held(first: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """`first` (n,) with what is `free` taken from the sample before that is not, or from the next, or zero."""
+def _fill_free(first: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """`first` (n,) with its `free` samples from the last sample that is not free, or from the next, or zero."""
     known = np.flatnonzero(~free)
     if not len(known):
         return np.zeros_like(first)
@@ -93,7 +93,7 @@ def _held(first: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
-    """Into [−π, π]; what is there already keeps its bits."""
+    """Wrap into [−π, π]; angles that are in it keep their bits."""
     return angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
 
 
@@ -116,10 +116,10 @@ def follow(angles: Angles3, name: str, near_lock: float) -> np.ndarray:
     same = np.square(wrap(np.diff(principal, axis=0))).sum(axis=1)
     swap = np.square(wrap(turned[1:] - principal[:-1])).sum(axis=1) < same
 
-    before, after, nearest = _passages(gimbal < near_lock, gimbal)
+    before, after, nearest = _find_passages(gimbal < near_lock, gimbal)
     change = np.abs(wrap(principal[after, 0] - principal[before, 0]))
     passed, anew = change > 0.75 * np.pi, (change >= 0.25 * np.pi) & (change <= 0.75 * np.pi)
-    swap[nearest - 1] ^= _over(swap, before, after) % 2 != passed
+    swap[nearest - 1] ^= _sum_steps(swap, before, after) % 2 != passed
     swapped = np.concatenate([[False], np.cumsum(swap) % 2 == 1])
     stretch = np.zeros(n, dtype=int)
     stretch[nearest[anew]] = 1
@@ -128,16 +128,16 @@ def follow(angles: Angles3, name: str, near_lock: float) -> np.ndarray:
 
     values = np.where(swapped[:, None], turned, principal)
     turns = np.zeros((n, 3), dtype=int)
-    turns[1:] = -_whole_turns(np.diff(values, axis=0))
-    astray = _over(turns[1:], before, after) + _whole_turns(values[after] - values[before])
+    turns[1:] = -_count_turns(np.diff(values, axis=0))
+    astray = _sum_steps(turns[1:], before, after) + _count_turns(values[after] - values[before])
     turns[nearest] -= astray
     values += 2.0 * np.pi * np.cumsum(turns, axis=0)
     ends = np.append(np.searchsorted(stretch, np.arange(stretch[-1] + 1)), n)
     furthest = [first + int(np.argmax(gimbal[first:end])) for first, end in pairwise(ends)]
-    return values - 2.0 * np.pi * _whole_turns(values[furthest])[stretch]
+    return values - 2.0 * np.pi * _count_turns(values[furthest])[stretch]
 
 
-def _passages(near: np.ndarray, gimbal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _find_passages(near: np.ndarray, gimbal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Last sample before, first after, and nearest to the lock, of each stay near it that has both."""
     inside = np.concatenate([[False], near, [False]])
     edges = np.flatnonzero(np.diff(inside.astype(int)))
@@ -148,18 +148,18 @@ def _passages(near: np.ndarray, gimbal: np.ndarray) -> tuple[np.ndarray, np.ndar
     return starts - 1, stops, np.array(nearest, dtype=int)
 
 
-def _over(steps: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Sums of `steps` (n − 1, …), the k-th from sample k to k + 1, on the ways from `before` to `after`."""
+def _sum_steps(steps: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Sums of `steps` (n − 1, …), the k-th from sample k to k + 1, between samples `before` and `after`."""
     summed = np.concatenate([np.zeros((1, *steps.shape[1:]), dtype=int), np.cumsum(steps, axis=0)])
     return summed[after] - summed[before]
 
 
-def _whole_turns(angle: np.ndarray) -> np.ndarray:
+def _count_turns(angle: np.ndarray) -> np.ndarray:
     return np.round(angle / (2.0 * np.pi)).astype(int)
 
 
 def gradients(values: np.ndarray, name: str) -> np.ndarray:
-    """By how much the angles (n, 3) change with a small turn of the rotation on its left: rows (n, 3, 3).
+    """Derivatives of the angles (n, 3) by a small rotation on the left: rows (n, 3, 3).
 
     In axes turned by the first angle the turn is ``ȧ e_i + ḃ e_j + ċ (cos(tip) e_i − ε sin(tip) e_k)``; this solved
     for the rates. The first and the third row grow with 1/sin(tip), without bound at the lock.

@@ -28,7 +28,7 @@ ISB_AXES = {
     "forearm": ("+y", "+z", "+x"),
     "hand": ("+y", "+z", "+x"),
 }
-# What lies across the sagittal plane is mirrored on it: quaternions xyzw, and vectors that stand for a turn.
+# Signs that mirror on the sagittal plane: quaternions xyzw, and rotation vectors.
 _MIRRORED_QUAT = np.array([-1.0, 1.0, -1.0, 1.0])
 _MIRRORED_TURN = np.array([-1.0, 1.0, -1.0])
 
@@ -47,7 +47,7 @@ SHOULDER_SEQUENCES = {
 
 
 class Joint(NamedTuple):
-    """Which segment moves in which, and how its angles are called; `sequence` is empty for the shoulder's choice."""
+    """A joint's two segments and the names of its angles; `sequence` is empty for the shoulder's choice."""
 
     proximal: str
     distal: str
@@ -55,7 +55,7 @@ class Joint(NamedTuple):
     names: tuple[str, ...]
 
 
-def _sided(side: str) -> dict[str, Joint]:
+def _mirror(side: str) -> dict[str, Joint]:
     upper_arm, forearm, hand = f"{side}_upper_arm", f"{side}_forearm", f"{side}_hand"
     return {
         f"{side}_shoulder": Joint("torso", upper_arm, "", ()),
@@ -66,8 +66,8 @@ def _sided(side: str) -> dict[str, Joint]:
 
 JOINTS = {
     "thorax": Joint("world", "torso", "ZXY", ("extension", "lateral_flexion_right", "axial_rotation_left")),  # 2.4.1
-    **_sided("left"),
-    **_sided("right"),
+    **_mirror("left"),
+    **_mirror("right"),
 }
 
 
@@ -134,18 +134,18 @@ def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK
         raise BadOption(f"shoulder sequence '{sequence}' is not known; {one_of(SHOULDER_SEQUENCES, sequence)}")
     if not LEAST_NEAR_LOCK <= near_lock <= np.pi / 4.0:
         raise BadOption(f"near_lock of {np.degrees(near_lock):g} degrees; between 2 and 45 degrees are needed")
-    found = {}
+    joints = {}
     for name, joint in JOINTS.items():
         if joint.distal in pose.quat_WL and (joint.proximal == "world" or joint.proximal in pose.quat_WL):
             if not joint.sequence:
                 joint = joint._replace(sequence=sequence, names=SHOULDER_SEQUENCES[sequence])
-            found[name] = _angles(pose, joint, name.startswith("left_"), near_lock)
-    if not found:
+            joints[name] = _angles(pose, joint, name.startswith("left_"), near_lock)
+    if not joints:
         raise BadData(
             f"no joint has its segments in the pose: torso, or an upper arm and its forearm, are needed; "
             f"{one_of(pose.quat_WL)}"
         )
-    return Angles(pose.time, found)
+    return Angles(pose.time, joints)
 
 
 def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngles:
@@ -163,16 +163,16 @@ def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngl
             cov_W = cov_W * np.outer(_MIRRORED_TURN, _MIRRORED_TURN)
         std = _spread(values, joint.sequence, quat_WP, cov_W)
     gap = np.any([~known, *(pose.gap[segment] for segment in members if segment in pose.gap)], axis=0)
-    gimbal = _at(known, angles.gimbal, n)
+    gimbal = _expand(known, angles.gimbal, n)
     return JointAngles(
         joint.sequence,
         joint.names,
-        _at(known, values, n),
+        _expand(known, values, n),
         gimbal,
         gimbal < near_lock,
         gap,
-        None if std is None else _at(known, std, n),
-        _at(known, rotations.unwrap_signs(quat), n),
+        None if std is None else _expand(known, std, n),
+        _expand(known, rotations.unwrap_signs(quat), n),
     )
 
 
@@ -203,7 +203,7 @@ def _spread(values: np.ndarray, sequence: str, quat_WP: np.ndarray, cov_W: np.nd
     return np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN)
 
 
-def _at(known: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+def _expand(known: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
     """`values` of the known samples among n, NaN elsewhere."""
     out = np.full((n, *values.shape[1:]), np.nan)
     out[known] = values

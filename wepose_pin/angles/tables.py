@@ -44,17 +44,17 @@ def _summary(time: np.ndarray, joint: JointAngles) -> JointSummary:
     span = time[m:] - time[:-m]
     lowest, highest, peak_rate = (np.full(3, np.nan) for _ in range(3))
     bad = joint.gap | joint.near_lock
-    sound = _whole(bad, m)
+    sound = _without_bad(bad, m)
     for k in range(3):
         value = joint.values[~(joint.gap if k == 1 else bad), k]
         if len(value):
             lowest[k], highest[k] = value.min(), value.max()
-        peak_rate[k] = _peak(np.abs(joint.values[m:, k] - joint.values[:-m, k])[sound] / span[sound])
-    whole = _whole(joint.gap, m)
+        peak_rate[k] = _peak_rate(np.abs(joint.values[m:, k] - joint.values[:-m, k])[sound] / span[sound])
+    whole = _without_bad(joint.gap, m)
     turn = multiply(conjugate(joint.quat[:-m][whole]), joint.quat[m:][whole])
     speed = 2.0 * np.arctan2(np.linalg.norm(turn[:, :3], axis=1), np.abs(turn[:, 3])) / span[whole]
     return JointSummary(
-        lowest, highest, peak_rate, _peak(speed), float(np.mean(joint.near_lock)), float(np.mean(joint.gap))
+        lowest, highest, peak_rate, _peak_rate(speed), float(np.mean(joint.near_lock)), float(np.mean(joint.gap))
     )
 
 
@@ -65,32 +65,32 @@ def _window(time: np.ndarray) -> int:
     return max(1, round(RATE_WINDOW_S / float(np.median(np.diff(time)))))
 
 
-def _whole(bad: np.ndarray, m: int) -> np.ndarray:
+def _without_bad(bad: np.ndarray, m: int) -> np.ndarray:
     """(n − m,) bool: none of the samples k … k + m is `bad`."""
     count = np.concatenate([[0], np.cumsum(bad)])
     return count[m + 1 :] == count[: -m - 1]
 
 
-def _peak(rates: np.ndarray) -> float:
+def _peak_rate(rates: np.ndarray) -> float:
     return float(rates.max()) if len(rates) else float("nan")
 
 
 def summary_table(angles: Angles) -> pl.DataFrame:
-    """`summary` in degrees, a row an angle; what belongs to the joint stands in each of its three rows."""
+    """`summary` in degrees, a row an angle; values of the joint are in each of its three rows."""
     rows = []
-    for name, found in summary(angles).items():
+    for name, ranges in summary(angles).items():
         for k, angle in enumerate(angles[name].names):
             rows.append(
                 {
                     "joint": name,
                     "angle": angle,
-                    "lowest_deg": np.degrees(found.lowest[k]),
-                    "highest_deg": np.degrees(found.highest[k]),
-                    "range_deg": np.degrees(found.range[k]),
-                    "peak_rate_deg_s": np.degrees(found.peak_rate[k]),
-                    "joint_peak_speed_deg_s": np.degrees(found.peak_speed),
-                    "joint_near_lock": found.near_lock,
-                    "joint_gap": found.gap,
+                    "lowest_deg": np.degrees(ranges.lowest[k]),
+                    "highest_deg": np.degrees(ranges.highest[k]),
+                    "range_deg": np.degrees(ranges.range[k]),
+                    "peak_rate_deg_s": np.degrees(ranges.peak_rate[k]),
+                    "joint_peak_speed_deg_s": np.degrees(ranges.peak_speed),
+                    "joint_near_lock": ranges.near_lock,
+                    "joint_gap": ranges.gap,
                 }
             )
     return pl.DataFrame(rows)

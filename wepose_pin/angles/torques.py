@@ -28,7 +28,7 @@ _LEAST_MASS = 1e-6  # [kg]
 
 @dataclass(frozen=True)
 class Torques:
-    """What the joints do.
+    """The torques of joints over time.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Torques:
             "cutoff_hz": self.cutoff_hz,
             "mass_kg": round(self.mass, 3),
             "rms": {name: round(float(np.sqrt(np.mean(of**2))), 3) for name, of in size.items()},
-            # Not the largest: that is where a fit leapt from one valley to another, or a sensor was hit.
+            # Not the largest: that is where a fit jumped between two minima, or at an impact on a sensor.
             "95_percent_below": {name: round(float(np.quantile(of, 0.95)), 3) for name, of in size.items()},
         }
 
@@ -92,11 +92,11 @@ def joint_torques(
     rate_hz = (len(time) - 1) / float(time[-1] - time[0]) if len(time) > 1 else 0.0
     if not 0.0 < cutoff_hz < 0.5 * rate_hz:
         raise BadOption(f"a cut-off of {cutoff_hz:g} Hz; above 0 and below half the rate, {0.5 * rate_hz:g} Hz")
-    # The filter's transient is let go over a second beyond each end, where the motion is mirrored through its end.
+    # The motion is mirrored for a second beyond each end, where the filter's transient decays.
     pad = min(len(time) - 1, max(10, round(rate_hz)))
     if pad < 10:
         raise BadData(f"{len(time)} samples are too few for torques; at least 11 are needed")
-    smooth = sosfiltfilt(butter(2, cutoff_hz, fs=rate_hz, output="sos"), _continuous(model, q), axis=0, padlen=pad)
+    smooth = sosfiltfilt(butter(2, cutoff_hz, fs=rate_hz, output="sos"), _unwrap(model, q), axis=0, padlen=pad)
     q = np.array([pin.normalize(model, row) for row in smooth])
     v, a = derivatives(model, q, rate_hz)
     data = model.createData()
@@ -104,8 +104,8 @@ def joint_torques(
     torque = {}
     for joint in range(1, model.njoints):
         bears = sum(model.inertias[k].mass for k in model.subtrees[joint])
-        asked = joints is None or joint in joints
-        if asked and bears > _LEAST_MASS and "Mimic" not in model.joints[joint].shortname():
+        included = joints is None or joint in joints
+        if included and bears > _LEAST_MASS and "Mimic" not in model.joints[joint].shortname():
             first = model.idx_vs[joint]
             torque[model.names[joint]] = tau[:, first : first + model.nvs[joint]]
     return Torques(time, torque, q, v, a, cutoff_hz, mass)
@@ -131,7 +131,7 @@ def derivatives(model: pin.Model, q: np.ndarray, rate_hz: float) -> tuple[np.nda
     return v, a
 
 
-def _continuous(model: pin.Model, q: np.ndarray) -> np.ndarray:
+def _unwrap(model: pin.Model, q: np.ndarray) -> np.ndarray:
     """Signs of quaternions that do not jump, angles of hinges unwrapped."""
     q = q.copy()
     for joint in range(1, model.njoints):

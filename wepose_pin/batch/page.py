@@ -19,7 +19,7 @@ MIN_VALUES = 8  # among which there can be an outlier
 MAX_ROWS = 2000  # of a table in the page; results.parquet has all
 MAX_HISTOGRAMS = 12
 # Columns shown first; others follow in the order in which steps give them.
-_MAIN = ("gap_mm", "right_hand_arm_error_mm", "left_hand_arm_error_mm", "right_hand_error_mm", "left_hand_error_mm")
+_MAIN = ("gap_mm", "right_palm_arm_error_mm", "left_palm_arm_error_mm", "right_palm_error_mm", "left_palm_error_mm")
 _TEXT = ("item", "session", "subject", "status", "error", "message", "page", "quality")
 _COST = ("seconds", "memory_mb")
 _UNITS = {"mm": "mm", "deg": "deg", "hz": "Hz", "s": "s"}

@@ -20,7 +20,7 @@ from ..jobs.fields import REQUIRED, build_job, convert_value, field_defaults, fi
 from ..jobs.retarget import RetargetJob
 from ..jobs.track import TrackJob
 from ..readers.tables import read_table
-from ..subject import LENGTHS, average_subject
+from ..subject import LENGTHS, population_subject
 from .storage import find_urls, is_remote
 
 SESSION = "session.toml"
@@ -218,7 +218,7 @@ def _list_protocol_lengths(steps: Mapping[str, Mapping[str, Any]]) -> tuple[str,
         return ()
     from ..calibration.protocols import load_protocol
 
-    return tuple(load_protocol(steps["calibrate"]["protocol"]).gauges)
+    return tuple(load_protocol(steps["calibrate"]["protocol"]).distances)
 
 
 # Subjects ------------------------------------------------------------------------------------------------------------
@@ -329,7 +329,7 @@ def _check_stature(stature: float | None, where: str) -> None:
 @lru_cache
 def _find_stature_problem(stature: float | None) -> str | None:
     try:
-        average_subject(stature)
+        population_subject(stature)
     except WeposeError as error:
         return str(error)
     return None

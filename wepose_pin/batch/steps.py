@@ -64,7 +64,7 @@ class ItemSteps:
         row = {
             "quality": outcome.quality.quality,
             "gap_mm": _finite(1e3 * calibration.rms_gap),
-            "effective_sample_size": calibration.independent,
+            "effective_sample_size": calibration.effective_sample_size,
         }
         for name, value in calibration.subject.lengths.items():
             row |= {f"{name}_mm": 1e3 * value, f"{name}_std_mm": _finite(1e3 * calibration.subject.std(name))}

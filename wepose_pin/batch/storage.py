@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ..errors import BadData, BadOption, ExistingOutput, MissingFile
-from ..writers.provenance import named_in
+from ..writers.provenance import list_named_files
 
 DONE_FILE = "done.json"  # written last: a folder without it is not complete
 
@@ -114,7 +114,7 @@ def fetch(url: str, into: Path, truth: bool = False) -> Path:
         top, into = path.rpartition("/")[0], Path(tempfile.mkdtemp(dir=into))
         local = into / path.rpartition("/")[2]
         system.get_file(path, str(local))
-    for name in named_in(local, truth):
+    for name in list_named_files(local, truth):
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
             raise BadData(f"{url}: names '{name}', outside its own folder; only files below it are fetched")
         target = into / name
@@ -139,7 +139,10 @@ def read_stamps(url: str, truth: bool = False) -> dict[str, list[Any]] | None:
                 if path.endswith(".toml"):
                     system.get_file(path, str(local))
                 top = path.rpartition("/")[0]
-                files = [path, *(f"{top}/{name}" for name in (named_in(local, truth) if local.exists() else ()))]
+                files = [
+                    path,
+                    *(f"{top}/{name}" for name in (list_named_files(local, truth) if local.exists() else ())),
+                ]
                 return {file: [info["size"], info["ETag"]] for file in files for info in [system.info(file)]}
         except (MissingFile, KeyError):
             return None
@@ -147,7 +150,7 @@ def read_stamps(url: str, truth: bool = False) -> dict[str, list[Any]] | None:
     place = place / "session.toml" if place.is_dir() else place
     stamps = {}
     try:
-        for file in (place, *(place.parent / name for name in named_in(place, truth))):
+        for file in (place, *(place.parent / name for name in list_named_files(place, truth))):
             for each in sorted(path for path in file.rglob("*") if path.is_file()) if file.is_dir() else [file]:
                 status = each.stat()
                 stamps[str(each)] = [status.st_size, status.st_mtime_ns]

@@ -1,8 +1,8 @@
 """Other solutions that explain the motion nearly as well.
 
-A covariance is that of one minimum and knows nothing of others. Where the hands hardly move, the closure has several:
-one arm's headings turned by 118 deg close the chain as well. So the closure is searched for all its minima; each is
-solved in full, and weighs by how much worse it explains all that is known.
+A covariance describes one minimum. Where the hands hardly move, the closure has several: one arm's headings turned by
+118 deg close the chain as well. So the closure is searched for all its minima. Each is solved in full and weighted by
+how much worse it explains all that is known.
 """
 
 from __future__ import annotations
@@ -13,89 +13,89 @@ from typing import NamedTuple
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
-from .problem import Fit, K, Layout, Looks, placed, solve
-from .start import distinct_headings
+from .initial_headings import find_distinct_headings
+from .least_squares import Fit, Gaussian, K, Layout, Observations, place_points, solve
+from .weights import WeightedFit
 
-SEEN_LOOKS = 120  # on which solutions are compared
+COMPARED_SAMPLES = 120  # on which solutions are compared
 STEPS = 25
-LEAST_WEIGHT = 1e-4  # of a solution that is worth a word
-NEAR = 3.0  # standard deviations within which a solution is no other one
+LEAST_WEIGHT = 1e-4  # of a solution that counts
+NEAR = 3.0  # standard deviations within which two solutions are the same
 CIRCLE_STD = np.pi / np.sqrt(3.0)  # [rad] of a heading that may be anywhere
 
 
 class Alternative(NamedTuple):
     """Another solution."""
 
-    off: np.ndarray  # (m,) from the solution that is handed on, headings within half a turn
-    weight: float  # its probability over that of the solution, at most 1
+    offset: np.ndarray  # (m,) from the best solution, headings within half a turn
+    weight: float  # its probability over that of the best solution, at most 1
 
 
-def alternatives(
-    looks: Looks,
-    known_at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
-    fit: Fit,
-    weights: np.ndarray,
-    independent: float,
-    told: Mapping[str, float],
+def find_alternatives(
+    observations: Observations,
+    prior_at: Callable[[np.ndarray], Gaussian],
+    result: WeightedFit,
+    stated: Mapping[str, float],
 ) -> list[Alternative]:
     """Solutions with other headings, the likeliest first, down to `LEAST_WEIGHT`.
 
     Parameters
     ----------
-    known_at : x (m,) → centre (m,) and information (m, m) of what is known without the closure, where the headings that
-        nothing tells are those of x
-    fit, weights, independent : the solution, the weights (n, 5) of its looks, how many independent ones these are
-    told : sensor → ψ [rad] where a stated mount tells it; where all are told there is nothing to search
+    prior_at : x (m,) → what is known without the closure, where headings without a stated mount are those of x
+    result : the best solution
+    stated : sensor → ψ [rad] of its stated mount; where all sensors have one there is nothing to search
     """
-    layout = looks.layout
-    unknown = np.array([name not in told for name in layout.sensors])
-    if not looks.closed.any() or not unknown.any():
+    layout, fit = observations.layout, result.fit
+    unknown = np.array([name not in stated for name in layout.sensors])
+    if not observations.closed.any() or not unknown.any():
         return []
-    every = max(1, looks.data.shape[1] // SEEN_LOOKS)
-    few = np.concatenate([np.arange(looks.data.shape[1])[span][::every] for _, span in looks.spans()])
-    some, weights = looks.take(few), every * weights[few]
+    stride = max(1, len(observations) // COMPARED_SAMPLES)
+    few = np.concatenate([np.arange(len(observations))[span][::stride] for _, span in observations.spans()])
+    some, weights = observations.take(few), stride * result.weights[few]
     rows = np.arange(layout.size)[layout.heading]
 
-    def solved(psi: np.ndarray) -> Fit:
-        begin = fit.x.copy()
-        begin[rows] += np.where(unknown, (psi - begin[rows] + np.pi) % (2.0 * np.pi) - np.pi, 0.0)
-        begin = placed(begin, some)
-        return solve(some, *known_at(begin), weights, begin, STEPS, strict=False)
+    def solve_from(psi: np.ndarray) -> Fit:
+        start = fit.x.copy()
+        start[rows] += np.where(unknown, (psi - start[rows] + np.pi) % (2.0 * np.pi) - np.pi, 0.0)
+        start = place_points(start, some)
+        return solve(some, prior_at(start), weights, start, STEPS, strict=False)
 
-    best = solved(fit.x[rows])
+    best = solve_from(fit.x[rows])
     std = np.sqrt(np.diag(np.linalg.inv(fit.information))[rows])
     found: list[Alternative] = []
-    for psi in distinct_headings(looks.take(looks.closed).stepped(fit.x), fit.x[:K], fit.x[layout.distances], told):
-        other = solved(psi)
-        off = other.x - best.x
-        off[rows] = (off[rows] + np.pi) % (2.0 * np.pi) - np.pi
-        # The variance of the residuals is found from as many of them as are independent: Student's t, not a Gaussian.
-        degrees = max(3.0 * independent, 1.0)
-        new = Alternative(off, float((1.0 + max(other.cost - best.cost, 0.0) / degrees) ** (-0.5 * degrees)))
-        if np.abs(off[rows] / std).max() < NEAR or new.weight < LEAST_WEIGHT:
+    closed = observations.take(observations.closed).apply_steps(fit.x)
+    for psi in find_distinct_headings(closed, fit.x[:K], fit.x[layout.distances], stated):
+        other = solve_from(psi)
+        offset = other.x - best.x
+        offset[rows] = (offset[rows] + np.pi) % (2.0 * np.pi) - np.pi
+        # The residuals' variance is estimated from the effective samples: Student's t, not a Gaussian.
+        degrees = max(3.0 * result.effective_sample_size, 1.0)
+        new = Alternative(offset, float((1.0 + max(other.cost - best.cost, 0.0) / degrees) ** (-0.5 * degrees)))
+        if np.abs(offset[rows] / std).max() < NEAR or new.weight < LEAST_WEIGHT:
             continue
-        if all(np.abs((off - each.off)[rows] / std).max() > NEAR for each in found):
+        if all(np.abs((offset - each.offset)[rows] / std).max() > NEAR for each in found):
             found.append(new)
     return sorted(found, key=lambda each: -each.weight)
 
 
-def spread_over(covariance: np.ndarray, others: list[Alternative], layout: Layout) -> np.ndarray:
-    """The covariance (m, m) about the solution where it may be one of the others; no heading beyond the circle's."""
+def widen_covariance(covariance: np.ndarray, others: list[Alternative], layout: Layout) -> np.ndarray:
+    """The covariance (m, m) about the solution with the alternatives included; no heading beyond the circle's."""
     if not others:
         return covariance
     total = 1.0 + sum(each.weight for each in others)
-    spread = covariance + sum((each.weight / total * np.outer(each.off, each.off) for each in others), 0.0 * covariance)
+    outer = sum((each.weight / total * np.outer(each.offset, each.offset) for each in others), 0.0 * covariance)
+    widened = covariance + outer
     rows = np.arange(layout.size)[layout.heading]
-    std = np.sqrt(np.diag(spread))
-    shrunk = np.ones(layout.size)
-    shrunk[rows] = np.minimum(1.0, CIRCLE_STD / std[rows])
-    return spread * np.outer(shrunk, shrunk)
+    std = np.sqrt(np.diag(widened))
+    shrink = np.ones(layout.size)
+    shrink[rows] = np.minimum(1.0, CIRCLE_STD / std[rows])
+    return widened * np.outer(shrink, shrink)
 
 
-def ambiguous_headings(others: list[Alternative], layout: Layout) -> list[Diagnostic]:
-    """The sensor whose heading differs most in the likeliest other solution, where there is one."""
+def diagnose_ambiguity(others: list[Alternative], layout: Layout) -> list[Diagnostic]:
+    """The sensor whose heading differs most in the likeliest alternative, where there is one."""
     if not others:
         return []
-    turned = np.abs(others[0].off[layout.heading])
+    turned = np.abs(others[0].offset[layout.heading])
     worst = int(np.argmax(turned))
     return [Diagnostic("headings-ambiguous", WARNING, layout.sensors[worst], float(turned[worst]))]

@@ -17,37 +17,23 @@ CHAIN = ("torso", *ARMS)
 
 def _reaches() -> dict[str, dict[str, np.ndarray]]:
     unit = dict(zip(LENGTHS, np.eye(len(LENGTHS)), strict=True))
-    found = {}
+    reaches = {}
     for side, y in zip(SIDES, (1.0, -1.0), strict=True):
         parts = {"torso": np.array([0.0 * unit["trunk"], 0.5 * y * unit["shoulder_width"], unit["trunk"]])}
-        found[f"{side}_shoulder"] = dict(parts)
-        for part, end in (("upper_arm", "elbow"), ("forearm", "wrist"), ("hand", "hand")):
+        reaches[f"{side}_shoulder"] = dict(parts)
+        for part, end in (("upper_arm", "elbow"), ("forearm", "wrist"), ("hand", "palm")):
             name = f"{side}_{part}"
             parts[name] = np.array([0.0 * unit[name], 0.0 * unit[name], -unit[name]])
-            found[f"{side}_{end}"] = dict(parts)
-    return found
+            reaches[f"{side}_{end}"] = dict(parts)
+    return reaches
 
 
-# Point → segment → (3, 8), by which the lengths make the segment's part of the way from the root, in its own frame.
+# Point → segment → (3, 8), by which the lengths make the segment's part of the chain from the root, in its own frame.
 REACHES = _reaches()
 
 
-def palm_gap(lengths: Any, quat_WL: Mapping[str, Any]) -> Any:
-    """Palm-to-palm vector (3,) [m] in W as a CasADi expression: left palm minus right palm.
-
-    Parameters
-    ----------
-    lengths : (8,) CasADi, in the order of `LENGTHS` [m]
-    quat_WL : segment → (4,) CasADi xyzw, for the torso and both upper arms, forearms, hands
-    """
-    left, right = REACHES["left_hand"], REACHES["right_hand"]
-    none = np.zeros((3, len(LENGTHS)))
-    way = {name: left.get(name, none) - right.get(name, none) for name in CHAIN}
-    return sum(links(lengths, quat_WL, way).values(), start=ca.SX.zeros(3))
-
-
 def links(lengths: Any, quat_WL: Mapping[str, Any], way: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Segment → its part (3,) [m] of a way, in W; `way` holds the (3, 8) of each segment, as in `REACHES`."""
+    """Segment → its part (3,) [m] of a chain, in W; `way` holds the (3, 8) of each segment, as in `REACHES`."""
     return {
         name: rotate(quat_WL[name], ca.vertcat(*(_combined(row, lengths) for row in rows)))
         for name, rows in way.items()
@@ -55,7 +41,7 @@ def links(lengths: Any, quat_WL: Mapping[str, Any], way: Mapping[str, np.ndarray
 
 
 def _combined(row: np.ndarray, lengths: Any) -> Any:
-    """``row · lengths`` of what is not zero."""
+    """``row · lengths`` without the zeros of the row."""
     return sum((row[i] * lengths[i] for i in map(int, np.flatnonzero(row))), start=ca.SX(0.0))
 
 

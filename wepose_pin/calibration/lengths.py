@@ -4,163 +4,90 @@ While the palms are held together the chain shoulder–arm–palm–palm–arm�
 
     g(ℓ) = R_torso e_y w + Σ_left R_i(−e_z) ℓ_i − Σ_right R_i(−e_z) ℓ_i
 
-is zero. It is linear and homogeneous in the lengths ℓ, and that decides the form of the problem:
+is zero. It is linear and homogeneous in the lengths ℓ, which decides the form of the problem:
 
 - Nothing in g fixes the scale: ℓ = 0 closes the chain perfectly. Errors of the orientations even favour it, since they
   add to ‖g‖² in proportion to ‖ℓ‖². So the residual is the gap whitened by the covariance that errors of the
-  orientations give it, which is as homogeneous as the gap: the quotient no longer changes with the scale (total
-  instead of ordinary least squares).
-- The scale comes from outside: a gauge (a measured length), else the anthropometric prior; the result says which.
-- What the gap does not see keeps the prior: `trunk` cancels, and of a hand without a sensor only the sum forearm + hand
-  is seen, the prior splits it.
-- Sensors may sit anywhere: headings come from the closure itself where no mount is stated, and nobody holds the start
-  pose exactly. Without a magnetometer headings drift, and soft tissue lets a sensor sag. None of that is noise that
-  averages out over the phase, so all of it is unknown beside the lengths (`problem`), with priors of its own (`known`).
-- Of headings the accelerations of shoulders and elbows tell as well, which two sensors each feel (`joints`).
-- How much the looks are worth is measured, not assumed (`weighing`).
+  orientations give it. That covariance is as homogeneous as the gap, so the residual does not change with the scale
+  (total instead of ordinary least squares).
+- The scale comes from outside: a measured length, else the population prior; the result says which.
+- What the gap does not show keeps the prior: `trunk` cancels, and of a hand without a sensor the gap shows only the sum
+  forearm + hand, which the prior splits.
+- Sensors may sit anywhere: where no mount is stated, headings come from the closure, and nobody holds the start pose
+  exactly. Without a magnetometer headings drift, and soft tissue moves under the sensors. None of this is noise that
+  averages out over the phase, so all of it is estimated beside the lengths (`least_squares`), with priors (`priors`).
+- The accelerations of shoulders and elbows, which two sensors each measure, show headings as well (`joints`).
+- The weight of the samples is measured, not assumed (`weights`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG, heading_to, nominal_mount
+from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG
 from ..arguments import Positive, check_arguments
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadOption, BadPhase, BadSession, NoSolution, one_of
+from ..errors import BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
-from ..filters.sensors import FilteredRecording, filter_recording
+from ..filters.sensors import filter_recording
 from ..recording import Recording
-from ..subject import LENGTHS, HeadingDrift, Hinge, StartPoseOffset, Subject, average_subject
-from .alternatives import Alternative, alternatives, ambiguous_headings, spread_over
-from .anatomy import (
-    BETTER,
-    Arms,
-    Labels,
-    against_gravity,
-    against_motion,
-    arms,
-    check_labels,
-    relabelled,
-    segments_at,
-    without_mounts,
+from ..subject import LENGTHS, HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
+from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
+from .anatomy import BETTER, LabelCheck, check_labels
+from .chain import SIDES
+from .contact import find_contact_start
+from .joints import add_couplings, estimate_couplings
+from .least_squares import HINGE_STD, Gaussian, K, Layout, Observations, place_points, residuals
+from .observability import diagnose_closures, diagnose_distances, diagnose_lengths, diagnose_mounts
+from .priors import build_prior, combine_lengths
+from .problem import SAMPLE_RATE_HZ, CalibrationProblem
+from .protocols import Protocol, load_protocol
+from .result import Calibration
+from .weights import (
+    MIN_CONTACT,
+    WeightedFit,
+    compare_measured,
+    compute_information_shares,
+    estimate_covariance,
+    project_to_subject,
+    solve_reweighted,
 )
-from .chain import CHAIN, SIDES
-from .joints import coupled, couplings
-from .known import known_before, known_lengths, stated_headings
-from .losses import connected, losses_of, need_start_pose, steps_of, tilted
-from .observability import assumed_distances, open_closures, unknown_mounts, unobserved_lengths
-from .problem import HINGE_STD, K, Layout, Looks, carrier, placed, residuals
-from .protocols import Closure, Protocol, load_protocol
-from .start import is_linear
-from .touching import touching_start
-from .weighing import TOUCHED, Tape, covariance_of, handed_on, learned_of, taped, weighed
 
-# One standard deviation [m] of a length taped over the skin, where the user gives none.
-GAUGE_STD = 0.003
-# The gap is looked at this often [Hz]; more only repeats what the motion's own slowness correlates anyway.
-LOOK_RATE_HZ = 8.0
-LEAST_LOOKS = 10
-# To see whether labels and mounts can be as stated, the closure alone at fewer looks tells enough.
-QUICK_RATE_HZ = 1.0
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """What a calibration found.
-
-    Parameters
-    ----------
-    subject : lengths and mounts with their joint covariance
-    prior : what was known before
-    rms_gap : palm-to-palm residual [m], root mean square of its length, where the palms touched
-    prior_rms_gap : the same with the prior's lengths
-    independent : how many independent looks at the gap the phase is worth
-    gauge : the measured lengths [m]; empty: the scale is the prior's
-    scale_std : relative standard deviation of the overall scale, the proportions taken as found
-    diagnostics : what the user should know besides its quality, see `assess`
-    time, gap, prior_gap : (n,) [s], (n,) [m] the residual's length at each look, and with the prior's lengths
-    kept : (n,) the weight that each look kept, near 0 where the palms were apart
-    start_tilt : segment → (2,) [rad] about x and y of W, how far it was off the start pose
-    drift : segment → [rad/s] of its sensor's heading
-    hinge : side → (3,) the elbow's axis in the upper arm's frame, unit length, y towards the left
-    hinge_rms : side → [rad] of the forearm against the plane of that hinge
-    learned : name as in the subject's covariance, or ``left_forearm + left_hand`` → (n,) share of what is known of it
-        that each look brought; their sum and what was known before make 1
-    before : (k, k) covariance before the motion, in the order of the subject's
-    quat_WL : segment → (n, 4) xyzw at each look, as `track` would have it
-    protocol : its name
-    closure : the kind of its closure, as in `protocols.KINDS`; empty where it has none
-    tape : the gauge that serves it best, with an example
-    tapes : each measured length beside what is known without it
-    labels : whether the sensors sit where the session says
-    contradicted : stated mounts that could not be and were not used
-    scaling : measured lengths that fix the scale; empty: the prior does
-    """
-
-    subject: Subject
-    prior: Subject
-    rms_gap: float
-    prior_rms_gap: float
-    independent: float
-    gauge: Mapping[str, float]
-    scale_std: float
-    diagnostics: tuple[Diagnostic, ...]
-    time: np.ndarray
-    gap: np.ndarray
-    prior_gap: np.ndarray
-    kept: np.ndarray
-    start_tilt: Mapping[str, np.ndarray]
-    drift: Mapping[str, float]
-    hinge: Mapping[str, np.ndarray]
-    hinge_rms: Mapping[str, float]
-    learned: Mapping[str, np.ndarray] = field(default_factory=dict)
-    before: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    quat_WL: Mapping[str, np.ndarray] = field(default_factory=dict)
-    protocol: str = "clasp"
-    closure: str = "coincide"
-    tape: str = Protocol.tape
-    tapes: Mapping[str, Tape] = field(default_factory=dict)
-    labels: Labels = field(default_factory=Labels)
-    contradicted: tuple[Diagnostic, ...] = ()
-    scaling: tuple[str, ...] = ()
-
-    def arms(self) -> Arms:
-        """How the arms moved while the chain was closed."""
-        closed = np.isfinite(self.gap)
-        touched = closed & (self.kept > TOUCHED) if closed.any() else np.ones(len(self.gap), dtype=bool)
-        gap = np.sqrt(np.average(self.gap[closed] ** 2, weights=self.kept[closed])) if closed.any() else 0.0
-        quat_WL = {name: quat[touched] for name, quat in self.quat_WL.items()}
-        return arms(quat_WL, self.subject.lengths, float(gap))
+# One standard deviation [m] of a length measured over the skin, where the user gives none.
+MEASURED_STD = 0.003
+MEASURED_RANGE = 0.02, 1.0  # [m] of lengths and distances that a user may measure
+QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
+MIN_LENGTH = 0.01  # [m] below which a length has not converged
 
 
 def calibrate_lengths(
     recording: Recording,
     *,
-    gauge: Mapping[str, float] | None = None,
+    measured: Mapping[str, float] | None = None,
     prior: Subject | None = None,
     protocol: str | Protocol = "clasp",
     method: str = BEST,
-    gauge_std: Positive = GAUGE_STD,
+    measured_std: Positive = MEASURED_STD,
 ) -> Calibration:
-    """Link lengths with their covariance, and what was found beside them.
+    """Link lengths with their covariance, and all else that a calibration estimates.
 
     Parameters
     ----------
-    gauge : measured lengths, and distances that the protocol names, name → [m]; without one the scale is the prior's
-    prior : lengths before, with covariance, and mounts; None for the anthropometric average
+    measured : measured lengths, and distances that the protocol names, name → [m]; without one the scale is the prior's
+    prior : lengths before, with covariance, and mounts; None: `population_subject`
     protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave
     method : the orientation filter
-    gauge_std : standard deviation [m] of each measured length
+    measured_std : standard deviation [m] of each measured length
 
     Raises
     ------
     BadOption
-        An unknown protocol, or a gauge that is no length or no plausible one.
+        An unknown protocol, or a measured length that is none or not plausible.
     BadSession, BadPhase
         A sensor that the protocol needs is missing; there is no such phase.
     """
@@ -168,88 +95,83 @@ def calibrate_lengths(
     check_method(method)
     if not isinstance(protocol, Protocol):
         protocol = load_protocol(protocol)
-    gauge = dict(gauge or {})
-    for name, value in gauge.items():
-        if name not in (*LENGTHS, *protocol.gauges):
-            raise BadOption(f"gauge {name}: not a length; {one_of((*LENGTHS, *protocol.gauges), name)}")
-        if not 0.02 < value < 1.0:
-            raise BadOption(f"gauge {name}={value:g}: a length in metres is needed, between 0.02 and 1.0")
-    if len(set(gauge) & set(protocol.chain)) < protocol.taped:
-        raise BadOption(
-            f"protocol '{protocol.name}' needs {protocol.taped} taped length of its chain, as in --measured "
-            f"{protocol.tape}; {one_of(protocol.chain)}"
-        )
+    with_std = {name: (metres, measured_std) for name, metres in (measured or {}).items()}
+    _check_measured(with_std, protocol)
     for segment in protocol.needs:
         if segment not in recording.sensors:
             raise BadSession(
                 f"{recording.where()}: no sensor on {segment}; protocol '{protocol.name}' needs one each on "
                 f"{', '.join(protocol.needs)}"
             )
-    before = prior or average_subject()
+    prior = prior or population_subject()
     for condition in protocol.conditions:
         recording.phase(condition.phase)
-    return _believed(recording, filter_recording(recording, method=method), protocol, before, gauge, gauge_std)
+    filtered = filter_recording(recording, method=method)
+    return _calibrate_checked(CalibrationProblem(recording, filtered, protocol, prior, with_std))
 
 
-def _believed(
-    recording: Recording,
-    found: FilteredRecording,
-    protocol: Protocol,
-    prior: Subject,
-    gauge: Mapping[str, float],
-    gauge_std: float,
-) -> Calibration:
-    """The calibration by what the session says of its sensors, as far as gravity, motion and anatomy let it stand."""
+def _check_measured(measured: Mapping[str, tuple[float, float]], protocol: Protocol) -> None:
+    """Raises `BadOption` where a measured length is none of the protocol's, not plausible, or missing."""
+    names, (low, high) = (*LENGTHS, *protocol.distances), MEASURED_RANGE
+    for name, (metres, _) in measured.items():
+        if name not in names:
+            raise BadOption(f"measured {name}: not a length; {one_of(names, name)}")
+        if not low < metres < high:
+            raise BadOption(f"measured {name}={metres:g}: a length in metres is needed, between {low} and {high}")
+    if len(set(measured) & set(protocol.chain)) < protocol.min_measured:
+        raise BadOption(
+            f"protocol '{protocol.name}' needs {protocol.min_measured} measured length of its chain, as in --measured "
+            f"{protocol.measured_example}; {one_of(protocol.chain)}"
+        )
 
-    def tried(recording: Recording, found: FilteredRecording, prior: Subject) -> Calibration:
-        return _solve(recording, found, protocol, prior, gauge, gauge_std, quick=True)
 
-    wrong = against_gravity(recording, prior, found)
-    contradicted = [_not_used(name, off, STATED_LIMIT_DEG) for name, off in wrong.items()]
-    recording, prior = without_mounts(recording, prior, wrong)
-    _need_start_pose(recording, found, protocol, prior)
-    stated = tried(recording, found, prior)
+def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
+    """The calibration without the mounts that gravity or the motion contradicts, and with its labels checked."""
+    wrong = problem.mounts_against_gravity()
+    unused = [_diagnose_unused_mount(name, angle, STATED_LIMIT_DEG) for name, angle in wrong.items()]
+    problem = problem.remove_mounts(wrong)
+    problem.check_start_pose()
+    stated = solve_calibration(problem, quick=True)
     doubt = stated.arms().doubt()
-    if doubt > 1.0 or against_motion(recording, prior, stated.subject.mounts):
-        bare, unknown = without_mounts(recording, prior, found.R_VS)
-        free = tried(bare, found, unknown)
+    if doubt > 1.0 or problem.mounts_against_motion(stated.subject.mounts):
+        free = solve_calibration(problem.remove_mounts(problem.filtered.R_VS), quick=True)
         if free.arms().doubt() < min(1.0, BETTER * max(doubt, 1.0 / BETTER)):
-            wrong = against_motion(recording, prior, free.subject.mounts)
-            contradicted += [_not_used(name, off, STATED_WARNING_DEG, "motion") for name, off in wrong.items()]
-            recording, prior = without_mounts(recording, prior, wrong)
+            wrong = problem.mounts_against_motion(free.subject.mounts)
+            unused += [_diagnose_unused_mount(n, angle, STATED_WARNING_DEG, "motion") for n, angle in wrong.items()]
+            problem = problem.remove_mounts(wrong)
             doubt = 0.0 if wrong else doubt
     if doubt > 1.0:
         labels = check_labels(
             stated.arms(),
-            lambda moved: tried(*relabelled(recording, found, moved), prior).arms(),
-            tuple(found.R_VS),
+            lambda moved: solve_calibration(problem.relabel(moved), quick=True).arms(),
+            tuple(problem.filtered.R_VS),
         )
         if labels.moved:
-            stated = replace(stated, diagnostics=(*contradicted, *stated.diagnostics))
-            return _nothing_learned(stated, labels, gauge, gauge_std)
+            return _keep_prior(replace(stated, diagnostics=(*unused, *stated.diagnostics)), labels, problem.measured)
     try:
-        best = _solve(recording, found, protocol, prior, gauge, gauge_std)
+        best = solve_calibration(problem)
     except NoSolution as error:
-        raise NoSolution(f"{recording.where()}: {error}") from error
-    how = best.arms()
-    labels = Labels(how.doubt(), how.contradiction() if how.doubt() > 1.0 else None)
-    return replace(best, labels=labels, contradicted=tuple(contradicted))
+        raise NoSolution(f"{problem.recording.where()}: {error}") from error
+    arms = best.arms()
+    labels = LabelCheck(arms.doubt(), arms.contradiction() if arms.doubt() > 1.0 else None)
+    return replace(best, labels=labels, unused_mounts=tuple(unused))
 
 
-def _not_used(segment: str, off_deg: float, limit_deg: float, by: str = "") -> Diagnostic:
-    off, limit = np.deg2rad([off_deg, limit_deg]).tolist()
-    return Diagnostic("mount-not-used", WARNING, segment, off, limit, {"variant": by} if by else {})
+def _diagnose_unused_mount(segment: str, angle_deg: float, limit_deg: float, contradiction: str = "") -> Diagnostic:
+    angle, limit = np.deg2rad([angle_deg, limit_deg]).tolist()
+    facts = {"variant": contradiction} if contradiction else {}
+    return Diagnostic("mount-not-used", WARNING, segment, angle, limit, facts)
 
 
-def _nothing_learned(
-    calibration: Calibration, labels: Labels, gauge: Mapping[str, float], gauge_std: float
+def _keep_prior(
+    calibration: Calibration, labels: LabelCheck, measured: Mapping[str, tuple[float, float]]
 ) -> Calibration:
-    """What is handed on where sensors sit elsewhere than labelled: the lengths and spreads of before the motion."""
-    lengths, information = known_lengths(calibration.prior, gauge, gauge_std)
+    """The calibration with the lengths and covariance from before the motion, where sensors sit on other segments."""
+    lengths, information = combine_lengths(calibration.prior, measured)
     subject = replace(
         calibration.subject,
         lengths=dict(zip(LENGTHS, lengths.tolist(), strict=True)),
-        covariance=calibration.before,
+        covariance=calibration.prior_covariance,
         hinges={},
         start_pose_offset={},
         heading_drift={},
@@ -259,190 +181,174 @@ def _nothing_learned(
     return replace(calibration, subject=subject, scale_std=scale_std, labels=labels)
 
 
-def _looks(
-    recording: Recording, found: FilteredRecording, protocol: Protocol, rate_hz: float = LOOK_RATE_HZ
-) -> tuple[Looks, np.ndarray]:
-    """The looks of all conditions, and their samples (n,)."""
-    stride = max(1, round(recording.rate_hz / rate_hz))
-    seen = {carrier(segment, found.R_VS) for segment in protocol.segments}
-    fixed = sum(closure.kind == "fixed_point" for closure in protocol.closures)
-    layout = Layout(tuple(name for name in CHAIN if name in seen), fixed, protocol.gauges)
-    losses = losses_of(recording, found.start, layout.sensors)
-    # Where headings are searched, or poses tell them, those beyond a long loss are not to be found.
-    apart = [] if is_linear(protocol.conditions) else [loss for loss in losses if loss.free]
-    samples = []
-    gaps = {name: of.gap for name, of in recording.sensors.items() if of.gap is not None}
-    for condition in protocol.conditions:
-        spans = [recording.span(interval) for interval in recording.phase(condition.phase)]
-        # Each look once, however the intervals overlap.
-        phase = np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride]
-        unseen = {name: gap[phase] for name, gap in gaps.items()}
-        for name in {loss.sensor for loss in losses}:
-            unseen[name] = unseen[name] | tilted(found.orientation[name], phase)
-        lost = [name for name, of in unseen.items() if of.any()]
-        measured = phase[~np.any([unseen[name] for name in lost], axis=0)] if lost else phase
-        samples.append(measured[connected(apart, measured)])
-        lost = [*dict.fromkeys([*lost, *(loss.sensor for loss in apart if loss.beyond(measured).any())])]
-        if len(samples[-1]) < LEAST_LOOKS * rate_hz / LOOK_RATE_HZ:
-            raise BadPhase(
-                f"{recording.where()}: phases.{condition.phase} holds {len(samples[-1])} looks at {LOOK_RATE_HZ:g} a "
-                f"second; at least {LEAST_LOOKS} are needed"
-                + (", better a minute" if isinstance(condition, Closure) else ", better five seconds")
-                + (f"; in the others {', '.join(f'sensors.{name}' for name in lost)} is lost" if lost else "")
-                + (", or its orientation since it was" if losses else "")
-            )
-    at = np.concatenate(samples)
-    steps, step_std, beyond = steps_of(losses, at)
-    layout = layout._replace(steps=steps)
-    turned = [(found.R_VS[name][at] * found.at_start[name].inv()).as_quat().T for name in layout.sensors]
-    of = np.repeat(np.arange(len(samples)), [len(part) for part in samples])
-    data = np.vstack([*turned, beyond, recording.time[at] - found.start[1]])
-    return Looks(layout, data, protocol.conditions, of, step_std), at
+class _Solution(NamedTuple):
+    """The solved least squares."""
+
+    observations: Observations
+    samples: np.ndarray  # (n,) of the recording
+    prior: Gaussian  # without what accelerations show
+    result: WeightedFit
+    covariance: np.ndarray  # (m, m) of x
+    information_shares: dict[str, np.ndarray]
+    alternatives: list[Alternative]
 
 
-def _need_start_pose(recording: Recording, found: FilteredRecording, protocol: Protocol, prior: Subject) -> None:
-    """Raises `BadPhase` where lost samples keep the motion from telling a mount that is not known."""
-    looks, at = _looks(recording, found, protocol)
-    unknown = [name for name in looks.layout.sensors if nominal_mount(recording, name, prior) is None]
-    losses = losses_of(recording, found.start, looks.layout.sensors)
-    need_start_pose(recording, losses, at, unknown, LEAST_LOOKS)
+def _solve(problem: CalibrationProblem) -> _Solution:
+    """The least squares solved with all that is known."""
+    observations, samples = problem.observe(SAMPLE_RATE_HZ)
+    layout, recording = observations.layout, problem.recording
+    prior = build_prior(problem, observations)
+    start, contact = find_contact_start(observations, lambda some: build_prior(problem, some).mean)
+    spans = [span for closure in problem.protocol.closures for span in recording.phase(closure.phase)]
+    couplings = estimate_couplings(recording, problem.filtered, layout.sensors, spans)
+    coupled = add_couplings(prior, layout, couplings, start)
+    result = solve_reweighted(observations, coupled, start, contact)
 
+    headings = problem.stated_headings(layout.sensors)
+    free = layout.heading.start + np.flatnonzero([name not in headings for name in layout.sensors])
 
-def _solve(
-    recording: Recording,
-    found: FilteredRecording,
-    protocol: Protocol,
-    prior: Subject,
-    gauge: Mapping[str, float],
-    gauge_std: float,
-    *,
-    quick: bool = False,
-) -> Calibration:
-    """The calibration; a quick one at fewer looks, by the closure alone, to see whether it can be at all."""
-    looks, at = _looks(recording, found, protocol, QUICK_RATE_HZ if quick else LOOK_RATE_HZ)
-    layout = looks.layout
-    center, known = known_before(recording, found, looks, prior, gauge, gauge_std)
-    uncoupled, information = center, known
-    start, touching = center, np.ones(len(at))
-    others: list[Alternative] = []
-    if not quick:
-        start, touching = touching_start(
-            looks, lambda some: known_before(recording, found, some, prior, gauge, gauge_std)[0]
-        )
-        spans = [span for closure in protocol.closures for span in recording.phase(closure.phase)]
-        told = couplings(recording, found, layout.sensors, spans)
-        center, information = coupled(center, known, layout, told, start)
+    def prior_at(x: np.ndarray) -> Gaussian:
+        mean = prior.mean.copy()
+        mean[free] = x[free]
+        return add_couplings(Gaussian(mean, prior.information), layout, couplings, x)
 
-    fit, weights, weight, independent = weighed(looks, center, information, start, touching, quick)
-    if not quick:
-        headings = stated_headings(recording, found, layout, prior)
-        free = layout.heading.start + np.flatnonzero([name not in headings for name in layout.sensors])
-
-        def known_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            begun = uncoupled.copy()
-            begun[free] = x[free]
-            return coupled(begun, known, layout, told, x)
-
-        others = alternatives(looks, known_at, fit, weights, independent, headings)
-    lengths = fit.x[:K]
-    if not quick and np.min(lengths) < 0.01:
+    alternatives = find_alternatives(observations, prior_at, result, headings)
+    lengths = result.fit.x[:K]
+    if np.min(lengths) < MIN_LENGTH:
         raise NoSolution(
             f"the lengths did not converge ({LENGTHS[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm); "
             f"check that the hands do in the phase what the protocol says, and that every sensor sits where the "
             f"session says"
         )
-    covariance = np.linalg.inv(fit.information)
-    if not quick:
-        learned = learned_of(fit, looks.layout, weights, covariance)
-        covariance = spread_over(covariance_of(looks, fit, information, weights, weight), others, layout)
-    order, joint = handed_on(layout, covariance)
-    mounts = {name: _mount(found, fit.x, layout, name).as_quat() for name in layout.sensors}
-    # Of sensors that are not in the chain the start pose has measured what it can.
-    for name in [name for name in found.R_VS if name not in mounts]:
-        stated = nominal_mount(recording, name, prior)
-        if stated is not None:
-            psi = heading_to(found.at_start[name], Rotation.from_quat(stated))
-            mounts[name] = (Rotation.from_rotvec([0.0, 0.0, psi]) * found.at_start[name]).as_quat()
+    shares = compute_information_shares(result.fit, layout, result.weights, np.linalg.inv(result.fit.information))
+    covariance = estimate_covariance(observations, result, coupled.information)
+    covariance = widen_covariance(covariance, alternatives, layout)
+    return _Solution(observations, samples, prior, result, covariance, shares, alternatives)
 
-    at_prior = fit.x.copy()
-    at_prior[:K] = [prior.lengths[name] for name in LENGTHS]
-    at_prior = placed(at_prior, looks)
-    scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance[:K, :K], lengths)) ** -1)
-    # What is not in the chain, as the trunk where the hands are joined, cannot scale it.
-    scaling = [*(name for name in gauge if name in (protocol.chain or LENGTHS)), *protocol.gauges]
-    without_data = np.linalg.inv(known[:K, :K])
-    measured = {name: (value, gauge_std) for name, value in gauge.items()}
-    measured |= {c.gauge: (c.metres, c.metres_std) for c in protocol.closures if c.gauge and c.gauge not in gauge}
-    loose = None if scaling else scale_std
-    diagnostics = list(found.diagnostics)
-    diagnostics += unobserved_lengths(protocol, lengths, covariance[:K, :K], without_data, prior, loose)
-    diagnostics += assumed_distances(protocol, gauge)
-    diagnostics += ambiguous_headings(others, layout)
-    diagnostics += unknown_mounts([name for name in found.R_VS if name not in mounts], protocol)
-    diagnostics += open_closures(recording.time[at], weight, looks)
-    seen = {side: SIDES.index(side) for side in (layout.arms if looks.closed.any() else ())}
-    axes = {side: np.array([x, 1.0, z]) for side, (x, z) in zip(SIDES, fit.x[layout.hinge].reshape(2, 2), strict=True)}
-    hinge = {side: axes[side] / np.linalg.norm(axes[side]) for side in seen}
-    hinge_rms = {side: HINGE_STD * _rms(fit.hinge[looks.closed, i]) for side, i in seen.items()}
-    tilts, spread = fit.x[layout.tilt].reshape(-1, 2), np.sqrt(np.diag(covariance))
-    # Half a turn and more is the same turn the other way round, and no uncertainty is larger.
-    tilts = Rotation.from_rotvec(np.pad(tilts, ((0, 0), (0, 1)))).as_rotvec()[:, :2]
-    spread[layout.tilt] = np.minimum(spread[layout.tilt], np.pi)
-    subject = replace(
-        prior,
-        name=recording.name,
-        hinges={side: Hinge(hinge[side], max(hinge_rms[side], HINGE_STD)) for side in seen},
-        start_pose_offset={
-            name: StartPoseOffset(tilt, float(np.sqrt(np.mean(std**2))))
-            for name, tilt, std in zip(layout.sensors, tilts, spread[layout.tilt].reshape(-1, 2), strict=True)
-        },
-        heading_drift={
-            name: HeadingDrift(float(rate), float(std))
-            for name, rate, std in zip(layout.sensors, fit.x[layout.drift], spread[layout.drift], strict=True)
-        },
-        lengths=dict(zip(LENGTHS, lengths.tolist(), strict=True)),
-        order=order,
-        covariance=joint,
-        mounts=mounts,
-        note=f"{protocol.title}; scale "
-        + (f"taped: {', '.join(scaling)}" if scaling else "of the anthropometric prior"),
-    )
-    gap, prior_gap = (np.linalg.norm(gaps, axis=1) for gaps in (fit.gaps, residuals(at_prior, looks)[2]))
-    gap[~looks.closed] = prior_gap[~looks.closed] = np.nan
-    touched = looks.closed & (weight > TOUCHED)
+
+def _solve_quickly(problem: CalibrationProblem) -> _Solution:
+    """The least squares solved at fewer samples, by the closure alone."""
+    observations, samples = problem.observe(QUICK_RATE_HZ)
+    prior = build_prior(problem, observations)
+    result = solve_reweighted(observations, prior, prior.mean, np.ones(len(samples)), quick=True)
+    return _Solution(observations, samples, prior, result, np.linalg.inv(result.fit.information), {}, [])
+
+
+def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Calibration:
+    """The calibration with mounts and labels as stated; a quick one shows whether they can be."""
+    solution = _solve_quickly(problem) if quick else _solve(problem)
+    recording, protocol, prior = problem.recording, problem.protocol, problem.prior
+    observations, samples, fit = solution.observations, solution.samples, solution.result.fit
+    layout, contact = observations.layout, solution.result.contact
+    lengths, covariance = fit.x[:K], solution.covariance[:K, :K]
+    scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1)
+    # A length outside the chain, such as the trunk where the hands are joined, does not fix its scale.
+    scale_lengths = [name for name in problem.measured if name in (protocol.chain or LENGTHS)]
+    scale_lengths += protocol.distances
+    measured = dict(problem.measured)
+    measured |= {
+        c.distance: (c.metres, c.metres_std) for c in protocol.closures if c.distance and c.distance not in measured
+    }
+    hinges = _hinges(fit.hinge[observations.closed], fit.x[layout.hinge], layout) if observations.closed.any() else {}
+    offsets = Rotation.from_rotvec(np.pad(fit.x[layout.tilt].reshape(-1, 2), ((0, 0), (0, 1)))).as_rotvec()[:, :2]
+    subject = _make_subject(problem, solution, {joint: hinge for joint, (hinge, _) in hinges.items()}, offsets)
+    scale = f"measured: {', '.join(scale_lengths)}" if scale_lengths else "of the population prior"
+
+    prior_x = fit.x.copy()
+    prior_x[:K] = [prior.lengths[name] for name in LENGTHS]
+    prior_gaps = residuals(place_points(prior_x, observations), observations)[2]
+    gap, prior_gap = (np.linalg.norm(gaps, axis=1) for gaps in (fit.gaps, prior_gaps))
+    gap[~observations.closed] = prior_gap[~observations.closed] = np.nan
+    touching = observations.closed & (contact > MIN_CONTACT)
+
+    diagnostics = list(problem.filtered.diagnostics)
+    prior_lengths_cov = np.linalg.inv(solution.prior.information[:K, :K])
+    free_scale_std = None if scale_lengths else scale_std
+    diagnostics += diagnose_lengths(problem, lengths, covariance, prior_lengths_cov, free_scale_std)
+    diagnostics += diagnose_distances(problem)
+    diagnostics += diagnose_ambiguity(solution.alternatives, layout)
+    diagnostics += diagnose_mounts([name for name in problem.filtered.R_VS if name not in subject.mounts], protocol)
+    diagnostics += diagnose_closures(recording.time[samples], contact, observations)
     return Calibration(
-        subject=subject,
+        subject=replace(subject, note=f"{protocol.title}; scale {scale}"),
         prior=prior,
-        rms_gap=_rms(gap[touched]),
-        prior_rms_gap=_rms(prior_gap[touched]),
-        independent=independent,
-        gauge=gauge,
+        rms_gap=_rms(gap[touching]),
+        prior_rms_gap=_rms(prior_gap[touching]),
+        effective_sample_size=solution.result.effective_sample_size,
+        measured={name: metres for name, (metres, _) in problem.measured.items()},
         scale_std=scale_std,
         diagnostics=tuple(diagnostics),
-        time=recording.time[at],
+        time=recording.time[samples],
         gap=gap,
         prior_gap=prior_gap,
-        kept=weight,
-        start_tilt=dict(zip(layout.sensors, tilts, strict=True)),
-        drift=dict(zip(layout.sensors, fit.x[layout.drift].tolist(), strict=True)),
-        hinge=hinge,
-        hinge_rms=hinge_rms,
-        learned={} if quick else learned,
-        before=handed_on(layout, np.linalg.inv(known))[1],
-        quat_WL=segments_at(found, mounts, at),
+        contact=contact,
+        start_pose_offset=dict(zip(layout.sensors, offsets, strict=True)),
+        heading_drift=dict(zip(layout.sensors, fit.x[layout.drift].tolist(), strict=True)),
+        hinge_axes={joint: hinge.axis for joint, (hinge, _) in hinges.items()},
+        hinge_rms={joint: rms for joint, (_, rms) in hinges.items()},
+        information_shares=solution.information_shares,
+        prior_covariance=project_to_subject(layout, np.linalg.inv(solution.prior.information))[1],
+        quat_WL=problem.orient_segments(subject.mounts, samples),
         protocol=protocol.name,
         closure=next((closure.kind for closure in protocol.closures), ""),
-        tape=protocol.tape,
-        tapes=taped(fit, layout, measured),
-        scaling=tuple(scaling),
+        measured_example=protocol.measured_example,
+        measured_lengths=compare_measured(fit, layout, measured),
+        scale_lengths=tuple(scale_lengths),
     )
 
 
-def _mount(found: FilteredRecording, x: np.ndarray, layout: Layout, name: str) -> Rotation:
-    i = layout.sensors.index(name)
-    tilt = np.append(x[layout.tilt][2 * i : 2 * i + 2], 0.0)
-    turn = Rotation.from_rotvec([0.0, 0.0, x[layout.heading][i]])
-    return Rotation.from_rotvec(-tilt) * turn * found.at_start[name]
+def _hinges(hinge_residuals: np.ndarray, xz: np.ndarray, layout: Layout) -> dict[str, tuple[Hinge, float]]:
+    """Joint → its hinge, and the root mean square [rad] by which the forearm leaves the plane across it.
+
+    Parameters
+    ----------
+    hinge_residuals : (n, 2) of left and right, in units of `HINGE_STD`
+    xz : (4,) of the axes (x, 1, z), left then right
+    """
+    hinges = {}
+    for i, (side, (x, z)) in enumerate(zip(SIDES, xz.reshape(2, 2), strict=True)):
+        if side in layout.arms:
+            axis, rms = np.array([x, 1.0, z]), HINGE_STD * _rms(hinge_residuals[:, i])
+            hinges[f"{side}_elbow"] = Hinge(axis / np.linalg.norm(axis), max(rms, HINGE_STD)), rms
+    return hinges
+
+
+def _make_subject(
+    problem: CalibrationProblem, solution: _Solution, hinges: Mapping[str, Hinge], offsets: np.ndarray
+) -> Subject:
+    """The subject of a solution; `offsets` (sensors, 2) [rad] are those of the start pose."""
+    layout, x, filtered = solution.observations.layout, solution.result.fit.x, problem.filtered
+    mounts = {}
+    for i, name in enumerate(layout.sensors):
+        tilt = Rotation.from_rotvec(-np.append(x[layout.tilt][2 * i : 2 * i + 2], 0.0))
+        mounts[name] = (tilt * _about_z(x[layout.heading][i]) * filtered.at_start[name]).as_quat()
+    # The mounts of sensors outside the chain are those of the start pose.
+    for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
+        mounts[name] = (_about_z(psi) * filtered.at_start[name]).as_quat()
+    order, covariance = project_to_subject(layout, solution.covariance)
+    std = np.sqrt(np.diag(solution.covariance))
+    offset_stds = np.minimum(std[layout.tilt], np.pi).reshape(-1, 2)  # no angle is more uncertain than half a turn
+    return replace(
+        problem.prior,
+        name=problem.recording.name,
+        hinges=hinges,
+        start_pose_offset={
+            name: StartPoseOffset(offset, float(np.sqrt(np.mean(offset_std**2))))
+            for name, offset, offset_std in zip(layout.sensors, offsets, offset_stds, strict=True)
+        },
+        heading_drift={
+            name: HeadingDrift(float(rate), float(rate_std))
+            for name, rate, rate_std in zip(layout.sensors, x[layout.drift], std[layout.drift], strict=True)
+        },
+        lengths=dict(zip(LENGTHS, x[:K].tolist(), strict=True)),
+        order=order,
+        covariance=covariance,
+        mounts=mounts,
+    )
+
+
+def _about_z(angle: float) -> Rotation:
+    return Rotation.from_rotvec([0.0, 0.0, angle])
 
 
 def _rms(values: np.ndarray) -> float:

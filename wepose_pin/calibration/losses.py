@@ -1,8 +1,8 @@
-"""What a sensor lost between the start pose and the motion: its heading there is not that of the start pose.
+"""Heading steps where a sensor lost samples between the start pose and the motion.
 
-A filter finds its tilt again from gravity, sooner or later, its heading never. So each loss between the start pose and
-a look is an unknown of its own, a step of the heading, and a closure tells it. What is seen of a sensor only beyond a
-long loss says where it points then, and nothing of how it sits on its segment.
+After a loss a filter recovers the tilt from gravity, but never the heading. So each loss between the start pose and a
+sample is an unknown heading step, which a closure shows. A sensor that is measured only beyond a long loss shows
+nothing of its mount.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..alignment import vertical_var
+from ..alignment import heading_variance
 from ..errors import BadPhase
 from ..filters import Orientation
 from ..filters.smekf import HOLD_S, UNSEEN_RATE_STD
 from ..recording import OrientationSensor, Recording, span_text
 from ..recording.gaps import runs
 
-HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of a heading that nothing tells: the whole circle
-FREE_STD = np.deg2rad(15.0)  # [rad] of a step from which on the heading after it may be any
-TILT_STD = np.deg2rad(5.0)  # [rad] of a tilt that the filter has not found again
+HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of an unknown heading: the whole circle
+FREE_STD = np.deg2rad(15.0)  # [rad] of a step, above which the heading after it may be any
+TILT_STD = np.deg2rad(5.0)  # [rad] above which the filter has not recovered the tilt
 
 
 class Loss(NamedTuple):
@@ -31,11 +31,11 @@ class Loss(NamedTuple):
     first: int
     last: int
     after: bool
-    std: float  # [rad] by which the heading may have stepped
+    std: float  # [rad] of the heading step
 
     @property
     def free(self) -> bool:
-        """The heading beyond it may be any."""
+        """Whether the heading beyond it may be any."""
         return self.std > FREE_STD
 
     def beyond(self, samples: np.ndarray) -> np.ndarray:
@@ -43,8 +43,8 @@ class Loss(NamedTuple):
         return samples > self.last if self.after else samples < self.first
 
 
-def losses_of(recording: Recording, start: tuple[float, float], sensors: Collection[str]) -> list[Loss]:
-    """What these sensors lost, those aside that fuse by themselves; `start` [s] is the start pose."""
+def find_losses(recording: Recording, start: tuple[float, float], sensors: Collection[str]) -> list[Loss]:
+    """The losses of these sensors except measured orientations; `start` [s] is the start pose."""
     begin, losses = recording.span(start).start, []
     for name in sensors:
         sensor = recording.sensors[name]
@@ -57,16 +57,16 @@ def losses_of(recording: Recording, start: tuple[float, float], sensors: Collect
     return losses
 
 
-def tilted(orientation: Orientation, samples: np.ndarray) -> np.ndarray:
-    """(n,) bool: at which samples (n,) the filter does not know the tilt; it says so where it has a covariance."""
+def find_unknown_tilt(orientation: Orientation, samples: np.ndarray) -> np.ndarray:
+    """(n,) bool: the filter's covariance of the tilt is large at these samples (n,); False without a covariance."""
     if orientation.attitude_cov is None:
         return np.zeros(len(samples), dtype=bool)
     cov = orientation.attitude_cov[samples]
-    heading_var = vertical_var(orientation.quat_WS[samples], cov)
+    heading_var = heading_variance(orientation.quat_WS[samples], cov)
     return np.trace(cov, axis1=1, axis2=2) - heading_var > 2.0 * TILT_STD**2
 
 
-def connected(losses: Sequence[Loss], samples: np.ndarray) -> np.ndarray:
+def mask_connected(losses: Sequence[Loss], samples: np.ndarray) -> np.ndarray:
     """(n,) bool: none of the losses lies between the start pose and these samples (n,)."""
     apart = np.zeros(len(samples), dtype=bool)
     for loss in losses:
@@ -74,10 +74,10 @@ def connected(losses: Sequence[Loss], samples: np.ndarray) -> np.ndarray:
     return ~apart
 
 
-def steps_of(losses: Sequence[Loss], samples: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Steps of headings that samples (n,) see: the sensor of each, its standard deviation (m,) [rad], beyond (m, n).
+def group_steps(losses: Sequence[Loss], samples: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Heading steps before samples (n,): the sensor of each, its standard deviation (m,) [rad], beyond (m, n).
 
-    Losses of a sensor between which there is no sample are one step.
+    Losses of a sensor without a sample between them are one step.
     """
     variances: dict[tuple[str, bytes], float] = {}
     for loss in losses:
@@ -90,25 +90,25 @@ def steps_of(losses: Sequence[Loss], samples: np.ndarray) -> tuple[tuple[str, ..
     return tuple(name for name, _ in variances), std, beyond
 
 
-def need_start_pose(
-    recording: Recording, losses: Sequence[Loss], samples: np.ndarray, unknown: Collection[str], least: int
+def check_start_pose(
+    recording: Recording, losses: Sequence[Loss], samples: np.ndarray, unknown: Collection[str], min_samples: int
 ) -> None:
-    """Raises `BadPhase` where the motion does not tell how a sensor sits: it, or the torso's, lost samples before.
+    """Raises `BadPhase` where the motion does not show a mount, since the sensor or the torso's lost samples before.
 
     Parameters
     ----------
-    samples : (n,) of the looks
+    samples : (n,) of the motion
     unknown : sensors of the chain whose mount is not known
-    least : looks that are needed
+    min_samples : at which the sensor and the torso must be connected with the start pose
     """
     for name in unknown:
         between = [loss for loss in losses if loss.sensor in (name, "torso") and loss.free]
-        if name == "torso" or np.count_nonzero(connected(between, samples)) >= least:
+        if name == "torso" or np.count_nonzero(mask_connected(between, samples)) >= min_samples:
             continue
         worst = max(between, key=lambda loss: np.count_nonzero(loss.beyond(samples)))
         span = span_text(recording.time[[worst.first, worst.last]])
         raise BadPhase(
             f"{recording.where()}: sensors.{worst.sensor} is lost from {span}, between the start pose and the motion, "
-            f"and its heading with it: how sensors.{name} sits is not to be found; state its mount, name a start pose "
-            f"and a motion with nothing lost between them, or record again"
+            f"and its heading with it: the mount of sensors.{name} cannot be estimated; state its mount, name a start "
+            f"pose and a motion with nothing lost between them, or record again"
         )

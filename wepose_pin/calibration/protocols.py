@@ -1,13 +1,13 @@
-"""Protocols as data: what a person does in which phase, and what therefore holds of the body at every look.
+"""Protocols as data: what a person does in which phase, and the conditions that hold for the body meanwhile.
 
 A ``calibration/<name>.toml`` lists steps for the person and conditions for the solver. There are three kinds:
 
 - ``[[closure]]``: two points of the body coincide (``kind = "coincide"``) or keep a distance (``"distance"``), or one
-  stays at an unknown point of W (``"fixed_point"``). All of them tell lengths and headings by motion.
+  stays at an unknown point of W (``"fixed_point"``). All of them show lengths and headings by motion.
 - ``[[pose]]``: segments point in given directions of the torso; `std_deg` is how well a person does that.
 - ``[[axis]]``: a segment turns forwards about its own y, as the torso in a bow.
 
-How well a pose is held cannot be seen in its own residual, so its weight is stated; that of a closure is measured.
+The residual of a pose does not show how exactly it was taken, so its weight is stated; that of a closure is measured.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ..recording import SEGMENTS
 from ..subject import LENGTHS
 from .chain import CHAIN, REACHES
 
-PROTOCOLS = ("clasp", "clasp_taped", "handle", "poses", "touch_left", "touch_right")
+PROTOCOLS = ("clasp", "clasp_measured", "handle", "poses", "touch_left", "touch_right")
 KINDS = {"coincide": 2, "distance": 2, "fixed_point": 1}  # how many points each takes
 
 
@@ -40,7 +40,7 @@ class Closure:
     kind : one of `KINDS`
     points : of the body
     slip : [m] one standard deviation, each axis, of what holds only nearly; sets the weights' shape, not their size
-    gauge : name of the distance, as in ``--measured handle=0.4``; empty where none is kept
+    distance : its name, as in ``--measured handle=0.4``; empty for other kinds
     metres, metres_std : the distance where the user gives none, and one standard deviation [m]
     """
 
@@ -48,13 +48,13 @@ class Closure:
     kind: str
     points: tuple[str, ...]
     slip: float = SLIP_STD
-    gauge: str = ""
+    distance: str = ""
     metres: float = 0.0
     metres_std: float = 0.003
 
     @property
     def rows(self) -> int:
-        """How many residuals one look has."""
+        """How many residuals a sample has."""
         return 1 if self.kind == "distance" else 3
 
 
@@ -102,8 +102,8 @@ class Protocol:
     needs : segments that must carry a sensor
     steps : for the person
     conditions : for the solver
-    taped : how many lengths of the chain must be given with a tape
-    tape : the length that serves best as gauge, with an example: ``name=metres``
+    min_measured : how many lengths of the chain the user must measure
+    measured_example : the length that fixes the scale best, as ``name=metres``
     """
 
     name: str
@@ -111,39 +111,39 @@ class Protocol:
     needs: tuple[str, ...]
     steps: tuple[Step, ...]
     conditions: tuple[Condition, ...]
-    taped: int = 0
-    tape: str = "shoulder_width=0.385"
+    min_measured: int = 0
+    measured_example: str = "shoulder_width=0.385"
 
     @property
     def closures(self) -> tuple[Closure, ...]:
         return tuple(c for c in self.conditions if isinstance(c, Closure))
 
     @property
-    def gauges(self) -> tuple[str, ...]:
-        """Names of distances outside the body that can be given as gauges."""
-        return tuple(dict.fromkeys(c.gauge for c in self.closures if c.gauge))
+    def distances(self) -> tuple[str, ...]:
+        """Names of distances outside the body that the user can measure."""
+        return tuple(dict.fromkeys(c.distance for c in self.closures if c.distance))
 
     @property
     def chain(self) -> tuple[str, ...]:
-        """Lengths that some closure holds."""
-        held = [abs(c) for closure in self.closures for c in coefficients(closure).values()]
-        return tuple(np.array(LENGTHS)[np.sum(held, axis=(0, 1)) > 0.0].tolist()) if held else ()
+        """Lengths in some closure."""
+        parts = [abs(c) for closure in self.closures for c in coefficients(closure).values()]
+        return tuple(np.array(LENGTHS)[np.sum(parts, axis=(0, 1)) > 0.0].tolist()) if parts else ()
 
     @property
     def segments(self) -> frozenset[str]:
-        """Segments whose orientation some condition looks at, hands included."""
-        held = {segment for closure in self.closures for segment in coefficients(closure)}
-        held |= {c.segment for c in self.conditions if isinstance(c, Direction | Axis)}
-        return frozenset(held | ({"torso"} if any(isinstance(c, Direction) for c in self.conditions) else set()))
+        """Segments whose orientation some condition uses, hands included."""
+        used = {segment for closure in self.closures for segment in coefficients(closure)}
+        used |= {c.segment for c in self.conditions if isinstance(c, Direction | Axis)}
+        return frozenset(used | ({"torso"} if any(isinstance(c, Direction) for c in self.conditions) else set()))
 
 
 def coefficients(closure: Closure) -> dict[str, np.ndarray]:
-    """Segment → (3, 8), by which the lengths make its part of the way that is closed, in its own frame."""
-    found = dict(REACHES[closure.points[0]])
+    """Segment → (3, 8), by which the lengths make its part of the closed chain, in its own frame."""
+    parts = dict(REACHES[closure.points[0]])
     for other in closure.points[1:]:
         for segment, part in REACHES[other].items():
-            found[segment] = found.get(segment, 0.0) - part
-    return {segment: part for segment, part in found.items() if np.any(part)}
+            parts[segment] = parts.get(segment, 0.0) - part
+    return {segment: part for segment, part in parts.items() if np.any(part)}
 
 
 def load_protocol(name: str | Path) -> Protocol:
@@ -164,7 +164,7 @@ def load_protocol(name: str | Path) -> Protocol:
 
 
 def _protocol(table: dict[str, Any], path: Path) -> Protocol:
-    known = ("name", "title", "needs", "taped", "tape", "step", "closure", "pose", "axis")
+    known = ("name", "title", "needs", "min_measured", "measured_example", "step", "closure", "pose", "axis")
     for key, value in table.items():
         if key not in known:
             raise BadOption(f"{path}: '{key}' is no key of a protocol; {one_of(known, key)}")
@@ -202,17 +202,17 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
         seconds = _number(entry, "seconds", place, 0.0, 3600.0)
         steps.append(Step(str(_get(entry, "phase", place)), seconds, str(_get(entry, "do", place))))
     name = str(table.get("name", path.stem))
-    tape = str(table.get("tape", Protocol.tape))
-    _among(tape.partition("=")[0], LENGTHS, f"{path}: tape")
+    measured_example = str(table.get("measured_example", Protocol.measured_example))
+    _among(measured_example.partition("=")[0], LENGTHS, f"{path}: measured_example")
     title = str(table.get("title", name))
-    taped = round(_number({"taped": 0, **table}, "taped", str(path), 0, len(LENGTHS)))
-    found = Protocol(name, title, needs, tuple(steps), tuple(conditions), taped, tape)
+    min_measured = round(_number({"min_measured": 0, **table}, "min_measured", str(path), 0, len(LENGTHS)))
+    protocol = Protocol(name, title, needs, tuple(steps), tuple(conditions), min_measured, measured_example)
     # A hand may go without a sensor, rigid with its forearm.
-    looked_at = {segment if segment in needs else segment.replace("hand", "forearm") for segment in found.segments}
-    if not looked_at <= set(needs):
-        lacking = ", ".join(sorted(looked_at - set(needs)))
-        raise BadOption(f"{path}: needs = {list(needs)} lacks {lacking}, whose orientation a condition looks at")
-    return found
+    used = {segment if segment in needs else segment.replace("hand", "forearm") for segment in protocol.segments}
+    if not used <= set(needs):
+        lacking = ", ".join(sorted(used - set(needs)))
+        raise BadOption(f"{path}: needs = {list(needs)} lacks {lacking}, whose orientation a condition uses")
+    return protocol
 
 
 def _closure(entry: dict[str, Any], place: str) -> Closure:
@@ -224,7 +224,7 @@ def _closure(entry: dict[str, Any], place: str) -> Closure:
     if "slip" in entry:
         more["slip"] = _number(entry, "slip", place, 1e-4, 0.1)
     if kind == "distance":
-        more["gauge"] = str(_get(entry, "gauge", place))
+        more["distance"] = str(_get(entry, "distance", place))
         more["metres"] = _number(entry, "metres", place, 0.02, 2.0)
         if "metres_std" in entry:
             more["metres_std"] = _number(entry, "metres_std", place, 1e-5, 0.1)
@@ -240,7 +240,7 @@ def _get(table: dict[str, Any], key: str, place: str) -> Any:
 def _list(table: dict[str, Any], key: str, place: str) -> list[Any]:
     value = _get(table, key, place)
     if not isinstance(value, list):
-        raise BadOption(f'{place}: {key} = {value!r}; a list of names is needed, as in {key} = ["left_hand"]')
+        raise BadOption(f'{place}: {key} = {value!r}; a list of names is needed, as in {key} = ["left_palm"]')
     return value
 
 

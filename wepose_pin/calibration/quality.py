@@ -1,7 +1,7 @@
-"""Whether a calibration is good enough, and what the motion did not determine.
+"""The quality of a calibration, and what the motion did not determine.
 
-Each check is one number against two stated limits: up to the first it passes, up to the second it is poor, beyond it
-fails; the quality is the worst of them. What is uncertain is explained by what was measured of the motion: the upper
+Each check is one number against two limits: up to the first it passes, up to the second it is poor, beyond it fails.
+The quality is the worst of them. The cause of an uncertainty is the part of the motion that was too small: the upper
 arms were hardly raised, the torso hardly leaned.
 """
 
@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
 from ..subject import LENGTHS
 from .anatomy import E_Z, SIDES
-from .lengths import Calibration
-from .observability import MOST_OPEN, intervals_of, longest_intervals
-from .weighing import CONTRADICTED, TOUCHED
+from .observability import MOST_OPEN, find_intervals, format_longest
+from .result import Calibration
+from .weights import CONTRADICTED, MIN_CONTACT
 
 Quality = Literal["pass", "poor", "fail"]
 QUALITIES: tuple[Quality, ...] = ("pass", "poor", "fail")
@@ -34,7 +34,7 @@ class Limits(NamedTuple):
     poor: float
 
     def quality(self, value: float) -> Quality:
-        """NaN is of what was not looked at, and passes."""
+        """Pass, poor or fail; NaN, a value that was not computed, passes."""
         sign = -1.0 if self.passes > self.poor else 1.0
         value, passes, poor = sign * value, sign * self.passes, sign * self.poor
         return "fail" if value > poor else "poor" if value > passes else "pass"
@@ -46,18 +46,18 @@ LENGTH = Limits(0.010, 0.020)  # [m] of an upper arm, of forearm + hand, of the 
 ARM_HEADING = Limits(np.deg2rad(3.0), np.deg2rad(6.0))  # [rad]
 TORSO_HEADING = Limits(np.deg2rad(5.0), np.deg2rad(7.0))  # [rad]; beyond, soft tissue makes it worse than stated
 HAND_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] short links, seen little
-LONE_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] by poses, or by one arm: no better is to be had
-SCALE = Limits(0.02, 0.08)  # relative; a tape has 1 %, the population prior 5 %
-# What the solution leaves over.
+LONE_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] by poses, or by one arm: the best that these reach
+SCALE = Limits(0.02, 0.08)  # relative; a measured length gives 1 %, the population prior 5 %
+# Residuals of the solution.
 GAP = Limits(0.030, 0.060)  # [m] rms while the palms touch
-APART = Limits(MOST_OPEN, 0.60)  # share of looks
+OPEN_SHARE = Limits(MOST_OPEN, 0.60)  # share of samples
 TILT = Limits(np.deg2rad(12.0), np.deg2rad(20.0))  # [rad] of a segment in the start pose; elbows hang 5 to 8 deg bent
 UNUSUAL = Limits(4.0, 6.0)  # standard deviations of a length from the population prior
-MEASURED = Limits(CONTRADICTED, 5.0)  # of a measured length from what the motion and the prior say of it
-SAMPLES = Limits(6.0, 2.0)  # effective sample size, at least: some six independent ones carry a calibration
+MEASURED = Limits(CONTRADICTED, 5.0)  # of a measured length from the estimate without it
+SAMPLES = Limits(6.0, 2.0)  # effective sample size, at least
 DOUBT = Limits(1.0, 1.0)  # of anatomy, see `anatomy`
 
-# What moved less than this [rad] is said to be the cause of what is uncertain.
+# A motion smaller than this [rad] is the cause of an uncertainty.
 ENOUGH = {
     "motion-elevation-small": np.deg2rad(40.0),
     "motion-sideways-small": np.deg2rad(35.0),
@@ -66,8 +66,8 @@ ENOUGH = {
     "motion-twist-small": np.deg2rad(12.0),
 }
 ENOUGH_SAMPLES = 12.0  # effective sample size
-# A direction counts as determined by the motion where that tells more than was known before.
-SEEN = 1e-2  # information, in units of what was known before, below which a direction was not seen at all
+# A direction is determined by the motion where that gives more information than the prior.
+MIN_INFORMATION = 1e-2  # of a direction, in units of the prior's, below which the motion does not show it
 
 
 class Check(NamedTuple):
@@ -76,16 +76,16 @@ class Check(NamedTuple):
     diagnostic: Diagnostic  # what is checked: its value, and as limit that up to which it passes
     quality: Quality
     limits: Limits
-    cause: Diagnostic | None = None  # what moved too little for it
+    cause: Diagnostic | None = None  # the motion that was too small
 
     @property
     def value(self) -> float:
-        assert self.diagnostic.value is not None
-        return self.diagnostic.value
+        """Of the diagnostic; NaN where it has none."""
+        return float("nan") if self.diagnostic.value is None else self.diagnostic.value
 
     @property
     def excess(self) -> float:
-        """How many times the limit up to which it passes it is, or that limit is the value where it is a least one."""
+        """The ratio of value and limit, above 1 where it does not pass."""
         passes, poor = self.limits
         value, limit = (passes, self.value) if passes > poor else (self.value, passes)
         return value / max(limit, 1e-9)
@@ -103,7 +103,7 @@ class Range(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What moved while the chain was closed, as solved; keys are sides."""
+    """How far the body moved while the chain was closed; keys are sides."""
 
     elevation: dict[str, Range]  # of the upper arm in the torso, 0 hanging, 90 level
     sideways: dict[str, Range]  # azimuth of the hand from its shoulder in the torso, positive left
@@ -113,25 +113,25 @@ class Motion(NamedTuple):
 
 
 class Direction(NamedTuple):
-    """A combination of lengths and mounts, and how much the motion told of it."""
+    """A combination of lengths and mounts, and how much information the motion gives on it."""
 
-    information: float  # in units of what was known before: 0 nothing, 1 as much again
+    information: float  # in units of the prior's: 0 none, 1 as much again
     of: dict[str, float]  # its largest parts, each in units of its standard deviation before
 
 
 @dataclass(frozen=True)
 class CalibrationQuality:
-    """What a calibration is worth.
+    """The quality of a calibration, and how the motion determined it.
 
     Parameters
     ----------
     quality : the worst of all checks
-    checks : in the order of the results; those that pass as well
-    reasons : what keeps it from passing, the worst first, each followed by its cause
+    checks : all of them, in the order of the results
+    reasons : why it does not pass, the worst first, each followed by its cause
     further : what else the user should know
-    motion : what moved
-    directions : of lengths and mounts jointly, best seen first
-    rank, determined, unknowns : directions seen at all, told better than before, and all
+    motion : how far the body moved
+    directions : of lengths and mounts jointly, best determined first
+    rank, determined, unknowns : directions that the motion shows, determines better than the prior, and all
     condition : largest over smallest standard deviation after the motion, each in units of that before
     """
 
@@ -153,13 +153,13 @@ class CalibrationQuality:
 
 
 def assess(calibration: Calibration) -> CalibrationQuality:
-    """The quality of a calibration, with what was and was not seen."""
-    motion = _motion(calibration)
-    checks = _labels(calibration)
-    if not calibration.labels.moved:  # of another arrangement of sensors nothing else means anything
-        checks += [*_deviations(calibration, motion), *_left_over(calibration)]
+    """The quality of a calibration."""
+    motion = _measure_motion(calibration)
+    checks = _check_sensors(calibration)
+    if not calibration.labels.moved:  # with exchanged sensors all other checks are meaningless
+        checks += [*_check_deviations(calibration, motion), *_check_residuals(calibration)]
     reasons = _reasons(checks)
-    directions = _directions(calibration)
+    directions = _find_directions(calibration)
     after = np.array([1.0 / (1.0 + d.information) for d in directions])
     return CalibrationQuality(
         quality=max((check.quality for check in checks), key=QUALITIES.index),
@@ -168,7 +168,7 @@ def assess(calibration: Calibration) -> CalibrationQuality:
         further=tuple(each for each in calibration.diagnostics if each.code not in {of.code for of in reasons}),
         motion=motion,
         directions=directions,
-        rank=sum(d.information > SEEN for d in directions),
+        rank=sum(d.information > MIN_INFORMATION for d in directions),
         determined=sum(d.information > 1.0 for d in directions),
         unknowns=len(directions),
         condition=float(np.sqrt(after.max() / after.min())) if len(after) else float("nan"),
@@ -176,14 +176,14 @@ def assess(calibration: Calibration) -> CalibrationQuality:
 
 
 def _reasons(checks: list[Check]) -> tuple[Diagnostic, ...]:
-    """What does not pass, the worst first; a cause once, behind the first that it explains."""
-    found: list[Diagnostic] = []
+    """Diagnostics that do not pass, the worst first; a cause once, behind the first that it explains."""
+    reasons: list[Diagnostic] = []
     failing = [check for check in checks if check.quality != "pass"]
     for check in sorted(failing, key=lambda check: (check.quality != "fail", -check.excess)):
-        found.append(check.diagnostic)
-        if check.cause is not None and check.cause.code not in {each.code for each in found}:
-            found.append(check.cause)
-    return tuple(found)
+        reasons.append(check.diagnostic)
+        if check.cause is not None and check.cause.code not in {each.code for each in reasons}:
+            reasons.append(check.cause)
+    return tuple(reasons)
 
 
 def _check(
@@ -197,53 +197,54 @@ def _check(
     return Check(diagnostic, quality, limits, None if cause is None else replace(cause, severity=severity))
 
 
-def _labels(calibration: Calibration) -> list[Check]:
-    """Sensors that sit elsewhere than labelled, and mounts that cannot be."""
+def _check_sensors(calibration: Calibration) -> list[Check]:
+    """Checks of labels and mounts."""
     labels = calibration.labels
-    found = [_check(labels.diagnostic(), DOUBT, labels.contradiction)]
-    for mount in calibration.contradicted:
-        found.append(_check(mount, Limits(float(mount.limit or 0.0), np.pi), quality="poor"))
-    return found
+    checks = [_check(labels.diagnostic(), DOUBT, labels.contradiction)]
+    for mount in calibration.unused_mounts:
+        checks.append(_check(mount, Limits(float(mount.limit or 0.0), np.pi), quality="poor"))
+    return checks
 
 
-def _deviations(calibration: Calibration, motion: Motion) -> list[Check]:
+def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
+    """Checks of the standard deviations."""
     subject, closure = calibration.subject, calibration.closure
     names = [name for name in LENGTHS if name != "trunk"]
     lengths = np.array([subject.lengths[name] for name in names])
     covariance = subject.lengths_covariance(names)
-    # Errors of the scale change all lengths together; they are judged by themselves.
+    # Errors of the scale change all lengths together; they have their own check.
     common = 1.0 / float(lengths @ np.linalg.solve(covariance, lengths))
     shape = covariance - common * np.outer(lengths, lengths)
 
-    def std(*of: str) -> float:
-        take = np.array([float(name in of) for name in names])
+    def std(*parts: str) -> float:
+        take = np.array([float(name in parts) for name in names])
         return float(np.sqrt(max(take @ shape @ take, 0.0)))
 
     sides = [side for side in SIDES if f"{side}_upper_arm" in subject.mounts]
-    found = []
+    checks = []
     if closure:  # without a closure lengths are the prior's
         upper_arms = {s: std(f"{s}_upper_arm") for s in sides}
         forearms = {s: std(f"{s}_forearm", f"{s}_hand") for s in sides}
         if sides:
             side = max(sides, key=lambda s: upper_arms[s])
             uncertain = Diagnostic("upper-arm-length-uncertain", INFO, f"{side}_upper_arm", upper_arms[side])
-            cause = _cause(calibration, motion, ("sideways", "elevation", "elbow"), [side])
-            found.append(_check(uncertain, LENGTH, cause))
+            cause = _find_cause(calibration, motion, ("sideways", "elevation", "elbow"), [side])
+            checks.append(_check(uncertain, LENGTH, cause))
             side = max(sides, key=lambda s: forearms[s])
             uncertain = Diagnostic("forearm-length-uncertain", INFO, f"{side}_forearm", forearms[side])
-            cause = _cause(calibration, motion, ("sideways", "elbow", "elevation"), [side])
-            found.append(_check(uncertain, LENGTH, cause))
+            cause = _find_cause(calibration, motion, ("sideways", "elbow", "elevation"), [side])
+            checks.append(_check(uncertain, LENGTH, cause))
         uncertain = Diagnostic(
             "shoulder-width-uncertain", INFO, "shoulder_width", std("shoulder_width"), facts={"variant": closure}
         )
         one_arm = closure == "fixed_point"
-        cause = None if one_arm else _cause(calibration, motion, ("sideways", "elevation"), sides)
-        found.append(_check(uncertain, LENGTH, cause))
+        cause = None if one_arm else _find_cause(calibration, motion, ("sideways", "elevation"), sides)
+        checks.append(_check(uncertain, LENGTH, cause))
     for segment in (s for s in subject.mounts if f"mounts.{s}.z" in subject.order):
         torso = segment == "torso"
         causes = ("lean", "twist", "sideways") if torso else ("sideways", "elevation", "elbow")
         own = [s for s in SIDES if segment.startswith(s)]
-        cause = _cause(calibration, motion, causes, own or sides)
+        cause = _find_cause(calibration, motion, causes, own or sides)
         limits = TORSO_HEADING if torso else HAND_HEADING if segment.endswith("hand") else ARM_HEADING
         if len(calibration.hinge_rms) < 2:
             limits = LONE_HEADING
@@ -254,19 +255,21 @@ def _deviations(calibration: Calibration, motion: Motion) -> list[Check]:
             subject.std(f"mounts.{segment}.z"),
             facts={"variant": closure or "poses"},
         )
-        found.append(_check(uncertain, limits, cause))
+        checks.append(_check(uncertain, limits, cause))
     prior = calibration.prior
-    facts: dict[str, float | str] = {"measured": calibration.tape}
-    if calibration.scaling:
+    facts: dict[str, float | str] = {"measured": calibration.measured_example}
+    if calibration.scale_lengths:
         scale = Diagnostic("scale-uncertain", INFO, value=calibration.scale_std, facts=facts)
     else:
         facts |= {"prior": prior.note or prior.name, "protocol": calibration.protocol}
         scale = Diagnostic("scale-from-prior", INFO, value=calibration.scale_std, facts=facts)
-    return [*found, _check(scale, SCALE)]
+    return [*checks, _check(scale, SCALE)]
 
 
-def _cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...], sides: list[str]) -> Diagnostic | None:
-    """Why something is uncertain: what moved least of what it needs, or that the motion was short."""
+def _find_cause(
+    calibration: Calibration, motion: Motion, causes: tuple[str, ...], sides: list[str]
+) -> Diagnostic | None:
+    """The cause of an uncertainty: the smallest of the motions that it needs, or too short a motion."""
     if not calibration.closure:
         return None
 
@@ -285,40 +288,43 @@ def _cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...], si
     least = min(codes, key=lambda code: codes[code] / ENOUGH[code], default="")
     if least and codes[least] < ENOUGH[least]:
         return Diagnostic(least, WARNING, "", float(codes[least]), float(ENOUGH[least]), facts)
-    if calibration.independent < ENOUGH_SAMPLES:
-        return Diagnostic("motion-too-short", WARNING, "", calibration.independent, ENOUGH_SAMPLES, facts)
+    if calibration.effective_sample_size < ENOUGH_SAMPLES:
+        return Diagnostic("motion-too-short", WARNING, "", calibration.effective_sample_size, ENOUGH_SAMPLES, facts)
     return None
 
 
-def _left_over(calibration: Calibration) -> list[Check]:
+def _check_residuals(calibration: Calibration) -> list[Check]:
+    """Checks of residuals, and of estimates against the prior."""
     closed, facts = np.isfinite(calibration.gap), {"variant": calibration.closure}
-    found = []
+    checks = []
     if calibration.closure:
-        share = float(np.mean(calibration.kept[closed] < TOUCHED))
-        intervals = {"intervals": longest_intervals(apart(calibration))}
-        found += [
+        share = float(np.mean(calibration.contact[closed] < MIN_CONTACT))
+        intervals = {"intervals": format_longest(find_open_intervals(calibration))}
+        checks += [
             _check(Diagnostic("closure-gap-large", INFO, value=calibration.rms_gap, facts=facts), GAP),
-            _check(Diagnostic("motion-too-short", INFO, value=calibration.independent, facts=facts), SAMPLES),
-            _check(Diagnostic("closure-open", INFO, value=share, facts=facts | intervals), APART),
+            _check(Diagnostic("motion-too-short", INFO, value=calibration.effective_sample_size, facts=facts), SAMPLES),
+            _check(Diagnostic("closure-open", INFO, value=share, facts=facts | intervals), OPEN_SHARE),
         ]
-    tilts = {name: float(np.linalg.norm(tilt)) for name, tilt in calibration.start_tilt.items()}
+    tilts = {name: float(np.linalg.norm(tilt)) for name, tilt in calibration.start_pose_offset.items()}
     if tilts:
         name = max(tilts, key=lambda n: tilts[n])
-        found.append(_check(Diagnostic("start-pose-off", INFO, name, tilts[name]), TILT))
-    for name, tape in calibration.tapes.items():
-        lengths: dict[str, float | str] = {"measured": tape.metres, "expected": tape.expected, "std": tape.std}
-        found.append(_check(Diagnostic("measured-length-contradicted", INFO, name, tape.off, facts=lengths), MEASURED))
-    if any(tape.off > MEASURED.passes for tape in calibration.tapes.values()):
-        return found  # all lengths have followed a measured one that is wrong
+        checks.append(_check(Diagnostic("start-pose-off", INFO, name, tilts[name]), TILT))
+    for name, length in calibration.measured_lengths.items():
+        lengths: dict[str, float | str] = {"measured": length.metres, "expected": length.expected, "std": length.std}
+        checks.append(
+            _check(Diagnostic("measured-length-contradicted", INFO, name, length.deviation, facts=lengths), MEASURED)
+        )
+    if any(length.deviation > MEASURED.passes for length in calibration.measured_lengths.values()):
+        return checks  # all lengths have followed a wrong measured one
     prior, subject = calibration.prior, calibration.subject
-    z = {n: abs(subject.lengths[n] - prior.lengths[n]) / prior.std(n) for n in LENGTHS if n not in calibration.gauge}
+    z = {n: abs(subject.lengths[n] - prior.lengths[n]) / prior.std(n) for n in LENGTHS if n not in calibration.measured}
     name = max(z, key=lambda n: z[n])
     metres = {"metres": float(subject.lengths[name])}
-    return [*found, _check(Diagnostic("length-unusual", INFO, name, z[name], facts=metres), UNUSUAL)]
+    return [*checks, _check(Diagnostic("length-unusual", INFO, name, z[name], facts=metres), UNUSUAL)]
 
 
-def _motion(calibration: Calibration) -> Motion:
-    closed = np.isfinite(calibration.gap) & (calibration.kept > TOUCHED)
+def _measure_motion(calibration: Calibration) -> Motion:
+    closed = np.isfinite(calibration.gap) & (calibration.contact > MIN_CONTACT)
     rows = closed if closed.any() else np.ones(len(calibration.time), dtype=bool)
     R = {name: Rotation.from_quat(quat[rows]) for name, quat in calibration.quat_WL.items()}
     length = calibration.subject.lengths
@@ -350,30 +356,30 @@ def _range(values: np.ndarray) -> Range:
     return Range(*(float(v) for v in np.percentile(values, (2, 98))))
 
 
-def _directions(calibration: Calibration) -> tuple[Direction, ...]:
-    """What the motion told, in units of what was known before: eigenvectors of one covariance in the other."""
+def _find_directions(calibration: Calibration) -> tuple[Direction, ...]:
+    """The information of the motion in units of the prior's: eigenvectors of one covariance in the other."""
     names = calibration.subject.order
-    if calibration.before.shape != calibration.subject.covariance.shape:
+    if calibration.prior_covariance.shape != calibration.subject.covariance.shape:
         return ()
-    scale = np.sqrt(np.diag(calibration.before))
-    before = calibration.before / np.outer(scale, scale)
+    scale = np.sqrt(np.diag(calibration.prior_covariance))
+    before = calibration.prior_covariance / np.outer(scale, scale)
     after = calibration.subject.covariance / np.outer(scale, scale)
     shares, vectors = eigh(after, before)
-    found = []
+    directions = []
     for share, vector in zip(shares, vectors.T, strict=True):
         way = before @ vector  # along which x moves, where vector weighs it
         way = way / np.linalg.norm(way) * np.sign(way[np.argmax(np.abs(way))])
         largest = [k for k in np.argsort(-np.abs(way))[:4] if abs(way[k]) > 0.2]
         of = {names[k]: round(float(way[k]), 2) for k in largest}
-        found.append(Direction(max(1.0 / float(share) - 1.0, 0.0), of))
-    return tuple(found)
+        directions.append(Direction(max(1.0 / float(share) - 1.0, 0.0), of))
+    return tuple(directions)
 
 
 MOST_POINTS = 600  # of the residual over time
 
 
 def document(calibration: Calibration, quality: CalibrationQuality) -> dict[str, Any]:
-    """What ``calibration.json`` holds; lengths [m], times [s], angles as named, checks and diagnostics SI."""
+    """The content of ``calibration.json``; lengths [m], times [s], angles as named, checks and diagnostics SI."""
     subject = calibration.subject
     stride = -(-len(calibration.time) // MOST_POINTS)
     some = slice(None, None, stride)
@@ -392,7 +398,7 @@ def document(calibration: Calibration, quality: CalibrationQuality) -> dict[str,
             for check in quality.checks
         ],
         "protocol": calibration.protocol,
-        "gauge": dict(calibration.gauge),
+        "measured": dict(calibration.measured),
         "scale_std": calibration.scale_std,
         "lengths": {n: {"value": v, "std": _number(subject.std(n))} for n, v in subject.lengths.items()},
         "mounts": {
@@ -402,21 +408,21 @@ def document(calibration: Calibration, quality: CalibrationQuality) -> dict[str,
             }
             for segment, quat in subject.mounts.items()
         },
-        "start_tilt_deg": {name: np.degrees(tilt) for name, tilt in calibration.start_tilt.items()},
-        "heading_drift_deg_min": {name: 60.0 * np.degrees(rate) for name, rate in calibration.drift.items()},
-        "hinge": {
-            side: {"axis": axis, "rms_deg": _number(np.degrees(calibration.hinge_rms[side]))}
-            for side, axis in calibration.hinge.items()
+        "start_pose_offset_deg": {name: np.degrees(tilt) for name, tilt in calibration.start_pose_offset.items()},
+        "heading_drift_deg_min": {name: 60.0 * np.degrees(rate) for name, rate in calibration.heading_drift.items()},
+        "hinges": {
+            joint: {"axis": axis, "rms_deg": _number(np.degrees(calibration.hinge_rms[joint]))}
+            for joint, axis in calibration.hinge_axes.items()
         },
         "gap_rms": {"after": _number(calibration.rms_gap), "before": _number(calibration.prior_rms_gap)},
         "gap": {
             "time": calibration.time[some].round(3),
             "after": [_number(v) for v in calibration.gap[some]],
             "before": [_number(v) for v in calibration.prior_gap[some]],
-            "kept": calibration.kept[some].round(3),
+            "contact": calibration.contact[some].round(3),
         },
-        "apart": apart(calibration),
-        "independent_looks": calibration.independent,
+        "open_intervals": find_open_intervals(calibration),
+        "effective_sample_size": calibration.effective_sample_size,
         "conditioning": {
             "unknowns": quality.unknowns,
             "rank": quality.rank,
@@ -429,10 +435,10 @@ def document(calibration: Calibration, quality: CalibrationQuality) -> dict[str,
     }
 
 
-def apart(calibration: Calibration) -> list[tuple[float, float]]:
-    """From when to when [s] the palms were apart."""
-    gone = np.isfinite(calibration.gap) & (calibration.kept < TOUCHED)
-    return [(round(a, 3), round(b, 3)) for a, b in intervals_of(calibration.time, gone)]
+def find_open_intervals(calibration: Calibration) -> list[tuple[float, float]]:
+    """Intervals [s] in which the palms were apart."""
+    mask = np.isfinite(calibration.gap) & (calibration.contact < MIN_CONTACT)
+    return [(round(a, 3), round(b, 3)) for a, b in find_intervals(calibration.time, mask)]
 
 
 def _number(value: float) -> float | None:

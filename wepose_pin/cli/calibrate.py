@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
 COLOURS = {"pass": "green", "poor": "yellow", "fail": "red"}
-GAPS = {"coincide": "Palm-to-palm gap", "distance": "Palms off their distance"}
+GAPS = {"coincide": "Palm-to-palm gap", "distance": "Error of the distance between the palms"}
 
 
 def run(job: CalibrateJob) -> int:
-    """Calibrate; say lengths, mounts, the gap between the palms and the quality."""
+    """Calibrate; print lengths, mounts, the gap between the palms and the quality."""
     with progress_bar() as progress:
         outcome = run_calibrate(job, progress)
     calibration, quality, protocol = outcome.calibration, outcome.quality, outcome.protocol
@@ -30,7 +30,7 @@ def run(job: CalibrateJob) -> int:
         gap = GAPS.get(calibration.closure, "Gap from palm to its point")
         prior_mm = f"{1e3 * calibration.prior_rms_gap:.1f} mm with the lengths of the population prior"
         say(f"{gap}: {1e3 * calibration.rms_gap:.1f} mm rms, {prior_mm}")
-        say(f"Effective sample size of the motion: {calibration.independent:.0f}")
+        say(f"Effective sample size of the motion: {calibration.effective_sample_size:.0f}")
     if job.report:
         say_pages(job.out, {"Report to look at": "report.html"})
     say(f"Subject: {job.out / 'subject.toml'}  {job.out / 'subject.urdf'}  {job.out / 'calibration.json'}")
@@ -45,10 +45,10 @@ def _print_mounts(calibration: Calibration) -> None:
     from ..subject import mount_rows
 
     rows: list[tuple[str, ...]] = []
-    for segment, tilt in calibration.start_tilt.items():
+    for segment, tilt in calibration.start_pose_offset.items():
         x, y, z = (np.degrees(calibration.subject.std(row)) for row in mount_rows(segment))
         up, forward = axes_from_mount(calibration.subject.mounts[segment])
-        off_start, drift = np.degrees(np.linalg.norm(tilt)), 60.0 * np.degrees(calibration.drift[segment])
+        off_start, drift = np.degrees(np.linalg.norm(tilt)), 60.0 * np.degrees(calibration.heading_drift[segment])
         cells = f"± {z:.1f}", f"± {np.hypot(x, y) / 2**0.5:.1f}", f"{off_start:.1f}", f"{drift:+.1f}"
         rows.append((segment, f"{up} up, {forward} ahead", *cells))
     header = ("sensor", "nearest axes", "heading", "tilt", "off the start pose", "heading drift [1/min]")

@@ -9,25 +9,25 @@ from .tables import mean_std, print_lengths
 
 
 def run(job: DemoJob) -> int:
-    """Run the whole chain; say the lengths and each method's errors beside the truth."""
+    """Run the whole chain; print the lengths and each method's errors beside the truth."""
     with progress_bar() as progress:
         outcome = run_demo(job, progress)
     person = outcome.person
-    print_lengths("Lengths from the joined hands", outcome.best.subject, person.average, person.taped, person.lengths)
+    print_lengths("Lengths from the joined hands", outcome.best.subject, person.prior, person.measured, person.lengths)
     print_table(
         "Right hand while drawing six circles: distance to the truth [mm], mean ± std",
         ("filter", "from the shoulders", "from the root"),
         [
             (
                 method,
-                mean_std(error.position_from_shoulders["right_hand"]),
-                mean_std(error.position["right_hand"]),
+                mean_std(error.position_from_shoulders["right_palm"]),
+                mean_std(error.position["right_palm"]),
             )
             for method, error in outcome.errors.items()
         ],
     )
     say("One person, one motion: the order of the filters changes with both, see --seed. Each filter tracks with the")
-    say("lengths that it calibrated. From the root the trunk counts too, whose length joined hands do not show.")
+    say("lengths that it calibrated. Errors from the root include the trunk, whose length joined hands do not show.")
     print_diagnostics(outcome.page_failures)
     out = job.out
     say_pages(out / "result", {"Motion to look at": "view.html"})

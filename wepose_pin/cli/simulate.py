@@ -8,10 +8,10 @@ from .parser import Command
 
 
 def run(job: SimulateJob) -> int:
-    """Simulate; say what would have been measured of the person."""
+    """Simulate; print the files, and the lengths that a user would measure."""
     with progress_bar() as progress:
         person = run_simulate(job, progress).person
-    measured = " ".join(f"{name}={value:.4f}" for name, value in person.taped.items())
+    measured = " ".join(f"{name}={value:.4f}" for name, value in person.measured.items())
     about = f"measured: {measured}, stature {person.stature:.2f} m, sex {person.sex}"
     say(f"Session: {job.out / 'session.toml'}  ({about})")
     say(f"Truth: {job.out / 'truth.parquet'}  {job.out / 'subject.toml'}")

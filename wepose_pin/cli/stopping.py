@@ -44,18 +44,18 @@ def whats_written() -> str:
 @contextlib.contextmanager
 def stop_requests() -> Iterator[Callable[[], bool]]:
     """Whether a signal asked to stop. It interrupts nothing, unless nobody has looked yet or it comes twice."""
-    asked: list[int] = []
+    requests: list[int] = []
     looked = False
 
     def ask(number: int, frame: Any) -> None:
-        if asked or not looked:
+        if requests or not looked:
             _stop(number, frame)
-        asked.append(number)
+        requests.append(number)
 
     def is_asked() -> bool:
         nonlocal looked
         looked = True
-        return bool(asked or _stopped)
+        return bool(requests or _stopped)
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

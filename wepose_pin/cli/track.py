@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def run(job: TrackJob) -> int:
-    """Track, and say what was found of the sensors."""
+    """Track; print the sensors' static share, bias and gravity, and the files."""
     with progress_bar() as progress:
         outcome = run_track(job, progress)
     print_diagnostics(from_json(each) for each in outcome.summary["diagnostics"])
@@ -58,14 +58,14 @@ def _print_chain(job: TrackJob, chain: TrackedChain, summary: Mapping[str, Any])
     print_table(
         f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {chain.method}, on "
         f"{chain.model.name}",
-        ("link", "off the joints, rms [deg]"),
+        ("link", "orientation residual, rms [deg]"),
         [(link, f"{angle:.2f}") for link, angle in summary["orientation_residual_rms_deg"].items()],
     )
     print_table(
         "Joints [rad or m]",
-        ("joint", "least", "greatest", ""),
+        ("joint", "minimum", "maximum", ""),
         [
-            (name, f"{value.min():.3f}", f"{value.max():.3f}", "left open" if name in chain.open else "")
+            (name, f"{value.min():.3f}", f"{value.max():.3f}", "undetermined" if name in chain.open else "")
             for name, value in chain.joints.items()
         ],
     )

@@ -24,7 +24,7 @@ from .ncf import Ncf, NcfParams
 from .noise import SensorNoise, noise_of
 from .smekf import Smekf, SmekfParams, starting_params
 from .smoother import Smoother
-from .start import MOVING_TILT_STD, StartTilt, start_tilt
+from .start import MOVING_TILT_STD, StartTilt, estimate_start_tilt
 from .static import StaticDetector, StaticTest
 
 __all__ = [
@@ -231,7 +231,7 @@ class SensorRun:
         """Make the filter, and filter the samples before the start phase; returns the filter's first sample."""
         phase = self._start or slice(0, self.test.samples(self._rate_hz))
         first = phase.start
-        start = start_tilt(gyro_S[phase], accel_S[phase], self._noise, self._rate_hz)
+        start = estimate_start_tilt(gyro_S[phase], accel_S[phase], self._noise, self._rate_hz)
         if self._start is None:  # it may move there
             static = StaticDetector(self._noise, self._rate_hz, self.test).run(gyro_S[phase], accel_S[phase])
             if not static[-1]:

@@ -25,7 +25,7 @@ class FilteredRecording(NamedTuple):
     at_start: dict[str, Rotation]  # their mean in the start pose
     orientation: dict[str, Orientation]  # what the filter gave; none for measured orientations
     start: tuple[float, float]  # [s]
-    still: tuple[float, float]  # [s]
+    static_phase: tuple[float, float]  # [s]
     diagnostics: list[Diagnostic]  # of the recording, and of its start pose
 
 
@@ -39,7 +39,7 @@ class SensorFilters:
 
     Attributes
     ----------
-    start, still, diagnostics : as in `FilteredRecording`
+    start, static_phase, diagnostics : as in `FilteredRecording`
     ahead : the smoother's: `push` gives the chunk before, and the last one comes from `finish`
 
     Raises
@@ -50,25 +50,25 @@ class SensorFilters:
 
     def __init__(self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> None:
         check_method(method)
-        self.start, self.still, self.diagnostics = reference_phases(first)
+        self.start, self.static_phase, self.diagnostics = reference_phases(first)
         self._held: Recording | None = None  # the chunk that the smoother has not given yet
         self._runs: dict[str, SensorRun] = {}
         noises: dict[str, SensorNoise] = {}
         for segment, sensor in first.sensors.items():
             if not sensor.aligned:
                 self.diagnostics += check_motion(first, segment, self.start, "start")
-            if self.still != self.start and not sensor.aligned:
-                self.diagnostics += check_motion(first, segment, self.still, "static")
+            if self.static_phase != self.start and not sensor.aligned:
+                self.diagnostics += check_motion(first, segment, self.static_phase, "static")
             if isinstance(sensor, OrientationSensor):
                 continue
-            at_rest = first.measured(segment, self.still)
+            at_rest = first.measured(segment, self.static_phase)
             try:
-                worn = self.still == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
+                worn = self.static_phase == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
                 noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
             except WeposeError as error:
                 raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
             noises[segment] = noise
-        self.diagnostics += check_common_rotation(first, noises, self.still)
+        self.diagnostics += check_common_rotation(first, noises, self.static_phase)
         for segment, noise in noises.items():
             self._runs[segment] = SensorRun(
                 first.rate_hz,
@@ -128,7 +128,9 @@ def filtered_chunk(
     """A chunk that `filters` gave, if the start pose is in it."""
     R_VS = sensor_rotations(chunk, orientation)
     at_start = {segment: R[chunk.measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
-    return FilteredRecording(R_VS, at_start, dict(orientation), filters.start, filters.still, filters.diagnostics)
+    return FilteredRecording(
+        R_VS, at_start, dict(orientation), filters.start, filters.static_phase, filters.diagnostics
+    )
 
 
 def sensor_rotations(chunk: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:

@@ -22,7 +22,7 @@ class StartTilt(NamedTuple):
     tilt_std: float  # [rad] one standard deviation of roll and of pitch
 
 
-def start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise, rate_hz: float) -> StartTilt:
+def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise, rate_hz: float) -> StartTilt:
     """Tilt before the first of some samples at rest, from their mean specific force.
 
     The gyroscope turns each sample's force into the sensor frame of the first, so that sway does not blur the mean.

@@ -33,9 +33,9 @@ class CalibrateJob:
     out : DIR
         Write subject.toml, subject.urdf, calibration.json (the quality and all figures) and report.html to this folder.
     protocol : NAME|FILE.toml
-        Calibrate by this protocol: clasp (hands together), clasp_taped (the same, with a length that must be measured),
-        handle (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), poses (T-pose
-        and bow: headings only), or a file of your own made like those in calibration/.
+        Calibrate by this protocol: clasp (hands together), clasp_measured (the same with a measured
+        length), handle (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), poses
+        (T-pose and bow: headings only), or a file of your own made like those in calibration/.
     measured : NAME=METRES
         Take this length as measured, such as shoulder_width=0.385; may be given several times. With the protocol
         handle also handle=0.42, the bar between the palms.
@@ -69,7 +69,7 @@ class CalibrateJob:
         from ..calibration import load_protocol
         from ..subject import LENGTHS
 
-        known = (*LENGTHS, *load_protocol(self.protocol).gauges)
+        known = (*LENGTHS, *load_protocol(self.protocol).distances)
         for name, metres in self.measured.items():
             stated = f"{name}={metres:g}"
             if name == "handle" and name not in known:
@@ -107,7 +107,7 @@ def run_calibrate(
     from ..model import load_model
     from ..readers import load_session
     from ..report import write_calibration_page
-    from ..subject import average_subject
+    from ..subject import population_subject
     from ..writers.calibration import write_calibration
     from ..writers.provenance import collect_provenance
     from ..writers.result import write_subject
@@ -116,11 +116,11 @@ def run_calibrate(
     protocol = load_protocol(job.protocol)
     with whole_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
-        prior = average_subject(job.stature, job.sex)
+        prior = population_subject(job.stature, job.sex)
         recording = load_session(job.session, gaps=job.gaps)
         progress("calibrating", 1 / 3)
         calibration = calibrate_lengths(
-            recording, gauge=dict(job.measured), prior=prior, protocol=protocol, method=job.method
+            recording, measured=dict(job.measured), prior=prior, protocol=protocol, method=job.method
         )
         quality = assess(calibration)
         write_subject(folder, calibration.subject, load_model(lengths=calibration.subject.lengths))

@@ -91,18 +91,18 @@ def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
         for k, method in enumerate(METHODS):
             progress(f"calibrating by {method}", (1 + 2 * k) / steps)
             calibrations[method] = calibrate_lengths(
-                recording, gauge=person.taped, prior=person.average, method=method, gauge_std=person.taped_std
+                recording, measured=person.measured, prior=person.prior, method=method, measured_std=person.measured_std
             )
             progress(f"tracking by {method}", (2 + 2 * k) / steps)
             tracked = track(recording, calibrations[method].subject, method=method)
             errors[method] = evaluate(tracked.pose, truth, circles)
             if method == BEST:
-                shown = tracked
+                playback = tracked
         best = calibrations[BEST]
-        write_subject(folder / "subject", best.subject, shown.model)
-        write_result(folder / "result", shown, phases=recording.phases)
+        write_subject(folder / "subject", best.subject, playback.model)
+        write_result(folder / "result", playback, phases=recording.phases)
         progress("making the page", (steps - 1) / steps)
-        failures = write_track_pages(folder / "result", shown, report=False)
+        failures = write_track_pages(folder / "result", playback, report=False)
         lengths = {
             name: {"true": value, "estimated": best.subject.lengths[name], "std": best.subject.std(name)}
             for name, value in person.lengths.items()

@@ -72,17 +72,17 @@ class SimulateJob:
         sizes = REALISTIC if self.preset == "mild" else PERFECT_WORLD
         names = [each.name for each in fields(sizes)]
         for name, value in self.imperfection.items():
-            given = f"--imperfection {name}={value}"
+            option = f"--imperfection {name}={value}"
             if name not in names:
-                raise BadOption(f"{given}: '{name}' is not an imperfection; {one_of(names, name, len(names))}")
+                raise BadOption(f"{option}: '{name}' is not an imperfection; {one_of(names, name, len(names))}")
             if name != "mount" and not isinstance(value, int | float):
-                raise BadOption(f"{given}: '{value}' is not a number, as in {name}=0")
+                raise BadOption(f"{option}: '{value}' is not a number, as in {name}=0")
             if name == "bits" and not float(value).is_integer():
-                raise BadOption(f"{given}: '{value}' is not a whole number, as in {name}=0")
+                raise BadOption(f"{option}: '{value}' is not a whole number, as in {name}=0")
             try:
                 sizes = replace(sizes, **dict[str, Any]({name: int(value) if name == "bits" else value}))
             except BadOption as error:
-                raise BadOption(f"{given}: {error}") from None
+                raise BadOption(f"{option}: {error}") from None
         return sizes
 
 
@@ -125,7 +125,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
         write_session(folder, simulation.recording(f"simulated-{job.seed}"), simulation.truth())
         order = (*LENGTHS, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
         true = replace(
-            person.average,
+            person.prior,
             name="truth",
             lengths=person.lengths,
             mounts=simulation.quat_LS,

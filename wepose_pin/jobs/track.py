@@ -128,7 +128,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
     from ..readers import is_live_log, load_session, read_live_log
     from ..recording import CONFIGURATION
     from ..report import write_track_pages
-    from ..subject import load_subject, subject_of
+    from ..subject import load_subject, parse_subject
     from ..tracking import track
     from ..writers import write_result
 
@@ -141,7 +141,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
             recording, causal = log.recording, causal or (job.method is None and subject is None)
             method = job.method or log.header["method"]
             if subject is None and log.header["subject"]:
-                subject = subject_of(log.header["subject"], job.session)
+                subject = parse_subject(log.header["subject"], job.session)
         else:
             recording = load_session(job.session, gaps=job.gaps)
         if job.model is not None and recording.start_pose == CONFIGURATION:
@@ -194,8 +194,10 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
     failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 1.0)
-        found = [from_json(each) for each in summary["diagnostics"]]
-        failures = write_decimated_pages(job.out, decimator, reader.phases, found, report=job.report, fps=view_rate_hz)
+        diagnostics = [from_json(each) for each in summary["diagnostics"]]
+        failures = write_decimated_pages(
+            job.out, decimator, reader.phases, diagnostics, report=job.report, fps=view_rate_hz
+        )
     if not job.view:
         (job.out / "view.html").unlink(missing_ok=True)
     return TrackOutcome(summary, failures, view_rate_hz)

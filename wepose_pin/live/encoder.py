@@ -10,11 +10,11 @@ import pinocchio as pin
 
 from ..model import BodyModel
 from ..model.chains import chains
-from ..pose import LiveKinematics, known_links
+from ..pose import LiveKinematics, find_known_links
 from ..report.viewer import visible
 from .state import LivePose, StreamInfo
 
-HANDS = ("left_hand", "right_hand")
+HANDS = ("left_palm", "right_palm")
 
 
 class PoseEncoder:
@@ -61,7 +61,7 @@ class MeasuredLinks:
         self._kinematics = LiveKinematics(model, info.segments)
         frames = [model.pin.getFrameId(link) for link in links]
         self._views = [self._kinematics.data.oMf[frame] for frame in frames]
-        known = set(known_links(model, info.segments))
+        known = set(find_known_links(model, info.segments))
         self.known = np.array([link in known for link in links], dtype=bool)
         self._hands = [info.points.index(hand) if hand in info.points else -1 for hand in HANDS]
         moved = {chain.joints[-1]: segment for segment, chain in chains(model.pin).items() if chain.joints}

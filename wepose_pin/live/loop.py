@@ -31,7 +31,7 @@ from ..recording.arrivals import (
     Ticks,
     arrivals,
 )
-from ..subject import Subject, average_subject
+from ..subject import Subject, population_subject
 from ..tracking import Tracker, TrackOptions
 from ..tracking.causal import SegmentFollower
 from ..tracking.start_pose import HOLD_S, StartGuide
@@ -407,7 +407,7 @@ def build_subject_model(subject: Subject | None, model: BodyModel | None) -> Bod
     body = model or load_model()
     if subject is None and model is not None:
         return body
-    lengths = (subject or average_subject()).lengths
+    lengths = (subject or population_subject()).lengths
     return body.with_lengths({name: value for name, value in lengths.items() if name in body.lengths})
 
 

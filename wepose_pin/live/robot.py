@@ -18,7 +18,7 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption
 from ..retargeting import Robot, find_map, load_robot, read_map
 from ..retargeting.stream import ArmObserver, Command, CommandStream, StreamOptions, check_segments
-from ..subject import average_subject
+from ..subject import population_subject
 from .loop import Latencies
 from .outputs import UdpSender
 from .setup import SensorSetup
@@ -317,7 +317,7 @@ def connect_robot(
         check_segments(robot, source.sensors)
     if isinstance(source, ReplaySource) and math.isinf(speed):
         source = TickReplay(source.recording, speed)
-    lengths_cov = (setup.subject or average_subject()).lengths_covariance()
+    lengths_cov = (setup.subject or population_subject()).lengths_covariance()
     stream = CommandStream(robot, options.stream)
     return RobotOutput(stream, options.to, lengths_cov=lengths_cov, speed=speed), source
 

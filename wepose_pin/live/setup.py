@@ -11,7 +11,7 @@ import numpy as np
 
 from ..readers.stated import joints_stated, phases_stated, read_session_file, sensor_stated
 from ..recording import SEGMENTS, START_POSES, Intervals, Recording
-from ..subject import Subject, subject_of, subject_toml
+from ..subject import Subject, parse_subject, subject_toml
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class SensorSetup:
         if self.subject is None or self.subject_text:
             return self
         text = subject_toml(self.subject)
-        return replace(self, subject=subject_of(text, Path("subject.toml")), subject_text=text)
+        return replace(self, subject=parse_subject(text, Path("subject.toml")), subject_text=text)
 
     def header(self, sensors: Sequence[str]) -> dict[str, Any]:
         """Header of the recording of a live session, without the method."""

@@ -1,6 +1,6 @@
 """The body: a URDF read into a `pin.Model` whose triples of revolute joints are spherical joints, with link lengths.
 
-URDF knows no spherical joint (Pinocchio rejects `type="spherical"`), so a body model spells each as three revolute
+URDF has no spherical joint (Pinocchio rejects `type="spherical"`), so a body model spells each as three revolute
 joints with intersecting orthogonal axes and massless links between them. They are joined here into one
 `pin.JointModelSpherical`, whose frame at zero is that of the link it moves; a `floating` joint likewise, since W does
 not travel. Other joints stay as they are.
@@ -9,7 +9,7 @@ Every body has links named after our segments, in our frames, and `POINTS` are o
 them from a table (`LinkTable`): massless links, fixed to its own.
 
 `tree` reads the joints, `table` names the links, `lengths` measures and stretches, `chains` turns a segment's
-orientation into joint values, `visuals` says what links look like.
+orientation into joint values, `visuals` reads the shapes of the links.
 """
 
 from .body import DEFAULT_URDF, BodyModel, load_model

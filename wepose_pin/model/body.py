@@ -14,16 +14,16 @@ from ..arguments import check_arguments
 from ..assets import asset
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, MissingFile, one_of
-from ..subject import average_subject
+from ..subject import population_subject
 from . import lengths as _lengths
 from . import visuals as _visuals
 from .chains import chains
-from .table import MOST_LINKS, NEEDED, LinkTable, closest_links, find_table, named, read_table, table_from
-from .tree import AxisLimits, build, impossible_inertia, tree_of
+from .table import MOST_LINKS, NEEDED, LinkTable, find_table, format_closest_links, read_table, rename_links, table_from
+from .tree import AxisLimits, build, find_impossible_inertia, parse_tree
 from .visuals import Visual
 
 DEFAULT_URDF = "upper_body.urdf"
-# A length is implausible that many standard deviations off the mean of adults (calibration/anthropometry.toml).
+# Standard deviations off the mean of adults (calibration/anthropometry.toml), above which a length is implausible.
 FAR_OFF = 5.0
 # So is a mass [kg] beyond ten standard deviations above the mean of men, 85.5 ± 14.2 kg (ANSUR II), or below an upper
 # body's share (head, arms and trunk: 68 %, Winter 2009, table 4.1) of five below the mean of women, 67.8 ± 11.0 kg.
@@ -54,34 +54,34 @@ class BodyModel:
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """What a person's body can hardly have: lengths, mass, moments of inertia; a trunk that cannot move."""
-        name, average = self.robot.name, average_subject()
-        found = []
+        """Implausible lengths, mass or moments of inertia, and a trunk that cannot move."""
+        name, prior = self.robot.name, population_subject()
+        diagnostics = []
         for length, value in self.lengths.items():
-            mean, std = average.lengths[length], average.std(length)
+            mean, std = prior.lengths[length], prior.std(length)
             if abs(value - mean) > FAR_OFF * std:
                 plausible = {"shortest": max(0.0, mean - FAR_OFF * std), "longest": mean + FAR_OFF * std}
                 facts: dict[str, float | str] = {"model": name, "deviations": FAR_OFF, **plausible}
-                found.append(Diagnostic("model-length-implausible", WARNING, length, value, facts=facts))
+                diagnostics.append(Diagnostic("model-length-implausible", WARNING, length, value, facts=facts))
         mass = sum(inertia.mass for inertia in self.pin.inertias)
         if mass and not LIGHTEST <= mass <= HEAVIEST:
             facts = {"lightest": LIGHTEST, "heaviest": HEAVIEST}
-            found.append(Diagnostic("model-mass-implausible", WARNING, name, mass, facts=facts))
-        impossible = impossible_inertia(self.robot)
+            diagnostics.append(Diagnostic("model-mass-implausible", WARNING, name, mass, facts=facts))
+        impossible = find_impossible_inertia(self.robot)
         if impossible:
             facts = {"links": ", ".join(impossible)}
-            found.append(Diagnostic("model-inertia-impossible", WARNING, name, facts=facts))
+            diagnostics.append(Diagnostic("model-inertia-impossible", WARNING, name, facts=facts))
         torso = chains(self.pin).get("torso")
         if torso is not None and not torso.joints:
-            rigid = ", ".join(joint.name for joint in tree_of(self.robot, name).path("torso"))
-            found.append(
+            rigid = ", ".join(joint.name for joint in parse_tree(self.robot, name).path("torso"))
+            diagnostics.append(
                 Diagnostic("model-torso-fixed", WARNING, name, facts={"joints": rigid or "the root is the torso"})
             )
-        return tuple(found)
+        return tuple(diagnostics)
 
     @property
     def visuals(self) -> list[Visual]:
-        """What all links look like."""
+        """The visuals of all links."""
         return _visuals.visuals(self.robot)
 
     def with_lengths(self, lengths: Mapping[str, float]) -> BodyModel:
@@ -155,19 +155,19 @@ def load_model(
             raise BadModel(f'{path}: names no URDF; urdf = "body.urdf" is wanted, a file beside this one')
         path = urdf
     if segments is not None:
-        given = {"segments": segments, "points": points or {}, "up": up, "forward": forward, "root": root}
-        table = table_from(given, str(path))
+        entries = {"segments": segments, "points": points or {}, "up": up, "forward": forward, "root": root}
+        table = table_from(entries, str(path))
     elif points is not None or root is not None or (up, forward) != ("+z", "+x"):
         raise BadModel(f"{path}: points, up, forward and root are part of a table; give segments with them")
     robot = read_urdf(path)
-    tree = tree_of(robot, str(path))
+    tree = parse_tree(robot, str(path))
     table = table or find_table(path, tree.below)
     if table is not None:
-        robot = named(robot, table)
-    lacking = [link for link in NEEDED if link not in tree_of(robot, str(path)).below]
+        robot = rename_links(robot, table)
+    lacking = [link for link in NEEDED if link not in parse_tree(robot, str(path)).below]
     if lacking:
         raise BadModel(
-            f"{path}: no link {closest_links(lacking, tree.below)}; name the segments' links in a table, as "
+            f"{path}: no link {format_closest_links(lacking, tree.below)}; name the segments' links in a table, as "
             f"docs/models.md shows; {one_of(tree.below, most=MOST_LINKS)}"
         )
     body = _body(robot, str(path))
@@ -191,8 +191,8 @@ def read_urdf(path: Path) -> Any:
         # yourdfpy's parser mends broken XML in silence: half a body would be read as a body. And it reads what entities
         # name, on disk too.
         _check_xml(path)
-    except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: of an encoding that nobody knows
-        raise BadModel(f"{path}: is no whole XML file, as a URDF is: {error}") from error
+    except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
+        raise BadModel(f"{path}: is no complete XML file, as a URDF is: {error}") from error
     try:
         robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # yourdfpy and lxml raise many kinds
@@ -207,18 +207,18 @@ def read_urdf(path: Path) -> Any:
 
 def _check_arms(body: BodyModel, where: str) -> None:
     """Raise an error on arm segments that no joint moves against the segment above, or that no joint could follow."""
-    found, tree = chains(body.pin), tree_of(body.robot, where)
+    links, tree = chains(body.pin), parse_tree(body.robot, where)
     rigid = []
     for segment in NEEDED[1:]:
-        if not found[segment].joints:
+        if not links[segment].joints:
             above = segment.replace("forearm", "upper_arm") if segment.endswith("forearm") else "torso"
             shared = {joint.name for joint in tree.path(above)}
             between = [f"'{joint.name}' ({joint.type})" for joint in tree.path(segment) if joint.name not in shared]
             rigid.append(f"{segment} against {above} (between them: {', '.join(between) or 'nothing'})")
     if rigid:
         raise BadModel(
-            f"{where}: no joint moves {'; '.join(rigid)}: the arm could not follow a person's; revolute joints are "
-            f"needed there"
+            f"{where}: no joint moves {'; '.join(rigid)}: the arm could not follow a person's; it needs revolute "
+            f"joints there"
         )
 
 

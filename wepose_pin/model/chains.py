@@ -6,7 +6,7 @@ orientations; how they share it is decided here:
 - an arm's segment is set by the joints nearest to it, as many as make three axes; others above (a clavicle) rest;
 - torso, pelvis and head are set by all joints in between: each place in the spine takes an equal share of the tilt;
 - where one of them is spherical, it takes what the others leave, with it the turn about the segment's long axis (a
-  person who turns round does not twist the spine): the segment follows exactly;
+  a whole turn of the person does not twist the spine): the segment follows exactly;
 - one or two axes come as near as they can, in closed form; three and more by Levenberg-Marquardt.
 
 Near means the smallest angle. Limits of joints are not looked at here; `follow` keeps those of hinges.
@@ -64,7 +64,7 @@ def chains(model: pin.Model) -> dict[str, Chain]:
     for segment in SEGMENTS:
         if segment in frames:
             at.setdefault(frames[segment].parentJoint, segment)
-    between = {segment: _between(model, joint, set(at)) for joint, segment in at.items()}
+    between = {segment: _joints_below(model, joint, set(at)) for joint, segment in at.items()}
     for segment, joints in between.items():
         for joint in joints:
             if "Mimic" in model.joints[joint].shortname():
@@ -74,13 +74,13 @@ def chains(model: pin.Model) -> dict[str, Chain]:
                 )
     # A joint that moves two segments at once rests.
     times = Counter(joint for joints in between.values() for joint in joints)
-    found = {}
+    by_segment = {}
     for segment, frame in sorted(frames.items(), key=lambda item: item[1].parentJoint):
         free = [j for j in between.get(segment, []) if times[j] == 1 and "Prismatic" not in model.joints[j].shortname()]
         if segment not in AXIAL:
-            free = _nearest_three(model, free)
-        found[segment] = _chain(model, frame, free)
-    return found
+            free = _take_nearest_three(model, free)
+        by_segment[segment] = _chain(model, frame, free)
+    return by_segment
 
 
 def solve(chain: Chain, quat: np.ndarray) -> list[np.ndarray]:
@@ -90,19 +90,19 @@ def solve(chain: Chain, quat: np.ndarray) -> list[np.ndarray]:
     """
     target = multiply(quat, conjugate(chain.quat_AL))
     if chain.exact:
-        found = _shared(chain, target)
+        values = _split_rotation(chain, target)
     else:
-        found = _hinges([axis for axis in chain.axes if axis is not None], target)
+        values = _hinges([axis for axis in chain.axes if axis is not None], target)
     return [
         multiply(conjugate(frame), multiply(value, frame)) if axis is None else value
-        for axis, frame, value in zip(chain.axes, chain.quat, found, strict=True)
+        for axis, frame, value in zip(chain.axes, chain.quat, values, strict=True)
     ]
 
 
 # Which joints -----------------------------------------------------------------------------------------------------
 
 
-def _between(model: pin.Model, joint: int, stops: set[int]) -> list[int]:
+def _joints_below(model: pin.Model, joint: int, stops: set[int]) -> list[int]:
     """Joints from below the next one that carries a segment, or from the root, down to `joint`."""
     joints: list[int] = []
     while joint != 0 and (not joints or joint not in stops):
@@ -111,7 +111,7 @@ def _between(model: pin.Model, joint: int, stops: set[int]) -> list[int]:
     return joints[::-1]
 
 
-def _nearest_three(model: pin.Model, joints: list[int]) -> list[int]:
+def _take_nearest_three(model: pin.Model, joints: list[int]) -> list[int]:
     """The joints nearest to the segment, as many as make three axes, or all."""
     axes = 0
     for k, joint in enumerate(reversed(joints)):
@@ -160,34 +160,34 @@ def _chain(model: pin.Model, frame: pin.Frame, free: list[int]) -> Chain:
 # Values -----------------------------------------------------------------------------------------------------------
 
 
-def _shared(chain: Chain, target: np.ndarray) -> list[np.ndarray]:
+def _split_rotation(chain: Chain, target: np.ndarray) -> list[np.ndarray]:
     """Values of joints, one of them spherical, whose product is `target` (n, 4).
 
     Places share the tilt of the segment's long axis equally; the last spherical joint takes what the others leave.
     """
     free = max(k for k, axis in enumerate(chain.axes) if axis is None)
     places = chain.place[-1] + 1
-    share = exp(log(_tilt(target, chain.quat_AL)) / places) if len(chain.axes) > 1 else target
-    found = [np.zeros(len(target)) for _ in chain.axes]
+    share = exp(log(_remove_heading(target, chain.quat_AL)) / places) if len(chain.axes) > 1 else target
+    angles = [np.zeros(len(target)) for _ in chain.axes]
     for place in set(chain.place) - {chain.place[free]}:
-        here = [k for k, at in enumerate(chain.place) if at == place]
-        spherical = [k for k in here if chain.axes[k] is None]
-        hinges = [(k, axis) for k in here if (axis := chain.axes[k]) is not None]
+        same_place = [k for k, at in enumerate(chain.place) if at == place]
+        spherical = [k for k in same_place if chain.axes[k] is None]
+        hinges = [(k, axis) for k in same_place if (axis := chain.axes[k]) is not None]
         if spherical:  # hinges in the same place rest
-            found[spherical[0]] = share
+            angles[spherical[0]] = share
         else:
             for (k, _), value in zip(hinges, _hinges([axis for _, axis in hinges], share), strict=True):
-                found[k] = value
+                angles[k] = value
     before = after = np.array([0.0, 0.0, 0.0, 1.0])
-    for k, (axis, value) in enumerate(zip(chain.axes, found, strict=True)):
+    for k, (axis, value) in enumerate(zip(chain.axes, angles, strict=True)):
         if k != free:
             turn = value if axis is None else rotation_about(axis, value)
             before, after = (multiply(before, turn), after) if k < free else (before, multiply(after, turn))
-    found[free] = multiply(multiply(conjugate(before), target), conjugate(after))
-    return found
+    angles[free] = multiply(multiply(conjugate(before), target), conjugate(after))
+    return angles
 
 
-def _tilt(target: np.ndarray, quat_AL: np.ndarray) -> np.ndarray:
+def _remove_heading(target: np.ndarray, quat_AL: np.ndarray) -> np.ndarray:
     """What is left of rotations (n, 4) when the turn about z of L at zero, that came before, is taken off."""
     up = Rotation.from_quat(quat_AL).apply([0.0, 0.0, 1.0])
     turn = np.column_stack([np.outer(target[:, :3] @ up, up), target[:, 3]])
@@ -202,7 +202,7 @@ def _hinges(axes: list[np.ndarray], target: np.ndarray) -> list[np.ndarray]:
     if not axes:
         return []
     if len(axes) == 1:
-        return [_wrapped(2.0 * np.arctan2(v @ axes[0], w))]
+        return [_wrap_angle(2.0 * np.arctan2(v @ axes[0], w))]
     if len(axes) > 2:
         return _many_hinges(np.array(axes), target)
     # With half angles α, β the scalar product of the two quaternions is (cos α, sin α) m (cos β, sin β)ᵀ, that is
@@ -212,7 +212,7 @@ def _hinges(axes: list[np.ndarray], target: np.ndarray) -> list[np.ndarray]:
     m00, m01, m10, m11 = w, v @ b, v @ a, v @ np.cross(a, b) - w * (a @ b)
     difference = np.arctan2(m10 - m01, m00 + m11)
     total = np.arctan2(m10 + m01, m00 - m11)
-    return [_wrapped(total + difference), _wrapped(total - difference)]
+    return [_wrap_angle(total + difference), _wrap_angle(total - difference)]
 
 
 def _many_hinges(axes: np.ndarray, target: np.ndarray) -> list[np.ndarray]:
@@ -234,7 +234,7 @@ def _many_hinges(axes: np.ndarray, target: np.ndarray) -> list[np.ndarray]:
         rows = open_rows[better]
         angles[rows], error[rows], J[rows] = tried[better], new_error[better], new_J[better]
         damping[open_rows] = np.where(better, lam / 10.0, lam * 10.0).clip(1e-12, 1e6)
-    return [_wrapped(angles[:, i]) for i in range(k)]
+    return [_wrap_angle(angles[:, i]) for i in range(k)]
 
 
 def _error(axes: np.ndarray, angles: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -247,6 +247,6 @@ def _error(axes: np.ndarray, angles: np.ndarray, target: np.ndarray) -> tuple[np
     return (Rotation.from_quat(target) * R.inv()).as_rotvec(), J
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
+def _wrap_angle(angle: np.ndarray) -> np.ndarray:
     """Angles [rad] in (−pi, pi]."""
     return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)

@@ -5,7 +5,7 @@ Pinocchio's Jacobian, each frame from the solution of the one before. Limits are
 limit that the gradient pushes outward takes no part in the step, and what a step carries over a limit ends on it
 (Bertsekas 1982, "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 20:221).
 
-Where joints cannot be told apart by the links that are known, each moves as little as it can from frame to frame.
+Joints that the known links do not determine move as little as possible from frame to frame.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Limits(NamedTuple):
     upper: np.ndarray  # (k,) [rad]
 
 
-def limits_of(model: pin.Model, joints: Sequence[int]) -> Limits:
+def joint_limits(model: pin.Model, joints: Sequence[int]) -> Limits:
     """Of those of `joints` that have one axis and an end to it; spherical joints and continuous ones have none."""
     at = np.array([model.idx_qs[joint] for joint in joints if model.nqs[joint] == 1], dtype=int)
     return Limits(at, model.lowerPositionLimit[at], model.upperPositionLimit[at])
@@ -82,7 +82,7 @@ class Fit:
         self._weight = weight
         self._free_q = np.concatenate([model.idx_qs[j] + np.arange(model.nqs[j]) for j in joints])
         bounded = [j for j in joints if model.nqs[j] == 1] if limits else []
-        self.limits = limits_of(model, bounded)
+        self.limits = joint_limits(model, bounded)
         column = {int(c): k for k, c in enumerate(self.columns)}
         self._bounded = np.array([column[model.idx_vs[j]] for j in bounded], dtype=int)
 
@@ -149,7 +149,7 @@ class Fit:
         return q, left
 
 
-def unseen(model: pin.Model, links: Sequence[str], q: np.ndarray) -> list[str]:
+def find_undetermined_joints(model: pin.Model, links: Sequence[str], q: np.ndarray) -> list[str]:
     """Names of joints whose value in `q` (nq,) the orientations of `links` leave open, at least in part."""
     data = model.createData()
     pin.computeJointJacobians(model, data, q)

@@ -11,7 +11,7 @@ import numpy as np
 from ..recording import SEGMENTS
 from ..subject import LENGTHS
 from .table import POINTS
-from .tree import Tree, tree_of
+from .tree import Tree, parse_tree
 
 _TOLERANCE = 1e-13  # [m]
 _MOST_ROUNDS = 50  # one is enough where every point lies on its joint
@@ -23,23 +23,23 @@ ENDS = {
     for part, first, last in (
         ("upper_arm", "shoulder", "elbow"),
         ("forearm", "elbow", "wrist"),
-        ("hand", "wrist", "hand"),
+        ("hand", "wrist", "palm"),
     )
 }
 
 
 def lengths(robot: Any) -> dict[str, float]:
     """The lengths [m] between the points of `robot` (yourdfpy), all joints at zero; those that it has."""
-    at = _points(tree_of(robot, robot.name))
-    found = {name: float(np.linalg.norm(at[b] - at[a])) for name, (a, b) in ENDS.items() if a in at and b in at}
+    at = _points(parse_tree(robot, robot.name))
+    measured = {name: float(np.linalg.norm(at[b] - at[a])) for name, (a, b) in ENDS.items() if a in at and b in at}
     if "left_shoulder" in at and "right_shoulder" in at:
-        found["shoulder_width"] = float(np.linalg.norm(at["left_shoulder"] - at["right_shoulder"]))
-        found["trunk"] = float(np.linalg.norm(at["left_shoulder"] + at["right_shoulder"]) / 2.0)
-    return {name: found[name] for name in LENGTHS if name in found}
+        measured["shoulder_width"] = float(np.linalg.norm(at["left_shoulder"] - at["right_shoulder"]))
+        measured["trunk"] = float(np.linalg.norm(at["left_shoulder"] + at["right_shoulder"]) / 2.0)
+    return {name: measured[name] for name in LENGTHS if name in measured}
 
 
-def with_lengths(robot: Any, wanted: Mapping[str, float]) -> Any:
-    """A copy of the robot that has the lengths `wanted` [m], each one of those it has.
+def with_lengths(robot: Any, targets: Mapping[str, float]) -> Any:
+    """A copy of the robot with these lengths [m], each of which it has.
 
     An arm's segment stretches along the line between its ends, the trunk along the lines from W's origin to the middle
     of the shoulders and from shoulder to shoulder, all joints at zero.
@@ -47,7 +47,7 @@ def with_lengths(robot: Any, wanted: Mapping[str, float]) -> Any:
     robot = copy.deepcopy(robot)
     for _ in range(_MOST_ROUNDS):
         own = lengths(robot)
-        ratio = {name: value / own[name] for name, value in wanted.items() if abs(own[name] - value) > _TOLERANCE}
+        ratio = {name: value / own[name] for name, value in targets.items() if abs(own[name] - value) > _TOLERANCE}
         if not ratio:
             break
         _stretch(robot, ratio)
@@ -64,7 +64,7 @@ def _stretch(robot: Any, ratio: Mapping[str, float]) -> None:
     To a segment belong all links from its own down to the next segments, to the torso also the spine below it, down to
     the pelvis or the root, which keep their shape.
     """
-    tree = tree_of(robot, robot.name)
+    tree = parse_tree(robot, robot.name)
     at = _points(tree)
     starts = {segment: tree.body(segment) for segment in SEGMENTS if segment in tree.below}
     of_link: dict[str, np.ndarray] = {}  # (3, 3) in W
@@ -73,7 +73,7 @@ def _stretch(robot: Any, ratio: Mapping[str, float]) -> None:
         S_W = _torso_stretch(at, ratio) if segment == "torso" else _arm_stretch(segment, at, ratio)
         if S_W is None:
             continue
-        links = _down_to(tree, start, set(starts.values()))
+        links = _links_between(tree, start, set(starts.values()))
         if segment == "torso":
             below = [joint.parent for joint in tree.path(start)]
             if starts.get("pelvis") in below:
@@ -84,10 +84,10 @@ def _stretch(robot: Any, ratio: Mapping[str, float]) -> None:
         of_joint |= {joint.name: S_W for link in links for joint in tree.below[link]}
     for joint in robot.joints:
         if joint.name in of_joint and joint.origin is not None:
-            joint.origin[:3, 3] = _in_link(tree, joint.parent, of_joint[joint.name]) @ joint.origin[:3, 3]
+            joint.origin[:3, 3] = _rotate_to_link(tree, joint.parent, of_joint[joint.name]) @ joint.origin[:3, 3]
     for link in robot.links:
         if link.name in of_link:
-            _stretch_link(link, _in_link(tree, link.name, of_link[link.name]))
+            _stretch_link(link, _rotate_to_link(tree, link.name, of_link[link.name]))
 
 
 def _arm_stretch(segment: str, at: Mapping[str, np.ndarray], ratio: Mapping[str, float]) -> np.ndarray | None:
@@ -107,16 +107,16 @@ def _torso_stretch(at: Mapping[str, np.ndarray], ratio: Mapping[str, float]) -> 
     return basis @ scale @ np.linalg.inv(basis)
 
 
-def _down_to(tree: Tree, start: str, others: set[str]) -> list[str]:
+def _links_between(tree: Tree, start: str, others: set[str]) -> list[str]:
     """`start` and the links below it, without the links `others` and what is below them."""
-    found, to_do = [], [start]
+    links, to_do = [], [start]
     while to_do:
-        found.append(link := to_do.pop())
+        links.append(link := to_do.pop())
         to_do += [joint.child for joint in tree.below[link] if joint.child not in others]
-    return found
+    return links
 
 
-def _in_link(tree: Tree, link: str, S_W: np.ndarray) -> np.ndarray:
+def _rotate_to_link(tree: Tree, link: str, S_W: np.ndarray) -> np.ndarray:
     R_WK = tree.neutral(link)[:3, :3]
     return R_WK.T @ S_W @ R_WK
 

@@ -11,7 +11,7 @@ import pinocchio as pin
 from ..arguments import check_arguments
 from ..errors import BadModel, BadSession, native_stderr_muted, one_of
 from .body import read_urdf
-from .tree import tree_of
+from .tree import parse_tree
 
 
 def load_robot(path: str | Path) -> pin.Model:
@@ -24,7 +24,7 @@ def load_robot(path: str | Path) -> pin.Model:
     """
     check_arguments(load_robot, locals())
     path = Path(path)
-    tree_of(read_urdf(path), str(path))
+    parse_tree(read_urdf(path), str(path))
     try:
         with native_stderr_muted():
             model = pin.buildModelFromUrdf(str(path))
@@ -60,11 +60,11 @@ def start_configuration(model: pin.Model, values: Mapping[str, float], where: st
 
 def joint_values(model: pin.Model, q: np.ndarray) -> dict[str, np.ndarray]:
     """Joint → its value (n,) [rad or m] of configurations (n, nq); only joints of one axis. Without end: unwrapped."""
-    found = {}
+    values = {}
     for joint in range(1, model.njoints):
         first = model.idx_qs[joint]
         if model.nqs[joint] == 1:
-            found[model.names[joint]] = q[:, first]
+            values[model.names[joint]] = q[:, first]
         elif model.nvs[joint] == 1:
-            found[model.names[joint]] = np.unwrap(np.arctan2(q[:, first + 1], q[:, first]))
-    return found
+            values[model.names[joint]] = np.unwrap(np.arctan2(q[:, first + 1], q[:, first]))
+    return values

@@ -22,13 +22,13 @@ from ..errors import BadModel, one_of
 from ..recording import SEGMENTS, mount_from_axes
 from ..recording.segments import segment_of
 from ..recording.sensors import read_axes
-from .tree import Tree, tree_of
+from .tree import Tree, parse_tree
 
 # A point is the origin of a link; the link is moved by the joint at that point.
 POINTS = {
     f"{side}_{point}": f"{side}_{link}"
     for side in ("left", "right")
-    for point, link in (("shoulder", "upper_arm"), ("elbow", "forearm"), ("wrist", "hand"), ("hand", "palm"))
+    for point, link in (("shoulder", "upper_arm"), ("elbow", "forearm"), ("wrist", "hand"), ("palm", "palm"))
 }
 NEEDED = SEGMENTS[:5]
 MODEL_TABLE = "model.toml"
@@ -57,8 +57,8 @@ class LinkTable:
     Parameters
     ----------
     segments : segment → its link
-    points : point → its link, where it is not the origin of the segment that begins there; the palm (`left_hand`,
-        `right_hand`) has none of its own
+    points : point → its link, where it is not the origin of the segment that begins there; the palm (`left_palm`,
+        `right_palm`) has none of its own
     up, forward : the root link's axes that point up and forward while all joints are at zero
     root : the link at whose origin W begins, or links whose middle it is; none: the root link
     where : for error texts
@@ -133,9 +133,9 @@ def find_table(urdf: Path, links: Iterable[str]) -> LinkTable | None:
     None where the links bear our names already, or nothing is found.
     """
     links = set(links)
-    beside = urdf.parent / MODEL_TABLE
-    if beside.is_file():
-        table, named = read_table(beside)
+    own_table = urdf.parent / MODEL_TABLE
+    if own_table.is_file():
+        table, named = read_table(own_table)
         if named is not None and named.name == urdf.name:
             return table
     if links.issuperset(NEEDED):
@@ -150,20 +150,20 @@ def find_table(urdf: Path, links: Iterable[str]) -> LinkTable | None:
 def _entries(top: TomlTable, key: str, names: Collection[str]) -> dict[str, TomlTable]:
     """Segment or point → the table that names its link; a link's name stands for a table of that alone."""
     entries = top.table(key, {})
-    found = {}
+    tables = {}
     for name, value in entries.values.items():
         if isinstance(value, SegmentLink | PointLink):
             value = {part: own for part, own in value._asdict().items() if own is not None}
-        found[name] = {"link": value} if isinstance(value, str) else value
-        if not isinstance(found[name], Mapping) or not isinstance(found[name].get("link"), str):
+        tables[name] = {"link": value} if isinstance(value, str) else value
+        if not isinstance(tables[name], Mapping) or not isinstance(tables[name].get("link"), str):
             raise BadModel(f'{entries.at(name)} = {value!r}; a link\'s name is wanted, or {{ link = "name", … }}')
-    return replace(entries, values=found).tables(names, key.removesuffix("s"))
+    return replace(entries, values=tables).tables(names, key.removesuffix("s"))
 
 
 # Naming -----------------------------------------------------------------------------------------------------------
 
 
-def named(robot: Any, table: LinkTable) -> Any:
+def rename_links(robot: Any, table: LinkTable) -> Any:
     """A copy of the robot (yourdfpy) with links named after our segments and points, in our frames.
 
     Every segment frame equals W in the N-pose. At zero of its joints a body may stand otherwise, in a T-pose say. There
@@ -179,7 +179,7 @@ def named(robot: Any, table: LinkTable) -> Any:
         A link that is not there; no wrist; an arm that points straight up, so that no rotation is the shortest.
     """
     where = table.where
-    tree = tree_of(robot, where)
+    tree = parse_tree(robot, where)
     _check_links(table, tree)
     R_WM = Rotation.from_quat(mount_from_axes(table.up, table.forward)).as_matrix()  # M: the root link
     M_WM = np.eye(4)
@@ -197,7 +197,7 @@ def named(robot: Any, table: LinkTable) -> Any:
             R_WL[segment] = M_WK[own.link][:3, :3] @ R_LK.T
     for segment in (*table.segments, "left_hand", "right_hand"):
         if segment not in R_WL:
-            R_WL[segment] = _at_zero(segment, p_W, R_WL, where)
+            R_WL[segment] = _neutral_orientation(segment, p_W, R_WL, where)
 
     # Our frames on their links; wrists and palms lie on the hand, else on the forearm.
     frames: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # name → their link, R_WL, p_W
@@ -205,7 +205,7 @@ def named(robot: Any, table: LinkTable) -> Any:
         frames[segment] = own.link, R_WL[segment], M_WK[own.link][:3, 3]
     for point, name in POINTS.items():
         side, part = point.split("_", 1)
-        segment = name if part != "hand" else f"{side}_hand"
+        segment = name if part != "palm" else f"{side}_hand"
         if point in p_W:
             on = table.segments.get(segment, table.segments[f"{side}_forearm"]).link
             frames[name] = on, R_WL[segment], p_W[point]
@@ -227,7 +227,7 @@ def _check_links(table: LinkTable, tree: Tree) -> None:
     lacking = [segment for segment in NEEDED if segment not in table.segments]
     if lacking:
         raise BadModel(
-            f"{where}: no link for segment {closest_links(lacking, tree.below)}; name it in segments; "
+            f"{where}: no link for segment {format_closest_links(lacking, tree.below)}; name it in segments; "
             f"{one_of(tree.below, most=MOST_LINKS)}"
         )
     handless = [side for side in ("left", "right") if f"{side}_wrist" not in _points(table)]
@@ -236,16 +236,16 @@ def _check_links(table: LinkTable, tree: Tree) -> None:
         raise BadModel(f"{where}: no wrist; name a link in {names}")
 
 
-def closest_links(segments: Iterable[str], links: Iterable[str]) -> str:
+def format_closest_links(segments: Iterable[str], links: Iterable[str]) -> str:
     """Segments that have no link, each with the links whose names speak of it or come closest."""
     links = list(links)
-    told = []
+    names = []
     for segment in segments:
         close = [link for link in links if segment_of(link) == segment]
         others = [link for link in links if segment_of(link) is None]
         close = close or get_close_matches(segment, others, n=3, cutoff=0.5)
-        told.append(f"'{segment}'" + (f" (maybe {' or '.join(close[:4])})" if close else ""))
-    return ", ".join(told)
+        names.append(f"'{segment}'" + (f" (maybe {' or '.join(close[:4])})" if close else ""))
+    return ", ".join(names)
 
 
 def _points(table: LinkTable) -> dict[str, PointLink]:
@@ -254,10 +254,12 @@ def _points(table: LinkTable) -> dict[str, PointLink]:
     return {point: PointLink(segment.link) for point, segment in begin.items()} | dict(table.points)
 
 
-def _at_zero(segment: str, p_W: Mapping[str, np.ndarray], R_WL: Mapping[str, np.ndarray], where: str) -> np.ndarray:
+def _neutral_orientation(
+    segment: str, p_W: Mapping[str, np.ndarray], R_WL: Mapping[str, np.ndarray], where: str
+) -> np.ndarray:
     """Orientation R_WL (3, 3) of a segment while all joints are at zero."""
     side, _, part = segment.partition("_")
-    ends = {"upper_arm": ("shoulder", "elbow"), "forearm": ("elbow", "wrist"), "hand": ("wrist", "hand")}.get(part)
+    ends = {"upper_arm": ("shoulder", "elbow"), "forearm": ("elbow", "wrist"), "hand": ("wrist", "palm")}.get(part)
     if ends is None:
         return np.eye(3)
     first, last = (f"{side}_{end}" for end in ends)
@@ -298,7 +300,7 @@ def _with_links(
     if not np.allclose(M_WM, np.eye(4), atol=1e-12):
         added["root"] = root, M_WM
     own = {link.name for link in robot.links}
-    renamed = {name: _free(f"{name}_link", own) for name in added if name in own}
+    renamed = {name: _make_unique(f"{name}_link", own) for name in added if name in own}
     for link in robot.links:
         link.name = renamed.get(link.name, link.name)
     for joint in robot.joints:
@@ -308,12 +310,12 @@ def _with_links(
     for name, (link, M) in added.items():
         ends = (name, renamed.get(link, link)) if name == "root" else (renamed.get(link, link), name)
         robot.links.append(yourdfpy.Link(name=name))
-        robot.joints.append(yourdfpy.Joint(_free(f"{name}_fixed", joints), "fixed", *ends, origin=M))
+        robot.joints.append(yourdfpy.Joint(_make_unique(f"{name}_fixed", joints), "fixed", *ends, origin=M))
     return robot
 
 
-def _free(name: str, taken: Iterable[str]) -> str:
+def _make_unique(name: str, used: Iterable[str]) -> str:
     """`name`, made longer until it is not `taken`."""
-    while name in taken:
+    while name in used:
         name += "_"
     return name

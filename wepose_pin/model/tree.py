@@ -17,7 +17,7 @@ _FAR = 1e6  # [m]
 _PARALLEL_TOLERANCE = 1e-6
 _MEET_TOLERANCE = 1e-9  # [m]
 # A link between the axes of a spherical joint may have as much mass [kg]; it then moves with the segment. URDFs give
-# such links 1e-5 kg, as simulators want none of zero. At 0.1 m off the joint a gram weighs 1 mN m.
+# such links 1e-5 kg, as simulators reject zero. At 0.1 m off the joint a gram weighs 1 mN m.
 _LIGHT = 1e-3
 
 
@@ -54,19 +54,19 @@ class Tree(NamedTuple):
         """Placement (4, 4) of `link` in the root link, all joints at zero."""
         M = np.eye(4)
         for joint in self.path(link):
-            M = M @ origin_of(joint)
+            M = M @ joint_placement(joint)
         return M
 
 
 class Built(NamedTuple):
-    """`pin.Model` and what `BodyModel` says of its spherical joints."""
+    """A `pin.Model` with the spherical joints of `BodyModel`."""
 
     pin: pin.Model
     joints: dict[str, int]
     limits: dict[str, AxisLimits]
 
 
-def tree_of(robot: Any, where: str) -> Tree:
+def parse_tree(robot: Any, where: str) -> Tree:
     """The tree that the joints of `robot` (yourdfpy) form.
 
     Raises
@@ -91,7 +91,7 @@ def tree_of(robot: Any, where: str) -> Tree:
             )
         above[joint.child] = joint
         below[joint.parent].append(joint)
-        axis, place = joint.axis, origin_of(joint)
+        axis, place = joint.axis, joint_placement(joint)
         numbers = np.concatenate([place.ravel(), np.ravel(axis) if axis is not None else ()]).astype(float)
         if place.shape != (4, 4) or np.shape(axis) not in ((), (3,)) or not (np.abs(numbers) < _FAR).all():
             raise BadModel(
@@ -99,8 +99,8 @@ def tree_of(robot: Any, where: str) -> Tree:
             )
     roots = [name for name in below if name not in above]
     if len(roots) != 1:
-        found = ", ".join(roots) if roots else "none"
-        raise BadModel(f"{where}: {len(roots)} links without a joint above them ({found}); a body has one root")
+        names = ", ".join(roots) if roots else "none"
+        raise BadModel(f"{where}: {len(roots)} links without a joint above them ({names}); a body has one root")
     reached, to_do = {roots[0]: 0}, [roots[0]]
     while to_do:
         link = to_do.pop()
@@ -117,7 +117,7 @@ def tree_of(robot: Any, where: str) -> Tree:
 
 
 def build(robot: Any, where: str) -> Built:
-    """The Pinocchio model, depth first as Pinocchio's algorithms want it; one frame a link.
+    """The Pinocchio model, depth first as Pinocchio's algorithms need it; one frame a link.
 
     A mimic joint follows the joint it mimics. The limits of joints that stay as they are are the URDF's.
 
@@ -126,7 +126,7 @@ def build(robot: Any, where: str) -> Built:
     BadModel
         No tree; a type of joint that is not known; an axis of zero; a mimic joint that cannot follow.
     """
-    tree = tree_of(robot, where)
+    tree = parse_tree(robot, where)
     links = {link.name: link for link in robot.links}
     mimicked = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
     model = pin.Model()
@@ -144,7 +144,7 @@ def build(robot: Any, where: str) -> Built:
         model.addFrame(pin.Frame(link, parent, 0, M_JL, pin.FrameType.BODY), False)
         carry(link, parent, M_JL)
         for first in tree.below[link]:
-            M_Jc = M_JL * pin.SE3(origin_of(first))
+            M_Jc = M_JL * pin.SE3(joint_placement(first))
             if first.type == "fixed":
                 grow(first.child, parent, M_Jc)
                 continue
@@ -157,13 +157,13 @@ def build(robot: Any, where: str) -> Built:
                 child = triple[-1].child
                 limits[child] = _limits(triple)
                 for joint in triple[1:]:
-                    M_Jc = M_Jc * pin.SE3(origin_of(joint))
+                    M_Jc = M_Jc * pin.SE3(joint_placement(joint))
             joints[child] = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
             if triple is not None:
                 # The links between the axes, as they stand at zero.
                 M_cK = pin.SE3.Identity()
                 for joint in triple[:0:-1]:
-                    M_cK = M_cK * pin.SE3(origin_of(joint)).inverse()
+                    M_cK = M_cK * pin.SE3(joint_placement(joint)).inverse()
                     carry(joint.parent, joints[child], M_cK)
             grow(child, joints[child], pin.SE3.Identity())
 
@@ -174,12 +174,12 @@ def build(robot: Any, where: str) -> Built:
     return Built(model, joints, limits)
 
 
-def origin_of(joint: Any) -> np.ndarray:
+def joint_placement(joint: Any) -> np.ndarray:
     """Placement (4, 4) of a joint, and so of its child at zero, in its parent link."""
     return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float)
 
 
-def axis_of(joint: Any) -> np.ndarray:
+def joint_axis(joint: Any) -> np.ndarray:
     """Unit axis (3,) of a joint in its own frame; URDF's default is x."""
     axis = np.asarray(joint.axis if joint.axis is not None else (1.0, 0.0, 0.0), dtype=float)
     norm = np.linalg.norm(axis)
@@ -197,7 +197,7 @@ def _triple(first: Any, tree: Tree, links: Mapping[str, Any], mimicked: set[str]
         chain.append(below[0])
     if any(joint.type not in _TURNS or joint.mimic is not None or joint.name in mimicked for joint in chain):
         return None
-    if any(np.linalg.norm(origin_of(joint)[:3, 3]) > _MEET_TOLERANCE for joint in chain[1:]):
+    if any(np.linalg.norm(joint_placement(joint)[:3, 3]) > _MEET_TOLERANCE for joint in chain[1:]):
         return None
     axes = _axes(chain)
     if np.abs(axes @ axes.T - np.eye(3)).max() > _PARALLEL_TOLERANCE:
@@ -209,9 +209,9 @@ def _axes(chain: Any) -> np.ndarray:
     """Axes (3, 3), a row each, in the frame of the last joint's child, all joints at zero."""
     rows = []
     for k, joint in enumerate(chain):
-        axis = axis_of(joint)
+        axis = joint_axis(joint)
         for later in chain[k + 1 :]:
-            axis = origin_of(later)[:3, :3].T @ axis
+            axis = joint_placement(later)[:3, :3].T @ axis
         rows.append(axis)
     return np.array(rows)
 
@@ -236,7 +236,7 @@ def _add_single(model: pin.Model, parent: int, M: pin.SE3, joint: Any, where: st
             f"{where}: joint '{joint.name}' is of type '{joint.type}'; known are fixed, revolute, continuous, "
             f"prismatic, floating, and spherical as three revolute joints"
         )
-    axis = axis_of(joint)
+    axis = joint_axis(joint)
     if not axis.any():
         raise BadModel(f"{where}: joint '{joint.name}' has an axis of zero length; three numbers as 0 0 1 are wanted")
     limit = joint.limit
@@ -275,23 +275,23 @@ def _inertia(inertial: Any, where: str) -> pin.Inertia:
     placement = pin.SE3.Identity() if inertial.origin is None else pin.SE3(np.asarray(inertial.origin, dtype=float))
     inertia = np.asarray(inertial.inertia if inertial.inertia is not None else np.zeros((3, 3)), dtype=float)
     if not 0.0 < inertial.mass < _FAR or not np.isfinite(placement.homogeneous).all() or not np.isfinite(inertia).all():
-        raise BadModel(f"{where}: mass {inertial.mass:g} kg, or its origin or inertia is no number; a mass is above 0")
+        raise BadModel(f"{where}: mass {inertial.mass:g} kg, or its origin or inertia is NaN; a mass is above 0")
     # The constructor refuses what no body can have, as some URDFs state it; Pinocchio's own reader does not, nor do we:
-    # `impossible_inertia` names it.
+    # `find_impossible_inertia` names it.
     found = pin.Inertia.Zero()
     found.mass, found.lever = float(inertial.mass), placement.translation
     found.inertia = placement.rotation @ inertia @ placement.rotation.T
     return found
 
 
-def impossible_inertia(robot: Any) -> list[str]:
+def find_impossible_inertia(robot: Any) -> list[str]:
     """Links whose moments of inertia no body can have: one is negative, or larger than the two others together."""
-    found = []
+    links = []
     for link in robot.links:
         inertial = link.inertial
         if inertial is not None and inertial.mass and inertial.inertia is not None:
             moments = np.linalg.eigvalsh(np.asarray(inertial.inertia, dtype=float))
             slack = 1e-6 * max(np.abs(moments).max(), 1e-9)  # of numbers that were cut
             if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
-                found.append(link.name)
-    return found
+                links.append(link.name)
+    return links

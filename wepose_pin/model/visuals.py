@@ -1,4 +1,4 @@
-"""What the links of a body look like."""
+"""The visuals of a body's links."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 
 class Visual(NamedTuple):
-    """What one link looks like; sizes as in URDF."""
+    """A visual of a link; sizes as in URDF."""
 
     link: str
     kind: str  # "box" | "cylinder" | "sphere" | "mesh"
@@ -21,9 +21,9 @@ class Visual(NamedTuple):
 
 
 def visuals(robot: Any) -> list[Visual]:
-    """What all links look like; what has no geometry is left out."""
+    """The visuals of all links that have a geometry."""
     colours = {m.name: m.color.rgba for m in robot.materials if m.color is not None}
-    found = []
+    shapes = []
     for link in robot.links:
         for visual in link.visuals:
             geometry, origin = visual.geometry, np.eye(4) if visual.origin is None else visual.origin
@@ -46,5 +46,5 @@ def visuals(robot: Any) -> list[Visual]:
                 rgba = own.rgba if own is not None else colours.get(visual.material.name, rgba)
             r, g, b, a = (float(v) for v in rgba)
             quat = Rotation.from_matrix(origin[:3, :3]).as_quat()
-            found.append(Visual(link.name, kind, size, quat, origin[:3, 3].copy(), (r, g, b, a), file))
-    return found
+            shapes.append(Visual(link.name, kind, size, quat, origin[:3, 3].copy(), (r, g, b, a), file))
+    return shapes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-# Loaded on first use: who tracks does not wait for the rooms of the calibration.
+# Loaded on first use: tracking does not need the calibration's imports.
 _WHERE = {
     "calibration_report": "calibration",
     "track_report": "track",

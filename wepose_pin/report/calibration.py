@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from ..alignment import START_POSE_STD
 from ..calibration import Calibration, CalibrationQuality
-from ..calibration.known import DRIFT_STD
-from ..calibration.lengths import GAUGE_STD
+from ..calibration.observability import find_intervals
+from ..calibration.priors import DRIFT_STD
 from ..calibration.protocols import Protocol, load_protocol
 from ..calibration.quality import Check
-from ..calibration.weighing import TOUCHED
+from ..calibration.weights import MIN_CONTACT
 from ..diagnostics import WARNING, Diagnostic, lines, quantity
 from ..errors import WeposeError, reason
 from ..filters import BEST
@@ -42,7 +42,7 @@ from .words import capital, degrees, intervals, plain, plus_minus, signed, versi
 TEMPLATE = "report/templates/calibration.html.j2"
 SIDES, PARTS = ("left", "right"), ("upper_arm", "forearm", "hand")
 FRAMES_A_SECOND = 20.0  # of the 3D view
-UNSEEN = 0.97  # of the standard deviation that the start pose has anyway: the motion showed nothing
+UNOBSERVED = 0.97  # of the start pose's standard deviation, above which the motion showed nothing
 # Zones of the joined hands, seen from the middle of the shoulders [m], and of their distance over the arm's length.
 LOW, ASIDE, BENT, STRETCHED = -0.25, 0.10, 0.60, 0.80
 
@@ -73,61 +73,60 @@ def calibration_report(
     recording: Recording,
     *,
     quality: CalibrationQuality | None = None,
-    pose: TrackedRecording | None = None,
+    tracked: TrackedRecording | None = None,
     method: str = BEST,
     protocol: str | Path | Protocol = "clasp",
-    gauge_std: float = GAUGE_STD,
     failures: list[str] | None = None,
 ) -> str:
     """``report.html``: one page that opens offline and prints; equal arguments give equal text.
 
     Parameters
     ----------
-    quality : of `assess`; None: the page gives none
-    pose : the recording tracked with the calibrated subject, for the hands and the 3D view; None: it is tracked here
-    method, protocol, gauge_std : as the calibration was run
-    failures : takes a line for each section that cannot be made; the page says so in its place
+    quality : of `assess`; None: the page has none
+    tracked : the recording tracked with the calibrated subject, for the hands and the 3D view; None: it is tracked here
+    method, protocol : as the calibration was run
+    failures : takes a line for each section that cannot be made; the page has the line in its place
     """
-    contact = _contact(protocol if isinstance(protocol, Protocol) else load_protocol(protocol))
+    contact = _describe_contact(protocol if isinstance(protocol, Protocol) else load_protocol(protocol))
     untracked: list[Diagnostic] = []
-    if pose is None:
+    if tracked is None:
         try:
-            pose = track(recording, calibration.subject, method=method)
+            tracked = track(recording, calibration.subject, method=method)
         except Exception as error:
             untracked = [Diagnostic("motion-not-shown", WARNING, facts={"reason": str(error)})]
             if not isinstance(error, WeposeError) and failures is not None:
                 failures.append(f"the motion cannot be tracked: {reason(error)}")
     page = Page(TEMPLATE, f"Calibration of {recording.name or 'a recording'}", failures)
-    page.add("first", lambda: _first(calibration, quality, untracked), name="The quality")
-    page.add("short", lambda: _short(calibration, contact), name="In short")
-    page.add("lengths", lambda: _lengths(calibration, contact), "Lengths")
-    page.add("sensors", lambda: _sensors(calibration, recording), "Sensors")
-    page.add("gap", lambda: _gap(calibration, contact), f"{capital(contact.gap)} over time")
+    page.add("first", lambda: _diagnostics_section(calibration, quality, untracked), name="The quality")
+    page.add("short", lambda: _summary_section(calibration, contact), name="In short")
+    page.add("lengths", lambda: _lengths_section(calibration, contact), "Lengths")
+    page.add("sensors", lambda: _sensors_section(calibration, recording), "Sensors")
+    page.add("gap", lambda: _gap_section(calibration, contact), f"{capital(contact.gap)} over time")
     page.add(
         "hands",
-        lambda: _hands(calibration, contact, None if pose is None else pose.pose),
+        lambda: _hands_section(calibration, contact, None if tracked is None else tracked.pose),
         "Where the motion was informative",
     )
-    page.add("posture", lambda: _posture(calibration), "The start pose")
-    page.add("elbows", lambda: _elbows(calibration), "The elbows as hinges")
-    page.add("view", lambda: _view(calibration, recording, pose), "The motion in 3D")
-    page.add("checks", lambda: _checks(quality, contact), "Behind the quality")
-    page.add("run", lambda: _run(calibration, recording, contact, method, gauge_std), "What was run")
+    page.add("posture", lambda: _posture_section(calibration), "The start pose")
+    page.add("elbows", lambda: _elbows_section(calibration), "The elbows as hinges")
+    page.add("view", lambda: _view_section(calibration, recording, tracked), "The motion in 3D")
+    page.add("checks", lambda: _checks_section(quality, contact), "Behind the quality")
+    page.add("run", lambda: _run_section(calibration, recording, contact, method), "What was run")
     return page.html(f"Calibration of {recording.name}" if recording.name else "Calibration")
 
 
 class _Contact(NamedTuple):
-    """What a protocol holds together, in words."""
+    """The words for a protocol's closure."""
 
     protocol: str
     hands: tuple[str, ...]
     noun: str
     gap: str
-    chain: tuple[str, ...]  # lengths that it holds
+    chain: tuple[str, ...]  # lengths in it
 
 
-def _contact(protocol: Protocol) -> _Contact:
-    hands = tuple(dict.fromkeys(p for c in protocol.closures for p in c.points if p.endswith("_hand")))
+def _describe_contact(protocol: Protocol) -> _Contact:
+    hands = tuple(dict.fromkeys(p for c in protocol.closures for p in c.points if p.endswith("_palm")))
     if len(hands) < 2:
         noun = f"the {plain(hands[0])}" if hands else "the hands"
         return _Contact(protocol.name, hands, noun, "palm to its point", protocol.chain)
@@ -139,7 +138,7 @@ def _contact(protocol: Protocol) -> _Contact:
 # The sections: the values that the macros of the template take --------------------------------------------------------
 
 
-def _first(
+def _diagnostics_section(
     calibration: Calibration, quality: CalibrationQuality | None, untracked: Sequence[Diagnostic]
 ) -> dict[str, Any]:
     further = calibration.diagnostics if quality is None else quality.further
@@ -150,9 +149,9 @@ def _first(
     }
 
 
-def _short(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
+def _summary_section(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
     subject = calibration.subject
-    scaling = [name for name in calibration.gauge if name in contact.chain or name not in subject.lengths]
+    scaling = [name for name in calibration.measured if name in contact.chain or name not in subject.lengths]
     tilts = {name: _mount_stds(subject, name) for name in subject.mounts}
     known = {name: std for name, std in tilts.items() if np.isfinite(std).all()}
     worst = [max(known, key=lambda name, k=k: known[name][k]) for k in (0, 1)] if known else []  # type: ignore[misc]
@@ -167,42 +166,42 @@ def _short(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
     }
 
 
-def _lengths(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
+def _lengths_section(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
     subject, prior = calibration.subject, calibration.prior
     rows, lines = [], []
     for parts in _ROWS:
         weights = np.ones(len(parts))
-        value, before = (sum(who.lengths.get(part, np.nan) for part in parts) for who in (subject, prior))
-        std, before_std = (_std(who, parts, weights) for who in (subject, prior))
-        taped = calibration.gauge.get(parts[0], np.nan) if len(parts) == 1 else np.nan
+        value, before = (sum(person.lengths.get(part, np.nan) for part in parts) for person in (subject, prior))
+        std, before_std = (_std(person, parts, weights) for person in (subject, prior))
+        measured = calibration.measured.get(parts[0], np.nan) if len(parts) == 1 else np.nan
         label = _label(parts)
-        rows.append(Length(label, value, std, before, before_std, taped))
-        learned = calibration.learned.get(" + ".join(parts))
+        rows.append(Length(label, value, std, before, before_std, measured))
+        learned = calibration.information_shares.get(" + ".join(parts))
         lines.append(
             [
                 label,
                 f"**{plus_minus(1e3 * value, 1e3 * std, 'mm')}**",
                 plus_minus(1e3 * before, 1e3 * before_std, "mm"),
-                f"{1e3 * taped:.0f} mm" if np.isfinite(taped) else "",
+                f"{1e3 * measured:.0f} mm" if np.isfinite(measured) else "",
                 f"{100 * float(np.sum(learned)):.0f} %" if learned is not None else "",
             ]
         )
     header = ["length", "estimated", "population prior", "measured", "learned from the motion"]
     return {
         "hands": any(f"{side}_hand" in contact.chain for side in SIDES),
-        "outside": [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.gauge],
-        "learned": bool(calibration.learned),
+        "outside": [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.measured],
+        "learned": bool(calibration.information_shares),
         "picture": lengths_picture(rows),
         "lengths": Table(header, lines),
     }
 
 
-def _sensors(calibration: Calibration, recording: Recording) -> dict[str, Any] | None:
+def _sensors_section(calibration: Calibration, recording: Recording) -> dict[str, Any] | None:
     subject = calibration.subject
     rows, lines = [], []
     for name, quat_LS in subject.mounts.items():
         tilt, heading = _mount_stds(subject, name)
-        drift = np.degrees(calibration.drift.get(name, np.nan)) * 60.0
+        drift = np.degrees(calibration.heading_drift.get(name, np.nan)) * 60.0
         rows.append(Sensor(plain(name), tilt, heading, drift))
         up, forward = axes_from_mount(quat_LS)
         nearest = Rotation.from_quat(mount_from_axes(up, forward))
@@ -212,7 +211,7 @@ def _sensors(calibration: Calibration, recording: Recording) -> dict[str, Any] |
         lines.append(
             [
                 plain(name),
-                f"{_sign(up)} up, {_sign(forward)} forward, turned {off:.0f}°",
+                f"{_minus_sign(up)} up, {_minus_sign(forward)} forward, turned {off:.0f}°",
                 "yes" if stated else "no",
                 degrees(tilt),
                 degrees(heading),
@@ -226,14 +225,14 @@ def _sensors(calibration: Calibration, recording: Recording) -> dict[str, Any] |
     return {"picture": picture, "sensors": Table(header, lines)}
 
 
-def _gap(calibration: Calibration, contact: _Contact) -> dict[str, Any] | None:
-    order = _observed(calibration)
+def _gap_section(calibration: Calibration, contact: _Contact) -> dict[str, Any] | None:
+    order = _closure_order(calibration)
     if len(order) < 2:
         return None
     time = calibration.time[order]
     learned = {
-        label: smoothed(time, np.mean([calibration.learned[name] for name in names], axis=0)[order])
-        for label, names in _learned(calibration, contact).items()
+        label: smoothed(time, np.mean([calibration.information_shares[name] for name in names], axis=0)[order])
+        for label, names in _group_shares(calibration, contact).items()
     }
     step = float(np.median(np.diff(time)))
     half = {}
@@ -241,7 +240,7 @@ def _gap(calibration: Calibration, contact: _Contact) -> dict[str, Any] | None:
         share = np.cumsum(np.sort(values)[::-1]) / max(float(np.sum(values)), 1e-12)
         half[label] = (int(np.searchsorted(share, 0.5)) + 1) * step
     gap, prior_gap = calibration.gap[order], calibration.prior_gap[order]
-    apart = _apart(time, calibration.kept[order])
+    apart = _open_spans(time, calibration.contact[order])
     return {
         "picture": gap_picture(time, gap, prior_gap, apart, learned, contact.gap),
         "gap": contact.gap,
@@ -249,18 +248,20 @@ def _gap(calibration: Calibration, contact: _Contact) -> dict[str, Any] | None:
         "after_mm": 1e3 * calibration.rms_gap,
         "half": half,
         "seconds": len(time) * step,
-        "samples": calibration.independent,
+        "samples": calibration.effective_sample_size,
     }
 
 
-def _hands(calibration: Calibration, contact: _Contact, pose: Pose | None) -> dict[str, Any] | None:
+def _hands_section(calibration: Calibration, contact: _Contact, pose: Pose | None) -> dict[str, Any] | None:
     """Where the motion was informative."""
     if pose is None:
         return None
-    told = [calibration.learned[name] for names in _learned(calibration, contact).values() for name in names]
-    order = _observed(calibration)
-    shoulders = [name.replace("hand", "shoulder") for name in contact.hands]
-    if not (told and len(order) and contact.hands) or not {*contact.hands, *shoulders} <= set(pose.points):
+    shares = [
+        calibration.information_shares[name] for names in _group_shares(calibration, contact).values() for name in names
+    ]
+    order = _closure_order(calibration)
+    shoulders = [name.replace("palm", "shoulder") for name in contact.hands]
+    if not (shares and len(order) and contact.hands) or not {*contact.hands, *shoulders} <= set(pose.points):
         return None
     if "torso" not in pose.quat_WL:
         return None
@@ -269,8 +270,8 @@ def _hands(calibration: Calibration, contact: _Contact, pose: Pose | None) -> di
     reach = np.mean([pose.points[name][at] for name in contact.hands], axis=0)
     reach = reach - np.mean([pose.points[name][at] for name in shoulders], axis=0)
     reach = Rotation.from_quat(pose.quat_WL["torso"][at]).inv().apply(reach)
-    share = np.mean(told, axis=0)[order]
-    touched = (calibration.kept[order] >= TOUCHED) & np.isfinite(reach).all(axis=1)
+    share = np.mean(shares, axis=0)[order]
+    touched = (calibration.contact[order] >= MIN_CONTACT) & np.isfinite(reach).all(axis=1)
     if not touched.any():
         return None
     arm = np.mean([[lengths[f"{name[:-5]}_{part}"] for part in PARTS] for name in contact.hands]) * len(PARTS)
@@ -304,8 +305,8 @@ def _hands(calibration: Calibration, contact: _Contact, pose: Pose | None) -> di
     return {
         "noun": contact.noun,
         "both": both,
-        "across": [_side(end[1], "right", "left") for end in (low, high)],
-        "up": [_side(end[2], "below", "above") for end in (low, high)],
+        "across": [_format_side(end[1], "right", "left") for end in (low, high)],
+        "up": [_format_side(end[2], "below", "above") for end in (low, high)],
         "stretch": [near, away],
         "rare": rare if both else [],
         "picture": hands_picture(hands, contact.noun),
@@ -313,17 +314,17 @@ def _hands(calibration: Calibration, contact: _Contact, pose: Pose | None) -> di
     }
 
 
-def _posture(calibration: Calibration) -> dict[str, Any] | None:
-    tilt = {name: np.asarray(t, dtype=float) for name, t in calibration.start_tilt.items()}
+def _posture_section(calibration: Calibration) -> dict[str, Any] | None:
+    tilt = {name: np.asarray(t, dtype=float) for name, t in calibration.start_pose_offset.items()}
     tilt = {name: t for name, t in tilt.items() if np.isfinite(t).all()}
     if not tilt:
         return None
-    lines, seen = [], {}
+    lines, observed = [], {}
     for name, (x, y) in tilt.items():
         std = np.degrees([calibration.subject.std(row) for row in mount_rows(name)[:2]])
-        seen[name] = (~(std > UNSEEN * np.degrees(START_POSE_STD))).tolist()
-        of = ((1, x, std[0], seen[name][0]), (0, y, std[1], seen[name][1]))
-        lines.append([plain(name), *(_tilt(name, *about) for about in of)])
+        observed[name] = (~(std > UNOBSERVED * np.degrees(START_POSE_STD))).tolist()
+        of = ((1, x, std[0], observed[name][0]), (0, y, std[1], observed[name][1]))
+        lines.append([plain(name), *(_format_tilt(name, *about) for about in of)])
     elbows = {}
     for side in SIDES:
         upper, fore = (tilt.get(f"{side}_{part}") for part in ("upper_arm", "forearm"))
@@ -332,19 +333,20 @@ def _posture(calibration: Calibration) -> dict[str, Any] | None:
             elbows[side] = float(np.degrees(np.arccos(np.clip(down[0] @ down[1], -1.0, 1.0))))
     return {
         "elbows": elbows,
-        "picture": posture_picture(tilt, seen, calibration.subject.lengths),
+        "picture": posture_picture(tilt, observed, calibration.subject.lengths),
         "tilts": Table(["segment", "sideways", "forwards or backwards"], lines),
     }
 
 
-def _elbows(calibration: Calibration) -> dict[str, Any] | None:
+def _elbows_section(calibration: Calibration) -> dict[str, Any] | None:
     lines = []
-    for side, axis in calibration.hinge.items():
+    for joint, axis in calibration.hinge_axes.items():
+        side = joint.removesuffix("_elbow")
         x, y, z = np.asarray(axis, dtype=float)
         if side == "right":  # seen along its outer end
             x, y, z = -x, -y, -z
         forward, up = np.degrees(np.arctan2(x, abs(y))), np.degrees(np.arctan2(z, abs(y)))
-        softness = float(np.degrees(calibration.hinge_rms.get(side, np.nan)))
+        softness = float(np.degrees(calibration.hinge_rms.get(joint, np.nan)))
         if not np.isfinite([forward, up]).all():
             continue
         ends = f"{abs(forward):.1f}° {'forwards' if forward > 0 else 'backwards'}", f"{abs(up):.1f}° "
@@ -353,30 +355,31 @@ def _elbows(calibration: Calibration) -> dict[str, Any] | None:
     return {"elbows": Table(header, lines)} if lines else None
 
 
-def _view(calibration: Calibration, recording: Recording, pose: TrackedRecording | None) -> dict[str, Any] | None:
-    if pose is None or pose.model is None or not len(calibration.time):
+def _view_section(
+    calibration: Calibration, recording: Recording, tracked: TrackedRecording | None
+) -> dict[str, Any] | None:
+    if tracked is None or not len(calibration.time):
         return None
     begin, end = float(calibration.time.min()), float(calibration.time.max())
-    of = slice(*np.searchsorted(pose.time, [begin - 1e-6, end + 1e-6]))
+    of = slice(*np.searchsorted(tracked.time, [begin - 1e-6, end + 1e-6]))
     if of.stop - of.start < 2:
         return None
     cut = Pose(
-        pose.time[of],
-        {name: quat[of] for name, quat in pose.quat_WL.items()},
-        {name: points[of] for name, points in pose.points.items()},
+        tracked.time[of],
+        {name: quat[of] for name, quat in tracked.quat_WL.items()},
+        {name: points[of] for name, points in tracked.points.items()},
     )
-    shown = {
+    visible = {
         name: [(max(a, begin), min(b, end)) for a, b in spans if b > begin and a < end]
         for name, spans in recording.phases.items()
     }
-    phases: Mapping[str, Sequence[tuple[float, float]]] = {name: spans for name, spans in shown.items() if spans}
-    return {"page": pose_html(pose.model, cut, phases=phases, title=recording.name, fps=FRAMES_A_SECOND)}
+    phases: Mapping[str, Sequence[tuple[float, float]]] = {name: spans for name, spans in visible.items() if spans}
+    return {"page": pose_html(tracked.model, cut, phases=phases, title=recording.name, fps=FRAMES_A_SECOND)}
 
 
-def _run(
-    calibration: Calibration, recording: Recording, contact: _Contact, method: str, gauge_std: float
-) -> dict[str, Any]:
-    gauge = [f"{plain(name)} {1e3 * v:.0f} ± {1e3 * gauge_std:.0f} mm" for name, v in calibration.gauge.items()]
+def _run_section(calibration: Calibration, recording: Recording, contact: _Contact, method: str) -> dict[str, Any]:
+    lengths = {name: calibration.measured_lengths[name] for name in calibration.measured}
+    measured = [f"{plain(n)} {1e3 * v.metres:.0f} ± {1e3 * v.measured_std:.0f} mm" for n, v in lengths.items()]
     imu, fused = len(recording.imus), len(recording.sensors) - len(recording.imus)
     raw = ["gyroscope and accelerometer"] * (imu > 0) + ["measured orientations"] * (fused > 0)
     rows = [
@@ -384,26 +387,26 @@ def _run(
         ("sensors", f"{', '.join(map(plain, recording.sensors))} ({', '.join(raw)})"),
         ("length", f"{recording.time[-1] - recording.time[0]:.1f} s at {recording.rate_hz:g} Hz"),
         *((f"phase {name}", intervals(spans)) for name, spans in recording.phases.items()),
-        ("protocol", f"{contact.protocol}, {len(calibration.time)} moments of it"),
+        ("protocol", f"{contact.protocol}, {len(calibration.time)} samples of it"),
         ("filter", method),
-        ("measured lengths", ", ".join(gauge) or "none"),
+        ("measured lengths", ", ".join(measured) or "none"),
         ("population prior", calibration.prior.note or calibration.prior.name),
-        ("sensors strapped on anew", "yes" if recording.remounted else "no"),
+        ("sensors mounted again", "yes" if recording.remounted else "no"),
         ("made with", versions()),
     ]
     return {"rows": rows}
 
 
-def _checks(quality: CalibrationQuality | None, contact: _Contact) -> dict[str, Any] | None:
+def _checks_section(quality: CalibrationQuality | None, contact: _Contact) -> dict[str, Any] | None:
     if quality is None:
         return None
     rows = []
     for check in quality.checks:
         if np.isfinite(check.value):
-            what, unit = _checked(check, contact)
+            quantity_name, unit = _describe_check(check, contact)
             bound = "at least" if check.limits.passes > check.limits.poor else "up to"
             limits = [f"{bound} {quantity(limit, unit)}" for limit in check.limits]
-            rows.append([what, quantity(check.value, unit), *limits, check.quality])
+            rows.append([quantity_name, quantity(check.value, unit), *limits, check.quality])
     header = ["checked", "value", "passes", "poor", "quality"]
     unknowns = {"unknowns": quality.unknowns, "rank": quality.rank, "determined": quality.determined}
     return {**unknowns, "checks": Table(header, rows)} if rows else None
@@ -415,9 +418,9 @@ _SIDED = [((f"{s}_upper_arm",), (f"{s}_forearm",), (f"{s}_hand",), (f"{s}_forear
 _ROWS: list[tuple[str, ...]] = [("shoulder_width",), *_SIDED[0], *_SIDED[1], ("trunk",)]
 
 
-def _learned(calibration: Calibration, contact: _Contact) -> dict[str, list[str]]:
-    """What the motion can show: label → names in `Calibration.learned`."""
-    learned = calibration.learned
+def _group_shares(calibration: Calibration, contact: _Contact) -> dict[str, list[str]]:
+    """Label → names in `Calibration.information_shares`, of the quantities that the motion can show."""
+    learned = calibration.information_shares
     arms = [f"{s}_upper_arm" for s in SIDES] + [f"{s}_forearm + {s}_hand" for s in SIDES]
     groups = {
         "lengths": [name for name in arms if name in learned and set(name.split(" + ")) <= set(contact.chain)],
@@ -426,17 +429,16 @@ def _learned(calibration: Calibration, contact: _Contact) -> dict[str, list[str]
     return {label: names for label, names in groups.items() if names}
 
 
-def _observed(calibration: Calibration) -> np.ndarray:
-    """Indices, in the order of time, of the observations at which a gap was to close."""
+def _closure_order(calibration: Calibration) -> np.ndarray:
+    """Indices of the samples of a closure, in the order of time."""
     order = np.argsort(calibration.time, kind="stable")
     return order[np.isfinite(calibration.gap[order])]
 
 
-def _apart(time: np.ndarray, kept: np.ndarray) -> list[tuple[float, float]]:
+def _open_spans(time: np.ndarray, contact: np.ndarray) -> list[tuple[float, float]]:
     """Spans [s] in which the palms were apart."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], (kept < TOUCHED).astype(int), [0]))))
     half = 0.5 * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    return [(time[a] - half, time[b - 1] + half) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [(begin - half, end + half) for begin, end in find_intervals(time, contact < MIN_CONTACT)]
 
 
 def _mount_stds(subject: Subject, segment: str) -> tuple[float, float]:
@@ -455,12 +457,12 @@ def _label(parts: Sequence[str]) -> str:
     return plain(parts[0]) if len(parts) == 1 else f"{plain(parts[0])} + hand"
 
 
-def _sign(axis: str) -> str:
+def _minus_sign(axis: str) -> str:
     return axis.replace("-", "−")
 
 
-def _checked(check: Check, contact: _Contact) -> tuple[str, str]:
-    """What a check is about, and the unit in which its value is shown."""
+def _describe_check(check: Check, contact: _Contact) -> tuple[str, str]:
+    """The quantity of a check, and the unit in which its value is shown."""
     place = plain(check.diagnostic.place)
     return {
         "arm-motion-implausible": ("doubt of the sensors' places, by anatomy", "number"),
@@ -473,7 +475,7 @@ def _checked(check: Check, contact: _Contact) -> tuple[str, str]:
         "scale-uncertain": ("± scale, all lengths together", "percent"),
         "scale-from-prior": ("± scale, all lengths together", "percent"),
         "closure-gap-large": (f"{contact.gap}, root mean square", "mm"),
-        "motion-too-short": ("effective sample size: what the motion is worth", "count"),
+        "motion-too-short": ("effective sample size of the motion", "count"),
         "closure-open": ("share of the time apart", "percent"),
         "start-pose-off": (f"segment farthest off the start pose: {place}", "deg"),
         "measured-length-contradicted": (f"standard deviations of the measured {place} from all else", "number"),
@@ -481,12 +483,12 @@ def _checked(check: Check, contact: _Contact) -> tuple[str, str]:
     }[check.diagnostic.code]
 
 
-def _tilt(name: str, across: int, angle: float, std: float, seen: bool) -> str:
+def _format_tilt(name: str, across: int, angle: float, std: float, observed: bool) -> str:
     deg = float(np.degrees(angle))
-    if not seen:
+    if not observed:
         return f"not seen, ± {std:.1f}° assumed"
     return f"{plus_minus(abs(deg), std, '°')} {direction(name, across, deg)}".replace(" °", "°")
 
 
-def _side(value: float, negative: str, positive: str) -> str:
+def _format_side(value: float, negative: str, positive: str) -> str:
     return f"{abs(value):.0f} cm {positive if value >= 0.0 else negative}"

@@ -40,10 +40,10 @@ class Sensor(NamedTuple):
 
 
 class Hands(NamedTuple):
-    """Where the joined hands were."""
+    """Places of the joined hands."""
 
     reach: np.ndarray  # (n, 3) [m] from the middle of the shoulders, in the torso's frame
-    learned: np.ndarray  # (n,) [%] of what is known at the end
+    learned: np.ndarray  # (n,) [%] share of the information
     touched: np.ndarray  # (n,) bool
     shoulder_width: float  # [m]
     trunk: float  # [m]
@@ -72,13 +72,13 @@ def lengths_picture(rows: Sequence[Length]) -> Picture:
         keys.append(Key("measured", "ink hollow", "triangle"))
     return Picture(
         "lengths",
-        "Lengths against the population prior's; to the right what was estimated.",
+        "Lengths against the population prior's; to the right the estimates.",
         Chart([[panel]], [26.0 * len(rows) + 6.0], keys),
     )
 
 
 def sensors_picture(rows: Sequence[Sensor], tilt_before_deg: float, drift_before: float) -> Picture:
-    """How well each mount is known, and how its heading drifted."""
+    """The uncertainty of each mount, and the drift of its heading."""
     names = [row.label for row in rows]
     columns = [[row.tilt_std for row in rows], [row.heading_std for row in rows], [r.drift_deg_min for r in rows]]
     titles = ["tilt of the mount, ± [°]", "heading of the mount, ± [°]", "heading drift [°/min]"]
@@ -126,7 +126,7 @@ def gap_picture(
     usual = np.concatenate([gap[touched], prior_gap[touched]] if touched.any() else [gap, prior_gap]) * 1e3
     most = 1.12 * max(float(np.max(usual, initial=0.0, where=np.isfinite(usual))), 1.0)
     ends = float(time[0]), float(time[-1])
-    top = Panel(f"{label} [mm]", x=ends, y=(0.0, most))  # the palms apart may leave the picture
+    top = Panel(f"{label} [mm]", x=ends, y=(0.0, most))  # where the palms are apart the line may leave the picture
     top.spans(apart, "hatched")
     top.line(*broken(time, 1e3 * prior_gap), "before dashed")
     top.line(*broken(time, 1e3 * gap), "accent")
@@ -146,8 +146,8 @@ def gap_picture(
     caption = capital(f"{'above: ' * bool(learned)}{label}, before and after.")
     if learned:
         caption += (
-            f" Below: the share of what is known at the end that each second showed, over {SMOOTHED_S:g} s; where it "
-            "is high the motion was informative."
+            f" Below: the share of the information that each second gave, over {SMOOTHED_S:g} s; where it is "
+            "high the motion was informative."
         )
     return Picture("gap", caption, Chart([[panel] for panel in panels], [170.0, 120.0][: len(panels)], keys))
 
@@ -172,38 +172,38 @@ def hands_picture(hands: Hands, noun: str) -> Picture:
 
 
 def posture_picture(
-    tilt: Mapping[str, np.ndarray], seen: Mapping[str, Sequence[bool]], lengths: Mapping[str, float]
+    tilt: Mapping[str, np.ndarray], observed: Mapping[str, Sequence[bool]], lengths: Mapping[str, float]
 ) -> Picture:
     """The start pose from the front and from both sides, with its tilts drawn larger than they are.
 
     Parameters
     ----------
-    tilt, seen : segment → (2,) [rad] about x and y; whether the motion showed anything about it
+    tilt, observed : segment → (2,) [rad] about x and y; whether the motion showed anything about it
     """
     largest = max([1e-9, *(float(np.degrees(np.linalg.norm(t))) for t in tilt.values())])
     factor = int(np.clip(round(EXAGGERATED_DEG / largest), 1, MOST_EXAGGERATED))
     arms = [side for side in ("left", "right") if any(name.startswith(side) for name in tilt)]
-    held, meant = (_stick(tilt, lengths, f) for f in (factor, 0))
+    tilted, exact = (_stick(tilt, lengths, f) for f in (factor, 0))
     views = [("from the front", 1, arms), *((f"from the {side}", 0, [side]) for side in arms)]
     panels = []
     for title, across, sides in views:
         panel = Panel(title, x=(-48.0, 48.0), y=(-12.0, 100 * lengths["trunk"] + 36.0), equal=True, bare=True)
         panel.flip_x = title == "from the left"
-        head = held["head"][1]
+        head = tilted["head"][1]
         panel.disc(100 * head[across], 100 * head[2], 9.5, "band")
-        panel.line(*_ends(held["head"], across), "band limb")
+        panel.line(*_ends(tilted["head"], across), "band limb")
         if across == 1:
-            shoulders = [held["left_shoulder"][0], held["right_shoulder"][0]]
+            shoulders = [tilted["left_shoulder"][0], tilted["right_shoulder"][0]]
             panel.line(*_ends(shoulders, across), "other limb")
         for name in ("torso", *(f"{side}_{part}" for side in sides for part in ("upper_arm", "forearm"))):
             if name in tilt:
                 about = 0 if across == 1 else 1
-                panel.line(*_ends(held[name], across), f"{name.split('_')[0] if name != 'torso' else 'other'} limb")
-                panel.line(*_ends(meant[name], across), "soft dotted")
+                panel.line(*_ends(tilted[name], across), f"{name.split('_')[0] if name != 'torso' else 'other'} limb")
+                panel.line(*_ends(exact[name], across), "soft dotted")
                 angle = float(np.degrees(tilt[name][about]))
                 text = f"{abs(angle):.1f}° {direction(name, across, angle)}" if abs(angle) >= 0.05 else "0.0°"
-                text = text if seen[name][about] else "not seen"
-                middle = 100 * np.mean(held[name], axis=0)
+                text = text if observed[name][about] else "not seen"
+                middle = 100 * np.mean(tilted[name], axis=0)
                 right = (middle[1] >= 0.0) if across == 1 else title == "from the right"
                 anchor: Anchor = "start" if right else "end"
                 if name == "torso":
@@ -211,9 +211,9 @@ def posture_picture(
                 else:
                     panel.text(middle[across], middle[2], text, "halo", anchor, dx=14.0 if right else -14.0)
         panels.append(panel)
-    keys = [*(Key(side, f"{side} bold") for side in arms), Key("as meant", "soft dotted")]
+    keys = [*(Key(side, f"{side} bold") for side in arms), Key("exact pose", "soft dotted")]
     drawn = f"drawn {factor} times as large as they are" if factor > 1 else "as they are"
-    caption = f"How the start pose was held; tilts {drawn}, the degrees are the true ones."
+    caption = f"The start pose; tilts are {drawn}, the degrees are the true ones."
     return Picture("posture", caption, Chart([panels], [320.0], keys))
 
 
@@ -230,7 +230,7 @@ def direction(segment: str, across: int, angle: float) -> str:
 
 
 def smoothed(time: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(n,) shares of each observation → (n,) [%/s], over `SMOOTHED_S` around each."""
+    """Smooth shares (n,) of the samples over `SMOOTHED_S`, to [%/s]."""
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     half = SMOOTHED_S / 2.0
     total = np.concatenate(([0.0], np.cumsum(np.nan_to_num(share))))

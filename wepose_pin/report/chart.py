@@ -149,9 +149,9 @@ class Panel:
 
     def limits(self, axis: Literal["x", "y"]) -> Limits:
         """Those given, or those of the marks and 5 % more."""
-        given = self.x if axis == "x" else self.y
-        if given is not None:
-            return given if given[1] > given[0] else (given[0] - 0.5, given[0] + 0.5)
+        interval = self.x if axis == "x" else self.y
+        if interval is not None:
+            return interval if interval[1] > interval[0] else (interval[0] - 0.5, interval[0] + 0.5)
         values = np.concatenate(
             [[np.nan]]
             + [
@@ -236,8 +236,8 @@ class Chart:
             for panel, room in zip(row, left, strict=False):
                 panels.append(_drawn_panel(panel, x + room, top, width, height))
                 x += room + width + panel.right
-            shown = [panel for panel in row if not panel.bare]
-            top += height + 3.0 + _LINE * any(p.shown_x for p in shown) + _LINE * any(p.x_label for p in shown)
+            framed = [panel for panel in row if not panel.bare]
+            top += height + 3.0 + _LINE * any(p.shown_x for p in framed) + _LINE * any(p.x_label for p in framed)
         return top, panels, keys
 
     def _drawn_legend(self) -> tuple[list[DrawnKey], float]:
@@ -261,7 +261,7 @@ class Chart:
 
 
 def envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line of at most 2 `COLUMNS` points that looks like the whole: the least and the largest value of each column.
+    """A line of at most 2 `COLUMNS` points with the same picture: the least and the largest value of each column.
 
     Parameters
     ----------
@@ -318,9 +318,9 @@ def _room_left(panel: Panel, height: float) -> float:
 
 
 def _ticks(panel: Panel, axis: Literal["x", "y"], low: float, high: float, length: float) -> Sequence[Tick]:
-    given = panel.x_ticks if axis == "x" else panel.y_ticks
-    if given is not None:
-        return given
+    ticks = panel.x_ticks if axis == "x" else panel.y_ticks
+    if ticks is not None:
+        return ticks
     if panel.log_x if axis == "x" else panel.log_y:
         return log_ticks(low, high)
     return round_ticks(low, high, max(2, int(length / (60.0 if axis == "x" else 28.0))))

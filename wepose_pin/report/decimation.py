@@ -13,7 +13,7 @@ from ..diagnostics import Diagnostic
 from ..pose import Pose
 from ..recording import Intervals, join
 from ..tracking import TrackedRecording
-from .measures import Signal, hands_of, signal_of
+from .measures import Signal, measure_hands, measure_signal
 
 MOST = 20_000  # samples that are kept
 _OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov")  # in `Orientation`
@@ -21,7 +21,7 @@ _OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov")  # in `Orie
 
 @dataclass(frozen=True)
 class Totals:
-    """What a decimated pose no longer tells of the recording."""
+    """Values of the whole recording that a decimated pose has lost."""
 
     samples: int
     rate_hz: float
@@ -31,18 +31,18 @@ class Totals:
     diagnostics: Sequence[Diagnostic]
 
 
-def totals_of(pose: TrackedRecording) -> Totals:
-    """That of a pose which has all its samples."""
-    recording = pose.recording
+def compute_totals(tracked: TrackedRecording) -> Totals:
+    """The totals of a pose with all its samples."""
+    recording = tracked.recording
     steps = 1e3 * np.diff(recording.time)
-    hands = hands_of(pose.pose, recording.rate_hz)
+    hands = measure_hands(tracked.pose, recording.rate_hz)
     return Totals(
         len(recording),
         recording.rate_hz,
         (float(steps.min()), float(steps.max())),
-        {name: signal_of(recording, name, pose) for name in recording.sensors},
+        {name: measure_signal(recording, name, tracked) for name in recording.sensors},
         {name: hand.peak_speed for name, hand in hands.items()},
-        pose.diagnostics,
+        tracked.diagnostics,
     )
 
 
@@ -65,7 +65,7 @@ class Decimator:
         self._error: Exception | None = None
 
     def add(self, chunk: TrackedRecording) -> None:
-        """The next chunk. What fails here is kept for `decimated`: it must not stop what the chunks are for."""
+        """Add the next chunk. `decimated` raises the errors of this function, so that they do not stop the tracking."""
         try:
             self._add(chunk)
         except Exception as error:
@@ -75,27 +75,27 @@ class Decimator:
         recording = chunk.recording
         at = np.arange(-self._seen % self._every, len(recording), self._every)
         for name in recording.sensors:
-            self._take_signal(name, signal_of(recording, name, chunk), at)
-        for name, hand in hands_of(chunk.pose, recording.rate_hz).items():
+            self._take_signal(name, measure_signal(recording, name, chunk), at)
+        for name, hand in measure_hands(chunk.pose, recording.rate_hz).items():
             self._peak_speed[name] = max(self._peak_speed.get(name, 0.0), hand.peak_speed)
         steps = 1e3 * np.diff(recording.time, prepend=self._last)
         self._steps = min(self._steps[0], float(np.nanmin(steps))), max(self._steps[1], float(np.nanmax(steps)))
         self._seen, self._last = self._seen + len(recording), float(recording.time[-1])
         if len(at):
-            self._kept.append(_decimated(chunk, at, recording.rate_hz / self._every))
+            self._kept.append(_decimate(chunk, at, recording.rate_hz / self._every))
 
     def decimated(
         self, phases: Mapping[str, Intervals], diagnostics: Sequence[Diagnostic]
     ) -> tuple[TrackedRecording, Totals]:
-        """The pose, and what it no longer tells; `phases` and `diagnostics` of the whole recording.
+        """The decimated pose and the totals; `phases` and `diagnostics` of the whole recording.
 
         Raises the first error of `add`, of any kind.
         """
         if self._error is not None:
             raise self._error
         last = self._kept[-1]
-        pose = _joined(self._kept, phases)
-        signals = {name: _joined_signal(parts) for name, parts in self._signals.items()}
+        pose = _join_recordings(self._kept, phases)
+        signals = {name: _join_signals(parts) for name, parts in self._signals.items()}
         rate_hz = last.recording.rate_hz * self._every
         return pose, Totals(self._seen, rate_hz, self._steps, signals, self._peak_speed, diagnostics)
 
@@ -107,17 +107,17 @@ class Decimator:
             rate=np.maximum.reduceat(signal.rate, edges),
             cut=np.logical_or.reduceat(signal.cut, edges),
             gap=np.logical_or.reduceat(signal.gap, edges),
-            rest=None if signal.rest is None else np.logical_and.reduceat(signal.rest, edges),
+            static=None if signal.static is None else np.logical_and.reduceat(signal.static, edges),
         )
         if len(edges) > len(at):
             before = parts[-1]
             before.rate[-1] = max(before.rate[-1], of.rate[0])
             before.cut[-1] |= of.cut[0]
             before.gap[-1] |= of.gap[0]
-            if before.rest is not None and of.rest is not None:
-                before.rest[-1] &= of.rest[0]
+            if before.static is not None and of.static is not None:
+                before.static[-1] &= of.static[0]
             of = of._replace(
-                rate=of.rate[1:], cut=of.cut[1:], gap=of.gap[1:], rest=None if of.rest is None else of.rest[1:]
+                rate=of.rate[1:], cut=of.cut[1:], gap=of.gap[1:], static=None if of.static is None else of.static[1:]
             )
         if len(at):
             parts.append(of)
@@ -125,19 +125,19 @@ class Decimator:
             parts[-1] = parts[-1]._replace(bias=of.bias, peak_accel=max(parts[-1].peak_accel, of.peak_accel))
 
 
-def _joined_signal(parts: list[Signal]) -> Signal:
-    rest = [part.rest for part in parts if part.rest is not None]
+def _join_signals(parts: list[Signal]) -> Signal:
+    static = [part.static for part in parts if part.static is not None]
     last = parts[-1]
     return last._replace(
         rate=np.concatenate([part.rate for part in parts]),
         cut=np.concatenate([part.cut for part in parts]),
         gap=np.concatenate([part.gap for part in parts]),
-        rest=np.concatenate(rest) if rest else None,
+        static=np.concatenate(static) if static else None,
         peak_accel=max(part.peak_accel for part in parts),
     )
 
 
-def _decimated(tracked: TrackedRecording, at: np.ndarray, rate_hz: float) -> TrackedRecording:
+def _decimate(tracked: TrackedRecording, at: np.ndarray, rate_hz: float) -> TrackedRecording:
     """The samples `at` of a recording, as if it had been recorded so slowly."""
     pose, recording, segments = tracked.pose, tracked.recording, tracked.segments
     sensors = {name: sensor.part(at) for name, sensor in recording.sensors.items()}
@@ -166,14 +166,14 @@ def _rows(values: Any, at: np.ndarray) -> Any:
     return None if values is None else values[at]
 
 
-def _joined(parts: list[TrackedRecording], phases: Mapping[str, Intervals]) -> TrackedRecording:
+def _join_recordings(parts: list[TrackedRecording], phases: Mapping[str, Intervals]) -> TrackedRecording:
     """One of many; what is one number comes from the last."""
     last = parts[-1]
     segments = [part.segments for part in parts]
     orientation = {
         name: of._replace(
             **{
-                field: _concatenated([getattr(s.orientation[name], field) for s in segments])
+                field: _concatenate([getattr(s.orientation[name], field) for s in segments])
                 for field in _OF_EACH_SAMPLE
             }
         )
@@ -181,19 +181,19 @@ def _joined(parts: list[TrackedRecording], phases: Mapping[str, Intervals]) -> T
     }
     return replace(
         last,
-        pose=Pose(*(_concatenated([getattr(part.pose, of.name) for part in parts]) for of in fields(Pose))),
+        pose=Pose(*(_concatenate([getattr(part.pose, of.name) for part in parts]) for of in fields(Pose))),
         recording=replace(reduce(join, [part.recording for part in parts]), phases=phases),
         segments=replace(
             segments[-1],
             time=np.concatenate([of.time for of in segments]),
-            quat_WL=_concatenated([of.quat_WL for of in segments]),
-            covariance_W=_concatenated([of.covariance_W for of in segments]),
+            quat_WL=_concatenate([of.quat_WL for of in segments]),
+            covariance_W=_concatenate([of.covariance_W for of in segments]),
             orientation=orientation,
         ),
     )
 
 
-def _concatenated(values: list[Any]) -> Any:
+def _concatenate(values: list[Any]) -> Any:
     """Arrays put together, or each array of mappings; None where one is missing."""
     if isinstance(values[0], Mapping):
         return {name: np.concatenate([arrays[name] for arrays in values]) for name in values[0]}

@@ -1,14 +1,15 @@
-"""What the report of a tracked recording measures: the sensors' signals, rest, headings, elbows, hands."""
+"""Measures of a tracked recording's report: the sensors' signals, static phases, headings, elbows, hands."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..pose import Pose, spread
+from ..pose import Pose, axis_std
 from ..recording import OrientationSensor, Recording
 from ..recording.gaps import runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
@@ -30,7 +31,7 @@ JOINTS = (
         )
     ),
 )
-BENT = np.deg2rad(20.0)  # from which on a forearm shows the plane of its elbow
+BENT = np.deg2rad(20.0)  # above which a forearm shows the plane of its elbow
 PEAK_OVER_S = 0.1  # a hand's speed is that of its mean over so long
 
 
@@ -41,15 +42,15 @@ class Signal(NamedTuple):
     peak_accel: float  # [m/s²], NaN for measured orientations
     cut: np.ndarray  # (n,) bool, an axis is cut off at the end of its range
     gap: np.ndarray  # (n,) bool, bridged over a long gap
-    rest: np.ndarray | None  # (n,) bool, still by the filter's test; None for measured orientations
+    static: np.ndarray | None  # (n,) bool by the filter's test; None for measured orientations
     gyro_noise: float  # [rad/s], root mean square of an axis in the static phase
     accel_noise: float  # [m/s²], the same
     gravity: float  # [m/s²]
     bias: tuple[np.ndarray, np.ndarray] | None  # (3,) [rad/s] at the beginning and at the end
 
 
-def signal_of(recording: Recording, name: str, pose: TrackedRecording) -> Signal:
-    """The signal of a sensor, and what its filter found."""
+def measure_signal(recording: Recording, name: str, tracked: TrackedRecording) -> Signal:
+    """The signal of a sensor, with the results of its filter."""
     sensor = recording.sensors[name]
     nothing = np.zeros(len(recording), dtype=bool)
     gap = sensor.gap if sensor.gap is not None else nothing
@@ -58,79 +59,98 @@ def signal_of(recording: Recording, name: str, pose: TrackedRecording) -> Signal
         rate = (R[:-1].inv() * R[1:]).magnitude() * recording.rate_hz
         nan = float("nan")
         return Signal(np.concatenate([rate[:1], rate]), nan, nothing, gap, None, nan, nan, nan, None)
-    of = pose.segments.orientation[name]
+    orientation = tracked.segments.orientation[name]
     cut = cut_off(sensor.gyro_S, NARROWEST_GYRO_RANGE) | cut_off(sensor.accel_S, NARROWEST_ACCEL_RANGE)
     return Signal(
         np.linalg.norm(sensor.gyro_S, axis=1),
         float(np.linalg.norm(sensor.accel_S, axis=1).max()),
         cut.any(axis=1),
         gap,
-        of.static,
-        _rms(of.noise.gyro_cov),
-        of.noise.gravity * _rms(of.noise.accel_cov),
-        of.noise.gravity,
-        (of.noise.gyro_bias, of.gyro_bias[-1].copy()),  # a view would keep the whole run
+        orientation.static,
+        _rms(orientation.noise.gyro_cov),
+        orientation.noise.gravity * _rms(orientation.noise.accel_cov),
+        orientation.noise.gravity,
+        (orientation.noise.gyro_bias, orientation.gyro_bias[-1].copy()),  # a view would keep the whole run
     )
 
 
-def largest(values: np.ndarray) -> float:
+def finite_max(values: np.ndarray) -> float:
     """The largest of the finite values; NaN where there is none."""
     return float(np.max(values, initial=-np.inf, where=np.isfinite(values))) if np.isfinite(values).any() else np.nan
 
 
-def usual(values: np.ndarray) -> float:
+def finite_median(values: np.ndarray) -> float:
     """The median of the finite values; NaN where there is none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else float("nan")
 
 
-def from_start(pose: TrackedRecording) -> np.ndarray:
-    """(n,) bool, the samples from the end of the start pose on: only of these the stated uncertainties are summed up.
+def mask_from_start(tracked: TrackedRecording) -> np.ndarray:
+    """(n,) bool, the samples after the start pose, which the summaries of uncertainty are of.
 
-    Before it the filters have only begun, and headings are followed back in time.
+    Before it the filters have not converged, and headings are extrapolated backwards.
     """
-    since = pose.time >= pose.segments.start[1] - 1e-9
+    since = tracked.time >= tracked.segments.start[1] - 1e-9
     return since if since.any() else ~since
 
 
-def longest(which: np.ndarray, rate_hz: float) -> float:
+def longest_run_s(mask: np.ndarray, rate_hz: float) -> float:
     """The longest run of true values [s]."""
-    return max((b - a for a, b in runs(which)), default=0) / rate_hz
+    return max((b - a for a, b in runs(mask)), default=0) / rate_hz
 
 
-def stated_mounts(pose: TrackedRecording) -> bool:
-    """The mounts are the session's and not calibrated ones."""
-    return not pose.subject.mounts or pose.recording.remounted
+def stated_mounts(tracked: TrackedRecording) -> bool:
+    """Whether the mounts are the session's and not calibrated ones."""
+    return not tracked.subject.mounts or tracked.recording.remounted
+
+
+@dataclass(frozen=True)
+class Measures:
+    """All measures of a tracked recording.
+
+    Parameters
+    ----------
+    signals : sensor → its signal
+    budgets : segment → the uncertainty of its heading
+    elbows : side → its elbow
+    hands : point → the motion of the hand
+    """
+
+    signals: Mapping[str, Signal]
+    budgets: Mapping[str, Budget]
+    elbows: Mapping[str, Elbow]
+    hands: Mapping[str, Hand]
 
 
 # Headings -------------------------------------------------------------------------------------------------------------
 
 
 class Budget(NamedTuple):
-    """What a segment's heading may be off by, one standard deviation [rad]."""
+    """The uncertainty of a segment's heading, one standard deviation [rad]."""
 
-    std: np.ndarray  # (n,) with all that is known of it
-    filter_end: float  # at the end by the filter alone
+    std: np.ndarray  # (n,) with the start pose and the heading correction
+    filter_end: float  # of the filter alone, at the end
     growth: float  # of the filter's, a minute of motion; NaN where it was never in motion
 
 
-def heading_budgets(pose: TrackedRecording) -> dict[str, Budget]:
+def heading_budgets(tracked: TrackedRecording) -> dict[str, Budget]:
     """Segment → its budget, from the covariances; none where the filter has none."""
-    found = {}
-    for name, cov_W in pose.pose.segment_cov.items():
-        of = pose.segments.orientation[name]
+    budgets = {}
+    for name, cov_W in tracked.pose.segment_cov.items():
+        orientation = tracked.segments.orientation[name]
+        if orientation.attitude_cov is None:
+            continue
         ends = np.array([0, -1])
-        up_S = Rotation.from_quat(of.quat_WS[ends]).inv().apply([0.0, 0.0, 1.0])
-        assert of.attitude_cov is not None
-        variance = np.einsum("na,nab,nb->n", up_S, of.attitude_cov[ends], up_S)
+        up_S = Rotation.from_quat(orientation.quat_WS[ends]).inv().apply([0.0, 0.0, 1.0])
+        variance = np.einsum("na,nab,nb->n", up_S, orientation.attitude_cov[ends], up_S)
         first, last = np.sqrt(np.maximum(variance, 0.0))
-        minutes = float(np.count_nonzero(~of.static)) / pose.recording.rate_hz / 60.0
+        minutes = float(np.count_nonzero(~orientation.static)) / tracked.recording.rate_hz / 60.0
         growth = max(float(last - first), 0.0) / minutes if minutes > 0.0 else float("nan")
-        found[name] = Budget(np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), float(last), growth)
-    return found
+        budgets[name] = Budget(np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), float(last), growth)
+    return budgets
 
 
-def between(budgets: Mapping[str, Budget]) -> dict[str, np.ndarray]:
+def joint_heading_stds(budgets: Mapping[str, Budget]) -> dict[str, np.ndarray]:
     """Joint → (n,) [rad], one standard deviation of the heading between its segments, as if they were independent."""
     return {
         joint: np.hypot(budgets[above].std, budgets[below].std)
@@ -151,7 +171,7 @@ class Elbow(NamedTuple):
     aside: np.ndarray  # (n,) [rad], the forearm out of that plane
 
 
-def elbow_of(pose: Pose, side: str, subject: Subject | None = None) -> Elbow | None:
+def measure_elbow(pose: Pose, side: str, subject: Subject | None = None) -> Elbow | None:
     """An elbow; None where a segment is not known. Without a calibrated hinge its axis is the upper arm's y."""
     names = f"{side}_upper_arm", f"{side}_forearm"
     if not set(names) <= set(pose.quat_WL):
@@ -166,13 +186,13 @@ def elbow_of(pose: Pose, side: str, subject: Subject | None = None) -> Elbow | N
     bend = np.arctan2(sine, np.sum(upper_W * fore_W, axis=1))
     std = None
     if set(names) <= set(pose.segment_cov):
-        # Errors turn each about W: what they do to the angle is their part about the axis across both.
+        # Only rotation errors about the axis across both segments change the angle.
         both = pose.segment_cov[names[0]] + pose.segment_cov[names[1]]
         along = axis_W / np.maximum(sine, 1e-9)[:, None]
         std = np.sqrt(np.einsum("na,nab,nb->n", along, both, along))
     axis_U = np.array([0.0, 1.0, 0.0])
-    if subject is not None and side in subject.hinges:
-        axis_U = subject.hinges[side].axis
+    if subject is not None and f"{side}_elbow" in subject.hinges:
+        axis_U = subject.hinges[f"{side}_elbow"].axis
     ahead_U = np.cross(axis_U, [0.0, 0.0, 1.0])
     fore_U = R_U.inv().apply(fore_W)
     forward = np.arctan2(fore_U @ (ahead_U / np.linalg.norm(ahead_U)), -fore_U[:, 2])
@@ -186,23 +206,23 @@ def elbow_of(pose: Pose, side: str, subject: Subject | None = None) -> Elbow | N
 
 
 class Hand(NamedTuple):
-    """Where a hand went."""
+    """The motion of a hand."""
 
     reach: np.ndarray  # (n, 3) [m] from the middle of the shoulders, in the torso's frame; NaN where not known
     std: np.ndarray | None  # (n,) [m], one axis, from the root; None where the filter has no covariance
     peak_speed: float  # [m/s]
 
 
-def hands_of(pose: Pose, rate_hz: float) -> dict[str, Hand]:
-    """Hand → where it went; hands that are not known are not in it."""
+def measure_hands(pose: Pose, rate_hz: float) -> dict[str, Hand]:
+    """Point → motion of the hand; only hands that are known."""
     points = pose.points
     if not {"left_shoulder", "right_shoulder"} <= set(points) or "torso" not in pose.quat_WL:
         return {}
     middle = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
     known = np.isfinite(pose.quat_WL["torso"]).all(axis=1)
     R_LW = _rotations(pose.quat_WL["torso"], known).inv()
-    found = {}
-    for name in ("left_hand", "right_hand"):
+    hands = {}
+    for name in ("left_palm", "right_palm"):
         if name not in points:
             continue
         reach = R_LW.apply(points[name] - middle)
@@ -212,9 +232,9 @@ def hands_of(pose: Pose, rate_hz: float) -> dict[str, Hand]:
         size = max(1, round(PEAK_OVER_S * rate_hz))
         moved = reach[size:] - reach[:-size]
         peak = float(np.nan_to_num(np.linalg.norm(moved, axis=1)).max(initial=0.0)) * rate_hz / size
-        std = spread(pose.point_cov[name]) if name in pose.point_cov else None
-        found[name] = Hand(reach, std, peak)
-    return found
+        std = axis_std(pose.point_cov[name]) if name in pose.point_cov else None
+        hands[name] = Hand(reach, std, peak)
+    return hands
 
 
 def _rotations(quat: np.ndarray, known: np.ndarray) -> Rotation:

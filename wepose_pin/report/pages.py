@@ -19,7 +19,7 @@ PAGES = ("view.html", "report.html")
 
 def write_track_pages(
     folder: Path,
-    pose: TrackedRecording,
+    tracked: TrackedRecording,
     *,
     view: bool = True,
     report: bool = True,
@@ -31,7 +31,7 @@ def write_track_pages(
     Parameters
     ----------
     view, report : which of them
-    totals : of a `pose` that `Decimator` made
+    totals : of a `tracked` that `Decimator` made
     fps : of ``view.html``
 
     Returns
@@ -39,15 +39,16 @@ def write_track_pages(
     list[str]
         A line for each page, or part of one, that cannot be made; they stand in ``summary.json`` too.
     """
-    model, recording = pose.model, pose.recording
+    model, recording = tracked.model, tracked.recording
     writer = PageWriter(folder, [name for name, wanted in zip(PAGES, (view, report), strict=True) if wanted])
     page = None
     if view:
         page = writer.write(
-            "view.html", lambda _: pose_html(model, pose.pose, phases=recording.phases, title=recording.name, fps=fps)
+            "view.html",
+            lambda _: pose_html(model, tracked.pose, phases=recording.phases, title=recording.name, fps=fps),
         )
     if report:
-        writer.write("report.html", lambda failures: track_report(pose, view=page, totals=totals, failures=failures))
+        writer.write("report.html", lambda failures: track_report(tracked, view=page, totals=totals, failures=failures))
     writer.save_diagnostics("summary.json")
     return writer.diagnostics
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..recording.gaps import runs
 from .chart import WIDTH, Chart, Key, Panel, Picture, category_rows, envelope
-from .measures import Hand, Signal, largest
+from .measures import Hand, Signal, finite_max
 from .words import plain
 
 TIME = "time in the recording [s]"
@@ -17,7 +17,7 @@ Spans = Sequence[tuple[float, float]]
 
 
 def timeline_picture(time: np.ndarray, signals: Mapping[str, Signal], phases: Mapping[str, Spans]) -> Picture:
-    """What each sensor did when: how fast it turned, where it was at rest, what was lost or cut off."""
+    """Each sensor over time: how fast it rotated, where it was static, lost, or cut off by its range."""
     ends = _ends(time)
     most = 1.08 * max(1.0, max(float(np.degrees(signal.rate.max())) for signal in signals.values()))
     rows = []
@@ -26,8 +26,8 @@ def timeline_picture(time: np.ndarray, signals: Mapping[str, Signal], phases: Ma
         for spans in phases.values():
             rows[0].spans(spans, "phase")
         _name_phases(rows[0], phases, ends)
-    legend = [Key("turning [°/s]", "soft", "box")]
-    legend += [Key("at rest", "ink", "box")] if any(_any(signal.rest) for signal in signals.values()) else []
+    legend = [Key("rotation [°/s]", "soft", "box")]
+    legend += [Key("static", "ink", "box")] if any(_any(signal.static) for signal in signals.values()) else []
     legend += [Key("phase", "phase", "box")] if phases else []
     legend += [Key("lost and bridged", "hatched", "box")] if any(_any(s.gap) for s in signals.values()) else []
     legend += [Key("cut off by the range", "before", "triangle")] if any(_any(s.cut) for s in signals.values()) else []
@@ -36,9 +36,9 @@ def timeline_picture(time: np.ndarray, signals: Mapping[str, Signal], phases: Ma
         panel.y_ticks = [(0.0, "0"), (_round_below(most), f"{_round_below(most):g}")]
         for spans in phases.values():
             panel.spans(spans, "phase")
-        panel.area(*envelope(time, np.degrees(signal.rate)), style_of(name).split()[0])
-        if signal.rest is not None:
-            panel.boxes(_times(time, signal.rest), (-0.13 * most, 0.0), "ink")
+        panel.area(*envelope(time, np.degrees(signal.rate)), line_style(name).split()[0])
+        if signal.static is not None:
+            panel.boxes(_times(time, signal.static), (-0.13 * most, 0.0), "ink")
         panel.spans(_times(time, signal.gap), "hatched")
         if signal.cut.any():
             first = _times(time, signal.cut)[:, 0]
@@ -46,7 +46,7 @@ def timeline_picture(time: np.ndarray, signals: Mapping[str, Signal], phases: Ma
         rows.append(panel)
     rows[-1].shown_x, rows[-1].x_label = True, TIME
     heights = [18.0] * bool(phases) + [38.0] * len(signals)
-    caption = "How fast each sensor turned, on one scale. Bars under the zero line: at rest by the filter's test."
+    caption = "How fast each sensor rotated, on one scale. Bars under the zero line: static by the filter's test."
     return Picture("timeline", caption, Chart([[row] for row in rows], heights, legend))
 
 
@@ -82,12 +82,12 @@ def noise_picture(signals: Mapping[str, Signal]) -> Picture:
 
 def headings_picture(time: np.ndarray, std_deg: Mapping[str, np.ndarray], clasps: Spans) -> Picture:
     """What each segment's heading may be off by, over time; `clasps`: spans of joined hands [s]."""
-    most = 1.06 * max(0.1, *(largest(values) for values in std_deg.values()))
+    most = 1.06 * max(0.1, *(finite_max(values) for values in std_deg.values()))
     panel = Panel("heading, ± [°]", TIME, x=_ends(time), y=(0.0, most))
     panel.spans(clasps, "phase")
     for name, values in std_deg.items():
-        panel.line(*envelope(time, values), style_of(name))
-    keys = [Key(plain(name), style_of(name)) for name in std_deg]
+        panel.line(*envelope(time, values), line_style(name))
+    keys = [Key(plain(name), line_style(name)) for name in std_deg]
     keys += [Key("hands joined", "phase", "box")] if clasps else []
     caption = "What each segment's heading may be off by: one standard deviation."
     return Picture("headings", caption, Chart([[panel]], [230.0], keys))
@@ -99,12 +99,12 @@ def paths_picture(hands: Mapping[str, Hand], shoulder_width: float, trunk: float
     for panel, across, up in body_views(50.0 * shoulder_width, 100.0 * trunk):
         for name, hand in hands.items():
             at = 100.0 * hand.reach[:: max(1, len(hand.reach) // PATH_POINTS)][:, [across, up]]
-            side = style_of(name).split()[0]
+            side = line_style(name).split()[0]
             panel.line(at[:, 0], at[:, 1], f"{side} faint")
             panel.markers(at[0, 0], at[0, 1], "circle" if side == "left" else "square", side)
         panels.append(panel)
     keys = [
-        Key(f"{plain(name)}, mark: beginning", style_of(name).split()[0], "square" if "right" in name else "circle")
+        Key(f"{plain(name)}, mark: beginning", line_style(name).split()[0], "square" if "right" in name else "circle")
         for name in hands
     ]
     return Picture(
@@ -161,10 +161,12 @@ def over_time_picture(
     return Picture(stem, caption, Chart(rows, [105.0] * len(rows), keys))
 
 
-def style_of(segment: str) -> str:
-    """How a segment's line looks, told apart without colour too: side by colour, part by dashes."""
+def line_style(segment: str) -> str:
+    """The style of a segment's line: the side by colour, the part by dashes."""
     side, _, part = segment.partition("_") if segment.startswith(("left_", "right_")) else ("other", "", segment)
-    return f"{side} {'dashed' if part in ('forearm', 'pelvis') else 'dotted' if part in ('hand', 'head') else ''}"
+    return (
+        f"{side} {'dashed' if part in ('forearm', 'pelvis') else 'dotted' if part in ('hand', 'palm', 'head') else ''}"
+    )
 
 
 def _side(name: str) -> str:
@@ -175,12 +177,12 @@ def _side(name: str) -> str:
 def _name_phases(panel: Panel, phases: Mapping[str, Spans], ends: tuple[float, float]) -> None:
     """Names of the phases where there is room, those of long ones first."""
     letter = 7.5 / WIDTH * (ends[1] - ends[0])
-    taken: list[tuple[float, float]] = []
+    occupied: list[tuple[float, float]] = []
     for _, a, name in sorted((a - b, a, name) for name, spans in phases.items() for a, b in spans):
         end = a + letter * (len(name) + 0.5)
-        if ends[0] <= a and end < ends[1] + 4 * letter and all(end <= begin or a >= stop for begin, stop in taken):
+        if ends[0] <= a and end < ends[1] + 4 * letter and all(end <= begin or a >= stop for begin, stop in occupied):
             panel.text(a, 0.5, name, dx=3.0)
-            taken.append((a, end))
+            occupied.append((a, end))
 
 
 def _ends(time: np.ndarray) -> tuple[float, float]:

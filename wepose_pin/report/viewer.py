@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.util import find_spec
+from importlib.metadata import distribution
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +20,7 @@ from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
 from ..model import BodyModel, Visual
-from ..pose import Pose, configuration, known_links, placements
+from ..pose import Pose, configuration, find_known_links, placements
 from .page import load_template
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ DARK = Backdrop((0.085, 0.105, 0.130), (0.135, 0.160, 0.190), (0.30, 0.34, 0.39)
 
 
 class Mesh(NamedTuple):
-    """Triangles that a link looks like, in its frame."""
+    """The triangles of a link, in its frame."""
 
     link: str
     vertices: np.ndarray  # (n, 3) [m]
@@ -81,13 +81,13 @@ def pose_html(
         q = pose.q[frames]
     else:
         q = configuration(model, {segment: quat_WL[frames] for segment, quat_WL in pose.quat_WL.items()})
-    known = set(known_links(model, pose.quat_WL))
+    known = set(find_known_links(model, pose.quat_WL))
     visuals = [visual for visual in model.visuals if visual.link in known]
     return view_html(
         visuals,
         pose.time[frames],
         placements(model, q, dict.fromkeys(visual.link for visual in visuals)),
-        trails={name: pose.points[name][frames] for name in ("left_hand", "right_hand") if name in pose.points},
+        trails={name: pose.points[name][frames] for name in ("left_palm", "right_palm") if name in pose.points},
         phases=phases,
         title=title,
         fps=fps,
@@ -101,7 +101,7 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     frames = frame_indices(trajectory.time, fps)
     nearest = np.abs(pose.time[:, None] - trajectory.recorded_time[frames][None, :]).argmin(axis=0)
     q = configuration(model, {segment: quat_WL[nearest] for segment, quat_WL in pose.quat_WL.items()})
-    known = set(known_links(model, pose.quat_WL))
+    known = set(find_known_links(model, pose.quat_WL))
     visuals = [visual for visual in model.visuals if visual.link in known]
     placed = placements(model, q, dict.fromkeys(visual.link for visual in visuals))
     robot = trajectory.robot
@@ -109,7 +109,7 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     shoulder_z = float(np.nanmedian([pose.points[f"{arm.side}_shoulder"][:, 2] for arm in robot.arms]))
     R_WB, p_WB = place_beside_person(robot, drawn, shoulder_z, FLOOR_Z)
     moved = compute_placements(trajectory, drawn, frames, R_WB, p_WB)
-    trails = {arm.side: pose.points[f"{arm.side}_hand"][nearest] for arm in robot.arms}  # short: heads are beside them
+    trails = {arm.side: pose.points[f"{arm.side}_palm"][nearest] for arm in robot.arms}  # short: heads are beside them
     trails |= {f"{arm.side}_robot": trajectory.hand[arm.side][frames] @ R_WB.T + p_WB for arm in robot.arms}
     return view_html(
         visuals,
@@ -142,13 +142,13 @@ def view_html(
     Parameters
     ----------
     visuals
-        What the body looks like. A link without a placement is not drawn, nor is a visual of kind ``"mesh"``.
+        The shapes of the body. A link without a placement is not drawn, nor is a visual of kind ``"mesh"``.
     time
         (n,) [s], n >= 1, rising.
     placements
         Link -> (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]). A link is hidden while its placement is NaN.
     meshes
-        More of what links look like.
+        More shapes of links.
     trails
         Point -> (n, 3) [m] in W, may hold NaN: the last seconds are drawn behind the point. A name that
         begins with left or right takes the colour of that arm.
@@ -204,22 +204,22 @@ def filled(template: str, data: Mapping[str, Any], title: str) -> str:
 
 
 def visible(visuals: Iterable[Visual]) -> list[Visual]:
-    """What can be drawn, in colours that can be told from each other."""
+    """The visuals that can be drawn, in colours that differ."""
     drawn = [v for v in visuals if v.kind != "mesh"]
     if drawn and max(max(v.rgba[:3]) for v in drawn) < 0.3:
         # A body without colours of its own (human-gazebo: 0.1 grey) would be a silhouette.
-        drawn = [_lighter(v) for v in drawn]
+        drawn = [_lighten(v) for v in drawn]
     return drawn
 
 
-def _lighter(visual: Visual) -> Visual:
+def _lighten(visual: Visual) -> Visual:
     red, green, blue, alpha = visual.rgba
     return visual._replace(rgba=(0.4 + 0.6 * red, 0.4 + 0.6 * green, 0.4 + 0.6 * blue, alpha))
 
 
 def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
     """(m,) int, rising: the samples nearest to a clock of `fps` a second, with the first and the last."""
-    if (time[-1] - time[0]) * fps > _SPARSE * len(time):  # a leap in time: the clock would tick without end
+    if (time[-1] - time[0]) * fps > _SPARSE * len(time):  # a jump in time would give too many frames
         return np.arange(len(time))
     clock = np.append(np.arange(time[0], time[-1], 1.0 / fps), time[-1])
     nearest_changes = 0.5 * (time[:-1] + time[1:])
@@ -338,10 +338,8 @@ def trail_colour(point: str, visuals: Sequence[Visual]) -> str:
 
 def _meshcat_source() -> Markup:
     """meshcat's viewer, safe inside a script element; its Python side, which brings a server, is not loaded."""
-    found = find_spec("meshcat")
-    assert found is not None
-    assert found.origin is not None
-    source = (Path(found.origin).parent / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8")
+    script = distribution("meshcat").locate_file("meshcat/viewer/dist/main.min.js")
+    source = Path(str(script)).read_text(encoding="utf-8")
     return Markup(source.replace("</script", "<\\/script").replace("<!--", "<\\!--"))
 
 

@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import BadData, WrongOption
-from ..pose import Pose, spread
+from ..pose import Pose, axis_std
 from .robot import Arm, Robot
 
 REACH_SHARE = 0.95  # of the robot's reach for a straight arm: its elbow stays flexed, far from the singularity
@@ -22,7 +22,7 @@ MAX_SLOWDOWN = 3.0  # times longer, where tracking is poor
 WEIGHT_POOR = 0.1  # of the hand's tasks, where tracking is poor
 JUMP_SPEED = 12.0  # [m/s] in the person's size: no hand is faster, so the tracking has jumped
 JUMP_S = 0.25  # [s] bridged on each side of a jump
-ARM_POINTS = ("shoulder", "elbow", "wrist", "hand")
+ARM_POINTS = ("shoulder", "elbow", "wrist", "palm")
 
 
 class HandPath(NamedTuple):
@@ -248,6 +248,6 @@ def _find_jumps(time: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 def _hand_std(pose: Pose, side: str, known: np.ndarray) -> np.ndarray:
     """(n,) [m] of the hand; poor where it is not known."""
-    cov = pose.point_cov.get(f"{side}_hand")
-    std = np.zeros(len(known)) if cov is None else np.nan_to_num(spread(cov), nan=STD_POOR)
+    cov = pose.point_cov.get(f"{side}_palm")
+    std = np.zeros(len(known)) if cov is None else np.nan_to_num(axis_std(cov), nan=STD_POOR)
     return np.where(known, std, STD_POOR)

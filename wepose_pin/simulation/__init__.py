@@ -5,8 +5,8 @@ it shares no code with the model room: what the tests compare against is written
 as everywhere: W is z up, x forward, y left, origin at the root of the trunk; each segment frame equals W in
 the N-pose; the arm runs along -z.
 
-By default a perfect world: no soft tissue, an exact N-pose, palms that coincide in the clasp, a hand still at rest, and
-sensors with noise and bias only. `Imperfections` add what reality has.
+By default a perfect world: no soft tissue, an exact N-pose, palms that coincide in the clasp, hands that are static on
+the table, and sensors with noise and bias only. `Imperfections` add those of real people and sensors.
 """
 
 from ..subject import LENGTHS

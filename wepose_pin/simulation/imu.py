@@ -63,7 +63,7 @@ class Device:
     g_matrix: np.ndarray  # (3, 3) [rad/s per m/s^2]
 
     @staticmethod
-    def draw(rng: np.random.Generator, imperfections: Imperfections) -> Device:
+    def sample(rng: np.random.Generator, imperfections: Imperfections) -> Device:
         """A sensor at random."""
         scale, tilt, g = rng.standard_normal((2, 3)), rng.standard_normal((2, 3, 3)), rng.standard_normal((3, 3))
         tilt *= np.deg2rad(imperfections.misalignment_deg) * (1.0 - np.eye(3))
@@ -136,18 +136,18 @@ def jittered(rng: np.random.Generator, time: np.ndarray, rate_hz: float, std: fl
 
 def lost(rng: np.random.Generator, n: int, rate_hz: float, share: float) -> np.ndarray:
     """Which of n samples are lost (n,): runs of 20 ms in the mean and 50 ms at most, ends and neighbours kept."""
-    gone = np.zeros(n, dtype=bool)
+    mask = np.zeros(n, dtype=bool)
     longest = max(1, int(LONGEST_RUN_S * rate_hz + 1e-9))
     # Unit draws first: another share is the same runs closer together.
     waits, lengths = rng.exponential(size=n), rng.exponential(size=n)
     runs = np.clip(np.round(lengths * _MEAN_RUN_S * rate_hz).astype(int), 1, longest)
     if share <= 0.0:
-        return gone
+        return mask
     first = 1
     for wait, run in zip(waits * np.mean(runs) / share, runs, strict=True):
         first += int(wait) + 1
         if first + run >= n:
             break
-        gone[first : first + run] = True
+        mask[first : first + run] = True
         first += run
-    return gone
+    return mask

@@ -171,7 +171,7 @@ class Motion:
         self.slip_gain = flaws.sizes.palm_slip / np.sqrt(3.0) / rms
 
     def activity(self, t: np.ndarray) -> np.ndarray:
-        """1 in the free motion of clasp and circles, 0 where the segments are still: (n,)."""
+        """1 in the free motion of clasp and circles, 0 where the segments are static: (n,)."""
         moving = pulse(t, *self.clasp, _RAMP_S)
         return moving + sum((pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
 
@@ -196,7 +196,7 @@ class Motion:
         lower = (lower**8 + chest**8) ** 0.125  # a smooth maximum
         return (lower + fraction * (upper - lower))[:, None] * ray
 
-    def _moving(self, t: np.ndarray) -> np.ndarray:
+    def _motion_share(self, t: np.ndarray) -> np.ndarray:
         return pulse(t, *self.clasp, _RAMP_S)  # 0 at both ends of the clasp
 
     def _torso(self, _t: np.ndarray, lean: np.ndarray) -> Rotation:
@@ -204,12 +204,12 @@ class Motion:
         return Rotation.from_euler("ZYX", lean)
 
     def _palms(
-        self, _t: np.ndarray, _moving: np.ndarray, clasp_T: np.ndarray, _R_WT: Rotation
+        self, _t: np.ndarray, _motion_share: np.ndarray, clasp_T: np.ndarray, _R_WT: Rotation
     ) -> dict[str, np.ndarray]:
         """Where each palm is before the right one goes to the table: (n, 3) [m] in T."""
         return {"left": clasp_T, "right": clasp_T}
 
-    def _led(self, _t: np.ndarray, led: np.ndarray, table: np.ndarray) -> dict[str, np.ndarray]:
+    def _lead_share(self, _t: np.ndarray, led: np.ndarray, table: np.ndarray) -> dict[str, np.ndarray]:
         """How far each arm is led by its palm, 0 where it hangs: (n,)."""
         return {"left": led * (1.0 - table), "right": led}  # the left arm goes back to hang
 
@@ -240,7 +240,7 @@ class Motion:
 
     def __call__(self, t: np.ndarray, sides: Collection[str] = tuple(SIDES)) -> BodyPose:
         """The pose of torso and arms of these sides at the times `t` (n,) [s], exact."""
-        moving = self._moving(t)
+        moving = self._motion_share(t)
         circling = sum((pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
         led = step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
         table = step(t, self.clasp[1], _BLEND_S)  # from the clasp to the table
@@ -261,7 +261,7 @@ class Motion:
                 [g * w(t) for g, w in zip(self.slip_gain, flaws.slip, strict=True)]
             )
             palm_T = {"left": palm_T["left"] + 0.5 * slip_T, "right": palm_T["right"] - 0.5 * slip_T}
-        led_by = self._led(t, led, table)
+        led_by = self._lead_share(t, led, table)
         palm_down = {"left": 0.0 * t, "right": np.deg2rad(40.0) * table}
 
         R_WL, points = {"torso": R_WT}, {}
@@ -294,7 +294,7 @@ class Motion:
             for part, end, R_WL_part in (
                 ("upper_arm", "elbow", R_WU),
                 ("forearm", "wrist", R_WF),
-                ("hand", "hand", R_WF),
+                ("hand", "palm", R_WF),
             ):
                 p_W = p_W + R_WL_part.apply((0.0, 0.0, -self.lengths[f"{side}_{part}"]))
                 points[f"{side}_{end}"] = p_W

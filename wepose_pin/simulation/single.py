@@ -17,7 +17,7 @@ _GRID_HZ = 200.0  # at which the motion is scaled to its peaks
 
 @dataclass(frozen=True)
 class SingleSensor:
-    """One sensor moved by hand.
+    """One sensor, moved in the hand.
 
     `gyro_S[k]` is the rate over (k−1, k], `accel_S[k]` the specific force at k; both with noise, bias and the sensor's
     imperfections.
@@ -104,7 +104,9 @@ def _record(
     turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(own_time)[:, None]
     rate_S = np.vstack((np.zeros(3), turned))
     force_S = R_WS.inv().apply(motion.acceleration(own_time) + GRAVITY * E_Z)
-    readings = Device.draw(device_rng, imperfections).measure(rate_S, force_S, rate_hz, noise, imperfections, noise_rng)
+    readings = Device.sample(device_rng, imperfections).measure(
+        rate_S, force_S, rate_hz, noise, imperfections, noise_rng
+    )
     return SingleSensor(
         time=time,
         rate_hz=rate_hz,
@@ -123,7 +125,7 @@ def paper_dynamic(
     noise: ImuNoise = MTI_3,
     imperfections: Imperfections = PERFECT_WORLD,
 ) -> SingleSensor:
-    """One trial of the paper's dynamic experiment: 5 s still, 50 s of free motion by hand, 5 s still.
+    """One trial of the paper's dynamic experiment: 5 s static, 50 s of free motion in the hand, 5 s static.
 
     Turns of 0.15 to 1.5 Hz with a peak of 6 to 8 rad/s, translation with a peak of 15 to 20 m/s^2, without pauses. Of
     `imperfections` those of a single sensor count: scale, misalignment, g-sensitivity, range, bits and jitter.
@@ -141,7 +143,7 @@ def paper_drift(
     noise: ImuNoise = MTI_3,
     imperfections: Imperfections = PERFECT_WORLD,
 ) -> SingleSensor:
-    """One trial of the paper's drift experiment: 25 s still, 10 s of fast shaking and turning, 25 s still.
+    """One trial of the paper's drift experiment: 25 s static, 10 s of fast shaking and rotating, 25 s static.
 
     Turns of 0.5 to 4 Hz with a peak of 13 to 15 rad/s, shaking of 2 to 5 Hz with a peak of 40 to 50 m/s^2;
     `imperfections` as in `paper_dynamic`.

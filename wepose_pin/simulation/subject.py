@@ -15,7 +15,7 @@ from ..pose import Pose
 from ..recording import ImuSensor, Recording, check, mount_from_axes
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, lost_samples
-from ..subject import LENGTHS, SEXES, Subject, average_subject, check_lengths
+from ..subject import LENGTHS, SEXES, Subject, check_lengths, population_subject
 from .imperfections import PERFECT_WORLD, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, jittered, lost
 from .motion import (
@@ -80,8 +80,8 @@ class Simulation:
     accel_bias: dict[str, np.ndarray]  # sensor -> (n, 3) [m/s^2], exact
     lengths: dict[str, float]  # [m]
     phases: dict[str, list[tuple[float, float]]]
-    """[s]. "start": still in the N-pose; "clasp": palms together; "circles": first lift off the table to last
-    return; "rest": each rest of the right hand on the table, all sensors still (but for the sway)."""
+    """[s]. "start": static in the N-pose; "clasp": palms together; "circles": first lift off the table to last
+    return; "rest": each rest of the right hand on the table, all sensors static (but for the sway)."""
     imperfections: Imperfections
     quat_WS: dict[str, np.ndarray]  # sensor -> (n, 4) xyzw, its own true orientation
     soft_tissue: dict[str, np.ndarray]  # sensor -> (n, 3) [rad], rotation vector in L
@@ -157,7 +157,7 @@ class _SoftTissue:
         self.gains = each * self.rms / np.sqrt(np.mean(total**2, axis=0))
 
     def _parts(self, moved: _Moved, activity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # In units of g and of 3 rad/s, about what free motion of the arms has; zero in a still N-pose.
+        # In units of g and of 3 rad/s, about what free motion of the arms has; zero in a static N-pose.
         force_L = moved.R_WL.inv().apply(moved.p_ddot / GRAVITY + E_Z) - E_Z
         follows = np.column_stack((force_L, moved.rate_L / 3.0)) @ self.mixture
         return follows, activity[:, None] * np.column_stack([wander(moved.time) for wander in self.wander])
@@ -184,7 +184,7 @@ def simulate(
 ) -> Simulation:
     """A recording of the paper's upper-body experiment with known truth.
 
-    0 to 5 s still in the N-pose; 2.5 s to the clasp; `clasp_s` of free motion with the palms together while
+    0 to 5 s static in the N-pose; 2.5 s to the clasp; `clasp_s` of free motion with the palms together while
     the torso leans and twists; 2.5 s in which the left arm returns to hang and the right hand goes to a
     table; then `circles` circles in the air (Lisini Baldi 2019, upper-body experiment), a rest on the table
     before and after each.
@@ -196,7 +196,7 @@ def simulate(
         own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
     rate_hz : samples a second.
     noise : of gyroscope and accelerometer; `PERFECT` for none.
-    imperfections : of subject, strapping and sensors; `PERFECT_WORLD` for none, `REALISTIC` for usual ones.
+    imperfections : of subject, mounting and sensors; `PERFECT_WORLD` for none, `REALISTIC` for usual ones.
     clasp_s : how long the palms stay together [s], at least 5.
     circles : how many circles, 0 or more.
     protocol : what is done in place of the clasp, one of `TASKS`; "handle": 0.4 m between the palms; "touch_left" and
@@ -240,8 +240,8 @@ def simulate(
     coarse_t = np.arange(motion.clasp[0], motion.rest[-1][1], 1.0 / _GAIN_RATE_HZ)
     coarse = _Sampled(motion, coarse_t) if imperfections.soft_tissue_deg else None
 
-    found: dict[str, dict] = {name: {} for name in ("quat_LS", "gyro_S", "accel_S", "gyro_bias", "accel_bias")}
-    found |= {name: {} for name in ("quat_WS", "soft_tissue", "device", "sample_time")}
+    sensors: dict[str, dict] = {name: {} for name in ("quat_LS", "gyro_S", "accel_S", "gyro_bias", "accel_bias")}
+    sensors |= {name: {} for name in ("quat_WS", "soft_tissue", "device", "sample_time")}
     for segment in SEGMENTS:
         heading, tilt = mount_rng.uniform(0.0, 2.0 * np.pi), np.deg2rad(mount_rng.uniform(2.0, 10.0))
         R_LS = Rotation.from_rotvec(tilt * np.array((np.cos(heading), np.sin(heading), 0.0))) * N
@@ -261,7 +261,7 @@ def simulate(
         # A product with the identity would not keep the last bit.
         R_WS = (moved.R_WL * Rotation.from_rotvec(soft_L) if tissue.rms else moved.R_WL) * R_LS
         rotvec = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec()
-        rate_S = np.vstack((np.zeros(3), rotvec * rate_hz))  # still before the first sample
+        rate_S = np.vstack((np.zeros(3), rotvec * rate_hz))  # static before the first sample
         if own_clocks:
             rate_S[1:] = rotvec / np.diff(own_time)[:, None]
         if never_still:  # a sample before the first one, for the rate that ends there
@@ -270,10 +270,10 @@ def simulate(
             rate_S[0] = (R_before[0].inv() * R_WS[0]).as_rotvec() * rate_hz
         force_S = R_WS.inv().apply(moved.p_ddot + GRAVITY * E_Z)
 
-        device = Device.draw(rngs["device"], imperfections)
+        device = Device.sample(rngs["device"], imperfections)
         readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, noise_rng)
-        gone = lost(rngs["dropped"], n, rate_hz, imperfections.dropped)
-        readings.gyro_S[gone] = readings.accel_S[gone] = np.nan
+        dropped = lost(rngs["dropped"], n, rate_hz, imperfections.dropped)
+        readings.gyro_S[dropped] = readings.accel_S[dropped] = np.nan
         for name, value in (
             ("quat_LS", R_LS.as_quat()),
             *readings._asdict().items(),
@@ -282,7 +282,7 @@ def simulate(
             ("device", device),
             ("sample_time", own_time),
         ):
-            found[name][segment] = value
+            sensors[name][segment] = value
 
     phases = {
         "start": [(0.5, STAND_S - 0.5)],
@@ -300,28 +300,28 @@ def simulate(
         lengths=lengths,
         phases=phases,
         imperfections=imperfections,
-        **found,
+        **sensors,
     )
 
 
 class Person(NamedTuple):
-    """A random person, and what a user with a tape would know of them."""
+    """A random person, and the lengths that a user would measure."""
 
     lengths: dict[str, float]  # [m], true
     stature: float  # [m]
     sex: str  # "f" or "m"
-    taped: dict[str, float]  # [m], measured lengths, each off by a draw of `taped_std`
-    taped_std: float  # [m]
-    average: Subject  # the average person of that stature and sex
+    measured: dict[str, float]  # [m] measured lengths, each with a random error of `measured_std`
+    measured_std: float  # [m]
+    prior: Subject  # the population prior of that stature and sex
 
 
-def simulated_person(seed: int, taped_std: float = 0.003) -> Person:
-    """A person drawn from the anthropometric distribution; shoulder width and trunk are taped."""
+def simulated_person(seed: int, measured_std: float = 0.003) -> Person:
+    """A random person of the population, with measured shoulder width and trunk."""
     rng = np.random.default_rng([seed, 7])
     sex = SEXES[int(rng.integers(2))]
     mean, std = {"f": (1.63, 0.064), "m": (1.756, 0.069)}[sex]  # [m], ANSUR II (Gordon et al. 2014)
     stature = float(np.clip(rng.normal(mean, std), 1.45, 2.0))
-    average = average_subject(round(stature, 2), sex)
-    lengths = dict(average_subject(stature, sex).draw(rng).lengths)
-    taped = {name: lengths[name] + float(rng.normal(0.0, taped_std)) for name in ("shoulder_width", "trunk")}
-    return Person(lengths, stature, sex, taped, taped_std, average)
+    prior = population_subject(round(stature, 2), sex)
+    lengths = dict(population_subject(stature, sex).sample(rng).lengths)
+    measured = {name: lengths[name] + float(rng.normal(0.0, measured_std)) for name in ("shoulder_width", "trunk")}
+    return Person(lengths, stature, sex, measured, measured_std, prior)

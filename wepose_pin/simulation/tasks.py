@@ -15,7 +15,7 @@ _BAR_DEG = np.array((40.0, 80.0))  # paddle, steering wheel
 _TURN_S = 2.5  # into the T-pose, and back
 
 
-def _in_reach(motion: Motion, side: str, distance: np.ndarray) -> bool:
+def _is_in_reach(motion: Motion, side: str, distance: np.ndarray) -> bool:
     """Whether the arm reaches through distances (n,) [m] from shoulder to palm."""
     upper, lower = motion.arm[side]
     span = np.sqrt(upper**2 + lower**2 + 2.0 * upper * lower * np.cos(np.deg2rad((12.0, 140.0))))
@@ -30,12 +30,12 @@ class Handle(Motion):
     def prepare(self, rng: np.random.Generator, _pose_deg: float) -> None:
         self.bar = [Wander(rng) for _ in range(2)]
         t = np.arange(*self.clasp, 0.05)
-        moving, none = self._moving(t), Rotation.identity()
+        moving, none = self._motion_share(t), Rotation.identity()
         for share in np.arange(1.0, 0.1, -0.05):  # as far as the arms allow
             self.share = share
             palm_T = self._palms(t, moving, self._clasp_point(t, moving), none)
             if all(
-                _in_reach(self, side, np.linalg.norm(palm_T[side] - [0.0, y * self.half_width, 0.0], axis=1))
+                _is_in_reach(self, side, np.linalg.norm(palm_T[side] - [0.0, y * self.half_width, 0.0], axis=1))
                 for side, y in SIDES.items()
             ):
                 break
@@ -71,7 +71,7 @@ class Touch(Motion):
             self.lean_deg = share * most
             lean = np.deg2rad(self.lean_deg) * np.column_stack([self.wander[n](t) for n in ("yaw", "pitch", "roll")])
             R_WT = Rotation.from_euler("ZYX", lean)
-            if _in_reach(self, self.side, np.linalg.norm(self.point_W - R_WT.apply(shoulder_W), axis=1)):
+            if _is_in_reach(self, self.side, np.linalg.norm(self.point_W - R_WT.apply(shoulder_W), axis=1)):
                 break
         if self.side == "right":
             self.table_W = self.point_W
@@ -79,7 +79,7 @@ class Touch(Motion):
     def _palms(self, _t: np.ndarray, _moving: np.ndarray, clasp_T: np.ndarray, R_WT: Rotation) -> dict[str, np.ndarray]:
         return {"left": clasp_T, "right": clasp_T} | {self.side: R_WT.inv().apply(self.point_W)}
 
-    def _led(self, _t: np.ndarray, led: np.ndarray, _table: np.ndarray) -> dict[str, np.ndarray]:
+    def _lead_share(self, _t: np.ndarray, led: np.ndarray, _table: np.ndarray) -> dict[str, np.ndarray]:
         return {side: led if side == self.side else 0.0 * led for side in SIDES}
 
 
@@ -105,7 +105,7 @@ class Poses(Motion):
             "bow": [(_BOW_S[0] - MARGIN_S, _BOW_S[1] + MARGIN_S)],
         }
 
-    def _moving(self, t: np.ndarray) -> np.ndarray:
+    def _motion_share(self, t: np.ndarray) -> np.ndarray:
         return 0.0 * t
 
     def _torso(self, t: np.ndarray, lean: np.ndarray) -> Rotation:
@@ -113,7 +113,7 @@ class Poses(Motion):
         bow = np.deg2rad(_BOW_DEG) * pulse(t, *_BOW_S, _TURN_S)
         return Rotation.from_rotvec(bow[:, None] * axis) * Rotation.from_euler("ZYX", lean)
 
-    def _led(self, t: np.ndarray, _led: np.ndarray, _table: np.ndarray) -> dict[str, np.ndarray]:
+    def _lead_share(self, t: np.ndarray, _lead_share: np.ndarray, _table: np.ndarray) -> dict[str, np.ndarray]:
         raised = step(t, _T_POSE_S[0] - _TURN_S, _TURN_S) * (1.0 - step(t, _T_POSE_S[1], _TURN_S))
         return dict.fromkeys(SIDES, raised)
 

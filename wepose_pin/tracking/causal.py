@@ -1,7 +1,7 @@
 """Segment orientations without a look ahead: from the end of the start pose on, sample by sample or many at once.
 
-Both go through the same compiled steps, so that a live session and its recording give the same quaternions,
-bit-identical. The start pose is filtered when it has ended; nothing that comes later changes what was given.
+Both use the same compiled steps, so that a live session and its recording give bit-identical quaternions. The start
+pose is filtered when it has ended; later samples change no result.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from ..alignment import (
     Segments,
     align,
     check_mounts,
-    covariance_of,
-    heading_to,
+    compute_heading,
+    compute_segment_covariance,
+    heading_variance,
     orient_segments,
-    vertical_var,
 )
 from ..compilation import kernel
 from ..errors import BadOption, BadPhase
@@ -29,12 +29,12 @@ from ..filters import BEST, Orientation
 from ..filters.bank import LiveBank, OneByOne, create_bank
 from ..filters.sensors import SensorFilters, filtered_chunk
 from ..filters.static import StaticTest
-from ..pose import spread
+from ..pose import axis_std
 from ..recording import OrientationSensor, Recording, join
 from ..rotations import product
 from ..subject import Subject
 from .segments import Oriented
-from .start_pose import HOLD_S, StartGuide, until_start
+from .start_pose import HOLD_S, StartGuide, cut_start_pose
 
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are set anew
 
@@ -54,14 +54,14 @@ class CausalEstimator:
         self, subject: Subject | None = None, *, method: str = BEST, static_test: StaticTest | None = None
     ) -> None:
         self._subject, self._method, self._static_test = subject, method, static_test
-        self._until: Recording | None = None  # what came until the start pose had ended
+        self._so_far: Recording | None = None  # samples until the end of the start pose
         self._guide: StartGuide | None = None
         self._follower: SegmentFollower | None = None
         self._tracked = False
 
     @property
     def follower(self) -> SegmentFollower:
-        """What goes on from the start pose.
+        """The segment orientations after the start pose, sample by sample.
 
         Raises
         ------
@@ -69,11 +69,11 @@ class CausalEstimator:
             The start pose has not ended.
         """
         if self._follower is None:
-            raise BadPhase("the start pose has not ended: push a recording that holds it")
+            raise BadPhase("the start pose has not ended: push a recording that includes it")
         return self._follower
 
     def push(self, chunk: Recording) -> list[Oriented]:
-        """Take a chunk; gives what of it follows the start pose, and its segments.
+        """Take a chunk; gives its part after the start pose, and its segments.
 
         Raises
         ------
@@ -81,7 +81,7 @@ class CausalEstimator:
             A sensor with measured orientations, or without a known mount; as `SensorFilters`.
         """
         if self._follower is None:
-            chunk = self._wait(chunk)
+            chunk = self._find_start(chunk)
         if self._follower is None or not len(chunk):
             return []
         self._tracked = True
@@ -97,45 +97,45 @@ class CausalEstimator:
         """
         if self._tracked:
             return []
-        recording = self._until
+        recording = self._so_far
         if self._follower is None and self._guide is not None and recording is not None:
             raise BadPhase(
                 f"{recording.where()}: nobody stands still for {HOLD_S:g} s ({self._guide.held_s:.1f} s at its end); "
-                f"name the seconds of the start pose, [phases] start = [[from, to]]"
+                f"state the seconds of the start pose, [phases] start = [[from, to]]"
             )
         where = "" if recording is None else f"{recording.where()}: "
         raise BadPhase(f"{where}phases.start ends with the recording; nothing is left to track")
 
-    def _wait(self, chunk: Recording) -> Recording:
-        """Look for the end of the start pose in a chunk, and begin there; gives what of the chunk follows it."""
+    def _find_start(self, chunk: Recording) -> Recording:
+        """The part of a chunk after the start pose; the whole chunk while the start pose has not ended."""
         for name, sensor in chunk.sensors.items():
             if isinstance(sensor, OrientationSensor):
                 raise BadOption(
                     f"{chunk.where()}: sensors.{name} comes with measured orientations: there is no filter to run "
                     f"causally; leave the option out"
                 )
-        came = chunk if self._until is None else join(self._until, chunk)
-        self._until = came
-        if came.phases.get("start"):
-            interval = came.phases["start"][0]
-            if came.time[-1] < interval[1] - 1e-9:
+        so_far = chunk if self._so_far is None else join(self._so_far, chunk)
+        self._so_far = so_far
+        if so_far.phases.get("start"):
+            interval = so_far.phases["start"][0]
+            if so_far.time[-1] < interval[1] - 1e-9:
                 return chunk
-            last = came.span(interval).stop
+            last = so_far.span(interval).stop
         else:
             if self._guide is None:
-                self._guide = StartGuide(came.rate_hz, len(came.sensors))
+                self._guide = StartGuide(so_far.rate_hz, len(so_far.sensors))
             rates = [sensor.gyro_S for sensor in chunk.imus.values()]
             for tick in np.stack(rates, axis=1):
                 if self._guide.push(tick) == "ready":
                     break
             else:
                 return chunk
-            interval = float(came.time[self._guide.begin]), float(came.time[self._guide.end])
+            interval = float(so_far.time[self._guide.begin]), float(so_far.time[self._guide.end])
             last = self._guide.end + 1
         self._follower = SegmentFollower(
-            until_start(came, interval), self._subject, method=self._method, static_test=self._static_test
+            cut_start_pose(so_far, interval), self._subject, method=self._method, static_test=self._static_test
         )
-        return came.cut(slice(last, len(came)))
+        return so_far.cut(slice(last, len(so_far)))
 
 
 class SegmentFollower:
@@ -173,14 +173,14 @@ class SegmentFollower:
             [of.filter for of in started if of.filter is not None],
             [of.detector for of in started if of.detector is not None],
         )
-        self._until, self._subject = until, subject
+        self._so_far, self._subject = until, subject
         self._mount = np.array([self.start.quat_LS[name] for name in self.names])
         self.heading = np.array([self.start.heading[name] for name in self.names])
         self._turn = _about_z(self.heading)
         self._recent = np.stack([of.quat_WS for of in started], axis=1)[-max(1, round(RESET_S * self.rate_hz)) :].copy()
         self._oldest = 0  # its place in `_recent`
         self.quat_WL = np.zeros((len(self.names), 4))
-        _place(self._turn, self._recent[-1:], self._mount, self.quat_WL, self.quat_WL[None].copy())
+        _place_segments(self._turn, self._recent[-1:], self._mount, self.quat_WL, self.quat_WL[None].copy())
         self._run_var = self.heading_var()  # (k,) [rad²] of each heading by its filter alone, after the last run
         self._var_at_reset: np.ndarray | None = None  # (k,) [rad²] of heading that a reset took away
 
@@ -196,7 +196,7 @@ class SegmentFollower:
         """`quat_WL` (k, 4) after one sample, (k, 3) [rad/s], (k, 3) [m/s²], NaN where a sensor is lost."""
         self._recent[self._oldest] = self._bank.update(gyro_S, accel_S)
         newest = self._recent[self._oldest : self._oldest + 1]
-        _place(self._turn, newest, self._mount, self.quat_WL, self.quat_WL[None])
+        _place_segments(self._turn, newest, self._mount, self.quat_WL, self.quat_WL[None])
         self._oldest = (self._oldest + 1) % len(self._recent)
         return self.quat_WL
 
@@ -208,21 +208,21 @@ class SegmentFollower:
             if begin in resets:
                 self.reset_headings(self._run_var)
             parts.append(self._run(chunk.cut(slice(begin, end))))
-        return parts[0] if len(parts) == 1 else _joined(chunk, parts)
+        return parts[0] if len(parts) == 1 else _join_segments(chunk, parts)
 
     def _run(self, chunk: Recording) -> Segments:
         """As `run`, without a reset."""
         _, orientation = self._filters.push(chunk) or self._filters.finish()
         quat_VS = np.stack([orientation[name].quat_WS for name in self.names], axis=1)
         quat_WL = np.empty(quat_VS.shape)
-        _place(self._turn, quat_VS, self._mount, self.quat_WL, quat_WL)
-        self._recent = np.concatenate([self._in_order(), quat_VS])[-len(self._recent) :].copy()
+        _place_segments(self._turn, quat_VS, self._mount, self.quat_WL, quat_WL)
+        self._recent = np.concatenate([self._order_recent(), quat_VS])[-len(self._recent) :].copy()
         self._oldest = 0
         covariance_W = {}
         covs = {name: of.attitude_cov for name, of in orientation.items() if of.attitude_cov is not None}
         if covs:
             last = np.stack([covs[name][-1] for name in self.names])
-            self._run_var = vertical_var(quat_VS[-1], last)
+            self._run_var = heading_variance(quat_VS[-1], last)
             covariance_W = {name: self._covariance_W(i, quat_VS[:, i], covs[name]) for i, name in enumerate(self.names)}
         return replace(
             self.start,
@@ -236,22 +236,22 @@ class SegmentFollower:
     def reset_headings(self, heading_var: np.ndarray | None = None) -> None:
         """Set headings anew: the person stands in the start pose again, and has for `RESET_S`.
 
-        `heading_var` (k,) [rad²]: what the filters' own covariance says of the heading now, and no longer counts; None
+        `heading_var` (k,) [rad²]: the filters' variance of the heading, which the reset ends; None
         for that of the last step.
         """
-        recent = self._in_order()
+        recent = self._order_recent()
         same_sign = recent * np.sign(np.einsum("nki,ki->nk", recent, recent[-1]))[:, :, None]
         mean = same_sign.sum(axis=0)
         mean /= np.linalg.norm(mean, axis=1)[:, None]
         for i in range(len(self.names)):
-            self.heading[i] = heading_to(Rotation.from_quat(mean[i]), Rotation.from_quat(self._mount[i]))
+            self.heading[i] = compute_heading(Rotation.from_quat(mean[i]), Rotation.from_quat(self._mount[i]))
         self._turn = _about_z(self.heading)
         self._var_at_reset = heading_var if heading_var is not None else self.heading_var()
 
     def heading_var(self) -> np.ndarray | None:
         """(k,) [rad²] variance of each heading by its filter alone, after a step; None where the filter has none."""
         cov = self._bank.attitude_cov
-        return None if cov is None else vertical_var(self._recent[self._oldest - 1], cov)
+        return None if cov is None else heading_variance(self._recent[self._oldest - 1], cov)
 
     def heading_std(self) -> np.ndarray:
         """(k,) [rad] one standard deviation of each segment's heading, as `track` states it: the mounts' part too.
@@ -262,7 +262,7 @@ class SegmentFollower:
 
     def std(self) -> np.ndarray:
         """(k,) [rad] one standard deviation of an axis of each segment; NaN where the filter has none."""
-        return spread(self._covariances_W())
+        return axis_std(self._covariances_W())
 
     def _covariances_W(self) -> np.ndarray:
         """(k, 3, 3) [rad²] of each segment in W after the last step; NaN where the filter has none."""
@@ -275,14 +275,14 @@ class SegmentFollower:
     def _covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
         """(n, 3, 3) [rad²] of sensor i's segment in W, error on the left of `quat_WL`, since the last reset.
 
-        As `alignment.covariance_of`; after a reset the heading is as good as a person stands, and grows from there.
+        As `alignment.compute_segment_covariance`; after a reset the heading's error is that of the pose, plus drift.
         """
         R_WS = Rotation.from_rotvec([0.0, 0.0, self.heading[i]]) * Rotation.from_quat(quat_VS)
         of = self.start.orientation[self.names[i]]._replace(attitude_cov=attitude_cov)
         mount = Rotation.from_quat(self._mount[i])
-        cov = covariance_of(self._until, self.names[i], self._subject, R_WS, mount, of)
+        cov = compute_segment_covariance(self._so_far, self.names[i], self._subject, R_WS, mount, of)
         if self._var_at_reset is not None:
-            var = vertical_var(quat_VS, attitude_cov)
+            var = heading_variance(quat_VS, attitude_cov)
             grown = np.maximum(0.0, var - self._var_at_reset[i])
             # The mount's part of the heading stays: the reset has set that of the start pose alone.
             share = np.sqrt((np.maximum(cov[:, 2, 2] - var, 0.0) + grown + START_POSE_STD**2) / cov[:, 2, 2])
@@ -290,11 +290,11 @@ class SegmentFollower:
             cov[:, :, 2] *= share[:, None]
         return cov
 
-    def _in_order(self) -> np.ndarray:
+    def _order_recent(self) -> np.ndarray:
         return np.concatenate([self._recent[self._oldest :], self._recent[: self._oldest]])
 
 
-def _joined(chunk: Recording, parts: list[Segments]) -> Segments:
+def _join_segments(chunk: Recording, parts: list[Segments]) -> Segments:
     """Segments of a chunk from those of its parts; headings are the last one's."""
 
     def orientation(name: str) -> Orientation:
@@ -322,7 +322,7 @@ def _about_z(angle: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _place(turn, quat_VS, mount, last, out):  # type: ignore[no-untyped-def]
+def _place_segments(turn, quat_VS, mount, last, out):  # type: ignore[no-untyped-def]
     """``turn ⊗ quat_VS ⊗ mount⁻¹`` for each of n ticks and k sensors, of the sign that is nearer to `last` (k, 4)."""
     for n in range(len(quat_VS)):
         for k in range(len(turn)):

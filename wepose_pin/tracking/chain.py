@@ -1,9 +1,9 @@
 """Any kinematic chain, a robot's arm say: sensors on links of a URDF → configuration.
 
-The chain stands still in a configuration that is known, as a person does in the N-pose. Seen from there a link's frame
-that equals W in that configuration is a segment's, and everything before this room holds for it: `mount` says which of
-the sensor's axes points up and which along W's x there, and gravity corrects its tilt. What the joints cannot do is
-taken off by the fit over all links: on a robot's arm that is most of the filters' error.
+The chain is static in a known configuration, as a person is in the N-pose. A link's frame
+that equals W in that configuration is a segment's, so that alignment works as for a person: `mount` states which of the
+sensor's axes points up and which along W's x there, and gravity corrects its tilt. The fit over all links removes
+rotations that the joints cannot make: on a robot's arm that is most of the filters' error.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ..diagnostics import WARNING, Diagnostic, as_json
 from ..errors import BadOption, BadSession, one_of
 from ..filters import BEST, check_method
 from ..filters.static import StaticTest
-from ..model.fit import fit, unseen
+from ..model.fit import find_undetermined_joints, fit
 from ..model.robot import joint_values, start_configuration
 from ..recording import CONFIGURATION, Recording
 from .segments import estimate_segments
@@ -81,7 +81,7 @@ class TrackedChain:
             "samples": len(self.time),
             "rate_hz": round(self.recording.rate_hz, 4),
             "duration_s": round(float(self.time[-1] - self.time[0]), 3),
-            "phases": {"start": list(self.segments.start), "static": list(self.segments.still)},
+            "phases": {"start": list(self.segments.start), "static": list(self.segments.static_phase)},
             "start": dict(self.recording.joints),
             "orientation_residual_rms_deg": {
                 link: round(float(np.degrees(np.sqrt(np.mean(angle**2)))), 3) for link, angle in self.residual.items()
@@ -140,7 +140,7 @@ def track_chain(
         {link: rotations.unwrap_signs(quat) for link, quat in quat_WL.items()},
         residual,
         segments.covariance_W,
-        tuple(unseen(model, list(quat_WL), q[len(q) // 2])),
+        tuple(find_undetermined_joints(model, list(quat_WL), q[len(q) // 2])),
         model,
         recording,
         segments,

@@ -27,83 +27,83 @@ CHAIN = SEGMENTS[:5]
 HANDS = ("left_hand", "right_hand")  # each in the chain where it has a sensor, else rigid with its forearm
 KNOT_S = 2.0
 SAMPLE_RATE_HZ = 8.0
-# How long errors of the residuals last that have nothing to do with headings: soft tissue and what is left of the
-# mounts' errors come back in every pose, so that a minute of joined hands is worth three samples. Taken from simulated
-# people, where less takes a good filter's headings for worse than they are.
+# Correlation time of residual errors other than those of headings: soft tissue and remaining errors of the mounts
+# recur in every pose, so that a minute of joined hands gives three effective samples. Chosen on simulated people: with
+# less, the headings of a good filter get worse.
 CORRELATION_S = 20.0
-TORSO_START_STD = np.deg2rad(0.5)  # [rad] of the torso's heading when the start pose ends: it says where x points
+TORSO_START_STD = np.deg2rad(0.5)  # [rad] of the torso's heading at the end of the start pose, which defines x
 UNKNOWN_DRIFT = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance
-APART = 5.0  # standard deviations from which on palms are not joined, or an elbow is no hinge
+OUTLIER_STDS = 5.0  # standard deviations above which palms are not joined, or an elbow is no hinge
 
 
 class HeadingCorrection(NamedTuple):
-    """What headings were corrected by: residuals before and after, and the largest correction."""
+    """The correction of headings: residuals before and after, and the largest correction."""
 
     clasp_mm: tuple[float, float] | None  # rms palm gap in the clasp phases
-    hinge_deg: Mapping[str, tuple[float, float]]  # side → rms of the forearm against the elbow's plane
+    hinge_deg: Mapping[str, tuple[float, float]]  # joint → rms of the forearm against the elbow's plane
     largest_deg: Mapping[str, float]  # segment → largest rotation about the vertical
 
 
 class HeadingCorrector:
     """Corrects the headings of a recording whose chunks come twice: `observe` all, `solve`, then `correct` each.
 
-    Put together, the chunks are bit-identical with the recording as one chunk: sums are taken knot by knot.
+    The result does not depend on the chunks: sums are taken knot by knot.
 
     Parameters
     ----------
     chunk : the first
     segments : names of those that are measured
-    begin : [s] end of the start pose, from which on there is drift
+    begin : [s] end of the start pose, after which headings drift
 
     Attributes
     ----------
-    has_chain : whether all segments from hand to hand are measured; without it there is nothing to hold
-    has_observations : whether there is a hinge, or a clasp that is not over when the start pose is
+    has_chain : whether all segments from hand to hand are measured; without them there is no correction
+    has_observations : whether there is a hinge, or a clasp that ends after the start pose
     """
 
     def __init__(self, chunk: Recording, segments: Collection[str], begin: float, subject: Subject) -> None:
         self.has_chain = set(CHAIN) <= set(segments)
         self._chain = (*CHAIN, *(hand for hand in HANDS if hand in segments))
         self._subject, self._start, self._clasp = subject, begin, chunk.phases.get("clasp", ())
-        # A hinge was seen through the mounts of its calibration and holds as long as they do.
+        # A hinge axis is relative to the calibrated mounts and holds as long as they do.
         self._hinges = subject.hinges if not chunk.remounted else {}
         self.has_observations = bool(self._hinges) or any(end >= begin for _, end in self._clasp)
         self._stride = max(1, round(chunk.rate_hz / SAMPLE_RATE_HZ))
         self._share = 1.0 / max(1.0, CORRELATION_S * chunk.rate_hz / self._stride)
         self._first: float | None = None  # [s] of the first sample that is used
-        self._seen = [0, 0]  # samples so far, of either pass
-        self._open: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # samples of a knot that is not complete
-        self._sums: list[tuple[np.ndarray, np.ndarray]] = []  # information and pull of knots that are
+        self._counts = [0, 0]  # samples so far, of either pass
+        self._incomplete: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # samples of the last knot
+        self._sums: list[tuple[np.ndarray, np.ndarray]] = []  # information and pull of complete knots
         self._observed = False
-        self._var: dict[str, list[np.ndarray]] = {}  # name → the filter's heading variance [rad²] at `_asked` times
-        self._asked = 0
+        self._var: dict[str, list[np.ndarray]] = {}  # name → the filter's heading variance [rad²] at `_recorded` times
+        self._recorded = 0
         self._last: dict[str, tuple[float, float]] = {}  # name → time and variance of the last sample
         self._gaps = {when: _Rms() for when in ("before", "after")}
-        self._hinge_rms = {when: {side: _Rms() for side in self._hinges} for when in ("before", "after")}
+        self._hinge_rms = {when: {joint: _Rms() for joint in self._hinges} for when in ("before", "after")}
         self._largest = dict.fromkeys(self._chain, 0.0)
 
     def observe(self, chunk: Recording, segments: Segments) -> None:
-        """Take a chunk, the first time that it comes."""
-        time, quats = self._sampled(chunk, segments, 0)
+        """Add a chunk in the first pass."""
+        time, quats = self._decimate(chunk, segments, 0)
         if len(time) and self._first is None:
             self._first = float(time[0])
-        self._ask(chunk, segments)
-        if self._open is not None:
-            time = np.concatenate([self._open[0], time])
-            quats = {name: np.concatenate([self._open[1][name], quat]) for name, quat in quats.items()}
+        self._record_variances(chunk, segments)
+        if self._incomplete is not None:
+            time = np.concatenate([self._incomplete[0], time])
+            quats = {name: np.concatenate([self._incomplete[1][name], quat]) for name, quat in quats.items()}
         if not len(time):
             return
-        knot = self._knots(time)
-        whole = int(np.searchsorted(knot, knot[-1]))
-        self._open = time[whole:], {name: quat[whole:] for name, quat in quats.items()}
-        if whole:
-            self._take(time[:whole], {name: quat[:whole] for name, quat in quats.items()})
+        knot = self._knot_of(time)
+        complete = int(np.searchsorted(knot, knot[-1]))
+        self._incomplete = time[complete:], {name: quat[complete:] for name, quat in quats.items()}
+        if complete:
+            self._sum_knots(time[:complete], {name: quat[:complete] for name, quat in quats.items()})
 
     def solve(self) -> bool:
-        """What the headings were off by; no where nothing saw them."""
-        if self._open is None or self._first is None:
+        """Estimate the heading errors; False where nothing observed them."""
+        if self._incomplete is None or self._first is None:
             return False
-        self._take(*self._open)
+        self._sum_knots(*self._incomplete)
         if not self._observed:
             return False
         information, pull = (np.concatenate(parts) for parts in zip(*self._sums, strict=True))
@@ -114,12 +114,12 @@ class HeadingCorrector:
                 at = np.concatenate(self._var[name])
                 at = np.concatenate([at, np.full(len(middle) + 1 - len(at), self._last[name][1])])
                 steps[:, i] = np.maximum(np.diff(at), 1e-10)
-        delta, self._cov = _smoothed(information, pull, steps)
+        delta, self._cov = _smooth_walk(information, pull, steps)
         self._middle, self._delta = middle, delta  # constant before the first middle and after the last
         return True
 
     def correct(self, chunk: Recording, segments: Segments) -> Segments:
-        """The chunk's segments with corrected headings, the second time that it comes."""
+        """The chunk's segments with corrected headings, in the second pass."""
         corrected, covariance = dict(segments.quat_WL), dict(segments.covariance_W)
         for i, name in enumerate(self._chain):
             psi = np.interp(chunk.time, self._middle, self._delta[:, i])
@@ -128,81 +128,84 @@ class HeadingCorrector:
             self._largest[name] = max(self._largest[name], float(np.degrees(np.abs(psi).max())))
             if name in covariance:
                 variance = np.interp(chunk.time, self._middle, self._cov[:, i, i])
-                with_heading, of_filter = _of_filter(segments, name)
+                with_heading, filter_var = _heading_covariance(segments, name)
                 start = start_heading_var(chunk, name, self._subject)
-                covariance[name] = _narrowed(covariance[name], with_heading, of_filter + start, variance)
+                covariance[name] = _narrow_covariance(covariance[name], with_heading, filter_var + start, variance)
         result = replace(segments, quat_WL=corrected, covariance_W=covariance)
-        time, quats = self._sampled(chunk, result, 1)
-        self._measure("after", time, {name: Rotation.from_quat(quat) for name, quat in quats.items()})
+        time, quats = self._decimate(chunk, result, 1)
+        self._add_residuals("after", time, {name: Rotation.from_quat(quat) for name, quat in quats.items()})
         return result
 
     def correction(self) -> HeadingCorrection:
-        """Residuals so far, before and after."""
+        """The residuals of the chunks so far."""
         gaps, hinge_rms = self._gaps, self._hinge_rms
         return HeadingCorrection(
             clasp_mm=(1e3 * gaps["before"].value, 1e3 * gaps["after"].value) if gaps["before"].count else None,
             hinge_deg={
-                side: (
-                    float(np.degrees(hinge_rms["before"][side].value)),
-                    float(np.degrees(hinge_rms["after"][side].value)),
+                joint: (
+                    float(np.degrees(hinge_rms["before"][joint].value)),
+                    float(np.degrees(hinge_rms["after"][joint].value)),
                 )
-                for side in self._hinges
+                for joint in self._hinges
             },
             largest_deg=dict(self._largest),
         )
 
-    def _sampled(self, chunk: Recording, segments: Segments, nth: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Times (m,) [s] and orientations (m, 4) at a few samples a second, the `nth` time that the chunk comes."""
-        at = np.arange(-self._seen[nth] % self._stride, len(chunk), self._stride)
-        self._seen[nth] += len(chunk)
+    def _decimate(self, chunk: Recording, segments: Segments, nth: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Times (m,) [s] and orientations (m, 4) at `SAMPLE_RATE_HZ`, in pass `nth`."""
+        at = np.arange(-self._counts[nth] % self._stride, len(chunk), self._stride)
+        self._counts[nth] += len(chunk)
         at = at[chunk.time[at] >= self._start]
         return chunk.time[at], {name: segments.quat_WL[name][at] for name in self._chain}
 
-    def _knots(self, time: np.ndarray) -> np.ndarray:
+    def _knot_of(self, time: np.ndarray) -> np.ndarray:
         return np.floor((time - self._first) / KNOT_S).astype(int)
 
-    def _take(self, time: np.ndarray, quats: Mapping[str, np.ndarray]) -> None:
-        """Information and pull of complete knots from their samples."""
+    def _sum_knots(self, time: np.ndarray, quats: Mapping[str, np.ndarray]) -> None:
+        """Add information and pull of complete knots from their samples."""
         R = {name: Rotation.from_quat(quat) for name, quat in quats.items()}
-        joined = self._measure("before", time, R)
+        joined = self._add_residuals("before", time, R)
         done = sum(len(pull) for _, pull in self._sums)
-        knot = self._knots(time) - done
+        knot = self._knot_of(time) - done
         count, size = int(knot[-1]) + 1, len(self._chain)
         information, pull = np.zeros((count, size, size)), np.zeros((count, size))
-        for row in (_gaps(R, self._subject, joined), *(_hinge(R, self._subject, side) for side in self._hinges)):
+        for row in (
+            _gap_rows(R, self._subject, joined),
+            *(_hinge_rows(R, self._subject, joint) for joint in self._hinges),
+        ):
             weight = self._share * row.weight[:, None]
             np.add.at(information, knot[row.sample], np.einsum("na,nb->nab", weight * row.H, row.H))
             np.add.at(pull, knot[row.sample], -weight * row.H * row.r[:, None])
             self._observed |= len(row.sample) > 0
         self._sums.append((information, pull))
 
-    def _measure(self, when: str, time: np.ndarray, R: Mapping[str, Rotation]) -> np.ndarray:
-        """Palms and elbows, for `reset`; gives where the palms are joined (m,)."""
+    def _add_residuals(self, when: str, time: np.ndarray, R: Mapping[str, Rotation]) -> np.ndarray:
+        """Add the residuals of palms and elbows; gives where the palms are joined (m,)."""
         joined = np.zeros(len(time), dtype=bool)
         for begin, end in self._clasp:
             joined |= (time >= begin) & (time <= end)
         if joined.any():
-            self._gaps[when].add(np.sum(_palms(R, self._subject)[joined] ** 2, axis=1))
+            self._gaps[when].add(np.sum(_palm_gap(R, self._subject)[joined] ** 2, axis=1))
         if len(time):
-            for side in self._hinges:
-                self._hinge_rms[when][side].add(_elbow(R, self._subject, side) ** 2)
+            for joint in self._hinges:
+                self._hinge_rms[when][joint].add(_hinge_residual(R, self._subject, joint) ** 2)
         return joined
 
-    def _ask(self, chunk: Recording, segments: Segments) -> None:
-        """The filters' heading variances at the end of the start pose and in the middles of the knots."""
+    def _record_variances(self, chunk: Recording, segments: Segments) -> None:
+        """Record the filters' heading variances at the end of the start pose and in the middles of the knots."""
         # The start pose may end in a chunk whose first used sample is in the next one.
-        times = np.array([self._start] if self._asked == 0 else [])
+        times = np.array([self._start] if self._recorded == 0 else [])
         if self._first is not None:
             last = int(np.floor((chunk.time[-1] - self._first) / KNOT_S - 0.5))
-            times = np.append(times, self._first + KNOT_S * (np.arange(max(0, self._asked - 1), last + 1) + 0.5))
+            times = np.append(times, self._first + KNOT_S * (np.arange(max(0, self._recorded - 1), last + 1) + 0.5))
         times = times[times <= chunk.time[-1]]
-        self._asked += len(times)
+        self._recorded += len(times)
         for name in self._chain:
             if name not in segments.covariance_W:
                 continue
-            _, variance = _of_filter(segments, name)
+            _, variance = _heading_covariance(segments, name)
             known = chunk.time
-            if name in self._last:  # what lies between two chunks
+            if name in self._last:  # the interval between two chunks
                 known = np.concatenate([[self._last[name][0]], known])
                 variance = np.concatenate([[self._last[name][1]], variance])
             self._var.setdefault(name, []).append(np.interp(times, known, variance))
@@ -210,7 +213,7 @@ class HeadingCorrector:
 
 
 class _Rms:
-    """Root mean square of what is added square by square."""
+    """Root mean square of added squares."""
 
     def __init__(self) -> None:
         self.count, self._sum = 0, 0.0
@@ -232,18 +235,18 @@ class _Rows(NamedTuple):
     weight: np.ndarray  # (m,) 1 / variance of e
 
 
-def _links(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
-    """(k, n, 3) [m] in W: each segment's part of the way from the right palm to the left one."""
+def _chain_links(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
+    """(k, n, 3) [m] in W: each segment's part of the chain from the right palm to the left one."""
     length = subject.lengths
     parts = [R["torso"].apply([0.0, length["shoulder_width"], 0.0])]
     for name in [name for name in R if name != "torso"]:
         side = name.split("_", 1)[0]
-        along = sum(length[part] for part in _carried(name, R))
+        along = sum(length[part] for part in _rotating_lengths(name, R))
         parts.append(R[name].apply([0.0, 0.0, -along if side == "left" else along]))
     return np.array(parts)
 
 
-def _carried(name: str, R: Mapping[str, Rotation]) -> tuple[str, ...]:
+def _rotating_lengths(name: str, R: Mapping[str, Rotation]) -> tuple[str, ...]:
     """The lengths that rotate with a segment of the chain."""
     hand = name.replace("forearm", "hand")
     if name == "torso":
@@ -251,14 +254,14 @@ def _carried(name: str, R: Mapping[str, Rotation]) -> tuple[str, ...]:
     return (name,) if hand in R else (name, hand)
 
 
-def _palms(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
+def _palm_gap(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
     """(n, 3) [m] left palm minus right palm in W."""
-    return _links(R, subject).sum(axis=0)
+    return _chain_links(R, subject).sum(axis=0)
 
 
-def _gaps(R: Mapping[str, Rotation], subject: Subject, joined: np.ndarray) -> _Rows:
-    """Of each sample with joined palms three whitened rows; those that lie far out are left out."""
-    v = _links(R, subject)[:, joined]
+def _gap_rows(R: Mapping[str, Rotation], subject: Subject, joined: np.ndarray) -> _Rows:
+    """Three whitened rows for each sample with joined palms, without outliers."""
+    v = _chain_links(R, subject)[:, joined]
     n = v.shape[1]
     eye = np.eye(3)
     covariance = np.tile(SLIP_STD**2 * eye, (n, 1, 1))
@@ -266,61 +269,65 @@ def _gaps(R: Mapping[str, Rotation], subject: Subject, joined: np.ndarray) -> _R
         covariance += ATTITUDE_STD**2 * (
             np.sum(link**2, axis=1)[:, None, None] * eye - np.einsum("na,nb->nab", link, link)
         )
-    covariance += _of_lengths(v, R, subject)
+    covariance += _length_covariance(v, R, subject)
     H = np.stack([np.cross([0.0, 0.0, 1.0], link) for link in v], axis=2)  # (n, 3, k)
     r = v.sum(axis=0)
     whiten = np.linalg.inv(np.linalg.cholesky(covariance)) if n else covariance
     r, H = np.einsum("nab,nb->na", whiten, r), whiten @ H
-    near = np.sum(r**2, axis=1) < APART**2 * 3.0
+    near = np.sum(r**2, axis=1) < OUTLIER_STDS**2 * 3.0
     sample = np.repeat(np.flatnonzero(joined)[near], 3)
     return _Rows(sample, r[near].ravel(), H[near].reshape(-1, len(v)), np.ones(len(sample)))
 
 
-def _of_lengths(v: np.ndarray, R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
-    """(n, 3, 3) [m²]: what the lengths' own covariance makes of the gap."""
+def _length_covariance(v: np.ndarray, R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
+    """Covariance (n, 3, 3) [m²] of the gap from that of the lengths."""
     names, J = [], []
     for link, name in zip(v, R, strict=True):
         direction = link / np.linalg.norm(link, axis=1)[:, None]
-        for length in _carried(name, R):
+        for length in _rotating_lengths(name, R):
             names.append(length)
             J.append(direction)
     jacobian = np.stack(J, axis=2)  # (n, 3, k)
     return jacobian @ subject.lengths_covariance(names) @ jacobian.swapaxes(1, 2)
 
 
-def _elbow(R: Mapping[str, Rotation], subject: Subject, side: str) -> np.ndarray:
-    """(n,) [rad] by which the forearm is out of the plane of the elbow's hinge."""
+def _hinge_residual(R: Mapping[str, Rotation], subject: Subject, joint: str) -> np.ndarray:
+    """(n,) [rad] by which the forearm leaves the plane of the elbow's hinge."""
+    side = joint.removesuffix("_elbow")
     forearm_U = R[f"{side}_upper_arm"].inv().apply(R[f"{side}_forearm"].apply([0.0, 0.0, -1.0]))
-    return forearm_U @ subject.hinges[side].axis
+    return forearm_U @ subject.hinges[joint].axis
 
 
-def _hinge(R: Mapping[str, Rotation], subject: Subject, side: str) -> _Rows:
+def _hinge_rows(R: Mapping[str, Rotation], subject: Subject, joint: str) -> _Rows:
+    side = joint.removesuffix("_elbow")
     upper, fore = R[f"{side}_upper_arm"], R[f"{side}_forearm"]
-    r = _elbow(R, subject, side)
+    r = _hinge_residual(R, subject, joint)
     turned = np.cross([0.0, 0.0, 1.0], fore.apply([0.0, 0.0, -1.0]))
-    slope = upper.inv().apply(turned) @ subject.hinges[side].axis
+    slope = upper.inv().apply(turned) @ subject.hinges[joint].axis
     H, names = np.zeros((len(r), len(R))), list(R)
     H[:, names.index(f"{side}_forearm")], H[:, names.index(f"{side}_upper_arm")] = slope, -slope
-    std = subject.hinges[side].std
-    near = np.abs(r) < APART * std + np.deg2rad(10.0)  # a heading that has drifted is no reason to doubt the hinge
+    std = subject.hinges[joint].std
+    near = np.abs(r) < OUTLIER_STDS * std + np.deg2rad(
+        10.0
+    )  # a drifted heading does not make the elbow less of a hinge
     sample = np.flatnonzero(near)
     return _Rows(sample, r[near], H[near], np.full(len(sample), std**-2))
 
 
-def _of_filter(segments: Segments, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """What the filter's own covariance says of the heading: with each axis of W (n, 3), and of itself (n,) [rad²]."""
-    of = segments.orientation[name]
-    R_VS = Rotation.from_quat(of.quat_WS)
-    assert of.attitude_cov is not None
-    with_heading_V = R_VS.apply(np.einsum("nab,nb->na", of.attitude_cov, R_VS.inv().apply([0.0, 0.0, 1.0])))
+def _heading_covariance(segments: Segments, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """The filter's covariance of the heading with each axis of W (n, 3), and its variance (n,) [rad²]."""
+    orientation = segments.orientation[name]
+    R_VS = Rotation.from_quat(orientation.quat_WS)
+    assert orientation.attitude_cov is not None  # as `covariance_W`, which the caller has checked
+    with_heading_V = R_VS.apply(np.einsum("nab,nb->na", orientation.attitude_cov, R_VS.inv().apply([0.0, 0.0, 1.0])))
     to_W = Rotation.from_rotvec([0.0, 0.0, segments.heading[name]])
     return to_W.apply(with_heading_V), with_heading_V[:, 2]
 
 
-def _smoothed(information: np.ndarray, pull: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Random walks (knots, k) and their covariances (knots, k, k), seen through information matrices."""
+def _smooth_walk(information: np.ndarray, pull: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smoothed random walks (knots, k) and their covariances (knots, k, k) from information matrices."""
     n, size = pull.shape
-    # How a person stands is part of the start: each segment's heading is off by it, the torso's by definition not.
+    # The start pose sets each segment's heading up to its own error; the torso's is right by definition.
     x, P = np.zeros(size), np.diag([TORSO_START_STD**2] + [START_POSE_STD**2] * (size - 1))
     before, filtered = [], []
     for k in range(n):
@@ -339,10 +346,12 @@ def _smoothed(information: np.ndarray, pull: np.ndarray, steps: np.ndarray) -> t
     return np.array(means[::-1]), np.array(covs[::-1])
 
 
-def _narrowed(cov_W: np.ndarray, filter_W: np.ndarray, filter_var: np.ndarray, heading_var: np.ndarray) -> np.ndarray:
+def _narrow_covariance(
+    cov_W: np.ndarray, filter_W: np.ndarray, filter_var: np.ndarray, heading_var: np.ndarray
+) -> np.ndarray:
     """Covariances (n, 3, 3) in which the heading's part of filter and start pose is no larger than `heading_var` (n,).
 
-    What comes from elsewhere, as from a mount's heading, joined hands and elbows do not take away: it stays.
+    Variance from elsewhere, such as a mount's heading, is not observed by joined hands and elbows: it stays.
     """
     share = np.sqrt(np.minimum(1.0, heading_var / filter_var))
     less = (1.0 - share)[:, None] * filter_W

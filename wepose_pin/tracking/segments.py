@@ -15,7 +15,7 @@ Oriented = tuple[Recording, Segments]
 class SegmentEstimator:
     """Orientation of each segment of a recording that comes in chunks.
 
-    Put together, the chunks of a causal filter are what one chunk gives, bit-identical; the smoother looks one chunk
+    The chunks of a causal filter together are bit-identical with one chunk; the smoother looks one chunk
     ahead. The phases `start` and `static` are in the first chunk.
 
     Parameters

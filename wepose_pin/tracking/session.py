@@ -1,8 +1,7 @@
 """Sessions too long for memory: read, filtered and posed a chunk at a time.
 
-Put together, the chunks of a causal filter are bit-identical with what `track` gives of the whole. The smoother looks
-one chunk ahead. Corrections of headings take a pass over the recording beforehand, of which little is kept: a few
-numbers every two seconds.
+The chunks of a causal filter together are bit-identical with the result of `track`. The smoother looks one chunk ahead.
+The heading correction needs a pass over the recording beforehand, which stores a few numbers every two seconds.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from .tracker import track_chunks
 
 CHUNK_S = 120.0
 SMOOTHER_CHUNK_S = 600.0  # how far the smoother looks ahead
-LARGE = 500_000_000  # bytes of a recording's files from which on it is better tracked in chunks
+LARGE = 500_000_000  # bytes of a recording's files, above which it is better tracked in chunks
 SHORTEST_S = 2.0  # of a chunk: a filter's first window has to fit
 
 
@@ -42,9 +41,9 @@ def track_session(
 ) -> Iterator[TrackedRecording]:
     """Track a session file in chunks of `seconds`, None for `CHUNK_S`, of the smoother `SMOOTHER_CHUNK_S`.
 
-    The first is as long as it takes to have the start pose, and the static phase, in it. Of a session in CSV or Parquet
-    only the times are held as a whole. `progress` gets what is done, and which share of it, chunk by chunk. Other
-    parameters as `Tracker`, and `load_session`.
+    The first chunk includes the start pose and the static phase. Of a session in CSV or Parquet only the times are in
+    memory as a whole. `progress` gets the name of the task and its share that is done, chunk by chunk. Other parameters
+    as `Tracker` and `load_session`.
 
     Raises
     ------

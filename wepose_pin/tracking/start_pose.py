@@ -1,4 +1,4 @@
-"""The start pose of whoever is tracked without a look ahead: waited for, and cut out of what came until then."""
+"""The start pose of causal tracking: detecting its end, and cutting it out of the recording so far."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..recording import Intervals, OrientationSensor, Recording, Sensor
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
 
-HOLD_S = 3.0  # [s] of standing still for a start pose that nobody named
+HOLD_S = 3.0  # [s] of standing still for a start pose that is not stated
 CHECK_S = 0.1  # [s] between two checks whether a person moves
 WINDOW_S = 0.5  # [s] over which a check goes
 
@@ -23,7 +23,7 @@ class StartGuide:
     Attributes
     ----------
     state : "waiting" for sensors, "hold", "moved" (in the last second, and held again since), "ready"
-    held_s : [s] of stillness so far
+    held_s : [s] of standing still so far
     missing, moving : columns of the sensors that are lost, or that moved last
     """
 
@@ -42,7 +42,7 @@ class StartGuide:
 
     @property
     def begin(self) -> int:
-        """Tick with which the stillness began."""
+        """First tick of standing still."""
         return self._tick - self._held
 
     @property
@@ -78,10 +78,10 @@ class StartGuide:
         return self.state
 
 
-def until_start(recording: Recording, interval: tuple[float, float]) -> Recording:
+def cut_start_pose(recording: Recording, interval: tuple[float, float]) -> Recording:
     """From the start pose's begin, or that of a phase `static` before its end, to its end.
 
-    What was lost in it is bridged by what is left of it: whoever reads a whole recording bridges with what came later.
+    Gaps are bridged from samples before its end alone, while a reader bridges them with later samples as well.
 
     Raises
     ------
@@ -97,17 +97,19 @@ def until_start(recording: Recording, interval: tuple[float, float]) -> Recordin
         begin = min(begin, recording.span(static[0]).start)
     part = recording.cut(slice(begin, span.stop))
     clock = Clock(np.arange(len(part)) / part.rate_hz, np.arange(len(part)), 1.0 / part.rate_hz)
-    sensors = {name: _bridged(part, name, clock) for name in part.sensors}
+    sensors = {name: _bridge_gaps(part, name, clock) for name in part.sensors}
     return replace(part, phases=before, sensors=sensors)
 
 
-def _bridged(part: Recording, name: str, clock: Clock) -> Sensor:
-    """A sensor with its gaps filled anew."""
+def _bridge_gaps(part: Recording, name: str, clock: Clock) -> Sensor:
+    """A sensor with its gaps filled from this part alone."""
     sensor = part.sensors[name]
     if isinstance(sensor, OrientationSensor) or sensor.gap is None or not sensor.gap.any():
         return sensor
     if sensor.gap.all():
-        raise BadPhase(f"{part.where()}: phases.start: sensors.{name} sent nothing in it; name seconds in which all do")
+        raise BadPhase(
+            f"{part.where()}: phases.start: sensors.{name} sent nothing in it; state seconds in which all do"
+        )
     marks = np.where(sensor.gap, LONG, GOOD).astype(np.int8)
     gyro_S, accel_S = bridge(sensor.gyro_S, marks, clock, rate=True), bridge(sensor.accel_S, marks, clock)
     return replace(sensor, gyro_S=gyro_S, accel_S=accel_S)

@@ -1,4 +1,4 @@
-"""`TrackedRecording`: a pose with all that led to it, and what is to be said of it."""
+"""`TrackedRecording`: a pose with its inputs and intermediate results, and its summary."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from ..alignment import Segments
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json
 from ..model import POINTS, BodyModel, load_model
-from ..pose import Pose, deviation
+from ..pose import Pose, orientation_residuals
 from ..recording import SEGMENTS, Recording
-from ..subject import Subject, average_subject
+from ..subject import Subject, population_subject
 from .headings import HeadingCorrection
 from .options import TrackOptions
 
@@ -23,14 +23,14 @@ _MOST_LATER = 10  # diagnostics of the later chunks of a long recording
 
 @dataclass(frozen=True)
 class TrackedRecording:
-    """A recording's pose, or that of a chunk, with all that led to it.
+    """The pose of a recording or a chunk, with its inputs and intermediate results.
 
     Parameters
     ----------
-    recording : what was tracked, of a causal tracker what follows the start pose
+    recording : the input; of a causal tracker the part after the start pose
     subject : lengths and mounts as used
     model : the body with those lengths
-    correction : what headings were corrected by so far; None where nothing is known that could correct them
+    correction : of the headings so far; None where nothing can correct them
     """
 
     pose: Pose
@@ -78,7 +78,7 @@ class TrackedRecording:
 
     def orientation_residual(self) -> dict[str, np.ndarray]:
         """Segment → angle (n,) [rad] between its measured orientation and the model's, where joints are too few."""
-        return deviation(self.model, self.q, self.quat_WL)
+        return orientation_residuals(self.model, self.q, self.quat_WL)
 
 
 class SummaryAccumulator:
@@ -87,7 +87,7 @@ class SummaryAccumulator:
     def __init__(self) -> None:
         self.last: TrackedRecording | None = None
         self._begin, self._samples = 0.0, 0
-        self._still: dict[str, int] = {}
+        self._static: dict[str, int] = {}
         self._lost: dict[str, tuple[int, int, bool]] = {}  # segment → gaps, lost samples, whether the last one was
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
         self._later: list[Diagnostic] = []  # of reading later chunks than the first
@@ -101,7 +101,7 @@ class SummaryAccumulator:
             self._later += [each for each in tracked.recording.diagnostics if each not in known]
         self._samples += len(tracked.time)
         for segment, of in tracked.segments.orientation.items():
-            self._still[segment] = self._still.get(segment, 0) + int(np.count_nonzero(of.static))
+            self._static[segment] = self._static.get(segment, 0) + int(np.count_nonzero(of.static))
         for segment, gap in tracked.pose.gap.items():
             gaps, samples, before = self._lost.get(segment, (0, 0, False))
             begun = int(np.count_nonzero(np.diff(gap, prepend=before) & gap))
@@ -121,7 +121,7 @@ class SummaryAccumulator:
             if orientation is None:
                 about["orientations"] = "from the recording"
             else:
-                about["static_share"] = round(self._still[segment] / self._samples, 4)
+                about["static_share"] = round(self._static[segment] / self._samples, 4)
                 about["gyro_bias_start_deg_s"] = np.degrees(orientation.noise.gyro_bias).round(5).tolist()
                 about["gyro_bias_end_deg_s"] = np.degrees(orientation.gyro_bias[-1]).round(5).tolist()
                 about["gravity_m_s2"] = round(orientation.noise.gravity, 4)
@@ -140,7 +140,7 @@ class SummaryAccumulator:
             "samples": self._samples,
             "rate_hz": round(last.recording.rate_hz, 4),
             "duration_s": round(float(last.time[-1]) - self._begin, 3),
-            "phases": {"start": list(last.segments.start), "static": list(last.segments.still)},
+            "phases": {"start": list(last.segments.start), "static": list(last.segments.static_phase)},
             "sensors": sensors,
             "points": sorted(last.points),
             "orientation_residual_rms_deg": {name: round(float(np.degrees(v)), 3) for name, v in residual_rms.items()},
@@ -176,7 +176,7 @@ def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | N
     if correction is None:
         return None
     about: dict[str, Any] = {
-        "hinge_rms_deg": {side: [round(v, 3) for v in values] for side, values in correction.hinge_deg.items()},
+        "hinge_rms_deg": {joint: [round(v, 3) for v in values] for joint, values in correction.hinge_deg.items()},
         "largest_correction_deg": {name: round(value, 3) for name, value in correction.largest_deg.items()},
     }
     if correction.clasp_mm is not None:
@@ -185,7 +185,7 @@ def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | N
 
 
 def _not_known(tracked: TrackedRecording) -> list[Diagnostic]:
-    """The points that have no place for want of a sensor."""
+    """The points that are unknown for lack of a sensor."""
     missing = [point for point in POINTS if point not in tracked.points]
     lacking = [name for name in SEGMENTS[:5] if name not in tracked.quat_WL]
     if not missing or not lacking:
@@ -194,12 +194,12 @@ def _not_known(tracked: TrackedRecording) -> list[Diagnostic]:
     return [Diagnostic("points-unknown", INFO, facts=facts)]
 
 
-def body_of(subject: Subject | None, model: BodyModel | None) -> tuple[Subject, BodyModel]:
-    """The subject as used, the average one for want of another, and a body of those lengths."""
-    who = subject or average_subject()
+def make_body(subject: Subject | None, model: BodyModel | None) -> tuple[Subject, BodyModel]:
+    """The subject as used, without one the population prior, and a body of those lengths."""
+    person = subject or population_subject()
     body = model or load_model()
     own = body.lengths
     if subject is None and model is not None:
-        # A model that somebody chose has that person's lengths; what it lacks stays the average person's.
-        who = replace(who, name=body.robot.name, lengths={**who.lengths, **own}, note="lengths of the model")
-    return who, body.with_lengths({name: value for name, value in who.lengths.items() if name in own})
+        # A chosen model has its person's lengths; lengths that it lacks are the population prior's.
+        person = replace(person, name=body.robot.name, lengths={**person.lengths, **own}, note="lengths of the model")
+    return person, body.with_lengths({name: value for name, value in person.lengths.items() if name in own})

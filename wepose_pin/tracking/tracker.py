@@ -7,14 +7,14 @@ from dataclasses import replace
 
 from ..errors import BadOption
 from ..model import BodyModel
-from ..pose import Poser, point_covariance
+from ..pose import KinematicsSolver, point_covariance
 from ..recording import CONFIGURATION, Recording
 from ..subject import Subject
 from .causal import CausalEstimator, SegmentFollower
 from .headings import HeadingCorrector
 from .options import TrackOptions
 from .segments import Oriented, SegmentEstimator
-from .tracked import TrackedRecording, body_of
+from .tracked import TrackedRecording, make_body
 
 Chunks = Callable[[], Iterable[Recording]]
 
@@ -22,18 +22,18 @@ Chunks = Callable[[], Iterable[Recording]]
 class Tracker:
     """The pose of the upper body of a recording that comes in chunks; the whole recording may be one.
 
-    `push` gives what can be said so far, `finish` the rest: the smoother looks one chunk ahead, and corrections of
-    headings need the whole recording. So that it need not be kept, `observe_headings` goes over its chunks beforehand;
-    its result is `headings` here. A causal tracker takes single samples as well, as `follower.step`.
+    `push` gives the chunks that are complete, `finish` the rest: the smoother looks one chunk ahead, and the heading
+    correction needs the whole recording. To save memory, `observe_headings` goes over the chunks beforehand; its result
+    is `headings` here. A causal tracker takes single samples as well, as `follower.step`.
 
-    All chunks of a recording carry its phases; `start` and `static` are in the first. Put together, what causal filters
-    give is bit-identical, whatever the chunks.
+    All chunks of a recording carry its phases; `start` and `static` are in the first. The result of a causal filter
+    does not depend on the chunks.
 
     Parameters
     ----------
-    subject : lengths and mounts; None for the population's mean and the session's stated mounts
+    subject : lengths and mounts; None for the population prior and the session's stated mounts
     model : a body; None for ours. It gets the subject's lengths; without a subject its own stand
-    headings : solved beforehand; None: solved in `finish`, where `options.correct_headings` and the subject ask for it
+    headings : solved beforehand; None: solved in `finish`, with `options.correct_headings`, where the subject allows it
     """
 
     def __init__(
@@ -48,8 +48,8 @@ class Tracker:
         self._subject, self._model = subject, model
         self._headings, self._solved = headings, headings is not None
         self._estimator = _estimator(subject, self.options)
-        self._person, self._body = body_of(subject, model)
-        self._poser: Poser | None = None
+        self._person, self._body = make_body(subject, model)
+        self._poser: KinematicsSolver | None = None
         self._waiting: list[Oriented] = []  # until the headings are solved
 
     @property
@@ -66,7 +66,7 @@ class Tracker:
         return self._estimator.follower
 
     def push(self, chunk: Recording) -> list[TrackedRecording]:
-        """Take the next chunk; gives those that are done.
+        """Take the next chunk; gives those that are complete.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class Tracker:
         return [tracked for oriented in self._estimator.push(chunk) for tracked in self._take(oriented)]
 
     def finish(self) -> list[TrackedRecording]:
-        """The chunks that are not done when the last one has been pushed."""
+        """The remaining chunks, after the last one has been pushed."""
         done = [tracked for oriented in self._estimator.finish() for tracked in self._take(oriented)]
         if self._headings is not None and not self._solved:
             self._solved = True
@@ -89,7 +89,7 @@ class Tracker:
 
     def _take(self, oriented: Oriented) -> list[TrackedRecording]:
         if self._headings is None and not self._solved:
-            self._headings = heading_corrector(oriented, self._subject, self.options)
+            self._headings = make_heading_corrector(oriented, self._subject, self.options)
             self._solved = self._headings is None
         if self._headings is not None and not self._solved:
             self._headings.observe(*oriented)
@@ -102,7 +102,7 @@ class Tracker:
         if self._headings is not None:
             segments = self._headings.correct(recording, segments)
         if self._poser is None:
-            self._poser = Poser(self._body, segments.quat_WL, limits=self.options.limits)
+            self._poser = KinematicsSolver(self._body, segments.quat_WL, limits=self.options.limits)
         pose = self._poser.pose(recording.time, segments.quat_WL)
         lengths_cov = self._person.lengths_covariance()
         pose = replace(
@@ -118,7 +118,7 @@ class Tracker:
 def observe_headings(
     chunks: Iterable[Recording], subject: Subject | None = None, options: TrackOptions | None = None
 ) -> HeadingCorrector | None:
-    """What corrects the headings of a recording, after a pass over its chunks; None where nothing does.
+    """The heading corrector of a recording after a pass over its chunks; None where nothing observes headings.
 
     Raises
     ------
@@ -135,20 +135,22 @@ def observe_headings(
         yield from estimator.finish()
 
     for oriented in estimates():
-        headings = headings or heading_corrector(oriented, subject, options)
+        headings = headings or make_heading_corrector(oriented, subject, options)
         if headings is None:
             return None
         headings.observe(*oriented)
     return headings if headings is not None and headings.solve() else None
 
 
-def heading_corrector(oriented: Oriented, subject: Subject | None, options: TrackOptions) -> HeadingCorrector | None:
-    """What may correct the headings of a recording that begins so; None where nothing is known that could."""
+def make_heading_corrector(
+    oriented: Oriented, subject: Subject | None, options: TrackOptions
+) -> HeadingCorrector | None:
+    """The heading corrector of a recording with this first chunk; None where nothing can correct headings."""
     recording, segments = oriented
     if subject is None or not subject.mounts or options.causal or not options.correct_headings:
         return None
     if recording.remounted or any(sensor.aligned for sensor in recording.sensors.values()):
-        return None  # frames that no calibration knows
+        return None  # not the frames of a calibration
     headings = HeadingCorrector(recording, segments.quat_WL, segments.start[1], subject)
     return headings if headings.has_chain and headings.has_observations else None
 

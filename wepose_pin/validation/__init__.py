@@ -33,9 +33,9 @@ __all__ = [
 
 def experiments(quick: bool = False, data: Path | None = None) -> dict[str, list[Job]]:
     """Name → its trials, a job each; `data`: the folder of the real recordings."""
-    found = paper.experiments(quick) | mounting.experiments(quick)
+    jobs = paper.experiments(quick) | mounting.experiments(quick)
     if data is not None:
-        found |= real.experiments(data, quick)
+        jobs |= real.experiments(data, quick)
     if not quick:
-        found |= gains.experiments(data)
-    return found
+        jobs |= gains.experiments(data)
+    return jobs

@@ -18,7 +18,7 @@ from .. import rotations
 from ..filters import METHODS, GdcParams, NcfParams, run_filter
 from ..filters.noise import SensorNoise
 from ..filters.static import StaticTest
-from .gains import gains_of
+from .gains import make_gains
 
 Orient = Callable[[np.ndarray, np.ndarray, float, SensorNoise], np.ndarray]
 
@@ -44,23 +44,23 @@ class Contender(NamedTuple):
 def contenders(setting: str, trial: str = "") -> list[Contender]:
     """Who takes part, ours first, then NCF and GDC, tuned and as they come, then the peers that are installed.
 
-    `setting`: "real" or a key of `gains.STATED`; `trial`: the name of a real one (see `gains_of`).
+    `setting`: "real" or a key of `gains.STATED`; `trial`: the name of a real one (see `make_gains`).
     """
-    tuned = gains_of(setting, trial)._asdict()
-    found = [_ours(method) for method in METHODS if method not in tuned]
-    found += [_set(method, params) for method, params in tuned.items()]
-    found += [_default_gains(method, params) for method, params in DEFAULT_GAINS.items()]
-    return found + [Contender(label, orient) for label, (module, orient) in _PEERS.items() if find_spec(module)]
+    tuned = make_gains(setting, trial)._asdict()
+    filters = [_make_ours(method) for method in METHODS if method not in tuned]
+    filters += [_make_tuned(method, params) for method, params in tuned.items()]
+    filters += [_default_gains(method, params) for method, params in DEFAULT_GAINS.items()]
+    return filters + [Contender(label, orient) for label, (module, orient) in _PEERS.items() if find_spec(module)]
 
 
-def _ours(method: str) -> Contender:
+def _make_ours(method: str) -> Contender:
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
         return run_filter(gyro_S, accel_S, rate_hz, noise, method, measured_start=True).quat_WS
 
     return Contender(method, orient, method)
 
 
-def _set(method: str, params: Any) -> Contender:
+def _make_tuned(method: str, params: Any) -> Contender:
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
         return run_filter(gyro_S, accel_S, rate_hz, noise, method, params).quat_WS
 
@@ -68,7 +68,7 @@ def _set(method: str, params: Any) -> Contender:
 
 
 def _default_gains(method: str, params: Any) -> Contender:
-    """Published gains, and nobody has looked at a static phase: the bias starts at zero."""
+    """Published gains without a static phase: the bias starts at zero."""
 
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
         unknown = replace(noise, gyro_bias=np.zeros(3))
@@ -85,8 +85,8 @@ def _vqf(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorN
     return rotations.xyzw_from_wxyz(import_module("vqf").VQF(1.0 / rate_hz).updateBatch(gyro, accel)["quat6D"])
 
 
-def _offline_vqf(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-    """Forward and backward over the whole recording: it knows the future, as a smoother does."""
+def _run_offline_vqf(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
+    """Forward and backward over the whole recording, as a smoother."""
     gyro, accel = np.ascontiguousarray(gyro_S - noise.gyro_bias), np.ascontiguousarray(accel_S, dtype=float)
     return rotations.xyzw_from_wxyz(import_module("vqf").offlineVQF(gyro, accel, None, 1.0 / rate_hz)["quat6D"])
 
@@ -116,6 +116,6 @@ def _imufusion(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: S
 
 _PEERS: dict[str, tuple[str, Orient]] = {  # label → the package it needs, and how it is run
     "vqf": ("vqf", _vqf),
-    "offline vqf": ("vqf", _offline_vqf),
+    "offline vqf": ("vqf", _run_offline_vqf),
     "imufusion": ("imufusion", _imufusion),
 }

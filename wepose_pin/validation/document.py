@@ -22,7 +22,7 @@ class Document(NamedTuple):
     results: list[Result]
     quick: bool
     versions: dict[str, str]
-    worlds: dict[str, dict[str, Any]]  # name → mounts_known, and imperfections with their sizes
+    worlds: dict[str, dict[str, Any]]  # name → with_exact_mounts, and imperfections with their sizes
     noise: dict[str, float]  # of the simulated sensors, in `ImuNoise`'s units
     gains: dict[str, dict[str, Any]]  # setting → "ncf", "gdc" → gains as stated
     skipped: list[Skipped] = []  # trials that could not be scored  # noqa: RUF012
@@ -33,14 +33,14 @@ def document_text(
 ) -> str:
     """The file's text: a line a result. No time stamp, so that two runs give the same file.
 
-    JSON knows no infinity and no NaN: a range without end, and a figure that is none, are null.
+    JSON has no infinity and no NaN: an unbounded range and a NaN are null.
     """
     head = {
         "versions": dict(versions),
         "quick": quick,
         **({"skipped": [each._asdict() for each in skipped]} if skipped else {}),
         "worlds": {
-            name: {"mounts_known": True, "imperfections": asdict(imperfections)}
+            name: {"with_exact_mounts": True, "imperfections": asdict(imperfections)}
             for name, imperfections in WORLDS.items()
         },
         "noise": asdict(MTI_3),
@@ -69,13 +69,13 @@ def read_document(path: Path) -> Document:
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a validation.json that `wepose validate -o DIR` wrote is wanted here")
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise BadData(f"{path}: is no JSON: {error}") from error
-    return as_document(found, str(path))
+    return as_document(content, str(path))
 
 
-def as_document(found: Any, where: str) -> Document:
+def as_document(content: Any, where: str) -> Document:
     """A run from what JSON gave.
 
     Raises
@@ -84,7 +84,7 @@ def as_document(found: Any, where: str) -> Document:
         A key is missing or its value is of the wrong kind.
     """
 
-    def wanted(of: Any, key: str, kind: type, place: str, default: Any = None) -> Any:
+    def read_value(of: Any, key: str, kind: type, place: str, default: Any = None) -> Any:
         value = of.get(key, default) if isinstance(of, dict) else None
         if not isinstance(value, kind):
             shown = "nothing" if value is None else type(value).__name__
@@ -92,25 +92,25 @@ def as_document(found: Any, where: str) -> Document:
         return value
 
     results = []
-    for k, item in enumerate(wanted(found, "results", list, "")):
+    for k, item in enumerate(read_value(content, "results", list, "")):
         place = f"results[{k}]."
-        experiment, trial, method = (wanted(item, key, str, place) for key in ("experiment", "trial", "method"))
-        series = wanted(item, "series", dict, place, {})
+        experiment, trial, method = (read_value(item, key, str, place) for key in ("experiment", "trial", "method"))
+        series = read_value(item, "series", dict, place, {})
         for curve in series:
-            wanted(series, curve, list, f"{place}series.")
-        results.append(Result(experiment, trial, method, wanted(item, "figures", dict, place), series))
+            read_value(series, curve, list, f"{place}series.")
+        results.append(Result(experiment, trial, method, read_value(item, "figures", dict, place), series))
     if not results:
         raise BadData(f"{where}: results: the list is empty; is it `wepose validate`'s?")
     return Document(
         results,
-        wanted(found, "quick", bool, "", False),
-        wanted(found, "versions", dict, "", {}),
-        wanted(found, "worlds", dict, "", {}),
-        wanted(found, "noise", dict, "", {}),
-        wanted(found, "gains", dict, "", {}),
+        read_value(content, "quick", bool, "", False),
+        read_value(content, "versions", dict, "", {}),
+        read_value(content, "worlds", dict, "", {}),
+        read_value(content, "noise", dict, "", {}),
+        read_value(content, "gains", dict, "", {}),
         [
-            Skipped(*(wanted(item, key, str, f"skipped[{k}].") for key in Skipped._fields))
-            for k, item in enumerate(wanted(found, "skipped", list, "", []))
+            Skipped(*(read_value(item, key, str, f"skipped[{k}].") for key in Skipped._fields))
+            for k, item in enumerate(read_value(content, "skipped", list, "", []))
         ],
     )
 

@@ -56,8 +56,8 @@ def pictures(document: Document, failures: list[str] | None = None) -> Iterator[
                 picture = draw(experiment, of, results)
             except Exception as error:
                 if failures is not None:
-                    what = draw.__name__.strip("_").replace("_", " ")
-                    failures.append(f"{experiment}: the figure of {what} cannot be drawn: {reason(error)}")
+                    kind = draw.__name__.strip("_").replace("_", " ")
+                    failures.append(f"{experiment}: the figure of {kind} cannot be drawn: {reason(error)}")
                 continue
             if picture is not None:
                 yield experiment, picture._replace(stem=f"{slug(experiment)}-{picture.stem}")
@@ -65,10 +65,10 @@ def pictures(document: Document, failures: list[str] | None = None) -> Iterator[
 
 def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Picture | None:
     """A bar a filter and figure, the paper's hatched below it."""
-    wanted = [AXES, tuple(HAND.values())]
+    quantities = [AXES, tuple(HAND.values())]
     if len({result.trial for result in results}) == 1:
-        wanted.append(tuple(name.replace("_", " ") for name in SPLIT[:3]))
-    names = next((names for names in wanted if all(name in row.figures for row in rows for name in names)), None)
+        quantities.append(tuple(name.replace("_", " ") for name in SPLIT[:3]))
+    names = next((names for names in quantities if all(name in row.figures for row in rows for name in names)), None)
     if names is None or experiment == ERROR_BUDGET:
         return None
     paper = {row.method: paper_figures(experiment, row.method) for row in rows if row.method in COLOURS}
@@ -76,14 +76,14 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Pi
     methods = [row.method for row in rows]
     panels: list[Panel] = []
     for name in names:
-        shown, unit = name_and_unit(name)
-        panel = Panel(f"{FROM.get(name, shown)} [{unit}]", shown_y=not panels)
+        title, unit = name_and_unit(name)
+        panel = Panel(f"{FROM.get(name, title)} [{unit}]", shown_y=not panels)
         bars = []  # place, mean, with whisker
         for at, row in zip(category_rows(panel, methods), rows, strict=True):
-            beside = paper.get(row.method, {}).get(name)
-            half, up = (0.18, 0.19) if beside else (0.25, 0.0)
+            reference = paper.get(row.method, {}).get(name)
+            half, up = (0.18, 0.19) if reference else (0.25, 0.0)
             both = [(at + up, row.figures[name], row.figures.get(f"{name} std", 0.0), _colour(row.method), "")]
-            both += [(at - up, *beside, "", "hatched outlined soft")] if beside else []
+            both += [(at - up, *reference, "", "hatched outlined soft")] if reference else []
             for place, mean, std, colour, css in both:
                 panel.boxes((0.0, mean), (place - half, place + half), css, colour=colour)
                 panel.line(np.array([mean, mean + std]), np.full(2, place), "ink thin")
@@ -91,12 +91,12 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Pi
         limit = limits.get(name, (0.0, 0.0))[1]
         panel.x = 0.0, _end_of_bars(bars, max([limit, *(sum(of[name]) for of in paper.values() if name in of)]))
         for place, mean, _ in bars:
-            if mean > panel.x[1]:  # it dwarfs the others: said, not shown
+            if mean > panel.x[1]:  # too large for the scale: as text
                 panel.text(panel.x[1], place, f"{mean:.1f} →", "halo", "end", dx=-3.0)
         if limit:
             panel.rule("ink dashed", x=limit)
         panels.append(panel)
-    caption = f"{capital(experiment)}: {'error' if names not in wanted[:2] else 'mean error'}"
+    caption = f"{capital(experiment)}: {'error' if names not in quantities[:2] else 'mean error'}"
     caption += ", whiskers: one standard deviation over time" if f"{names[0]} std" in rows[0].figures else ""
     keys = []
     if any(paper.values()):
@@ -117,14 +117,14 @@ def _trials(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> 
         panel = Panel(f"{name} [°]", shown_y=not panels)
         places = category_rows(panel, [trial.replace("_", " ") for trial in trials])
         place = dict(zip(trials, places, strict=True))
-        shown = [(r.method, place[r.trial], value) for r in results if (value := figures(r).get(name)) is not None]
-        values = np.array([value for _, _, value in shown])
+        points = [(r.method, place[r.trial], value) for r in results if (value := figures(r).get(name)) is not None]
+        values = np.array([value for _, _, value in points])
         panel.grid = "xy"
         panel.log_x = bool(values.min() > 0.0 and values.max() > 12.0 * values.min())
         panel.x = None if panel.log_x else (0.0, 1.05 * float(values.max()))
         for k, method in reversed(list(enumerate(row.method for row in rows))):  # ours on top
-            beside = 0.6 * (0.5 - (k + 0.5) / len(rows))  # equal errors do not hide each other
-            at = np.array([(value, at + beside) for label, at, value in shown if label == method]).reshape(-1, 2)
+            offset = 0.6 * (0.5 - (k + 0.5) / len(rows))  # equal errors do not hide each other
+            at = np.array([(value, at + offset) for label, at, value in points if label == method]).reshape(-1, 2)
             size = 4.5 if method == OURS else 3.2
             panel.markers(at[:, 0], at[:, 1], _marker(method), "", size=size, colour=_colour(method))
         panels.append(panel)
@@ -191,15 +191,15 @@ def _path(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pictu
 
 def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Picture | None:
     """What each imperfection adds to the hand's error."""
-    found = error_budget(results)
-    if experiment != ERROR_BUDGET or found is None:
+    budget = error_budget(results)
+    if experiment != ERROR_BUDGET or budget is None:
         return None
-    lines = [("all on", found.full, "ink"), *((part.name, part.added, "accent") for part in found.parts)]
-    lines += [(f"more: {part.name}", part.added, "before") for part in found.more]
+    lines = [("all on", budget.full, "ink"), *((part.name, part.added, "accent") for part in budget.parts)]
+    lines += [(f"more: {part.name}", part.added, "before") for part in budget.more]
     names = [line[0] for line in lines]
-    values = [line[1].get(name, 0.0) for line in lines for name in found.full]
+    values = [line[1].get(name, 0.0) for line in lines for name in budget.full]
     panels: list[Panel] = []
-    for name in found.full:
+    for name in budget.full:
         ends = min(0.0, 1.05 * min(values)), 1.15 * max(values)
         panel = Panel(f"{FROM[name]} [mm]", x=ends, shown_y=not panels)
         for at, (__, of, css) in zip(category_rows(panel, names), lines, strict=True):
@@ -214,9 +214,9 @@ def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pic
         "The error budget: root mean square error of the hand with all imperfections on, and what each of them adds: "
         "√(all on² − without it²). Parts that are independent add up in quadrature, not in a sum"
     )
-    if any(value < 0.0 for part in found.parts for value in part.added.values()):
+    if any(value < 0.0 for part in budget.parts for value in part.added.values()):
         caption += "; hatched, to the left: the error grows without it"
-    if found.more:
+    if budget.more:
         caption += "; orange: what would come on top"
     return Picture("parts", f"{caption}.", Chart([panels], [28.0 * len(lines) + 6.0]))
 

@@ -1,11 +1,10 @@
 """Gains of NCF and GDC: a grid search on trials that are scored nowhere else.
 
 Each setting has its own grid search, so that no filter runs with gains of another kind of motion. The score is the mean
-over trials of the total RMSE over the motion, heading aligned at rest, which is also what the experiments report; bias
-and noise are the static phase's, the start is the tilt measured there. `STATED` holds what the search found (a test and
-the experiment "gains" repeat it); of BROAD each half is run with the gains found on the other, and other recordings
-with those found on all of it. The drift experiment runs with those of "simulated 1 kHz": a search of its own lowers the
-total RMSE there by 3 %.
+over trials of the total RMSE over the motion, which the experiments report too. Heading, bias, noise and initial tilt
+are those of the static phase. `STATED` holds the results of the search (a test and the experiment "gains" repeat it).
+Each half of BROAD is run with the gains of the other half, and other recordings with those of all of it. The drift
+experiment runs with those of "simulated 1 kHz": a search of its own lowers the total RMSE there by 3 %.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
+from ..errors import BadOption
 from ..filters import Gdc, GdcParams, Ncf, NcfParams
 from ..filters.noise import SensorNoise, noise_of
 from ..filters.static import StaticTest
@@ -49,7 +49,7 @@ class Gains(NamedTuple):
     gdc: GdcParams
 
 
-def _on_grid(proportional: float, integral: float, descent: float) -> Gains:
+def _grid_points(proportional: float, integral: float, descent: float) -> Gains:
     """The points of the grid that these round."""
     nearest = [
         float(min(axis, key=lambda point: abs(point - rounded)))
@@ -61,13 +61,13 @@ def _on_grid(proportional: float, integral: float, descent: float) -> Gains:
 # Sensor noise alone and a minute without rest: with the bias removed the accelerometer has next to nothing to add, and
 # GDC is best without it, that is with the gyroscope integrated.
 STATED = {
-    "simulated 100 Hz": _on_grid(0.0032, 1e-4, 0.0),
-    "simulated 1 kHz": _on_grid(0.0032, 3.2e-5, 0.0),
-    "upper body, MTi-3 noise alone": _on_grid(0.032, 1e-5, 5.6e-4),
-    "upper body, realistic": _on_grid(0.1, 0.0, 1.8e-3),
-    "BROAD, first half": _on_grid(0.1, 1e-3, 0.018),
-    "BROAD, second half": _on_grid(0.056, 3.2e-4, 0.01),
-    "BROAD": _on_grid(0.1, 1e-3, 0.018),
+    "simulated 100 Hz": _grid_points(0.0032, 1e-4, 0.0),
+    "simulated 1 kHz": _grid_points(0.0032, 3.2e-5, 0.0),
+    "upper body, MTi-3 noise alone": _grid_points(0.032, 1e-5, 5.6e-4),
+    "upper body, realistic": _grid_points(0.1, 0.0, 1.8e-3),
+    "BROAD, first half": _grid_points(0.1, 1e-3, 0.018),
+    "BROAD, second half": _grid_points(0.056, 3.2e-4, 0.01),
+    "BROAD": _grid_points(0.1, 1e-3, 0.018),
 }
 
 
@@ -91,7 +91,7 @@ class Score(NamedTuple):
     total_rmse: float
 
 
-def gains_of(setting: str, trial: str = "") -> Gains:
+def make_gains(setting: str, trial: str = "") -> Gains:
     """The stated gains of a `setting`: a key of `STATED`, or "real".
 
     `trial`: its name; one of BROAD gets what was found on the half that it is not in.
@@ -134,7 +134,8 @@ def trials(setting: str, data: Path | None = None) -> list[TuningTrial]:
         return [_dynamic(seed, RATES[setting]) for seed in DYNAMIC_SEEDS]
     if setting in WORLDS:
         return [trial for seed in PERSON_SEEDS for trial in _person(seed, WORLDS[setting])]
-    assert data is not None
+    if data is None:
+        raise BadOption(f"{setting}: its trials need the folder of the real recordings")
     paths = sorted((data / "broad").glob("*.mat"))
     return [_broad(path) for path in paths if path.stem.split("_")[0] in BROAD[setting]]
 
@@ -154,19 +155,19 @@ def _person(seed: int, imperfections: Imperfections) -> list[TuningTrial]:
     rest[recording.span(recording.phases["start"][0])] = True
     for phase in ("clasp", "circles"):
         moving[recording.span(recording.phases[phase][0])] = True
-    found = []
+    trials = []
     for segment, sensor in recording.imus.items():
         true = simulation.quat_WS[segment]
-        found.append(_trial(sensor.gyro_S, sensor.accel_S, recording.rate_hz, true, rest, moving))
-    return found
+        trials.append(_trial(sensor.gyro_S, sensor.accel_S, recording.rate_hz, true, rest, moving))
+    return trials
 
 
 def _broad(path: Path) -> TuningTrial:
     trial = read_broad(path)
     rest = np.zeros(len(trial.scored), dtype=bool)
     rest[trial.static] = True
-    seen = np.isfinite(trial.quat_true).all(axis=1)
-    return _trial(trial.gyro_S, trial.accel_S, trial.rate_hz, trial.quat_true, rest, trial.scored, seen)
+    known = np.isfinite(trial.quat_true).all(axis=1)
+    return _trial(trial.gyro_S, trial.accel_S, trial.rate_hz, trial.quat_true, rest, trial.scored, known)
 
 
 def _trial(
@@ -176,11 +177,11 @@ def _trial(
     quat_WS: np.ndarray,
     rest: np.ndarray,
     scored: np.ndarray,
-    seen: np.ndarray | bool = True,
+    known: np.ndarray | bool = True,
 ) -> TuningTrial:
     looked_at = np.zeros(len(gyro_S), dtype=bool)
     looked_at[:: max(1, round(rate_hz / _SCORED_HZ))] = True
-    at = np.flatnonzero(looked_at & (rest | scored) & seen)
+    at = np.flatnonzero(looked_at & (rest | scored) & known)
     noise = noise_of(gyro_S[rest], accel_S[rest], rate_hz)
     return TuningTrial(gyro_S, accel_S, rate_hz, noise, at, Rotation.from_quat(quat_WS[at]), rest[at], scored[at])
 
@@ -188,16 +189,16 @@ def _trial(
 def experiments(data: Path | None = None) -> dict[str, list[Job]]:
     """The grid searches as jobs, one a setting: gains found, their score, and every point of the grid."""
     settings = [*RATES, *WORLDS, *(BROAD if data is not None and any((data / "broad").glob("*.mat")) else ())]
-    return {"gains": [Job("gains", setting, _searched, (data,)) for setting in settings]}
+    return {"gains": [Job("gains", setting, _search_experiment, (data,)) for setting in settings]}
 
 
-def _searched(experiment: str, setting: str, data: Path | None) -> list[Result]:
+def _search_experiment(experiment: str, setting: str, data: Path | None) -> list[Result]:
     results = []
     stated = STATED[setting]
     for name, scores, params in zip(("ncf", "gdc"), search(trials(setting, data)), stated, strict=True):
-        found, rmse = best(scores)
+        gains, rmse = best(scores)
         at_stated = next(score.total_rmse for score in scores if score.gains == params)
-        gain, integral = (*vars(found).values(), 0.0)[:2]
+        gain, integral = (*vars(gains).values(), 0.0)[:2]
         grid = [[*vars(score.gains).values(), score.total_rmse] for score in scores]
         figures = {
             "gain": gain,

@@ -52,21 +52,21 @@ class Job(NamedTuple):
 def run(jobs: Sequence[Job], workers: int | None = None) -> Iterator[list[Result] | Skipped]:
     """Results of each job in the order of the jobs, whatever the number of `workers` (None: one a core).
 
-    One that fails, as by a recording that cannot be read, is told and takes none of the others with it.
+    A job that fails, for example on an unreadable recording, is reported and does not stop the others.
     """
     count = min(workers or os.cpu_count() or 1, len(jobs))
     if count <= 1:
-        yield from map(_called, jobs)
+        yield from map(_call, jobs)
         return
     with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
         try:
-            yield from pool.map(_called, jobs)
+            yield from pool.map(_call, jobs)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-def _called(job: Job) -> list[Result] | Skipped:
+def _call(job: Job) -> list[Result] | Skipped:
     try:
         return job()
     except WeposeError as error:

@@ -25,25 +25,25 @@ def experiments(quick: bool = False) -> dict[str, list[Job]]:
 
 
 def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
-    """Nothing of the mounts is stated; shoulder width and trunk are taped; then six circles with what was found."""
+    """Calibration without stated mounts, with measured shoulder width and trunk, then six circles."""
     person = simulated_person(seed)
     simulation = simulate(person.lengths, seed=seed, imperfections=replace(REALISTIC, mount="any"))
     recording, truth = simulation.recording(), simulation.truth()
     results = []
     for method in METHODS:
         subject = calibrate_lengths(
-            recording, gauge=person.taped, prior=person.average, method=method, gauge_std=person.taped_std
+            recording, measured=person.measured, prior=person.prior, method=method, measured_std=person.measured_std
         ).subject
         errors = evaluate(track(recording, subject, method=method).pose, truth, simulation.phases["circles"][0])
-        found = _found(subject, person, simulation) | {
-            "hand_mm": errors.position["right_hand"]._asdict(),
-            "hand_from_shoulders_mm": errors.position_from_shoulders["right_hand"]._asdict(),
+        figures = _calibration_errors(subject, person, simulation) | {
+            "hand_mm": errors.position["right_palm"]._asdict(),
+            "hand_from_shoulders_mm": errors.position_from_shoulders["right_palm"]._asdict(),
         }
-        results.append(Result(experiment, trial, method, found))
+        results.append(Result(experiment, trial, method, figures))
     return results
 
 
-def _found(subject: Subject, person: Person, simulation: Simulation) -> dict[str, float]:
+def _calibration_errors(subject: Subject, person: Person, simulation: Simulation) -> dict[str, float]:
     """Errors of the calibration; all of them by the standard deviations that it states, too."""
     names = [name for name in LENGTHS if name != "trunk"]  # which joined hands do not show
     lengths = np.array([subject.lengths[name] - person.lengths[name] for name in names])

@@ -41,7 +41,7 @@ from .tables import ERROR_BUDGET
 
 RATES = {"100 Hz": 100.0, "1 kHz": 1000.0}
 WORLDS = {"MTi-3 noise alone": PERFECT_WORLD, "realistic": REALISTIC}
-KNOWN_MOUNT_STD = np.deg2rad(0.5)  # what the tracker is told of mounts that are in truth exact
+KNOWN_MOUNT_STD = np.deg2rad(0.5)  # stated for mounts that are exact
 # What is switched off in turn: imperfections as in a perfect world, or a part of the chain known exactly.
 SWITCHED: dict[str, dict[str, Any]] = {
     label: {name: getattr(PERFECT_WORLD, name) for name in names.split()}
@@ -64,21 +64,21 @@ SWITCHED: dict[str, dict[str, Any]] = {
 
 def experiments(quick: bool = False) -> dict[str, list[Job]]:
     """Name → jobs; `quick`: one trial of each, and no error budget."""
-    found = {}
+    jobs = {}
     for rate, rate_hz in RATES.items():
         name = f"dynamic {rate}"
-        found[name] = [Job(name, str(k), _dynamic, (k, rate, rate_hz)) for k in range(1 if quick else 12)]
-    found["drift"] = [Job("drift", str(k), _drift, (k,)) for k in range(1 if quick else 10)]
+        jobs[name] = [Job(name, str(k), _dynamic, (k, rate, rate_hz)) for k in range(1 if quick else 12)]
+    jobs["drift"] = [Job("drift", str(k), _drift, (k,)) for k in range(1 if quick else 10)]
     for world, imperfections in WORLDS.items():
         name = f"upper body, {world}"
-        found[name] = [Job(name, str(k), _upper_body, (k, imperfections)) for k in range(1 if quick else 10)]
+        jobs[name] = [Job(name, str(k), _upper_body, (k, imperfections)) for k in range(1 if quick else 10)]
     if not quick:
-        found[ERROR_BUDGET] = [Job(ERROR_BUDGET, str(k), _error_budget, (k,)) for k in range(10)]
-    return found
+        jobs[ERROR_BUDGET] = [Job(ERROR_BUDGET, str(k), _error_budget, (k,)) for k in range(10)]
+    return jobs
 
 
 def _dynamic(experiment: str, trial: str, seed: int, rate: str, rate_hz: float) -> list[Result]:
-    """5 s still, 50 s of free motion, 5 s still; errors over the motion."""
+    """5 s static, 50 s of free motion, 5 s static; errors over the motion."""
     sensor = paper_dynamic(seed, rate_hz)
     results = []
     for method, scored, error in _single(sensor, f"simulated {rate}"):
@@ -88,7 +88,7 @@ def _dynamic(experiment: str, trial: str, seed: int, rate: str, rate_hz: float) 
 
 
 def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
-    """25 s still, 10 s of shaking and turning, 25 s still; the heading error after the motion, against before it."""
+    """25 s static, 10 s of shaking and rotating, 25 s static; the heading error after the motion, against before it."""
     sensor = paper_drift(seed)
     after = sensor.time > sensor.moving[1] + 1.0
     results = []
@@ -103,7 +103,7 @@ def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
 
 
 def _single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, AttitudeError, Rotation]]:
-    """Label, its error over the motion, and the error rotation of each sample; the heading aligned at rest."""
+    """Label, error over the motion, and error rotation of each sample; headings are aligned in the static phase."""
     rest = (sensor.time >= sensor.static[0][0] + 0.5) & (sensor.time <= sensor.static[0][1] - 0.5)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
     true = Rotation.from_quat(sensor.quat_WS)
@@ -121,11 +121,11 @@ def _simulated(seed: int, imperfections: Imperfections) -> tuple[Person, Simulat
 
 
 def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfections) -> list[Result]:
-    """Clasp calibration by each filter with shoulder width and trunk taped and mounts known, then six circles."""
+    """Clasp calibration by each filter with measured shoulder width and trunk and known mounts, then six circles."""
     person, simulation = _simulated(seed, imperfections)
     recorded, truth = simulation.recording(), simulation.truth()
     circles = simulation.phases["circles"][0]
-    prior = mounts_known(person.average, simulation)
+    prior = with_exact_mounts(person.prior, simulation)
     results = []
     for contender in contenders(experiment):
         recording, method = oriented(recorded, contender)
@@ -134,9 +134,9 @@ def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfect
         series = {}
         if seed == 0:
             inside = recording.span(circles)
-            off = pose.points["right_hand"][inside] - truth.points["right_hand"][inside]
-            paths = {f"{axis}_mm": 1e3 * pose.points["right_hand"][inside, k] for k, axis in enumerate("xyz")}
-            paths |= {f"true_{axis}_mm": 1e3 * truth.points["right_hand"][inside, k] for k, axis in enumerate("xyz")}
+            off = pose.points["right_palm"][inside] - truth.points["right_palm"][inside]
+            paths = {f"{axis}_mm": 1e3 * pose.points["right_palm"][inside, k] for k, axis in enumerate("xyz")}
+            paths |= {f"true_{axis}_mm": 1e3 * truth.points["right_palm"][inside, k] for k, axis in enumerate("xyz")}
             series = over_time(recording.time[inside], error_mm=1e3 * np.linalg.norm(off, axis=1), **paths)
         figures = _hand(evaluate(pose, truth, circles)) | {"lengths_rms_mm": _lengths_rms(subject, person)}
         results.append(Result(experiment, trial, contender.label, figures, series))
@@ -149,7 +149,7 @@ def _error_budget(experiment: str, trial: str, seed: int) -> list[Result]:
     for label, off in SWITCHED.items():
         person, simulation = _simulated(seed, replace(REALISTIC, **off))
         recording = simulation.recording()
-        prior = person.average if label == "mounts as stated" else mounts_known(person.average, simulation)
+        prior = person.prior if label == "mounts as stated" else with_exact_mounts(person.prior, simulation)
         if label == "orientations exact":
             sensors = {
                 name: OrientationSensor(simulation.quat_WS[name], sensor.stated_quat_LS, sensor.gap)
@@ -169,17 +169,19 @@ def _error_budget(experiment: str, trial: str, seed: int) -> list[Result]:
 
 
 def _calibrated(recording: Recording, person: Person, prior: Subject, method: str) -> Subject:
-    found = calibrate_lengths(recording, gauge=person.taped, prior=prior, method=method, gauge_std=person.taped_std)
+    found = calibrate_lengths(
+        recording, measured=person.measured, prior=prior, method=method, measured_std=person.measured_std
+    )
     return found.subject
 
 
 def _hand(errors: Evaluation) -> dict[str, dict[str, float]]:
     figures = {
-        "hand_mm": errors.position["right_hand"]._asdict(),
-        "hand_from_shoulders_mm": errors.position_from_shoulders["right_hand"]._asdict(),
+        "hand_mm": errors.position["right_palm"]._asdict(),
+        "hand_from_shoulders_mm": errors.position_from_shoulders["right_palm"]._asdict(),
     }
-    if "right_hand" in errors.position_uncertainty:
-        figures["hand_uncertainty"] = errors.position_uncertainty["right_hand"]._asdict()
+    if "right_palm" in errors.position_uncertainty:
+        figures["hand_uncertainty"] = errors.position_uncertainty["right_palm"]._asdict()
     return figures
 
 
@@ -190,7 +192,7 @@ def _lengths_rms(subject: Subject, person: Person) -> float:
     )
 
 
-def mounts_known(subject: Subject, simulation: Simulation) -> Subject:
+def with_exact_mounts(subject: Subject, simulation: Simulation) -> Subject:
     """The subject with the simulation's exact mounts, stated as known to `KNOWN_MOUNT_STD`."""
     rows = [row for segment in simulation.quat_LS for row in mount_rows(segment)]
     covariance = block_diag(subject.covariance, KNOWN_MOUNT_STD**2 * np.eye(len(rows)))

@@ -1,8 +1,8 @@
 """Real recordings with a truth: BROAD, the paper authors' own trial, the RING chain, a UR5 arm.
 
 Heading aligned once, on a stretch that is not scored, and never fitted to the truth afterwards; optical gaps left out.
-Where nobody has done it (RING, UR5) clocks, frames and the tilt of the truth's world are found on the first ten
-seconds, which are not scored (`registration`). The static phase's bias is removed for every filter. RING has no still
+For RING and UR5 clocks, frames and the tilt of the truth's world are estimated on the first ten seconds, which are not
+scored (`registration`). The static phase's bias is removed for every filter. RING has no still
 phase: there the bias found on the ten seconds is removed; "bias unknown" is without, as a user would have it.
 """
 
@@ -80,7 +80,9 @@ def experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
         ]
     for mount in RING_MOUNTS:
         name = f"RING, link lengths, {mount} mounts"
-        found[name] = [Job(name, ring.folder.name, _links, (ring, mount)) for ring in rings if mount in ring.imu]
+        found[name] = [
+            Job(name, ring.folder.name, _compare_links, (ring, mount)) for ring in rings if mount in ring.imu
+        ]
     ur5 = [files for files in find_ur5(data) if (files.recording, files.sensor) not in UR5_OFF]
     found["UR5"] = [
         Job("UR5", f"{files.recording} {files.sensor}", _ur5, (files, n == 0))
@@ -98,13 +100,13 @@ def experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
 def _broad(experiment: str, name: str, path: Path, first: bool) -> list[Result]:
     """Errors over the marked motion, the heading aligned in the static phase."""
     trial = read_broad(path)
-    seen = np.isfinite(trial.quat_true).all(axis=1)
-    at_rest = np.zeros(len(seen), dtype=bool)
-    at_rest[trial.static] = seen[trial.static]
-    true = Rotation.from_quat(np.where(seen[:, None], trial.quat_true, [0.0, 0.0, 0.0, 1.0]))
+    known = np.isfinite(trial.quat_true).all(axis=1)
+    at_rest = np.zeros(len(known), dtype=bool)
+    at_rest[trial.static] = known[trial.static]
+    true = Rotation.from_quat(np.where(known[:, None], trial.quat_true, [0.0, 0.0, 0.0, 1.0]))
     return [
-        Result(experiment, name, label, *_scored(aligned(R_VS, true, at_rest), true, trial, first))
-        for label, R_VS in _filtered(trial)
+        Result(experiment, name, label, *_score(aligned(R_VS, true, at_rest), true, trial, first))
+        for label, R_VS in _run_contenders(trial)
     ]
 
 
@@ -119,23 +121,23 @@ def _authors(experiment: str, name: str, path: Path) -> list[Result]:
     first = int(np.argmax(trial.scored))
     true = Rotation.from_quat(np.where(trial.scored[:, None], trial.quat_true, [0.0, 0.0, 0.0, 1.0]))
     return [
-        Result(experiment, name, label, *_scored((true[first] * R_VS[first].inv()) * R_VS, true, trial, True))
-        for label, R_VS in _filtered(trial)
+        Result(experiment, name, label, *_score((true[first] * R_VS[first].inv()) * R_VS, true, trial, True))
+        for label, R_VS in _run_contenders(trial)
     ]
 
 
-def _filtered(trial: Trial) -> Iterator[tuple[str, Rotation]]:
+def _run_contenders(trial: Trial) -> Iterator[tuple[str, Rotation]]:
     noise = noise_of(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
     for contender in contenders("real", trial.name):
         yield contender.label, Rotation.from_quat(contender.orient(trial.gyro_S, trial.accel_S, trial.rate_hz, noise))
 
 
-def _scored(R_WS: Rotation, true: Rotation, trial: Trial, keep: bool) -> tuple[dict[str, Any], dict[str, list[float]]]:
+def _score(R_WS: Rotation, true: Rotation, trial: Trial, keep: bool) -> tuple[dict[str, Any], dict[str, list[float]]]:
     time = np.arange(len(trial.scored))[trial.scored] / trial.rate_hz
-    return _errors(R_WS[trial.scored], true[trial.scored], time, keep)
+    return _make_errors(R_WS[trial.scored], true[trial.scored], time, keep)
 
 
-def _errors(
+def _make_errors(
     estimated: Rotation, true: Rotation, time: np.ndarray, keep: bool
 ) -> tuple[dict[str, Any], dict[str, list[float]]]:
     """Figures, and the curve where it is to be kept."""
@@ -149,7 +151,7 @@ def _ring(experiment: str, name: str, files: RingFiles, segment: str, mount: str
     chain, registered = _registered_ring(files.folder)
     sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
     noise = assumed_noise(sensor.rate_hz, registration.gyro_bias if bias_known else None)
-    return _referenced(experiment, name, sensor, registration, noise, segment == RING_SEGMENTS[0])
+    return _score_reference(experiment, name, sensor, registration, noise, segment == RING_SEGMENTS[0])
 
 
 def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result]:
@@ -158,27 +160,27 @@ def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result
     The tilt of the world comes out as 1.0 to 2.6 deg where it is one robot on one base: some 20 mg of error of the
     accelerometers are in it, and in the inclinations.
     """
-    found = read_ur5(files)
-    (registration,) = register([found], (0.0, UNSCORED_S))
-    noise = noise_of(found.gyro_S[found.static], found.accel_S[found.static], found.rate_hz)
-    return _referenced(experiment, name, found, registration, noise, keep)
+    trial = read_ur5(files)
+    (registration,) = register([trial], (0.0, UNSCORED_S))
+    noise = noise_of(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
+    return _score_reference(experiment, name, trial, registration, noise, keep)
 
 
-def _links(experiment: str, name: str, files: RingFiles, mount: str) -> list[Result]:
+def _compare_links(experiment: str, name: str, files: RingFiles, mount: str) -> list[Result]:
     """Lengths of the chain's links from each contender's orientations and the optical tip, beside the optical ones."""
     chain, registered = _registered_ring(files.folder)
-    links = optical_links(chain)
+    links = fit_optical_links(chain)
     optical = (links.lengths["seg2"] + links.lengths["seg3"], links.lengths["seg4"])
     orientations = []
     for segment in ("seg2", "seg3", "seg4"):
         sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
         noise = assumed_noise(sensor.rate_hz, registration.gyro_bias)
-        orientations.append(dict(_oriented(sensor, registration, noise)))
+        orientations.append(dict(_run_orientations(sensor, registration, noise)))
     tip_W = Rotation.from_quat(registered[mount, "seg2"].quat_WV).apply(links.tip_V)
     results = []
     for contender in contenders("real"):
         of = [each[contender.label] for each in orientations]
-        fitted = fitted_links(tip_W[of[0].scored], *(each.estimated[each.scored] for each in of))
+        fitted = fit_links(tip_W[of[0].scored], *(each.estimated[each.scored] for each in of))
         figures: dict[str, float] = {}
         for link, length, true in zip(("seg2_and_seg3", "seg4"), fitted, optical, strict=True):
             figures |= {f"{link}_mm": 1e3 * float(length), f"{link}_optical_mm": 1e3 * true}
@@ -188,37 +190,37 @@ def _links(experiment: str, name: str, files: RingFiles, mount: str) -> list[Res
 
 
 class Links(NamedTuple):
-    """What the optical system says of the RING chain's links."""
+    """The RING chain's links from the optical system."""
 
     lengths: dict[str, float]  # segment → [m], between its joints
     tip_V: np.ndarray  # (m, 3) [m], from the joint of seg1 and seg2 to that of seg4 and seg5; NaN: not seen
 
 
-def optical_links(chain: Chain) -> Links:
+def fit_optical_links(chain: Chain) -> Links:
     """Lengths and tip from the joints' centres, the points that two neighbours agree on best (least squares).
 
     A hinge leaves the point open along its own axis. About y and z (seg3 to seg5) that does not touch the lengths,
     which are counted along the links; about x, the link itself (seg2 to seg3), the split is what the hinge's play
     says, and the sum stands.
     """
-    seen = np.isfinite(chain.quat_VB["seg1"]).all(axis=1)
-    R_VB = {segment: Rotation.from_quat(quat[seen]).as_matrix() for segment, quat in chain.quat_VB.items()}
+    known = np.isfinite(chain.quat_VB["seg1"]).all(axis=1)
+    R_VB = {segment: Rotation.from_quat(quat[known]).as_matrix() for segment, quat in chain.quat_VB.items()}
     centres = {}
     for near, far in pairwise(RING_SEGMENTS):
         A = np.concatenate([R_VB[near], -R_VB[far]], axis=2).reshape(-1, 6)
-        b = (chain.origin_V[far][seen] - chain.origin_V[near][seen]).ravel()
+        b = (chain.origin_V[far][known] - chain.origin_V[near][known]).ravel()
         solution = np.linalg.lstsq(A, b, rcond=1e-6)[0]
         centres[near, "end"], centres[far, "begin"] = solution[:3], solution[3:]
     lengths = {s: float(centres[s, "end"][0] - centres[s, "begin"][0]) for s in ("seg2", "seg3", "seg4")}
     # The hinge of seg4 and seg5 leaves the joint's z in seg4 open: that of the link's other end is taken.
     end = np.array([*centres["seg4", "end"][:2], centres["seg4", "begin"][2]])
     tip_V = np.full_like(chain.origin_V["seg4"], np.nan)
-    tip_V[seen] = chain.origin_V["seg4"][seen] + R_VB["seg4"] @ end
-    tip_V[seen] -= chain.origin_V["seg2"][seen] + R_VB["seg2"] @ centres["seg2", "begin"]
+    tip_V[known] = chain.origin_V["seg4"][known] + R_VB["seg4"] @ end
+    tip_V[known] -= chain.origin_V["seg2"][known] + R_VB["seg2"] @ centres["seg2", "begin"]
     return Links(lengths, tip_V)
 
 
-def fitted_links(tip_W: np.ndarray, R_W2: Rotation, R_W3: Rotation, R_W4: Rotation) -> np.ndarray:
+def fit_links(tip_W: np.ndarray, R_W2: Rotation, R_W3: Rotation, R_W4: Rotation) -> np.ndarray:
     """Lengths (2,) [m] of seg2 and seg3 together, and of seg4: tip = l₂₃ x₂₃ + l₄ x₄, least squares.
 
     seg3 turns on seg2 about the link itself: both have one axis x₂₃, the mean of the two, and only their sum is seen.
@@ -246,18 +248,20 @@ class Compared(NamedTuple):
     scored: np.ndarray  # (m,) bool
 
 
-def _oriented(sensor: Referenced, registration: Registration, noise: SensorNoise) -> Iterator[tuple[str, Compared]]:
+def _run_orientations(
+    sensor: Referenced, registration: Registration, noise: SensorNoise
+) -> Iterator[tuple[str, Compared]]:
     """Label and orientations of each contender."""
     time = sensor.time + registration.offset_s
     clock = np.arange(len(sensor.gyro_S)) / sensor.rate_hz
-    seen = np.isfinite(sensor.quat_VB).all(axis=1) & (time >= 0.0) & (time <= clock[-1])
-    R_VB = Rotation.from_quat(np.where(seen[:, None], sensor.quat_VB, [0.0, 0.0, 0.0, 1.0]))
+    known = np.isfinite(sensor.quat_VB).all(axis=1) & (time >= 0.0) & (time <= clock[-1])
+    R_VB = Rotation.from_quat(np.where(known[:, None], sensor.quat_VB, [0.0, 0.0, 0.0, 1.0]))
     true, R_SB = Rotation.from_quat(registration.quat_WV) * R_VB, Rotation.from_quat(registration.quat_BS).inv()
     early = sensor.time <= UNSCORED_S
     for contender in contenders("real"):
         R_WS = Rotation.from_quat(contender.orient(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise))
         R_WB = Slerp(clock, R_WS)(np.clip(time, 0.0, clock[-1])) * R_SB
-        yield contender.label, Compared(aligned(R_WB, true, seen & early), true, seen & ~early)
+        yield contender.label, Compared(aligned(R_WB, true, known & early), true, known & ~early)
 
 
 def assumed_noise(rate_hz: float, gyro_bias: np.ndarray | None = None) -> SensorNoise:
@@ -278,11 +282,11 @@ def assumed_noise(rate_hz: float, gyro_bias: np.ndarray | None = None) -> Sensor
     )
 
 
-def _referenced(
+def _score_reference(
     experiment: str, name: str, sensor: Referenced, registration: Registration, noise: SensorNoise, keep: bool
 ) -> list[Result]:
     results = []
-    for label, of in _oriented(sensor, registration, noise):
-        figures, series = _errors(of.estimated[of.scored], of.true[of.scored], sensor.time[of.scored], keep)
+    for label, of in _run_orientations(sensor, registration, noise):
+        figures, series = _make_errors(of.estimated[of.scored], of.true[of.scored], sensor.time[of.scored], keep)
         results.append(Result(experiment, name, label, figures | registration.figures(), series))
     return results

@@ -110,11 +110,11 @@ class _Span:
         self.R_VB = Rotation.from_quat(sensor.quat_VB[self.seen])
         self.first = self.seen[np.isin(self.seen + 1, self.seen)]
         self.interval = sensor.time[self.first + 1] - sensor.time[self.first]
-        self.rate = np.linalg.norm(self._turns(self.first, 1), axis=1) / self.interval
+        self.rate = np.linalg.norm(self._rotation_vectors(self.first, 1), axis=1) / self.interval
         if self.rate.std() < _LEAST_TURN:
             raise BadData(f"{sensor.name}: its body does not turn in the stretch that is to align it, {stretch} s")
 
-    def _turns(self, first: np.ndarray, n: int) -> np.ndarray:
+    def _rotation_vectors(self, first: np.ndarray, n: int) -> np.ndarray:
         """Rotation vectors (k, 3) of the body from `first` to n samples later, in its frame."""
         begin, end = (Rotation.from_quat(self.sensor.quat_VB[k]) for k in (first, first + n))
         return (begin.inv() * end).as_rotvec()
@@ -140,7 +140,7 @@ class _Span:
             raise BadData(f"{self.sensor.name}: the reference is not seen for {TURN_S:g} s on end in the stretch")
         at = Slerp(self.clock, self.integrated(self.bias))
         begin, end = (at(self.sensor.time[k] + offset) for k in (first, first + n))
-        true, turned = self._turns(first, n), (begin.inv() * end).as_rotvec()
+        true, turned = self._rotation_vectors(first, n), (begin.inv() * end).as_rotvec()
         use = np.maximum(np.linalg.norm(true, axis=1), np.linalg.norm(turned, axis=1)) < _LARGEST_TURN
         true, turned = true[use], turned[use]
         if len(true) < 10 or np.linalg.svd(true, compute_uv=False)[1] < _LEAST_TURN * np.sqrt(len(true)):
@@ -156,10 +156,10 @@ class _Span:
             R_VI = self.R_VB * R_BS * Rotation.from_rotvec(x[:3]) * turned.inv()
             return (R_VI.mean().inv() * R_VI).as_rotvec().ravel()
 
-        found = least_squares(off, np.zeros(3 if self.known_bias else 6))
-        bias = self.bias if self.known_bias else self.bias + found.x[3:]
-        rms = float(np.sqrt(2.0 * found.cost / len(time)))
-        return _Fit(R_BS * Rotation.from_rotvec(found.x[:3]), bias, rms)
+        solution = least_squares(off, np.zeros(3 if self.known_bias else 6))
+        bias = self.bias if self.known_bias else self.bias + solution.x[3:]
+        rms = float(np.sqrt(2.0 * solution.cost / len(time)))
+        return _Fit(R_BS * Rotation.from_rotvec(solution.x[:3]), bias, rms)
 
     def up(self, offset: float, fit: _Fit) -> np.ndarray:
         """The vertical (3,) in the reference's world."""

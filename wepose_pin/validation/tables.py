@@ -115,13 +115,13 @@ def summary(results: Sequence[Result]) -> list[Row]:
 
 def figures(result: Result) -> dict[str, float]:
     """What a table shows of one trial: name → value, "name std" → its deviation over time where there is one."""
-    experiment, found = result.experiment, result.figures
+    experiment, values = result.experiment, result.figures
     if experiment.startswith("dynamic"):
-        return _flat({name: found[name] for name in AXES if name in found})
-    if all(name in found for name in SPLIT[:3]):
-        return _flat({name.replace("_", " "): found[name] for name in SPLIT if name in found})
+        return _flat({name: values[name] for name in AXES if name in values})
+    if all(name in values for name in SPLIT[:3]):
+        return _flat({name.replace("_", " "): values[name] for name in SPLIT if name in values})
     return {
-        SHORT.get(name, name): value for name, value in _flat({HAND.get(k, k): v for k, v in found.items()}).items()
+        SHORT.get(name, name): value for name, value in _flat({HAND.get(k, k): v for k, v in values.items()}).items()
     }
 
 
@@ -140,13 +140,13 @@ def paper_text(experiment: str, method: str) -> str:
     """The paper's figures in a few words; empty where it has none."""
     if experiment == "drift":
         return PAPER_DRIFT.get(method.removesuffix(DEFAULTS), "")
-    found = paper_figures(experiment, method).values()
-    texts = list(dict.fromkeys(f"{mean:.2f} ± {std:.2f}" for mean, std in found))
+    values = paper_figures(experiment, method).values()
+    texts = list(dict.fromkeys(f"{mean:.2f} ± {std:.2f}" for mean, std in values))
     return texts[0] if len(texts) == 1 else "  ".join(text.replace(" ", "") for text in texts)
 
 
 def name_and_unit(name: str) -> tuple[str, str]:
-    """A figure's name as a reader wants it, and its unit; empty where it has none."""
+    """A figure's name for readers, and its unit; empty where it has none."""
     if name in DEGREES:
         return name, "deg"
     if name in HAND.values():
@@ -343,9 +343,9 @@ def _size(value: Any, factor: float, unit: str) -> str:
 # Figures of trials ----------------------------------------------------------------------------------------------------
 
 
-def _flat(found: Mapping[str, Any], above: str = "") -> dict[str, float]:
+def _flat(values: Mapping[str, Any], above: str = "") -> dict[str, float]:
     flat: dict[str, float] = {}
-    for key, value in found.items():
+    for key, value in values.items():
         name = f"{above} {key}".strip()
         if isinstance(value, Mapping) and {"mean", "std"} <= set(value):
             flat |= {name: value["mean"], f"{name} std": value["std"]}

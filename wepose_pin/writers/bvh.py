@@ -1,4 +1,4 @@
-"""Biovision hierarchy (.bvh), by hand: the format is a page of text, smaller than any library for it.
+"""Biovision hierarchy (.bvh), without a library: the format is a page of text.
 
 The skeleton with the subject's lengths, and its motion.
 
@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 from ..angles import NEAR_LOCK, euler
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..pose import configuration, forward_kinematics, pose_of
+from ..pose import compute_pose, configuration, forward_kinematics
 from ..rotations import conjugate, multiply
-from .motion import Motion, bridged, even, whole
+from .motion import Motion, check_complete, diagnose_gaps, resample_evenly
 
 _ROTATIONS = "Zrotation Xrotation Yrotation"
 _NAMES = {"upper_arm": "Arm", "forearm": "ForeArm", "hand": "Hand"}
@@ -52,7 +52,7 @@ def skeleton(motion: Motion) -> Bone:
     if "torso" not in measured:
         raise BadData(f"{motion.where}: no orientation of the torso in pose.parquet; a .bvh ties the arms to it")
     upright = {segment: np.array([[0.0, 0.0, 0.0, 1.0]]) for segment in measured}
-    points = {name: p[0] for name, p in pose_of(model, np.zeros(1), upright).points.items()}
+    points = {name: p[0] for name, p in compute_pose(model, np.zeros(1), upright).points.items()}
     middle = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
     children = [bone for side in ("left", "right") if (bone := _arm(side, "upper_arm", measured, points)) is not None]
     if "head" in measured:
@@ -71,14 +71,14 @@ def _arm(side: str, part: str, measured: set[str], points: dict[str, np.ndarray]
         return None
     at = points[f"{side}_{_POINT_ABOVE[part]}"]
     if part == "hand":
-        return Bone(f"{side.capitalize()}Hand", segment, at, [], points[f"{side}_hand"])
+        return Bone(f"{side.capitalize()}Hand", segment, at, [], points[f"{side}_palm"])
     below = "forearm" if part == "upper_arm" else "hand"
     child = _arm(side, below, measured, points)
     lower = points.get(f"{side}_{_POINT_ABOVE[below]}", at + [0.0, 0.0, -0.3])
     return Bone(f"{side.capitalize()}{_NAMES[part]}", segment, at, [child] if child else [], lower)
 
 
-def _turned(v_W: np.ndarray) -> np.ndarray:
+def _to_file_axes(v_W: np.ndarray) -> np.ndarray:
     """Vectors (…, 3) of W in the file's axes: x left, y up, z forward."""
     return v_W[..., [1, 2, 0]]
 
@@ -91,16 +91,16 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
     BadData
         The torso is not known, or a sample has no orientation.
     """
-    whole(motion, "a .bvh")
-    motion, found = even(motion)
+    check_complete(motion, "a .bvh")
+    motion, diagnostics = resample_evenly(motion)
     root = skeleton(motion)
-    columns = [100.0 * _turned(_root_position(motion, root)), *_rotations(motion, root, None)]
+    columns = [100.0 * _to_file_axes(_root_position(motion, root)), *_rotations(motion, root, None)]
     lines = ["HIERARCHY", *_hierarchy(root, root.at, 0), "MOTION"]
     lines += [f"Frames: {len(motion.pose.time)}", f"Frame Time: {1.0 / motion.rate_hz:.8f}"]
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         np.savetxt(file, np.column_stack(columns), fmt="%.6f")
-    return [*found, *bridged(motion)]
+    return [*diagnostics, *diagnose_gaps(motion)]
 
 
 def _root_position(motion: Motion, root: Bone) -> np.ndarray:
@@ -117,7 +117,7 @@ def _rotations(motion: Motion, bone: Bone, above: np.ndarray | None) -> Iterator
     """Angles (n, 3) [deg] about z, x, y of each bone, in the order of the hierarchy."""
     quat_WL = motion.pose.quat_WL[bone.segment]
     quat = quat_WL if above is None else multiply(conjugate(above), quat_WL)
-    turned = np.column_stack([_turned(quat[:, :3]), quat[:, 3]])
+    turned = np.column_stack([_to_file_axes(quat[:, :3]), quat[:, 3]])
     yield np.degrees(euler.follow(euler.decompose(turned, "ZXY"), "ZXY", NEAR_LOCK))
     for child in bone.children:
         yield from _rotations(motion, child, quat_WL)
@@ -138,4 +138,4 @@ def _hierarchy(bone: Bone, above: np.ndarray, depth: int) -> Iterator[str]:
 
 
 def _offset(v_W: np.ndarray) -> str:
-    return "OFFSET " + " ".join(f"{100.0 * value + 0.0:.6f}" for value in _turned(v_W))
+    return "OFFSET " + " ".join(f"{100.0 * value + 0.0:.6f}" for value in _to_file_axes(v_W))

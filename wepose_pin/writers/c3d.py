@@ -12,7 +12,7 @@ import numpy as np
 
 from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, ExistingOutput
-from .motion import Motion, even, seen_points
+from .motion import Motion, find_measured_points, resample_evenly
 
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
 
@@ -33,8 +33,8 @@ def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
         import ezc3d
     except ImportError:
         raise BadOption("--format c3d: needs ezc3d, which is not installed: pip install 'wepose-pin[export]'") from None
-    motion, found = even(motion)
-    points = seen_points(motion)
+    motion, diagnostics = resample_evenly(motion)
+    points = find_measured_points(motion)
     n = len(motion.pose.time)
     if n > MOST_FRAMES:
         rate_hz = np.floor(motion.rate_hz * MOST_FRAMES / n)
@@ -60,11 +60,11 @@ def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
         named.replace(path)
     finally:
         named.unlink(missing_ok=True)
-    return found
+    return diagnostics
 
 
 def _check(file: Path, points: int) -> None:
-    """Complain of a file that ends early: ezc3d says nothing of a full disk."""
+    """Raise an error on a truncated file: ezc3d does not report a full disk."""
     with file.open("rb") as opened:
         first_block = int.from_bytes(opened.read(18)[16:], "little")  # word 9 of the header, counted from 1
     if file.stat().st_size < 512 * (first_block - 1) + 16 * points:

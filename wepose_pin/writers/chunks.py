@@ -46,14 +46,14 @@ class ChunkWriter:
 
     def finish(self, phases: Mapping[str, Sequence[tuple[float, float]]], provenance: Mapping[str, Any]) -> None:
         """The other files."""
-        _put_together(self._parts, self._folder / "pose.parquet")
+        _concatenate(self._parts, self._folder / "pose.parquet")
         shutil.rmtree(self._parts)
         last = self.accumulator.last
         assert last is not None
         write_about(self._folder, last, self.accumulator.summary(), phases, provenance)
 
 
-def _put_together(parts: Path, path: Path) -> None:
+def _concatenate(parts: Path, path: Path) -> None:
     """One Parquet file of those in a folder, in the order of their names; a few row groups at a time in memory."""
     lazy = pl.scan_parquet(sorted(parts.glob("*.parquet")))
     try:

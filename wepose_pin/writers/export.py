@@ -87,8 +87,8 @@ def export(
     with contextlib.ExitStack() as files:
         partial = files.enter_context(whole_file(file, force))
         if provenance is not None:
-            beside = files.enter_context(whole_file(provenance_file(file), True))
-            beside.write_text(provenance_text(provenance), encoding="utf-8")
+            partial_provenance = files.enter_context(whole_file(provenance_file(file), True))
+            partial_provenance.write_text(provenance_text(provenance), encoding="utf-8")
         if format == "urdf":
             if not (result / "subject.urdf").is_file():
                 raise MissingFile(f"{result}: no subject.urdf in it; a folder that `wepose track` wrote is wanted here")
@@ -108,7 +108,9 @@ def _format(file: Path, format: str | None) -> str:
     if format is None:
         format = file.suffix.lower().removeprefix(".")
         if format not in FORMATS:
-            raise BadOption(f"-o {file}: '{file.suffix}' is no format's suffix; --format says which; {one_of(FORMATS)}")
+            raise BadOption(
+                f"-o {file}: '{file.suffix}' is no format's suffix; state it by --format; {one_of(FORMATS)}"
+            )
     if format not in FORMATS:
         raise BadOption(f"--format {format}: not known; {one_of(FORMATS, format)}")
     suffix = SUFFIXES.get(format, f".{format}")

@@ -27,7 +27,7 @@ SYNC_S = 1.0  # [s] what a power cut may cost at most
 class LiveLog:
     """A file that holds all that was received, up to a quarter of a second before any end.
 
-    A disk that is full ends the recording and not the session: `problem` says so.
+    A full disk ends the recording and not the session: `problem` holds the reason.
 
     Parameters
     ----------
@@ -69,10 +69,10 @@ class LiveLog:
             self._first = tick
         self._poses.append(quat_WL.copy())
 
-    def event(self, kind: str, **what: Any) -> None:
+    def event(self, kind: str, **values: Any) -> None:
         """Something that decides the poses from here on."""
         self._put_samples()
-        self._block(EVENT, json.dumps({"kind": kind, **what}).encode())
+        self._block(EVENT, json.dumps({"kind": kind, **values}).encode())
 
     def due(self) -> None:
         """Write what waits, if it has waited for long."""
@@ -109,8 +109,8 @@ class LiveLog:
     def _put_samples(self) -> None:
         if not self._samples:
             return
-        kept, self._samples, self._waiting = self._samples, [], 0
-        which, *numbers = (np.concatenate(of) for of in zip(*kept, strict=True))
+        samples, self._samples, self._waiting = self._samples, [], 0
+        which, *numbers = (np.concatenate(of) for of in zip(*samples, strict=True))
         parts = [which.astype("u1").tobytes(), *(part.astype("<f8").tobytes() for part in numbers)]
         payload = struct.pack("<I", len(which)) + b"".join(parts)
         self._block(SAMPLES, payload)

@@ -1,4 +1,4 @@
-"""What is exported: a pose with its body, on even times where a format knows only a rate."""
+"""The motion to export: a pose with its body, on even times where a format has only a rate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, WrongOption
 from ..model import BodyModel
-from ..pose import Pose, pose_of
+from ..pose import Pose, compute_pose
 from ..recording import span_text
 
 # Times count as even while none is off the even grid by more than this share of a step.
@@ -43,7 +43,7 @@ class Motion:
         return float(f"{1.0 / float(np.median(np.diff(self.pose.time))):.6g}")
 
 
-def even(motion: Motion) -> tuple[Motion, list[Diagnostic]]:
+def resample_evenly(motion: Motion) -> tuple[Motion, list[Diagnostic]]:
     """The motion on even times, and what to know of them if they are new."""
     time = motion.pose.time
     grid = time[0] + np.arange(len(time)) * (time[-1] - time[0]) / (len(time) - 1)
@@ -70,17 +70,17 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
     BadOption
         No rate that a recording has.
     BadData
-        An orientation is not known; times leap so far that hardly a sample would be a measured one.
+        An orientation is not known; a time gap so long that nearly all new samples would be interpolated.
     """
     check_rate(rate_hz)
-    whole(motion, "resampling")
+    check_complete(motion, "resampling")
     pose = motion.pose
     old = pose.time
     samples = int(np.floor((old[-1] - old[0]) * rate_hz + 1e-6)) + 1
     if samples > max(_FEW, _MOST_NEW * len(old)):
-        leap = int(np.argmax(np.diff(old)))
+        jump = int(np.argmax(np.diff(old)))
         raise BadData(
-            f"{motion.where}: time leaps from {span_text((old[leap], old[leap + 1]))} in row {leap + 2} of "
+            f"{motion.where}: time jumps from {span_text((old[jump], old[jump + 1]))} in row {jump + 2} of "
             f"pose.parquet; at {rate_hz:g} Hz that is {samples} samples of {len(old)}"
         )
     time = old[0] + np.arange(samples) / rate_hz
@@ -94,7 +94,7 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
 
     quat_WL = {name: Slerp(old, Rotation.from_quat(quat))(time).as_quat() for name, quat in pose.quat_WL.items()}
     new = replace(
-        pose_of(motion.model, time, quat_WL),
+        compute_pose(motion.model, time, quat_WL),
         segment_cov={name: between(cov) for name, cov in pose.segment_cov.items()},
         point_cov={name: between(cov) for name, cov in pose.point_cov.items()},
         gap={
@@ -105,7 +105,7 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
     return replace(motion, pose=new)
 
 
-def whole(motion: Motion, what: str) -> None:
+def check_complete(motion: Motion, format_name: str) -> None:
     """Every sample of every segment has an orientation.
 
     Raises
@@ -118,17 +118,17 @@ def whole(motion: Motion, what: str) -> None:
         if lost.any():
             raise BadData(
                 f"{motion.where}: {segment} has no orientation in row {int(np.argmax(lost)) + 1} of pose.parquet; "
-                f"{what} needs one in every row, csv and parquet do not"
+                f"{format_name} needs one in every row, csv and parquet do not"
             )
 
 
-def bridged(motion: Motion) -> list[Diagnostic]:
+def diagnose_gaps(motion: Motion) -> list[Diagnostic]:
     """Segments with gaps, where a format has no way to mark them."""
     gaps = {segment: int(np.count_nonzero(gap)) for segment, gap in motion.pose.gap.items()}
     return [Diagnostic("export-gaps-unmarked", WARNING, segment, count) for segment, count in gaps.items() if count]
 
 
-def seen_points(motion: Motion) -> dict[str, np.ndarray]:
+def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:
     """Point → (n, 3) [m] in W, NaN where a segment on its way from the root was bridged over a gap.
 
     Raises
@@ -138,14 +138,12 @@ def seen_points(motion: Motion) -> dict[str, np.ndarray]:
     """
     pose = motion.pose
     if not pose.points:
-        raise BadData(
-            f"{motion.where}: no points in pose.parquet, for want of a torso's sensor; there is none to write"
-        )
-    found = {}
+        raise BadData(f"{motion.where}: no points in pose.parquet, for lack of a torso sensor; this format needs them")
+    points = {}
     for point, p_W in pose.points.items():
         side, part = point.split("_", 1)
         hand = ("hand",) if f"{side}_hand" in pose.quat_WL else ()
         way = ("torso", *(f"{side}_{of}" for of in _WAY.get(part, (*_WAY["wrist"], *hand))))
         lost = [pose.gap[segment] for segment in way if segment in pose.gap]
-        found[point] = np.where(np.any(lost, axis=0)[:, None], np.nan, p_W) if lost else p_W
-    return found
+        points[point] = np.where(np.any(lost, axis=0)[:, None], np.nan, p_W) if lost else p_W
+    return points

@@ -26,7 +26,7 @@ from ..angles import joint_angles
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from ..readers.opensim import OWN
-from .motion import Motion, bridged, even, seen_points, whole
+from .motion import Motion, check_complete, diagnose_gaps, find_measured_points, resample_evenly
 from .rajagopal import coordinates, in_ground, orientations
 
 _TRC_KEYS = (
@@ -44,8 +44,8 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagno
     BadData
         No joint has both of its segments, or a sample has no orientation.
     """
-    whole(motion, "a .mot")
-    found = bridged(motion)
+    check_complete(motion, "a .mot")
+    diagnostics = diagnose_gaps(motion)
     if names == "isb":
         angles = joint_angles(motion.pose)
         columns = {
@@ -54,10 +54,10 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagno
             for k, angle in enumerate(of.names)
         }
     else:
-        columns, missed = coordinates(orientations(motion.pose.quat_WL))
-        found += [
+        columns, residuals = coordinates(orientations(motion.pose.quat_WL))
+        diagnostics += [
             Diagnostic("opensim-axes-too-few", WARNING, body, float(angle), MOST_MISSED)
-            for body, angle in missed.items()
+            for body, angle in residuals.items()
             if angle > MOST_MISSED
         ]
     if not columns:
@@ -68,7 +68,7 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagno
     header = {"version": 1, "nRows": rows.height, "nColumns": rows.width, "inDegrees": "yes"}
     name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
     _write(path, [name, *(f"{key}={value}" for key, value in header.items()), "endheader"], rows)
-    return found
+    return diagnostics
 
 
 # Orientations -----------------------------------------------------------------------------------------------------
@@ -82,9 +82,9 @@ def write_sto(path: Path, motion: Motion) -> list[Diagnostic]:
     BadData
         No segment is a body of the model, or a sample has no orientation.
     """
-    whole(motion, "a .sto")
+    check_complete(motion, "a .sto")
     _write_quaternions(path, motion, motion.pose.time, _bodies(motion))
-    return bridged(motion)
+    return diagnose_gaps(motion)
 
 
 def write_placement(path: Path, motion: Motion) -> list[Diagnostic]:
@@ -95,10 +95,10 @@ def write_placement(path: Path, motion: Motion) -> list[Diagnostic]:
 
 
 def _bodies(motion: Motion) -> dict[str, np.ndarray]:
-    found = orientations(motion.pose.quat_WL)
-    if not found:
+    bodies = orientations(motion.pose.quat_WL)
+    if not bodies:
         raise BadData(f"{motion.where}: no segment in pose.parquet is a body of the model; there is none to write")
-    return found
+    return bodies
 
 
 def _write_quaternions(path: Path, motion: Motion, time: np.ndarray, quat_GB: Mapping[str, np.ndarray]) -> None:
@@ -121,8 +121,8 @@ def write_trc(path: Path, motion: Motion) -> list[Diagnostic]:
     BadData
         No point is known.
     """
-    motion, found = even(motion)
-    points = seen_points(motion)
+    motion, diagnostics = resample_evenly(motion)
+    points = find_measured_points(motion)
     n, rate = len(motion.pose.time), f"{motion.rate_hz:g}"
     keys = "\t".join(_TRC_KEYS)
     values = "\t".join((rate, rate, str(n), str(len(points)), "mm", rate, "1", str(n)))
@@ -134,7 +134,7 @@ def write_trc(path: Path, motion: Motion) -> list[Diagnostic]:
     rows = pl.DataFrame({"Frame#": np.arange(1, n + 1), "Time": motion.pose.time, **columns, "": [None] * n})
     header = [f"PathFileType\t4\t(X/Y/Z)\t{path.name.removeprefix('.').removesuffix('.partial')}", keys, values]
     _write(path, [*header, labels, axes, ""], rows, labels=False)
-    return found
+    return diagnostics
 
 
 def _mm(p_W: np.ndarray) -> np.ndarray:

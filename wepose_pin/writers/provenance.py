@@ -49,7 +49,7 @@ def machine() -> str:
 
 
 def _commit() -> str | None:
-    if not (_PACKAGE.parent / ".git").exists():  # a wheel; a repository further up is somebody else's
+    if not (_PACKAGE.parent / ".git").exists():  # a wheel; a repository further up is another one
         return None
     try:
         described = subprocess.run(
@@ -111,34 +111,34 @@ def file_hashes(path: Path, truth: bool = False) -> dict[str, str]:
         One is not there, or cannot be read.
     """
     top = path if path.is_dir() else path.parent
-    return {_name(file, top): file_hash(file) for file in files_of(path, truth)}
+    return {_relative_name(file, top): file_hash(file) for file in list_files(path, truth)}
 
 
-def files_of(path: Path, truth: bool = False) -> list[Path]:
+def list_files(path: Path, truth: bool = False) -> list[Path]:
     """The files that an input consists of."""
     if path.is_dir() and (path / "session.toml").is_file():
         path = path / "session.toml"
     if path.is_dir():
-        return [path / name for name in _RESULT if (path / name).is_file()] or sorted(_all(path))
+        return [path / name for name in _RESULT if (path / name).is_file()] or sorted(_list_all(path))
     # A map may name a URDF of example-robot-data, which lies elsewhere and has a version of its own.
-    named = [path.parent / name for name in named_in(path, truth)]
-    return [path, *(of for of in named if of.exists() or of.suffix != ".urdf"), *_beside(path)]
+    named = [path.parent / name for name in list_named_files(path, truth)]
+    return [path, *(of for of in named if of.exists() or of.suffix != ".urdf"), *_companion_files(path)]
 
 
-def _beside(path: Path) -> list[Path]:
+def _companion_files(path: Path) -> list[Path]:
     """What is read with a URDF because it lies there: the map of a robot, the table of a body."""
     tables = (path.with_suffix(".toml"), path.with_name("model.toml")) if path.suffix == ".urdf" else ()
     return [table for table in dict.fromkeys(tables) if table.is_file()]
 
 
-def named_in(path: Path, truth: bool = False) -> list[str]:
+def list_named_files(path: Path, truth: bool = False) -> list[str]:
     """Files and folders that a session, or a model's table, names, as they stand there."""
     if path.suffix != ".toml" or not path.is_file():  # a pipe would hold us up
         return []
     try:
         content = parse_toml(path.read_bytes().decode("utf-8"))
     except (OSError, ValueError):
-        return []  # whoever reads it says what is wrong with it
+        return []  # its reader reports what is wrong
     data, sensors = content.get("data"), content.get("sensors")
     tables = [data, *(sensors.values() if isinstance(sensors, dict) else ())]
     names = [table.get("file") for table in tables if isinstance(table, dict)]
@@ -156,8 +156,8 @@ def file_hash(path: Path) -> str:
     """
     try:
         if path.is_dir():
-            told = "".join(f"{_name(file, path)} {file_hash(file)}\n" for file in sorted(_all(path)))
-            return hashlib.sha256(told.encode()).hexdigest()
+            listing = "".join(f"{_relative_name(file, path)} {file_hash(file)}\n" for file in sorted(_list_all(path)))
+            return hashlib.sha256(listing.encode()).hexdigest()
         if path.exists() and not path.is_file():
             raise MissingFile(f"{path}: is no regular file")
         with path.open("rb") as file:
@@ -166,11 +166,11 @@ def file_hash(path: Path) -> str:
         raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _all(folder: Path) -> Iterator[Path]:
+def _list_all(folder: Path) -> Iterator[Path]:
     return (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
 
 
-def _name(file: Path, top: Path) -> str:
+def _relative_name(file: Path, top: Path) -> str:
     try:
         return file.relative_to(top).as_posix()
     except ValueError:

@@ -52,12 +52,12 @@ def orientations(quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     Who stands in the N-pose, palms to the thighs, is the model with 90° of `pro_sup` and zero of all others.
     """
-    found = {}
+    bodies = {}
     for segment, body in BODIES.items():
         if segment in quat_WL:
             moved = multiply(multiply(_QUAT_GW, quat_WL[segment]), conjugate(_QUAT_GW))
-            found[body] = multiply(moved, in_n_pose(body).as_quat())
-    return found
+            bodies[body] = multiply(moved, in_n_pose(body).as_quat())
+    return bodies
 
 
 def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, float]]:
@@ -67,13 +67,13 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
     have two axes: of each arm the sum of the squared angles between the model's bodies and the measured ones is the
     least, as it is for OpenSense with equal weights. A pelvis without a sensor stands still and upright.
     """
-    found: dict[str, np.ndarray] = {}
-    missed: dict[str, float] = {}
+    columns: dict[str, np.ndarray] = {}
+    residuals: dict[str, float] = {}
     if "pelvis" in quat_GB:
-        found |= _three(quat_GB["pelvis"], ("pelvis_tilt", "pelvis_list", "pelvis_rotation"))
+        columns |= _solve_three_axes(quat_GB["pelvis"], ("pelvis_tilt", "pelvis_list", "pelvis_rotation"))
     if "torso" in quat_GB:
         lumbar = multiply(conjugate(quat_GB.get("pelvis", _STILL)), quat_GB["torso"])
-        found |= _three(lumbar, ("lumbar_extension", "lumbar_bending", "lumbar_rotation"))
+        columns |= _solve_three_axes(lumbar, ("lumbar_extension", "lumbar_bending", "lumbar_rotation"))
     for side in "rl":
         arm = [name for body in ("humerus", "radius", "hand") if (name := f"{body}_{side}") in quat_GB]
         if not arm or arm[0] != f"humerus_{side}":
@@ -84,15 +84,15 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
         if arm[1:2] == [f"radius_{side}"]:
             quat[0], angles, left = _arm(quat)
             below = {f"{name}_{side}": value for name, value in zip(_MIDDLE, angles, strict=False)}
-            missed |= {name: float(np.sqrt(np.mean(angle**2))) for name, angle in zip(arm, left, strict=True)}
+            residuals |= {name: float(np.sqrt(np.mean(angle**2))) for name, angle in zip(arm, left, strict=True)}
         if "torso" in quat_GB:
             shoulder = multiply(conjugate(quat_GB["torso"] * mirror), quat[0])
-            found |= _three(shoulder, [f"arm_{of}_{side}" for of in ("flex", "add", "rot")])
-        found |= below
-    return found, missed
+            columns |= _solve_three_axes(shoulder, [f"arm_{of}_{side}" for of in ("flex", "add", "rot")])
+        columns |= below
+    return columns, residuals
 
 
-def _three(quat: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
+def _solve_three_axes(quat: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
     values = euler.follow(euler.decompose(quat, "ZXY"), "ZXY", NEAR_LOCK)
     return {name: values[:, k] for k, name in enumerate(names)}
 
@@ -104,10 +104,12 @@ def _arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list[np.
     """
     joints = [tuple(axis / np.linalg.norm(axis) for axis in axes) for axes in (ELBOW, WRIST)[: len(quat) - 1]]
     axes = [axis for pair in joints for axis in pair]
-    starts = [_two(pair, multiply(conjugate(a), b)) for pair, a, b in zip(joints, quat, quat[1:], strict=False)]
+    starts = [
+        _solve_two_axes(pair, multiply(conjugate(a), b)) for pair, a, b in zip(joints, quat, quat[1:], strict=False)
+    ]
     angles = np.column_stack([value for pair in starts for value in pair])
     humerus = quat[0].copy()
-    error, J = _errors(humerus, angles, axes, quat)
+    error, J = _body_errors(humerus, angles, axes, quat)
     damping = np.full(len(humerus), 1e-6)
     for _ in range(_ROUNDS):
         A = np.swapaxes(J, 1, 2) @ J
@@ -116,7 +118,7 @@ def _arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list[np.
         half = 0.5 * step[:, :3]
         tried = multiply(humerus, np.column_stack([half, np.ones(len(half))]))
         tried /= np.linalg.norm(tried, axis=1)[:, None]
-        new_error, new_J = _errors(tried, angles + step[:, 3:], axes, quat)
+        new_error, new_J = _body_errors(tried, angles + step[:, 3:], axes, quat)
         better = np.square(new_error).sum(axis=1) < np.square(error).sum(axis=1)
         humerus[better], angles[better] = tried[better], (angles + step[:, 3:])[better]
         error[better], J[better] = new_error[better], new_J[better]
@@ -128,7 +130,7 @@ def _arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list[np.
     return humerus, list(angles.T), [np.linalg.norm(part, axis=1) for part in np.split(error, len(quat), axis=1)]
 
 
-def _errors(
+def _body_errors(
     humerus: np.ndarray, angles: np.ndarray, axes: list[np.ndarray], quat: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotation vectors (n, 3 m) from the m measured bodies to the model's, and how they change (n, 3 m, 3 + k).
@@ -151,7 +153,7 @@ def _errors(
     return error, J
 
 
-def _two(axes: Sequence[np.ndarray], quat: np.ndarray) -> list[np.ndarray]:
+def _solve_two_axes(axes: Sequence[np.ndarray], quat: np.ndarray) -> list[np.ndarray]:
     """Angles (n,) [rad] about two axes that come nearest to rotations (n, 4)."""
     chain = Chain(joints=(1, 2), above=0, axes=tuple(axes), place=(0, 0), quat=(_STILL, _STILL), quat_AL=_STILL)
     return solve(chain, quat)

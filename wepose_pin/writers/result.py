@@ -25,9 +25,6 @@ from ..tracking import TrackedRecording
 if TYPE_CHECKING:  # it loads scipy.signal, which few results need
     from ..angles.torques import Torques
 
-if TYPE_CHECKING:  # it loads scipy.signal, which few results need
-    from ..angles.torques import Torques
-
 
 def write_result(
     folder: Path,
@@ -37,7 +34,7 @@ def write_result(
     torques: Torques | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write what `track` gave into an existing folder; with `covariance` its entries as well, not only deviations.
+    """Write a tracked recording into an existing folder; with `covariance` its entries besides standard deviations.
 
     `phases` of the recording go to the summary, so that a page made from the folder shows them too. `torques` become
     ``torques.parquet``, `provenance` part of the summary.
@@ -59,7 +56,7 @@ def write_about(
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """What stands in a result folder beside its tables: the subject as used, and ``summary.json``."""
+    """Write the files of a result beside its tables: the subject as used, and ``summary.json``."""
     write_subject(folder, tracked.subject, tracked.model)
     spans = {name: [[float(a), float(b)] for a, b in of] for name, of in (phases or {}).items()}
     about = {**summary, "recorded_phases": spans, "versions": versions()}
@@ -88,12 +85,12 @@ def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
     """``subject.toml``, and ``subject.urdf``: the body with the subject's lengths."""
     (folder / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
     head, _, body = model.urdf().partition("\n")
-    said = "; ".join(
+    text = "; ".join(
         f"{name} {value:.4f}" + (f" ± {subject.std(name):.4f}" if np.isfinite(subject.std(name)) else "")
         for name, value in subject.lengths.items()
     )
     comment = re.sub(
-        "-(?=-)", "- ", f"{subject.name}: lengths in metres ± one standard deviation. {said}"
+        "-(?=-)", "- ", f"{subject.name}: lengths in metres ± one standard deviation. {text}"
     )  # no -- in XML
     (folder / "subject.urdf").write_text(f"{head}\n<!-- {comment} -->\n{body}", encoding="utf-8")
 
@@ -123,7 +120,7 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
 
 @cache
 def versions() -> dict[str, str]:
-    """What a result was made with."""
+    """Package → version, for the provenance of a result."""
     packages = ("pin", "casadi", "numpy", "scipy", "numba", "polars")
     return {
         "wepose-pin": __version__,
@@ -133,7 +130,7 @@ def versions() -> dict[str, str]:
 
 
 def as_json(value: Any) -> Any:
-    """Named tuples and arrays as what JSON holds."""
+    """Named tuples and arrays as JSON values."""
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
         return {key: as_json(item) for key, item in value._asdict().items()}
     if isinstance(value, dict):

@@ -2,7 +2,7 @@
 
 First every segment by itself, from the root outwards (`chains`). A spherical joint has done its work with that. Where a
 segment of an arm hangs on fewer axes, or on hinges that have ends, what they cannot do is shared: `Fit` over all
-measured segments of that arm, in the frames in which something is missed or a limit passed.
+measured segments of that arm, in the frames in which an orientation is not reached or a limit passed.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from .. import rotations
 from ..rotations import conjugate, multiply, rotation_about
 from .body import BodyModel
 from .chains import AXIAL, Chain, axis_in_joint, solve
-from .fit import Fit, Limits, limits_of
+from .fit import Fit, Limits, joint_limits
 
-_MISSED = 1e-9  # [rad] that is nothing
+_MAX_RESIDUAL = 1e-9  # [rad] that is nothing
 
 
 class Group(NamedTuple):
@@ -29,25 +29,25 @@ class Group(NamedTuple):
     joints: tuple[int, ...]
 
 
-def groups(found: Mapping[str, Chain], measured: Collection[str]) -> list[Group]:
+def groups(chains: Mapping[str, Chain], measured: Collection[str]) -> list[Group]:
     """What has to be fitted: an arm, or a segment of the trunk, with a chain that cannot follow everything."""
     together: dict[str, list[str]] = {}
-    for segment in found:
+    for segment in chains:
         if segment in measured:
             together.setdefault(segment if segment in AXIAL else segment.split("_")[0], []).append(segment)
     return [
-        Group(tuple(segments), tuple(sorted({joint for segment in segments for joint in found[segment].joints})))
+        Group(tuple(segments), tuple(sorted({joint for segment in segments for joint in chains[segment].joints})))
         for segments in together.values()
-        if any(found[segment].joints and not found[segment].exact for segment in segments)
+        if any(chains[segment].joints and not chains[segment].exact for segment in segments)
     ]
 
 
-class Follower:
+class OrientationIk:
     """Configurations that follow orientations; what does not change from call to call is looked up once.
 
     Parameters
     ----------
-    found : `chains` of the model
+    chains : of the model
     segments : the measured ones
     limits, weights : as in `pose.configuration`
     """
@@ -55,18 +55,18 @@ class Follower:
     def __init__(
         self,
         model: BodyModel,
-        found: Mapping[str, Chain],
+        chains: Mapping[str, Chain],
         segments: Collection[str],
         *,
         limits: bool = True,
         weights: Mapping[str, float] | None = None,
     ) -> None:
-        self.model, self.found = model.pin, found
+        self.model, self.chains = model.pin, chains
         self._limits, self._weights = limits, weights
-        to_fit = sorted(groups(found, segments), key=lambda group: group.segments[0] not in AXIAL)
+        to_fit = sorted(groups(chains, segments), key=lambda group: group.segments[0] not in AXIAL)
         self._fits = [(group, Fit(self.model, group.segments, group.joints, weights or {}, limits)) for group in to_fit]
-        self._ends = [limits_of(self.model, group.joints) for group in to_fit]
-        self._begins = {chain.joints[0]: name for name, chain in found.items() if chain.joints and name in segments}
+        self._ends = [joint_limits(self.model, group.joints) for group in to_fit]
+        self._begins = {chain.joints[0]: name for name, chain in chains.items() if chain.joints and name in segments}
         self._neutral = pin.neutral(self.model)
         placed = [placement.rotation for placement in self.model.jointPlacements]
         self._placements = [pin.Quaternion(R).coeffs() for R in placed]
@@ -86,7 +86,7 @@ class Follower:
         kept: dict[int, np.ndarray] = {}
         q, quat_WJ = self.stepwise(quat_WL, kept)
         for nth, ((group, fit), ends) in enumerate(zip(self._fits, self._ends, strict=True)):
-            rows = np.flatnonzero(self._astray(q, quat_WJ, quat_WL, group, ends))
+            rows = np.flatnonzero(self._find_unreached(q, quat_WJ, quat_WL, group, ends))
             if not len(rows):
                 continue
             begin = self._solved.get(nth) if go_on else before
@@ -116,32 +116,32 @@ class Follower:
         for joint in range(1, self.model.njoints):
             above = self.model.parents[joint]
             if joint in kept:
-                turns[joint] = self._set(q, joint, kept[joint])
+                turns[joint] = self._write_joint(q, joint, kept[joint])
             elif joint in self._begins:
-                chain = self.found[self._begins[joint]]
-                wanted = quat_WL[self._begins[joint]]
-                values = solve(chain, multiply(conjugate(world[chain.above]), wanted))
+                chain = self.chains[self._begins[joint]]
+                target = quat_WL[self._begins[joint]]
+                values = solve(chain, multiply(conjugate(world[chain.above]), target))
                 for moved, value in zip(chain.joints, values, strict=True):
-                    turns[moved] = self._set(q, moved, value)
+                    turns[moved] = self._write_joint(q, moved, value)
             turned = self._placements[joint]
             world.append(multiply(world[above], multiply(turned, turns[joint]) if joint in turns else turned))
         return q, world
 
-    def _astray(
+    def _find_unreached(
         self, q: np.ndarray, quat_WJ: list[np.ndarray], quat_WL: Mapping[str, np.ndarray], group: Group, ends: Limits
     ) -> np.ndarray:
-        """(n,) bool: frames in which a segment is missed, or a limit passed."""
+        """(n,) bool: frames in which an orientation is not reached, or a limit passed."""
         astray = np.zeros(len(q), dtype=bool)
         for segment in group.segments:
             joint, quat_JL = self._stands[segment]
             stands = multiply(quat_WJ[joint], quat_JL.coeffs())
-            missed = multiply(conjugate(stands), quat_WL[segment])
-            astray |= np.linalg.norm(missed[..., :3], axis=-1) > 0.5 * _MISSED
+            residual = multiply(conjugate(stands), quat_WL[segment])
+            astray |= np.linalg.norm(residual[..., :3], axis=-1) > 0.5 * _MAX_RESIDUAL
         if self._limits:
             astray |= ((q[:, ends.at] < ends.lower) | (q[:, ends.at] > ends.upper)).any(axis=1)
         return astray
 
-    def _set(self, q: np.ndarray, joint: int, value: np.ndarray) -> np.ndarray:
+    def _write_joint(self, q: np.ndarray, joint: int, value: np.ndarray) -> np.ndarray:
         """Write a joint's value into `q`: an angle (n,) [rad] or a rotation (n, 4); gives its rotation."""
         first = self.model.idx_qs[joint]
         if value.ndim == 2:
@@ -160,7 +160,7 @@ class Follower:
 
 
 def _value(model: pin.Model, q: np.ndarray, joint: int) -> np.ndarray:
-    """What `Follower._set` takes: an angle (n,) [rad] or a rotation (n, 4)."""
+    """What `OrientationIk._write_joint` takes: an angle (n,) [rad] or a rotation (n, 4)."""
     first, n = model.idx_qs[joint], model.nqs[joint]
     if n == 4:
         return q[:, first : first + 4].copy()

@@ -1,0 +1,52 @@
+"""Initial headings from samples at which the palms touch.
+
+The linear start weighs all samples alike: where the hands are apart for a good part of the phase, its headings are
+wrong. Then it is computed from subsets of short windows, and the subset that closes most of the samples is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from .least_squares import Observations, residuals
+
+WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
+MANY_WIDE = 0.05  # share of samples with such gaps, above which subsets are tried
+# Windows of a subset, their length [s], and subsets: with half of the phase apart one in 16 has none of it.
+WINDOWS, WINDOW_S, SUBSETS = 4, 2.5, 60
+SCORED = 120  # samples by which a start is scored
+
+
+def find_contact_start(
+    observations: Observations, start_from: Callable[[Observations], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """A start x (m,) and the weight (n,) of each sample's gap in it, near 0 where the palms are apart.
+
+    Parameters
+    ----------
+    start_from : observations → x (m,), the prior's mean with headings from the closure of these observations
+    """
+    n = len(observations)
+    window = max(5, round(WINDOW_S / max(float(np.median(np.diff(observations.data[-1]))), 1e-3)))
+    few = observations.take(np.linspace(0, n - 1, min(n, SCORED)).astype(int))
+
+    def gap_ratios(x: np.ndarray, some: Observations) -> np.ndarray:
+        return np.sum(residuals(x, some)[2] ** 2, axis=1) / WIDE**2
+
+    def score(x: np.ndarray) -> float:
+        return float(np.mean(np.minimum(gap_ratios(x, few), 1.0)))
+
+    best = start_from(observations)
+    lowest = score(best)
+    if observations.closed.all() and np.mean(gap_ratios(best, few) > 1.0) > MANY_WIDE and n > 2 * WINDOWS * window:
+        rng = np.random.default_rng(0)
+        windows = np.array_split(np.arange(n), n // window)
+        for _ in range(SUBSETS):
+            chosen = rng.choice(len(windows), WINDOWS, replace=False)
+            x = start_from(observations.take(np.concatenate([windows[k] for k in np.sort(chosen)])))
+            cost = score(x)
+            if cost < lowest:
+                best, lowest = x, cost
+    return best, (1.0 + gap_ratios(best, observations)) ** -2

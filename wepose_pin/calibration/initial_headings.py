@@ -1,0 +1,263 @@
+"""Headings without an initial guess.
+
+Poses show them directly: the azimuth at which an arm is raised, the axis about which the torso bows.
+
+Where points coincide, the closure is linear in lengths times headings. A hanging segment's direction in its sensor's
+start world is v(t) = Q(t)(−e_z), and L Rz(ψ) v is linear in (L cos ψ, L sin ψ, L). So R_torso(t) s + Σ ± L_i Rz(ψ_i)
+v_i(t) = 0, with s the line between the shoulders at the start, has its least-squares solution in the smallest singular
+vector. Beyond a heading step of the sensor, or of the torso, to which all others are relative, ψ is another unknown and
+L is the same.
+
+A fixed point is nearly the same, but a torso that hardly turns solves it by itself (s = c, no arms); a distance is not
+linear at all. There the headings are searched: Gauss-Newton from many starts at once, over headings and the size of
+each sensor's part of the chain, with the prior's few per cent of uncertainty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
+
+from .least_squares import Observations, sensor_of
+from .protocols import Axis, Closure, Condition, Direction, coefficients
+
+STARTS, NEARER = 256, 24  # starts, and how many of the best continue after some rounds
+MINIMA, MOST_DISTINCT = 64, 12  # as `NEARER` for a search of all minima, and how many of these at most
+DISTINCT = np.deg2rad(15.0)  # [rad] of one heading, by which two minima differ
+FIRST_ROUNDS, MORE_ROUNDS = 6, 16
+SEARCH_SAMPLES = 48  # of each closure
+GAP_STD = 0.03  # [m] of a closure in the search; includes all that the search leaves out
+SIZE_STD = 0.08  # of a part of the chain, relative
+KNOWN_STD = np.deg2rad(10.0)  # [rad] of a heading from a mount or a pose
+
+
+def estimate_headings(
+    observations: Observations, lengths: np.ndarray, distances: np.ndarray, stated: Mapping[str, float]
+) -> np.ndarray:
+    """ψ [rad] of each sensor of the chain, then each heading step [rad], which is zero where the closure is not linear.
+
+    ψ turns the sensor's world to W, whose y is the line of the shoulders at the start.
+
+    Parameters
+    ----------
+    lengths, distances : (8,) and as many as the layout's distances [m], as known before
+    stated : sensor → ψ [rad] of its stated mount
+    """
+    sensors = observations.layout.sensors
+    if is_linear(observations.conditions):
+        return _solve_linear(observations.take(observations.closed), stated)
+    known, steps = {**_solve_poses(observations, stated), **stated}, np.zeros(len(observations.layout.steps))
+    if observations.closed.any() and not set(sensors) <= set(known):
+        x = _find_minima(observations, lengths, distances, known, NEARER)
+        return np.append(x[0, : len(sensors)], steps)
+    return np.append([known.get(name, 0.0) for name in sensors], steps)
+
+
+def is_linear(conditions: Sequence[Condition]) -> bool:
+    """Whether headings come from joined hands."""
+    closures = [c for c in conditions if isinstance(c, Closure)]
+    return len(closures) == 1 and closures[0].kind == "coincide" and closures[0].points == ("left_palm", "right_palm")
+
+
+def _rotations(observations: Observations) -> dict[str, Rotation]:
+    """Q of each sensor, n of them."""
+    data = observations.data
+    return {name: Rotation.from_quat(data[4 * i : 4 * i + 4].T) for i, name in enumerate(observations.layout.sensors)}
+
+
+def _solve_poses(observations: Observations, stated: Mapping[str, float]) -> dict[str, float]:
+    """Sensor → ψ [rad] from poses and axes; the torso's comes first, since directions are in its frame."""
+    Q = _rotations(observations)
+    headings: dict[str, float] = {}
+    for condition, span in observations.spans():
+        if isinstance(condition, Axis):
+            turn = Q[condition.segment][span].as_rotvec().sum(axis=0)  # forwards: about +y
+            headings[condition.segment] = np.pi / 2.0 - np.arctan2(turn[1], turn[0])
+    torso = {**headings, **stated}.get("torso")
+    for condition, span in observations.spans():
+        if isinstance(condition, Direction) and np.hypot(*condition.direction[:2]) > 0.3:
+            target = np.tile(condition.direction, (span.stop - span.start, 1))
+            if torso is not None:
+                to_W = Rotation.from_rotvec([0.0, 0.0, torso])
+                target = (to_W * Q["torso"][span] * to_W.inv()).apply(target)
+            v = Q[condition.segment][span].apply([0.0, 0.0, -1.0])
+            turn = np.sum((target[:, 0] + 1j * target[:, 1]) * (v[:, 0] - 1j * v[:, 1]))
+            headings[condition.segment] = float(np.angle(turn))
+    return headings
+
+
+def _solve_linear(observations: Observations, stated: Mapping[str, float]) -> np.ndarray:
+    """ψ of each sensor and each heading step [rad], from the smallest singular vector of the closure."""
+    columns, parts = [], []
+    for i, (name, R) in enumerate(_rotations(observations).items()):
+        if i == 0:
+            columns.append(R.as_matrix())
+            continue
+        v = R.apply([0.0, 0.0, -1.0 if name.startswith("left") else 1.0])
+        zero = np.zeros(len(v))
+        part = _group_by_steps(observations, name)
+        parts.append(part)
+        across = np.stack((np.column_stack((v[:, 0], v[:, 1], zero)), np.column_stack((-v[:, 1], v[:, 0], zero))), 2)
+        columns += [across * (part == k)[:, None, None] for k in range(part.max() + 1)]
+        columns.append(np.column_stack((zero, zero, v[:, 2]))[:, :, None])
+    A = np.concatenate(columns, axis=2).reshape(3 * observations.data.shape[1], -1)
+    z = np.linalg.svd(A, full_matrices=False)[2][-1]
+    sizes = [2 * (int(part.max()) + 1) for part in parts]
+    ends = 3 + np.cumsum([size + 1 for size in sizes])
+    if z[ends - 1].sum() < 0.0:  # lengths are positive; their mirror image solves it as well
+        z = -z
+    torso = -np.arctan2(-z[0], z[1])  # turns s to y
+    solved = [z[end - 1 - size : end - 1].reshape(-1, 2) for end, size in zip(ends, sizes, strict=True)]
+    arms = np.array(
+        [(np.arctan2(xy[:, 1], xy[:, 0]) + torso)[part] for xy, part in zip(solved, parts, strict=True)]
+    )  # (m − 1, n) ψ and steps of each sensor at each sample, less the torso's steps
+    return _separate_steps(observations, np.vstack([np.full(arms.shape[1], torso), arms]), stated)
+
+
+def _group_by_steps(observations: Observations, name: str) -> np.ndarray:
+    """(n,) which samples have the same heading of a sensor relative to the torso, numbered from 0 on."""
+    steps = zip(observations.layout.steps, observations.beyond, strict=True)
+    between = [row for sensor, row in steps if sensor in (name, "torso")]
+    if not between:
+        return np.zeros(observations.data.shape[1], dtype=int)
+    return np.unique(np.array(between), axis=1, return_inverse=True)[1].ravel()
+
+
+def _separate_steps(observations: Observations, headings: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
+    """ψ of each of the m sensors and each step [rad], of `headings` (m, n) relative to the torso at each sample.
+
+    The steps are solved from the start pose outwards: ψ is that before any of them, or the `stated` one.
+    """
+    layout, beyond = observations.layout, observations.beyond
+    index = np.array([layout.sensors.index(name) for name in layout.steps], dtype=int)
+    steps, known = np.zeros(len(index)), np.zeros(len(index), dtype=bool)
+    psi = np.array([stated.get(name, np.nan) for name in layout.sensors])
+    psi[0] = headings[0, 0]
+    for k in np.argsort(beyond.sum(axis=0), kind="stable") if len(index) else [0]:
+        passed_steps = beyond[:, k]
+        psi = np.where(np.isnan(psi), headings[:, k], psi)
+        if known[passed_steps].all():
+            continue
+        passed = np.bincount(index[passed_steps], steps[passed_steps], len(psi))
+        off = _within_half_turn(headings[:, k] - psi - passed + passed[0])
+        new = passed_steps & ~known
+        old = np.setdiff1d(np.arange(1, len(psi)), index[new])
+        turn = (
+            float(np.angle(np.exp(1j * off[old]).sum())) if 0 in index[new] and len(old) else 0.0
+        )  # the torso's, back
+        for step in np.flatnonzero(new):
+            steps[step] = -turn if index[step] == 0 else _within_half_turn(off[index[step]] - turn)
+        known |= passed_steps
+    return np.append(psi, steps)
+
+
+def find_distinct_headings(
+    observations: Observations, lengths: np.ndarray, distances: np.ndarray, known: Mapping[str, float]
+) -> np.ndarray:
+    """Headings (k, m) [rad] of the m sensors at which the closures have a minimum each, the best first.
+
+    Parameters
+    ----------
+    known : sensor → ψ [rad] from a mount or a pose; the others may be anywhere
+    """
+    x = _find_minima(observations, lengths, distances, known, MINIMA)
+    distinct: list[np.ndarray] = []
+    for psi in x[:, : len(observations.layout.sensors)]:
+        if all(np.abs(_within_half_turn(psi - other)).max() > DISTINCT for other in distinct):
+            distinct.append(psi)
+    return np.array(distinct[:MOST_DISTINCT])
+
+
+def _within_half_turn(angle: np.ndarray) -> np.ndarray:
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def _find_minima(
+    observations: Observations, lengths: np.ndarray, distances: np.ndarray, known: Mapping[str, float], nearer: int
+) -> np.ndarray:
+    """Headings and log sizes (`nearer`, 2 m) at the minima that the best of many starts reach, the lowest first."""
+    sensors = observations.layout.sensors
+    m = len(sensors)
+    parts = []  # of each closure: it, Q (m, n, 3, 3), and u (m, 3), each sensor's part of the chain in its own frame
+    for closure, span in observations.spans():
+        if not isinstance(closure, Closure):
+            continue
+        few = np.unique(np.linspace(span.start, span.stop - 1, SEARCH_SAMPLES).astype(int))
+        Q = np.stack([R.as_matrix() for R in _rotations(observations.take(few)).values()])
+        u = np.zeros((m, 3))
+        for segment, coefficient in coefficients(closure).items():
+            u[sensors.index(sensor_of(segment, sensors))] += coefficient @ lengths
+        parts.append((closure, Q, u))
+
+    def closure_residuals(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _closure_residuals(x, parts, observations, distances)
+
+    is_known = np.array([name in known for name in sensors])
+    center = np.array([known.get(name, 0.0) for name in sensors] + [0.0] * m)
+    prior = np.array([KNOWN_STD**-2 if k else 0.0 for k in is_known] + [SIZE_STD**-2] * m)
+    starts = 2.0 * np.pi * qmc.Sobol(m, scramble=False).random(STARTS)
+    x = np.column_stack([np.where(is_known, center[:m], starts), np.zeros((STARTS, m))])
+    x, cost = _descend(x, center, prior, closure_residuals, FIRST_ROUNDS)
+    x = x[np.argsort(cost)[:nearer]]
+    x, cost = _descend(x, center, prior, closure_residuals, MORE_ROUNDS)
+    return x[np.argsort(cost, kind="stable")]
+
+
+def _descend(
+    x: np.ndarray,
+    center: np.ndarray,
+    prior: np.ndarray,
+    residuals: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    rounds: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Starts (b, k) after some rounds of damped Gauss-Newton, and their costs (b,); `center`, `prior` (k,)."""
+    x, damping = x.copy(), np.full(len(x), 1e-2)
+    r, J = residuals(x)
+    cost = np.sum(r**2, axis=1) + np.sum(prior * (x - center) ** 2, axis=1)
+    for _ in range(rounds):
+        H = J.swapaxes(1, 2) @ J + np.diag(prior)
+        gradient = np.einsum("brk,br->bk", J, r) + prior * (x - center)
+        diagonal = np.einsum("bkk->bk", H)
+        H = H + (damping[:, None] * diagonal + 1e-6)[:, :, None] * np.eye(x.shape[1])
+        nearer = x - np.linalg.solve(H, gradient[:, :, None])[:, :, 0]
+        r_next, J_next = residuals(nearer)
+        lower = np.sum(r_next**2, axis=1) + np.sum(prior * (nearer - center) ** 2, axis=1)
+        better = lower < cost
+        x[better], r[better], J[better], cost[better] = nearer[better], r_next[better], J_next[better], lower[better]
+        damping = np.where(better, damping / 4.0, damping * 8.0).clip(1e-8, 1e8)
+    return x, cost
+
+
+def _closure_residuals(
+    x: np.ndarray, parts: list, observations: Observations, distances: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (starts, r) of the closures and their Jacobian (starts, r, 2 sensors), for `x` (starts, 2 sensors)."""
+    m = x.shape[1] // 2
+    psi, size = x[:, :m], np.exp(x[:, m:])
+    rs, Js = [], []
+    for closure, Q, u in parts:
+        c, s = np.cos(psi), np.sin(psi)
+        # Rz(ψ) Q Rz(−ψ) u, and its derivative Rz(ψ) (e_z × Q b − Q (e_z × b)) with b = Rz(−ψ) u.
+        b = np.stack([c * u[:, 0] + s * u[:, 1], c * u[:, 1] - s * u[:, 0], u[:, 2] + 0.0 * c], axis=2)  # (B, m, 3)
+        across = np.stack([-b[..., 1], b[..., 0], 0.0 * c], axis=2)
+        Qb, Qa = np.einsum("mnij,bmj->bmni", Q, b), np.einsum("mnij,bmj->bmni", Q, across)
+        slope = np.stack([-Qb[..., 1], Qb[..., 0], 0.0 * Qb[..., 2]], axis=3) - Qa
+        c, s, k = c[:, :, None], s[:, :, None], size[:, :, None, None]
+
+        def turned(v: np.ndarray, c: np.ndarray = c, s: np.ndarray = s, k: np.ndarray = k) -> np.ndarray:
+            return k * np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1], v[..., 2]], axis=3)
+
+        parts_W, J = turned(Qb), np.concatenate([turned(slope), turned(Qb)], axis=1)  # (B, m, n, 3), (B, 2m, n, 3)
+        gap = parts_W.sum(axis=1)
+        if closure.kind == "fixed_point":
+            gap, J = gap - gap.mean(axis=1, keepdims=True), J - J.mean(axis=2, keepdims=True)
+        if closure.kind == "distance":
+            length = np.linalg.norm(gap, axis=2) + 1e-9
+            J = np.einsum("bkni,bni->bkn", J, gap / length[:, :, None])[..., None]
+            gap = (length - distances[observations.layout.distance_names.index(closure.distance)])[..., None]
+        rs.append(gap.reshape(len(x), -1) / GAP_STD)
+        Js.append(J.reshape(len(x), 2 * m, -1).swapaxes(1, 2) / GAP_STD)
+    return np.concatenate(rs, axis=1), np.concatenate(Js, axis=1)

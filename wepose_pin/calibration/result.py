@@ -1,0 +1,83 @@
+"""`Calibration`: the result of a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..diagnostics import Diagnostic
+from ..subject import Subject
+from .anatomy import ArmMotion, LabelCheck, measure_arms
+from .protocols import Protocol
+from .weights import MIN_CONTACT, MeasuredLength
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The estimates of a calibration; n samples are those of the least squares.
+
+    Parameters
+    ----------
+    subject : lengths and mounts with their joint covariance
+    prior : what was known before
+    rms_gap : palm-to-palm residual [m], root mean square of its length, where the palms touch
+    prior_rms_gap : the same with the prior's lengths
+    effective_sample_size : effective sample size of the gap
+    measured : the measured lengths [m]; empty: the scale is the prior's
+    scale_std : relative standard deviation of the overall scale, with the proportions as estimated
+    diagnostics : what the user should know besides its quality, see `assess`
+    time, gap, prior_gap : (n,) [s], (n,) [m] the residual's length at each sample, and with the prior's lengths
+    contact : (n,) the weight of each sample's gap, near 0 where the palms are apart
+    start_pose_offset : segment → (2,) [rad] about x and y of W, how far it was off the start pose
+    heading_drift : segment → [rad/s] of its sensor's heading
+    hinge_axes : joint of `HINGES` → (3,) its axis in the upper arm's frame, unit length, y towards the left
+    hinge_rms : joint → [rad] of the forearm against the plane of that hinge
+    information_shares : name as in the subject's covariance, or ``left_forearm + left_hand`` → (n,) share of the
+        information on it that each sample brings; their sum and the prior's share make 1
+    prior_covariance : (k, k) before the motion, in the order of the subject's
+    quat_WL : segment → (n, 4) xyzw at each sample, as tracking gives it
+    protocol : its name
+    closure : the kind of its closure, as in `protocols.KINDS`; empty where it has none
+    measured_example : the length that would fix the scale best, as ``name=metres``
+    measured_lengths : each measured length beside what is known without it
+    labels : whether the sensors sit where the session says
+    unused_mounts : stated mounts that gravity or the motion contradicts
+    scale_lengths : measured lengths that fix the scale; empty: the prior does
+    """
+
+    subject: Subject
+    prior: Subject
+    rms_gap: float
+    prior_rms_gap: float
+    effective_sample_size: float
+    measured: Mapping[str, float]
+    scale_std: float
+    diagnostics: tuple[Diagnostic, ...]
+    time: np.ndarray
+    gap: np.ndarray
+    prior_gap: np.ndarray
+    contact: np.ndarray
+    start_pose_offset: Mapping[str, np.ndarray]
+    heading_drift: Mapping[str, float]
+    hinge_axes: Mapping[str, np.ndarray]
+    hinge_rms: Mapping[str, float]
+    information_shares: Mapping[str, np.ndarray] = field(default_factory=dict)
+    prior_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    quat_WL: Mapping[str, np.ndarray] = field(default_factory=dict)
+    protocol: str = "clasp"
+    closure: str = "coincide"
+    measured_example: str = Protocol.measured_example
+    measured_lengths: Mapping[str, MeasuredLength] = field(default_factory=dict)
+    labels: LabelCheck = field(default_factory=LabelCheck)
+    unused_mounts: tuple[Diagnostic, ...] = ()
+    scale_lengths: tuple[str, ...] = ()
+
+    def arms(self) -> ArmMotion:
+        """How the arms moved while the chain was closed."""
+        closed = np.isfinite(self.gap)
+        rows = closed & (self.contact > MIN_CONTACT) if closed.any() else np.ones(len(self.gap), dtype=bool)
+        gap = np.sqrt(np.average(self.gap[closed] ** 2, weights=self.contact[closed])) if closed.any() else 0.0
+        quat_WL = {name: quat[rows] for name, quat in self.quat_WL.items()}
+        return measure_arms(quat_WL, self.subject.lengths, float(gap))

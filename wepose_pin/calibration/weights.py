@@ -1,0 +1,216 @@
+"""The weights of the samples, their effective size, and the covariance of the result.
+
+The weight of the data is measured, not assumed. In a few rounds of Gauss-Newton the residual's own mean square gives
+its variance, and its autocorrelation the effective sample size. Samples at which the palms are apart are outliers and
+lose their weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ..subject import LENGTHS, mount_rows
+from .chain import SIDES
+from .least_squares import Fit, Gaussian, K, Layout, Observations, solve
+from .protocols import Closure
+
+# Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
+LEAST_VARIANCE = 1e-4
+# Errors of orientations are slow: two samples closer than this [s] are never independent, however white the residual
+# of one phase is. Chosen on simulated people, whose joint errors it brings within the covariance.
+LEAST_CORRELATION_S = 3.0
+THIRD_CHI2 = {1: 0.1485, 3: 1.4237}  # 30 % quantile of chi², by degrees of freedom
+ROUNDS, STEPS = 5, 60
+QUICK_ROUNDS, QUICK_STEPS = 1, 15
+MANY_SAMPLES = 1000  # from twice as many on, all rounds but the last take every second, third, … sample
+OUTLIER = 5.0  # times the usual gap, at which the palms are apart
+MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
+MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about right
+CONTRADICTED = 3.0  # standard deviations between a measured length and what is known without it
+
+
+class MeasuredLength(NamedTuple):
+    """A measured length beside the estimate without it, from the motion, the prior and other measured lengths."""
+
+    metres: float  # [m] as measured
+    expected: float  # [m] without it
+    std: float  # [m] of that
+    measured_std: float  # [m]
+
+    @property
+    def deviation(self) -> float:
+        """By how many standard deviations the two differ."""
+        return abs(self.metres - self.expected) / float(np.hypot(self.std, self.measured_std))
+
+
+class WeightedFit(NamedTuple):
+    """A solution with the weights that its own residuals give."""
+
+    fit: Fit
+    weights: np.ndarray  # (n, 5) of the residuals
+    contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
+    effective_sample_size: float  # effective sample size of the gap
+
+
+def solve_reweighted(
+    observations: Observations, prior: Gaussian, start: np.ndarray, contact: np.ndarray, quick: bool = False
+) -> WeightedFit:
+    """The fit with gap and hinges weighted by their own residuals: variance, and how long it stays correlated.
+
+    Parameters
+    ----------
+    start, contact : x (m,) to begin with, and the weight (n,) of each sample's gap in it
+    quick : one round with few steps and without hinges
+    """
+    n, closed = len(observations), observations.closed
+    rounds, steps = (range(QUICK_ROUNDS), QUICK_STEPS) if quick else (range(ROUNDS), STEPS)
+    if n >= 2 * MANY_SAMPLES and closed.any() and not quick:
+        rows = np.concatenate([np.arange(n)[span][:: n // MANY_SAMPLES] for _, span in observations.spans()])
+        thinned = solve_reweighted(observations.take(rows), prior, start, contact[rows])
+        start, contact, rounds = thinned.fit.x, np.interp(np.arange(n), rows, thinned.contact), rounds[-1:]
+    x: np.ndarray | Fit = start
+    contact, correlation = contact.copy(), _min_correlation(observations)
+    weights = np.full((n, 5), 1.0 / correlation)
+    weights[:, :3] *= contact[:, None]
+    if quick:
+        weights[:, 3:] = 0.0
+    for condition, span in observations.spans():
+        if not isinstance(condition, Closure):
+            weights[span] = 1.0 / (span.stop - span.start)  # the error of a pose is constant: one effective sample
+    effective = float(closed.sum())
+    if not closed.any():
+        fit = solve(observations, prior, weights, x, steps, not quick)
+        return WeightedFit(fit, weights, contact, effective)
+    for k in rounds:
+        x = fit = solve(observations, prior, weights, x, steps, strict=False)  # the last solve is the strict one
+        effective = 0.0
+        for closure, span in observations.spans():
+            if isinstance(closure, Closure):
+                r = fit.closure[span, : closure.rows]
+                contact[span] = _estimate_contact(r, MIN_LATE_CONTACT if k > 1 else MIN_CONTACT)
+                weights[span, :3] = _weigh(r, contact[span], correlation)
+                effective += float(contact[span].sum()) / _correlated_samples(r * contact[span, None], correlation)
+        arms = [SIDES.index(side) for side in observations.layout.arms]
+        if arms and not quick:
+            weights[closed, 3:] = _weigh(fit.hinge[closed][:, arms], np.ones(int(closed.sum())), correlation)
+    fit = solve(observations, prior, weights, x, steps, not quick)
+    return WeightedFit(fit, weights, contact, effective)
+
+
+def _estimate_contact(r: np.ndarray, least: float) -> np.ndarray:
+    """The weight (n,) of the gaps with whitened residuals `r` (n, k); zero below `least`."""
+    size, k = np.sum(r**2, axis=1), r.shape[1]
+    # The lower third: the palms may be apart for half of the phase and more.
+    usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[k], LEAST_VARIANCE)
+    weight = (1.0 + size / (usual * OUTLIER**2 * k)) ** -2
+    return np.where(weight > least, weight, 0.0)
+
+
+def _weigh(r: np.ndarray, contact: np.ndarray, least: float) -> np.ndarray:
+    """Weights (n, 1) of residuals (n, k): one over their variance and the number of correlated samples."""
+    variance = max(float(np.sum(contact * np.sum(r**2, axis=1))) / (r.shape[1] * float(contact.sum())), LEAST_VARIANCE)
+    return contact[:, None] / (_correlated_samples(r * contact[:, None], least) * variance)
+
+
+def _min_correlation(observations: Observations) -> float:
+    """The number of samples in `LEAST_CORRELATION_S`."""
+    return LEAST_CORRELATION_S / max(float(np.median(np.diff(observations.data[-1]))), 1e-3)
+
+
+def _correlated_samples(r: np.ndarray, least: float) -> float:
+    """How many samples of `r` (n, k) make one independent one, at least `least`: 1 + 2 Σ ρ up to the first zero."""
+    n = len(r)
+    centred = r - r.mean(axis=0)
+    size = 1 << (2 * n - 1).bit_length()
+    spectrum = np.abs(np.fft.rfft(centred, size, axis=0)) ** 2
+    rho = np.fft.irfft(spectrum, size, axis=0)[:n].sum(axis=1)
+    if not rho[0] > 0.0:
+        return max(1.0, least)
+    rho = rho / rho[0]
+    crossing = int(np.argmax(rho <= 0.0)) if np.any(rho <= 0.0) else n
+    return max(float(1.0 + 2.0 * rho[1:crossing].sum()), least)
+
+
+def estimate_covariance(observations: Observations, result: WeightedFit, prior_information: np.ndarray) -> np.ndarray:
+    """Covariance (m, m) of x under errors that are correlated over time.
+
+    The weights count as many samples as one as the errors last. That is right where the motion is as slow as the
+    errors. Where the motion covers a good part of its range meanwhile, an error acts on other unknowns from sample to
+    sample and cancels. So the gradient's covariance is that of sums over windows of the errors' duration,
+    C (Λ + Σ (Σ w J)ᵀ σ² (Σ w J) / duration) C, as of Newey and West 1987 with their triangle of weights.
+    """
+    fit, contact = result.fit, result.contact
+    C = np.linalg.inv(fit.information)
+    J, r, least = fit.jacobian, np.hstack((fit.closure, fit.hinge)), _min_correlation(observations)
+    weights = np.broadcast_to(result.weights, r.shape)
+    arms = [3 + SIDES.index(side) for side in observations.layout.arms]
+    gradient = prior_information.copy()
+    for condition, span in observations.spans():
+        parts = [(list(range(condition.rows)), contact[span])]
+        if isinstance(condition, Closure):
+            parts += [(arms, np.ones(span.stop - span.start))] if arms else []
+        for rows, share in parts:
+            slope, w = J[span][:, rows], weights[span][:, rows]
+            pull = w[:, :, None] * slope
+            if not isinstance(condition, Closure):
+                gradient += np.einsum("nki,nkj->ij", pull, slope)
+                continue
+            if not share.sum() > 0.0:
+                continue
+            # The fit has reduced the residuals: their variance gets back what it took.
+            size = np.sum(r[span][:, rows] ** 2, axis=1) + np.einsum("nki,ij,nkj->n", slope, C, slope, optimize=True)
+            variance = max(float(share @ size) / (len(rows) * float(share.sum())), LEAST_VARIANCE)
+            duration = round(_correlated_samples(r[span][:, rows] * share[:, None], least))
+            summed = np.concatenate((np.zeros((1, *pull.shape[1:])), np.cumsum(pull, axis=0)))
+            ends = np.arange(1, len(pull) + duration)
+            windows = summed[np.minimum(ends, len(pull))] - summed[np.maximum(ends - duration, 0)]
+            windows = windows.reshape(-1, C.shape[0])
+            gradient += variance / duration * windows.T @ windows
+    return C @ gradient @ C
+
+
+def compare_measured(
+    fit: Fit, layout: Layout, measured: Mapping[str, tuple[float, float]]
+) -> dict[str, MeasuredLength]:
+    """Each measured length or distance, name → ([m], its standard deviation [m]), beside the solution without it."""
+    C, compared = np.linalg.inv(fit.information), {}
+    rows = dict(zip(LENGTHS, range(K), strict=True)) | dict(
+        zip(layout.distance_names, range(layout.size)[layout.distances], strict=True)
+    )
+    for name, (metres, std) in measured.items():
+        variance = C[rows[name], rows[name]]
+        rest = 1.0 / variance - 1.0 / std**2  # information without that of the measured length
+        expected = metres + (fit.x[rows[name]] - metres) / (variance * rest)
+        compared[name] = MeasuredLength(metres, float(expected), float(rest**-0.5), std)
+    return compared
+
+
+def project_to_subject(layout: Layout, covariance: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names and covariance of the lengths and mount errors, from x's covariance: R_LS = exp(−ε) Rz(ψ) R_VS(start)."""
+    rows = [row for name in layout.sensors for row in mount_rows(name)]
+    T = np.zeros((K + len(rows), layout.size))
+    T[:K, :K] = np.eye(K)
+    for i in range(len(layout.sensors)):
+        T[K + 3 * i, layout.tilt.start + 2 * i] = -1.0
+        T[K + 3 * i + 1, layout.tilt.start + 2 * i + 1] = -1.0
+        T[K + 3 * i + 2, layout.heading.start + i] = 1.0
+    return (*LENGTHS, *rows), T @ covariance @ T.T
+
+
+def compute_information_shares(
+    fit: Fit, layout: Layout, weights: np.ndarray, covariance: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Name → share (n,) of the information that each sample brings: C = C (Σ Jᵀ W J + Λ) C, over C, is a sum to 1."""
+    unit = np.eye(layout.size)
+    directions = dict(zip(LENGTHS, unit[:K], strict=True))
+    directions |= {f"{s}_forearm + {s}_hand": directions[f"{s}_forearm"] + directions[f"{s}_hand"] for s in SIDES}
+    for i, name in enumerate(layout.sensors):
+        rows = (layout.tilt.start + 2 * i, layout.tilt.start + 2 * i + 1, layout.heading.start + i)
+        directions |= dict(zip(mount_rows(name), unit[list(rows)], strict=True))
+    T = np.array(list(directions.values()))
+    moved = fit.jacobian @ covariance @ T.T  # (n, 5, k)
+    share = np.einsum("ni,nik->kn", weights, moved**2) / np.einsum("ki,ij,kj->k", T, covariance, T)[:, None]
+    return dict(zip(directions, share, strict=True))

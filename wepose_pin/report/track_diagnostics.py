@@ -1,0 +1,206 @@
+"""Diagnostics of a tracked recording: signals, headings, hands, elbows, subject."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from ..diagnostics import INFO, WARNING, Diagnostic, gravest_first, merge, render
+from ..recording import OrientationSensor
+from ..recording.limits import STANDARD_GRAVITY
+from ..tracking import TrackedRecording
+from .measures import (
+    BENT,
+    Budget,
+    Elbow,
+    Hand,
+    Measures,
+    Signal,
+    finite_max,
+    joint_heading_stds,
+    longest_run_s,
+    mask_from_start,
+)
+
+GRAVITY_OFF = 0.02
+BIAS_LARGE = np.deg2rad(1.5)  # [rad/s], three times what is usual from the factory
+BIAS_MOVED = np.deg2rad(0.3)  # [rad/s]
+LITTLE_STATIC, LONG_MOTION_S = 0.02, 120.0
+LATE_START_S = 10.0
+LOST = 0.01  # share of samples
+JITTER = 0.2  # of a step, one standard deviation
+HEADING = np.deg2rad(10.0)  # one standard deviation, between the segments of a joint
+PLACE = 0.1  # [m], one standard deviation of a hand: what 10 deg of heading do at the end of an arm
+TURNED = np.deg2rad(10.0)  # by which elbows and joined hands corrected a heading
+# In the start pose a hanging elbow is bent by some 5 to 15 deg; few elbows open by more than 10 deg beyond straight.
+BACKWARD, FOLDED = np.deg2rad(-20.0), np.deg2rad(160.0)
+ASIDE = np.deg2rad(30.0)
+APART = np.deg2rad(15.0)  # between the halves of a recording
+LASTING_S = 1.0
+
+
+def diagnose_pose(tracked: TrackedRecording, measures: Measures, known: Sequence[Diagnostic]) -> list[Diagnostic]:
+    """All diagnostics, the gravest first; `known` are those of the pose's summary."""
+    budgets, hands = measures.budgets, measures.hands
+    diagnostics = [
+        *_diagnose_signals(tracked, measures.signals),
+        *_diagnose_headings(tracked, budgets),
+        *_diagnose_hands(tracked, hands),
+        *_diagnose_method(tracked, budgets, hands),
+        *_diagnose_time_before_start(tracked, budgets, hands),
+        *_diagnose_elbows(tracked.recording.rate_hz, measures.elbows),
+        *_diagnose_subject(tracked),
+    ]
+    return gravest_first(merge(known, diagnostics))
+
+
+def _diagnose_signals(tracked: TrackedRecording, signals: Mapping[str, Signal]) -> Iterator[Diagnostic]:
+    recording = tracked.recording
+    for name, signal in signals.items():
+        if signal.cut.any():
+            yield Diagnostic("signal-saturated", WARNING, name, np.count_nonzero(signal.cut) / recording.rate_hz)
+    for name, signal in signals.items():
+        if signal.gap.mean() > LOST:
+            yield Diagnostic("samples-lost", WARNING, name, float(signal.gap.mean()), LOST)
+    step = np.diff(recording.time) * recording.rate_hz
+    if float(step.std()) > JITTER:
+        yield Diagnostic("time-stamps-uneven", WARNING, "", float(step.std()), JITTER)
+    start, end = tracked.segments.static_phase
+    for name, signal in signals.items():
+        share = signal.gravity / STANDARD_GRAVITY - 1.0
+        if abs(share) > GRAVITY_OFF:
+            at_rest = {"share": share, "start": start, "end": end}
+            yield Diagnostic("accel-scale", INFO, name, signal.gravity, GRAVITY_OFF, at_rest)
+    biases = {name: signal.bias for name, signal in signals.items() if signal.bias is not None}
+    for name, bias in biases.items():
+        largest_bias = float(np.linalg.norm(bias, axis=1).max())
+        if largest_bias > BIAS_LARGE:
+            yield Diagnostic("gyro-bias-large", INFO, name, largest_bias, BIAS_LARGE)
+    for name, (first, last) in biases.items():
+        change = float(np.linalg.norm(last - first))
+        if change > BIAS_MOVED:
+            yield Diagnostic("gyro-bias-changed", INFO, name, change, BIAS_MOVED)
+    for name, signal in signals.items():
+        if signal.static is None:
+            continue
+        share, seconds = float(signal.static.mean()), longest_run_s(~signal.static, recording.rate_hz)
+        if seconds > LONG_MOTION_S or share < LITTLE_STATIC:
+            severity = WARNING if tracked.options.method == "smekf" else INFO
+            yield Diagnostic("static-phases-rare", severity, name, share, LITTLE_STATIC, {"longest": seconds})
+    late = tracked.segments.start[0] - float(recording.time[0])
+    if late > LATE_START_S:
+        yield Diagnostic("start-pose-late", INFO, "", late, LATE_START_S)
+
+
+def _diagnose_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> Iterator[Diagnostic]:
+    wide = _find_uncertain_headings(tracked, budgets)
+    for joint in sorted(wide, key=wide.__getitem__, reverse=True):
+        place = joint.replace(" ", "_")
+        yield Diagnostic("heading-uncertain", WARNING, place, wide[joint], HEADING, _remedy_variant(tracked))
+    if tracked.correction is not None:
+        for name, turned in tracked.correction.largest_deg.items():
+            if np.deg2rad(turned) > TURNED:
+                yield Diagnostic("heading-corrected-far", WARNING, name, np.deg2rad(turned), TURNED)
+
+
+def _diagnose_hands(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> Iterator[Diagnostic]:
+    for name, std in _find_uncertain_hands(tracked, hands).items():
+        yield Diagnostic("position-uncertain", WARNING, name, std, PLACE, _remedy_variant(tracked))
+
+
+def _diagnose_method(
+    tracked: TrackedRecording, budgets: Mapping[str, Budget], hands: Mapping[str, Hand]
+) -> Iterator[Diagnostic]:
+    if tracked.options.method == "smekf" and (
+        _find_uncertain_headings(tracked, budgets) or _find_uncertain_hands(tracked, hands)
+    ):
+        yield Diagnostic("method-needs-static", WARNING, facts={"method": tracked.options.method})
+
+
+def _find_uncertain_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, float]:
+    """Joint → uncertainty [rad] of the heading between its segments, of those beyond the limit."""
+    since = mask_from_start(tracked)
+    return {
+        joint: most for joint, std in joint_heading_stds(budgets).items() if (most := finite_max(std[since])) > HEADING
+    }
+
+
+def _find_uncertain_hands(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, float]:
+    """Point → uncertainty [m], of those beyond the limit."""
+    since = mask_from_start(tracked)
+    stds = {name: finite_max(hand.std[since]) for name, hand in hands.items() if hand.std is not None}
+    return {name: most for name, most in stds.items() if most > PLACE}
+
+
+def _diagnose_time_before_start(
+    tracked: TrackedRecording, budgets: Mapping[str, Budget], hands: Mapping[str, Hand]
+) -> Iterator[Diagnostic]:
+    """Headings and hands that are less certain before the start pose than after it, longer than filters converge."""
+    since, before = mask_from_start(tracked), tracked.time < tracked.segments.start[0]
+    rate_hz = tracked.recording.rate_hz
+    facts = {"before": float(tracked.segments.start[0] - tracked.time[0])}
+
+    def widest(stds: list[np.ndarray], limit: float) -> float:
+        wide = [std[before & (std > max(limit, finite_max(std[since])))] for std in stds]
+        return max((finite_max(std) for std in wide if len(std) / rate_hz > LASTING_S), default=0.0)
+
+    heading = widest(list(joint_heading_stds(budgets).values()), HEADING)
+    if heading:
+        yield Diagnostic("heading-uncertain-before-start", INFO, "", heading, HEADING, facts)
+    hand = widest([hand.std for hand in hands.values() if hand.std is not None], PLACE)
+    if hand:
+        yield Diagnostic("position-uncertain-before-start", INFO, "", hand, PLACE, facts)
+
+
+def _remedy_variant(tracked: TrackedRecording) -> dict[str, str]:
+    """The variant of the texts on drifting headings."""
+    if tracked.correction is None:
+        return {"variant": "uncalibrated"}
+    return {} if tracked.recording and tracked.recording.phases.get("clasp") else {"variant": "no-clasp"}
+
+
+def heading_remedy(tracked: TrackedRecording) -> str:
+    """The advice on drifting headings."""
+    return render(Diagnostic("heading-uncertain", INFO, facts=_remedy_variant(tracked))).do
+
+
+def _diagnose_elbows(rate_hz: float, elbows: Mapping[str, Elbow]) -> Iterator[Diagnostic]:
+    for side, elbow in elbows.items():
+        in_plane = np.abs(elbow.aside) < np.deg2rad(45.0)
+        back = in_plane & (elbow.forward < BACKWARD) & (elbow.bend < np.deg2rad(90.0))
+        seconds = np.count_nonzero(back) / rate_hz
+        if seconds > LASTING_S:
+            most = float(-elbow.forward[back].min())
+            facts = {"duration": seconds}
+            yield Diagnostic("elbow-hyperextended", WARNING, f"{side}_elbow", most, float(-BACKWARD), facts)
+        folded = elbow.bend > FOLDED
+        if np.count_nonzero(folded) / rate_hz > LASTING_S:
+            yield Diagnostic("elbow-overflexed", WARNING, f"{side}_elbow", finite_max(elbow.bend), float(FOLDED))
+        aside = (elbow.bend > BENT) & (np.abs(elbow.aside) > ASIDE)
+        if np.count_nonzero(aside) / rate_hz > LASTING_S:
+            most = float(np.abs(elbow.aside[aside]).max())
+            early, late = _median_of_halves(elbow)
+            halves: dict[str, float | str] = {"first_half": early, "second_half": late}
+            if abs(late - early) > APART:
+                halves["variant"] = "drifting"
+            yield Diagnostic("forearm-out-of-plane", WARNING, f"{side}_forearm", most, float(ASIDE), halves)
+
+
+def _median_of_halves(elbow: Elbow) -> tuple[float, float]:
+    """Median [rad] by which the bent forearm is out of plane, in the first and the second half."""
+    half = len(elbow.bend) // 2
+    parts = [elbow.aside[of][elbow.bend[of] > BENT] for of in (slice(half), slice(half, None))]
+    if not all(len(part) for part in parts):
+        return 0.0, 0.0
+    return float(np.median(parts[0])), float(np.median(parts[1]))
+
+
+def _diagnose_subject(tracked: TrackedRecording) -> Iterator[Diagnostic]:
+    if tracked.subject.name == "population":
+        yield Diagnostic("population-lengths", INFO)
+    measured = [name for name, sensor in tracked.recording.sensors.items() if isinstance(sensor, OrientationSensor)]
+    if measured:
+        yield Diagnostic("measured-orientations", INFO, facts={"segments": ", ".join(measured)})
+    if tracked.recording.remounted and tracked.subject.mounts:
+        yield Diagnostic("sensors-remounted", INFO)
