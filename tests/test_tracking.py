@@ -76,7 +76,7 @@ def test_the_real_person_hangs_the_arms_again(data: Path) -> None:
     # In the N-pose all is where it should be: arms down, facing forward.
     start = recording.span((40.2, 44.4))
     for side, y in (("left", 1.0), ("right", -1.0)):
-        hand = pose.points[f"{side}_hand"][start].mean(axis=0)
+        hand = pose.points[f"{side}_palm"][start].mean(axis=0)
         shoulder = pose.points[f"{side}_shoulder"][start].mean(axis=0)
         np.testing.assert_allclose(hand[:2], shoulder[:2], atol=0.02)
         assert shoulder[1] * y > 0.15
