@@ -10,6 +10,7 @@ import numpy as np
 
 from ..alignment import Segments
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json
+from ..errors import BadData
 from ..model import POINTS, BodyModel, load_model
 from ..pose import Pose, orientation_residuals
 from ..recording import SEGMENTS, Recording
@@ -68,7 +69,7 @@ class TrackedRecording:
         return self._accumulated().diagnostics()
 
     def summary(self) -> dict[str, Any]:
-        """What was run on what, in numbers and words, for ``summary.json``."""
+        """The content of ``summary.json``: inputs, options and results."""
         return self._accumulated().summary()
 
     def _accumulated(self) -> SummaryAccumulator:
@@ -85,16 +86,29 @@ class SummaryAccumulator:
     """The summary of a recording that is tracked in chunks, each added as it comes."""
 
     def __init__(self) -> None:
-        self.last: TrackedRecording | None = None
+        self._last: TrackedRecording | None = None
         self._begin, self._samples = 0.0, 0
         self._static: dict[str, int] = {}
         self._lost: dict[str, tuple[int, int, bool]] = {}  # segment → gaps, lost samples, whether the last one was
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
         self._later: list[Diagnostic] = []  # of reading later chunks than the first
 
+    @property
+    def last(self) -> TrackedRecording:
+        """The last chunk.
+
+        Raises
+        ------
+        BadData
+            No chunk was added.
+        """
+        if self._last is None:
+            raise BadData("no chunk was tracked: there is nothing to summarise")
+        return self._last
+
     def add(self, tracked: TrackedRecording) -> None:
-        """The next chunk."""
-        if self.last is None:
+        """Add the next chunk."""
+        if self._last is None:
             self._begin = float(tracked.time[0])
         else:
             known = (*self._later, *tracked.segments.diagnostics)
@@ -108,12 +122,11 @@ class SummaryAccumulator:
             self._lost[segment] = gaps + begun, samples + int(np.count_nonzero(gap)), bool(gap[-1])
         for segment, angle in tracked.orientation_residual().items():
             self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
-        self.last = tracked
+        self._last = tracked
 
     def summary(self) -> dict[str, Any]:
         """As `TrackedRecording.summary`, of all chunks."""
         last = self.last
-        assert last is not None
         sensors: dict[str, Any] = {}
         for segment in last.recording.sensors:
             about: dict[str, Any] = {"heading_deg": round(float(np.degrees(last.segments.heading[segment])), 3)}
@@ -151,13 +164,12 @@ class SummaryAccumulator:
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """As `TrackedRecording.diagnostics`, of all chunks; of later ones a day's would be too many to read."""
         last = self.last
-        assert last is not None
         more = len(self._later) - _MOST_LATER
         return (
             *last.segments.diagnostics,
             *self._later[:_MOST_LATER],
             *([Diagnostic("diagnostics-omitted", INFO, value=more)] if more > 0 else []),
-            *_not_known(last),
+            *_diagnose_unknown_points(last),
             *(
                 Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
                 for segment, rms in self._residual_rms().items()
@@ -184,7 +196,7 @@ def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | N
     return about
 
 
-def _not_known(tracked: TrackedRecording) -> list[Diagnostic]:
+def _diagnose_unknown_points(tracked: TrackedRecording) -> list[Diagnostic]:
     """The points that are unknown for lack of a sensor."""
     missing = [point for point in POINTS if point not in tracked.points]
     lacking = [name for name in SEGMENTS[:5] if name not in tracked.quat_WL]

@@ -45,12 +45,10 @@ class ChunkWriter:
         self.accumulator.add(chunk)
 
     def finish(self, phases: Mapping[str, Sequence[tuple[float, float]]], provenance: Mapping[str, Any]) -> None:
-        """The other files."""
+        """Write the other files."""
         _concatenate(self._parts, self._folder / "pose.parquet")
         shutil.rmtree(self._parts)
-        last = self.accumulator.last
-        assert last is not None
-        write_about(self._folder, last, self.accumulator.summary(), phases, provenance)
+        write_about(self._folder, self.accumulator.last, self.accumulator.summary(), phases, provenance)
 
 
 def _concatenate(parts: Path, path: Path) -> None:
