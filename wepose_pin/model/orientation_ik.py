@@ -72,7 +72,8 @@ class OrientationIk:
         self._placements = [pin.Quaternion(R).coeffs() for R in placed]
         frames = [self.model.frames[self.model.getFrameId(name)] for group in to_fit for name in group.segments]
         self._stands = {frame.name: (frame.parentJoint, pin.Quaternion(frame.placement.rotation)) for frame in frames}
-        self._axes: dict[int, np.ndarray] = {}
+        axes = {j: axis_in_joint(self.model, j) for j in range(1, self.model.njoints) if self.model.nvs[j] == 1}
+        self._axes = {joint: axis for joint, axis in axes.items() if axis is not None}
         self._solved: dict[int, np.ndarray] = {}  # which fit → the last q that it found
 
     def run(
@@ -152,10 +153,6 @@ class OrientationIk:
             q[:, first] = value
         else:  # without limits: cosine and sine
             q[:, first], q[:, first + 1] = np.cos(value), np.sin(value)
-        if joint not in self._axes:
-            axis = axis_in_joint(self.model, joint)
-            assert axis is not None
-            self._axes[joint] = axis
         return rotation_about(self._axes[joint], value)
 
 

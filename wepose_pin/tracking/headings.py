@@ -126,9 +126,10 @@ class HeadingCorrector:
             about_z = Rotation.from_rotvec(psi[:, None] * [0.0, 0.0, 1.0])
             corrected[name] = (about_z * Rotation.from_quat(corrected[name])).as_quat()
             self._largest[name] = max(self._largest[name], float(np.degrees(np.abs(psi).max())))
-            if name in covariance:
+            filter_cov = _heading_covariance(segments, name)
+            if filter_cov is not None:
                 variance = np.interp(chunk.time, self._middle, self._cov[:, i, i])
-                with_heading, filter_var = _heading_covariance(segments, name)
+                with_heading, filter_var = filter_cov
                 start = start_heading_var(chunk, name, self._subject)
                 covariance[name] = _narrow_covariance(covariance[name], with_heading, filter_var + start, variance)
         result = replace(segments, quat_WL=corrected, covariance_W=covariance)
@@ -201,9 +202,10 @@ class HeadingCorrector:
         times = times[times <= chunk.time[-1]]
         self._recorded += len(times)
         for name in self._chain:
-            if name not in segments.covariance_W:
+            filter_cov = _heading_covariance(segments, name)
+            if filter_cov is None:
                 continue
-            _, variance = _heading_covariance(segments, name)
+            variance = filter_cov[1]
             known = chunk.time
             if name in self._last:  # the interval between two chunks
                 known = np.concatenate([[self._last[name][0]], known])
@@ -314,11 +316,12 @@ def _hinge_rows(R: Mapping[str, Rotation], subject: Subject, joint: str) -> _Row
     return _Rows(sample, r[near], H[near], np.full(len(sample), std**-2))
 
 
-def _heading_covariance(segments: Segments, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """The filter's covariance of the heading with each axis of W (n, 3), and its variance (n,) [rad²]."""
-    orientation = segments.orientation[name]
+def _heading_covariance(segments: Segments, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """The filter's covariance of the heading with each axis of W (n, 3), and its variance (n,) [rad²], if it has one."""
+    orientation = segments.orientation.get(name)
+    if orientation is None or orientation.attitude_cov is None:
+        return None
     R_VS = Rotation.from_quat(orientation.quat_WS)
-    assert orientation.attitude_cov is not None  # as `covariance_W`, which the caller has checked
     with_heading_V = R_VS.apply(np.einsum("nab,nb->na", orientation.attitude_cov, R_VS.inv().apply([0.0, 0.0, 1.0])))
     to_W = Rotation.from_rotvec([0.0, 0.0, segments.heading[name]])
     return to_W.apply(with_heading_V), with_heading_V[:, 2]
