@@ -317,7 +317,7 @@ def _hinge_rows(R: Mapping[str, Rotation], subject: Subject, joint: str) -> _Row
 
 
 def _heading_covariance(segments: Segments, name: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """The filter's covariance of the heading with each axis of W (n, 3), and its variance (n,) [rad²], if it has one."""
+    """The filter's covariance of the heading with each axis of W (n, 3), and its variance (n,) [rad²], if any."""
     orientation = segments.orientation.get(name)
     if orientation is None or orientation.attitude_cov is None:
         return None
