@@ -22,7 +22,7 @@ class Document(NamedTuple):
     results: list[Result]
     quick: bool
     versions: dict[str, str]
-    worlds: dict[str, dict[str, Any]]  # name → with_exact_mounts, and imperfections with their sizes
+    worlds: dict[str, dict[str, Any]]  # name → mounts_known, and imperfections with their sizes
     noise: dict[str, float]  # of the simulated sensors, in `ImuNoise`'s units
     gains: dict[str, dict[str, Any]]  # setting → "ncf", "gdc" → gains as stated
     skipped: list[Skipped] = []  # trials that could not be scored  # noqa: RUF012
@@ -40,7 +40,7 @@ def document_text(
         "quick": quick,
         **({"skipped": [each._asdict() for each in skipped]} if skipped else {}),
         "worlds": {
-            name: {"with_exact_mounts": True, "imperfections": asdict(imperfections)}
+            name: {"mounts_known": True, "imperfections": asdict(imperfections)}
             for name, imperfections in WORLDS.items()
         },
         "noise": asdict(MTI_3),
