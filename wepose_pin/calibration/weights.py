@@ -24,6 +24,7 @@ LEAST_VARIANCE = 1e-4
 LEAST_CORRELATION_S = 3.0
 THIRD_CHI2 = {1: 0.1485, 3: 1.4237}  # 30 % quantile of chi², by degrees of freedom
 ROUNDS, STEPS = 5, 60
+FINAL_STEPS = 300  # of the last solve, which must converge: hands that hardly move take a hundred
 QUICK_ROUNDS, QUICK_STEPS = 1, 15
 MANY_SAMPLES = 1000  # from twice as many on, all rounds but the last take every second, third, … sample
 OUTLIER = 5.0  # times the usual gap, at which the palms are apart
@@ -96,7 +97,7 @@ def solve_reweighted(
         arms = [SIDES.index(side) for side in observations.layout.arms]
         if arms and not quick:
             weights[closed, 3:] = _weigh(fit.hinge[closed][:, arms], np.ones(int(closed.sum())), correlation)
-    fit = solve(observations, prior, weights, x, steps, not quick)
+    fit = solve(observations, prior, weights, x, steps if quick else FINAL_STEPS, not quick)
     return WeightedFit(fit, weights, contact, effective)
 
 

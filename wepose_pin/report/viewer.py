@@ -294,19 +294,26 @@ def view(
     right /= np.linalg.norm(right)
     R_WC = np.stack([right, np.cross(toward, right), toward], axis=1)
     motion = motion[:, :: max(1, motion.shape[1] // MOST_POSES)].astype(float)
+    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    fan = np.column_stack([np.cos(angle), np.sin(angle)])
+
+    def outermost(points_C: np.ndarray) -> np.ndarray:
+        """The points (n, 3) that lie outermost, seen along the view or from above."""
+        points_C = points_C[np.isfinite(points_C).all(axis=1)]
+        if not len(points_C):
+            return points_C
+        return points_C[np.unique([np.argmax(fan @ points_C[:, plane].T, axis=1) for plane in ([0, 2], [1, 2])])]
+
     seen_W = [np.zeros((1, 3)), *(trail[:: max(1, len(trail) // (4 * MOST_POSES))] for trail in trails)]
+    seen_C = [outermost(points_W @ R_WC) for points_W in seen_W]
     for link, placed in zip(links, motion, strict=True):
         placed = placed[np.isfinite(placed).all(axis=1)]
         corners_L = [_corners(visual) for visual in visuals if visual.link == link]
         if len(placed):
             R_WL = Rotation.from_quat(placed[:, :4]).as_matrix()
-            seen_W.append((np.concatenate(corners_L) @ R_WL.swapaxes(1, 2) + placed[:, None, 4:]).reshape(-1, 3))
-    seen_C = np.concatenate(seen_W) @ R_WC
-    seen_C = seen_C[np.isfinite(seen_C).all(axis=1)]
-    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
-    fan = np.column_stack([np.cos(angle), np.sin(angle)])
-    outermost = np.unique([np.argmax(fan @ seen_C[:, plane].T, axis=1) for plane in ([0, 2], [1, 2])])
-    return {"axes": R_WC.T.tolist(), "points": np.round(seen_C[outermost], 4).tolist()}
+            corners_W = np.concatenate(corners_L) @ R_WL.swapaxes(1, 2) + placed[:, None, 4:]
+            seen_C.append(outermost(corners_W.reshape(-1, 3) @ R_WC))
+    return {"axes": R_WC.T.tolist(), "points": np.round(outermost(np.concatenate(seen_C)), 4).tolist()}
 
 
 def _corners(visual: Visual) -> np.ndarray:
