@@ -302,7 +302,8 @@ def view(
         points_C = points_C[np.isfinite(points_C).all(axis=1)]
         if not len(points_C):
             return points_C
-        return points_C[np.unique([np.argmax(fan @ points_C[:, plane].T, axis=1) for plane in ([0, 2], [1, 2])])]
+        planes = points_C[:, [0, 2]], points_C[:, [1, 2]]
+        return points_C[np.unique([int(np.argmax(plane @ direction)) for plane in planes for direction in fan])]
 
     seen_W = [np.zeros((1, 3)), *(trail[:: max(1, len(trail) // (4 * MOST_POSES))] for trail in trails)]
     seen_C = [outermost(points_W @ R_WC) for points_W in seen_W]
