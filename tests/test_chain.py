@@ -57,7 +57,7 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def turned(model: pin.Model, q: np.ndarray, link: str) -> Rotation:
     """Orientations of a link in W."""
-    data, frame = model.createData(), model.getFrameId(link)
+    data, frame = model.createData(), model.getFrameId(link, pin.FrameType.BODY)
     rows = []
     for row in q:
         pin.framesForwardKinematics(model, data, row)
@@ -100,6 +100,18 @@ def test_sensors_on_all_links_give_all_joints(urdf: Path) -> None:
     for k, value in enumerate(chain.joints.values()):
         assert np.abs(value - q[:, k]).max() < np.deg2rad(1.0)
     assert max(rms_deg(angle) for angle in chain.residual.values()) < 0.5
+
+
+def test_a_link_may_have_the_name_of_its_fixed_joint(urdf: Path, tmp_path: Path) -> None:
+    joint = '<joint name="tool" type="fixed"><parent link="wrist_1_link"/><child link="tool"/></joint>'
+    (tmp_path / "arm.urdf").write_text(
+        urdf.read_text().replace("</robot>", f'<link name="tool"/>{joint}</robot>'), encoding="utf-8"
+    )
+    model = load_robot(tmp_path / "arm.urdf")
+    recording, _ = made(model, ["forearm_link", "tool"], 8.0)
+    chain = track_chain(recording, model)
+    assert max(rms_deg(angle) for angle in chain.residual.values()) < 0.5
+    assert set(chain.orientations()) == {"forearm_link", "tool"}
 
 
 def test_what_the_links_leave_open_is_named_and_the_rest_is_right(urdf: Path) -> None:

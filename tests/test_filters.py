@@ -384,7 +384,8 @@ def test_a_recording_may_begin_in_motion(method: str) -> None:
         assert found.static[4900:].mean() > 0.8
         worst.append(float(tilt_deg.max()))
     print(f"{method}: tilt within {np.round(worst, 2)} deg")
-    assert method in ("ncf", "gdc") or max(worst) < 1.0
+    if found.attitude_cov is not None:  # what the others keep depends on their gains
+        assert max(worst) < 1.0
 
 
 @pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])

@@ -6,24 +6,29 @@ import json
 import shlex
 from dataclasses import FrozenInstanceError, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
+from benchmarks.results import adapter
 from wepose_pin.batch.plan import STEPS, step_options
 from wepose_pin.batch.reproduction import REPRODUCIBLE
+from wepose_pin.calibration import PROTOCOLS
 from wepose_pin.cli import COMMANDS, find_command
 from wepose_pin.cli.parser import parse
 from wepose_pin.errors import BadOption
+from wepose_pin.filters import METHODS, OFFLINE
+from wepose_pin.jobs import LiveMethod, Method
 from wepose_pin.jobs.calibrate import CalibrateJob
 from wepose_pin.jobs.demo import DemoJob
 from wepose_pin.jobs.evaluate import EvaluateJob
 from wepose_pin.jobs.export import ExportJob
-from wepose_pin.jobs.fields import REQUIRED, build_job, field_values
+from wepose_pin.jobs.fields import REQUIRED, build_job, field_types, field_values
 from wepose_pin.jobs.retarget import RetargetJob
 from wepose_pin.jobs.simulate import SimulateJob, run_simulate
 from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.simulation.tasks import TASKS
 from wepose_pin.writers import write_session
 from wepose_pin.writers.provenance import collect_provenance
 
@@ -35,6 +40,13 @@ JOBS = {
     "demo": DemoJob(Path("out"), 4),
     "export": ExportJob(Path("result"), Path("a.mot"), names="isb", rate_hz=50.0),
 }
+
+
+def test_choices_of_options_are_those_of_the_rooms() -> None:
+    """Options are annotated without loading a room; what is added there must be added here."""
+    assert get_args(Method) == tuple(METHODS) == adapter.METHODS
+    assert get_args(LiveMethod) == tuple(name for name in METHODS if name not in OFFLINE)
+    assert set(get_args(field_types(SimulateJob)["protocol"])) == set(TASKS) <= set(PROTOCOLS)
 
 
 @pytest.mark.parametrize("command", REPRODUCIBLE)

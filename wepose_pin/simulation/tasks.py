@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from .motion import MARGIN_S, SIDES, Motion, Wander, pulse, step
 
-HANDLE_M = 0.40  # between the palms
 _T_POSE_S = (7.5, 12.5)
 _BOW_S = (15.5, 22.0)
 _BOW_DEG = 45.0
@@ -26,6 +25,7 @@ class Handle(Motion):
     """Both hands on a bar that tilts and turns."""
 
     phase = "handle"
+    length = 0.40  # [m] between the palms
 
     def prepare(self, rng: np.random.Generator, _pose_deg: float) -> None:
         self.bar = [Wander(rng) for _ in range(2)]
@@ -50,7 +50,7 @@ class Handle(Motion):
         angles = (
             np.deg2rad(self.share * _BAR_DEG) * moving[:, None] * np.column_stack([wander(t) for wander in self.bar])
         )
-        half_T = Rotation.from_euler("ZX", angles).apply([0.0, 0.5 * HANDLE_M, 0.0])
+        half_T = Rotation.from_euler("ZX", angles).apply([0.0, 0.5 * self.length, 0.0])
         return {"left": clasp_T + half_T, "right": clasp_T - half_T}
 
 
