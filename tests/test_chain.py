@@ -104,9 +104,8 @@ def test_sensors_on_all_links_give_all_joints(urdf: Path) -> None:
 
 def test_a_link_may_have_the_name_of_its_fixed_joint(urdf: Path, tmp_path: Path) -> None:
     joint = '<joint name="tool" type="fixed"><parent link="wrist_1_link"/><child link="tool"/></joint>'
-    (tmp_path / "arm.urdf").write_text(
-        urdf.read_text().replace("</robot>", f'<link name="tool"/>{joint}</robot>'), encoding="utf-8"
-    )
+    text = urdf.read_text(encoding="utf-8").replace("</robot>", f'<link name="tool"/>{joint}</robot>')
+    (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
     model = load_robot(tmp_path / "arm.urdf")
     recording, _ = made(model, ["forearm_link", "tool"], 8.0)
     chain = track_chain(recording, model)
