@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
 import tomllib
-from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
 from keyword import kwlist
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import wepose_pin
+from wepose_pin.calibration import load_protocol
 from wepose_pin.cli import COMMANDS, find_command
+from wepose_pin.filters import TYPICAL
 from wepose_pin.jobs.fields import field_types
+from wepose_pin.retargeting.maps import read_map
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("CONTRIBUTING.md", "docs/architecture.md", "docs/recipes.md")
@@ -147,27 +153,73 @@ def test_every_room_is_in_the_architecture_and_its_picture() -> None:
     assert [room for room in LAYERS if f">{room}<" not in picture] == []
 
 
-def imported(block: str) -> Iterator[tuple[str, str]]:
-    """Module and name of each import from the project in a block, which may say its path in its first line."""
-    path = re.match(r"# (\S+)\.py\n", block)
-    package = path[1].split("/")[:-1] if path else []
-    for node in ast.walk(ast.parse(block)):
-        if isinstance(node, ast.ImportFrom):
-            above = package[: len(package) - node.level + 1] if node.level else []
-            module = ".".join([*above, *([node.module] if node.module else [])])
-            if module.startswith("wepose_pin"):
-                yield from ((module, alias.name) for alias in node.names)
+# Examples of the recipes ---------------------------------------------------------------------------------------------
 
 
-def test_examples_of_recipes_parse_and_import_what_is_there() -> None:
+def example(path: str, folder: Path) -> Path:
+    """The file of that path as docs/recipes.md shows it, in the folder."""
+    language = {".py": "python", ".toml": "toml"}[Path(path).suffix]
+    [block] = [block for block in blocks("docs/recipes.md", language) if block.startswith(f"# {path}\n")]
+    file = folder / Path(path).name
+    file.write_text(block, encoding="utf-8")
+    return file
+
+
+def example_module(path: str, folder: Path) -> ModuleType:
+    spec = spec_from_file_location(path.removesuffix(".py").replace("/", "."), example(path, folder))
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, spec.name, module)  # a dataclass looks for its module there
+        spec.loader.exec_module(module)
+    return module
+
+
+def test_the_filter_of_the_recipe_follows_a_tilt(tmp_path: Path) -> None:
+    """It takes single samples as it takes many."""
+    module = example_module("wepose_pin/filters/levelled.py", tmp_path)
+    accel = np.tile(Rotation.from_rotvec([0.5, 0.0, 0.0]).inv().apply([0.0, 0.0, 9.8]), (2000, 1))
+    gyro, static = np.tile(TYPICAL.gyro_bias, (2000, 1)), np.zeros(2000, dtype=bool)
+    start = np.array([0.0, 0.0, 0.0, 1.0])
+    run = module.Levelled(TYPICAL, 100.0, start).run(gyro, accel, static)
+    filter_ = module.Levelled(TYPICAL, 100.0, start)
+    np.testing.assert_array_equal([filter_.update(g, a, False) for g, a in zip(gyro, accel, strict=True)], run.quat_WS)
+    np.testing.assert_allclose(Rotation.from_quat(run.quat_WS[-1]).as_rotvec(), [0.5, 0.0, 0.0], atol=2e-3)
+
+
+def test_the_reader_of_the_recipe_reads(tmp_path: Path) -> None:
+    module = example_module("wepose_pin/readers/acme.py", tmp_path)
+    file = tmp_path / "torso.csv"
+    file.write_text("serial: A17\nt_ms;wx;wy;wz;fx;fy;fz\n0;180;0;0;0;0;1000\n10;0;0;90;0;0;1000\n", encoding="utf-8")
+    device = module.read_acme(file)
+    assert dict(device.labels) == {"A17": "torso"}
+    assert device.table["time"].to_list() == [0.0, 0.01]
+    np.testing.assert_allclose(
+        device.table[device.signals("A17")["gyro"]].to_numpy(), [[np.pi, 0, 0], [0, 0, np.pi / 2]]
+    )
+    np.testing.assert_allclose(device.table[device.signals("A17")["accel"]].to_numpy()[:, 2], 9.80665)
+
+
+def test_the_protocol_and_the_robot_of_the_recipes_are_read(tmp_path: Path) -> None:
+    protocol = load_protocol(example("calibration/rod.toml", tmp_path))
+    assert {condition.phase for condition in protocol.conditions} == {step.phase for step in protocol.steps} - {"start"}
+    file = example("urdf/robots/xarm7.toml", tmp_path)
+    file.write_text(re.sub(r"(?m)^srdf = .*\n", "", file.read_text(encoding="utf-8")), encoding="utf-8")
+    robot = read_map(file, urdf=file)  # the URDF itself is example-robot-data's
+    assert set(robot.rest) <= set(robot.arms["right"].joints)
+
+
+def test_the_other_examples_of_the_recipes_import_what_is_there() -> None:
     names = []
     for block in blocks("docs/recipes.md", "python"):
-        if block.startswith(" "):  # lines for the middle of a function or table
-            continue
-        names += list(imported(block))
+        if not block.startswith((" ", "# wepose_pin/")):  # not lines for the middle of a function
+            for node in ast.walk(ast.parse(block)):
+                if isinstance(node, ast.ImportFrom) and node.module is not None:
+                    names += [(node.module, alias.name) for alias in node.names]
+    assert names
     for module, name in names:
         assert hasattr(import_module(module), name), f"{module}.{name}"
-    assert len(names) > 10
     for block in blocks("docs/recipes.md", "toml"):
         assert tomllib.loads(block)
 
