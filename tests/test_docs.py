@@ -25,7 +25,7 @@ from wepose_pin.jobs.fields import field_types
 from wepose_pin.retargeting.maps import read_map
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("CONTRIBUTING.md", "docs/architecture.md", "docs/recipes.md")
+PAGES = ("CONTRIBUTING.md", "docs/architecture.md", "docs/glossary.md", "docs/recipes.md")
 NOTATION = {"p_WH"}  # examples of how frames are written, which no code needs to have
 LAYERS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"][0][
     "layers"
