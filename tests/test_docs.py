@@ -108,6 +108,7 @@ def missing(span: str) -> str:
         return "" if ".venv" in text_of("Makefile") else span
     if re.fullmatch(r"[\w.-]*/[\w./-]*", span):
         return "" if (ROOT / span).exists() else span
+    span = re.sub(r"^wp\.", "wepose_pin.", span)
     if re.fullmatch(r"[A-Za-z_]\w*(\.\w+)+", span) and span.partition(".")[0] in {*LAYERS, "wepose_pin"}:
         try:
             resolve(span)
