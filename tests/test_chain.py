@@ -57,7 +57,7 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def turned(model: pin.Model, q: np.ndarray, link: str) -> Rotation:
     """Orientations of a link in W."""
-    data, frame = model.createData(), model.getFrameId(link, pin.FrameType.BODY)
+    data, frame = model.createData(), model.getFrameId(link)
     rows = []
     for row in q:
         pin.framesForwardKinematics(model, data, row)

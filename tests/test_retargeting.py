@@ -190,6 +190,14 @@ def test_a_small_person_and_a_tall_one_move_the_robot_alike(arm) -> None:
     assert np.abs(small.u[:n] - tall.u[:n]).max() < 1e-6
 
 
+def test_a_link_may_have_the_name_of_its_fixed_joint(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    plain = retarget(person(2.0), str(urdf))
+    text = urdf.read_text(encoding="utf-8").replace('joint name="stand"', 'joint name="base"')
+    urdf.write_text(text, encoding="utf-8")
+    np.testing.assert_array_equal(retarget(person(2.0), str(urdf)).u, plain.u)
+
+
 def test_turned_bases_move_alike(arm, tmp_path: Path) -> None:
     straight = retarget(person(4.0), arm)
     turned = load_robot(find_map(str(write_arm(tmp_path, turned=(0.5 * np.pi, 0.2, -1.1)))))

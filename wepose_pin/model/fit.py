@@ -67,7 +67,7 @@ class Fit:
         self, model: pin.Model, links: Sequence[str], joints: Sequence[int], weights: Mapping[str, float], limits: bool
     ) -> None:
         self.model, self.data = model, model.createData()
-        frames = [model.frames[model.getFrameId(link, pin.FrameType.BODY)] for link in links]
+        frames = [model.frames[model.getFrameId(link)] for link in links]
         # The joint's frame is compared in place of the link's, which is fixed to it: its rotation comes for nothing.
         self._R_LJ = np.array([frame.placement.rotation.T for frame in frames])
         self._views = [self.data.oMi[frame.parentJoint].rotation for frame in frames]
@@ -154,10 +154,7 @@ def find_undetermined_joints(model: pin.Model, links: Sequence[str], q: np.ndarr
     data = model.createData()
     pin.computeJointJacobians(model, data, q)
     J = np.concatenate(
-        [
-            pin.getFrameJacobian(model, data, model.getFrameId(link, pin.FrameType.BODY), pin.LOCAL_WORLD_ALIGNED)[3:]
-            for link in links
-        ]
+        [pin.getFrameJacobian(model, data, model.getFrameId(link), pin.LOCAL_WORLD_ALIGNED)[3:] for link in links]
     )
     _, s, Vt = np.linalg.svd(J)
     null = Vt[np.count_nonzero(s > 1e-6) :]

@@ -27,12 +27,21 @@ def load_robot(path: str | Path) -> pin.Model:
     parse_tree(read_urdf(path), str(path))
     try:
         with native_stderr_muted():
-            model = pin.buildModelFromUrdf(str(path))
+            model = distinguish_frames(pin.buildModelFromUrdf(str(path)))
     except Exception as error:  # what C++ throws
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadModel(f"{path}: Pinocchio cannot build it: {reason}") from error
     if model.nv == 0:
         raise BadModel(f"{path}: no joint moves; a chain of revolute or prismatic joints is wanted")
+    return model
+
+
+def distinguish_frames(model: pin.Model) -> pin.Model:
+    """The model with other names for fixed joints that have the name of a link: Pinocchio finds frames by name."""
+    links = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.FIXED_JOINT and frame.name in links:
+            frame.name = f"{frame.name} (fixed joint)"
     return model
 
 

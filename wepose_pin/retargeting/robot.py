@@ -11,6 +11,7 @@ import pinocchio as pin
 from scipy.optimize import minimize
 
 from ..errors import BadModel, BadOption, native_stderr_muted, one_of
+from ..model.robot import distinguish_frames
 from .limits import JointLimit, read_joint_limits
 from .maps import AXES, ArmMap, LinkPoint, RobotMap, package_folders
 
@@ -108,7 +109,7 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
     limits = read_joint_limits(robot.urdf)
     try:
         with native_stderr_muted():  # urdfdom repeats the exception's text
-            full = pin.buildModelFromUrdf(str(robot.urdf))
+            full = distinguish_frames(pin.buildModelFromUrdf(str(robot.urdf)))
     except Exception as error:  # what C++ throws
         raise BadModel(f"{robot.urdf}: Pinocchio cannot build it: {_first_line(error)}") from error
     joints = [name for arm in maps.values() for name in arm.joints]

@@ -150,7 +150,7 @@ def track_chain(
 
 def _orientations(model: pin.Model, q: np.ndarray, links: list[str]) -> dict[str, np.ndarray]:
     data = model.createData()
-    frames = [model.getFrameId(link, pin.FrameType.BODY) for link in links]
+    frames = [model.getFrameId(link) for link in links]
     R = np.empty((len(q), len(links), 3, 3))
     for k, row in enumerate(q):
         pin.framesForwardKinematics(model, data, row)
