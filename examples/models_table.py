@@ -11,28 +11,28 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
+from wepose_pin.kinematics import configuration, orientation_residuals
 from wepose_pin.model import chains
-from wepose_pin.pose import configuration, deviation
 
 N = 200  # random poses: every segment up to 60 deg from the one above
 for path in sys.argv[1:] or [None]:
     body = wp.load_model(path)
-    found = chains(body.pin)
+    chain_of = chains(body.pin)
     rng = np.random.default_rng(0)
     quat_WL = {}
-    for segment in found:
+    for segment in chain_of:
         above = segment.replace("forearm", "upper_arm").replace("hand", "forearm")
         R = Rotation.from_rotvec(np.radians(60.0) * rng.uniform(-0.57, 0.57, (N, 3)))
         R_WA = Rotation.from_quat(quat_WL[above]) if above in quat_WL and above != segment else Rotation.identity()
         quat_WL[segment] = (R_WA * R).as_quat()
-    missed = deviation(body, configuration(body, quat_WL), quat_WL)
+    residuals = orientation_residuals(body, configuration(body, quat_WL), quat_WL)
 
     print(f"{path or 'the body that comes with the package'}")
     singles = [name for k, name in enumerate(body.pin.names) if body.pin.nvs[k] == 1]
     print(f"  {body.pin.nv} degrees of freedom: {len(body.joints)} spherical joints, {len(singles)} of one axis")
     print(f"  mass {sum(inertia.mass for inertia in body.pin.inertias):.2f} kg")
     print("  lengths [m]  " + "  ".join(f"{name} {length:.3f}" for name, length in body.lengths.items()))
-    for segment, chain in found.items():
+    for segment, chain in chain_of.items():
         joints = ", ".join(body.pin.names[joint] for joint in chain.joints) or "none: rigid with what it hangs on"
-        rms = np.degrees(np.sqrt(np.mean(missed[segment] ** 2))) if segment in missed else 0.0
-        print(f"  {segment:16s} missed by {rms:4.1f} deg (rms)   joints: {joints}")
+        rms = np.degrees(np.sqrt(np.mean(residuals[segment] ** 2))) if segment in residuals else 0.0
+        print(f"  {segment:16s} residual {rms:4.1f} deg (rms)   joints: {joints}")

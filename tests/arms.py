@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.pose import Pose
+from wepose_pin.kinematics import Pose
 
 UPPER, FORE, HAND = 0.30, 0.27, 0.08  # [m] of the person
 

@@ -26,7 +26,7 @@ from wepose_pin.angles import (
 )
 from wepose_pin.angles.euler import UNKNOWN, decompose, follow, wrap
 from wepose_pin.errors import BadData, BadOption
-from wepose_pin.pose import Pose
+from wepose_pin.kinematics import Pose
 from wepose_pin.simulation import Person, Simulation
 from wepose_pin.subject import population_subject
 

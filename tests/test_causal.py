@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption, BadPhase
-from wepose_pin.pose import pose_table
+from wepose_pin.kinematics import pose_table
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import LENGTHS, Subject, mount_rows, population_subject

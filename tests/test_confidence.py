@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
+from wepose_pin.kinematics import axis_std, compute_pose, point_covariance, pose_table
 from wepose_pin.model import load_model
-from wepose_pin.pose import axis_std, compute_pose, point_covariance, pose_table
 from wepose_pin.simulation import REALISTIC, simulate, simulated_person
 from wepose_pin.subject import LENGTHS, population_subject
 from wepose_pin.tracking import track

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadData
 from wepose_pin.evaluation import evaluate, uncertainty
-from wepose_pin.pose import Pose, pose_from_table, pose_table
+from wepose_pin.kinematics import Pose, pose_from_table, pose_table
 
 TIME = np.arange(101) / 10.0
 

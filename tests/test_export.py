@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from wepose_pin import cli
 from wepose_pin.angles import joint_angles
 from wepose_pin.errors import BadData, BadOption, ExistingOutput, MissingFile
+from wepose_pin.kinematics import Pose, compute_pose, pose_from_table, pose_table
 from wepose_pin.model import load_model
-from wepose_pin.pose import Pose, compute_pose, pose_from_table, pose_table
 from wepose_pin.recording import SEGMENTS
 from wepose_pin.writers import export as writers
 from wepose_pin.writers.export import export

@@ -13,9 +13,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.angles.torques import pose_torques
+from wepose_pin.kinematics import configuration, forward_kinematics, orientation_residuals, placements
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.fit import find_undetermined_joints, fit, joint_limits
-from wepose_pin.pose import configuration, forward_kinematics, orientation_residuals, placements
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track

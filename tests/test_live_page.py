@@ -26,12 +26,12 @@ from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from wepose_pin.errors import BadOption
+from wepose_pin.kinematics import LiveKinematics, configuration, placements
 from wepose_pin.live.encoder import PoseEncoder
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.server import status_json
 from wepose_pin.live.state import LivePose, SensorStatus, Status, StreamInfo
 from wepose_pin.model import BodyModel, load_model
-from wepose_pin.pose import LiveKinematics, configuration, placements
 
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 NARROW = "document.documentElement.scrollWidth <= innerWidth"

@@ -26,11 +26,11 @@ from test_retargeting import far_away
 
 from wepose_pin import cli
 from wepose_pin.errors import BadData, BadOption
+from wepose_pin.kinematics import Pose, axis_std, point_covariance
 from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, RobotStatusView, TickReplay, command_json
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.state import LivePose, Status, StreamInfo
-from wepose_pin.pose import Pose, axis_std, point_covariance
 from wepose_pin.readers import load_session
 from wepose_pin.retargeting import Robot, compute_arm_targets, find_map, load_robot
 from wepose_pin.retargeting.limits import read_joint_limits

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.assets import asset
 from wepose_pin.diagnostics import from_json, render
 from wepose_pin.errors import BadModel, BadOption, MissingFile
+from wepose_pin.kinematics import compute_pose, forward_kinematics
 from wepose_pin.model import POINTS, BodyModel, SegmentLink, chains, load_model
-from wepose_pin.pose import compute_pose, forward_kinematics
 from wepose_pin.tracking import track
 
 OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"

@@ -21,8 +21,8 @@ from wepose_pin.diagnostics import from_json
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.filters import METHODS, SensorRun, chunk_multiple, run_filter
 from wepose_pin.filters.noise import noise_of
+from wepose_pin.kinematics import pose_table
 from wepose_pin.model import load_model
-from wepose_pin.pose import pose_table
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.report import track_report
@@ -129,7 +129,7 @@ def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation, tmp_pa
 
 def test_a_body_whose_joints_are_too_few(made: Simulation, tmp_path: Path, data: Path) -> None:
     """Its elbows are fitted from frame to frame: the next piece begins where the last one ended."""
-    from test_pose import gazebo
+    from test_kinematics import gazebo
 
     recording = made.recording()
     first = {

@@ -17,8 +17,8 @@ from wepose_pin.calibration.protocols import Closure
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, render, render_all
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
+from wepose_pin.kinematics import compute_pose
 from wepose_pin.model import load_model
-from wepose_pin.pose import compute_pose
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
-from wepose_pin.pose import Pose, axis_std
+from wepose_pin.kinematics import Pose, axis_std
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.plausibility import cut_off
 from wepose_pin.report import track_report

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin import cli
 from wepose_pin.errors import BadData, BadModel, BadOption, MissingFile, NoSolution
-from wepose_pin.pose import Pose
+from wepose_pin.kinematics import Pose
 from wepose_pin.retargeting import (
     LimitCheck,
     Trajectory,

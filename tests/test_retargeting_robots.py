@@ -11,7 +11,7 @@ from arms import FORE, HAND, UPPER, person
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import NoSolution
-from wepose_pin.pose import Pose
+from wepose_pin.kinematics import Pose
 from wepose_pin.retargeting import (
     ROBOTS,
     Trajectory,

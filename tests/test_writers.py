@@ -12,8 +12,8 @@ import pytest
 
 from wepose_pin.documents import whole_folder
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
+from wepose_pin.kinematics import pose_from_table, pose_table
 from wepose_pin.model import load_model
-from wepose_pin.pose import pose_from_table, pose_table
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import population_subject

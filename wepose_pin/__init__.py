@@ -21,7 +21,7 @@ _WHERE = {
     "CalibrationFailed": "errors",
     "ImuSensor": "recording",
     "OrientationSensor": "recording",
-    "Pose": "pose",
+    "Pose": "kinematics",
     "Recording": "recording",
     "Sensor": "recording",
     "StaticTest": "filters.static",

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from . import rotations
 from .arguments import check_arguments
 from .errors import BadData, BadOption
-from .pose import Pose
+from .kinematics import Pose
 from .recording import span_text
 
 

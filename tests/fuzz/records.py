@@ -155,7 +155,7 @@ def result(folder: Path, data: bytes) -> object:
 
     from wepose_pin.errors import WeposeError
     from wepose_pin.evaluation import evaluate
-    from wepose_pin.pose import pose_from_table
+    from wepose_pin.kinematics import pose_from_table
     from wepose_pin.readers.tables import read_table
     from wepose_pin.report.viewer import pose_html
     from wepose_pin.writers.export import export

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..arguments import check_arguments
 from ..errors import BadData, BadOption, one_of
-from ..pose import Pose
+from ..kinematics import Pose
 from ..recording import AXES
 from ..rotations import conjugate, multiply
 from . import euler

@@ -11,7 +11,7 @@ from . import Progress, no_progress
 
 if TYPE_CHECKING:
     from ..evaluation import Evaluation
-    from ..pose import Pose
+    from ..kinematics import Pose
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def run_evaluate(job: EvaluateJob, progress: Progress = no_progress, pose: Pose 
         No result, no reference, or nothing that both have.
     """
     from ..evaluation import evaluate
-    from ..pose import pose_from_table
+    from ..kinematics import pose_from_table
     from ..readers import load_session
     from ..readers.tables import read_table
     from ..writers import read_result

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from ..kinematics import LiveKinematics, find_known_links
 from ..model import BodyModel
 from ..model.chains import chains
-from ..pose import LiveKinematics, find_known_links
 from ..report.viewer import visible
 from .state import LivePose, StreamInfo
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..diagnostics import Diagnostic
 from ..filters import BEST
+from ..kinematics import LiveKinematics
 from ..model import BodyModel, load_model
-from ..pose import LiveKinematics
 from ..readers.live_log import recording_of
 from ..recording import SEGMENTS, ImuSensor, Recording
 from ..recording.arrivals import (

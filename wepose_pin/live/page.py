@@ -13,9 +13,9 @@ from collections import deque
 import numpy as np
 import pinocchio as pin
 
+from ..kinematics import find_known_points
 from ..model import POINTS, BodyModel
 from ..model.chains import chains
-from ..pose import find_known_points
 from ..report.viewer import DARK, LIGHT, backdrop, filled, scene, trail_colour, view
 from .addresses import LOOPBACK
 from .encoder import HANDS, PoseEncoder

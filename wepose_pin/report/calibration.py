@@ -19,7 +19,7 @@ from ..calibration.weights import MIN_CONTACT
 from ..diagnostics import WARNING, Diagnostic, lines, quantity
 from ..errors import WeposeError, reason
 from ..filters import BEST
-from ..pose import Pose
+from ..kinematics import Pose
 from ..recording import Recording, axes_from_mount, mount_from_axes
 from ..subject import Subject, mount_rows
 from ..tracking import TrackedRecording, track

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..diagnostics import Diagnostic
-from ..pose import Pose
+from ..kinematics import Pose
 from ..recording import Intervals, join
 from ..tracking import TrackedRecording
 from .measures import Signal, measure_hands, measure_signal

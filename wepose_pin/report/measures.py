@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..pose import Pose, axis_std
+from ..kinematics import Pose, axis_std
 from ..recording import OrientationSensor, Recording
 from ..recording.gaps import runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..diagnostics import INFO, Diagnostic, lines
-from ..pose import axis_std, orientation_residuals
+from ..kinematics import axis_std, orientation_residuals
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
 from .decimation import Totals, compute_totals

@@ -19,8 +19,8 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
+from ..kinematics import Pose, configuration, find_known_links, placements
 from ..model import BodyModel, Visual
-from ..pose import Pose, configuration, find_known_links, placements
 from .page import load_template
 
 if TYPE_CHECKING:

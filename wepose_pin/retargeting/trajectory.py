@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..arguments import check_arguments
 from ..errors import NoSolution, WrongOption
-from ..pose import Pose
+from ..kinematics import Pose
 from .collision import CollisionModel
 from .controller import ActiveConstraints, JointState, QpController, StepCounts, Tasks, sample_hand_targets
 from .maps import find_map

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arguments import Count, NonNegative, Positive, check_arguments
 from ..errors import BadOption
-from ..pose import Pose
+from ..kinematics import Pose
 from ..recording import ImuSensor, Recording, check, mount_from_axes
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, lost_samples

@@ -29,7 +29,7 @@ from ..filters import BEST, Orientation
 from ..filters.bank import LiveBank, OneByOne, create_bank
 from ..filters.sensors import SensorFilters, filtered_chunk
 from ..filters.static import StaticTest
-from ..pose import axis_std
+from ..kinematics import axis_std
 from ..recording import OrientationSensor, Recording, join
 from ..rotations import product
 from ..subject import Subject

@@ -11,8 +11,8 @@ import numpy as np
 from ..alignment import Segments
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json
 from ..errors import BadData
+from ..kinematics import Pose, orientation_residuals
 from ..model import POINTS, BodyModel, load_model
-from ..pose import Pose, orientation_residuals
 from ..recording import SEGMENTS, Recording
 from ..subject import Subject, population_subject
 from .headings import HeadingCorrection

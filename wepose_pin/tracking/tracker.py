@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 from ..errors import BadOption
+from ..kinematics import KinematicsSolver, point_covariance
 from ..model import BodyModel
-from ..pose import KinematicsSolver, point_covariance
 from ..recording import CONFIGURATION, Recording
 from ..subject import Subject
 from .causal import CausalEstimator, SegmentFollower

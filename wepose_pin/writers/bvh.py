@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from ..angles import NEAR_LOCK, euler
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..pose import compute_pose, configuration, forward_kinematics
+from ..kinematics import compute_pose, configuration, forward_kinematics
 from ..rotations import conjugate, multiply
 from .motion import Motion, check_complete, diagnose_gaps, resample_evenly
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import polars as pl
 
 from ..angles.torques import Torques, torque_table
-from ..pose import axis_std
+from ..kinematics import axis_std
 from ..tracking import TrackedChain
 from .result import versions, write_table
 

@@ -10,7 +10,7 @@ from typing import Any
 import polars as pl
 
 from ..errors import ExistingOutput
-from ..pose import pose_table
+from ..kinematics import pose_table
 from ..tracking import SummaryAccumulator, TrackedRecording
 from .result import write_about, write_table
 

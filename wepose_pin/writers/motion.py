@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, WrongOption
+from ..kinematics import Pose, compute_pose
 from ..model import BodyModel
-from ..pose import Pose, compute_pose
 from ..recording import span_text
 
 # Times count as even while none is off the even grid by more than this share of a step.

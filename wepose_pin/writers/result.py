@@ -16,8 +16,8 @@ import polars as pl
 
 from .. import __version__
 from ..errors import BadData, ExistingOutput, MissingFile
+from ..kinematics import Pose, pose_from_table, pose_table
 from ..model import BodyModel, load_model
-from ..pose import Pose, pose_from_table, pose_table
 from ..readers.tables import read_table
 from ..subject import Subject, subject_toml
 from ..tracking import TrackedRecording

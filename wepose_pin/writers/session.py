@@ -7,7 +7,7 @@ from pathlib import Path
 import polars as pl
 
 from ..documents import toml_key, toml_string, toml_strings
-from ..pose import Pose, pose_table
+from ..kinematics import Pose, pose_table
 from ..recording import ImuSensor, Recording, axes_from_mount
 from .result import write_table
 

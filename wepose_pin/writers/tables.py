@@ -9,7 +9,7 @@ import polars as pl
 from ..angles import angle_table, joint_angles
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..pose import pose_table
+from ..kinematics import pose_table
 from .motion import Motion
 from .result import write_table
 

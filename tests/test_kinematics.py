@@ -11,9 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadModel
-from wepose_pin.model import POINTS, BodyModel, chains, load_model
-from wepose_pin.model.orientation_ik import OrientationIk
-from wepose_pin.pose import (
+from wepose_pin.kinematics import (
     LiveKinematics,
     compute_pose,
     configuration,
@@ -23,6 +21,8 @@ from wepose_pin.pose import (
     orientation_residuals,
     placements,
 )
+from wepose_pin.model import POINTS, BodyModel, chains, load_model
+from wepose_pin.model.orientation_ik import OrientationIk
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track
 
