@@ -471,18 +471,19 @@ def test_a_measured_orientation_that_is_lost_for_long_is_the_same_in_chunks(tmp_
             np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in pieces]), getattr(whole, name))
 
 
+@pytest.mark.parametrize("options", [[], ["--causal"]])
 def test_a_start_pose_that_was_guessed_says_so(
-    made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = written(tmp_path / "in", made.recording("guessed"))
     text = (path / "session.toml").read_text()
     mount, phases = text.index("mount = {"), text.index("[phases]")
     wrong = text[:mount] + 'mount = { up = "+y", forward = "+x" }' + text[text.index("}", mount) + 1 :]
     (path / "session.toml").write_text(wrong)
-    line = refused(["track", str(path), "-o", str(tmp_path / "out")], capsys)
+    line = refused(["track", str(path), "-o", str(tmp_path / "out"), *options], capsys)
     assert "guessed" not in line
     (path / "session.toml").write_text(wrong[:phases] + wrong[wrong.index("[sensors") :])
-    line = refused(["track", str(path), "-o", str(tmp_path / "out")], capsys)
+    line = refused(["track", str(path), "-o", str(tmp_path / "out"), *options], capsys)
     assert "guessed" in line
     assert "[phases] start = [[from, to]]" in line
 

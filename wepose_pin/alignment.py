@@ -137,7 +137,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
         A mount that gravity contradicts.
     """
     start, diagnostics = filtered.start, list(filtered.diagnostics)
-    guessed = not recording.phases.get("start")
+    guessed = recording.start_is_guessed or not recording.phases.get("start")
     facts = {"variant": "guessed"} if guessed else {}
     mount, turn, heading = {}, {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]

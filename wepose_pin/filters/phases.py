@@ -35,6 +35,8 @@ def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[f
         start = recording.phases["start"][0]
         if len(recording.phases["start"]) > 1:
             diagnostics.append(_ignored_intervals("start", start))
+        if recording.start_is_guessed:
+            diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
     elif recording.phases.get("static"):
         raise BadPhase(
             f"{recording.where()}: phases.static without phases.start; name the seconds of the start pose, "
@@ -116,7 +118,7 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
         R = Rotation.from_quat(rotations.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
     rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
     turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
-    guessed = phase not in recording.phases or not recording.phases[phase]
+    guessed = not recording.phases.get(phase) or (phase == "start" and recording.start_is_guessed)
     place = "the guessed start pose" if guessed else f"phases.{phase}"
     if rms > MOVES_DEG_S or turn > MOVES_DEG:
         raise BadPhase(

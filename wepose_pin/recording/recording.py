@@ -35,6 +35,7 @@ class Recording:
     sensors : one a segment
     phases : name → intervals [s] on `time`; `start` is the start pose, `static` sensors on a table
     remounted : the sensors were strapped on anew since the subject's calibration: its mounts do not hold here
+    start_is_guessed : phases.start is not the user's: it was found in the motion
     source : the file it was read from, for messages
     truth : file with the reference, where there is one
     resets : samples before which headings were set anew, live: the person stood in the start pose
@@ -49,6 +50,7 @@ class Recording:
     phases: Mapping[str, Intervals] = field(default_factory=dict)
     start_pose: str = "n_pose"
     remounted: bool = False
+    start_is_guessed: bool = False
     source: Path | None = None
     truth: Path | None = None
     resets: tuple[int, ...] = ()

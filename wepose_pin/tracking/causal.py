@@ -132,9 +132,8 @@ class CausalEstimator:
                 return chunk
             interval = float(so_far.time[self._guide.begin]), float(so_far.time[self._guide.end])
             last = self._guide.end + 1
-        self._follower = SegmentFollower(
-            cut_start_pose(so_far, interval), self._subject, method=self._method, static_test=self._static_test
-        )
+        start_pose = replace(cut_start_pose(so_far, interval), start_is_guessed=not so_far.phases.get("start"))
+        self._follower = SegmentFollower(start_pose, self._subject, method=self._method, static_test=self._static_test)
         return so_far.cut(slice(last, len(so_far)))
 
 
