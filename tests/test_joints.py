@@ -14,6 +14,7 @@ from wepose_pin import rotations
 from wepose_pin.alignment import compute_heading
 from wepose_pin.calibration import calibrate_lengths, lengths
 from wepose_pin.calibration.joints import (
+    MAX_STD,
     SYSTEMATIC_STD,
     Coupling,
     _estimate_heading,
@@ -71,6 +72,23 @@ def test_too_little_motion_rate_or_time_tells_nothing(exact: tuple[Simulation, R
     }
     R_VS = {name: Rotation.concatenate([R[0]] * len(recording)) for name, R in found.R_VS.items()}
     assert estimate_couplings(replace(recording, sensors=still), found._replace(R_VS=R_VS), NAMES, clasp) == []
+
+
+@pytest.mark.parametrize(("moving", "trusted"), [(1.0, True), (0.01, False)])
+def test_a_heading_half_a_turn_away_that_explains_as_much_makes_it_uncertain(moving: float, trusted: bool) -> None:
+    """Two sensors at one joint whose small accelerations are lost in what tissue shakes: many headings fit as well."""
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        joint = moving * rng.normal(size=(600, 3))
+        turned = Rotation.from_rotvec([0.0, 0.0, 0.4]).apply(joint)
+        levers = rng.normal(scale=0.01, size=(2, 600, 3, 3))
+        shaken = rng.normal(scale=0.05, size=(2, 600, 3))
+        near = np.concatenate([(joint + shaken[0])[:, :, None], levers[0]], axis=2)
+        far = np.concatenate([(turned + shaken[1])[:, :, None], levers[1]], axis=2)
+        heading, std = _estimate_heading(near, far)
+        off = abs(float(np.angle(np.exp(1j * (heading - 0.4)))))
+        assert off < 3.0 * std
+        assert (std < MAX_STD) == trusted
 
 
 def test_samples_that_are_missing_are_bridged(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:

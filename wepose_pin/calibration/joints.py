@@ -41,6 +41,7 @@ LEAST_RATE_HZ, LEAST_S = 20.0, 20.0  # of recordings that are used
 LEAST_LEVER = 1e-6  # [1/s⁴], keeps unobserved levers finite
 LEAST_MISMATCH = 0.005  # [m/s²] below which no two sensors agree
 STARTS, ROUNDS = 24, 20
+DISTANT = np.deg2rad(30.0)  # [rad] from the best heading, from where on others count as other explanations
 # What lasts in the error: tissue that changes the lever as it goes, clocks a millisecond apart. On simulated people it
 # is 1.1 deg at elbows and 1.6 at shoulders, where the residual alone gives half of it.
 SYSTEMATIC_STD = np.deg2rad(1.5)
@@ -128,7 +129,8 @@ def _interpolate_missing(values: np.ndarray) -> np.ndarray:
 def _estimate_heading(near: np.ndarray, far: np.ndarray) -> tuple[float, float]:
     """The rotation [rad] about z from the near sensor's world to the far one's, and its standard deviation."""
     starts = np.linspace(0.0, 2.0 * np.pi, STARTS, endpoint=False)
-    heading = float(starts[int(np.argmin([np.sum(_mismatch(near, far, angle)[0] ** 2) for angle in starts]))])
+    costs = np.array([np.sum(_mismatch(near, far, angle)[0] ** 2) for angle in starts])
+    heading = float(starts[int(np.argmin(costs))])
     for _ in range(ROUNDS):
         r, J = _mismatch(near, far, heading)
         step = -float(J @ r) / max(float(J @ J), 1e-12)
@@ -137,7 +139,13 @@ def _estimate_heading(near: np.ndarray, far: np.ndarray) -> tuple[float, float]:
             break
     r, J = _mismatch(near, far, heading)
     variance = max(float(np.mean(r**2)), LEAST_MISMATCH**2) * LEAST_CORRELATION_S * SAMPLES_HZ
-    return heading, float(np.sqrt(variance / max(float(J @ J), 1e-12)))
+    std = float(np.sqrt(variance / max(float(J @ J), 1e-12)))
+    # Where little moves, a heading half a turn away explains it nearly as well: the whole circle's variance counts.
+    off = np.angle(np.exp(1j * (starts - heading)))
+    distant = np.abs(off) > DISTANT
+    mass = np.exp(-0.5 * np.maximum(costs[distant] - float(r @ r), 0.0) / variance) * (2.0 * np.pi / STARTS)
+    total = np.sqrt(2.0 * np.pi) * std + mass.sum()
+    return heading, float(np.sqrt(((total - mass.sum()) * std**2 + mass @ off[distant] ** 2) / total))
 
 
 def _mismatch(near: np.ndarray, far: np.ndarray, heading: float) -> tuple[np.ndarray, np.ndarray]:
