@@ -13,7 +13,7 @@ from wepose_pin import rotations
 from wepose_pin.errors import MissingFile
 from wepose_pin.evaluation import attitude_error
 from wepose_pin.filters import METHODS, run_filter
-from wepose_pin.filters.noise import noise_of
+from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.readers.trials import read_authors_trial, read_broad
 
 from .filters import STANDARD_GRAVITY, Sample, imufusion_filter, simulated_trial
@@ -35,7 +35,7 @@ def simulated_accuracy(trials: int) -> Table:
     for seed in range(trials):
         trial = simulated_trial(seed, 100.0)
         static = (trial.time >= 0.5) & (trial.time <= 4.5)
-        noise = noise_of(trial.gyro_S[static], trial.accel_S[static], trial.rate_hz)
+        noise = estimate_noise(trial.gyro_S[static], trial.accel_S[static], trial.rate_hz)
         scored = (trial.time >= trial.moving[0]) & (trial.time <= trial.moving[1])
         truths.append(Truth(Sample(trial.gyro_S, trial.accel_S, trial.rate_hz, noise), trial.quat_WS, static, scored))
     return _accuracy(f"Accuracy: {len(truths)} simulated trials of the paper's dynamic experiment, 100 Hz", truths)
@@ -68,7 +68,7 @@ def recorded_accuracy(paths: Mapping[str, list[Path]]) -> Table:
             static[trial.static] = True
             if name != "BROAD":  # Vicon's world begins after the static phase
                 static = np.arange(len(gyro)) == int(np.argmax(trial.scored))
-            noise = noise_of(gyro[trial.static], accel[trial.static], trial.rate_hz)
+            noise = estimate_noise(gyro[trial.static], accel[trial.static], trial.rate_hz)
             data = Sample(np.ascontiguousarray(gyro), np.ascontiguousarray(accel), trial.rate_hz, noise)
             truths.append(Truth(data, trial.quat_true, static, trial.scored))
     what = " and ".join(f"{len(files)} of {name}" if name == "BROAD" else name for name, files in paths.items())

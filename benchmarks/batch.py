@@ -25,7 +25,7 @@ from wepose_pin.batch.cluster import TASK_S, connect
 from wepose_pin.batch.storage import lock_folder, write_bytes
 from wepose_pin.errors import ExistingOutput, NoSolution
 from wepose_pin.jobs.batch import BatchJob
-from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
 from wepose_pin.writers.provenance import code
 
@@ -141,7 +141,7 @@ def _data(folder: Path, sessions: int) -> float:
 
 
 def _session(folder: str, seed: int) -> None:
-    made = simulate(simulated_person(seed).lengths, seed=seed, clasp_s=CLASP_S, circles=CIRCLES)
+    made = simulate(simulate_person(seed).lengths, seed=seed, clasp_s=CLASP_S, circles=CIRCLES)
     partial = Path(folder) / "partial" / f"{seed:04d}"
     partial.mkdir(parents=True, exist_ok=True)
     write_session(partial, made.recording(f"simulated-{seed}"), made.truth())

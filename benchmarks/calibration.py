@@ -24,7 +24,7 @@ from wepose_pin.calibration.protocols import load_protocol
 from wepose_pin.calibration.weights import solve_reweighted
 from wepose_pin.filters.sensors import filter_recording
 from wepose_pin.recording import Recording
-from wepose_pin.simulation import REALISTIC, Person, simulate, simulated_person
+from wepose_pin.simulation import MILD_PRESET, Person, simulate, simulate_person
 
 from .tables import Column, Section, Table, time_in_turn
 
@@ -49,8 +49,8 @@ def sections(quick: bool) -> dict[str, Section]:
 
 def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Table:
     """The solve of a hands-together calibration beside SciPy's, at each rate of samples."""
-    person = simulated_person(3)
-    made = simulate(person.lengths, seed=3, imperfections=REALISTIC, clasp_s=clasp_s, circles=0)
+    person = simulate_person(3)
+    made = simulate(person.lengths, seed=3, imperfections=MILD_PRESET, clasp_s=clasp_s, circles=0)
     table = Table(
         f"Calibration: {clasp_s:g} s of joined hands, one least squares from one start",
         (

@@ -23,10 +23,10 @@ import numpy as np
 from wepose_pin import rotations
 from wepose_pin.filters import METHODS, OFFLINE, Smekf, run_filter
 from wepose_pin.filters.bank import LiveBank
-from wepose_pin.filters.base import in_parallel, processors
-from wepose_pin.filters.noise import SensorNoise, noise_of
+from wepose_pin.filters.base import count_processors, run_in_parallel
+from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
-from wepose_pin.simulation import paper_dynamic
+from wepose_pin.simulation import simulate_paper_dynamic
 
 from .tables import Column, Section, Table, is_installed, time_in_turn
 
@@ -86,7 +86,7 @@ def sections(effort: Effort = FULL, data: Path | None = None) -> dict[str, Secti
     return found
 
 
-simulated_trial = lru_cache(paper_dynamic)
+simulated_trial = lru_cache(simulate_paper_dynamic)
 
 
 def repeated_trial(seconds: float, rate_hz: float = 100.0, seed: int = 1) -> Sample:
@@ -94,7 +94,7 @@ def repeated_trial(seconds: float, rate_hz: float = 100.0, seed: int = 1) -> Sam
     trial = simulated_trial(seed, rate_hz)
     n = round(seconds * rate_hz)
     rest = slice(round(0.5 * rate_hz), round(4.5 * rate_hz))
-    noise = noise_of(trial.gyro_S[rest], trial.accel_S[rest], rate_hz)
+    noise = estimate_noise(trial.gyro_S[rest], trial.accel_S[rest], rate_hz)
     gyro, accel = (np.resize(signal, (n, 3)) for signal in (trial.gyro_S, trial.accel_S))
     return Sample(gyro, accel, rate_hz, noise)
 
@@ -295,13 +295,13 @@ def sensors(effort: Effort) -> Table:
             Column("ns", "a sample [ns]"),
             Column("speedup", "× one thread", 2),
         ),
-        notes=[f"{processors()} processors."],
+        notes=[f"{count_processors()} processors."],
     )
     for count in effort.counts:
         columns = list(zip(*[(*data, "smekf")] * count, strict=True))
         cases = {
-            "one": partial(in_parallel, run_filter, *columns, threads=1),
-            "all": partial(in_parallel, run_filter, *columns),
+            "one": partial(run_in_parallel, run_filter, *columns, threads=1),
+            "all": partial(run_in_parallel, run_filter, *columns),
         }
         timing = time_in_turn(cases, effort.rounds, "one", time.perf_counter)["all"]
         row = {"seconds": timing.median, "ns": 1e9 * timing.median / n / count, "speedup": 1.0 / timing.ratio}
@@ -315,12 +315,12 @@ begin = time.perf_counter()
 import numpy as np
 from wepose_pin.filters import METHODS, OFFLINE, Smekf, run_filter
 from wepose_pin.filters.bank import LiveBank
-from wepose_pin.filters.noise import noise_of
+from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.filters.static import StaticDetector
 rng = np.random.default_rng(0)
 gyro = rng.normal(scale=1e-3, size=(1000, 3))
 accel = rng.normal(scale=1e-2, size=(1000, 3)) + [0.0, 0.0, 9.81]
-noise = noise_of(gyro, accel, 100.0)
+noise = estimate_noise(gyro, accel, 100.0)
 print("imports", time.perf_counter() - begin)
 for name in METHODS:
     begin = time.perf_counter()

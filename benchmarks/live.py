@@ -19,7 +19,7 @@ import numpy as np
 from wepose_pin.live import Output, SensorSetup, Status, run_session
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.recording import Recording
-from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.simulation import simulate, simulate_person
 
 from .tables import Column, Section, Table
 
@@ -103,7 +103,7 @@ def live_session(seconds: float) -> Table:
 
 def _recording(seconds: float) -> Recording:
     """A person who stands, then moves; the motion is repeated until it is `seconds` long."""
-    person = simulated_person(1)
+    person = simulate_person(1)
     made = simulate(person.lengths, seed=1, rate_hz=RATE_HZ, clasp_s=MOTION_S, circles=0).recording("live")
     start, n = made.span(made.phases["start"][0]).stop, round(seconds * RATE_HZ)
     rows = np.concatenate([np.arange(start), start + np.arange(n) % (len(made) - start)])

@@ -19,7 +19,7 @@ from wepose_pin.calibration import calibrate_lengths
 from wepose_pin.errors import NoSolution
 from wepose_pin.model import load_model
 from wepose_pin.recording import Recording, Sensor
-from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.tracking import CHUNK_S, SMOOTHER_CHUNK_S
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import write_subject
@@ -79,7 +79,7 @@ def long_recordings(hours: tuple[float, ...]) -> Table:
 
 def _write(folder: Path, hours: float) -> None:
     """A person who stands, joins hands, draws circles and does it all backwards, again and again; calibrated."""
-    person = simulated_person(1)
+    person = simulate_person(1)
     made = simulate(person.lengths, seed=1)
     recording = made.recording("day")
     found = calibrate_lengths(recording, measured=person.measured, prior=person.prior, measured_std=person.measured_std)

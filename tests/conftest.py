@@ -26,7 +26,7 @@ _STATE = hashlib.sha256(
 ).hexdigest()
 os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"wepose-pin-numba-{_STATE[:16]}")
 
-from wepose_pin.simulation import Person, Simulation, simulate, simulated_person  # noqa: E402
+from wepose_pin.simulation import Person, Simulation, simulate, simulate_person  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("WEPOSE_DATA") or ROOT.parent / "shared" / "data")
@@ -43,7 +43,7 @@ def data() -> Path:
 
 @pytest.fixture(scope="session")
 def person() -> Person:
-    return simulated_person(3)
+    return simulate_person(3)
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import pytest
 
 from wepose_pin.batch import Item
 from wepose_pin.batch.plan import step_options
-from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
 
 QUICK = {"track": {**step_options("track"), "view": False, "report": False}, "evaluate": {"interval": None}}
@@ -29,7 +29,7 @@ def three_sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three short sessions, one/ to three/."""
     folder = tmp_path_factory.mktemp("recorded")
     for seed, name in enumerate(("one", "two", "three"), 1):
-        made_up = simulate(simulated_person(seed).lengths, seed=seed, clasp_s=8.0, circles=0)
+        made_up = simulate(simulate_person(seed).lengths, seed=seed, clasp_s=8.0, circles=0)
         (folder / name).mkdir()
         write_session(folder / name, made_up.recording(name), made_up.truth())
     return folder

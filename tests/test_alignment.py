@@ -18,30 +18,30 @@ from wepose_pin.recording import (
     ImuSensor,
     OrientationSensor,
     Recording,
-    axes_from_mount,
-    mount_from_axes,
+    compute_mount,
+    find_mount_axes,
 )
-from wepose_pin.simulation import Simulation, paper_dynamic
+from wepose_pin.simulation import Simulation, simulate_paper_dynamic
 from wepose_pin.subject import StartPoseOffset, Subject, mount_rows, population_subject
 from wepose_pin.tracking.segments import estimate_segments
 
 
 @pytest.mark.parametrize(("up", "forward"), [("+x", "-z"), ("-y", "+x"), ("+z", "+x"), ("-z", "-y")])
 def test_stated_axes_are_what_they_say(up: str, forward: str) -> None:
-    R_LS = Rotation.from_quat(mount_from_axes(up, forward)).as_matrix()
+    R_LS = Rotation.from_quat(compute_mount(up, forward)).as_matrix()
     axis = {"x": 0, "y": 1, "z": 2}
     for name, segment_axis in ((up, [0, 0, 1]), (forward, [1, 0, 0])):
         in_sensor = np.eye(3)[axis[name[1]]] * (1 if name[0] == "+" else -1)
         np.testing.assert_allclose(R_LS @ in_sensor, segment_axis, atol=1e-15)
     assert np.linalg.det(R_LS) == pytest.approx(1.0)
-    assert axes_from_mount(mount_from_axes(up, forward)) == (up, forward)
+    assert find_mount_axes(compute_mount(up, forward)) == (up, forward)
 
 
 def test_any_mount_has_two_different_nearest_axes() -> None:
     """Turned by 45 degrees, one axis is nearest to both: that pair would be no mount."""
     for R in [Rotation.from_euler("y", 45.0, degrees=True), *Rotation.random(200, np.random.default_rng(0))]:
-        up, forward = axes_from_mount(R.as_quat())
-        nearest = Rotation.from_quat(mount_from_axes(up, forward))
+        up, forward = find_mount_axes(R.as_quat())
+        nearest = Rotation.from_quat(compute_mount(up, forward))
         assert np.degrees((R * nearest.inv()).magnitude()) < 64.0  # no rotation is further from all 24
 
 
@@ -51,7 +51,7 @@ def test_a_mount_tilted_from_its_stated_axes_is_found_by_gravity(simulation: Sim
         off = Rotation.from_quat(true).inv() * Rotation.from_quat(segments.quat_LS[name])
         # What is left is the accelerometer's bias: 3 mg on each axis.
         assert np.degrees(off.magnitude()) < 0.8
-        stated = Rotation.from_quat(true).inv() * Rotation.from_quat(mount_from_axes(*simulation.stated_mount[name]))
+        stated = Rotation.from_quat(true).inv() * Rotation.from_quat(compute_mount(*simulation.stated_mount[name]))
         assert np.degrees(stated.magnitude()) > 1.5
         early = simulation.time < 30.0
         error = Rotation.from_quat(segments.quat_WL[name]) * Rotation.from_quat(simulation.quat_WL[name]).inv()
@@ -84,7 +84,7 @@ def test_calibrated_mounts_give_headings_of_any_size() -> None:
 
 def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
     """A person stands with the arm 5 deg bent: a sure mount sees it, a vague one takes it for its own error."""
-    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     bent = Rotation.from_rotvec([0.0, -np.deg2rad(5.0), 0.0])
     recording, true = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * mount})
     # Sensor orientation = bent pose times true mount: `true` of the helper is the segment, straight at the start.
@@ -105,7 +105,7 @@ def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
 
 def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
     """A mount whose tilt and heading err together is corrected in both, and the person still faces ahead."""
-    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     bent = Rotation.from_rotvec([0.0, -np.deg2rad(5.0), 0.0])
     recording, _ = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * mount})
     known = np.deg2rad(4.0) ** 2 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.9], [0.0, 0.9, 1.0]])
@@ -124,7 +124,7 @@ def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
 
 
 def test_a_calibrated_mount_that_has_moved_is_said() -> None:
-    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     moved = Rotation.from_rotvec([0.0, np.deg2rad(20.0), 0.0])
     recording, _ = ready_recording({"torso": 0.0}, {"torso": moved * mount})
     subject = replace(
@@ -146,7 +146,7 @@ def test_a_calibrated_mount_that_has_moved_is_said() -> None:
 
 def test_a_person_stands_as_in_the_calibration() -> None:
     """Leaning by 20 deg in both start poses is no mount that moved; by 20 deg in one of them is."""
-    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     lean = np.array([0.0, np.deg2rad(20.0)])
     subject = replace(
         population_subject(),
@@ -163,7 +163,7 @@ def test_a_person_stands_as_in_the_calibration() -> None:
 
 
 def test_a_calibrated_mount_that_cannot_be_names_the_strapping() -> None:
-    mount = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     over = Rotation.from_rotvec([0.0, np.pi, 0.0])
     recording, _ = ready_recording({"torso": 0.0}, {"torso": over * mount})
     subject = replace(population_subject(), mounts={"torso": mount.as_quat()})
@@ -173,7 +173,7 @@ def test_a_calibrated_mount_that_cannot_be_names_the_strapping() -> None:
 
 def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
     headings = {"torso": 0.2, "left_upper_arm": -0.1}
-    stated = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    stated = Rotation.from_quat(compute_mount("+x", "-z"))
     recording, _ = ready_recording(headings, dict.fromkeys(headings, stated))
     sensors = {name: replace(s, stated_quat_LS=stated.as_quat()) for name, s in recording.sensors.items()}
     wrong = (Rotation.from_rotvec([0, 0, 1.0]) * stated).as_quat()
@@ -208,7 +208,7 @@ def test_heading_is_the_nearest_turn() -> None:
 
 def test_a_mount_that_contradicts_gravity_and_one_that_is_missing(simulation: Simulation) -> None:
     recording = simulation.recording()
-    wrong = replace(recording.sensors["torso"], stated_quat_LS=mount_from_axes("-x", "+z"))
+    wrong = replace(recording.sensors["torso"], stated_quat_LS=compute_mount("-x", "+z"))
     with pytest.raises(BadSession, match=r"sensors\.torso\.mount is \d+ deg off gravity"):
         estimate_segments(replace(recording, sensors={**recording.sensors, "torso": wrong}))
     without = replace(recording.sensors["torso"], stated_quat_LS=None)
@@ -230,7 +230,7 @@ def test_what_is_bridged_is_uncertain(method: str) -> None:
     """Half a second of the motion is lost and bridged: the orientation is off, and its covariance says so."""
     nees = []
     for seed in range(4):
-        sensor = paper_dynamic(seed, 100.0)
+        sensor = simulate_paper_dynamic(seed, 100.0)
         lost = np.zeros(len(sensor.time), dtype=bool)
         lost[2000:2050] = True
         gyro, accel = sensor.gyro_S.copy(), sensor.accel_S.copy()

@@ -18,10 +18,10 @@ from wepose_pin.evaluation import attitude_error, uncertainty
 from wepose_pin.filters import TYPICAL, Amekf, AmekfParams, FilterRun, Smoother, estimate_orientation, run_filter
 from wepose_pin.filters.amekf import BLOCK, ERROR, STATES, transition_rows
 from wepose_pin.filters.bank import LiveBank
-from wepose_pin.filters.noise import SensorNoise, noise_of
+from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector
 from wepose_pin.readers.trials import read_authors_trial, read_broad
-from wepose_pin.simulation import PERFECT_WORLD, REALISTIC, paper_dynamic
+from wepose_pin.simulation import IDEAL_PRESET, MILD_PRESET, simulate_paper_dynamic
 
 RATE = 100.0
 GRAVITY = 9.81
@@ -42,13 +42,13 @@ class Case(NamedTuple):
 
 @lru_cache
 def case(seed: int, realistic: bool = False) -> Case:
-    sensor = paper_dynamic(seed, RATE, imperfections=REALISTIC if realistic else PERFECT_WORLD)
+    sensor = simulate_paper_dynamic(seed, RATE, imperfections=MILD_PRESET if realistic else IDEAL_PRESET)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
     return as_case(sensor.gyro_S, sensor.accel_S, sensor.quat_WS, moving)
 
 
 def as_case(gyro: np.ndarray, accel: np.ndarray, true: np.ndarray, moving: np.ndarray) -> Case:
-    noise = noise_of(gyro[50:450], accel[50:450], RATE)
+    noise = estimate_noise(gyro[50:450], accel[50:450], RATE)
     static = StaticDetector(noise, RATE).run(gyro, accel)
     return Case(gyro, accel, static, true, noise, rotations.quat_from_gravity(accel[:50].mean(axis=0)), moving)
 
@@ -58,7 +58,7 @@ def drawn(seed: int) -> Case:
     """A trial whose sensor is drawn from what `AmekfParams` says of sensors: matrix, biases and noise in motion."""
     p = AmekfParams()
     rng = np.random.default_rng([seed, 5])
-    sensor = paper_dynamic(seed, RATE)
+    sensor = simulate_paper_dynamic(seed, RATE)
     R_WS = Rotation.from_quat(sensor.quat_WS)
     rate = np.vstack([np.zeros(3), (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * RATE])
     n = len(rate)
@@ -408,7 +408,7 @@ def test_a_person_who_sways_at_rest_does_not_pass_for_bias() -> None:
     sway = np.deg2rad(0.14) * np.sin(2.0 * np.pi * 0.4 * time[:, None] + [0.3, 1.7, 4.0])
     gyro = bias + sway + np.deg2rad(0.05) * rng.normal(size=(500, 3))
     accel = [0.0, 0.0, 9.81] + 0.02 * rng.normal(size=(500, 3))
-    noise = noise_of(gyro[:400], accel[:400], RATE)
+    noise = estimate_noise(gyro[:400], accel[:400], RATE)
     start = np.array([0.0, 0.0, 0.0, 1.0])
     found = Amekf(noise, RATE, start).run(gyro, accel, np.ones(500, dtype=bool))
     off = np.degrees(np.abs(found.gyro_bias[400:] - bias)).max()
@@ -474,7 +474,7 @@ def test_broad_against_vqf(data: Path) -> None:
     shares: dict[str, list[tuple[float, float]]] = {"amekf": [], "smoother": []}
     for path in paths:
         trial = read_broad(path)
-        noise = noise_of(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
+        noise = estimate_noise(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
         seen = np.isfinite(trial.quat_true).all(axis=1)
         rest = np.flatnonzero(seen[trial.static]) + trial.static.start
         scored = np.flatnonzero(trial.scored)[::3]

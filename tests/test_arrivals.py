@@ -24,7 +24,7 @@ from wepose_pin.recording.arrivals import (
     Arrivals,
     Samples,
     Ticks,
-    arrivals,
+    order_arrivals,
 )
 
 NAMES = ("torso", "left_upper_arm", "left_forearm")
@@ -42,7 +42,7 @@ def fed(aligner: Aligner, came: Iterable[tuple[int, float, np.ndarray, np.ndarra
     """All ticks of single samples (sensor, time, gyro, accel) that come one by one."""
     made = [
         aligner.push(
-            arrivals([Samples(aligner.sensors[i], np.array([t]), g[None], a[None])], aligner.sensors),
+            order_arrivals([Samples(aligner.sensors[i], np.array([t]), g[None], a[None])], aligner.sensors),
         )
         for i, t, g, a in came
     ]
@@ -98,7 +98,7 @@ def test_what_one_read_gives_is_taken_by_time_and_not_by_sensor() -> None:
     times = BEGIN + np.arange(200) / RATE
     aligner = Aligner(NAMES, RATE, BEGIN)
     got = [Samples(name, times, gyro[i], accel[i]) for i, name in enumerate(NAMES)]
-    ticks = aligner.push(arrivals(got, NAMES))
+    ticks = aligner.push(order_arrivals(got, NAMES))
     assert np.array_equal(ticks.gyro_S, gyro.swapaxes(0, 1))
 
 
@@ -280,7 +280,7 @@ def test_ticks_wait_for_a_silent_sensor_once_and_not_again() -> None:
     for i, t, g, a in in_order(gyro, accel):
         if i == 1 and 100 <= round((t - BEGIN) * RATE) < 300:
             continue
-        aligner.push(arrivals([Samples(NAMES[i], np.array([t]), g[None], a[None])], NAMES))
+        aligner.push(order_arrivals([Samples(NAMES[i], np.array([t]), g[None], a[None])], NAMES))
         if i == 2:
             behind.append(round((t - BEGIN) * RATE) + 1 - aligner.next_tick)
     wait = round(WAIT_S * RATE)
@@ -335,7 +335,7 @@ def test_random_arrivals_never_stop_the_ticks() -> None:
         t = float(rng.choice([np.nan, np.inf, -1e9, 1e9, rng.normal(0.0, 1e3)])) if wild else tick_time(k // 3)
         values = rng.standard_normal((2, 3)) * (1e6 if rng.random() < 0.05 else 1.0)
         name = NAMES[int(rng.integers(3))]
-        made += len(aligner.push(arrivals([Samples(name, np.array([t]), values[:1], values[1:])], NAMES)).time)
+        made += len(aligner.push(order_arrivals([Samples(name, np.array([t]), values[:1], values[1:])], NAMES)).time)
     assert made > 900
 
 
@@ -344,7 +344,7 @@ def test_after_a_long_silence_ticks_come_in_pieces() -> None:
     zero = np.zeros((1, 3))
 
     def at(t: float) -> Arrivals:
-        return arrivals([Samples(name, np.array([t]), zero, zero) for name in NAMES], NAMES)
+        return order_arrivals([Samples(name, np.array([t]), zero, zero) for name in NAMES], NAMES)
 
     whole, parts = (Aligner(NAMES, RATE, BEGIN) for _ in range(2))
     made = []

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin import rotations
 from wepose_pin.filters import GdcParams, Smekf, run_filter
-from wepose_pin.filters.noise import noise_of
+from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.readers.trials import read_broad
 
@@ -26,7 +26,7 @@ def errors_deg(path: Path) -> dict[str, tuple[float, float, float]]:
     """Row → (inclination, heading, total) RMSE [deg] of one trial."""
     trial = read_broad(path)
     gyro, accel, rate_hz = trial.gyro_S, trial.accel_S, trial.rate_hz
-    noise = noise_of(gyro[trial.static], accel[trial.static], rate_hz)
+    noise = estimate_noise(gyro[trial.static], accel[trial.static], rate_hz)
     seen = np.isfinite(trial.quat_true).all(axis=1)
     true = Rotation.from_quat(np.where(seen[:, None], trial.quat_true, [0, 0, 0, 1]))
     resting = np.zeros(len(seen), dtype=bool)

@@ -15,7 +15,7 @@ from wepose_pin.calibration.chain import ARMS, rotate
 from wepose_pin.calibration.quality import assess
 from wepose_pin.errors import BadOption, BadPhase, BadSession
 from wepose_pin.recording import OrientationSensor, Recording
-from wepose_pin.simulation import PERFECT, PERFECT_WORLD, Person, Simulation, simulate, simulated_person
+from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.simulation.motion import Motion, Wander
 from wepose_pin.subject import LENGTHS, mount_rows, population_subject
 
@@ -32,8 +32,8 @@ def ready(simulation: Simulation) -> Recording:
 
 @pytest.fixture(scope="module")
 def exact() -> tuple[Person, Recording]:
-    person = simulated_person(11)
-    return person, ready(simulate(person.lengths, seed=11, noise=PERFECT, clasp_s=30.0, circles=0))
+    person = simulate_person(11)
+    return person, ready(simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=30.0, circles=0))
 
 
 def test_rotate_in_casadi_is_scipys() -> None:
@@ -65,9 +65,9 @@ def test_a_known_mount_is_known_better_after_and_a_new_strapping_not(exact: tupl
 
 def test_mounts_at_any_rotation_come_from_the_closure_alone() -> None:
     """Exact motion, no noise: headings drawn from the full circle come back without a guess."""
-    person = simulated_person(3)
+    person = simulate_person(3)
     simulation = simulate(
-        person.lengths, seed=3, noise=PERFECT, imperfections=replace(PERFECT_WORLD, mount="any"), circles=0
+        person.lengths, seed=3, noise=NOISE_FREE, imperfections=replace(IDEAL_PRESET, mount="any"), circles=0
     )
     recording = simulation.recording()
     assert all(sensor.stated_quat_LS is None for sensor in recording.sensors.values())
@@ -168,7 +168,7 @@ def test_the_standard_deviations_are_honest() -> None:
     """MTi-3 noise, real filtering, a measured shoulder width: errors over their standard deviations, 12 people."""
     z, chi2 = [], []
     for seed in range(12):
-        person = simulated_person(100 + seed)
+        person = simulate_person(100 + seed)
         simulation = simulate(person.lengths, seed=seed, circles=0)
         subject = calibrate(
             simulation.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std
@@ -243,9 +243,9 @@ def test_hands_that_hardly_move_leave_the_headings_open(
     monkeypatch.setattr(Motion, "_clasp_point", lambda self, t, moving: point(self, t, scale * moving))
     monkeypatch.setattr(Motion, "lean_deg", scale * Motion.lean_deg)
     monkeypatch.setattr(Wander, "__call__", lambda self, t: scale * wander(self, t))
-    person = simulated_person(seed)
+    person = simulate_person(seed)
     made = simulate(
-        person.lengths, seed=seed, clasp_s=30.0, circles=0, imperfections=replace(PERFECT_WORLD, mount="any")
+        person.lengths, seed=seed, clasp_s=30.0, circles=0, imperfections=replace(IDEAL_PRESET, mount="any")
     )
     found = calibrate_lengths(made.recording(), measured=person.measured, prior=person.prior)
     for name, quat in found.subject.mounts.items():

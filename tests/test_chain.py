@@ -16,9 +16,9 @@ from wepose_pin.cli import main
 from wepose_pin.errors import BadModel, BadOption, BadSession, WeposeError
 from wepose_pin.model.robot import joint_values, load_robot, start_configuration
 from wepose_pin.readers import load_session
-from wepose_pin.readers.describe import describe
+from wepose_pin.readers.describe import describe_file
 from wepose_pin.readers.trials import find_ur5, read_ur5
-from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, mount_from_axes
+from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.tracking import track, track_chain
 from wepose_pin.validation.real import UNSCORED_S, UR5_OFF
 from wepose_pin.writers import write_session
@@ -78,7 +78,7 @@ def made(model: pin.Model, links: list[str], seconds: float = 30.0) -> tuple[Rec
     sensors = {}
     for link in links:
         R_WL = turned(model, q, link)
-        mount = mount_from_axes("-y", "-x")  # S to a frame that equals W at the start
+        mount = compute_mount("-y", "-x")  # S to a frame that equals W at the start
         R_WS = R_WL * R_WL[0].inv() * Rotation.from_quat(mount)
         gyro = np.zeros((len(t), 3))
         gyro[1:] = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * RATE
@@ -215,7 +215,7 @@ def test_the_command_writes_joints_orientations_and_torques(
             main(words)
         assert end.value.code == 2
         assert "of a chain, its motion is in joints.parquet; a person's result" in capsys.readouterr().err
-    said = describe(out)
+    said = describe_file(out)
     assert "of a chain, sensors on: wrist_1_link, forearm_link" in said.facts
     assert not any("wepose view" in fact for fact in said.facts)
 

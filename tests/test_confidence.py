@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.cli import main
 from wepose_pin.kinematics import axis_std, compute_pose, point_covariance, pose_table
 from wepose_pin.model import load_model
-from wepose_pin.simulation import REALISTIC, simulate, simulated_person
+from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
 from wepose_pin.subject import LENGTHS, population_subject
 from wepose_pin.tracking import track
 
@@ -69,8 +69,8 @@ def test_the_whole_chain_is_honest() -> None:
 
     hand, segments = [], []
     for seed in range(5):
-        person = simulated_person(200 + seed)
-        simulation = simulate(person.lengths, seed=seed, imperfections=REALISTIC)
+        person = simulate_person(200 + seed)
+        simulation = simulate(person.lengths, seed=seed, imperfections=MILD_PRESET)
         recording = simulation.recording()
         pose = track(recording, calibrate(recording, measured=person.measured, prior=person.prior)).pose
         during = recording.span(simulation.phases["circles"][0])
@@ -87,7 +87,7 @@ def test_the_whole_chain_is_honest() -> None:
 
 
 def test_the_columns_of_the_result(tmp_path: Path) -> None:
-    person = simulated_person(1)
+    person = simulate_person(1)
     simulation = simulate(person.lengths, seed=1, clasp_s=5.0, circles=1)
     from wepose_pin.writers import write_session
 

@@ -13,21 +13,21 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.evaluation import attitude_error
 from wepose_pin.filters import METHODS, GdcParams, NcfParams
-from wepose_pin.filters.noise import noise_of
-from wepose_pin.simulation import SingleSensor, paper_dynamic
+from wepose_pin.filters.noise import estimate_noise
+from wepose_pin.simulation import SingleSensor, simulate_paper_dynamic
 from wepose_pin.validation import gains as tuning
-from wepose_pin.validation.contenders import DEFAULT_GAINS, Contender, contenders
-from wepose_pin.validation.gains import STATED, make_gains, total_rmse, trials
-from wepose_pin.validation.series import aligned
+from wepose_pin.validation.contenders import DEFAULT_GAINS, Contender, list_contenders
+from wepose_pin.validation.gains import STATED, compute_rmse, list_trials, make_gains
+from wepose_pin.validation.series import align_rotation
 
 SETTING = "simulated 100 Hz"
-ALL = contenders(SETTING)
+ALL = list_contenders(SETTING)
 NAMES = [contender.label for contender in ALL]
 
 
 @pytest.fixture(scope="module")
 def sensor() -> SingleSensor:
-    return paper_dynamic(50, 100.0)
+    return simulate_paper_dynamic(50, 100.0)
 
 
 def at_rest(sensor: SingleSensor) -> np.ndarray:
@@ -44,7 +44,7 @@ def test_who_takes_part() -> None:
 def test_peers_take_part_where_they_are_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     module = import_module("wepose_pin.validation.contenders")  # the package has a function of that name
     monkeypatch.setattr(module, "find_spec", lambda name: name == "vqf" or None)
-    labels = [contender.label for contender in contenders(SETTING)]
+    labels = [contender.label for contender in list_contenders(SETTING)]
     assert labels[-2:] == ["vqf", "offline vqf"]
     assert "imufusion" not in labels
 
@@ -53,12 +53,12 @@ def test_peers_take_part_where_they_are_installed(monkeypatch: pytest.MonkeyPatc
 def test_orientations_are_xyzw_from_sensor_to_a_world_with_z_up(contender: Contender, sensor: SingleSensor) -> None:
     """Another order or the inverse is off by tens of degrees."""
     rest = at_rest(sensor)
-    noise = noise_of(sensor.gyro_S[rest], sensor.accel_S[rest], sensor.rate_hz)
+    noise = estimate_noise(sensor.gyro_S[rest], sensor.accel_S[rest], sensor.rate_hz)
     quat = contender.orient(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise)
     assert quat.shape == (len(sensor.time), 4)
     np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-12)
     true = Rotation.from_quat(sensor.quat_WS)
-    error = attitude_error(aligned(Rotation.from_quat(quat), true, rest), true, sensor.time)
+    error = attitude_error(align_rotation(Rotation.from_quat(quat), true, rest), true, sensor.time)
     print(f"{contender.label}: {error.total_rmse:.2f} deg")
     assert error.total_rmse < (8.0 if "default gains" in contender.label else 3.0)
 
@@ -66,7 +66,7 @@ def test_orientations_are_xyzw_from_sensor_to_a_world_with_z_up(contender: Conte
 @pytest.mark.parametrize("contender", ALL, ids=NAMES)
 def test_the_bias_is_removed_for_all_but_as_it_comes(contender: Contender, sensor: SingleSensor) -> None:
     rest, bias = at_rest(sensor), np.deg2rad([1.5, -1.0, 0.5])
-    noise = noise_of(sensor.gyro_S[rest], sensor.accel_S[rest], sensor.rate_hz)
+    noise = estimate_noise(sensor.gyro_S[rest], sensor.accel_S[rest], sensor.rate_hz)
     biased = replace(noise, gyro_bias=noise.gyro_bias + bias)
     without, with_ = (
         Rotation.from_quat(contender.orient(gyro, sensor.accel_S, sensor.rate_hz, measured))
@@ -81,16 +81,16 @@ def test_the_bias_is_removed_for_all_but_as_it_comes(contender: Contender, senso
 
 def test_a_tuning_trial_is_scored_as_the_experiments_do() -> None:
     trial = tuning._dynamic(tuning.DYNAMIC_SEEDS[0], 100.0)
-    sensor = paper_dynamic(tuning.DYNAMIC_SEEDS[0], 100.0)
+    sensor = simulate_paper_dynamic(tuning.DYNAMIC_SEEDS[0], 100.0)
     true, rest = Rotation.from_quat(sensor.quat_WS), at_rest(sensor)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
     for contender in ALL:
         if contender.label in ("ncf", "gdc"):
             quat = contender.orient(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, trial.noise)
-            R_WS = aligned(Rotation.from_quat(quat), true, rest)
+            R_WS = align_rotation(Rotation.from_quat(quat), true, rest)
             expected = attitude_error(R_WS[moving], true[moving], sensor.time[moving]).total_rmse
             params = getattr(make_gains(SETTING), contender.label)
-            assert total_rmse(trial, params) == pytest.approx(expected, rel=0.02)
+            assert compute_rmse(trial, params) == pytest.approx(expected, rel=0.02)
 
 
 def test_tuning_trials_are_scored_nowhere_else() -> None:
@@ -111,10 +111,10 @@ def test_the_stated_gains_are_the_best_around(setting: str, request: pytest.Fixt
         folder = request.getfixturevalue("data")
         if not any((folder / "broad").glob("*.mat")):
             pytest.skip(f"no real recordings at {folder / 'broad'}")
-    found = trials(setting, folder)
+    found = list_trials(setting, folder)
 
     def score(params: NcfParams | GdcParams) -> float:
-        return float(np.mean([total_rmse(trial, params) for trial in found]))
+        return float(np.mean([compute_rmse(trial, params) for trial in found]))
 
     def around(axis: tuple[float, ...], value: float) -> list[float]:
         at = axis.index(value)

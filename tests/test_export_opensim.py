@@ -22,7 +22,7 @@ from wepose_pin.angles import joint_angles
 from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
-from wepose_pin.readers.describe import describe
+from wepose_pin.readers.describe import describe_file
 from wepose_pin.writers.export import export
 from wepose_pin.writers.rajagopal import coordinates, orientations
 
@@ -119,7 +119,7 @@ def test_sto_keeps_the_rules(result: Path, tmp_path: Path) -> None:
 def test_sto_is_read_back_as_it_was(result: Path, tmp_path: Path) -> None:
     """As segments of the body, with nothing to state but which way they faced."""
     export(result, tmp_path / "x.sto")
-    session = describe(tmp_path / "x.sto").session
+    session = describe_file(tmp_path / "x.sto").session
     assert session is not None
     (tmp_path / "session.toml").write_text(session)
     recording = load_session(tmp_path)

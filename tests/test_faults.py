@@ -23,7 +23,7 @@ from test_bad_input import Files, good_table, refused
 from wepose_pin.cli import main
 from wepose_pin.documents import whole_file, whole_folder
 from wepose_pin.errors import ExistingOutput
-from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
 
 TRACKED = {"pose.parquet", "report.html", "subject.toml", "subject.urdf", "summary.json", "view.html"}
@@ -33,7 +33,7 @@ TRACKED = {"pose.parquet", "report.html", "subject.toml", "subject.urdf", "summa
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A person with both arms, who can be calibrated in a second."""
     folder = tmp_path_factory.mktemp("faults")
-    made = simulate(simulated_person(1).lengths, seed=1, clasp_s=5.0, circles=0)
+    made = simulate(simulate_person(1).lengths, seed=1, clasp_s=5.0, circles=0)
     write_session(folder, made.recording("made"), made.truth())
     return folder
 

@@ -24,13 +24,13 @@ from wepose_pin.filters import (
     run_filter,
 )
 from wepose_pin.filters.bank import LiveBank
-from wepose_pin.filters.base import in_parallel
-from wepose_pin.filters.noise import SensorNoise, noise_of
+from wepose_pin.filters.base import run_in_parallel
+from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.smekf import starting_params
 from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.readers.trials import read_authors_trial
 from wepose_pin.rotations import quat_from_gravity
-from wepose_pin.simulation import paper_dynamic
+from wepose_pin.simulation import simulate_paper_dynamic
 
 RATE = 100.0
 GRAVITY = 9.81
@@ -118,7 +118,7 @@ def heading_error_deg(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 def test_smekf_is_algorithm_1() -> None:
     gyro, accel, _, rest = measured(np.random.default_rng(0), 30.0, bias=(0.01, -0.02, 0.005))
-    noise = noise_of(gyro[:180], accel[:180], RATE)
+    noise = estimate_noise(gyro[:180], accel[:180], RATE)
     start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
     quat, bias, cov = smekf_by_the_book(noise, start, gyro, accel, rest, 1 / RATE)
     run = Smekf(noise, RATE, start, SmekfParams(first_order=True)).run(gyro, accel, rest)
@@ -210,7 +210,7 @@ def test_correction_brings_the_bias_home_and_stops_the_heading() -> None:
     for seed in range(8):
         rng = np.random.default_rng(seed)
         gyro, accel, true, _ = measured(rng, 60.0, tilt=0.15)
-        noise = noise_of(gyro[:180], accel[:180], RATE)
+        noise = estimate_noise(gyro[:180], accel[:180], RATE)
         wrong = np.deg2rad([0.0, 0.0, 0.3])
         noise = replace(noise, gyro_bias=wrong, gyro_bias_cov=noise.gyro_bias_cov + np.diag(wrong**2))
         row = []
@@ -235,7 +235,7 @@ def test_the_exact_covariance_keeps_the_heading_through_wild_motion() -> None:
     worst: dict[bool, list[float]] = {False: [], True: []}
     for seed in range(8):
         gyro, accel, true, _ = measured(np.random.default_rng(seed), 120.0, tilt=1.2)
-        noise = noise_of(gyro[:180], accel[:180], RATE)
+        noise = estimate_noise(gyro[:180], accel[:180], RATE)
         for first_order, found in worst.items():
             out = run_filter(gyro, accel, RATE, noise, "smekf", SmekfParams(first_order=first_order))
             error = heading_error_deg(out.quat_WS, true)
@@ -296,7 +296,7 @@ def test_where_the_papers_start_and_bias_noise_are_wrong() -> None:
     rows: dict[str, list[tuple[float, float]]] = {"paper": [], "measured P0": [], "measured P0, real bias": []}
     for seed in range(16):
         gyro, accel, true, _ = measured(np.random.default_rng(seed), 120.0, bias=(0.01, -0.02, 0.015), tilt=0.8)
-        noise = noise_of(gyro[:180], accel[:180], RATE)
+        noise = estimate_noise(gyro[:180], accel[:180], RATE)
         for name, found in rows.items():
             params = SmekfParams(first_order=True) if name == "paper" else None
             told = replace(noise, bias_step_cov=real_step) if name.endswith("bias") else noise
@@ -323,7 +323,7 @@ def test_the_heading_of_a_sensor_that_turns_round_and_round_is_as_uncertain_as_i
     accel = np.tile([0.0, 0.0, GRAVITY], (len(gyro), 1)) + np.random.default_rng(5).normal(
         scale=0.01, size=(500 + n, 3)
     )
-    out = run_filter(gyro, accel, RATE, noise_of(gyro[:500], accel[:500], RATE), "smekf", measured_start=True)
+    out = run_filter(gyro, accel, RATE, estimate_noise(gyro[:500], accel[:500], RATE), "smekf", measured_start=True)
     assert out.attitude_cov is not None
     turned = Rotation.from_quat(out.quat_WS[-1]).as_rotvec()[2] - rate * n / RATE
     off = float(np.angle(np.exp(1j * turned)))
@@ -336,7 +336,7 @@ def test_the_heading_of_a_sensor_that_turns_round_and_round_is_as_uncertain_as_i
 
 def test_ncf_is_mahonys_equations() -> None:
     gyro, accel, _, rest = measured(np.random.default_rng(1), 10.0, bias=(0.02, 0.0, -0.01))
-    noise = noise_of(gyro[:180], accel[:180], RATE)
+    noise = estimate_noise(gyro[:180], accel[:180], RATE)
     start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
     filter_ = Ncf(noise, RATE, start)
     run = filter_.run(gyro, accel, rest)
@@ -356,7 +356,7 @@ def test_how_the_sensors_axes_lie_changes_nothing(method: str) -> None:
     runs = []
     for R in (Rotation.identity(), turn):
         own_gyro, own_accel = R.apply(gyro), R.apply(accel)
-        noise = noise_of(own_gyro[:180], own_accel[:180], RATE)
+        noise = estimate_noise(own_gyro[:180], own_accel[:180], RATE)
         quat = run_filter(own_gyro, own_accel, RATE, noise, method, measured_start=True, start=slice(0, 180)).quat_WS
         R_WS = Rotation.from_quat(quat) * R
         runs.append(R_WS[0].inv() * R_WS)  # each world has a heading of its own
@@ -375,7 +375,7 @@ def test_a_recording_may_begin_in_motion(method: str) -> None:
     """The start phase is the rest after 47 s of free motion by hand; what lies before is filtered backward from it."""
     worst: list[float] = []
     for seed in range(3):
-        trial = paper_dynamic(seed)
+        trial = simulate_paper_dynamic(seed)
         gyro, accel, true = trial.gyro_S[800:], trial.accel_S[800:], trial.quat_WS[800:]
         found = estimate_orientation(gyro, accel, RATE, method=method, static=(47.6, 51.6))
         tilt_deg = tilt_error_deg(found.quat_WS, true)
@@ -391,7 +391,7 @@ def test_a_recording_may_begin_in_motion(method: str) -> None:
 @pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
 def test_what_is_before_the_start_phase_comes_with_the_first_chunk(method: str) -> None:
     gyro, accel, _, _ = measured(np.random.default_rng(3), 60.0)
-    noise = noise_of(gyro[1000:1180], accel[1000:1180], RATE)
+    noise = estimate_noise(gyro[1000:1180], accel[1000:1180], RATE)
     run = SensorRun(RATE, noise, method, measured_start=True, start=slice(1003, 1180))
     chunks = [run.push(gyro[a:b], accel[a:b]) for a, b in ((0, 2000), (2000, 4000), (4000, 6000))]
     chunks += [run.finish()] if method == "smoother" else []
@@ -419,7 +419,7 @@ def test_the_rate_changes_little(method: str) -> None:
         gyro = (R[:-1].inv() * R[1:]).as_rotvec() * rate + rng.normal(scale=1e-4 * np.sqrt(rate), size=(n, 3))
         accel = R[1:].inv().apply([0.0, 0.0, GRAVITY]) + rng.normal(scale=1e-3 * np.sqrt(rate), size=(n, 3))
         k = round(4.5 * rate)
-        noise = noise_of(gyro[:k], accel[:k], rate)
+        noise = estimate_noise(gyro[:k], accel[:k], rate)
         found = run_filter(gyro, accel, rate, noise, method, measured_start=True, start=slice(0, k))
         assert found.attitude_cov is not None
         std.append(np.sqrt(np.trace(found.attitude_cov[round(50.0 * rate)])))
@@ -432,7 +432,7 @@ def test_the_rate_changes_little(method: str) -> None:
 def test_gdc_is_madgwicks_equations() -> None:
     """f and its Jacobian in the paper's order q1 … q4 = w x y z, eq. (25), (26), (33)."""
     gyro, accel, _, rest = measured(np.random.default_rng(2), 10.0, bias=(0.02, 0.0, -0.01))
-    noise = noise_of(gyro[:180], accel[:180], RATE)
+    noise = estimate_noise(gyro[:180], accel[:180], RATE)
     start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
     run = Gdc(noise, RATE, start, GdcParams(0.1)).run(gyro, accel, rest)
     q = np.roll(start, 1)
@@ -457,7 +457,7 @@ def test_gdc_is_madgwicks_equations() -> None:
 @pytest.mark.parametrize("cut", [1, 333, 999])
 def test_a_run_cut_in_two_and_one_by_one_give_the_same_bits(method: str, cut: int) -> None:
     gyro, accel, _, rest = measured(np.random.default_rng(3), 10.0, bias=(0.02, 0.0, -0.01))
-    noise = noise_of(gyro[:180], accel[:180], RATE)
+    noise = estimate_noise(gyro[:180], accel[:180], RATE)
     start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
     whole = METHODS[method](noise, RATE, start).run(gyro, accel, rest)
     filter_ = METHODS[method](noise, RATE, start)
@@ -505,7 +505,7 @@ def test_wrong_input_is_named() -> None:
         estimate_orientation(gyro, gyro, RATE, method="smekv", static=(0, 0.5))
     with pytest.raises(BadData, match=r"must both be \(n, 3\)"):
         estimate_orientation(gyro, gyro[:50], RATE, static=(0, 0.5))
-    noise = noise_of(*measured(np.random.default_rng(0), 2.0)[:2], RATE)
+    noise = estimate_noise(*measured(np.random.default_rng(0), 2.0)[:2], RATE)
     for wrong in (-1.0, np.nan, np.diag([1.0, 1.0, -1.0])):
         with pytest.raises(BadOption, match="positive semidefinite"):
             Smekf(noise, RATE, np.array([0.0, 0.0, 0.0, 1.0]), SmekfParams(attitude_cov0=wrong))
@@ -521,7 +521,7 @@ def test_wrong_input_is_named() -> None:
 
 def test_starting_params_trust_tilt_and_heading_as_far_as_known() -> None:
     gyro, accel, _, _ = measured(np.random.default_rng(8), 2.0)
-    noise = noise_of(gyro, accel, RATE)
+    noise = estimate_noise(gyro, accel, RATE)
     quat = Rotation.from_rotvec([0.3, -0.5, 0.0]).as_quat()
     up_S = true_vertical(quat)
     still, moving = (starting_params(noise, RATE, quat, std).attitude_cov0 for std in (0.004, 0.2))
@@ -543,7 +543,7 @@ def sensors(
     """Gyro (n, k, 3), accel (n, k, 3), true quaternions (n, k, 4), noise and start of each."""
     found = [measured(np.random.default_rng(seed), seconds, bias=(0.01, -0.02, 0.005)) for seed in range(count)]
     gyro, accel, true = (np.stack([sensor[i] for sensor in found], axis=1) for i in range(3))
-    noises = [noise_of(gyro[:180, i], accel[:180, i], RATE) for i in range(count)]
+    noises = [estimate_noise(gyro[:180, i], accel[:180, i], RATE) for i in range(count)]
     return gyro, accel, true, noises, [quat_from_gravity(accel[:50, i].mean(axis=0)) for i in range(count)]
 
 
@@ -599,14 +599,14 @@ def test_runs_in_threads_are_the_runs_one_after_the_other() -> None:
     def run(i: int, noise: SensorNoise) -> Any:
         return run_filter(gyro[:, i], accel[:, i], RATE, noise, "smekf")
 
-    one = in_parallel(run, range(7), noises, threads=1)
+    one = run_in_parallel(run, range(7), noises, threads=1)
     for threads in (2, 5, None):
-        for parallel, single in zip(in_parallel(run, range(7), noises, threads=threads), one, strict=True):
+        for parallel, single in zip(run_in_parallel(run, range(7), noises, threads=threads), one, strict=True):
             for found, expected in zip(parallel[:4], single[:4], strict=True):
                 np.testing.assert_array_equal(found, expected)
     with pytest.raises(BadOption, match="not known"):
-        in_parallel(check_method, ["smekf", "none"])
-    assert in_parallel(check_method, []) == []
+        run_in_parallel(check_method, ["smekf", "none"])
+    assert run_in_parallel(check_method, []) == []
 
 
 @pytest.mark.parametrize("method", ["smekf", "ncf", "gdc"])
@@ -614,7 +614,7 @@ def test_runs_in_threads_are_the_runs_one_after_the_other() -> None:
 def test_a_sample_that_is_no_number_does_not_stay(method: str, wrong: float) -> None:
     """One in motion, three at rest, one at the very start; batch and sample by sample alike."""
     gyro, accel, _, rest = measured(np.random.default_rng(9), 20.0)
-    noise = noise_of(gyro[:180], accel[:180], RATE)
+    noise = estimate_noise(gyro[:180], accel[:180], RATE)
     start = quat_from_gravity(accel[:50].mean(axis=0))
     clean = METHODS[method](noise, RATE, start).run(gyro, accel, rest)
     gyro[[0, 500, 1050, 1051, 1052], [0, 1, 2, 0, 1]] = wrong
@@ -637,7 +637,7 @@ def test_what_is_unseen_is_in_the_covariance(gap: int) -> None:
     normalised, growth = [], []
     for seed in range(40):
         gyro, accel, _, rest = measured(np.random.default_rng(100 + seed), 10.0)
-        noise = noise_of(gyro[:180], accel[:180], RATE)
+        noise = estimate_noise(gyro[:180], accel[:180], RATE)
         params = SmekfParams(1e-8, 1e-10)
         clean = Smekf(noise, RATE, quat_from_gravity(accel[:50].mean(axis=0)), params).run(gyro, accel, rest)
         first = 350 + 5 * seed

@@ -16,11 +16,11 @@ from test_mvnx import mvnx, turning
 import wepose_pin as wp
 from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadData, BadSession, MissingFile, UnknownColumn, WeposeError
-from wepose_pin.readers.device import unwrapped
-from wepose_pin.readers.formats import format_of, read_device
+from wepose_pin.readers.device import unwrap_counter
+from wepose_pin.readers.formats import detect_format, read_device
 from wepose_pin.readers.guess import guess_columns
 from wepose_pin.recording import OrientationSensor, Recording
-from wepose_pin.recording.segments import segment_of
+from wepose_pin.recording.segments import guess_segment
 
 N, RATE = 400, 100.0
 TIME = np.arange(N) / RATE
@@ -84,7 +84,7 @@ def mt_manager(
 )
 def test_mt_manager_in_every_separator(separator: str, decimal: str, tmp_path: Path) -> None:
     path = mt_manager(tmp_path / "MT_012345_001-000_00B40001.txt", separator=separator, decimal=decimal)
-    assert format_of(path) == "mt_manager"
+    assert detect_format(path) == "mt_manager"
     check_raw(load(tmp_path, f'[data]\nfile = "{path.name}"\n[sensors.torso]'))
     check_orientation(load(tmp_path, f'[data]\nfile = "{path.name}"\nuse = "orientation"\n[sensors.torso]'))
 
@@ -279,7 +279,7 @@ def apdm_by_name(path: Path) -> Path:
 
 @pytest.mark.parametrize("make", [apdm, apdm_by_name])
 def test_apdm(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    assert format_of(make(tmp_path / "a.csv")) == "apdm"
+    assert detect_format(make(tmp_path / "a.csv")) == "apdm"
     check_raw(load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.torso]'))
     check_orientation(load(tmp_path, '[data]\nfile = "a.csv"\nuse = "orientation"\n[sensors.torso]'))
 
@@ -343,7 +343,7 @@ def dot(path: Path, mode: str = "rates", *, tag: str = "left_wrist", sync: str =
 @pytest.mark.parametrize("mode", ["rates", "increments"])
 def test_dot_rates_and_increments(mode: str, tmp_path: Path) -> None:
     path = dot(tmp_path / "1_20250711.csv", mode)
-    assert format_of(path) == "dot"
+    assert detect_format(path) == "dot"
     recording = load(tmp_path, f'[data]\nfile = "{path.name}"\n[sensors.left_forearm]')
     check_raw(recording, "left_forearm")
 
@@ -381,9 +381,9 @@ def test_a_dot_without_its_preamble_must_be_named_if_rates_alone_are_in_it(tmp_p
     path = dot(tmp_path / "a.csv")
     table = path.read_bytes().partition(b"\n\n")[2]
     path.write_bytes(table)
-    assert format_of(path) == "dot"  # Quat_W is the DOT's word
+    assert detect_format(path) == "dot"  # Quat_W is the DOT's word
     path.write_bytes(table.replace(b"Quat_", b"Other_"))
-    assert format_of(path) is None  # Gyr_X could be in deg/s or rad/s
+    assert detect_format(path) is None  # Gyr_X could be in deg/s or rad/s
     with pytest.raises(BadSession, match=r"sensors\.torso\.gyro is missing"):
         load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.torso]')
     check_raw(load(tmp_path, '[data]\nfile = "a.csv"\nformat = "dot"\n[sensors.torso]'))
@@ -406,7 +406,7 @@ def ximu3(folder: Path, first_us: int = 52100347) -> Path:
 def test_ximu3_by_its_folder_or_a_file_of_it(first_us: int, tmp_path: Path) -> None:
     ximu3(tmp_path / "x-IMU3 12AB34CD (UDP)", first_us)
     for file in ("x-IMU3 12AB34CD (UDP)", "x-IMU3 12AB34CD (UDP)/Inertial.csv"):
-        assert format_of(tmp_path / file) == "ximu3"
+        assert detect_format(tmp_path / file) == "ximu3"
         check_raw(load(tmp_path, f'[data]\nfile = "{file}"\n[sensors.torso]'))
     file = "x-IMU3 12AB34CD (UDP)"
     check_orientation(load(tmp_path, f'[data]\nfile = "{file}"\nuse = "orientation"\n[sensors.torso]'))
@@ -656,7 +656,7 @@ def test_a_session_in_pieces_is_the_session(tmp_path: Path) -> None:
 
 def test_a_counter_that_begins_anew_goes_on() -> None:
     counter = np.array([65534.0, 65535.0, np.nan, 1.0, 2.0])
-    np.testing.assert_array_equal(unwrapped(counter, 65536.0), [65534.0, 65535.0, np.nan, 65537.0, 65538.0])
+    np.testing.assert_array_equal(unwrap_counter(counter, 65536.0), [65534.0, 65535.0, np.nan, 65537.0, 65538.0])
 
 
 @pytest.mark.parametrize(
@@ -679,7 +679,7 @@ def test_a_counter_that_begins_anew_goes_on() -> None:
     ],
 )
 def test_segments_by_their_names(label: str, segment: str | None) -> None:
-    assert segment_of(label) == segment
+    assert guess_segment(label) == segment
 
 
 def test_columns_by_their_names() -> None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate
 from wepose_pin.recording import OrientationSensor, Recording
-from wepose_pin.simulation import MTI_3, PERFECT, Simulation, simulate, simulated_person
+from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.subject import LENGTHS, Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.tracking import track
 
@@ -21,8 +21,8 @@ HINGES = {joint: Hinge(np.array([0.0, 1.0, 0.0]), np.deg2rad(2.0)) for joint in 
 
 @pytest.fixture(scope="module")
 def made() -> tuple[Simulation, Subject]:
-    person = simulated_person(4)
-    simulation = simulate(person.lengths, seed=4, noise=PERFECT, clasp_s=40.0, circles=4)
+    person = simulate_person(4)
+    simulation = simulate(person.lengths, seed=4, noise=NOISE_FREE, clasp_s=40.0, circles=4)
     mounts = dict.fromkeys(simulation.quat_WL, np.array([0.0, 0.0, 0.0, 1.0]))
     return simulation, replace(person.prior, lengths=person.lengths, mounts=mounts, hinges=HINGES)
 
@@ -98,9 +98,9 @@ def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simula
 def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     """Joined hands bound the drift; of a mount's heading that is off they say nothing."""
     noise = replace(MTI_3, gyro_density=40.0 * MTI_3.gyro_density)
-    simulation = simulate(simulated_person(4).lengths, seed=4, noise=noise, clasp_s=40.0, circles=2)
+    simulation = simulate(simulate_person(4).lengths, seed=4, noise=noise, clasp_s=40.0, circles=2)
     recording = simulation.recording()
-    average = simulated_person(4).prior
+    average = simulate_person(4).prior
     order = (*LENGTHS, *mount_rows("torso"), *mount_rows("right_forearm"))
     covariance = np.zeros((len(order), len(order)))
     covariance[:8, :8] = average.covariance

@@ -13,23 +13,23 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadSession
 from wepose_pin.readers import load_session
-from wepose_pin.recording import ImuSensor, Recording, mount_from_axes
+from wepose_pin.recording import ImuSensor, Recording, compute_mount
 from wepose_pin.simulation import (
-    PERFECT,
-    PERFECT_WORLD,
-    REALISTIC,
+    IDEAL_PRESET,
+    MILD_PRESET,
+    NOISE_FREE,
     SEGMENTS,
     Device,
     Imperfections,
     ImuNoise,
     Simulation,
     SingleSensor,
-    paper_drift,
-    paper_dynamic,
     simulate,
-    simulated_person,
+    simulate_paper_drift,
+    simulate_paper_dynamic,
+    simulate_person,
 )
-from wepose_pin.simulation.imu import lost
+from wepose_pin.simulation.imu import draw_lost
 from wepose_pin.simulation.motion import Flaws, Sway
 from wepose_pin.simulation.subject import _STREAMS
 from wepose_pin.subject import population_subject
@@ -58,22 +58,22 @@ BODY = Imperfections(
     sway_deg_s=0.1,
 )
 IN_BODY = ("soft_tissue_deg", "palm_slip", "shoulder_wander", "start_elbow_deg", "start_segment_deg", "sway_deg_s")
-SHORT = {"rate_hz": 50.0, "clasp_s": 5.0, "circles": 0, "noise": PERFECT}
+SHORT = {"rate_hz": 50.0, "clasp_s": 5.0, "circles": 0, "noise": NOISE_FREE}
 
 
 @pytest.fixture(scope="module")
 def body() -> Simulation:
-    return simulate(LENGTHS, seed=3, noise=PERFECT, imperfections=BODY)
+    return simulate(LENGTHS, seed=3, noise=NOISE_FREE, imperfections=BODY)
 
 
 @pytest.fixture(scope="module")
 def fast() -> Simulation:
-    return simulate(LENGTHS, seed=4, rate_hz=1000.0, noise=PERFECT, imperfections=BODY, clasp_s=10.0, circles=1)
+    return simulate(LENGTHS, seed=4, rate_hz=1000.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=10.0, circles=1)
 
 
 @pytest.fixture(scope="module")
 def realistic() -> Simulation:
-    return simulate(LENGTHS, seed=5, imperfections=REALISTIC, clasp_s=20.0, circles=2)
+    return simulate(LENGTHS, seed=5, imperfections=MILD_PRESET, clasp_s=20.0, circles=2)
 
 
 def within(sim: Simulation, phase: str) -> np.ndarray:
@@ -102,17 +102,17 @@ def in_torso(sim: Simulation, vectors: np.ndarray) -> np.ndarray:
 
 
 def test_presets() -> None:
-    assert Imperfections() == PERFECT_WORLD
+    assert Imperfections() == IDEAL_PRESET
     for field in fields(Imperfections):
         if field.name != "mount":
-            off, on = getattr(PERFECT_WORLD, field.name), getattr(REALISTIC, field.name)
+            off, on = getattr(IDEAL_PRESET, field.name), getattr(MILD_PRESET, field.name)
             assert off in (0, np.inf), field.name
             assert 0 < on < np.inf, field.name
-    assert REALISTIC.mount == PERFECT_WORLD.mount == "stated"
+    assert MILD_PRESET.mount == IDEAL_PRESET.mount == "stated"
 
 
 def test_the_perfect_world_is_the_default_and_what_it_was() -> None:
-    one, same = (simulate(LENGTHS, seed=1, clasp_s=5.0, circles=1, **k) for k in ({}, {"imperfections": PERFECT_WORLD}))
+    one, same = (simulate(LENGTHS, seed=1, clasp_s=5.0, circles=1, **k) for k in ({}, {"imperfections": IDEAL_PRESET}))
     for segment in SEGMENTS:
         assert np.array_equal(one.gyro_S[segment], same.gyro_S[segment])
         assert not one.soft_tissue[segment].any()
@@ -197,7 +197,7 @@ def test_segments_keep_their_length(body: Simulation) -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_arms_reach_also_when_imperfect(seed: int, scale: float) -> None:
     lengths = {k: scale * v for k, v in LENGTHS.items()}
-    sim = simulate(lengths, seed=seed, rate_hz=50.0, noise=PERFECT, imperfections=BODY, clasp_s=30.0, circles=2)
+    sim = simulate(lengths, seed=seed, rate_hz=50.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=30.0, circles=2)
     for segment in SEGMENTS:  # of human size still
         assert np.linalg.norm(sim.gyro_S[segment], axis=1).max() < 15
         assert np.linalg.norm(sim.accel_S[segment], axis=1).max() < 40
@@ -221,7 +221,7 @@ def test_soft_tissue_has_its_rms(body: Simulation) -> None:
 
 def test_soft_tissue_follows_the_movement_and_is_still_at_rest() -> None:
     """Half of it is a fixed mixture of force and rate: a regression on them finds that half and no more."""
-    sim = simulate(LENGTHS, seed=6, noise=PERFECT, imperfections=Imperfections(soft_tissue_deg=1.5))
+    sim = simulate(LENGTHS, seed=6, noise=NOISE_FREE, imperfections=Imperfections(soft_tissue_deg=1.5))
     moving = sim.time >= sim.phases["clasp"][0][0]
     explained = []
     for segment in SEGMENTS:
@@ -236,7 +236,7 @@ def test_soft_tissue_follows_the_movement_and_is_still_at_rest() -> None:
             assert np.abs(sim.gyro_S[segment][within(sim, phase)]).max() < 1e-9
     assert 0.4 < np.mean(explained) < 0.75
     # The same at another rate: it is a function of time.
-    slow = simulate(LENGTHS, seed=6, rate_hz=50.0, noise=PERFECT, imperfections=Imperfections(soft_tissue_deg=1.5))
+    slow = simulate(LENGTHS, seed=6, rate_hz=50.0, noise=NOISE_FREE, imperfections=Imperfections(soft_tissue_deg=1.5))
     for segment in SEGMENTS:
         n = len(slow.time)
         np.testing.assert_allclose(slow.soft_tissue[segment], sim.soft_tissue[segment][::2][:n], atol=1e-9)
@@ -314,7 +314,7 @@ def test_a_standing_person_sways() -> None:
 
 def test_devices_err_as_stated() -> None:
     rng = np.random.default_rng(0)
-    devices = [Device.sample(rng, REALISTIC) for _ in range(400)]
+    devices = [Device.sample(rng, MILD_PRESET) for _ in range(400)]
     gyro, accel = (
         np.stack([getattr(d, name) for d in devices]) - np.eye(3) for name in ("gyro_matrix", "accel_matrix")
     )
@@ -327,9 +327,9 @@ def test_devices_err_as_stated() -> None:
 
 
 def test_data_are_the_device_times_the_truth() -> None:
-    options = {"seed": 2, "noise": PERFECT, "clasp_s": 10.0, "circles": 1}
+    options = {"seed": 2, "noise": NOISE_FREE, "clasp_s": 10.0, "circles": 1}
     clean = simulate(LENGTHS, **options)
-    sizes = replace(PERFECT_WORLD, gyro_scale=0.01, accel_scale=0.02, misalignment_deg=1.0, g_sensitivity_deg_s=0.1)
+    sizes = replace(IDEAL_PRESET, gyro_scale=0.01, accel_scale=0.02, misalignment_deg=1.0, g_sensitivity_deg_s=0.1)
     sim = simulate(LENGTHS, imperfections=sizes, **options)
     for segment, device in sim.device.items():
         accel_S = clean.accel_S[segment]
@@ -359,14 +359,14 @@ def test_quantisation_and_range() -> None:
             assert np.array_equal(getattr(cut, name)[segment], expected)
     assert np.sum(np.abs(cut.gyro_S["left_forearm"]) == np.deg2rad(90.0)) > 10
     # the largest number of 16 bits is one step below the full scale
-    device = Device.sample(np.random.default_rng(0), PERFECT_WORLD)
+    device = Device.sample(np.random.default_rng(0), IDEAL_PRESET)
     full = np.array([[1e3, -1e3, 0.0]])
-    readings = device.measure(full, full, 100.0, PERFECT, digital.imperfections, np.random.default_rng(0))
+    readings = device.measure(full, full, 100.0, NOISE_FREE, digital.imperfections, np.random.default_rng(0))
     np.testing.assert_allclose(readings.gyro_S, [[(2**15 - 1) * gyro_step, -np.deg2rad(2000.0), 0.0]])
 
 
 def test_clocks_shift_the_samples_in_the_data() -> None:
-    options = {"seed": 2, "noise": PERFECT, "clasp_s": 10.0, "circles": 1, "rate_hz": 200.0}
+    options = {"seed": 2, "noise": NOISE_FREE, "clasp_s": 10.0, "circles": 1, "rate_hz": 200.0}
     clean = simulate(LENGTHS, **options)
     sizes = Imperfections(clock_jitter=2e-4, clock_offset=5e-3)
     sim = simulate(LENGTHS, imperfections=sizes, **options)
@@ -395,7 +395,7 @@ def runs_of(mask: np.ndarray) -> Iterator[int]:
 @pytest.mark.parametrize("rate_hz", [10.0, 100.0, 1000.0])
 @pytest.mark.parametrize("share", [0.002, 0.05])
 def test_lost_samples(rate_hz: float, share: float) -> None:
-    masks = [lost(np.random.default_rng(seed), 200000, rate_hz, share) for seed in range(5)]
+    masks = [draw_lost(np.random.default_rng(seed), 200000, rate_hz, share) for seed in range(5)]
     assert np.mean(masks) == pytest.approx(share, rel=0.15)
     longest = max(max(runs_of(mask)) for mask in masks)
     assert longest == max(1, round(0.05 * rate_hz))
@@ -405,7 +405,7 @@ def test_lost_samples(rate_hz: float, share: float) -> None:
 def test_lost_samples_are_bridged_as_in_a_users_file(realistic: Simulation, tmp_path: Path) -> None:
     recorded = realistic.recording()
     raw = {
-        segment: ImuSensor(realistic.gyro_S[segment], realistic.accel_S[segment], mount_from_axes(*mount))
+        segment: ImuSensor(realistic.gyro_S[segment], realistic.accel_S[segment], compute_mount(*mount))
         for segment, mount in realistic.stated_mount.items()
         if mount is not None
     }
@@ -446,7 +446,7 @@ def allan_deviation(rates: np.ndarray, rate_hz: float, m: int) -> np.ndarray:
 
 
 def test_allan_deviation_gives_the_densities_back() -> None:
-    noisy, clean = (simulate(LENGTHS, seed=2, noise=noise) for noise in (ImuNoise(), PERFECT))
+    noisy, clean = (simulate(LENGTHS, seed=2, noise=noise) for noise in (ImuNoise(), NOISE_FREE))
     for name, density in (("gyro_S", np.deg2rad(0.007)), ("accel_S", 120e-6 * G)):
         noise = np.hstack([getattr(noisy, name)[s] - getattr(clean, name)[s] for s in SEGMENTS])
         for tau in (0.05, 0.2, 1.0):
@@ -459,8 +459,8 @@ def test_allan_deviation_gives_the_densities_back() -> None:
 
 def off(name: str) -> Imperfections:
     if name.endswith(("range_deg_s", "range_g")):  # bits need a range
-        return replace(REALISTIC, **{name: np.inf, "bits": 0})
-    return replace(REALISTIC, **{name: getattr(PERFECT_WORLD, name)})
+        return replace(MILD_PRESET, **{name: np.inf, "bits": 0})
+    return replace(MILD_PRESET, **{name: getattr(IDEAL_PRESET, name)})
 
 
 def subject_draws(sizes: Imperfections, seed: int = 5) -> dict[str, np.ndarray]:
@@ -497,7 +497,7 @@ def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, 
     without = simulate(LENGTHS, seed=5, imperfections=off(name), clasp_s=20.0, circles=2)
     for draws, less in (
         (sensor_draws(realistic), sensor_draws(without)),
-        (subject_draws(REALISTIC), subject_draws(off(name))),
+        (subject_draws(MILD_PRESET), subject_draws(off(name))),
     ):
         for other, values in draws.items():
             if other == name and name not in ("palm_slip", "sway_deg_s"):
@@ -523,7 +523,7 @@ def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, 
 
 
 def test_mount_is_a_stream_of_its_own(realistic: Simulation) -> None:
-    loose = simulate(LENGTHS, seed=5, imperfections=replace(REALISTIC, mount="any"), clasp_s=20.0, circles=2)
+    loose = simulate(LENGTHS, seed=5, imperfections=replace(MILD_PRESET, mount="any"), clasp_s=20.0, circles=2)
     for name, values in sensor_draws(loose).items():
         assert np.array_equal(values, sensor_draws(realistic)[name]) == (name != "mount")
     assert np.array_equal(loose.points["left_palm"], realistic.points["left_palm"])
@@ -534,11 +534,14 @@ def test_mount_is_a_stream_of_its_own(realistic: Simulation) -> None:
 
 @pytest.mark.parametrize(
     ("make", "moving", "rate_peak", "accel_peak"),
-    [(paper_dynamic, (5.0, 55.0), (6.0, 8.0), (15.0, 20.0)), (paper_drift, (25.0, 35.0), (13.0, 15.0), (40.0, 50.0))],
+    [
+        (simulate_paper_dynamic, (5.0, 55.0), (6.0, 8.0), (15.0, 20.0)),
+        (simulate_paper_drift, (25.0, 35.0), (13.0, 15.0), (40.0, 50.0)),
+    ],
 )
 def test_single_sensor(make: Callable[..., SingleSensor], moving: tuple, rate_peak: tuple, accel_peak: tuple) -> None:
     for seed in range(3):
-        one = make(seed, 1000.0, noise=PERFECT)
+        one = make(seed, 1000.0, noise=NOISE_FREE)
         assert one.moving == moving
         assert one.time[-1] == 60.0
         R_WS = Rotation.from_quat(one.quat_WS)
@@ -558,11 +561,11 @@ def test_single_sensor(make: Callable[..., SingleSensor], moving: tuple, rate_pe
 
 
 def test_single_sensor_at_both_rates_and_with_a_real_device() -> None:
-    for make in (paper_dynamic, paper_drift):
-        slow, quick = make(4, 100.0, noise=PERFECT), make(4, 1000.0, noise=PERFECT)
+    for make in (simulate_paper_dynamic, simulate_paper_drift):
+        slow, quick = make(4, 100.0, noise=NOISE_FREE), make(4, 1000.0, noise=NOISE_FREE)
         np.testing.assert_allclose(slow.quat_WS, quick.quat_WS[::10], atol=1e-12)
         np.testing.assert_allclose(slow.accel_S, quick.accel_S[::10], atol=1e-6)
-        real = make(4, 100.0, imperfections=REALISTIC)
+        real = make(4, 100.0, imperfections=MILD_PRESET)
         assert np.array_equal(real.quat_WS, slow.quat_WS)
         counts = real.gyro_S / (np.deg2rad(2000.0) / 2**15)
         np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
@@ -573,8 +576,8 @@ def test_single_sensor_at_both_rates_and_with_a_real_device() -> None:
 
 
 def test_realistic_people_are_tracked() -> None:
-    person = simulated_person(1)
-    sim = simulate(person.lengths, seed=1, imperfections=REALISTIC, clasp_s=5.0, circles=1)
+    person = simulate_person(1)
+    sim = simulate(person.lengths, seed=1, imperfections=MILD_PRESET, clasp_s=5.0, circles=1)
     pose = track(sim.recording(), replace(person.prior, lengths=person.lengths))
     error = np.linalg.norm(pose.points["right_palm"] - sim.points["right_palm"], axis=1)
     assert 0.005 < error.mean() < 0.12

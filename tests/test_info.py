@@ -15,7 +15,7 @@ from test_mvnx import mvnx, turning
 import wepose_pin as wp
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, WARNING, Diagnostic, render
-from wepose_pin.readers.describe import describe
+from wepose_pin.readers.describe import describe_file
 from wepose_pin.recording import SEGMENTS, Recording
 
 
@@ -30,7 +30,7 @@ def info(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> st
 
 def diagnosed(path: Path) -> dict[str, Diagnostic]:
     """Code → what `wepose info` says of a file besides its facts."""
-    return {each.code: each for each in describe(path).diagnostics}
+    return {each.code: each for each in describe_file(path).diagnostics}
 
 
 def written(capsys: pytest.CaptureFixture[str], path: Path) -> Recording:

@@ -27,7 +27,7 @@ from wepose_pin.jobs.fields import REQUIRED, build_job, field_types, field_value
 from wepose_pin.jobs.retarget import RetargetJob
 from wepose_pin.jobs.simulate import SimulateJob, run_simulate
 from wepose_pin.jobs.track import TrackJob, run_track
-from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.simulation.tasks import TASKS
 from wepose_pin.writers import write_session
 from wepose_pin.writers.provenance import collect_provenance
@@ -129,7 +129,7 @@ def test_a_step_of_a_plan_has_the_options_of_its_command(step: str) -> None:
 
 def test_jobs_print_nothing_and_tell_a_growing_share(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     told: list[tuple[str, float]] = []
-    made = simulate(simulated_person(1).lengths, seed=1, clasp_s=8.0, circles=0)
+    made = simulate(simulate_person(1).lengths, seed=1, clasp_s=8.0, circles=0)
     (tmp_path / "session").mkdir()
     write_session(tmp_path / "session", made.recording("made"), made.truth())
     outcome = run_track(TrackJob(tmp_path / "session", tmp_path / "result"), lambda *of: told.append(of))

@@ -26,15 +26,15 @@ from wepose_pin.calibration.least_squares import Gaussian, Layout
 from wepose_pin.filters import run_filter
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
 from wepose_pin.recording import ImuSensor, Recording
-from wepose_pin.simulation import PERFECT, REALISTIC, Simulation, simulate, simulated_person
-from wepose_pin.validation.real import RING_SEGMENTS, _registered_ring, assumed_noise
+from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
+from wepose_pin.validation.real import RING_SEGMENTS, _registered_ring, assume_noise
 
 NAMES = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 
 
 @pytest.fixture(scope="module")
 def exact() -> tuple[Simulation, Recording, FilteredRecording]:
-    simulation = simulate(simulated_person(2).lengths, seed=2, noise=PERFECT, clasp_s=40.0, circles=0)
+    simulation = simulate(simulate_person(2).lengths, seed=2, noise=NOISE_FREE, clasp_s=40.0, circles=0)
     recording = simulation.recording()
     return simulation, recording, filter_recording(recording)
 
@@ -124,8 +124,8 @@ def test_soft_tissue_of_the_torso_is_no_heading(monkeypatch: pytest.MonkeyPatch)
     """The closure alone is off by 3 to 5 deg on these people, whose tissue turns the sensor as they lean."""
     off: dict[bool, list[float]] = {False: [], True: []}
     for seed in (0, 6):
-        person = simulated_person(seed)
-        simulation = simulate(person.lengths, seed=seed, imperfections=replace(REALISTIC, mount="any"), circles=0)
+        person = simulate_person(seed)
+        simulation = simulate(person.lengths, seed=seed, imperfections=replace(MILD_PRESET, mount="any"), circles=0)
         measured = {"shoulder_width": person.measured["shoulder_width"]}
         for coupled in (True, False):
             with monkeypatch.context() as patch:
@@ -149,7 +149,7 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
         R_VS, psi = {}, {}
         for segment in RING_SEGMENTS:
             sensor, found = chain.sensors[mount, segment], registered[mount, segment]
-            noise = assumed_noise(sensor.rate_hz, found.gyro_bias)
+            noise = assume_noise(sensor.rate_hz, found.gyro_bias)
             R_VS[segment] = Rotation.from_quat(
                 run_filter(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise, "amekf").quat_WS
             )

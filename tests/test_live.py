@@ -19,7 +19,7 @@ from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, Status, StreamInfo
-from wepose_pin.readers.live_log import SAMPLES, blocks, read_live_log
+from wepose_pin.readers.live_log import SAMPLES, read_blocks, read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.simulation import Simulation
@@ -267,7 +267,7 @@ def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recordin
     assert not any(lost[j] for _, lost in shown for j in range(len(recording.sensors)) if j != i)
     assert watcher.statuses[-2].problems == {}
     # All that was received is in the file.
-    of_samples = [payload for tag, payload in blocks(tmp_path / "a.wepose") if tag == SAMPLES]
+    of_samples = [payload for tag, payload in read_blocks(tmp_path / "a.wepose") if tag == SAMPLES]
     assert sum(int.from_bytes(payload[:4], "little") for payload in of_samples) == count
 
 

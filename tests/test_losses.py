@@ -13,14 +13,14 @@ from wepose_pin.calibration.lengths import Calibration
 from wepose_pin.calibration.losses import Loss, find_losses, group_steps, mask_connected
 from wepose_pin.errors import BadPhase
 from wepose_pin.recording import ImuSensor, Recording
-from wepose_pin.simulation import PERFECT, Simulation, simulate, simulated_person
+from wepose_pin.simulation import NOISE_FREE, Simulation, simulate, simulate_person
 
 ALL = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 
 
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
-    return simulate(simulated_person(3).lengths, seed=3, noise=PERFECT, clasp_s=24.0, circles=0)
+    return simulate(simulate_person(3).lengths, seed=3, noise=NOISE_FREE, clasp_s=24.0, circles=0)
 
 
 def lossy(simulation: Simulation, lost: tuple[float, float], names: tuple[str, ...], stated: bool = False) -> Recording:
@@ -69,7 +69,7 @@ def test_samples_without_a_known_tilt_are_left_out(simulation: Simulation) -> No
 
 
 def test_what_lies_beyond_a_loss() -> None:
-    simulation = simulate(simulated_person(3).lengths, seed=3, noise=PERFECT, clasp_s=10.0, circles=0)
+    simulation = simulate(simulate_person(3).lengths, seed=3, noise=NOISE_FREE, clasp_s=10.0, circles=0)
     recording = simulation.recording()
     start = recording.span(recording.phases["start"][0])
     sensor = recording.sensors["torso"]

@@ -1,4 +1,4 @@
-"""Noise and bias of a static phase, and the quietest window."""
+"""Noise and bias of a static phase, and the find_static_window window."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadPhase
-from wepose_pin.filters.noise import ACCEL_FLOOR, GYRO_FLOOR, QUIET_S, noise_of, quietest
+from wepose_pin.filters.noise import ACCEL_FLOOR, GYRO_FLOOR, QUIET_S, estimate_noise, find_static_window
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 
 RATE = 100.0
@@ -17,7 +17,7 @@ def test_moments_are_the_samples() -> None:
     rng = np.random.default_rng(0)
     gyro = rng.normal(scale=1e-2, size=(4000, 3)) + [0.01, 0.02, -0.03]
     accel = rng.normal(scale=0.05, size=(4000, 3)) + [0.0, 0.0, 9.7]
-    noise = noise_of(gyro, accel, RATE)
+    noise = estimate_noise(gyro, accel, RATE)
     np.testing.assert_allclose(noise.gyro_bias, gyro.mean(axis=0))
     np.testing.assert_allclose(noise.gyro_cov, np.cov(gyro.T))
     assert noise.gravity == pytest.approx(np.linalg.norm(accel, axis=1).mean())
@@ -34,7 +34,7 @@ def test_sway_makes_the_bias_uncertain() -> None:
     sway = np.deg2rad(0.1) * np.outer(np.sin(2 * np.pi * 0.3 * time + 1.0), [0.0, 1.0, 0.0])
     white = rng.normal(scale=1e-4, size=(400, 3))
     accel = rng.normal(scale=0.01, size=(400, 3)) + [0, 0, 9.8]
-    still, swaying = noise_of(white, accel, RATE), noise_of(white + sway, accel, RATE)
+    still, swaying = estimate_noise(white, accel, RATE), estimate_noise(white + sway, accel, RATE)
     assert np.sqrt(swaying.gyro_bias_cov[1, 1]) > 5 * np.sqrt(still.gyro_bias_cov[1, 1])
     error = abs(swaying.gyro_bias[1] - white[:, 1].mean())
     assert error < 4 * np.sqrt(swaying.gyro_bias_cov[1, 1])
@@ -50,7 +50,7 @@ def test_a_worn_sensor_s_bias_is_as_uncertain_as_sway_makes_it(seconds: float) -
         omega, phase = 2.0 * np.pi * rng.uniform(0.1, 0.5, (3, 3, 1)), rng.uniform(0.0, 6.3, (3, 3, 1))
         sway = np.deg2rad(rng.uniform(0.3, 1.0)) * np.sqrt(2.0 / 3.0) * np.cos(omega * time + phase).sum(axis=1).T
         gyro = sway + rng.normal(scale=np.deg2rad(0.07), size=(len(time), 3))
-        noise = noise_of(gyro, np.tile([0.0, 0.0, 9.8], (len(time), 1)), RATE, worn=True)
+        noise = estimate_noise(gyro, np.tile([0.0, 0.0, 9.8], (len(time), 1)), RATE, worn=True)
         z += list(noise.gyro_bias / np.sqrt(np.diag(noise.gyro_bias_cov)))
     print(f"{seconds} s: rms {np.sqrt(np.mean(np.square(z))):.2f}, largest {np.abs(z).max():.1f} standard deviations")
     assert np.sqrt(np.mean(np.square(z))) < 1.7
@@ -63,7 +63,7 @@ def test_a_sensor_that_does_not_sway_is_not_taken_for_a_person() -> None:
     for seconds in (0.6, 1.9, 2.5, 4.0):
         gyro = rng.normal(scale=1e-3, size=(round(seconds * RATE), 3))
         accel = np.tile([0.0, 0.0, 9.8], (len(gyro), 1))
-        worn, lying = (noise_of(gyro, accel, RATE, worn).gyro_bias_cov for worn in (True, False))
+        worn, lying = (estimate_noise(gyro, accel, RATE, worn).gyro_bias_cov for worn in (True, False))
         assert (np.sqrt(np.trace(worn) / 3) < np.deg2rad(0.1)) == (seconds > 2.0)
         assert np.trace(worn) >= np.trace(lying)
 
@@ -78,21 +78,21 @@ def test_a_steady_turn_is_not_the_quietest_window() -> None:
         gyro[:1000, 2] += np.deg2rad(20.0)  # a chair, very evenly
         gyro[1000:] += np.deg2rad(0.5) * np.sin(2.0 * time[1000:, None] + [0.0, 1.0, 2.0])  # standing, with sway
         sensors[segment] = ImuSensor(gyro_S=gyro, accel_S=rng.normal(scale=0.02, size=(n, 3)) + [0.0, 0.0, 9.8])
-    first, _ = quietest(Recording("chair", time, RATE, sensors, {}))
+    first, _ = find_static_window(Recording("chair", time, RATE, sensors, {}))
     assert first >= 9.9
 
 
 def test_a_quantised_signal_leaves_invertible_covariances() -> None:
-    noise = noise_of(np.zeros((50, 3)), np.tile([0.0, 0.0, 9.8], (50, 1)), RATE)
+    noise = estimate_noise(np.zeros((50, 3)), np.tile([0.0, 0.0, 9.8], (50, 1)), RATE)
     assert np.linalg.eigvalsh(noise.gyro_cov)[0] >= 0.99 * GYRO_FLOOR**2
     assert np.linalg.eigvalsh(noise.accel_cov)[0] >= 0.99 * ACCEL_FLOOR**2
 
 
 def test_too_little_and_weightless_are_named() -> None:
     with pytest.raises(BadPhase, match="holds 5 samples"):
-        noise_of(np.zeros((5, 3)), np.ones((5, 3)), RATE)
+        estimate_noise(np.zeros((5, 3)), np.ones((5, 3)), RATE)
     with pytest.raises(BadPhase, match="no gravity"):
-        noise_of(np.zeros((50, 3)), np.zeros((50, 3)), RATE)
+        estimate_noise(np.zeros((50, 3)), np.zeros((50, 3)), RATE)
 
 
 @pytest.mark.parametrize("ready", [False, True])
@@ -110,7 +110,7 @@ def test_the_quietest_window_is_found(ready: bool) -> None:
         sensor = OrientationSensor(quat_WS=Rotation.concatenate(rotation[1:]).as_quat())
     else:
         sensor = ImuSensor(gyro_S=gyro, accel_S=np.tile([0, 0, 9.8], (3000, 1)))
-    first, last = quietest(Recording("r", time, RATE, {"torso": sensor}))
+    first, last = find_static_window(Recording("r", time, RATE, {"torso": sensor}))
     assert first >= 106.95
     assert last <= 109.55
     assert last - first == pytest.approx(QUIET_S, abs=0.02)

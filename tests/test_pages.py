@@ -17,7 +17,7 @@ from wepose_pin.batch.page import build_study_page
 from wepose_pin.batch.plan import Item, Plan, step_options
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import as_json
-from wepose_pin.recording import ImuSensor, Recording, check, mount_from_axes
+from wepose_pin.recording import ImuSensor, Recording, check_recording, compute_mount
 from wepose_pin.report import track_report, write_decimated_pages
 from wepose_pin.report.decimation import Decimator
 from wepose_pin.simulation import Simulation
@@ -32,7 +32,7 @@ def recorded(moved: dict[str, float], *, seconds: float = 6.0, noise: float = 1e
     """A person who stands for two seconds and then swings `moved` about the y axis."""
     rate_hz, rng = 100.0, np.random.default_rng(1)
     time = np.arange(round(seconds * rate_hz)) / rate_hz
-    R_LS = Rotation.from_quat(mount_from_axes("+x", "-z"))
+    R_LS = Rotation.from_quat(compute_mount("+x", "-z"))
     segments = {
         "both": ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"),
         "one arm": ("torso", "right_upper_arm", "right_forearm"),
@@ -50,7 +50,7 @@ def recorded(moved: dict[str, float], *, seconds: float = 6.0, noise: float = 1e
             stated_quat_LS=R_LS.as_quat(),
         )
     until = min(1.9, seconds - 0.1)
-    return check(Recording("hangs", time, rate_hz, made, {"start": ((0.2, until),)}))
+    return check_recording(Recording("hangs", time, rate_hz, made, {"start": ((0.2, until),)}))
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ import pytest
 
 from wepose_pin.errors import BadData, UnknownColumn
 from wepose_pin.readers import tables
-from wepose_pin.readers.parquet import contents
+from wepose_pin.readers.parquet import read_contents
 
 VALUES = np.arange(12.0)
 N = len(VALUES)
@@ -90,7 +90,7 @@ def spoil(parts: dict[str, Any], changed: tuple[Any, ...], to: Any) -> None:
 def refusal(path: Path, data: bytes) -> str:
     path.write_bytes(data)
     with pytest.raises(BadData) as refused:
-        contents(path)
+        read_contents(path)
     return str(refused.value).removeprefix(f"{path}: cannot be read as a Parquet file: ")
 
 
@@ -102,7 +102,7 @@ def test_a_file_made_by_hand_is_what_polars_takes(pages: str, tmp_path: Path) ->
     """So that what is refused below is refused for what was changed."""
     (tmp_path / "a.parquet").write_bytes(made(pages))
     assert pl.read_parquet(tmp_path / "a.parquet")["a"].to_list() == VALUES.tolist()
-    assert contents(tmp_path / "a.parquet") == (N, {"a": max(8 * N, sum(header[2] for header, _ in PAGES[pages]))})
+    assert read_contents(tmp_path / "a.parquet") == (N, {"a": max(8 * N, sum(header[2] for header, _ in PAGES[pages]))})
 
 
 @pytest.mark.parametrize("compression", ["uncompressed", "snappy", "zstd", "gzip", "lz4", "brotli"])
@@ -120,7 +120,7 @@ def test_what_polars_writes_is_taken(options: dict[str, Any], compression: Any, 
     })  # fmt: skip
     for part in (table, table.head(0), table.head(1)):
         part.write_parquet(tmp_path / "a.parquet", compression=compression, **options)
-        found = contents(tmp_path / "a.parquet")
+        found = read_contents(tmp_path / "a.parquet")
         assert found.rows == part.height
         assert list(found.sizes) == part.columns
         assert all(size >= 8 * part.height for size in found.sizes.values())
@@ -129,15 +129,15 @@ def test_what_polars_writes_is_taken(options: dict[str, Any], compression: Any, 
 
 def test_a_table_without_columns(tmp_path: Path) -> None:
     pl.DataFrame().write_parquet(tmp_path / "a.parquet")
-    assert contents(tmp_path / "a.parquet") == (0, {})
+    assert read_contents(tmp_path / "a.parquet") == (0, {})
 
 
 def test_a_column_is_sought_in_what_the_file_holds(tmp_path: Path) -> None:
     pl.DataFrame({"time": VALUES}).write_parquet(tmp_path / "a.parquet")
-    values, height = tables.one_column(tmp_path / "a.parquet", "time", "a.parquet", "data.time")
+    values, height = tables.read_column(tmp_path / "a.parquet", "time", "a.parquet", "data.time")
     assert (values.tolist(), height) == (VALUES.tolist(), N)
     with pytest.raises(UnknownColumn, match=r"data.time: no column 'tine' in a.parquet; did you mean 'time'\?"):
-        tables.one_column(tmp_path / "a.parquet", "tine", "a.parquet", "data.time")
+        tables.read_column(tmp_path / "a.parquet", "tine", "a.parquet", "data.time")
 
 
 def test_how_often_a_file_is_walked_does_not_grow_with_the_pieces(
@@ -145,7 +145,7 @@ def test_how_often_a_file_is_walked_does_not_grow_with_the_pieces(
 ) -> None:
     pl.DataFrame({"time": VALUES}).write_parquet(tmp_path / "a.parquet")
     walked = []
-    monkeypatch.setattr(tables, "contents", lambda path: (walked.append(path), contents(path))[1])
+    monkeypatch.setattr(tables, "read_contents", lambda path: (walked.append(path), read_contents(path))[1])
     rows = tables.Rows(tmp_path / "a.parquet")
     assert [rows[k : k + 2]["time"].to_list() for k in range(0, N, 2)] == VALUES.reshape(-1, 2).tolist()
     assert len(walked) == 1
@@ -210,7 +210,7 @@ def test_rows_of_no_columns(tmp_path: Path) -> None:
     footer = thrift({1: 1, 2: [{4: b"table", 5: 0}], 3: Long(10**17), 4: groups})
     (tmp_path / "a.parquet").write_bytes(b"PAR1" + footer + struct.pack("<I", len(footer)) + b"PAR1")
     with pytest.raises(BadData, match="holds 100000000000000000 rows of 0 columns"):
-        tables.one_column(tmp_path / "a.parquet", None, "a.parquet", "data.time")
+        tables.read_column(tmp_path / "a.parquet", None, "a.parquet", "data.time")
 
 
 @pytest.mark.parametrize("at", ["beginning", "end"])

@@ -20,7 +20,7 @@ from wepose_pin.cli import main
 from wepose_pin.diagnostics import from_json
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.filters import METHODS, SensorRun, chunk_multiple, run_filter
-from wepose_pin.filters.noise import noise_of
+from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.kinematics import pose_table
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
@@ -157,7 +157,7 @@ def one_sensor(made: Simulation) -> tuple[np.ndarray, np.ndarray]:
 def test_filters_in_pieces(made: Simulation, method: str) -> None:
     """The last two pieces of the smoother have seen all that lies behind them."""
     gyro, accel = one_sensor(made)
-    noise = noise_of(gyro[50:450], accel[50:450], RATE)
+    noise = estimate_noise(gyro[50:450], accel[50:450], RATE)
     whole = run_filter(gyro, accel, RATE, noise, method)
     size = 40 * chunk_multiple(method, RATE)
     edges = [*range(0, len(gyro) - size, size), len(gyro)] if size > 40 else [0, 60, 1000, 1001, 3000, len(gyro)]

@@ -22,14 +22,14 @@ from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (
+    IDEAL_PRESET,
+    MILD_PRESET,
     MTI_3,
-    PERFECT,
-    PERFECT_WORLD,
-    REALISTIC,
+    NOISE_FREE,
     Person,
     Simulation,
     simulate,
-    simulated_person,
+    simulate_person,
 )
 from wepose_pin.simulation.tasks import TASKS, Touch
 from wepose_pin.subject import LENGTHS
@@ -44,15 +44,15 @@ def made(protocol: str, seed: int, real: bool) -> tuple[Person, Simulation]:
     """A minute of a protocol with mounts at any rotation, exact or with usual imperfections."""
     key = (protocol, seed, real)
     if key not in MADE:
-        person = simulated_person(seed)
+        person = simulate_person(seed)
         MADE[key] = (
             person,
             simulate(
                 person.lengths,
                 seed=seed,
                 rate_hz=100.0 if real else 50.0,
-                noise=MTI_3 if real else PERFECT,
-                imperfections=replace(REALISTIC if real else PERFECT_WORLD, mount="any"),
+                noise=MTI_3 if real else NOISE_FREE,
+                imperfections=replace(MILD_PRESET if real else IDEAL_PRESET, mount="any"),
                 circles=0,
                 protocol=protocol,
                 pose_deg=POSE_DEG if real else 0.0,

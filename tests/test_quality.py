@@ -20,19 +20,19 @@ from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, INFO, WARNING, from_json, render
 from wepose_pin.errors import CalibrationFailed, WeposeWarning
 from wepose_pin.recording import Recording
-from wepose_pin.simulation import REALISTIC, Imperfections, Person, Simulation, simulate, simulated_person
+from wepose_pin.simulation import MILD_PRESET, Imperfections, Person, Simulation, simulate, simulate_person
 from wepose_pin.simulation import motion as motions
 from wepose_pin.simulation.tasks import TASKS
 from wepose_pin.subject import LENGTHS
 from wepose_pin.writers import write_session
 
-ANY = replace(REALISTIC, mount="any")
+ANY = replace(MILD_PRESET, mount="any")
 SEED = 3
 
 
 @pytest.fixture(scope="module")
 def person() -> Person:
-    return simulated_person(SEED)
+    return simulate_person(SEED)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def anywhere(person: Person) -> Simulation:
 
 @pytest.fixture(scope="module")
 def stated(person: Person) -> Simulation:
-    return simulate(person.lengths, seed=SEED, imperfections=REALISTIC, circles=0)
+    return simulate(person.lengths, seed=SEED, imperfections=MILD_PRESET, circles=0)
 
 
 def moved_otherwise(person: Person, share: Mapping[str, float], imperfections: Imperfections = ANY) -> Simulation:

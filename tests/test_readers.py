@@ -18,13 +18,13 @@ from wepose_pin.cli import main
 from wepose_pin.diagnostics import Diagnostic, as_json, render
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.readers import iter_session
-from wepose_pin.readers.tables import Rows, one_column, read_table
-from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, Sensor, check
-from wepose_pin.recording.clocks import clock_of, common_time
-from wepose_pin.recording.gaps import BRIDGED, LONG, bridge, bridge_quat, lost_samples
+from wepose_pin.readers.tables import Rows, read_column, read_table
+from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, Sensor, check_recording
+from wepose_pin.recording.clocks import build_clock, find_common_time
+from wepose_pin.recording.gaps import BRIDGED, LONG, bridge, bridge_quat, mark_lost_samples
 from wepose_pin.recording.limits import GRAVITY_ERROR_NOTED
-from wepose_pin.recording.plausibility import check_signals, cut_off
-from wepose_pin.recording.resampling import on_time
+from wepose_pin.recording.plausibility import check_signals, find_cut_off
+from wepose_pin.recording.resampling import resample
 
 SIGNALS = {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"], "orientation": ["qx", "qy", "qz", "qw"]}
 RAW = [*SIGNALS["gyro"], *SIGNALS["accel"]]
@@ -177,7 +177,7 @@ def test_rows_of_a_csv_are_those_of_the_whole(tmp_path: Path, monkeypatch: pytes
     for first, last in ((0, 3), (2, 20), (20, 21), (60, 100)):
         part = rows[first:last]
         assert part.cast(pl.Float64).equals(whole[first:last].cast(pl.Float64))
-    values, height = one_column(tmp_path / "t.csv", "b", "t.csv", "x")
+    values, height = read_column(tmp_path / "t.csv", "b", "t.csv", "x")
     assert height == 100
     np.testing.assert_array_equal(values, whole["b"])
 
@@ -223,11 +223,11 @@ def test_ready_orientations_are_bridged_along_the_rotation(tmp_path: Path) -> No
 
 
 def test_gaps_at_both_ends_keep_the_nearest_value() -> None:
-    clock = clock_of(np.arange(10) / 100.0, "x")
+    clock = build_clock(np.arange(10) / 100.0, "x")
     values = np.arange(10.0)[:, None]
     good = np.ones(10, dtype=bool)
     good[[0, 1, 9]] = False
-    marks = lost_samples(clock, good)
+    marks = mark_lost_samples(clock, good)
     assert marks.tolist() == [BRIDGED] * 2 + [0] * 7 + [BRIDGED]
     assert bridge(values, marks, clock)[:, 0].tolist() == [2.0, 2.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 8.0]
     quat = rotations.exp(values * [0.0, 0.0, 0.1])
@@ -236,22 +236,22 @@ def test_gaps_at_both_ends_keep_the_nearest_value() -> None:
 
 @pytest.mark.parametrize("step", [0.001, 0.01, 0.1])
 def test_fifty_milliseconds_are_bridged_and_one_sample_more_is_not(step: float) -> None:
-    clock = clock_of(np.arange(1000) * step, "x")
+    clock = build_clock(np.arange(1000) * step, "x")
     most = max(1, round(0.05 / step))
     for count, mark in ((most, BRIDGED), (most + 1, LONG)):
         good = np.ones(1000, dtype=bool)
         good[200 : 200 + count] = False
-        assert set(lost_samples(clock, good)[~good]) == {mark}
+        assert set(mark_lost_samples(clock, good)[~good]) == {mark}
 
 
 def test_in_a_long_gap_the_rate_falls_to_the_bias() -> None:
-    clock = clock_of(np.arange(1000) / 100.0, "x")
+    clock = build_clock(np.arange(1000) / 100.0, "x")
     bias = np.array([0.01, -0.02, 0.03])
     rate = np.tile(bias, (1000, 1))
     rate[400:] += 2.0 * np.sin(np.arange(600) / 7.0)[:, None]
     good = np.ones(1000, dtype=bool)
     good[500:700] = False
-    filled = bridge(np.where(good[:, None], rate, np.nan), lost_samples(clock, good), clock, rate=True)
+    filled = bridge(np.where(good[:, None], rate, np.nan), mark_lost_samples(clock, good), clock, rate=True)
     np.testing.assert_allclose(filled[515:685], np.tile(bias, (170, 1)), atol=1e-12)
     assert np.abs(np.diff(filled[498:702], axis=0)).max() < 0.35
     assert np.abs(filled[500:700]).max() <= np.abs(rate).max()
@@ -364,7 +364,7 @@ def test_a_faster_sensor_is_averaged_so_that_its_noise_does_not_fold_down() -> N
     rng = np.random.default_rng(0)
     clock = np.arange(20000) / 1000.0
     noisy = ImuSensor(gyro_S=0.1 * rng.standard_normal((20000, 3)), accel_S=rng.standard_normal((20000, 3)))
-    slow = on_time(noisy, clock, np.arange(1900) / 100.0)
+    slow = resample(noisy, clock, np.arange(1900) / 100.0)
     np.testing.assert_allclose(slow.accel_S.std(), 1.0 / np.sqrt(10.0), rtol=0.05)
     np.testing.assert_allclose(slow.gyro_S.std(), 0.1 / np.sqrt(10.0), rtol=0.05)
 
@@ -394,10 +394,10 @@ def test_a_gap_is_marked_on_the_common_time(tmp_path: Path) -> None:
 
 def test_lost_rows_are_put_back_at_their_times() -> None:
     time = np.delete(np.arange(20) / 100.0, [3, 10, 11, 12])
-    clock = clock_of(time, "x")
+    clock = build_clock(time, "x")
     np.testing.assert_allclose(clock.time, np.arange(20) / 100.0)
     assert clock.row.tolist() == [0, 1, 2, -1, 3, 4, 5, 6, 7, 8, -1, -1, -1, *range(9, 16)]
-    base, diagnostics = common_time("x", {"torso": clock})
+    base, diagnostics = find_common_time("x", {"torso": clock})
     assert base is clock.time
     assert diagnostics == ()
 
@@ -422,7 +422,7 @@ def test_pieces_put_together_are_the_whole(file: str, seconds: float, tmp_path: 
     path = write(tmp_path, table, file=file)
     whole = load_session(path)
     pieces = list(iter_session(path, seconds))
-    assert all(check(piece) is piece for piece in pieces)
+    assert all(check_recording(piece) is piece for piece in pieces)
     assert all(piece.rate_hz == whole.rate_hz for piece in pieces)
     np.testing.assert_array_equal(np.concatenate([piece.time for piece in pieces]), whole.time)
     for name in ("gyro_S", "accel_S"):
@@ -493,8 +493,8 @@ NOISY_PEAK = """-1521 -1583 -1645 -1704 -1764 -1818 -1877 -1926 -1974 -2022 -206
 def test_noise_that_levels_a_peak_is_no_saturation() -> None:
     rate = np.array(NOISY_PEAK.split(), dtype=float) * np.deg2rad(2000.0) / 2**15
     gyro_S = np.column_stack([rate, rate, rate])
-    assert not cut_off(gyro_S, 2.0).any()
-    assert cut_off(np.clip(gyro_S, -2.3, 2.3), 2.0).all(axis=1).sum() == np.count_nonzero(rate < -2.3)
+    assert not find_cut_off(gyro_S, 2.0).any()
+    assert find_cut_off(np.clip(gyro_S, -2.3, 2.3), 2.0).all(axis=1).sum() == np.count_nonzero(rate < -2.3)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 1.6, 3.0, 30.0])
@@ -508,7 +508,7 @@ def test_saturation_is_told_from_noise_of_any_size(noise: float) -> None:
         measured = motion + noise * digit * rng.standard_normal(2000)
         whole, cut = (np.round(np.clip(measured, -m, m) / digit) * digit for m in (9.0, 0.9 * np.abs(motion).max()))
         values = np.column_stack([whole, cut, 0.0 * time])
-        told = cut_off(values, 2.0)
+        told = find_cut_off(values, 2.0)
         assert not told[:, 0].any()
         found += bool(told[:, 1].any())
     assert found == 50

@@ -25,9 +25,9 @@ from wepose_pin.readers.trials import (
     read_ring,
     read_ur5,
 )
-from wepose_pin.simulation import SingleSensor, paper_dynamic
-from wepose_pin.validation import Result, real, summary
-from wepose_pin.validation.registration import register
+from wepose_pin.simulation import SingleSensor, simulate_paper_dynamic
+from wepose_pin.validation import Result, real, summarize
+from wepose_pin.validation.registration import register_sensors
 
 # What the simulated sensor and its reference lie apart by.
 OFFSET_S = -0.028
@@ -49,7 +49,7 @@ def ur5_files(folder: Path, recording: str, sensor: str) -> Ur5Files:
 
 @pytest.fixture(scope="module")
 def moving() -> SingleSensor:
-    return paper_dynamic(5, 100.0)
+    return simulate_paper_dynamic(5, 100.0)
 
 
 def seen_from_elsewhere(sensor: SingleSensor, still: slice = slice(0, 0)) -> Referenced:
@@ -67,7 +67,7 @@ def seen_from_elsewhere(sensor: SingleSensor, still: slice = slice(0, 0)) -> Ref
 
 @pytest.mark.parametrize("still", [slice(0, 0), slice(50, 450)], ids=["bias unknown", "bias known"])
 def test_registration_finds_what_lies_between(moving: SingleSensor, still: slice) -> None:
-    (found,) = register([seen_from_elsewhere(moving, still)], (6.0, 16.0))
+    (found,) = register_sensors([seen_from_elsewhere(moving, still)], (6.0, 16.0))
     assert found.offset_s == pytest.approx(OFFSET_S, abs=1e-3)
     assert np.degrees((Rotation.from_quat(found.quat_BS) * R_BS.inv()).magnitude()) < 0.1
     up_W = (Rotation.from_quat(found.quat_WV) * R_VW).apply([0.0, 0.0, 1.0])
@@ -79,15 +79,15 @@ def test_registration_finds_what_lies_between(moving: SingleSensor, still: slice
 def test_what_cannot_be_registered_is_said(moving: SingleSensor) -> None:
     apart = seen_from_elsewhere(moving)
     with pytest.raises(BadData, match="made: its body does not turn"):
-        register([apart], (0.0, 4.5))  # at rest
+        register_sensors([apart], (0.0, 4.5))  # at rest
     R_WS = Rotation.from_rotvec(np.sin(3.0 * apart.time)[:, None] * [0.5, 0.0, 0.0])
     gyro = np.column_stack([1.5 * np.cos(3.0 * (moving.time - 0.005 - OFFSET_S)), *np.zeros((2, len(moving.time)))])
     with pytest.raises(BadData, match="made: its body turns about one axis only"):
-        register([apart._replace(gyro_S=gyro, quat_VB=R_WS.as_quat())], (6.0, 16.0))
+        register_sensors([apart._replace(gyro_S=gyro, quat_VB=R_WS.as_quat())], (6.0, 16.0))
     with pytest.raises(BadData, match="made: the reference saw 0 samples"):
-        register([apart._replace(quat_VB=np.full_like(apart.quat_VB, np.nan))], (6.0, 16.0))
+        register_sensors([apart._replace(quat_VB=np.full_like(apart.quat_VB, np.nan))], (6.0, 16.0))
     with pytest.raises(BadData, match=r"made: no offset of the clocks within 0\.3 s"):
-        register([apart._replace(time=apart.time + 0.31)], (6.0, 16.0))
+        register_sensors([apart._replace(time=apart.time + 0.31)], (6.0, 16.0))
 
 
 def test_links_are_fitted_from_orientations_and_tip() -> None:
@@ -133,7 +133,7 @@ def test_ring_registration_is_consistent(data: Path) -> None:
         rigid = registered["rigid", segment]
         assert rigid.left_deg < 0.5
         assert rigid.left_deg < registered["loose", segment].left_deg
-        (alone,) = register([chain.sensors["rigid", segment]], (0.0, 10.0))
+        (alone,) = register_sensors([chain.sensors["rigid", segment]], (0.0, 10.0))
         assert alone.offset_s == pytest.approx(rigid.offset_s, abs=2e-3)
         mounts = Rotation.from_quat(alone.quat_BS) * Rotation.from_quat(rigid.quat_BS).inv()
         assert np.degrees(mounts.magnitude()) < 0.3
@@ -143,11 +143,11 @@ def test_ring_registration_is_consistent(data: Path) -> None:
 
 @cache
 def results(data: Path, experiment: str) -> tuple[Result, ...]:
-    return tuple(result for job in real.experiments(data)[experiment] for result in job())
+    return tuple(result for job in real.list_experiments(data)[experiment] for result in job())
 
 
 def means(data: Path, experiment: str) -> dict[str, dict[str, float]]:
-    found = {row.method: row.figures for row in summary(results(data, experiment))}
+    found = {row.method: row.figures for row in summarize(results(data, experiment))}
     for method, figures in found.items():
         print(f"{experiment}, {method}: " + ", ".join(f"{k} {v:.2f}" for k, v in figures.items()))
     return found
@@ -204,7 +204,7 @@ def test_broad_needs_no_registration(data: Path) -> None:
     sensor = Referenced(
         trial.name, trial.rate_hz, gyro, trial.accel_S[part], time, trial.quat_true[part], trial.static
     )._replace(static=slice(0, 0))
-    (found,) = register([sensor], (0.0, 12.8))
+    (found,) = register_sensors([sensor], (0.0, 12.8))
     assert found.offset_s == pytest.approx(0.5 / trial.rate_hz, abs=1e-3)
     assert np.degrees(Rotation.from_quat(found.quat_BS).magnitude()) < 0.3
     assert found.tilt_deg < 0.4
@@ -246,10 +246,10 @@ def test_a_ur5_that_does_not_fit_is_said(
 
 
 def test_quick_takes_two_of_broad_and_one_of_the_others(data: Path) -> None:
-    quick = real.experiments(data, quick=True)
+    quick = real.list_experiments(data, quick=True)
     assert len(quick["BROAD"]) == 2
     assert len(quick["RING, rigid mounts"]) == len(quick["UR5"]) == 1
-    assert len(real.experiments(data)["RING, loose mounts"]) == 5
+    assert len(real.list_experiments(data)["RING, loose mounts"]) == 5
 
 
 def test_files_are_found_by_their_columns_wherever_they_lie(data: Path, tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_files_are_found_by_their_columns_wherever_they_lie(data: Path, tmp_path
     (run / "notes.csv").write_text("a,b\n1,2\n")
     (run / "damaged.csv").write_bytes(b"\xff\xfe\x00")
     (run / "folder.csv").mkdir()
-    found = real.experiments(tmp_path)
+    found = real.list_experiments(tmp_path)
     assert [job.trial for job in found["UR5"]] == ["monday carpus"]
     assert [job.trial for job in found["RING, loose mounts"]] == list(RING_SEGMENTS)
     assert find_ring(tmp_path)[0].imu["loose"].name == "imu LOOSE.csv"
@@ -283,7 +283,7 @@ def test_a_trial_that_cannot_be_scored_is_told_and_skipped(
     good = sorted((data / "broad").glob("*.mat"))[0]
     (tmp_path / "broad" / "00_damaged.mat").write_bytes(b"no trial")
     (tmp_path / "broad" / good.name).symlink_to(good)
-    monkeypatch.setattr("wepose_pin.validation.experiments", lambda _, folder: real.experiments(folder))
+    monkeypatch.setattr("wepose_pin.validation.list_experiments", lambda _, folder: real.list_experiments(folder))
     out = tmp_path / "out"
     with pytest.raises(SystemExit) as stop:
         main(["validate", "--data", str(tmp_path), "-o", str(out)])

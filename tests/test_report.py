@@ -18,7 +18,7 @@ from wepose_pin.recording import Recording
 from wepose_pin.report import calibration_report
 from wepose_pin.report.calibration_figures import broken, direction, smoothed
 from wepose_pin.report.words import plus_minus
-from wepose_pin.simulation import REALISTIC, simulate, simulated_person
+from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
 from wepose_pin.tracking import TrackedRecording, track
 
 Made = tuple[Calibration, Recording, TrackedRecording]
@@ -27,8 +27,8 @@ UNCERTAIN = Diagnostic("upper-arm-length-uncertain", WARNING, "left_upper_arm", 
 
 @pytest.fixture(scope="module")
 def made() -> Made:
-    person = simulated_person(3)
-    world = replace(REALISTIC, mount="any")
+    person = simulate_person(3)
+    world = replace(MILD_PRESET, mount="any")
     recording = simulate(person.lengths, seed=3, imperfections=world, clasp_s=30.0, circles=0).recording("anna <3")
     found = calibrate_lengths(recording, measured=person.measured, prior=person.prior)
     return found, recording, track(recording, found.subject)

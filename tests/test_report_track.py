@@ -21,7 +21,7 @@ from wepose_pin.cli import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.kinematics import Pose, axis_std
 from wepose_pin.recording import OrientationSensor, Recording
-from wepose_pin.recording.plausibility import cut_off
+from wepose_pin.recording.plausibility import find_cut_off
 from wepose_pin.report import track_report
 from wepose_pin.report.chart import COLUMNS, envelope
 from wepose_pin.report.measures import (
@@ -35,7 +35,7 @@ from wepose_pin.report.measures import (
 )
 from wepose_pin.report.track_diagnostics import diagnose_pose
 from wepose_pin.report.words import listed, signed, whole
-from wepose_pin.simulation import Simulation, simulate, simulated_person
+from wepose_pin.simulation import Simulation, simulate, simulate_person
 from wepose_pin.subject import Hinge, Subject, population_subject
 from wepose_pin.tracking import TrackedRecording, TrackOptions, track
 from wepose_pin.writers import write_session
@@ -155,7 +155,7 @@ def test_equal_arguments_give_equal_text_and_a_ready_view_is_taken(pose: Tracked
 
 
 def test_it_does_not_grow_with_the_recording() -> None:
-    simulation = simulate(simulated_person(3).lengths, seed=3, rate_hz=50.0, clasp_s=600.0, circles=0)
+    simulation = simulate(simulate_person(3).lengths, seed=3, rate_hz=50.0, clasp_s=600.0, circles=0)
     page = track_report(track(simulation.recording("long")))
     assert len(page) < 5e6
     assert re.search(r"thinned to 8\.\d pictures a second", page)
@@ -204,7 +204,7 @@ def test_motion_beyond_the_range(simulation: Simulation) -> None:
     gyro = recording.sensors["right_forearm"].gyro_S
     assert gyro is not None
     clipped = np.clip(gyro, -2.1, 2.1)
-    count = np.count_nonzero(cut_off(clipped, 2.0).any(axis=1))
+    count = np.count_nonzero(find_cut_off(clipped, 2.0).any(axis=1))
     assert count > 10
     pose = track(changed(recording, "right_forearm", gyro_S=clipped))
     saturated = the("signal-saturated", pose)
@@ -418,11 +418,11 @@ def test_an_envelope_keeps_the_extremes_and_the_holes() -> None:
 def test_what_is_cut_off() -> None:
     wave = 5.0 * np.sin(np.linspace(0.0, 20.0, 4000))
     values = np.column_stack([np.clip(wave, -3.0, 3.0), wave, np.clip(wave, -9.0, 2.5)])
-    cut = cut_off(values, 2.0)
+    cut = find_cut_off(values, 2.0)
     np.testing.assert_array_equal(cut[:, 0], np.abs(wave) >= 3.0)
     assert not cut[:, 1].any()
     np.testing.assert_array_equal(cut[:, 2], wave >= 2.5)
-    assert not cut_off(values, 4.0)[:, 0].any()
+    assert not find_cut_off(values, 4.0)[:, 0].any()
 
 
 def test_words() -> None:
@@ -435,7 +435,7 @@ def test_words() -> None:
 
 
 def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made = simulate(simulated_person(3).lengths, seed=3, clasp_s=5.0, circles=0)
+    made = simulate(simulate_person(3).lengths, seed=3, clasp_s=5.0, circles=0)
     write_session(tmp_path, made.recording("short"))
     for folder, options in (("with", []), ("without", ["--no-report"])):
         with pytest.raises(SystemExit) as ended:

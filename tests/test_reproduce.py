@@ -19,7 +19,7 @@ from wepose_pin.batch.comparison import find_differences
 from wepose_pin.batch.items import run_items
 from wepose_pin.batch.plan import Item, step_options
 from wepose_pin.cli import main
-from wepose_pin.simulation import simulate, simulated_person
+from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
 from wepose_pin.writers.provenance import code, collect_provenance, file_hash, read_provenance
 
@@ -37,7 +37,7 @@ def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def session(tmp_path: Path) -> Path:
-    made = simulate(simulated_person(1).lengths, seed=1, clasp_s=8.0, circles=0)
+    made = simulate(simulate_person(1).lengths, seed=1, clasp_s=8.0, circles=0)
     (tmp_path / "session").mkdir()
     write_session(tmp_path / "session", made.recording("made"), made.truth())
     return tmp_path / "session"

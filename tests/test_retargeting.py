@@ -559,12 +559,12 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from wepose_pin.simulation import simulate, simulated_person
+    from wepose_pin.simulation import simulate, simulate_person
     from wepose_pin.tracking import track
     from wepose_pin.writers import write_result
 
     folder = tmp_path_factory.mktemp("result")
-    made = simulate(simulated_person(2).lengths, seed=2)
+    made = simulate(simulate_person(2).lengths, seed=2)
     tracked = track(made.recording("made"))
     pose, keep = tracked.pose, slice(0, 600)
     short = replace(

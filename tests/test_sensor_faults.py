@@ -15,15 +15,15 @@ from wepose_pin import estimate_orientation, load_session, rotations
 from wepose_pin.alignment import START_POSE_STD
 from wepose_pin.diagnostics import Diagnostic, render
 from wepose_pin.errors import BadData, BadPhase
-from wepose_pin.filters.noise import quietest
+from wepose_pin.filters.noise import find_static_window
 from wepose_pin.readers import iter_session
 from wepose_pin.readers.session import SessionReader
 from wepose_pin.readers.trials import read_broad
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
-from wepose_pin.recording.clocks import clock_of
-from wepose_pin.recording.faults import faults_of, scan_sensor
+from wepose_pin.recording.clocks import build_clock
+from wepose_pin.recording.faults import find_faults, scan_sensor
 from wepose_pin.recording.plausibility import check_signals
-from wepose_pin.simulation import PERFECT, Simulation, simulate, simulated_person
+from wepose_pin.simulation import NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.tracking import TrackOptions, track, track_session
 from wepose_pin.tracking.segments import estimate_segments
 from wepose_pin.writers import write_session
@@ -36,12 +36,12 @@ AXES = [f"{signal} {axis}" for signal in ("gyro", "accel") for axis in "xyz"]
 @pytest.fixture(scope="module")
 def made() -> Simulation:
     """Twenty-five seconds: start pose from 0.5 to 4.5 s, then the arms move."""
-    return simulate(simulated_person(1).lengths, seed=1, clasp_s=5.0, circles=1)
+    return simulate(simulate_person(1).lengths, seed=1, clasp_s=5.0, circles=1)
 
 
 @pytest.fixture(scope="module")
 def clean() -> Simulation:
-    return simulate(simulated_person(1).lengths, seed=1, noise=PERFECT, clasp_s=20.0, circles=1)
+    return simulate(simulate_person(1).lengths, seed=1, noise=NOISE_FREE, clasp_s=20.0, circles=1)
 
 
 def with_sensor(recording: Recording, name: str, **changes: object) -> Recording:
@@ -206,7 +206,7 @@ def found(recording: Recording) -> dict[str, list[tuple[str, float]]]:
     """Sensor → what stands still in it and from when [s]."""
     sensors = recording.sensors.items()
     scans = {name: scan_sensor(recording.time, sensor.gyro_S, sensor.accel_S) for name, sensor in sensors}
-    return {name: [(f.signals, round(f.first, 3)) for f in faults] for name, faults in faults_of(scans).items()}
+    return {name: [(f.signals, round(f.first, 3)) for f in faults] for name, faults in find_faults(scans).items()}
 
 
 @pytest.mark.parametrize("axis", AXES)
@@ -260,7 +260,7 @@ def test_axes_of_a_coarse_sensor_stay_the_same(bias_deg: float, moving: bool) ->
     accel = R.inv().apply([3.0, 1.0, 9.3]) + 0.05 * rng.standard_normal(gyro.shape)
     scan = scan_sensor(time, np.round(gyro / step) * step, np.round(accel / 0.04) * 0.04)
     assert any(scan.long_runs(axis) for axis in AXES[:3])
-    assert faults_of({"one": scan}) == {}
+    assert find_faults({"one": scan}) == {}
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.1, 0.2, 0.3, 0.5])
@@ -269,7 +269,7 @@ def test_an_axis_between_two_digits_says_nothing_of_one_on_a_digit(noise: float)
     rng, digit, time = np.random.default_rng(0), np.deg2rad(0.06), np.arange(30_000) / 100.0
     gyro = np.array([0.0, 0.5, 0.5]) + noise * rng.standard_normal((len(time), 3))
     accel = [0.0, 0.0, 9.81] + 0.02 * rng.standard_normal((len(time), 3))
-    assert faults_of({"one": scan_sensor(time, digit * np.round(gyro), accel)}) == {}
+    assert find_faults({"one": scan_sensor(time, digit * np.round(gyro), accel)}) == {}
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0.8, 0), (0.6, 0, 0.8)])
@@ -291,7 +291,7 @@ def test_a_clean_motion_about_one_axis_is_one(
     rate = np.gradient(angle, time)[:, None] * np.round(R_SL.apply(axis), 12)
     scan = scan_sensor(time, rate, np.round(force, 9))
     assert tilt == 0.5 or any(scan.long_runs(axis) for axis in AXES[:3])
-    assert [fault.signals for fault in faults_of({"one": scan}).get("one", []) if fault.signals in AXES] == []
+    assert [fault.signals for fault in find_faults({"one": scan}).get("one", []) if fault.signals in AXES] == []
 
 
 def test_real_sensors_measure_on_every_axis(data: Path) -> None:
@@ -303,7 +303,7 @@ def test_real_sensors_measure_on_every_axis(data: Path) -> None:
     for name, sensor in worn.sensors.items():
         scans[name] = scan_sensor(worn.time, sensor.gyro_S, sensor.accel_S)
     assert len(scans) == 22
-    assert faults_of(scans) == {}
+    assert find_faults(scans) == {}
     assert all(max(scan.repeats(axis) for axis in range(6)) < 0.5 for scan in scans.values())
 
 
@@ -354,10 +354,10 @@ def lost(recording: Recording, name: str, first: float, last: float) -> Recordin
 
 def test_the_quietest_window_is_one_that_was_measured(made: Simulation) -> None:
     whole = replace(made.recording("gap"), phases={})
-    first, last = quietest(lost(whole, "torso", 1.0, 3.0))
+    first, last = find_static_window(lost(whole, "torso", 1.0, 3.0))
     assert last < 1.0 or first > 3.0
     with pytest.raises(BadPhase, match=r"sensors\.torso"):
-        quietest(lost(whole, "torso", 0.0, 25.0))
+        find_static_window(lost(whole, "torso", 0.0, 25.0))
 
 
 def test_gravity_and_noise_are_those_of_measured_samples(made: Simulation) -> None:
@@ -446,11 +446,11 @@ def test_time_stamps_of_packets_are_spread_over_their_samples(packet: int, withi
     true = 1.7e9 + np.arange(2000) / RATE
     stamps = true[packet - 1 :: packet].repeat(packet)
     stamps += np.tile(np.arange(packet) - packet + 1, 2000 // packet) * within
-    clock = clock_of(stamps, "x")
+    clock = build_clock(stamps, "x")
     assert clock.packet == packet
     np.testing.assert_allclose(clock.time, true, atol=1e-4 + 0.02 * within)
     lost = np.r_[0:1000, 1000 + packet : 2000]
-    clock = clock_of(stamps[lost], "x")
+    clock = build_clock(stamps[lost], "x")
     np.testing.assert_allclose(clock.time[clock.row >= 0], true[lost], atol=1e-4 + 0.02 * within)
     assert np.count_nonzero(clock.row < 0) == packet
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.simulation import LENGTHS, PERFECT, SEGMENTS, ImuNoise, Simulation, simulate
+from wepose_pin.simulation import LENGTHS, NOISE_FREE, SEGMENTS, ImuNoise, Simulation, simulate
 
 G = 9.81
 SIDES = ("left", "right")
@@ -28,12 +28,12 @@ SUBJECT = {
 
 @pytest.fixture(scope="module")
 def perfect() -> Simulation:
-    return simulate(SUBJECT, seed=3, noise=PERFECT)
+    return simulate(SUBJECT, seed=3, noise=NOISE_FREE)
 
 
 @pytest.fixture(scope="module")
 def fast() -> Simulation:
-    return simulate(SUBJECT, seed=4, rate_hz=1000.0, noise=PERFECT, clasp_s=10.0, circles=1)
+    return simulate(SUBJECT, seed=4, rate_hz=1000.0, noise=NOISE_FREE, clasp_s=10.0, circles=1)
 
 
 def rotation_WS(sim: Simulation, segment: str) -> Rotation:
@@ -220,7 +220,7 @@ def test_stated_axes_and_gravity_give_the_mount(perfect: Simulation) -> None:
 
 def test_gyro_and_accel_are_of_human_size() -> None:
     for seed in range(12):
-        sim = simulate(SUBJECT, seed=seed, rate_hz=50.0, noise=PERFECT)
+        sim = simulate(SUBJECT, seed=seed, rate_hz=50.0, noise=NOISE_FREE)
         for segment in SEGMENTS:
             assert np.linalg.norm(sim.gyro_S[segment], axis=1).max() < 15
             assert np.linalg.norm(sim.accel_S[segment], axis=1).max() < 40
@@ -248,7 +248,7 @@ def test_same_seed_same_bits() -> None:
 def test_noise_and_rate_leave_motion_and_mounts_alone() -> None:
     slow, quick = (
         simulate(SUBJECT, seed=9, rate_hz=r, noise=n, clasp_s=5.0, circles=2)
-        for r, n in ((100.0, PERFECT), (400.0, ImuNoise()))
+        for r, n in ((100.0, NOISE_FREE), (400.0, ImuNoise()))
     )
     n = len(slow.time)
     for segment in SEGMENTS:
@@ -260,7 +260,7 @@ def test_noise_and_rate_leave_motion_and_mounts_alone() -> None:
 def test_white_noise_has_the_stated_density(rate_hz: float) -> None:
     noise = ImuNoise(gyro_bias_std=0.0, gyro_bias_instability=0.0, accel_bias_std=0.0, accel_bias_instability=0.0)
     options = {"seed": 2, "rate_hz": rate_hz, "clasp_s": 20.0, "circles": 1}
-    noisy, clean = simulate(SUBJECT, noise=noise, **options), simulate(SUBJECT, noise=PERFECT, **options)
+    noisy, clean = simulate(SUBJECT, noise=noise, **options), simulate(SUBJECT, noise=NOISE_FREE, **options)
     for segment in SEGMENTS:
         gyro = noisy.gyro_S[segment] - clean.gyro_S[segment]
         accel = noisy.accel_S[segment] - clean.accel_S[segment]
@@ -275,7 +275,7 @@ def test_white_noise_has_the_stated_density(rate_hz: float) -> None:
 def test_bias_is_what_remains_of_the_noise() -> None:
     noise = replace(ImuNoise(), gyro_density=0.0, accel_density=0.0)
     options = {"seed": 5, "clasp_s": 5.0, "circles": 0}
-    biased, clean = simulate(SUBJECT, noise=noise, **options), simulate(SUBJECT, noise=PERFECT, **options)
+    biased, clean = simulate(SUBJECT, noise=noise, **options), simulate(SUBJECT, noise=NOISE_FREE, **options)
     for segment in SEGMENTS:
         np.testing.assert_allclose(
             biased.gyro_S[segment] - clean.gyro_S[segment], biased.gyro_bias[segment], atol=1e-14

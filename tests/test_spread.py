@@ -26,7 +26,7 @@ from wepose_pin.calibration.problem import CalibrationProblem
 from wepose_pin.calibration.weights import LEAST_CORRELATION_S
 from wepose_pin.filters.sensors import FilteredRecording
 from wepose_pin.recording import ImuSensor, Recording
-from wepose_pin.simulation import PERFECT, Person, simulate, simulated_person
+from wepose_pin.simulation import NOISE_FREE, Person, simulate, simulate_person
 from wepose_pin.subject import LENGTHS, mount_rows
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -69,8 +69,8 @@ def motion() -> Motion:
 
 
 def motion_of(seed: int) -> Motion:
-    person = simulated_person(seed)
-    simulation = simulate(person.lengths, seed=seed, noise=PERFECT, circles=0)
+    person = simulate_person(seed)
+    simulation = simulate(person.lengths, seed=seed, noise=NOISE_FREE, circles=0)
     begin, end = simulation.phases["clasp"][0]
     stride = round(simulation.rate_hz / RATE_HZ)
     at = np.flatnonzero((simulation.time >= begin) & (simulation.time <= end))[::stride]

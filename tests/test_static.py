@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import run_filter
-from wepose_pin.filters.noise import SensorNoise, noise_of
+from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
 
 RATE = 100.0
@@ -50,7 +50,7 @@ def stop_and_go(rng: np.random.Generator, n: int = 3000) -> tuple[np.ndarray, np
 )
 def test_it_is_what_the_four_conditions_say(test: StaticTest) -> None:
     gyro, accel = stop_and_go(np.random.default_rng(0))
-    noise = noise_of(gyro[:500], accel[:500], RATE)
+    noise = estimate_noise(gyro[:500], accel[:500], RATE)
     expected = by_the_book(gyro, accel, noise, test, RATE)
     found = StaticDetector(noise, RATE, test).run(gyro, accel)
     assert 0.05 < expected.mean() < 0.95
@@ -61,7 +61,7 @@ def test_it_is_what_the_four_conditions_say(test: StaticTest) -> None:
 def test_each_condition_alone_can_say_no(condition: int) -> None:
     rng = np.random.default_rng(1)
     gyro, accel = rng.normal(scale=2e-3, size=(1000, 3)), rng.normal(scale=0.02, size=(1000, 3)) + [0, 0, 9.8]
-    noise = noise_of(gyro, accel, RATE)
+    noise = estimate_noise(gyro, accel, RATE)
     tests = {
         1: PaperTest(alpha=0.01, beta=9, gamma1=1, gamma2=1),
         2: PaperTest(alpha=9, beta=0.01, gamma1=1, gamma2=1),
@@ -78,7 +78,7 @@ def test_the_inequalities_are_of_matrices() -> None:
     mix = np.array([[1.0, -0.95, 0], [-0.95, 1.0, 0], [0, 0, 1]])
     still = rng.multivariate_normal(np.zeros(3), 1e-6 * mix, size=2000)
     accel = rng.normal(scale=0.02, size=(2000, 3)) + [0, 0, 9.8]
-    noise = noise_of(still, accel, RATE)
+    noise = estimate_noise(still, accel, RATE)
     moving = rng.multivariate_normal(np.zeros(3), 1e-6 * np.abs(mix), size=2000)
     assert (np.var(moving, axis=0) < 2 * np.diag(noise.gyro_cov)).all()
     assert StaticDetector(noise, RATE, PaperTest()).run(still, accel)[100:].mean() > 0.9
@@ -88,7 +88,7 @@ def test_the_inequalities_are_of_matrices() -> None:
 @pytest.mark.parametrize("cut", [1, 37, 49, 50, 51, 1234])
 def test_a_run_cut_in_two_and_one_by_one_give_the_same(cut: int) -> None:
     gyro, accel = stop_and_go(np.random.default_rng(3))
-    noise = noise_of(gyro[:500], accel[:500], RATE)
+    noise = estimate_noise(gyro[:500], accel[:500], RATE)
     whole = StaticDetector(noise, RATE, PaperTest()).run(gyro, accel)
     detector = StaticDetector(noise, RATE, PaperTest())
     halves = [detector.run(gyro[:cut], accel[:cut]), detector.run(gyro[cut:], accel[cut:])]
@@ -100,7 +100,7 @@ def test_a_run_cut_in_two_and_one_by_one_give_the_same(cut: int) -> None:
 def test_no_window_before_the_first_is_full() -> None:
     rng = np.random.default_rng(4)
     gyro, accel = rng.normal(scale=2e-3, size=(200, 3)), rng.normal(scale=0.02, size=(200, 3)) + [0, 0, 9.8]
-    static = StaticDetector(noise_of(gyro, accel, RATE), RATE, PaperTest(alpha=9, beta=9)).run(gyro, accel)
+    static = StaticDetector(estimate_noise(gyro, accel, RATE), RATE, PaperTest(alpha=9, beta=9)).run(gyro, accel)
     assert not static[:49].any()
     assert static[49:].all()
 
@@ -128,7 +128,7 @@ def test_what_came_before_the_last_two_windows_leaves_no_trace() -> None:
     """Why 1e8 samples are as good as the first hundred: the state after them is, to the last bit, that of a detector
     that has seen the end alone."""
     gyro, accel = stop_and_go(np.random.default_rng(6))
-    noise = noise_of(gyro[:500], accel[:500], RATE)
+    noise = estimate_noise(gyro[:500], accel[:500], RATE)
     rng = np.random.default_rng(7)
     states = []
     for windows in (0, 1, 3, 2000):
@@ -167,7 +167,7 @@ def test_a_sample_that_is_no_number_says_no_for_one_window_and_is_forgotten(
     wrong: float, at: int, gyro_is_wrong: bool
 ) -> None:
     gyro, accel = stop_and_go(np.random.default_rng(8))
-    noise = noise_of(gyro[:500], accel[:500], RATE)
+    noise = estimate_noise(gyro[:500], accel[:500], RATE)
     without = StaticDetector(noise, RATE, PaperTest()).run(gyro, accel)
     assert without[300:450].any()
     (gyro if gyro_is_wrong else accel)[at, 1] = wrong
@@ -206,7 +206,7 @@ def chair(rate_deg_s: float, seed: int = 0, sway_deg_s: float = 0.0) -> tuple[np
 @pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
 def test_an_office_chair_is_no_bias(method: str, rate: float) -> None:
     gyro, accel, R = chair(rate)
-    noise = noise_of(gyro[:500], accel[:500], RATE)
+    noise = estimate_noise(gyro[:500], accel[:500], RATE)
     paper = StaticDetector(noise, RATE, PaperTest()).run(gyro, accel)
     assert paper[600:1600].mean() > 0.8  # the paper's conditions see nothing in it
     found = run_filter(gyro, accel, RATE, noise, method, measured_start=True, start=slice(0, 500))
@@ -223,7 +223,7 @@ def test_a_rotation_too_slow_to_tell_from_the_bias_is_in_the_standard_deviation(
     worst = 0.0
     for rate in (0.0, 0.02, 0.05, 0.1, 0.2, 0.3):
         gyro, accel, R = chair(rate, 1, sway)
-        noise = noise_of(gyro[:500], accel[:500], RATE, worn=True)
+        noise = estimate_noise(gyro[:500], accel[:500], RATE, worn=True)
         found = run_filter(gyro, accel, RATE, noise, method, measured_start=True, start=slice(0, 500))
         assert found.attitude_cov is not None
         error = Rotation.from_quat(found.quat_WS) * R.inv()
@@ -244,7 +244,7 @@ def test_a_bias_that_warms_up_is_followed() -> None:
     accel = rng.normal(scale=0.02, size=(n, 3)) + [0.0, 0.0, 9.81]
     moving = ~resting
     gyro[moving] += rng.normal(scale=0.5, size=(moving.sum(), 3))
-    detector = StaticDetector(noise_of(gyro[:400], accel[:400], RATE), RATE)
+    detector = StaticDetector(estimate_noise(gyro[:400], accel[:400], RATE), RATE)
     static = detector.run(gyro, accel)
     settled = resting & (time % 60.0 > 1.0)
     assert static[settled].mean() > 0.9

@@ -13,15 +13,15 @@ from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, as_json
 from wepose_pin.evaluation import evaluate
 from wepose_pin.filters import METHODS
 from wepose_pin.readers import load_session
-from wepose_pin.recording import join
-from wepose_pin.simulation import PERFECT, Person, Simulation, simulate
+from wepose_pin.recording import join_recordings
+from wepose_pin.simulation import NOISE_FREE, Person, Simulation, simulate
 from wepose_pin.subject import population_subject
 from wepose_pin.tracking import SummaryAccumulator, Tracker, track
 
 
 def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
     """1 kHz, no noise, the true lengths: what is left is the filter's and the alignment's own error."""
-    simulation = simulate(person.lengths, seed=5, rate_hz=1000.0, noise=PERFECT, clasp_s=10.0, circles=1)
+    simulation = simulate(person.lengths, seed=5, rate_hz=1000.0, noise=NOISE_FREE, clasp_s=10.0, circles=1)
     subject = replace(population_subject(), lengths=person.lengths)
     errors = evaluate(track(simulation.recording(), subject).pose, simulation.truth())
     for name, error in errors.position.items():
@@ -107,5 +107,5 @@ def test_diagnostics_of_later_chunks_are_listed_once_and_not_without_end(simulat
 def test_joined_recordings_keep_the_diagnostics_of_both(simulation: Simulation) -> None:
     first, second = (Diagnostic("signal-saturated", WARNING, name, 0.1) for name in ("torso", "head"))
     begin, end, *_ = simulation.recording().chunks(30.0)
-    joined = join(replace(begin, diagnostics=(first,)), replace(end, diagnostics=(first, second)))
+    joined = join_recordings(replace(begin, diagnostics=(first,)), replace(end, diagnostics=(first, second)))
     assert joined.diagnostics == (first, second)

@@ -12,17 +12,16 @@ from wepose_pin.cli import main
 from wepose_pin.errors import BadData, MissingFile
 from wepose_pin.filters import METHODS
 from wepose_pin.readers.trials import read_authors_trial, read_broad
-from wepose_pin.validation import Result, experiments, summary
-from wepose_pin.validation import run as run_jobs
+from wepose_pin.validation import Result, list_experiments, run_jobs, summarize
 
 
 def run(name: str, quick: bool = True) -> list[Result]:
-    return [result for job in experiments(quick)[name] for result in job()]
+    return [result for job in list_experiments(quick)[name] for result in job()]
 
 
 def test_the_papers_order_comes_back_out_of_the_box_only() -> None:
     """As they come, NCF and GDC are behind as in the paper; with tuned gains and the bias removed they are not."""
-    mean = {method: figures for _, method, figures, _ in summary(run("dynamic 100 Hz"))}
+    mean = {method: figures for _, method, figures, _ in summarize(run("dynamic 100 Hz"))}
     assert set(METHODS) < set(mean)
     for axis in ("roll", "pitch", "yaw"):
         assert mean["smekf"][axis] < mean["gdc, default gains"][axis] < 5.0
@@ -32,14 +31,14 @@ def test_the_papers_order_comes_back_out_of_the_box_only() -> None:
 
 
 def test_two_runs_give_the_same_figures_on_any_number_of_workers() -> None:
-    jobs = experiments(True)["dynamic 100 Hz"] * 2
+    jobs = list_experiments(True)["dynamic 100 Hz"] * 2
     alone, again, *_ = run_jobs(jobs, workers=1)
     assert alone == again
     assert list(run_jobs(jobs, workers=2)) == [alone, again]
 
 
 def test_the_drift_experiment_is_the_papers() -> None:
-    mean = {method: figures for _, method, figures, _ in summary(run("drift"))}
+    mean = {method: figures for _, method, figures, _ in summarize(run("drift"))}
     assert mean["smekf"]["drift_deg_min"] < 0.1
     assert mean["smekf"]["drift_deg_min"] < mean["ncf"]["drift_deg_min"] < mean["ncf, default gains"]["drift_deg_min"]
 
@@ -56,8 +55,8 @@ def test_the_hand_of_one_subject(world: str, limit_mm: float) -> None:
 def test_the_command_writes_every_trial(
     tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = {k: v[:1] for k, v in experiments(True, data).items() if k in ("dynamic 100 Hz", "BROAD", "UR5")}
-    monkeypatch.setattr("wepose_pin.validation.experiments", lambda *_: few)
+    few = {k: v[:1] for k, v in list_experiments(True, data).items() if k in ("dynamic 100 Hz", "BROAD", "UR5")}
+    monkeypatch.setattr("wepose_pin.validation.list_experiments", lambda *_: few)
     with pytest.raises(SystemExit) as stop:
         main(["validate", "--quick", "--data", str(data), "-o", str(tmp_path / "out")])
     assert not stop.value.code
@@ -70,7 +69,7 @@ def test_the_command_writes_every_trial(
 
 def test_trials_that_are_none_are_named(tmp_path: Path) -> None:
     with pytest.raises(MissingFile, match="neither broad"):
-        experiments(data=tmp_path)
+        list_experiments(data=tmp_path)
     for read in (read_broad, read_authors_trial):
         with pytest.raises(MissingFile, match="no such file"):
             read(tmp_path / "nothing.mat")

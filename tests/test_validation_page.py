@@ -11,19 +11,19 @@ import pytest
 
 from wepose_pin.cli import main
 from wepose_pin.errors import BadData, MissingFile
-from wepose_pin.validation import Document, Result, document_text, read_document, summary
-from wepose_pin.validation.document import as_document
-from wepose_pin.validation.figures import pictures
-from wepose_pin.validation.page import as_html, markdown
+from wepose_pin.validation import Document, Result, format_document, read_document, summarize
+from wepose_pin.validation.document import parse_document
+from wepose_pin.validation.figures import draw_pictures
+from wepose_pin.validation.page import render_html, render_markdown
 from wepose_pin.validation.tables import (
     ARBITRARY_MOUNTING,
-    error_budget,
-    experiment_table,
-    imperfections_table,
-    noise_table,
-    overview_table,
-    table_note,
-    targets_table,
+    compute_error_budget,
+    describe_table,
+    make_experiment_table,
+    make_imperfections_table,
+    make_noise_table,
+    make_overview_table,
+    make_targets_table,
 )
 
 TIME = np.linspace(0.0, 10.0, 61)
@@ -78,7 +78,7 @@ RESULTS = [
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     path = tmp_path / "validation.json"
-    path.write_text(document_text(RESULTS, True, {"wepose-pin": "0.0"}), encoding="utf-8")
+    path.write_text(format_document(RESULTS, True, {"wepose-pin": "0.0"}), encoding="utf-8")
     return path
 
 
@@ -103,20 +103,20 @@ def test_the_file_comes_back_as_it_was(document: Document, file: Path) -> None:
 
 
 def test_means_and_both_kinds_of_deviation() -> None:
-    rows = summary([dynamic("smekf", 1.0, 1.0, 1.0, 0), dynamic("smekf", 3.0, 1.0, 1.0, 1)])
+    rows = summarize([dynamic("smekf", 1.0, 1.0, 1.0, 0), dynamic("smekf", 3.0, 1.0, 1.0, 1)])
     assert rows[0].figures["roll"] == 2.0
     assert rows[0].figures["roll std"] == 0.5
     assert rows[0].figures["roll between"] == pytest.approx(np.sqrt(2.0))
     assert rows[0].names() == ["roll", "pitch", "yaw"]
-    header, (line,) = experiment_table(rows, whole=True)
+    header, (line,) = make_experiment_table(rows, whole=True)
     assert header[:2] == ["filter", "roll [deg]"]
     assert line[:2] == ["smekf", "2.00 ± 0.50 (1.41)"]
     assert line[header.index("paper: pitch")] == "1.46 ± 1.71"
-    assert "between the trials" in table_note(rows)
+    assert "between the trials" in describe_table(rows)
 
 
 def test_an_overview_beside_the_paper_and_the_best() -> None:
-    rows = overview_table(summary(DYNAMIC)).rows
+    rows = make_overview_table(summarize(DYNAMIC)).rows
     assert rows == [
         ["dynamic 100 Hz", "roll [deg]", "1.00", "1.10", "1.00", "smekf"],
         ["dynamic 100 Hz", "pitch [deg]", "**1.52**", "1.46", "1.20", "ncf"],
@@ -125,37 +125,39 @@ def test_an_overview_beside_the_paper_and_the_best() -> None:
 
 
 def test_small_gains_are_not_rounded_away() -> None:
-    rows = summary([Result("gains", "BROAD", "gdc, BROAD", {"gain": 0.000562, "integral": 0.0, "total_rmse_deg": 1.0})])
-    assert experiment_table(rows, whole=True).rows == [["gdc, BROAD", "0.000562", "0", "1.00"]]
+    rows = summarize(
+        [Result("gains", "BROAD", "gdc, BROAD", {"gain": 0.000562, "integral": 0.0, "total_rmse_deg": 1.0})]
+    )
+    assert make_experiment_table(rows, whole=True).rows == [["gdc, BROAD", "0.000562", "0", "1.00"]]
 
 
 def test_targets_are_met_or_missed() -> None:
-    found = {(row[0], row[2]): row for row in targets_table(summary(RESULTS)).rows}
+    found = {(row[0], row[2]): row for row in make_targets_table(summarize(RESULTS)).rows}
     assert len(found) == 4
     assert found[REALISTIC, "hand from root"][3:] == ["18.04 mm", "at most 18 mm", "**missed**"]
     assert found[REALISTIC, "hand from shoulders"][-1] == "met"
     assert found[ALONE, "hand from root"][-1] == "met"
     assert found[ALONE, "hand from shoulders"][-1] == "**missed**"
-    assert targets_table(summary(DYNAMIC)).rows == []
+    assert make_targets_table(summarize(DYNAMIC)).rows == []
     mounting = Result(ARBITRARY_MOUNTING, "0", "amekf", {"errors_by_std_rms": 0.6, "lengths_rms_mm": 7.0})
-    assert [row[3:] for row in targets_table(summary([mounting])).rows] == [
+    assert [row[3:] for row in make_targets_table(summarize([mounting])).rows] == [
         ["7.00 mm", "at most 8 mm", "met"],
         ["0.60", "0.7 to 1.5", "**missed**"],
     ]
 
 
 def test_the_error_budget_adds_in_quadrature() -> None:
-    found = error_budget(RESULTS)
+    found = compute_error_budget(RESULTS)
     assert found is not None
     assert found.full["hand"] == 13.0
     assert [part.name for part in found.parts] == ["soft tissue"]
     assert found.parts[0].added["hand"] == pytest.approx(12.0)  # √(13² − 5²)
     assert found.more[0].added["hand"] == pytest.approx(np.sqrt(20.0**2 - 13.0**2))
-    assert error_budget(DYNAMIC) is None
+    assert compute_error_budget(DYNAMIC) is None
 
 
 def test_figures_are_made(document: Document) -> None:
-    made = {picture.stem: picture for _, picture in pictures(document)}
+    made = {picture.stem: picture for _, picture in draw_pictures(document)}
     assert set(made) == {
         "dynamic-100-hz-bars",
         "dynamic-100-hz-over-time",
@@ -171,7 +173,7 @@ def test_figures_are_made(document: Document) -> None:
 
 
 def text_of(document: Document) -> str:
-    return markdown(document, list(pictures(document)))
+    return render_markdown(document, list(draw_pictures(document)))
 
 
 def test_the_page_says_what_it_must(document: Document) -> None:
@@ -190,8 +192,8 @@ def test_the_page_says_what_it_must(document: Document) -> None:
     ):
         assert words in text, words
     assert text_of(document) == text
-    page = as_html(text, list(pictures(document)))
-    assert page.count('<svg class="chart"') == len(list(pictures(document)))
+    page = render_html(text, list(draw_pictures(document)))
+    assert page.count('<svg class="chart"') == len(list(draw_pictures(document)))
     assert 'src="' not in page
     assert '<a href="#never-heard-of">' in page
     assert '<td style="text-align:right"><strong>1.52</strong></td>' in page
@@ -200,21 +202,21 @@ def test_the_page_says_what_it_must(document: Document) -> None:
 
 def test_text_of_a_file_stays_text() -> None:
     nasty = "<script>alert(1)</script>"
-    document = as_document(
+    document = parse_document(
         {"results": [{"experiment": nasty, "trial": "0", "method": nasty, "figures": {"a": 1}}]}, "x"
     )
-    page = as_html(text_of(document), [])
+    page = render_html(text_of(document), [])
     assert "<script" not in page.split("<body>")[1]
     assert "alert(1)" in page
 
 
 def test_which_imperfections_were_on(document: Document) -> None:
-    table = imperfections_table(document.worlds)
+    table = make_imperfections_table(document.worlds)
     assert table.header == ["imperfection", "MTi-3 noise alone", "realistic"]
     sizes = {row[0]: row[1:] for row in table.rows}
     assert sizes["slip of the palms in the clasp, rms"] == ["–", "8 mm"]
     assert sizes["gyroscope range"] == ["–", "2000°/s"]
-    assert ["gyroscope, turn-on bias", "0.2°/s"] in noise_table(document.noise).rows
+    assert ["gyroscope, turn-on bias", "0.2°/s"] in make_noise_table(document.noise).rows
 
 
 def test_pages_anew_from_a_file(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -269,6 +271,6 @@ def test_a_missing_file_and_options_that_do_not_fit(tmp_path: Path, capsys: pyte
 
 def test_broken_figures_in_a_whole_file_do_not_break_the_page() -> None:
     item: dict[str, Any] = {"experiment": "dynamic 100 Hz", "trial": "0", "method": "smekf", "figures": {}}
-    document = as_document({"results": [item, {**item, "experiment": "drift", "series": {}}]}, "made")
+    document = parse_document({"results": [item, {**item, "experiment": "drift", "series": {}}]}, "made")
     assert "Dynamic 100 Hz" in text_of(document)
-    assert as_html(text_of(document), [])
+    assert render_html(text_of(document), [])

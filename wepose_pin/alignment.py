@@ -18,9 +18,9 @@ from . import rotations
 from .diagnostics import WARNING, Diagnostic
 from .errors import BadSession
 from .filters import Orientation
-from .filters.sensors import FilteredRecording, sensor_rotations
+from .filters.sensors import FilteredRecording, collect_rotations
 from .filters.start import ACCEL_BIAS_STD
-from .recording import SEGMENTS, Recording, span_text
+from .recording import SEGMENTS, Recording, format_span
 from .subject import Subject
 
 # Angles [deg] between a stated mount and gravity or motion, above which it is an error or a warning.
@@ -168,7 +168,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
             why = ", which was only guessed: [phases] start = [[from, to]] is missing" if guessed else ""
             raise BadSession(
                 f"{recording.where()}: sensors.{segment}{of} is {off:.0f} deg off gravity in the start pose "
-                f"({span_text(start)}){why}; {do}"
+                f"({format_span(start)}){why}; {do}"
             )
         if off > STATED_WARNING_DEG:
             value, limit = float(np.deg2rad(off)), float(np.deg2rad(STATED_WARNING_DEG))
@@ -198,7 +198,7 @@ def orient_segments(
 ) -> Segments:
     """A recording's segments, or those of a chunk of it, from what its sensors' filters gave."""
     quat_WL, covariance_W = {}, {}
-    for segment, R_VS in sensor_rotations(chunk, orientation).items():
+    for segment, R_VS in collect_rotations(chunk, orientation).items():
         turn, R_LS = alignment.turn[segment], alignment.mount[segment]
         if chunk.sensors[segment].aligned:
             quat_WL[segment] = (turn * R_VS).as_quat()

@@ -12,7 +12,7 @@ from . import rotations
 from .arguments import check_arguments
 from .errors import BadData, BadOption
 from .kinematics import Pose
-from .recording import span_text
+from .recording import format_span
 
 
 class AttitudeError(NamedTuple):
@@ -84,9 +84,9 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
     inside = (pose.time >= first - 1e-9) & (pose.time <= last + 1e-9)
     if not np.any(inside):
         raise BadData(
-            f"pose ({span_text((pose.time[0], pose.time[-1]))}) and reference "
-            f"({span_text((truth.time[0], truth.time[-1]))}) have no time in common"
-            + (f" within the interval {span_text(interval)}" if interval else "")
+            f"pose ({format_span((pose.time[0], pose.time[-1]))}) and reference "
+            f"({format_span((truth.time[0], truth.time[-1]))}) have no time in common"
+            + (f" within the interval {format_span(interval)}" if interval else "")
         )
     time = np.clip(pose.time[inside], truth.time[0], truth.time[-1])
     attitude, position = {}, {}

@@ -106,9 +106,9 @@ def simulated(
     """A short simulated session: 20 s of the protocol, one circle."""
     from dataclasses import replace
 
-    from wepose_pin.simulation import PERFECT_WORLD, REALISTIC, simulate, simulated_person
+    from wepose_pin.simulation import IDEAL_PRESET, MILD_PRESET, simulate, simulate_person
 
-    person = simulated_person(seed)
+    person = simulate_person(seed)
     made = simulate(
         person.lengths,
         seed=seed,
@@ -116,7 +116,7 @@ def simulated(
         protocol=protocol,
         clasp_s=20.0,
         circles=0 if protocol == "poses" else 1,
-        imperfections=replace({"ideal": PERFECT_WORLD, "mild": REALISTIC}[preset], mount=mount),
+        imperfections=replace({"ideal": IDEAL_PRESET, "mild": MILD_PRESET}[preset], mount=mount),
     )
     signals = {
         name: Signals(gyro, made.accel_S[name], mount=made.stated_mount[name]) for name, gyro in made.gyro_S.items()

@@ -341,7 +341,7 @@ def session_hash() -> str:
 
 
 def validation() -> bytes:
-    from wepose_pin.validation import Result, document_text
+    from wepose_pin.validation import Result, format_document
 
     dynamic = {"roll": [1.1, 0.5], "pitch": [1.2, 0.5], "yaw": [1.3, 0.5], "total_rmse": 2.0}
     hand = {key: {"mean": 17.0, "std": 2.0, "rmse": 18.0} for key in ("hand_mm", "hand_from_shoulders_mm")}
@@ -350,7 +350,7 @@ def validation() -> bytes:
     results += [Result("upper body, MTi-3 noise alone", "0", method, hand, series) for method in ("ncf", "smekf")]
     board = {"inclination_rmse": 0.6, "heading_rmse": 2.0, "total_rmse": 2.5}
     results += [Result("BROAD", trial, method, board) for trial in "12" for method in ("amekf", "smekf")]
-    return document_text(results, True, {"wepose-pin": "0.1.0"}).encode()
+    return format_document(results, True, {"wepose-pin": "0.1.0"}).encode()
 
 
 def broad(compressed: bool) -> bytes:

@@ -17,12 +17,12 @@ KINDS = (".csv", ".txt", ".sto", ".mvnx", ".xml", ".mat", ".h5", ".parquet", ".t
 
 def _described(folder: Path, data: bytes) -> object:
     """The first byte says what the file's name ends with."""
-    from wepose_pin.readers.describe import describe
+    from wepose_pin.readers.describe import describe_file
 
     path = folder / f"a{KINDS[data[0] % len(KINDS) if data else 0]}"
     path.write_bytes(data[1:])
     try:
-        return describe(path)
+        return describe_file(path)
     finally:
         path.unlink()  # what lies beside a file is looked at too
 
@@ -178,13 +178,13 @@ def _pose(path: Path) -> object:
 
 
 def _summary(path: Path) -> object:
-    from wepose_pin.readers.describe import describe
+    from wepose_pin.readers.describe import describe_file
     from wepose_pin.writers.result import read_result
 
     (path.parent / "pose.parquet").write_bytes(seeds.pose())
     if not (path.parent / "subject.urdf").is_file():
         (path.parent / "subject.urdf").write_bytes(seeds.shipped("urdf/upper_body.urdf")[0])
-    describe(path.parent)
+    describe_file(path.parent)
     return read_result(path.parent)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ..errors import BadOption, LostWorker
-from ..filters.base import processors
+from ..filters.base import count_processors
 from .isolation import run_isolated
 from .items import build_failed_row, run_items
 from .plan import Item
@@ -66,7 +66,7 @@ def connect(scheduler: str | None = None, workers: int | None = None) -> Iterato
         if scheduler is None:
             cluster = stack.enter_context(
                 LocalCluster(
-                    n_workers=workers or processors(),
+                    n_workers=workers or count_processors(),
                     threads_per_worker=1,
                     processes=True,
                     host="127.0.0.1",

@@ -16,8 +16,8 @@ from ..alignment import heading_variance
 from ..errors import BadPhase
 from ..filters import Orientation
 from ..filters.smekf import HOLD_S, UNSEEN_RATE_STD
-from ..recording import OrientationSensor, Recording, span_text
-from ..recording.gaps import runs
+from ..recording import OrientationSensor, Recording, format_span
+from ..recording.gaps import find_runs
 
 HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of an unknown heading: the whole circle
 FREE_STD = np.deg2rad(15.0)  # [rad] of a step, above which the heading after it may be any
@@ -50,7 +50,7 @@ def find_losses(recording: Recording, start: tuple[float, float], sensors: Colle
         sensor = recording.sensors[name]
         if sensor.gap is None or isinstance(sensor, OrientationSensor):
             continue
-        for first, end in runs(sensor.gap):
+        for first, end in find_runs(sensor.gap):
             seconds = (end - first + 1) / recording.rate_hz
             std = min(HEADING_STD, UNSEEN_RATE_STD * seconds**2 / (seconds + HOLD_S))
             losses.append(Loss(name, first, end - 1, first >= begin, std))
@@ -106,7 +106,7 @@ def check_start_pose(
         if name == "torso" or np.count_nonzero(mask_connected(between, samples)) >= min_samples:
             continue
         worst = max(between, key=lambda loss: np.count_nonzero(loss.beyond(samples)))
-        span = span_text(recording.time[[worst.first, worst.last]])
+        span = format_span(recording.time[[worst.first, worst.last]])
         raise BadPhase(
             f"{recording.where()}: sensors.{worst.sensor} is lost from {span}, between the start pose and the motion, "
             f"and its heading with it: the mount of sensors.{name} cannot be estimated; state its mount, name a start "

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..recording import span_text
+from ..recording import format_span
 from ..subject import LENGTHS
 from .least_squares import K, Observations
 from .problem import CalibrationProblem
@@ -105,4 +105,4 @@ def find_intervals(time: np.ndarray, mask: np.ndarray) -> list[tuple[float, floa
 def format_longest(intervals: Sequence[tuple[float, float]]) -> str:
     """The text of the longest intervals [s], in the order of time."""
     longest = sorted(intervals, key=lambda interval: interval[0] - interval[1])[:MOST_INTERVALS]
-    return ", ".join(span_text((round(a, 1), round(b, 1))) for a, b in sorted(longest))
+    return ", ".join(format_span((round(a, 1), round(b, 1))) for a, b in sorted(longest))

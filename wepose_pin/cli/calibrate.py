@@ -41,13 +41,13 @@ def run(job: CalibrateJob) -> int:
 def _print_mounts(calibration: Calibration) -> None:
     import numpy as np
 
-    from ..recording import axes_from_mount
+    from ..recording import find_mount_axes
     from ..subject import mount_rows
 
     rows: list[tuple[str, ...]] = []
     for segment, tilt in calibration.start_pose_offset.items():
         x, y, z = (np.degrees(calibration.subject.std(row)) for row in mount_rows(segment))
-        up, forward = axes_from_mount(calibration.subject.mounts[segment])
+        up, forward = find_mount_axes(calibration.subject.mounts[segment])
         off_start, drift = np.degrees(np.linalg.norm(tilt)), 60.0 * np.degrees(calibration.heading_drift[segment])
         cells = f"± {z:.1f}", f"± {np.hypot(x, y) / 2**0.5:.1f}", f"{off_start:.1f}", f"{drift:+.1f}"
         rows.append((segment, f"{up} up, {forward} ahead", *cells))

@@ -12,9 +12,9 @@ def run(job: EvaluateJob) -> int:
     """Compare; print the errors."""
     with progress_bar() as progress:
         errors = run_evaluate(job, progress)
-    from ..recording import span_text
+    from ..recording import format_span
 
-    say(f"{errors.samples} samples from {span_text(errors.interval)}")
+    say(f"{errors.samples} samples from {format_span(errors.interval)}")
     if errors.attitude:
         print_table(
             "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",

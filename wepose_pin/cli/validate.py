@@ -29,20 +29,20 @@ def run(job: ValidateJob) -> int:
 
 def print_experiments(document: Document) -> None:
     """A table an experiment, and the targets."""
-    from ..validation import summary
-    from ..validation.tables import experiment_table, shared_unit, targets_table
+    from ..validation import summarize
+    from ..validation.tables import find_shared_unit, make_experiment_table, make_targets_table
 
-    rows = summary(document.results)
+    rows = summarize(document.results)
     for experiment in dict.fromkeys(row.experiment for row in rows):
         of = [row for row in rows if row.experiment == experiment]
         trials = len({result.trial for result in document.results if result.experiment == experiment})
-        unit = shared_unit(of)
-        header, lines = experiment_table(of, whole=False)
+        unit = find_shared_unit(of)
+        header, lines = make_experiment_table(of, whole=False)
         header = [name if len(name) < LONGEST_HEADER else "\n".join(name.rsplit(" ", 1)) for name in header]
         title = f"{experiment}, {trials} trial{'s' * (trials != 1)}" + (f" [{unit}]" if unit else "")
         print_table(title + ", a quick run" * document.quick, header, [[str(cell) for cell in line] for line in lines])
         say("")
-    targets = targets_table(rows)
+    targets = make_targets_table(rows)
     if targets.rows:
         cells = [[str(cell).replace("**", "") for cell in row] for row in targets.rows]
         print_table("Targets for the mean errors", list(targets.header), cells)

@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 from ..arguments import check_arguments
 from ..diagnostics import WARNING, Diagnostic, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
-from ..recording.faults import faults_of, scan_sensor
+from ..recording.faults import find_faults, scan_sensor
 from ..recording.limits import STANDARD_GRAVITY
 from .amekf import Amekf, AmekfParams
 from .base import FilterRun, OrientationFilter
 from .gdc import Gdc, GdcParams
 from .ncf import Ncf, NcfParams
-from .noise import SensorNoise, noise_of
+from .noise import SensorNoise, estimate_noise
 from .smekf import Smekf, SmekfParams, starting_params
 from .smoother import Smoother
 from .start import MOVING_TILT_STD, StartTilt, estimate_start_tilt
@@ -145,7 +145,7 @@ def estimate_orientation(
     if not np.isfinite(gyro).all() or not np.isfinite(accel).all():
         raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
     scan = scan_sensor(np.arange(len(gyro)) / rate_hz, gyro, accel)
-    for fault in faults_of({"": scan}).get("", []):
+    for fault in find_faults({"": scan}).get("", []):
         raise BadData(f"{fault.described(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
     noise, start = TYPICAL, None
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -158,12 +158,12 @@ def estimate_orientation(
         first, last = round(static[0] * rate_hz), round(static[1] * rate_hz) + 1
         if not 0 <= first < last <= len(gyro) + 1:
             raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
-        noise, start = noise_of(gyro[first:last], accel[first:last], rate_hz), slice(first, last)
+        noise, start = estimate_noise(gyro[first:last], accel[first:last], rate_hz), slice(first, last)
     run = SensorRun(rate_hz, noise, method, params, static_test, start=start, gyro_range=scan.gyro_range)
     return (run.push(gyro, accel) or run.finish())._replace(diagnostics=diagnostics)
 
 
-def with_range(method: str, params: Any, gyro_range: float) -> Any:
+def add_range(method: str, params: Any, gyro_range: float) -> Any:
     """The filter's parameters with the range [rad/s] at which gyro is cut off, for those filters that know of one."""
     kinds: dict[str, type] = {"amekf": AmekfParams, "smoother": AmekfParams, "smekf": SmekfParams}
     if method not in kinds:
@@ -269,7 +269,7 @@ class SensorRun:
         if params is None and method == "smekf" and self._measured_start:
             params = starting_params(noise, self._rate_hz, start.quat_WS, start.tilt_std)
         if np.isfinite(self._gyro_range):
-            params = with_range(method, params, self._gyro_range)
+            params = add_range(method, params, self._gyro_range)
         return METHODS[method](noise, self._rate_hz, start.quat_WS, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:

@@ -30,7 +30,7 @@ from ..compilation import inlined, kernel
 from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
-from .base import STATIC_TURN_NOISE, FilterRun, OneSample, samples
+from .base import STATIC_TURN_NOISE, FilterRun, OneSample, prepare_samples
 from .covariance import fill_symmetric, into_sensor
 from .noise import SensorNoise
 from .static import static_step
@@ -249,7 +249,7 @@ class Amekf:
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, blocks: np.ndarray
     ) -> FilterRun:
         """`run` that also fills one of `blocks`, an array of `BLOCK`, at the end of each block."""
-        gyro, accel, is_static = samples(gyro_S, accel_S, static)
+        gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
         out = np.empty((len(gyro), 4)), np.empty((len(gyro), 3)), np.empty((len(gyro), 3, 3))
         _run(self.state.record, self.model, gyro, accel, is_static, blocks, *out)
         return FilterRun(*out)

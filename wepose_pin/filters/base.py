@@ -44,7 +44,7 @@ class OrientationFilter(Protocol):
         ...
 
 
-def samples(
+def prepare_samples(
     gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One sample or many as the contiguous arrays that the compiled steps take: (n, 3), (n, 3), (n,)."""
@@ -72,21 +72,21 @@ class OneSample:
         return self.inputs
 
 
-def in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads: int | None = None) -> list[T]:
+def run_in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads: int | None = None) -> list[T]:
     """``[function(*row) for row in zip(*columns)]`` in threads: the compiled runs of several sensors at a time.
 
     The runs release the interpreter's lock, so that as many go on at once as there are processors (`threads` to say
     otherwise). The order is that of the columns; the first error that one raises is raised here.
     """
     rows = list(zip(*columns, strict=True))
-    workers = min(threads or processors(), len(rows))
+    workers = min(threads or count_processors(), len(rows))
     if workers <= 1:
         return [function(*row) for row in rows]
     with ThreadPoolExecutor(workers) as pool:
         return list(pool.map(lambda row: function(*row), rows))
 
 
-def processors() -> int:
+def count_processors() -> int:
     """Processors that this process may use; WEPOSE_THREADS says fewer, as where processes share the machine."""
     if (stated := os.environ.get("WEPOSE_THREADS", "")).isdecimal():
         return max(1, int(stated))

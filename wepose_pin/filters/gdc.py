@@ -14,7 +14,7 @@ import numpy as np
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import derivative, up_in_sensor
-from .base import FilterRun, OneSample, samples
+from .base import FilterRun, OneSample, prepare_samples
 from .noise import SensorNoise
 
 
@@ -43,7 +43,7 @@ class Gdc:
         self._one = OneSample()
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
-        gyro, accel, _ = samples(gyro_S, accel_S, static)
+        gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
         quat = np.empty((len(gyro), 4))
         _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, self.params.gain, quat)
         return FilterRun(quat, np.tile(self.state.gyro_bias, (len(gyro), 1)), None)

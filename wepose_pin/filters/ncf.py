@@ -13,7 +13,7 @@ import numpy as np
 from ..compilation import kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, up_in_sensor
-from .base import FilterRun, OneSample, samples
+from .base import FilterRun, OneSample, prepare_samples
 from .noise import SensorNoise
 
 
@@ -43,7 +43,7 @@ class Ncf:
         self._one = OneSample()
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
-        gyro, accel, _ = samples(gyro_S, accel_S, static)
+        gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
         quat, bias = np.empty((len(gyro), 4)), np.empty((len(gyro), 3))
         self._go(gyro, accel, quat, bias)
         return FilterRun(quat, bias, None)

@@ -28,7 +28,7 @@ SWAY_CORRELATION_S = 2.0  # half a sway: so long half-second means go on alike
 STEADY_TURN_S = 20.0  # so long may a person turn steadily, as on an office chair
 LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks, beyond white noise: less is no person
 
-# Without stated phases: the quietest stretch of this length within the beginning is taken.
+# Without stated phases: the find_static_window stretch of this length within the beginning is taken.
 QUIET_S = 2.0
 BEGINNING_S = 20.0
 
@@ -69,7 +69,7 @@ class SensorNoise:
         return (total - white) * lasts_s
 
 
-def noise_of(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool = False) -> SensorNoise:
+def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool = False) -> SensorNoise:
     """Noise and bias from samples at rest: `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²].
 
     `worn`: a person wears the sensor and sways, which a phase of a second or two does not show: the bias is then as
@@ -140,7 +140,7 @@ def _floored(cov: np.ndarray, std: float) -> np.ndarray:
     return cov if np.linalg.eigvalsh(cov)[0] >= std**2 else cov + std**2 * np.eye(3)
 
 
-def quietest(recording: Recording) -> tuple[float, float]:
+def find_static_window(recording: Recording) -> tuple[float, float]:
     """Interval [s] of `QUIET_S` within the first `BEGINNING_S` in which all sensors measure and together move least.
 
     A steady rotation about the vertical varies nothing: what all sensors have of it in common counts as motion.

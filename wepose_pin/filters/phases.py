@@ -11,8 +11,8 @@ from scipy.special import stdtr  # of Student; scipy.stats takes half a second t
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase
-from ..recording import OrientationSensor, Recording, format_time, span_text
-from .noise import SensorNoise, quietest
+from ..recording import OrientationSensor, Recording, format_span, format_time
+from .noise import SensorNoise, find_static_window
 
 # Turning in the start pose: root mean square of the rate, and largest turn from its mean. A person who stands sways
 # below 3 deg/s and 3 deg; at the limits the mean pose is no longer the pose that was meant.
@@ -28,7 +28,7 @@ LARGEST_BIAS = float(np.deg2rad(5.0))
 FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 
 
-def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[Diagnostic]]:
+def find_reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[Diagnostic]]:
     """The start pose's interval [s], that of noise and bias, and the recording's diagnostics with those of both."""
     diagnostics = list(recording.diagnostics)
     if recording.phases.get("start"):
@@ -43,7 +43,7 @@ def reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[f
             f"start = [[from, to]]"
         )
     else:
-        start = quietest(recording)
+        start = find_static_window(recording)
         diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
     still = recording.phases.get("static", ())
     if len(still) > 1:
@@ -93,7 +93,7 @@ def check_common_rotation(
     turn_deg = abs(np.degrees(mean)) * (interval[1] - interval[0])
     if turn_deg > MOVES_DEG:
         raise BadPhase(
-            f"{recording.where()}: phases.start ({span_text(interval)}): all sensors turn about the vertical at "
+            f"{recording.where()}: phases.start ({format_span(interval)}): all sensors turn about the vertical at "
             f"{np.degrees(mean):.1f} deg/s, by {turn_deg:.0f} deg in all, where gyroscopes have biases of their own: "
             f"name seconds in which the person does not turn"
         )
@@ -123,7 +123,7 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
     if rms > MOVES_DEG_S or turn > MOVES_DEG:
         raise BadPhase(
             f"{recording.where()}: sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} "
-            f"({span_text(interval)}); name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "
+            f"({format_span(interval)}); name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "
             f"{MOVES_DEG:g} deg"
         )
     if rms > SWAYS_DEG_S or turn > SWAYS_DEG:

@@ -12,9 +12,9 @@ from ..diagnostics import Diagnostic
 from ..errors import WeposeError
 from ..recording import CONFIGURATION, OrientationSensor, Recording
 from . import BEST, OFFLINE, Orientation, SensorRun, check_method
-from .base import in_parallel
-from .noise import SensorNoise, noise_of
-from .phases import check_common_rotation, check_motion, reference_phases
+from .base import run_in_parallel
+from .noise import SensorNoise, estimate_noise
+from .phases import check_common_rotation, check_motion, find_reference_phases
 from .static import StaticTest
 
 
@@ -50,7 +50,7 @@ class SensorFilters:
 
     def __init__(self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> None:
         check_method(method)
-        self.start, self.static_phase, self.diagnostics = reference_phases(first)
+        self.start, self.static_phase, self.diagnostics = find_reference_phases(first)
         self._held: Recording | None = None  # the chunk that the smoother has not given yet
         self._runs: dict[str, SensorRun] = {}
         noises: dict[str, SensorNoise] = {}
@@ -64,7 +64,7 @@ class SensorFilters:
             at_rest = first.measured(segment, self.static_phase)
             try:
                 worn = self.static_phase == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
-                noise = noise_of(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
+                noise = estimate_noise(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
             except WeposeError as error:
                 raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
             noises[segment] = noise
@@ -92,7 +92,7 @@ class SensorFilters:
                 gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
             measured.append((gyro_S, accel_S))
         before, self._held = self._held, chunk
-        results = in_parallel(lambda run, of: run.push(*of), self._runs.values(), measured)
+        results = run_in_parallel(lambda run, of: run.push(*of), self._runs.values(), measured)
         orientation = {segment: of for segment, of in zip(self._runs, results, strict=True) if of is not None}
         if len(orientation) < len(self._runs):
             return None
@@ -103,7 +103,7 @@ class SensorFilters:
     def finish(self) -> tuple[Recording, dict[str, Orientation]]:
         """The smoother's last chunk."""
         assert self._held is not None
-        orientation = in_parallel(SensorRun.finish, self._runs.values())
+        orientation = run_in_parallel(SensorRun.finish, self._runs.values())
         return self._held, dict(zip(self._runs, orientation, strict=True))
 
 
@@ -119,21 +119,21 @@ def filter_recording(
     """
     filters = SensorFilters(recording, method=method, static_test=static_test)
     _, orientation = filters.push(recording) or filters.finish()
-    return filtered_chunk(filters, recording, orientation)
+    return combine_chunk(filters, recording, orientation)
 
 
-def filtered_chunk(
+def combine_chunk(
     filters: SensorFilters, chunk: Recording, orientation: Mapping[str, Orientation]
 ) -> FilteredRecording:
     """A chunk that `filters` gave, if the start pose is in it."""
-    R_VS = sensor_rotations(chunk, orientation)
+    R_VS = collect_rotations(chunk, orientation)
     at_start = {segment: R[chunk.measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
     return FilteredRecording(
         R_VS, at_start, dict(orientation), filters.start, filters.static_phase, filters.diagnostics
     )
 
 
-def sensor_rotations(chunk: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:
+def collect_rotations(chunk: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:
     """Segment → n orientations of its sensor, each in a world of its own."""
     return {
         segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_WS)

@@ -20,7 +20,7 @@ from ..compilation import inlined, kernel
 from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, rotation_terms, up_in_sensor
-from .base import STATIC_TURN_NOISE, FilterRun, OneSample, samples
+from .base import STATIC_TURN_NOISE, FilterRun, OneSample, prepare_samples
 from .covariance import fill_symmetric, symmetric
 from .noise import SWAY_CORRELATION_S, SensorNoise
 from .start import ACCEL_BIAS_STD
@@ -161,7 +161,7 @@ class Smekf:
         return _live
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
-        gyro, accel, is_static = samples(gyro_S, accel_S, static)
+        gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
         out = FilterRun(np.empty((len(gyro), 4)), np.empty((len(gyro), 3)), np.empty((len(gyro), 3, 3)))
         _run(self.state.record, self.model, gyro, accel, is_static, *out)
         return out

@@ -69,7 +69,7 @@ def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
     from ..evaluation import evaluate
     from ..filters import BEST, METHODS
     from ..report import write_track_pages
-    from ..simulation import simulate, simulated_person
+    from ..simulation import simulate, simulate_person
     from ..tracking import track
     from ..writers import write_result, write_session
     from ..writers.provenance import collect_provenance, write_provenance
@@ -79,7 +79,7 @@ def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
     steps = 2 + 2 * len(METHODS)
     with whole_folder(job.out, job.force) as folder:
         progress("simulating a person", 0.0)
-        person = simulated_person(job.seed)
+        person = simulate_person(job.seed)
         simulation = simulate(person.lengths, seed=job.seed)
         recording, truth = simulation.recording(f"demo-{job.seed}"), simulation.truth()
         for name in ("session", "subject", "result"):

@@ -60,13 +60,13 @@ def run_info(job: InfoJob, progress: Progress = no_progress) -> InfoOutcome:
         No such file, or of no kind that is known; a session that exists or cannot be written, or that there is none of.
     """
     from ..documents import check_file, whole_file
-    from ..readers.describe import describe
+    from ..readers.describe import describe_file
 
     progress("reading", 0.0)
     if not (job.write or job.out):
-        return InfoOutcome(describe(job.file, job.file.absolute().parent), None)
+        return InfoOutcome(describe_file(job.file, job.file.absolute().parent), None)
     check_file(job.session_file, job.force)
-    description = describe(job.file, job.session_file.absolute().parent)
+    description = describe_file(job.file, job.session_file.absolute().parent)
     if description.session is None:
         raise BadOption(f"--write: there is no session to write for {description.what}")
     with whole_file(job.session_file, job.force) as partial:

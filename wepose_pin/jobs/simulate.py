@@ -67,9 +67,9 @@ class SimulateJob:
         """Those of the preset, with the sizes that were given."""
         from dataclasses import fields, replace
 
-        from ..simulation import PERFECT_WORLD, REALISTIC
+        from ..simulation import IDEAL_PRESET, MILD_PRESET
 
-        sizes = REALISTIC if self.preset == "mild" else PERFECT_WORLD
+        sizes = MILD_PRESET if self.preset == "mild" else IDEAL_PRESET
         names = [each.name for each in fields(sizes)]
         for name, value in self.imperfection.items():
             option = f"--imperfection {name}={value}"
@@ -105,7 +105,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
     import numpy as np
 
     from ..documents import whole_folder
-    from ..simulation import simulate, simulated_person
+    from ..simulation import simulate, simulate_person
     from ..subject import LENGTHS, mount_rows, subject_toml
     from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
@@ -113,7 +113,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
     job.check()
     with whole_folder(job.out, job.force) as folder:
         progress("simulating a person", 0.0)
-        person = simulated_person(job.seed)
+        person = simulate_person(job.seed)
         simulation = simulate(
             person.lengths,
             seed=job.seed,

@@ -105,7 +105,7 @@ def run_track(
     WeposeError
         What the session, the subject, the model or an option lacks.
     """
-    from ..readers import data_bytes, is_live_log
+    from ..readers import estimate_data_bytes, is_live_log
     from ..tracking import LARGE
 
     job.check()
@@ -116,7 +116,7 @@ def run_track(
     )  # fmt: skip
     if job.chunk_seconds and as_whole:
         raise BadOption(f"--chunk-seconds {job.chunk_seconds:g}: {as_whole} is tracked as a whole; leave it out")
-    if job.chunk_seconds or (job.chunk_seconds is None and not as_whole and data_bytes(job.session) >= LARGE):
+    if job.chunk_seconds or (job.chunk_seconds is None and not as_whole and estimate_data_bytes(job.session) >= LARGE):
         return _track_in_chunks(job, progress, provenance)
     return _track_as_whole(job, progress, provenance)
 

@@ -69,8 +69,8 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
     from ..documents import whole_folder
     from ..errors import reason
     from ..report.page import page_incomplete
-    from ..validation import Skipped, document_text, experiments, read_document, run
-    from ..validation.document import as_document
+    from ..validation import Skipped, format_document, list_experiments, read_document, run_jobs
+    from ..validation.document import parse_document
     from ..validation.page import write_pages
     from ..writers.result import versions
 
@@ -82,12 +82,12 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
                 progress("drawing the figures", 0.0)
                 failures = [page_incomplete("validation.html", each) for each in write_pages(folder, document)]
         return ValidateOutcome(document, failures)
-    trials = [trial for of in experiments(job.quick, job.data).values() for trial in of]
+    trials = [trial for of in list_experiments(job.quick, job.data).values() for trial in of]
     steps = len(trials) + (job.out is not None)
     with contextlib.ExitStack() as place:
         folder_or_none = place.enter_context(whole_folder(job.out, job.force)) if job.out is not None else None
         results, skipped = [], []
-        for k, (trial, outcome) in enumerate(zip(trials, run(trials), strict=True), 1):
+        for k, (trial, outcome) in enumerate(zip(trials, run_jobs(trials), strict=True), 1):
             progress(trial.experiment, k / steps)
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
@@ -95,10 +95,10 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
                 results += outcome
         if not results:
             raise BadData(f"nothing could be scored; {skipped[0].line()}")
-        text = document_text(results, job.quick, versions(), skipped)
+        text = format_document(results, job.quick, versions(), skipped)
         if folder_or_none is not None:
             (folder_or_none / "validation.json").write_text(text, encoding="utf-8")
-    document, failures = as_document(json.loads(text), "this run"), list[Diagnostic]()
+    document, failures = parse_document(json.loads(text), "this run"), list[Diagnostic]()
     if job.out is not None:
         progress("drawing the figures", 1.0)
         try:

@@ -14,7 +14,7 @@ from ..diagnostics import Diagnostic
 from ..filters import BEST
 from ..kinematics import LiveKinematics
 from ..model import BodyModel, load_model
-from ..readers.live_log import recording_of
+from ..readers.live_log import build_recording
 from ..recording import SEGMENTS, ImuSensor, Recording
 from ..recording.arrivals import (
     COUNTS,
@@ -29,7 +29,7 @@ from ..recording.arrivals import (
     Arrivals,
     Samples,
     Ticks,
-    arrivals,
+    order_arrivals,
 )
 from ..subject import Subject, population_subject
 from ..tracking import Tracker, TrackOptions
@@ -192,7 +192,7 @@ class LiveLoop:
             return
         for some in samples:
             self._newest[some.sensor] = max(self._newest[some.sensor], float(some.time[-1]))
-        came = arrivals(samples, self.source.sensors)
+        came = order_arrivals(samples, self.source.sensors)
         if self.log is not None:
             self.log.samples(came)
         if self._search is None:
@@ -269,7 +269,9 @@ class LiveLoop:
     def _start_tracking(self, search: StartSearch, begin: int, end: int) -> SegmentFollower:
         """Track from the start pose on, ticks `begin` to `end`."""
         rate_hz = search.aligner.rate_hz
-        recording = recording_of(self.setup.header(self.source.sensors), rate_hz, search.ticks, (begin, end), last=end)
+        recording = build_recording(
+            self.setup.header(self.source.sensors), rate_hz, search.ticks, (begin, end), last=end
+        )
         tracker = Tracker(self.setup.subject, model=self.model, options=TrackOptions(self.method, causal=True))
         tracker.push(recording)
         search.ticks = []
@@ -446,4 +448,4 @@ def warm_up(method: str) -> None:
     follower.step(np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
     follower.std()
     aligner = Aligner(sensors, 100.0, 0.0)
-    aligner.push(arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))
+    aligner.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))

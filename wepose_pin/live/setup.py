@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..readers.stated import joints_stated, phases_stated, read_session_file, sensor_stated
+from ..readers.session_file import read_joints, read_phases, read_sensor_keys, read_session_file
 from ..recording import SEGMENTS, START_POSES, Intervals, Recording
 from ..subject import Subject, parse_subject, subject_toml
 
@@ -78,11 +78,11 @@ def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "
         Not there, or a key in it that no session has.
     """
     top = read_session_file(path)
-    phases_stated(top.table("phases", {}))
+    read_phases(top.table("phases", {}))
     sensors = top.table("sensors").tables(SEGMENTS, "segment")
-    stated = {segment: sensor_stated(table).mount for segment, table in sensors.items()}
+    stated = {segment: read_sensor_keys(table).mount for segment, table in sensors.items()}
     start_pose = top.choice("start_pose", START_POSES, "n_pose")
-    joints_stated(top, start_pose)
+    read_joints(top, start_pose)
     return SensorSetup(
         top.text("name", None) or Path(top.file).absolute().parent.name,
         subject,

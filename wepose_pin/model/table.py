@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from ..assets import asset
 from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadModel, one_of
-from ..recording import SEGMENTS, mount_from_axes
-from ..recording.segments import segment_of
+from ..recording import SEGMENTS, compute_mount
+from ..recording.segments import guess_segment
 from ..recording.sensors import read_axes
 from .tree import Tree, parse_tree
 
@@ -181,7 +181,7 @@ def rename_links(robot: Any, table: LinkTable) -> Any:
     where = table.where
     tree = parse_tree(robot, where)
     _check_links(table, tree)
-    R_WM = Rotation.from_quat(mount_from_axes(table.up, table.forward)).as_matrix()  # M: the root link
+    R_WM = Rotation.from_quat(compute_mount(table.up, table.forward)).as_matrix()  # M: the root link
     M_WM = np.eye(4)
     M_WM[:3, :3] = R_WM
     M_WM[:3, 3] = -R_WM @ np.mean([tree.neutral(link)[:3, 3] for link in table.root or (tree.root,)], axis=0)
@@ -193,7 +193,7 @@ def rename_links(robot: Any, table: LinkTable) -> Any:
         p_W[point] = M_WK[link.link][:3, :3] @ link.at + M_WK[link.link][:3, 3]
     for segment, own in table.segments.items():
         if own.up is not None and own.forward is not None:
-            R_LK = Rotation.from_quat(mount_from_axes(own.up, own.forward)).as_matrix()
+            R_LK = Rotation.from_quat(compute_mount(own.up, own.forward)).as_matrix()
             R_WL[segment] = M_WK[own.link][:3, :3] @ R_LK.T
     for segment in (*table.segments, "left_hand", "right_hand"):
         if segment not in R_WL:
@@ -241,8 +241,8 @@ def format_closest_links(segments: Iterable[str], links: Iterable[str]) -> str:
     links = list(links)
     names = []
     for segment in segments:
-        close = [link for link in links if segment_of(link) == segment]
-        others = [link for link in links if segment_of(link) is None]
+        close = [link for link in links if guess_segment(link) == segment]
+        others = [link for link in links if guess_segment(link) is None]
         close = close or get_close_matches(segment, others, n=3, cutoff=0.5)
         names.append(f"'{segment}'" + (f" (maybe {' or '.join(close[:4])})" if close else ""))
     return ", ".join(names)

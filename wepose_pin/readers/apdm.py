@@ -17,8 +17,8 @@ import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, one_of
-from ..recording.segments import segment_of
-from .device import Device, Text, first_lines, parsed_rows, table_of
+from ..recording.segments import guess_segment
+from .device import Device, Text, make_table, parse_rows, read_first_lines
 
 US = 1e-6
 # What is measured → the signal, and its axes in the file.
@@ -51,7 +51,7 @@ def read_apdm(path: Path, use: str | None = None, rate_hz: float | None = None) 
     MissingFile, BadData
         Not there; no CSV of APDM; not what `use` asks for.
     """
-    head = first_lines(path, 4)
+    head = read_first_lines(path, 4)
     if not is_apdm(head):
         raise BadData(f"{path}: is no CSV of APDM: neither 'Format=7' nor 'Test Name:' begins its first line")
     rows = [[cell.strip() for cell in line.split(",")] for line in head]
@@ -60,7 +60,7 @@ def read_apdm(path: Path, use: str | None = None, rate_hz: float | None = None) 
     lines = 3 if newer else 4
     names = [str(k) for k in range(len(rows[1] if newer else rows[2]))]
     body = path.read_bytes().split(b"\n", lines)[lines:]
-    text = Text(path, {}, parsed_rows(path, body[0] if body else b"", names, ",", lines, "CSV of APDM"))
+    text = Text(path, {}, parse_rows(path, body[0] if body else b"", names, ",", lines, "CSV of APDM"))
     wanted = {"raw": ("gyro", "accel"), "orientation": ("orientation",)}
     kinds = [use] if use else list(wanted)
     signals = {
@@ -88,8 +88,8 @@ def read_apdm(path: Path, use: str | None = None, rate_hz: float | None = None) 
     facts = {"devices": ", ".join(left_out), "signals": " and ".join(wanted[kind])}
     missing = (Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts),) if left_out else ()
     time = np.arange(text.cells.height) / rate_hz if rate_hz else (US if newer else 1.0) * text.numbers(["0"])[:, 0]
-    labels = {label: segment_of(label) for label in values}
-    return Device("apdm", table_of(time, values), labels, kind, since_power_on=True, diagnostics=missing)
+    labels = {label: guess_segment(label) for label in values}
+    return Device("apdm", make_table(time, values), labels, kind, since_power_on=True, diagnostics=missing)
 
 
 def _places_of_format_7(rows: Sequence[Sequence[str]]) -> tuple[dict[str, dict[str, list[int]]], dict[str, float]]:

@@ -17,7 +17,7 @@ import polars as pl
 
 from ..errors import BadData, MissingFile, UnknownColumn, one_of
 from .mat5 import is_level_5, read_mat5
-from .tables import most_bytes, too_large
+from .tables import explain_size, limit_bytes
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -53,7 +53,7 @@ class ArrayFile:
             raise MissingFile(f"{self.path}: {reason}; an HDF5 or MATLAB file is wanted here") from None
         self._hdf5 = HDF5_MAGIC in (start[:8], start[512:520])  # MATLAB puts 512 bytes of its own before it
         self._level_5 = is_level_5(start)
-        self._most = most_bytes(self.path)
+        self._most = limit_bytes(self.path)
         self._loaded: dict[str, np.ndarray] = {}
         self.shapes = self._hdf5_shapes() if self._hdf5 else self._matlab_shapes()
         if not self.shapes:
@@ -109,7 +109,7 @@ class ArrayFile:
         if path not in self._loaded:
             self._most -= 8 * int(np.prod(self.shapes[path], dtype=object))
             if self._most < 0:
-                raise BadData(f"{self.path}: {path} is {self.shapes[path]}, {too_large(self.path)}")
+                raise BadData(f"{self.path}: {path} is {self.shapes[path]}, {explain_size(self.path)}")
             with _reading(self.path), _h5py(self.path).File(self.path) as file:
                 self._loaded[path] = np.asarray(file[path], dtype=float)
         return self._loaded[path]

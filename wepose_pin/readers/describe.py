@@ -16,19 +16,19 @@ import numpy as np
 from ..diagnostics import ERROR, WARNING, Diagnostic
 from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
 from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
-from ..recording import AXES, CONFIGURATION, SEGMENTS, ImuSensor, OrientationSensor, Recording, format_time, span_text
-from ..recording.clocks import TIME_UNITS, time_unit_of
-from ..recording.gaps import runs
+from ..recording import AXES, CONFIGURATION, SEGMENTS, ImuSensor, OrientationSensor, Recording, format_span, format_time
+from ..recording.clocks import TIME_UNITS, guess_time_unit
+from ..recording.gaps import find_runs
 from ..recording.limits import LONGEST_STEP_S
-from ..recording.sensors import angular_rate
+from ..recording.sensors import compute_rate
 from .arrays import ArrayFile, is_array_file
 from .device import Device
-from .formats import TITLES, format_of, read_device
+from .formats import TITLES, detect_format, read_device
 from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
 from .session import SessionReader
 from .tables import FORMATS as TABLES
-from .tables import Rows, columns, read_table
+from .tables import Rows, read_columns, read_table
 
 # A sensor is static where over `BLOCK_S` its rate varies by less [rad/s] and its specific force [m/s²]: a person who
 # stands sways below.
@@ -72,7 +72,7 @@ class _Proposal:
     diagnostics: Sequence[Diagnostic] = ()
 
 
-def describe(path: Path, folder: Path | None = None) -> Description:
+def describe_file(path: Path, folder: Path | None = None) -> Description:
     """What a file or folder is; a session that is proposed is to stand in `folder`, the file's own by default.
 
     Raises
@@ -84,7 +84,7 @@ def describe(path: Path, folder: Path | None = None) -> Description:
         raise MissingFile(f"{path}: no such file or folder")
     if path.is_dir() and (path / "pose.parquet").is_file():
         return _result(path)
-    if path.is_dir() and format_of(path) is None:
+    if path.is_dir() and detect_format(path) is None:
         named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
         if named is None:
             raise MissingFile(
@@ -95,7 +95,7 @@ def describe(path: Path, folder: Path | None = None) -> Description:
     if path.suffix.lower() == ".toml":
         return _toml(path)
     folder = folder or path.absolute().parent
-    format = format_of(path)
+    format = detect_format(path)
     if format:
         return _described(path, folder, _of_devices(path, folder, format))
     if is_array_file(path):
@@ -347,7 +347,7 @@ def _siblings(path: Path, format: str) -> list[Path]:
         same = [own if folder == own.absolute() else folder for folder in beside]
     else:
         same = [file for file in sorted(path.parent.iterdir()) if file.suffix == path.suffix and file.is_file()]
-    found = [file for file in same[: 10 * MOST_SIBLINGS] if file == path or format_of(file) == format]
+    found = [file for file in same[: 10 * MOST_SIBLINGS] if file == path or detect_format(file) == format]
     return found[:MOST_SIBLINGS] if path in found[:MOST_SIBLINGS] else [path]
 
 
@@ -398,13 +398,13 @@ def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str]
         return [f"rate_hz = 100.0{CHECK}no column looks like time"], ["no column looks like time: state the rate"]
     table = arrays.table({name: str(path)}) if arrays else read_table(path)
     try:
-        time = columns(table, [name], str(path), "time")[:, 0]
+        time = read_columns(table, [name], str(path), "time")[:, 0]
     except BadData as error:  # dates, say
         return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {error}"]
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     said = guess.time_unit
-    fits = said if said is not None and 0.0 < step * TIME_UNITS[said] < LONGEST_STEP_S else time_unit_of(step)
+    fits = said if said is not None and 0.0 < step * TIME_UNITS[said] < LONGEST_STEP_S else guess_time_unit(step)
     line = f"time = {toml_string(name)}"
     if fits in (None, "s"):
         return [line], []
@@ -422,7 +422,7 @@ def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
     blocks = len(recording) // size
     static = np.ones(blocks, dtype=bool)
     for sensor in recording.sensors.values():
-        rate = angular_rate(sensor, recording.rate_hz)[: blocks * size].reshape(blocks, size, 3)
+        rate = compute_rate(sensor, recording.rate_hz)[: blocks * size].reshape(blocks, size, 3)
         about = rate - rate.mean(axis=1, keepdims=True) if isinstance(sensor, ImuSensor) else rate
         static &= np.sqrt((about**2).sum(axis=2).mean(axis=1)) < STATIC_GYRO
         # A bias is below the rate of whoever turns evenly.
@@ -433,7 +433,7 @@ def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
             )
         if sensor.gap is not None:
             static &= ~sensor.gap[: blocks * size].reshape(blocks, size).any(axis=1)
-    spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in runs(static)]
+    spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in find_runs(static)]
     return [(first, last) for first, last in spans if last - first >= SHORTEST_STATIC_S - BLOCK_S]
 
 
@@ -457,7 +457,7 @@ def _mount_comment(recording: Recording, segment: str, static: list[tuple[float,
 
 def _facts(recording: Recording) -> tuple[str, ...]:
     first, last = float(recording.time[0]), float(recording.time[-1])
-    facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {span_text((first, last))}"]
+    facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {format_span((first, last))}"]
     static = find_static_intervals(recording)
     listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in static[:8]) + (" …" if len(static) > 8 else "")
     facts.append(f"all sensors static [s]: {listed}" if static else "all sensors are never static for a second")
@@ -475,9 +475,9 @@ def _rows(recording: Recording, labels: Mapping[str, str]) -> tuple[tuple[str, .
             gravity = f"{np.median(np.linalg.norm(sensor.accel_S, axis=1)):.2f} m/s²"
             holds = "gyro, accel"
         else:
-            fast = f"{np.degrees(np.linalg.norm(angular_rate(sensor, recording.rate_hz), axis=1).max()):.0f} deg/s"
+            fast = f"{np.degrees(np.linalg.norm(compute_rate(sensor, recording.rate_hz), axis=1).max()):.0f} deg/s"
             holds, gravity = "segment's orientation" if sensor.aligned else "orientation", ""
-        lost = runs(sensor.gap) if sensor.gap is not None else []
+        lost = find_runs(sensor.gap) if sensor.gap is not None else []
         longest = max((b - a for a, b in lost), default=0) / recording.rate_hz
         gaps = f"{len(lost)}, up to {longest:.2f} s" if lost else "none"
         named = (

@@ -12,7 +12,7 @@ import polars as pl
 from ..diagnostics import Diagnostic
 from ..errors import BadData, MissingFile
 from ..recording.limits import LARGEST_NUMBER
-from .tables import NO_VALUE, columns
+from .tables import NO_VALUE, read_columns
 
 # A table begins within this many lines of a file; what comes before it is about the device.
 PREAMBLE_LINES = 100
@@ -27,7 +27,7 @@ class Device:
     Parameters
     ----------
     format : its name, a key of `wepose_pin.readers.formats.FORMATS`
-    table : `time` [s] on the device's clock, and the columns of `names`
+    table : `time` [s] on the device's clock, and the columns of `name_columns`
     labels : the file's name of each sensor or segment → our segment, None where the name does not say
     kind : "raw" for gyro and accel, "orientation"
     since_power_on : the clock counts from when the device was switched on, or another moment that says nothing
@@ -49,23 +49,25 @@ class Device:
 
     def signals(self, label: str) -> dict[str, list[str]]:
         """Columns by signal."""
-        return {name: names(label, name) for name in (("gyro", "accel") if self.kind == "raw" else ("orientation",))}
+        return {
+            name: name_columns(label, name) for name in (("gyro", "accel") if self.kind == "raw" else ("orientation",))
+        }
 
 
-def names(label: str, signal: str) -> list[str]:
+def name_columns(label: str, signal: str) -> list[str]:
     return [f"{label} {signal} {axis}" for axis in AXES[signal]]
 
 
-def table_of(time: np.ndarray, values: Mapping[str, Mapping[str, np.ndarray]]) -> pl.DataFrame:
+def make_table(time: np.ndarray, values: Mapping[str, Mapping[str, np.ndarray]]) -> pl.DataFrame:
     """The table of `Device` from times (n,) [s] and label → signal → (n, 3 or 4)."""
     found = {"time": time}
     for label, signals in values.items():
         for signal, array in signals.items():
-            found |= dict(zip(names(label, signal), array.T, strict=True))
+            found |= dict(zip(name_columns(label, signal), array.T, strict=True))
     return pl.DataFrame(found)
 
 
-def must_be_measured(path: Path, values: np.ndarray, what: str) -> None:
+def check_measured(path: Path, values: np.ndarray, what: str) -> None:
     """Raise an error on numbers (n, k) beyond `LARGEST_NUMBER`."""
     huge = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
     if huge.size:
@@ -73,7 +75,7 @@ def must_be_measured(path: Path, values: np.ndarray, what: str) -> None:
         raise BadData(f"{path}: {what} holds {found:.3g} in row {huge[0] + 1}; no device measures as much")
 
 
-def first_lines(path: Path, most: int = PREAMBLE_LINES) -> list[str]:
+def read_first_lines(path: Path, most: int = PREAMBLE_LINES) -> list[str]:
     """The first lines of a text file, as text whatever the bytes.
 
     Raises
@@ -111,8 +113,8 @@ class Text:
 
     def numbers(self, wanted: Sequence[str]) -> np.ndarray:
         """Columns (n, k); empty cells are NaN."""
-        values = columns(self.cells, wanted, str(self.path), str(self.path))
-        must_be_measured(self.path, values, ", ".join(wanted))
+        values = read_columns(self.cells, wanted, str(self.path), str(self.path))
+        check_measured(self.path, values, ", ".join(wanted))
         return values
 
 
@@ -124,7 +126,7 @@ def read_text(path: Path, first: str, what: str) -> Text:
     MissingFile, BadData
         Not there; no such line in it; no line of numbers after it.
     """
-    lines = first_lines(path)
+    lines = read_first_lines(path)
     head, separator = _line_of_names(lines, first)
     if head is None:
         raise BadData(f"{path}: no line of names with '{first}' in its first {PREAMBLE_LINES} lines; {what} has one")
@@ -142,10 +144,10 @@ def read_text(path: Path, first: str, what: str) -> Text:
     wanted = [cell.strip(' "\r') for cell in header.decode("utf-8", errors="replace").split(separator)]
     while wanted and not wanted[-1]:
         wanted.pop()
-    return Text(path, about, parsed_rows(path, body, wanted, separator, head + 1, what))
+    return Text(path, about, parse_rows(path, body, wanted, separator, head + 1, what))
 
 
-def parsed_rows(
+def parse_rows(
     path: Path, body: bytes, wanted: Sequence[str], separator: str, names_line: int, what: str
 ) -> pl.DataFrame:
     """The rows after the line of names, number `names_line` of the file: all cells text, null where there is no value.
@@ -196,14 +198,14 @@ def _line_of_names(lines: Sequence[str], first: str) -> tuple[int | None, str]:
     return None, ""
 
 
-def counted_time(counter: np.ndarray, rate_hz: float, wraps: float) -> tuple[np.ndarray, float]:
+def compute_counted_time(counter: np.ndarray, rate_hz: float, wraps: float) -> tuple[np.ndarray, float]:
     """Times (n,) [s] of packets that are counted, and after how long [s] the counter begins anew."""
-    packets = unwrapped(counter, wraps)
+    packets = unwrap_counter(counter, wraps)
     usual = max(1.0, float(np.median(np.diff(packets)))) if len(packets) > 1 else 1.0
     return packets / (usual * rate_hz), wraps / (usual * rate_hz)
 
 
-def unwrapped(counter: np.ndarray, wraps: float) -> np.ndarray:
+def unwrap_counter(counter: np.ndarray, wraps: float) -> np.ndarray:
     """A counter (n,) that begins anew at `wraps`, going on instead; NaN stay."""
     filled = np.where(np.isfinite(counter), counter, 0.0)
     good = np.isfinite(counter)

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
-from ..recording.segments import segment_of
-from .device import Device, Text, counted_time, read_text, table_of, unwrapped
-from .mt_manager import RAW, orientation
+from ..recording.segments import guess_segment
+from .device import Device, Text, compute_counted_time, make_table, read_text, unwrap_counter
+from .mt_manager import RAW, read_orientation
 
 FINE_S, WRAPS = 1e-6, 2.0**32
 INCREMENTS = (
@@ -48,7 +48,7 @@ def read_dot(path: Path, use: str | None = None, rate_hz: float | None = None) -
             f"data.use and its orientation is read"
         )
     if kind == "orientation":
-        values = {"orientation": orientation(text)}
+        values = {"orientation": read_orientation(text)}
     elif RAW in text:
         numbers = text.numbers(RAW)
         values = {"accel": numbers[:, :3], "gyro": np.deg2rad(numbers[:, 3:])}
@@ -60,8 +60,8 @@ def read_dot(path: Path, use: str | None = None, rate_hz: float | None = None) -
     unsynced = Diagnostic("device-not-synchronized", WARNING, path.name)
     diagnostics = () if status.startswith("synced") else (unsynced,)
     label = text.about.get("DeviceTag") or path.stem
-    labels = {label: segment_of(label) or segment_of(path.stem)}
-    table = table_of(time, {label: values})
+    labels = {label: guess_segment(label) or guess_segment(path.stem)}
+    table = make_table(time, {label: values})
     return Device("dot", table, labels, kind, since_power_on=True, wraps_s=wraps_s, diagnostics=diagnostics)
 
 
@@ -85,7 +85,7 @@ def _usual_step(text: Text, time: np.ndarray) -> float:
 def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
     """Times (n,) [s] on the device's clock, and after how long it begins anew."""
     if ["SampleTimeFine"] in text and rate_hz is None:
-        time = FINE_S * unwrapped(text.numbers(["SampleTimeFine"])[:, 0], WRAPS)
+        time = FINE_S * unwrap_counter(text.numbers(["SampleTimeFine"])[:, 0], WRAPS)
         return time, FINE_S * WRAPS
     number = re.match(r"\d+(\.\d+)?", text.about.get("OutputRate", ""))
     rate = rate_hz or (float(number[0]) if number else 0.0)
@@ -94,4 +94,4 @@ def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
             f"{text.path}: no SampleTimeFine and no OutputRate to tell the time by; state the output rate as rate_hz "
             f"in [data], or export one of the two"
         )
-    return counted_time(text.numbers(["PacketCounter"])[:, 0], rate, WRAPS)[0], None
+    return compute_counted_time(text.numbers(["PacketCounter"])[:, 0], rate, WRAPS)[0], None

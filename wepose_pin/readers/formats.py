@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..errors import MissingFile
 from .apdm import is_apdm, read_apdm
-from .device import Device, first_lines
+from .device import Device, read_first_lines
 from .dot import read_dot
 from .live_log import is_live_log, read_live_device
 from .mt_manager import read_mt_manager
@@ -36,7 +36,7 @@ TITLES = {
 USES = ("raw", "orientation")
 
 
-def format_of(path: Path) -> str | None:
+def detect_format(path: Path) -> str | None:
     """The key of `FORMATS` for a file or folder, by its ending and its first lines; None if it is none of these.
 
     Raises
@@ -55,7 +55,7 @@ def format_of(path: Path) -> str | None:
         return {".mvnx": "mvnx", ".sto": "opensim"}[suffix]
     if suffix not in (".csv", ".txt", ".xml"):
         return None
-    lines = first_lines(path, 40)
+    lines = read_first_lines(path, 40)
     start = "\n".join(lines)
     if "<mvnx" in start:
         return "mvnx"

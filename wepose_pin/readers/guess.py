@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from ..recording.segments import segment_of
+from ..recording.segments import guess_segment
 
 AXIS = re.compile(r"(?P<stem>.*?)[ _.\-\[(]*(?P<axis>[xyzw0-3])[\])]?\s*(?P<unit>[\[(].*[\])])?", re.IGNORECASE)
 # What is measured, in the order in which the words are looked for; (?![a-z]) for names such as gx, ax.
@@ -44,7 +44,7 @@ def guess_columns(names: Iterable[str]) -> Guess:
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for name in names:
         match = AXIS.fullmatch(name)
-        signal = signal_of(match["stem"]) if match else None
+        signal = guess_signal(match["stem"]) if match else None
         if match and signal:
             groups.setdefault((match["stem"], signal), {})[match["axis"].lower()] = name
     found: dict[str, dict[str, list[str]]] = {}
@@ -63,7 +63,7 @@ def guess_arrays(shapes: Mapping[str, tuple[int, ...]]) -> Guess:
     """Arrays (n, 3) and (n, 4) whose path says what they are."""
     found: dict[str, dict[str, list[str]]] = {}
     for path, shape in shapes.items():
-        signal = signal_of(path)
+        signal = guess_signal(path)
         if signal and len(shape) == 2 and len(ORDER[signal]) in shape:
             found.setdefault(_owner(path), {}).setdefault(signal, [path])
     times = {path.rpartition("/")[2]: path for path, shape in shapes.items() if max(shape, default=0) == _size(shape)}
@@ -71,7 +71,7 @@ def guess_arrays(shapes: Mapping[str, tuple[int, ...]]) -> Guess:
     return guess._replace(time=times.get(guess.time or ""))
 
 
-def signal_of(stem: str) -> str | None:
+def guess_signal(stem: str) -> str | None:
     """The signal that a column's name without its axis speaks of."""
     text = stem.lower()
     if re.search(NOT, text):
@@ -99,7 +99,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 def _owner(stem: str) -> str:
     """The segment, or what is left of the name without its signal: one sensor's signals have it in common."""
-    segment = segment_of(stem)
+    segment = guess_segment(stem)
     if segment:
         return segment
     text = stem.lower()

@@ -25,12 +25,12 @@ import numpy as np
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable, is_number
 from ..errors import BadData, MissingFile
-from ..recording import SEGMENTS, ImuSensor, Recording, check
+from ..recording import SEGMENTS, ImuSensor, Recording, check_recording
 from ..recording.arrivals import Aligner, Arrivals, Ticks
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
-from .device import Device, table_of
-from .stated import phases_stated
+from .device import Device, make_table
+from .session_file import read_phases
 
 MAGIC = b"WEPOSE-LIVE-1\n"
 SUFFIX = ".wepose"
@@ -84,7 +84,7 @@ def read_live_log(path: Path) -> LiveRecording:
     resets, poses = [], []
     end_s, late = 0.0, 0
     broken_off = True
-    for tag, payload in blocks(path):
+    for tag, payload in read_blocks(path):
         if tag == b"":
             broken_off = False
         elif tag == HEAD:
@@ -115,7 +115,7 @@ def read_live_log(path: Path) -> LiveRecording:
     resets = [tick for tick in resets if tick < aligner.next_tick]
     if aligner.next_tick <= start[1] + 1:
         raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
-    recording = check(recording_of(header, aligner.rate_hz, ticks, start, path, tuple(resets)))
+    recording = check_recording(build_recording(header, aligner.rate_hz, ticks, start, path, tuple(resets)))
     if broken_off:
         killed = Diagnostic("live-recording-incomplete", WARNING, path.name, facts={"variant": "killed"})
         recording = replace(recording, diagnostics=(killed,))
@@ -153,7 +153,7 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
         diagnostics.append(Diagnostic("heading-resets-not-repeated", INFO, path.name, len(resets)))
     return Device(
         "wepose_live",
-        table_of(log.recording.time, values),
+        make_table(log.recording.time, values),
         {label: label for label in values},
         "raw",
         mounts=mounts,
@@ -161,7 +161,7 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     )
 
 
-def blocks(path: Path) -> Iterator[tuple[bytes, bytes]]:
+def read_blocks(path: Path) -> Iterator[tuple[bytes, bytes]]:
     """Tag and payload of each whole block; at the end an empty one where nothing is left over."""
     with path.open("rb") as file:
         file.seek(len(MAGIC))
@@ -194,7 +194,7 @@ def _header(path: Path, payload: bytes) -> dict[str, Any]:
         raise BadData(f"{path}: its header lacks name, start_pose, remounted or method; the file is damaged")
     if not (isinstance(mounts, dict) and all(_is_quat(mount) for mount in mounts.values())):
         raise BadData(f"{path}: mounts = {mounts!r} in its header; a unit quaternion x, y, z, w each is needed")
-    phases_stated(TomlTable(phases if isinstance(phases, dict) else {"phases": phases}, str(path), "phases."))
+    read_phases(TomlTable(phases if isinstance(phases, dict) else {"phases": phases}, str(path), "phases."))
     return {"subject": None, **header}
 
 
@@ -249,7 +249,7 @@ def _arrivals(path: Path, payload: bytes, sensors: int) -> Arrivals:
     return Arrivals(which, time, gyro.reshape(count, 3), accel.reshape(count, 3))
 
 
-def recording_of(
+def build_recording(
     header: Mapping[str, Any],
     rate_hz: float,
     ticks: Sequence[Ticks],
@@ -303,6 +303,6 @@ def recording_of(
         phases,
         header["start_pose"],
         header["remounted"],
-        source,
+        source=source,
         resets=tuple(tick - first for tick in resets),
     )

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, MissingRate
-from ..recording.segments import segment_of
-from .device import Device, Text, counted_time, read_text, table_of, unwrapped
+from ..recording.segments import guess_segment
+from .device import Device, Text, compute_counted_time, make_table, read_text, unwrap_counter
 
 COUNTER_WRAPS = 65536.0
 FINE_S, FINE_WRAPS = 1e-4, 2.0**32
@@ -52,15 +52,15 @@ def read_mt_manager(path: Path, use: str | None = None, rate_hz: float | None = 
         numbers = text.numbers(RAW)
         values = {"accel": numbers[:, :3], "gyro": numbers[:, 3:]}
     else:
-        values = {"orientation": orientation(text)}
+        values = {"orientation": read_orientation(text)}
     # MT_012345_001-000_00B40001.txt: the last part is the sensor's number.
     label = path.stem.rpartition("_")[2] or path.stem
-    labels = {label: segment_of(path.stem)}
-    table = table_of(time, {label: values})
+    labels = {label: guess_segment(path.stem)}
+    table = make_table(time, {label: values})
     return Device("mt_manager", table, labels, kind, since_power_on=True, wraps_s=wraps_s)
 
 
-def orientation(text: Text) -> np.ndarray:
+def read_orientation(text: Text) -> np.ndarray:
     """`quat_WS` (n, 4) xyzw of an Xsens export, from a quaternion, a matrix or angles; NaN where it has none.
 
     Raises
@@ -106,11 +106,11 @@ def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
     rate = rate_hz or (float(number[0]) if number else 0.0)
     counter = text.numbers(["PacketCounter"])[:, 0]
     if rate > 0.0 and np.isfinite(counter).all() and len(counter) > 1:
-        return counted_time(counter, rate, COUNTER_WRAPS)
+        return compute_counted_time(counter, rate, COUNTER_WRAPS)
     if rate_hz:
         return np.arange(len(counter)) / rate_hz, None
     if ["SampleTimeFine"] in text:
-        return FINE_S * unwrapped(text.numbers(["SampleTimeFine"])[:, 0], FINE_WRAPS), FINE_S * FINE_WRAPS
+        return FINE_S * unwrap_counter(text.numbers(["SampleTimeFine"])[:, 0], FINE_WRAPS), FINE_S * FINE_WRAPS
     raise MissingRate(
         f"{text.path}: no line '// Update Rate: …' and no SampleTimeFine to tell the time by; state the update rate "
         f"as rate_hz in [data], or export one of the two"

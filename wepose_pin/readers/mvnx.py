@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, MissingFile
-from .device import Device, must_be_measured, table_of
+from .device import Device, check_measured, make_table
 
 SEGMENT_OF = {
     "T8": "torso",
@@ -95,7 +95,7 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         raise BadData(f"{path}: none of the upper body's segments, such as T8; there is: {found}")
     return Device(
         "mvnx",
-        table_of(frames.time, values),
+        make_table(frames.time, values),
         {label: SEGMENT_OF[label] for label in values},
         "raw" if raw and use != "orientation" else "orientation",
         aligned=not raw or use == "orientation",
@@ -256,7 +256,7 @@ def _values(path: Path, tag: str, rows: list[str], count: int, frames: int) -> n
                 f"{path}: <{tag}> of frame {k} holds {len(row)} numbers; {WIDTH[tag]} for each of {count} are needed"
             )
         values[k] = row
-    must_be_measured(path, values, f"<{tag}>")
+    check_measured(path, values, f"<{tag}>")
     return values.reshape(frames, count, WIDTH[tag])
 
 

@@ -16,9 +16,9 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData
-from ..recording.segments import segment_of
-from .device import Device, first_lines, must_be_measured, table_of
-from .tables import columns
+from ..recording.segments import guess_segment
+from .device import Device, check_measured, make_table, read_first_lines
+from .tables import read_columns
 
 # The header line of our own files. OpenSim takes it for a remark.
 OWN = ("Frames", "bodies of Rajagopal's model in ground")
@@ -28,7 +28,7 @@ R_GW = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
 PRONATION = np.array([0.05639803, 0.99840646, 0.001952])
 
 
-def in_n_pose(body: str) -> Rotation:
+def compute_n_pose(body: str) -> Rotation:
     """A body of the model to G while the person stands in the N-pose, palms to the thighs: 90° of `pro_sup`."""
     if not body.startswith(("radius", "hand")):
         return Rotation.identity()
@@ -46,7 +46,7 @@ def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = Non
     """
     if use == "raw":
         raise BadData(f"{path}: an OpenSim .sto holds orientations, no gyroscope and accelerometer; leave out data.use")
-    lines = first_lines(path)
+    lines = read_first_lines(path)
     end = next((k for k, line in enumerate(lines) if line.strip().lower() == "endheader"), None)
     if end is None:
         raise BadData(f"{path}: no line 'endheader' in its first {len(lines)} lines; an OpenSim .sto file has one")
@@ -71,7 +71,7 @@ def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = Non
     labels = names[1:]
     if len(set(labels)) < len(labels):
         raise BadData(f"{path}: two columns have one name; each needs its own: {', '.join(labels)}")
-    time = columns(pl.DataFrame({"time": [row[0] for row in rows]}), ["time"], str(path), str(path))[:, 0]
+    time = read_columns(pl.DataFrame({"time": [row[0] for row in rows]}), ["time"], str(path), str(path))[:, 0]
     if rate_hz:
         time = np.arange(len(rows)) / rate_hz
     quats = {label: _quat(path, label, [row[k] for row in rows]) for k, label in enumerate(labels, 1)}
@@ -80,8 +80,8 @@ def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = Non
         quats = {label: _segment_quat(label.removesuffix("_imu"), quat) for label, quat in quats.items()}
     return Device(
         "opensim",
-        table_of(time, {label: {"orientation": quat} for label, quat in quats.items()}),
-        {label: segment_of(label) for label in labels},
+        make_table(time, {label: {"orientation": quat} for label, quat in quats.items()}),
+        {label: guess_segment(label) for label in labels},
         "orientation",
         aligned=own,
     )
@@ -91,7 +91,7 @@ def _segment_quat(body: str, quat_GB: np.ndarray) -> np.ndarray:
     """`quat_WL` (n, 4) xyzw of our segment from that of the model's body; a lost sample stays one."""
     quat_WL = np.full(quat_GB.shape, np.nan)
     known = np.linalg.norm(np.nan_to_num(quat_GB), axis=1) > 0.5
-    quat_WL[known] = (R_GW.inv() * Rotation.from_quat(quat_GB[known]) * in_n_pose(body).inv() * R_GW).as_quat()
+    quat_WL[known] = (R_GW.inv() * Rotation.from_quat(quat_GB[known]) * compute_n_pose(body).inv() * R_GW).as_quat()
     return quat_WL
 
 
@@ -105,5 +105,5 @@ def _quat(path: Path, label: str, cells: list[str]) -> np.ndarray:
             raise BadData(
                 f"{path}: column '{label}' holds '{cell[:40]}' in row {k + 1}; a quaternion w,x,y,z is needed"
             ) from None
-    must_be_measured(path, quat, f"column '{label}'")
+    check_measured(path, quat, f"column '{label}'")
     return quat[:, [1, 2, 3, 0]]

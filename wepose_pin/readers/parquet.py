@@ -37,7 +37,7 @@ class Contents(NamedTuple):
     sizes: dict[str, int]
 
 
-def contents(path: Path) -> Contents:
+def read_contents(path: Path) -> Contents:
     """What a Parquet file of flat columns holds, once its footer and the headers of its pages agree with each other.
 
     Raises

@@ -22,32 +22,32 @@ from ..recording import (
     OrientationSensor,
     Recording,
     Sensor,
-    check,
     check_phases,
-    span_text,
+    check_recording,
+    format_span,
 )
-from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, clock_of, common_time
+from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time
 from ..recording.faults import ROWS, Scan
-from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, lost_samples, runs
+from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from ..recording.plausibility import check_signals
-from ..recording.resampling import on_time
+from ..recording.resampling import resample
 from .arrays import ArrayFile, is_array_file
 from .device import Device
-from .formats import FORMATS, USES, format_of, read_device
-from .stated import (
+from .formats import FORMATS, USES, detect_format, read_device
+from .session_file import (
     WIDTHS,
     Stated,
-    joints_stated,
-    label_stated,
-    phases_stated,
+    check_session_keys,
+    choose_label,
+    find_truth,
+    read_joints,
+    read_phases,
+    read_sensor_keys,
     read_session_file,
-    sensor_stated,
-    session_keys,
-    truth_stated,
 )
 from .tables import FORMATS as TABLES
-from .tables import Rows, columns, one_column, read_table
+from .tables import Rows, read_column, read_columns, read_table
 
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "g": STANDARD_GRAVITY}
@@ -100,7 +100,7 @@ def iter_session(path: str | Path, seconds: float = 600.0) -> Iterator[Recording
         first = last
 
 
-def data_bytes(path: str | Path) -> int:
+def estimate_data_bytes(path: str | Path) -> int:
     """Size of the CSV and Parquet files that a session names; 0 where that cannot be told, as its reading will say."""
     try:
         path = Path(path)
@@ -155,7 +155,7 @@ class SessionReader:
         path = Path(path)
         self.path = path / "session.toml" if path.is_dir() else path
         self.gaps = gaps
-        top = read_session_file(self.path) if values is None else session_keys(values, self.path)
+        top = read_session_file(self.path) if values is None else check_session_keys(values, self.path)
         data, sensors = top.table("data"), top.table("sensors", {})
         data.allow(*_FOR_SENSORS, "truth")
         self._used: set[str] = set()  # which of `_FOR_SENSORS` some sensor had a use for
@@ -171,14 +171,14 @@ class SessionReader:
             time=np.empty(0),
             rate_hz=0.0,
             sensors={},
-            phases=phases_stated(top.table("phases", {})),
+            phases=read_phases(top.table("phases", {})),
             start_pose=start_pose,
-            joints=joints_stated(top, start_pose),
+            joints=read_joints(top, start_pose),
             remounted=top.flag("remounted"),
             source=self.path,
-            truth=truth_stated(self.path, data),
+            truth=find_truth(self.path, data),
         )
-        stated = {segment: sensor_stated(table) for segment, table in tables.items()}
+        stated = {segment: read_sensor_keys(table) for segment, table in tables.items()}
         self._units: Mapping[str, float] = SI
         if any(said.signals is not None for said in stated.values()):
             raw = any("gyro" in (said.signals or ()) for said in stated.values())
@@ -202,7 +202,7 @@ class SessionReader:
         if unused:
             raise BadSession(f"{data.at(unused[0])}: {_useless(unused[0])}; leave it out")
         clocks = {segment: plan.clock for segment, plan in self._plans.items()}
-        self.time, resampled = common_time(str(self.path), clocks)
+        self.time, resampled = find_common_time(str(self.path), clocks)
         self._resampled = bool(resampled)
         packets = {plan.path: clock.packet for plan in self._plans.values() if (clock := plan.clock).packet > 1}
         self._diagnostics = (
@@ -241,7 +241,7 @@ class SessionReader:
         """A file whose format says where its values stand."""
         path = self._file(keys, data)
         own = keys if "format" in keys else data
-        format = own.choice("format", FORMATS) if "format" in own else format_of(path) if path.exists() else None
+        format = own.choice("format", FORMATS) if "format" in own else detect_format(path) if path.exists() else None
         self._used |= {"format", "use"} if own is data else {"use"}
         if format is None:
             if not path.exists():
@@ -303,7 +303,7 @@ class SessionReader:
         offset = keys.number("offset_s", 0.0) or 0.0
         which = str(path)
         if device is not None:
-            label = label_stated(keys, device, segment, path)
+            label = choose_label(keys, device, segment, path)
             signals: Mapping[str, list[str]] = device.signals(label)
         else:
             assert stated.signals is not None
@@ -321,13 +321,13 @@ class SessionReader:
         if key not in self._clocks:
             table, place = self._tables[which], own.at("time")
             if isinstance(table, Rows):
-                time, height = one_column(path, name, str(path), place)
+                time, height = read_column(path, name, str(path), place)
             else:
-                time = columns(table, [name], str(path), place)[:, 0] if name is not None else np.empty(0)
+                time = read_columns(table, [name], str(path), place)[:, 0] if name is not None else np.empty(0)
                 height = table.height
             time = np.arange(height) / rate_hz if rate_hz is not None else unit * time
-            self._clocks[key] = clock = clock_of(time + offset, str(path))
-            lost = runs(lost_samples(clock, clock.row >= 0) == LONG)
+            self._clocks[key] = clock = build_clock(time + offset, str(path))
+            lost = find_runs(mark_lost_samples(clock, clock.row >= 0) == LONG)
             if lost and not self.gaps:
                 before, after = lost[0][0] - 1, lost[0][1]
                 raise BadData(
@@ -387,7 +387,7 @@ class SessionReader:
                 values = []
                 for name, names in plan.signals.items():
                     place = f"{self.path}: {plan.place}.{name}"
-                    read = columns(tables[plan.table], names, str(plan.path), place, first)
+                    read = read_columns(tables[plan.table], names, str(plan.path), place, first)
                     values.append(read * plan.units.get(name, 1.0))
                 blocks[segment] = times[id(plan.clock)][rows], np.column_stack(values)
             scan.push(blocks)
@@ -420,7 +420,7 @@ class SessionReader:
                 marks = marks[first - low : last - low]
             else:
                 before = 1 if first else 0  # a rate needs the sample before it
-                sensor = on_time(sensor, clock.time, self.time[first - before : last])
+                sensor = resample(sensor, clock.time, self.time[first - before : last])
                 sensors[segment] = sensor.part(slice(before, last - first + before))
             bridged += _bridged_gaps(segment, marks, clock.step)
         whole = last - first == len(self.time)
@@ -432,7 +432,7 @@ class SessionReader:
             phases=self._head.phases if whole else _within(self._head.phases, time),
             diagnostics=(*self._diagnostics, *scan.diagnostics(), *bridged),
         )
-        check(recording)
+        check_recording(recording)
         begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
         doubtful = check_signals(recording, whole=begins, units=first == 0)
         return replace(recording, diagnostics=(*recording.diagnostics, *doubtful))
@@ -465,16 +465,16 @@ class SessionReader:
                 lost_a_while &= self._scan().orientations[segment].rows > 0
             if not good.any() and not lost_a_while:
                 columns_ = ", ".join(plan.signals[name])
-                raise BadData(f"{place}: no numbers from {span_text(clock.time[[0, -1]])} in {columns_}")
-            marks[name] = lost_samples(clock, good)
+                raise BadData(f"{place}: no numbers from {format_span(clock.time[[0, -1]])} in {columns_}")
+            marks[name] = mark_lost_samples(clock, good)
             if not self.gaps and (marks[name] == LONG).any():
-                first, last = runs(marks[name] == LONG)[0]
+                first, last = find_runs(marks[name] == LONG)[0]
                 raise BadData(
                     f"{place}: {last - first} samples without numbers, {(last - first) * clock.step:.3f} s from "
                     f"{clock.time[first]:.3f} s; {_too_long(clock)}"
                 )
             if frozen.any():
-                marks[name] = lost_samples(clock, good & ~frozen)
+                marks[name] = mark_lost_samples(clock, good & ~frozen)
         every = np.max(list(marks.values()), axis=0)
         gap = every == LONG if self.gaps or faults else None
         if "orientation" in found:
@@ -492,7 +492,7 @@ class SessionReader:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Values (n, k) in SI on the clock, and which of them are there (n,)."""
         place = f"{self.path}: {plan.place}.{name}"
-        read = columns(table, plan.signals[name], str(plan.path), place, first_row)
+        read = read_columns(table, plan.signals[name], str(plan.path), place, first_row)
         there = clock.row >= 0
         if there.all() and len(read) == len(clock.row):
             values = read
@@ -550,7 +550,7 @@ def _too_long(clock: Clock) -> str:
 def _bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterator[Diagnostic]:
     """The gaps of a sensor that were bridged, from the marks (n,) of its samples and their usual step [s]."""
     for mark, code, severity in ((LONG, "long-gaps-bridged", WARNING), (BRIDGED, "short-gaps-bridged", INFO)):
-        spans = [last - first for first, last in runs(marks == mark)]
+        spans = [last - first for first, last in find_runs(marks == mark)]
         if spans:
             facts = {"samples": sum(spans), "longest": max(spans) * step}
             yield Diagnostic(code, severity, segment, len(spans), max(LONGEST_GAP_S, step), facts)

@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 
 from ..errors import BadData, MissingFile, UnknownColumn, native_stderr_muted, one_of
-from .parquet import Contents, contents
+from .parquet import Contents, read_contents
 
 FORMATS = (".csv", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
@@ -49,7 +49,7 @@ def read_table(path: Path) -> pl.DataFrame:
     return table.head(table.height - _empty_end(path)) if table.height else table
 
 
-def columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str, first_row: int = 0) -> np.ndarray:
+def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str, first_row: int = 0) -> np.ndarray:
     """Columns of numbers as a C-contiguous float array (n, len(names)); empty cells are NaN.
 
     `file` and `place` (such as ``sensors.torso.gyro``) begin the error's text; `first_row` is the row of the file that
@@ -132,7 +132,7 @@ class Rows:
         return self._held.slice(rows.start - self._first, rows.stop - rows.start)
 
 
-def one_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.ndarray, int]:
+def read_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.ndarray, int]:
     """A column (n,) of a table that is not held as a whole, and the number of rows; without a name an empty array."""
     _must_be_table(path)
     if _is_parquet(path):
@@ -145,12 +145,12 @@ def one_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.
             values, lazy = np.empty(height), pl.scan_parquet(_source(path)).select(name)
             for first in range(0, height, COLUMN_ROWS):  # what polars took to read stays with it
                 part = lazy.slice(first, COLUMN_ROWS).collect()
-                values[first : first + part.height] = columns(part, [name], file, place, first)[:, 0]
+                values[first : first + part.height] = read_columns(part, [name], file, place, first)[:, 0]
         return values, height
     parts, height = [np.empty(0)], 0
     for block in _csv_blocks(path, _header(path)):
         if name is not None:
-            parts.append(columns(block, [name], file, place, height)[:, 0])
+            parts.append(read_columns(block, [name], file, place, height)[:, 0])
         height += block.height
     return np.concatenate(parts), height
 
@@ -189,22 +189,22 @@ def _is_parquet(path: Path) -> bool:
     return path.suffix.lower() == ".parquet"
 
 
-def most_bytes(path: Path) -> int:
+def limit_bytes(path: Path) -> int:
     """How many bytes of numbers a packed file may hold."""
     return max(MOST_BYTES, MOST_GROWTH * path.stat().st_size)
 
 
-def too_large(path: Path) -> str:
-    """For an error's end: what a packed file says it holds is more than `most_bytes`."""
+def explain_size(path: Path) -> str:
+    """For an error's end: what a packed file says it holds is more than `limit_bytes`."""
     return f"in a file of {path.stat().st_size} bytes: no recording packs so well; write it anew without compression"
 
 
 def _parquet(path: Path) -> Contents:
     """What a Parquet file holds, before polars sees it: on some that are damaged polars ends the whole process."""
-    found = contents(path)
-    if max(8 * found.rows, sum(found.sizes.values())) > most_bytes(path):
+    found = read_contents(path)
+    if max(8 * found.rows, sum(found.sizes.values())) > limit_bytes(path):
         rows, width = found.rows, len(found.sizes)
-        raise BadData(f"{path}: says that it holds {rows} rows of {width} columns, {too_large(path)}")
+        raise BadData(f"{path}: says that it holds {rows} rows of {width} columns, {explain_size(path)}")
     return found
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..errors import BadData, MissingFile
 from .mat5 import read_mat5
-from .tables import columns, most_bytes, read_table
+from .tables import limit_bytes, read_columns, read_table
 
 RING_SEGMENTS = ("seg1", "seg2", "seg3", "seg4", "seg5")
 RING_MOUNTS = ("rigid", "loose")
@@ -47,7 +47,7 @@ def read_broad(path: Path) -> Trial:
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a .mat file of the BROAD benchmark is wanted here")
     try:
-        mat = read_mat5(path, most_bytes(path))
+        mat = read_mat5(path, limit_bytes(path))
         gyro, accel, true = (
             np.ascontiguousarray(mat[f"/{key}"], dtype=float) for key in ("imu_gyr", "imu_acc", "opt_quat")
         )
@@ -214,8 +214,8 @@ def read_ring(files: RingFiles) -> Chain:
     table, rate_hz = read_table(omc), _stated_rate(omc)
     for segment, marker in zip(RING_SEGMENTS, (2, 2, 1, 2, 4), strict=True):  # the origins of arm.xml
         names = [f"{segment}_quat_{axis}" for axis in "wxyz"], [f"{segment}_marker{marker}_{axis}" for axis in "xyz"]
-        quat_VB[segment] = rotations.xyzw_from_wxyz(columns(table, names[0], str(omc), segment))
-        origin_V[segment] = columns(table, names[1], str(omc), segment)
+        quat_VB[segment] = rotations.xyzw_from_wxyz(read_columns(table, names[0], str(omc), segment))
+        origin_V[segment] = read_columns(table, names[1], str(omc), segment)
     seen: np.ndarray = np.isfinite(np.stack([quat_VB[segment] for segment in RING_SEGMENTS])).all(axis=(0, 2))
     if seen.sum() < 2:
         raise BadData(f"{omc}: there are not two lines in which all segments were seen")
@@ -228,7 +228,7 @@ def read_ring(files: RingFiles) -> Chain:
         table, imu_hz = read_table(path), _stated_rate(path)
         for segment in RING_SEGMENTS:
             gyro, accel = (
-                _complete(columns(table, [f"{segment}_{kind}_{axis}" for axis in "xyz"], str(path), segment), path)
+                _complete(read_columns(table, [f"{segment}_{kind}_{axis}" for axis in "xyz"], str(path), segment), path)
                 for kind in ("gyr", "acc")
             )
             sensors[mount, segment] = Referenced(
@@ -270,11 +270,11 @@ def read_ur5(files: Ur5Files) -> Referenced:
     recording, sensor, imu, encoder = files
     measured, true = read_table(imu), read_table(encoder)
     gyro, accel = (
-        _complete(columns(measured, [f"{kind}_{axis}" for axis in "xyz"], str(imu), sensor), imu)
+        _complete(read_columns(measured, [f"{kind}_{axis}" for axis in "xyz"], str(imu), sensor), imu)
         for kind in ("gyr", "acc")
     )
-    time = 1e-6 * columns(true, ["TIME"], str(encoder), sensor)[:, 0]
-    quat_VB = rotations.xyzw_from_wxyz(columns(true, [f"QUATERNION_{k}" for k in range(4)], str(encoder), sensor))
+    time = 1e-6 * read_columns(true, ["TIME"], str(encoder), sensor)[:, 0]
+    quat_VB = rotations.xyzw_from_wxyz(read_columns(true, [f"QUATERNION_{k}" for k in range(4)], str(encoder), sensor))
     steps = np.diff(time)
     if len(gyro) != len(time):
         raise BadData(f"{encoder}: {len(time)} lines, but {len(gyro)} in {imu}; as many are needed")

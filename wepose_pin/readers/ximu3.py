@@ -14,8 +14,8 @@ import numpy as np
 
 from ..errors import BadData, MissingFile
 from ..recording.limits import STANDARD_GRAVITY
-from ..recording.segments import segment_of
-from .device import Device, Text, first_lines, read_text, table_of
+from ..recording.segments import guess_segment
+from .device import Device, Text, make_table, read_first_lines, read_text
 
 INERTIAL, QUATERNION = "Inertial.csv", "Quaternion.csv"
 TIMES = {"Timestamp (us)": 1e-6, "Time (s)": 1.0}
@@ -54,12 +54,12 @@ def read_ximu3(path: Path, use: str | None = None, rate_hz: float | None = None)
         values = {"orientation": _quat(text)}
     label = folder.name if file.name in (INERTIAL, QUATERNION) else file.stem
     kind = "raw" if "gyro" in values else "orientation"
-    segment = segment_of(folder.absolute().name if file.name in (INERTIAL, QUATERNION) else file.stem)
-    return Device("ximu3", table_of(time, {label: values}), {label: segment}, kind, since_power_on=True)
+    segment = guess_segment(folder.absolute().name if file.name in (INERTIAL, QUATERNION) else file.stem)
+    return Device("ximu3", make_table(time, {label: values}), {label: segment}, kind, since_power_on=True)
 
 
 def _has(file: Path, name: str) -> bool:
-    return any(line.startswith(name) for line in first_lines(file, 3))
+    return any(line.startswith(name) for line in read_first_lines(file, 3))
 
 
 def _quat(text: Text) -> np.ndarray:

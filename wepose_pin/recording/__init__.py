@@ -5,10 +5,10 @@ sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a f
 `faults` and `plausibility` say whether the sensors measured, by the `limits` of what sensors can.
 """
 
-from .intervals import Intervals, check_phases, check_time, format_time, span_text
-from .recording import CONFIGURATION, EACH_TIME, START_POSES, Recording, check, join
+from .intervals import Intervals, check_phases, check_time, format_span, format_time
+from .recording import CONFIGURATION, EACH_TIME, START_POSES, Recording, check_recording, join_recordings
 from .segments import SEGMENTS
-from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, axes_from_mount, mount_from_axes
+from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, compute_mount, find_mount_axes
 
 __all__ = [
     "AXES",
@@ -21,12 +21,12 @@ __all__ = [
     "OrientationSensor",
     "Recording",
     "Sensor",
-    "axes_from_mount",
-    "check",
     "check_phases",
+    "check_recording",
     "check_time",
+    "compute_mount",
+    "find_mount_axes",
+    "format_span",
     "format_time",
-    "join",
-    "mount_from_axes",
-    "span_text",
+    "join_recordings",
 ]

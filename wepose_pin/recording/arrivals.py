@@ -71,7 +71,7 @@ class Arrivals(NamedTuple):
     accel_S: np.ndarray  # (m, 3) [m/s²]
 
 
-def arrivals(got: Sequence[Samples], sensors: Sequence[str]) -> Arrivals:
+def order_arrivals(got: Sequence[Samples], sensors: Sequence[str]) -> Arrivals:
     """What one read gave, by time: which sensor was asked first says nothing of when its samples came."""
     which = np.repeat([sensors.index(s.sensor) for s in got], [len(s.time) for s in got]).astype(np.uint8)
     time, gyro_S, accel_S = (np.concatenate(of, dtype=float) for of in tuple(zip(*got, strict=True))[1:])
@@ -277,7 +277,7 @@ def _remember(m, t, gyro, accel):  # type: ignore[no-untyped-def]
 
 @kernel
 def _look_for_range(m):  # type: ignore[no-untyped-def]
-    """Where axes of gyro are cut off: as `plausibility.cut_off`, with what came so far."""
+    """Where axes of gyro are cut off: as `plausibility.find_cut_off`, with what came so far."""
     largest = max(m[_SIZE], m[_SIZE + 1], m[_SIZE + 2])
     for k in range(3):
         value, step = abs(m[_LAST + k]), abs(m[_STEP + k])

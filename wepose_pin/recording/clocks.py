@@ -9,7 +9,7 @@ import numpy as np
 
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData
-from .intervals import check_time, span_text
+from .intervals import check_time, format_span
 from .limits import LONGEST_STEP_S
 
 LONGEST_GAP_S = 0.05  # [s] of lost samples that are bridged in silence
@@ -52,7 +52,7 @@ class Clock:
         return max(LONGEST_GAP_S, self.step) * (1.0 + 1e-6)
 
 
-def clock_of(time: np.ndarray, place: str) -> Clock:
+def build_clock(time: np.ndarray, place: str) -> Clock:
     """The clock of a sensor whose rows have these times [s]; `place` begins an error's text.
 
     Raises
@@ -67,7 +67,7 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
     usual = np.diff(time[: BLOCK + 1])  # of a day's times not all are needed to know it
     step = float(np.median(usual))
     if step > LONGEST_STEP_S:
-        unit = time_unit_of(step)
+        unit = guess_time_unit(step)
         guess = f'; time_unit = "{unit}" would fit' if unit else ""
         raise BadData(f"{place}: time grows by {step:g} s from row to row, slower than any body sensor{guess}")
     wide = np.concatenate([first + np.flatnonzero(s > (1.0 + UNEVEN) * step) for first, s in _steps(time)])
@@ -78,7 +78,7 @@ def clock_of(time: np.ndarray, place: str) -> Clock:
     if lost.sum() > 10 * len(time) + 1000:
         k = int(wide[np.argmax(time[wide + 1] - time[wide])])
         raise BadData(
-            f"{place}: time jumps from {span_text(time[k : k + 2])} in row {k + 2}, by more than the recording "
+            f"{place}: time jumps from {format_span(time[k : k + 2])} in row {k + 2}, by more than the recording "
             f"is long; cut the recording there"
         )
     if not lost.any():
@@ -121,7 +121,7 @@ def _unpacked(time: np.ndarray) -> tuple[int, np.ndarray]:
     return usual, came[packet] - own[packet] * (ends[packet] - np.arange(n))
 
 
-def time_unit_of(step: float) -> str | None:
+def guess_time_unit(step: float) -> str | None:
     """The unit in which the usual `step` of a column of times is that of a body sensor; None: in none.
 
     A step at which two units would do (0.2 to 0.5 s, or ms) is taken for seconds.
@@ -135,7 +135,7 @@ def _steps(time: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         yield first, np.diff(time[first : first + BLOCK + 1])
 
 
-def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tuple[Diagnostic, ...]]:
+def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tuple[Diagnostic, ...]]:
     """One time base (n,) [s] for all sensors, and a diagnostic where it is not their own.
 
     Their own where they share an even one. Else an even one over their overlap at the rate of the slowest sensor: of a
@@ -157,7 +157,7 @@ def common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tu
     end = min(float(clock.time[-1]) for clock in clocks.values())
     usual = max(float(clock.time[-1] - clock.time[0]) / (len(clock.time) - 1) for clock in clocks.values())
     if end - begin < 2.0 * usual:
-        spans = ", ".join(f"{name} {span_text(c.time[[0, -1]])}" for name, c in clocks.items())
+        spans = ", ".join(f"{name} {format_span(c.time[[0, -1]])}" for name, c in clocks.items())
         raise BadData(
             f"{where}: the sensors' clocks do not overlap ({spans}); check each sensor's time and offset_s, in seconds"
         )

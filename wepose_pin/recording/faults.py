@@ -32,10 +32,10 @@ from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from .clocks import LONGEST_GAP_S, Clock
-from .gaps import GOOD, runs
+from .gaps import GOOD, find_runs
 from .intervals import format_time
 from .limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE, STANDARD_GRAVITY
-from .plausibility import ROUNDING, cut_off
+from .plausibility import ROUNDING, find_cut_off
 
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5  # of rate and force both at one value: longer than gaps that are bridged in silence
 STUCK_S = 1.0  # of one of them alone, or of one axis
@@ -161,7 +161,7 @@ class SensorScan:
         self._cut_off(changing[:, 1:])
 
     def _gather(self, name: str, block: np.ndarray, same: np.ndarray, first_row: bool) -> None:
-        spans = np.array(runs(same), dtype=np.int64).reshape(-1, 2)
+        spans = np.array(find_runs(same), dtype=np.int64).reshape(-1, 2)
         length = spans[:, 1] - spans[:, 0] + 1
         if name == "gyro and accel":
             length = np.minimum(length, _LONGEST)
@@ -232,7 +232,7 @@ class SensorScan:
         """The levels at which an axis of gyro stays though something else changes."""
         gyro = values[:, :3]
         self._peak = max(self._peak, float(np.abs(gyro).max()))
-        cut = cut_off(gyro, NARROWEST_GYRO_RANGE)
+        cut = find_cut_off(gyro, NARROWEST_GYRO_RANGE)
         if cut.any():
             changes = (np.abs(np.diff(values, axis=0)) > ROUNDING * np.abs(values).max(axis=0)).any(axis=1)
             stays = cut[1:] & cut[:-1] & changes[:, None]
@@ -321,7 +321,7 @@ def _up_off(rows: np.ndarray) -> float:
     return float(np.max(off * (known[2:] & known[:-2]), initial=0.0))
 
 
-def faults_of(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
+def find_faults(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
     """Sensor → the stretches in which it was frozen or stuck, in the order of time; none where all measure."""
     noisy = {name: scan.noisy() for name, scan in scans.items()}
     found = {}
@@ -409,7 +409,7 @@ class Scan:
                 f"{where}: sensors.{name} and sensors.{other} hold the same values in {self._alike[name, other]} rows: "
                 f"one is a copy of the other; name the file and columns in which each was recorded"
             )
-        self.faults = faults_of(self.sensors)
+        self.faults = find_faults(self.sensors)
         for name, faults in self.faults.items():
             scan = self.sensors[name]
             for fault in faults:

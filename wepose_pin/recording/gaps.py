@@ -18,15 +18,15 @@ FADE_S = 0.1
 GOOD, BRIDGED, LONG = 0, 1, 2
 
 
-def lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
+def mark_lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
     """`GOOD`, `BRIDGED` or `LONG` for every sample (n,), of the runs that are not `good` (n,)."""
     marks = np.zeros(len(good), dtype=np.int8)
-    for first, last in runs(~good):
+    for first, last in find_runs(~good):
         marks[first:last] = LONG if (last - first) * clock.step > clock.longest_bridge else BRIDGED
     return marks
 
 
-def runs(which: np.ndarray) -> list[tuple[int, int]]:
+def find_runs(which: np.ndarray) -> list[tuple[int, int]]:
     """First and one past the last index of each run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
@@ -49,7 +49,7 @@ def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = 
         filled[lost, k] = np.interp(time[lost], time[~lost], values[~lost, k])
     if rate and (marks == LONG).any():
         static = _static_rate(values, ~lost, clock)
-        for first, last in runs(marks == LONG):
+        for first, last in find_runs(marks == LONG):
             edges = [edge for edge in (first - 1, last) if 0 <= edge < len(time)]
             near = [np.clip(1.0 - np.abs(time[first:last] - time[edge]) / FADE_S, 0.0, None) for edge in edges]
             whole = np.maximum(1.0, np.sum(near, axis=0))
@@ -71,7 +71,7 @@ def bridge_quat(
     `before` and `after` are the time [s] and the quaternion (4,) last and next measured beyond a piece of a recording.
     """
     filled = quat.copy()
-    for first, last in runs(marks != GOOD):
+    for first, last in find_runs(marks != GOOD):
         ends = [
             before if first == 0 else (clock.time[first - 1], quat[first - 1]),
             after if last == len(quat) else (clock.time[last], quat[last]),

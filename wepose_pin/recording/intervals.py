@@ -1,4 +1,4 @@
-"""Times and intervals [s] of a recording: their checks, and how they are written in texts."""
+"""Times and intervals [s] of a recording: checks and format."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ Intervals = tuple[tuple[float, float], ...]
 
 
 def format_time(time: float, decimals: int = 3) -> str:
-    """A time [s] as it stands in the file, to the millisecond: on a clock that counts from 1970 as well."""
+    """Format a time [s] to the millisecond as in the file, also on a clock that starts in 1970."""
     return f"{time:.{decimals}f}".rstrip("0").rstrip(".")
 
 
-def span_text(interval: Sequence[float] | np.ndarray) -> str:
-    """From when to when [s], in words."""
+def format_span(interval: Sequence[float] | np.ndarray) -> str:
+    """Format an interval [s] as "begin to end s"."""
     return f"{format_time(interval[0])} to {format_time(interval[1])} s"
 
 
 def check_time(where: str, time: np.ndarray) -> None:
-    """Every time (n,) [s] is finite and later than the one before; `where` begins the error's text."""
+    """Check that times (n,) [s] are finite and increase strictly; `where` begins the error's text."""
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
         raise BadData(f"{where}: time: not a finite number in row {bad[0] + 1}; every row needs its time in seconds")
     back = np.flatnonzero(time[1:] <= time[:-1])
     if back.size:
         k = int(back[0])
-        how = "stands still" if time[k + 1] == time[k] else "goes back"
+        fault = "stands still" if time[k + 1] == time[k] else "goes back"
         raise BadData(
-            f"{where}: time {how} in row {k + 2}: {format_time(time[k + 1], 6)} s after {format_time(time[k], 6)} s; "
+            f"{where}: time {fault} in row {k + 2}: {format_time(time[k + 1], 6)} s after {format_time(time[k], 6)} s; "
             f"it must grow in every row"
         )
 
 
 def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tuple[float, float]]]) -> None:
-    """Every interval [s] has a length and lies in the recording."""
+    """Check that every interval [s] has a positive length and lies in the recording."""
     for name, intervals in phases.items():
         for first, last in intervals:
             place = f"{where}: phases.{name}: [{format_time(first)}, {format_time(last)}]"

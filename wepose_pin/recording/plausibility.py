@@ -16,8 +16,8 @@ from scipy.special import ndtr, ndtri
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongUnit
-from .gaps import runs
-from .intervals import span_text
+from .gaps import find_runs
+from .intervals import format_span
 from .limits import (
     GRAVITY_ERROR_NOTED,
     GRAVITY_ERROR_REFUSED,
@@ -74,7 +74,7 @@ def check_signals(recording: Recording, *, whole: bool = True, units: bool = Tru
             ("gyro", sensor.gyro_S, NARROWEST_GYRO_RANGE),
             ("accel", sensor.accel_S, NARROWEST_ACCEL_RANGE),
         ):
-            cut = cut_off(values, least)
+            cut = find_cut_off(values, least)
             if cut.any():
                 facts: dict[str, float | str] = {"variant": name, "range": float(np.abs(values[cut]).min())}
                 seconds = np.count_nonzero(cut.any(axis=1)) / recording.rate_hz
@@ -96,7 +96,7 @@ def _gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, 
     norm = float(np.linalg.norm(sensor.accel_S[static], axis=1).mean())
     share = norm / STANDARD_GRAVITY - 1.0
     if abs(share) > GRAVITY_ERROR_REFUSED:
-        found = f"norm {norm:.4g} m/s^2 {when} ({span_text((first, last))})"
+        found = f"norm {norm:.4g} m/s^2 {when} ({format_span((first, last))})"
         raise _wrong_gravity(f"{place}.accel: {found}, where gravity's {STANDARD_GRAVITY:.3g} is expected", norm)
     if abs(share) <= GRAVITY_ERROR_NOTED:
         return []
@@ -212,7 +212,7 @@ def _range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: 
         )
 
 
-def cut_off(values: np.ndarray, least: float) -> np.ndarray:
+def find_cut_off(values: np.ndarray, least: float) -> np.ndarray:
     """(n, 3) bool: where an axis of `values` (n, 3) stays at its extreme, `least` or more, as if cut off there.
 
     It is cut off where the motion before and after one such plateau would have led beyond it, and neither digits nor
@@ -224,7 +224,7 @@ def cut_off(values: np.ndarray, least: float) -> np.ndarray:
             if abs(extreme) < least:
                 continue
             same = ROUNDING * abs(extreme)
-            plateaus = [(a, b) for a, b in runs(np.abs(x - extreme) <= same) if PLATEAU <= b - a < len(x)]
+            plateaus = [(a, b) for a, b in find_runs(np.abs(x - extreme) <= same) if PLATEAU <= b - a < len(x)]
             if not plateaus:
                 continue
             steps = np.abs(np.diff(x))

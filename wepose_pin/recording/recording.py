@@ -1,4 +1,4 @@
-"""`Recording`: what the sensors measured, checked once; everything after this room trusts it."""
+"""`Recording`: the sensors' measurements, checked once; the rooms after this one rely on the check."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from ..errors import BadData, BadOption, BadPhase, one_of
 from .intervals import Intervals, check_phases, check_time
 from .limits import MEDIAN_FORCE
 from .segments import SEGMENTS
-from .sensors import ImuSensor, OrientationSensor, Sensor, join_parts
+from .sensors import ImuSensor, OrientationSensor, Sensor, join_sensors
 
 START_POSES = ("n_pose",)
-CONFIGURATION = "configuration"  # the start pose of any other chain: values of its joints; sensors are named by links
+# The start pose of a chain that is not a person: values of its joints. Its sensors are named by links.
+CONFIGURATION = "configuration"
 
-RATE_OFF = 0.01  # share by which the stated rate may be off that of the times: its error is one of all angles
-LONGEST_STEP = 2.5  # steps of the rate from one time to the next; uneven clocks are resampled while read
+RATE_ERROR = 0.01  # allowed relative error of the stated rate; it is the relative error of all angles
+LONGEST_STEP = 2.5  # allowed step between two times, in steps of the rate; readers resample uneven clocks
 
-EACH_TIME = ", a row for each time"  # why an array has another shape
+EACH_TIME = ", a row for each time"  # part of an error's text on an array's shape
 
 
 @dataclass(frozen=True)
@@ -32,15 +33,15 @@ class Recording:
     Parameters
     ----------
     time : (n,) [s], uniform at `rate_hz` to within the clock's jitter
-    sensors : one a segment
+    sensors : segment → sensor
     phases : name → intervals [s] on `time`; `start` is the start pose, `static` sensors on a table
-    remounted : the sensors were strapped on anew since the subject's calibration: its mounts do not hold here
-    start_is_guessed : phases.start is not the user's: it was found in the motion
-    source : the file it was read from, for messages
-    truth : file with the reference, where there is one
-    resets : samples before which headings were set anew, live: the person stood in the start pose
-    joints : joint → its value [rad or m] in the start pose, where that is `CONFIGURATION`; the others are at zero
-    diagnostics : what was assumed, bridged or found wrong while reading
+    remounted : the sensors were remounted after the subject's calibration, so that its mounts do not hold here
+    start_is_guessed : `phases.start` was found in the motion and not stated by the user
+    source : the file of the recording, for messages
+    truth : file with the reference; None: there is none
+    resets : samples before which a live session reset the headings, with the person in the start pose
+    joints : joint → value [rad or m] in the start pose `CONFIGURATION`; joints that are not named are at zero
+    diagnostics : assumptions, bridged gaps and faults from reading
     """
 
     name: str
@@ -61,14 +62,14 @@ class Recording:
         return len(self.time)
 
     def check(self) -> Recording:
-        """The same recording, if it can be one, as the function `check` says: made by hand it may be anything.
+        """Check a recording that was built in code, and return it; see `check_recording`.
 
         Raises
         ------
         BadOption, BadData, BadPhase
-            As `check`; specific forces in another unit, which reading a file would have found.
+            As `check_recording`; specific force in another unit, which a reader of files would have detected.
         """
-        check(self)
+        check_recording(self)
         for segment, sensor in self.imus.items():
             force = float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
             if force and not MEDIAN_FORCE[0] < force < MEDIAN_FORCE[1]:
@@ -84,29 +85,29 @@ class Recording:
         return {segment: sensor for segment, sensor in self.sensors.items() if isinstance(sensor, ImuSensor)}
 
     def where(self) -> str:
-        """Beginning of an error's text: the file, or the recording's name."""
+        """Return the beginning of an error's text: the file, or the recording's name."""
         return str(self.source) if self.source else self.name
 
     def span(self, interval: tuple[float, float]) -> slice:
-        """Samples within the interval [s], both ends included."""
+        """Return the samples within the interval [s], both ends included."""
         first, last = np.searchsorted(self.time, [interval[0] - 1e-9, interval[1] + 1e-9])
         return slice(int(first), int(last))
 
     def measured(self, segment: str, interval: tuple[float, float]) -> np.ndarray:
-        """Samples (k,) within the interval [s] that the sensor measured: what lies in its gaps was bridged."""
+        """Return the samples (k,) within the interval [s] that the sensor measured; samples in gaps are bridged."""
         span, gap = self.span(interval), self.sensors[segment].gap
         samples = np.arange(len(self))[span]
         return samples if gap is None else samples[~gap[span]]
 
     def cut(self, span: slice) -> Recording:
-        """The samples of a span; phases as they were."""
+        """Return the recording of a span of samples; its phases stay whole."""
         first, last, _ = span.indices(len(self))
         sensors = {name: sensor.part(slice(first, last)) for name, sensor in self.sensors.items()}
         resets = tuple(tick - first for tick in self.resets if first <= tick < last)
         return replace(self, time=self.time[first:last], sensors=sensors, resets=resets)
 
     def chunks(self, seconds: float) -> Iterator[Recording]:
-        """The recording in chunks of so many seconds, one after the other; the last may be longer by a half."""
+        """Iterate over consecutive chunks of so many seconds; the last one may be half a chunk longer."""
         size = max(1, round(seconds * self.rate_hz))
         first = 0
         while first < len(self):
@@ -115,12 +116,12 @@ class Recording:
             first = last
 
     def phase(self, name: str) -> Intervals:
-        """Intervals of a phase that must be there.
+        """Return the intervals of a phase.
 
         Raises
         ------
         BadPhase
-            The recording has no such phase.
+            The recording does not have the phase.
         """
         intervals = self.phases.get(name, ())
         if not intervals and self.source is not None and self.source.suffix == ".wepose":
@@ -137,34 +138,33 @@ class Recording:
         return intervals
 
 
-def join(first: Recording, second: Recording) -> Recording:
-    """Two recordings of the same sensors, one after the other; diagnostics of both, all else is the first's."""
-    sensors = {name: join_parts([sensor, second.sensors[name]]) for name, sensor in first.sensors.items()}
+def join_recordings(first: Recording, second: Recording) -> Recording:
+    """Join two recordings of the same sensors in time; diagnostics are those of both, all else is the first's."""
+    sensors = {name: join_sensors([sensor, second.sensors[name]]) for name, sensor in first.sensors.items()}
     resets = (*first.resets, *(len(first) + tick for tick in second.resets))
     diagnostics = (*first.diagnostics, *(each for each in second.diagnostics if each not in first.diagnostics))
     time = np.concatenate([first.time, second.time])
     return replace(first, time=time, sensors=sensors, resets=resets, diagnostics=diagnostics)
 
 
-def check(recording: Recording) -> Recording:
-    """The same recording, if it can be one.
+def check_recording(recording: Recording) -> Recording:
+    """Check a recording and return it.
 
     Raises
     ------
     BadOption
-        A field that is not of its kind, or a name that is not known.
+        A field has a wrong type, or a name is not known.
     BadData
-        Shapes that differ, too few samples, numbers that are not finite, time that stands still or goes back, or that
-        has not the rate.
+        Shapes differ, samples are too few, a number is not finite, time does not increase or contradicts the rate.
     BadPhase
-        A phase that is empty or outside the recording.
+        A phase is empty or outside the recording.
     """
     where, time = recording.where(), recording.time
     check_fields(recording, f"{where}: ")
     start_poses = (*START_POSES, CONFIGURATION)
     if recording.start_pose not in start_poses:
         raise BadOption(f"{where}: start_pose = '{recording.start_pose}' is not known; {one_of(start_poses)}")
-    if recording.start_pose != CONFIGURATION:  # else they are links
+    if recording.start_pose != CONFIGURATION:  # else the sensors are named by links
         links = f'; a chain\'s links need start_pose = "{CONFIGURATION}"'
         check_names(f"{where}: sensors", recording.sensors, SEGMENTS, links)
     if not recording.sensors:
@@ -183,7 +183,7 @@ def check(recording: Recording) -> Recording:
 
 
 def _check_sensor(place: str, time: np.ndarray, sensor: Sensor) -> None:
-    """Each array has a finite row for each time (n,) [s], and quaternions are unit ones."""
+    """Check that each array has a finite row for each time (n,) [s], and that quaternions have unit norm."""
     if isinstance(sensor, ImuSensor):
         arrays = {"gyro": (sensor.gyro_S, 3), "accel": (sensor.accel_S, 3)}
     else:
@@ -210,13 +210,13 @@ def _check_sensor(place: str, time: np.ndarray, sensor: Sensor) -> None:
 
 
 def _check_rate(where: str, time: np.ndarray, rate_hz: float) -> None:
-    """Times (n,) [s] go on evenly at the rate, their jitter aside."""
+    """Check that times (n,) [s] increase evenly at the rate, jitter aside."""
     steps = len(time) - 1
     stated = (time[-1] - time[0]) * rate_hz
-    if abs(stated - steps) > max(1.0, RATE_OFF * steps):
+    if abs(stated - steps) > max(1.0, RATE_ERROR * steps):
         raise BadData(
             f"{where}: rate_hz = {rate_hz:g}, and time has {steps / (time[-1] - time[0]):.6g} samples a second; they "
-            f"must agree to {100.0 * RATE_OFF:g} %"
+            f"must agree to {100.0 * RATE_ERROR:g} %"
         )
     k = int(np.argmax(np.diff(time)))
     if (time[k + 1] - time[k]) * rate_hz > LONGEST_STEP:

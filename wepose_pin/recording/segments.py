@@ -1,4 +1,4 @@
-"""Our names of a person's segments, and the words by which others name them."""
+"""Names of a person's segments, and the words that labels and file names use for them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SEGMENTS = (
     "right_hand",
 )
 
-# Words that name a segment in a label or a file's name, after its side.
+# Words in a label or a file name that name a segment of a side.
 PARTS = (
     ("forearm", r"fore ?arm|lower ?arm|ulna|radius|wrist"),
     ("upper_arm", r"upper ?arm|humerus|biceps|brachium"),
@@ -29,10 +29,10 @@ MIDDLE = (
 )
 
 
-def segment_of(label: str) -> str | None:
-    """The segment that a label or a file's name speaks of, as ``humerus_r_imu`` or ``LeftForeArm``; None if unclear."""
+def guess_segment(label: str) -> str | None:
+    """Guess the segment from a label or a file name, as ``humerus_r_imu`` or ``LeftForeArm``; None if unclear."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+|(?<=[a-z])(?=\d)", " ", label).lower()
     sides = {side for side in ("left", "right") if re.search(rf"\b({side}|{side[0]})(?=\b|hand|fore|upper)", words)}
-    found = {f"{side}_{part}" for part, pattern in PARTS if re.search(pattern, words) for side in sides}
-    found |= {part for part, pattern in MIDDLE if re.search(rf"\b({pattern})\b", words)}
-    return found.pop() if len(found) == 1 else None
+    matches = {f"{side}_{part}" for part, pattern in PARTS if re.search(pattern, words) for side in sides}
+    matches |= {part for part, pattern in MIDDLE if re.search(rf"\b({pattern})\b", words)}
+    return matches.pop() if len(matches) == 1 else None

@@ -20,7 +20,7 @@ from ..diagnostics import WARNING, Diagnostic, lines, quantity
 from ..errors import WeposeError, reason
 from ..filters import BEST
 from ..kinematics import Pose
-from ..recording import Recording, axes_from_mount, mount_from_axes
+from ..recording import Recording, compute_mount, find_mount_axes
 from ..subject import Subject, mount_rows
 from ..tracking import TrackedRecording, track
 from .calibration_figures import (
@@ -203,8 +203,8 @@ def _sensors_section(calibration: Calibration, recording: Recording) -> dict[str
         tilt, heading = _mount_stds(subject, name)
         drift = np.degrees(calibration.heading_drift.get(name, np.nan)) * 60.0
         rows.append(Sensor(plain(name), tilt, heading, drift))
-        up, forward = axes_from_mount(quat_LS)
-        nearest = Rotation.from_quat(mount_from_axes(up, forward))
+        up, forward = find_mount_axes(quat_LS)
+        nearest = Rotation.from_quat(compute_mount(up, forward))
         off = np.degrees((nearest.inv() * Rotation.from_quat(quat_LS)).magnitude())
         sensor = recording.sensors.get(name)
         stated = sensor is not None and sensor.stated_quat_LS is not None

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..diagnostics import Diagnostic
 from ..kinematics import Pose
-from ..recording import Intervals, join
+from ..recording import Intervals, join_recordings
 from ..tracking import TrackedRecording
 from .measures import Signal, measure_hands, measure_signal
 
@@ -182,7 +182,7 @@ def _join_recordings(parts: list[TrackedRecording], phases: Mapping[str, Interva
     return replace(
         last,
         pose=Pose(*(_concatenate([getattr(part.pose, of.name) for part in parts]) for of in fields(Pose))),
-        recording=replace(reduce(join, [part.recording for part in parts]), phases=phases),
+        recording=replace(reduce(join_recordings, [part.recording for part in parts]), phases=phases),
         segments=replace(
             segments[-1],
             time=np.concatenate([of.time for of in segments]),

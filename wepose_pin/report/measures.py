@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from ..kinematics import Pose, axis_std
 from ..recording import OrientationSensor, Recording
-from ..recording.gaps import runs
+from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
-from ..recording.plausibility import cut_off
+from ..recording.plausibility import find_cut_off
 from ..subject import Subject
 from ..tracking import TrackedRecording
 
@@ -60,7 +60,7 @@ def measure_signal(recording: Recording, name: str, tracked: TrackedRecording) -
         nan = float("nan")
         return Signal(np.concatenate([rate[:1], rate]), nan, nothing, gap, None, nan, nan, nan, None)
     orientation = tracked.segments.orientation[name]
-    cut = cut_off(sensor.gyro_S, NARROWEST_GYRO_RANGE) | cut_off(sensor.accel_S, NARROWEST_ACCEL_RANGE)
+    cut = find_cut_off(sensor.gyro_S, NARROWEST_GYRO_RANGE) | find_cut_off(sensor.accel_S, NARROWEST_ACCEL_RANGE)
     return Signal(
         np.linalg.norm(sensor.gyro_S, axis=1),
         float(np.linalg.norm(sensor.accel_S, axis=1).max()),
@@ -96,7 +96,7 @@ def mask_from_start(tracked: TrackedRecording) -> np.ndarray:
 
 def longest_run_s(mask: np.ndarray, rate_hz: float) -> float:
     """The longest run of true values [s]."""
-    return max((b - a for a, b in runs(mask)), default=0) / rate_hz
+    return max((b - a for a, b in find_runs(mask)), default=0) / rate_hz
 
 
 def stated_mounts(tracked: TrackedRecording) -> bool:

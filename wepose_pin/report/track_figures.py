@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..recording.gaps import runs
+from ..recording.gaps import find_runs
 from .chart import WIDTH, Chart, Key, Panel, Picture, category_rows, envelope
 from .measures import Hand, Signal, finite_max
 from .words import plain
@@ -199,7 +199,7 @@ def _times(time: np.ndarray, which: np.ndarray) -> np.ndarray:
     """
     least = max(1, len(time) // 1500)
     merged: list[list[int]] = []
-    for a, b in runs(which):
+    for a, b in find_runs(which):
         if merged and a - merged[-1][1] < least:
             merged[-1][1] = b
         else:

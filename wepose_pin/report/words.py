@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..recording import span_text
+from ..recording import format_span
 from ..writers.result import versions as package_versions
 
 
@@ -37,7 +37,7 @@ def degrees(value: float) -> str:
 
 def intervals(spans: Sequence[tuple[float, float]]) -> str:
     """Intervals [s]."""
-    return ", ".join(map(span_text, spans))
+    return ", ".join(map(format_span, spans))
 
 
 def plus_minus(value: float, std: float, unit: str, digits: int = 1) -> str:

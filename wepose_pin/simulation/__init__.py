@@ -10,20 +10,20 @@ the table, and sensors with noise and bias only. `Imperfections` add those of re
 """
 
 from ..subject import LENGTHS
-from .imperfections import PERFECT_WORLD, REALISTIC, Imperfections
-from .imu import GRAVITY, MTI_3, PERFECT, Device, ImuNoise
+from .imperfections import IDEAL_PRESET, MILD_PRESET, Imperfections
+from .imu import GRAVITY, MTI_3, NOISE_FREE, Device, ImuNoise
 from .motion import SEGMENTS, SIDES
-from .single import SingleSensor, paper_drift, paper_dynamic
-from .subject import MOUNT, Person, Simulation, simulate, simulated_person
+from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
+from .subject import MOUNT, Person, Simulation, simulate, simulate_person
 
 __all__ = [
     "GRAVITY",
+    "IDEAL_PRESET",
     "LENGTHS",
+    "MILD_PRESET",
     "MOUNT",
     "MTI_3",
-    "PERFECT",
-    "PERFECT_WORLD",
-    "REALISTIC",
+    "NOISE_FREE",
     "SEGMENTS",
     "SIDES",
     "Device",
@@ -32,8 +32,8 @@ __all__ = [
     "Person",
     "Simulation",
     "SingleSensor",
-    "paper_drift",
-    "paper_dynamic",
     "simulate",
-    "simulated_person",
+    "simulate_paper_drift",
+    "simulate_paper_dynamic",
+    "simulate_person",
 ]

@@ -13,7 +13,7 @@ from ..errors import BadOption
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Sizes of all that a perfect world lacks; the defaults are a perfect world, `REALISTIC` is a usual one.
+    """Sizes of all that a perfect world lacks; the defaults are a perfect world, `MILD_PRESET` is a usual one.
 
     The switch of each is its own off value: zero, or infinity for a range. Each draws from a stream of random numbers
     of its own, in numbers that do not depend on the sizes: switching one off, or making it larger, leaves the draws of
@@ -23,35 +23,35 @@ class Imperfections:
     ----------
     soft_tissue_deg : the sensor turns on its segment, rms of the whole turn from the clasp to the last rest; an axis
         has 1/√3 of it. Half of the variance follows the movement (specific force and rate of the segment, each axis a
-        fixed mixture), half is a wandering that stops when the segments do. REALISTIC: 1.5 deg, an assumption for
+        fixed mixture), half is a wandering that stops when the segments do. Mild: 1.5 deg, an assumption for
         sensors that are strapped well and away from joints and bellies of muscles: of the humerus' axial rotation the
         skin alone loses much more (Cutti et al. 2005, Gait & Posture 21, 341-349)
     palm_slip : [m] palm to palm in the clasp, rms of the vector's length over the clasp, each axis of the torso has
-        1/√3 of it; starts and ends at zero. Half each palm. REALISTIC: 8 mm, assumption
+        1/√3 of it; starts and ends at zero. Half each palm. Mild: 8 mm, assumption
     shoulder_wander : [m] of each shoulder's centre in the torso at 90 deg of elevation of the upper arm, in proportion
-        to 1 − cos(elevation): up, inwards and a little back, the direction drawn. REALISTIC: 4 mm, assumption, what
+        to 1 − cos(elevation): up, inwards and a little back, the direction drawn. Mild: 4 mm, assumption, what
         remains beside a mean centre; the girdle's own travel over the whole range is centimetres
     start_elbow_deg : bend of the elbows in the start pose, each drawn around it with a fifth of it as standard
-        deviation. REALISTIC: 5 deg, assumption
-    start_segment_deg : each arm segment's turn off the start pose, rms of the whole turn. REALISTIC: 1.5 deg,
+        deviation. Mild: 5 deg, assumption
+    start_segment_deg : each arm segment's turn off the start pose, rms of the whole turn. Mild: 1.5 deg,
         assumption
     sway_deg_s : a standing person sways: rms rate, about x and y, of the torso in W and, while it hangs, of each arm
-        against the torso, at 0.3 to 0.5 Hz, from before the first sample to the last. REALISTIC: 0.1 deg/s, assumption
-    gyro_scale, accel_scale : scale factor's error, standard deviation of each axis, a share. REALISTIC: 0.001, 0.005,
+        against the torso, at 0.3 to 0.5 Hz, from before the first sample to the last. Mild: 0.1 deg/s, assumption
+    gyro_scale, accel_scale : scale factor's error, standard deviation of each axis, a share. Mild: 0.001, 0.005,
         the non-linearities of the MTi 1-series data sheet taken for scale errors
     misalignment_deg : of each sensing axis towards each other axis, standard deviation, gyroscope and accelerometer
-        each its own. REALISTIC: 0.05 deg, alignment error of the MTi 1-series data sheet
+        each its own. Mild: 0.05 deg, alignment error of the MTi 1-series data sheet
     g_sensitivity_deg_s : [deg/s per g] what specific force adds to the gyroscope, standard deviation of each entry of
-        the matrix. REALISTIC: 0.001, assumption
-    gyro_range_deg_s, accel_range_g : full scale, cut off beyond. REALISTIC: 2000 deg/s, 16 g (MTi-3)
-    bits : of a sample over the full scale; 0: not quantised. REALISTIC: 16
+        the matrix. Mild: 0.001, assumption
+    gyro_range_deg_s, accel_range_g : full scale, cut off beyond. Mild: 2000 deg/s, 16 g (MTi-3)
+    bits : of a sample over the full scale; 0: not quantised. Mild: 16
     clock_jitter : [s] standard deviation of each sampling time, at most a quarter of a step. The file states the even
-        time, as devices do that count samples, so that it stays in the data. REALISTIC: 0.1 ms, assumption
+        time, as devices do that count samples, so that it stays in the data. Mild: 0.1 ms, assumption
     clock_offset : [s] standard deviation of each sensor's clock against the stated time, unknown to the user as well.
-        REALISTIC: 1 ms, assumption, of a wireless set that synchronises itself
+        Mild: 1 ms, assumption, of a wireless set that synchronises itself
     dropped : share of samples that each sensor loses, in runs of up to 50 ms (mean 20 ms, one sample at least).
-        REALISTIC: 0.002, assumption
-    mount : "stated": within 10 deg of stated axes; "any": uniformly random, nothing stated. REALISTIC: "stated"
+        Mild: 0.002, assumption
+    mount : "stated": within 10 deg of stated axes; "any": uniformly random, nothing stated. Mild: "stated"
     """
 
     soft_tissue_deg: float = 0.0
@@ -85,8 +85,8 @@ class Imperfections:
             raise BadOption(f"dropped {self.dropped} must be at most 0.2: runs of 50 ms would meet")
 
 
-PERFECT_WORLD = Imperfections()
-REALISTIC = Imperfections(
+IDEAL_PRESET = Imperfections()
+MILD_PRESET = Imperfections(
     soft_tissue_deg=1.5,
     palm_slip=0.008,
     shoulder_wander=0.004,

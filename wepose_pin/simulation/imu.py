@@ -42,7 +42,7 @@ class ImuNoise:
 
 
 MTI_3 = ImuNoise()
-PERFECT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NOISE_FREE = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Readings(NamedTuple):
@@ -121,7 +121,7 @@ def _digits(values: np.ndarray, full_scale: float, bits: int) -> np.ndarray:
     return np.clip(np.round(values / full_scale * count), -count, count - 1) * (full_scale / count)
 
 
-def jittered(rng: np.random.Generator, time: np.ndarray, rate_hz: float, std: float) -> np.ndarray:
+def jitter_time(rng: np.random.Generator, time: np.ndarray, rate_hz: float, std: float) -> np.ndarray:
     """When a clock samples that means to at `time` (n,) [s]: off by `std` [s], in order all the same.
 
     Raises
@@ -134,7 +134,7 @@ def jittered(rng: np.random.Generator, time: np.ndarray, rate_hz: float, std: fl
     return time + np.clip(std * rng.standard_normal(len(time)), -0.45 / rate_hz, 0.45 / rate_hz)
 
 
-def lost(rng: np.random.Generator, n: int, rate_hz: float, share: float) -> np.ndarray:
+def draw_lost(rng: np.random.Generator, n: int, rate_hz: float, share: float) -> np.ndarray:
     """Which of n samples are lost (n,): runs of 20 ms in the mean and 50 ms at most, ends and neighbours kept."""
     mask = np.zeros(n, dtype=bool)
     longest = max(1, int(LONGEST_RUN_S * rate_hz + 1e-9))

@@ -37,15 +37,15 @@ class BodyPose(NamedTuple):
     points: dict[str, np.ndarray]  # point -> (n, 3) [m] in W
 
 
-def step(t: np.ndarray, start: float, duration: float) -> np.ndarray:
+def make_step(t: np.ndarray, start: float, duration: float) -> np.ndarray:
     """0 before `start`, 1 after `start + duration`, four derivatives continuous: (n,)."""
     x = np.clip((t - start) / duration, 0.0, 1.0)
     return x**5 * (126.0 + x * (-420.0 + x * (540.0 + x * (-315.0 + x * 70.0))))
 
 
-def pulse(t: np.ndarray, start: float, stop: float, ramp: float) -> np.ndarray:
+def make_pulse(t: np.ndarray, start: float, stop: float, ramp: float) -> np.ndarray:
     """1 between `start + ramp` and `stop - ramp`, exactly 0 outside `start` and `stop`: (n,)."""
-    return step(t, start, ramp) * (1.0 - step(t, stop - ramp, ramp))
+    return make_step(t, start, ramp) * (1.0 - make_step(t, stop - ramp, ramp))
 
 
 class Wander:
@@ -117,9 +117,9 @@ class _Circle:
 
     def offset_W(self, t: np.ndarray, table_W: np.ndarray) -> np.ndarray:
         """From the table point to the hand: (n, 3) [m]."""
-        angle = 2.0 * np.pi * self.sense * step(t, self.start + _LIFT_S - 0.5, self.duration)
+        angle = 2.0 * np.pi * self.sense * make_step(t, self.start + _LIFT_S - 0.5, self.duration)
         circle_W = self.centre_W + np.cos(angle)[:, None] * self.axes_W[0] + np.sin(angle)[:, None] * self.axes_W[1]
-        return pulse(t, self.start, self.stop, _LIFT_S)[:, None] * (circle_W - table_W)
+        return make_pulse(t, self.start, self.stop, _LIFT_S)[:, None] * (circle_W - table_W)
 
 
 class Motion:
@@ -166,14 +166,14 @@ class Motion:
             self.rest.append((circle.stop, circle.stop + _REST_S[1]))
         # The slip's gains [m]: the stated rms on each axis over the clasp, whatever the sampling rate.
         grid = np.arange(*self.clasp, 0.05)
-        gate = pulse(grid, *self.clasp, _RAMP_S)
+        gate = make_pulse(grid, *self.clasp, _RAMP_S)
         rms = np.array([np.sqrt(np.mean((gate * wander(grid)) ** 2)) for wander in flaws.slip])
         self.slip_gain = flaws.sizes.palm_slip / np.sqrt(3.0) / rms
 
     def activity(self, t: np.ndarray) -> np.ndarray:
         """1 in the free motion of clasp and circles, 0 where the segments are static: (n,)."""
-        moving = pulse(t, *self.clasp, _RAMP_S)
-        return moving + sum((pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
+        moving = make_pulse(t, *self.clasp, _RAMP_S)
+        return moving + sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
 
     def _clasp_point(self, t: np.ndarray, moving: np.ndarray) -> np.ndarray:
         """Where the palms meet, from midway between the shoulders in T: (n, 3) [m], in reach of both arms."""
@@ -197,7 +197,7 @@ class Motion:
         return (lower + fraction * (upper - lower))[:, None] * ray
 
     def _motion_share(self, t: np.ndarray) -> np.ndarray:
-        return pulse(t, *self.clasp, _RAMP_S)  # 0 at both ends of the clasp
+        return make_pulse(t, *self.clasp, _RAMP_S)  # 0 at both ends of the clasp
 
     def _torso(self, _t: np.ndarray, lean: np.ndarray) -> Rotation:
         """R_WT, `lean` (n, 3) [rad] yaw, pitch, roll."""
@@ -241,9 +241,9 @@ class Motion:
     def __call__(self, t: np.ndarray, sides: Collection[str] = tuple(SIDES)) -> BodyPose:
         """The pose of torso and arms of these sides at the times `t` (n,) [s], exact."""
         moving = self._motion_share(t)
-        circling = sum((pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
-        led = step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
-        table = step(t, self.clasp[1], _BLEND_S)  # from the clasp to the table
+        circling = sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
+        led = make_step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
+        table = make_step(t, self.clasp[1], _BLEND_S)  # from the clasp to the table
 
         lean = np.column_stack([self.wander[name](t) for name in ("yaw", "pitch", "roll")])
         lean *= np.deg2rad(self.lean_deg * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
@@ -301,7 +301,7 @@ class Motion:
         return BodyPose(R_WL, points)
 
 
-def sensor_places(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
+def place_sensors(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
     """Where each sensor sits in L [m]: on the sternum, half-way along the outer side of the arm segments."""
     places = {"torso": np.array((0.11, 0.0, 0.8 * lengths["trunk"]))}
     for side, y in SIDES.items():
@@ -310,7 +310,7 @@ def sensor_places(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
     return places
 
 
-def sensor_position(pose: BodyPose, segment: str, p_LS: np.ndarray) -> np.ndarray:
+def locate_sensor(pose: BodyPose, segment: str, p_LS: np.ndarray) -> np.ndarray:
     """The sensor's place in W: (n, 3) [m]."""
     p_W = pose.R_WL[segment].apply(p_LS)
     if segment == "torso":

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .imperfections import PERFECT_WORLD, Imperfections
-from .imu import GRAVITY, MTI_3, Device, ImuNoise, jittered
-from .motion import E_Z, pulse
+from .imperfections import IDEAL_PRESET, Imperfections
+from .imu import GRAVITY, MTI_3, Device, ImuNoise, jitter_time
+from .motion import E_Z, make_pulse
 
 _STENCIL_S = 1e-3
 _GRID_HZ = 200.0  # at which the motion is scaled to its peaks
@@ -68,7 +68,7 @@ class _HandMotion:
         waves = np.sum(np.sin(omega * t[:, None, None] + phase) / omega**power, axis=2)
         swell, start = self.vigour
         vigour = 0.66 + 0.17 * np.sum(np.sin(swell * t[:, None] + start), axis=1)
-        return self.gain[which] * (pulse(t, *self.span, self.ramp) * vigour)[:, None] * waves
+        return self.gain[which] * (make_pulse(t, *self.span, self.ramp) * vigour)[:, None] * waves
 
     def orientation(self, t: np.ndarray) -> Rotation:
         return self.R_W0 * Rotation.from_euler("ZYX", self._waves(0, t))
@@ -99,7 +99,7 @@ def _record(
     noise_rng, device_rng, jitter_rng = rng.spawn(3)
     n = int(np.floor(duration * rate_hz)) + 1
     time = np.arange(n) / rate_hz
-    own_time = jittered(jitter_rng, time, rate_hz, imperfections.clock_jitter)
+    own_time = jitter_time(jitter_rng, time, rate_hz, imperfections.clock_jitter)
     R_WS = motion.orientation(own_time)
     turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(own_time)[:, None]
     rate_S = np.vstack((np.zeros(3), turned))
@@ -118,12 +118,12 @@ def _record(
     )
 
 
-def paper_dynamic(
+def simulate_paper_dynamic(
     seed: int,
     rate_hz: float = 100.0,
     *,
     noise: ImuNoise = MTI_3,
-    imperfections: Imperfections = PERFECT_WORLD,
+    imperfections: Imperfections = IDEAL_PRESET,
 ) -> SingleSensor:
     """One trial of the paper's dynamic experiment: 5 s static, 50 s of free motion in the hand, 5 s static.
 
@@ -136,17 +136,17 @@ def paper_dynamic(
     return _record(sensor_rng, motion, 60.0, rate_hz, noise, imperfections)
 
 
-def paper_drift(
+def simulate_paper_drift(
     seed: int,
     rate_hz: float = 1000.0,
     *,
     noise: ImuNoise = MTI_3,
-    imperfections: Imperfections = PERFECT_WORLD,
+    imperfections: Imperfections = IDEAL_PRESET,
 ) -> SingleSensor:
     """One trial of the paper's drift experiment: 25 s static, 10 s of fast shaking and rotating, 25 s static.
 
     Turns of 0.5 to 4 Hz with a peak of 13 to 15 rad/s, shaking of 2 to 5 Hz with a peak of 40 to 50 m/s^2;
-    `imperfections` as in `paper_dynamic`.
+    `imperfections` as in `simulate_paper_dynamic`.
     """
     motion_rng, sensor_rng = np.random.default_rng([seed, 12]).spawn(2)
     peaks = motion_rng.uniform(13.0, 15.0), motion_rng.uniform(40.0, 50.0)

@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 from ..arguments import Count, NonNegative, Positive, check_arguments
 from ..errors import BadOption
 from ..kinematics import Pose
-from ..recording import ImuSensor, Recording, check, mount_from_axes
+from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock
-from ..recording.gaps import bridge, lost_samples
+from ..recording.gaps import bridge, mark_lost_samples
 from ..subject import LENGTHS, SEXES, Subject, check_lengths, population_subject
-from .imperfections import PERFECT_WORLD, Imperfections
-from .imu import GRAVITY, MTI_3, Device, ImuNoise, jittered, lost
+from .imperfections import IDEAL_PRESET, Imperfections
+from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
 from .motion import (
     E_Z,
     MARGIN_S,
@@ -28,8 +28,8 @@ from .motion import (
     Flaws,
     Motion,
     Wander,
-    sensor_places,
-    sensor_position,
+    locate_sensor,
+    place_sensors,
 )
 from .tasks import TASKS
 
@@ -97,15 +97,15 @@ class Simulation:
         clock = Clock(self.time, np.arange(len(self.time)), 1.0 / self.rate_hz)
         sensors = {}
         for segment, gyro_S in self.gyro_S.items():
-            marks = lost_samples(clock, np.isfinite(gyro_S).all(axis=1))
+            marks = mark_lost_samples(clock, np.isfinite(gyro_S).all(axis=1))
             stated = self.stated_mount[segment]
             sensors[segment] = ImuSensor(
                 gyro_S=bridge(gyro_S, marks, clock, rate=True),
                 accel_S=bridge(self.accel_S[segment], marks, clock),
-                stated_quat_LS=None if stated is None else mount_from_axes(*stated),
+                stated_quat_LS=None if stated is None else compute_mount(*stated),
             )
         phases = {phase: tuple(spans) for phase, spans in self.phases.items() if spans}
-        return check(Recording(name, self.time, self.rate_hz, sensors, phases))
+        return check_recording(Recording(name, self.time, self.rate_hz, sensors, phases))
 
     def truth(self) -> Pose:
         """The exact pose."""
@@ -133,8 +133,8 @@ class _Sampled:
 
     def segment(self, segment: str, p_LS: np.ndarray) -> _Moved:
         # Differences to the middle first: where nothing moves they are exactly zero.
-        p_W = sensor_position(self.pose, segment, p_LS)
-        far, near, near_after, far_after = (sensor_position(b, segment, p_LS) - p_W for b in self.beside)
+        p_W = locate_sensor(self.pose, segment, p_LS)
+        far, near, near_after, far_after = (locate_sensor(b, segment, p_LS) - p_W for b in self.beside)
         p_ddot = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
         turn = self.beside[1].R_WL[segment].inv() * self.beside[2].R_WL[segment]
         return _Moved(self.time, self.pose.R_WL[segment], p_ddot, turn.as_rotvec() / (2.0 * _STENCIL_S))
@@ -176,7 +176,7 @@ def simulate(
     seed: Count,
     rate_hz: Positive = 100.0,
     noise: ImuNoise = MTI_3,
-    imperfections: Imperfections = PERFECT_WORLD,
+    imperfections: Imperfections = IDEAL_PRESET,
     clasp_s: Positive = 60.0,
     circles: Count = 6,
     protocol: str = "clasp",
@@ -195,8 +195,8 @@ def simulate(
     seed : the same seed gives the same bits. Motion, mounts, noise and each imperfection draw from streams of their
         own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
     rate_hz : samples a second.
-    noise : of gyroscope and accelerometer; `PERFECT` for none.
-    imperfections : of subject, mounting and sensors; `PERFECT_WORLD` for none, `REALISTIC` for usual ones.
+    noise : of gyroscope and accelerometer; `NOISE_FREE` for none.
+    imperfections : of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for usual ones.
     clasp_s : how long the palms stay together [s], at least 5.
     circles : how many circles, 0 or more.
     protocol : what is done in place of the clasp, one of `TASKS`; "handle": 0.4 m between the palms; "touch_left" and
@@ -231,7 +231,7 @@ def simulate(
     motion.prepare(rngs["task"], pose_deg)
     n = int(np.floor(motion.rest[-1][1] * rate_hz)) + 1
     time = np.arange(n) / rate_hz
-    p_LS = sensor_places(lengths)
+    p_LS = place_sensors(lengths)
     N = Rotation.from_matrix([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # x_S to z_L, -z_S to x_L
 
     stated_time = _Sampled(motion, time)
@@ -248,7 +248,7 @@ def simulate(
         any_quat = rngs["mount"].standard_normal(4)  # uniform on the sphere
         if imperfections.mount == "any":
             R_LS = Rotation.from_quat(any_quat / np.linalg.norm(any_quat))
-        own_time = jittered(rngs["clock_jitter"], time, rate_hz, imperfections.clock_jitter)
+        own_time = jitter_time(rngs["clock_jitter"], time, rate_hz, imperfections.clock_jitter)
         own_time = own_time + imperfections.clock_offset * rngs["clock_offset"].standard_normal()
 
         tissue = _SoftTissue(rngs["soft_tissue"], imperfections.soft_tissue_deg)
@@ -272,7 +272,7 @@ def simulate(
 
         device = Device.sample(rngs["device"], imperfections)
         readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, noise_rng)
-        dropped = lost(rngs["dropped"], n, rate_hz, imperfections.dropped)
+        dropped = draw_lost(rngs["dropped"], n, rate_hz, imperfections.dropped)
         readings.gyro_S[dropped] = readings.accel_S[dropped] = np.nan
         for name, value in (
             ("quat_LS", R_LS.as_quat()),
@@ -315,7 +315,7 @@ class Person(NamedTuple):
     prior: Subject  # the population prior of that stature and sex
 
 
-def simulated_person(seed: int, measured_std: float = 0.003) -> Person:
+def simulate_person(seed: int, measured_std: float = 0.003) -> Person:
     """A random person of the population, with measured shoulder width and trunk."""
     rng = np.random.default_rng([seed, 7])
     sex = SEXES[int(rng.integers(2))]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .motion import MARGIN_S, SIDES, Motion, Wander, pulse, step
+from .motion import MARGIN_S, SIDES, Motion, Wander, make_pulse, make_step
 
 _T_POSE_S = (7.5, 12.5)
 _BOW_S = (15.5, 22.0)
@@ -110,11 +110,11 @@ class Poses(Motion):
 
     def _torso(self, t: np.ndarray, lean: np.ndarray) -> Rotation:
         axis = np.array((-np.sin(self.bow_axis), np.cos(self.bow_axis), 0.0))
-        bow = np.deg2rad(_BOW_DEG) * pulse(t, *_BOW_S, _TURN_S)
+        bow = np.deg2rad(_BOW_DEG) * make_pulse(t, *_BOW_S, _TURN_S)
         return Rotation.from_rotvec(bow[:, None] * axis) * Rotation.from_euler("ZYX", lean)
 
     def _lead_share(self, t: np.ndarray, _lead_share: np.ndarray, _table: np.ndarray) -> dict[str, np.ndarray]:
-        raised = step(t, _T_POSE_S[0] - _TURN_S, _TURN_S) * (1.0 - step(t, _T_POSE_S[1], _TURN_S))
+        raised = make_step(t, _T_POSE_S[0] - _TURN_S, _TURN_S) * (1.0 - make_step(t, _T_POSE_S[1], _TURN_S))
         return dict.fromkeys(SIDES, raised)
 
     def _arm(self, side: str, palm_T: np.ndarray, _swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:

@@ -27,10 +27,10 @@ from ..compilation import kernel
 from ..errors import BadOption, BadPhase
 from ..filters import BEST, Orientation
 from ..filters.bank import LiveBank, OneByOne, create_bank
-from ..filters.sensors import SensorFilters, filtered_chunk
+from ..filters.sensors import SensorFilters, combine_chunk
 from ..filters.static import StaticTest
 from ..kinematics import axis_std
-from ..recording import OrientationSensor, Recording, join
+from ..recording import OrientationSensor, Recording, join_recordings
 from ..rotations import product
 from ..subject import Subject
 from .segments import Oriented
@@ -114,7 +114,7 @@ class CausalEstimator:
                     f"{chunk.where()}: sensors.{name} comes with measured orientations: there is no filter to run "
                     f"causally; leave the option out"
                 )
-        so_far = chunk if self._so_far is None else join(self._so_far, chunk)
+        so_far = chunk if self._so_far is None else join_recordings(self._so_far, chunk)
         self._so_far = so_far
         if so_far.phases.get("start"):
             interval = so_far.phases["start"][0]
@@ -163,7 +163,7 @@ class SegmentFollower:
         check_mounts(until, subject)
         self._filters = SensorFilters(until, method=method, static_test=static_test)
         _, orientation = self._filters.push(until) or self._filters.finish()
-        alignment = align(until, subject, filtered_chunk(self._filters, until, orientation))
+        alignment = align(until, subject, combine_chunk(self._filters, until, orientation))
         self.start = orient_segments(until, alignment, orientation, subject)
         self.names = tuple(until.sensors)
         self.rate_hz = until.rate_hz

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..alignment import Alignment, Segments, align, check_mounts, orient_segments
 from ..filters import BEST, Orientation
-from ..filters.sensors import SensorFilters, filtered_chunk
+from ..filters.sensors import SensorFilters, combine_chunk
 from ..filters.static import StaticTest
 from ..recording import Recording
 from ..subject import Subject
@@ -52,7 +52,7 @@ class SegmentEstimator:
 
     def _orient(self, filters: SensorFilters, chunk: Recording, orientation: dict[str, Orientation]) -> Oriented:
         if self._alignment is None:
-            self._alignment = align(chunk, self._subject, filtered_chunk(filters, chunk, orientation))
+            self._alignment = align(chunk, self._subject, combine_chunk(filters, chunk, orientation))
         return chunk, orient_segments(chunk, self._alignment, orientation, self._subject)
 
 

@@ -1,8 +1,8 @@
-"""How wrong the estimates are: the paper's experiments on simulated subjects, and real recordings with a truth.
+"""Validation: errors of the estimates in the paper's experiments on simulated subjects and in real recordings.
 
-Everything is seeded: two runs give the same numbers. `contenders` are the filters as they are compared, `paper` the
-simulated experiments, `mounting` one of ours, `real` the recordings, `tables` sums them up beside the paper's figures,
-`document` is their file, `page` the pages, with `figures` and the fixed text in templates/validation.md.j2.
+All random numbers have fixed seeds: two runs give the same figures. `contenders` holds the filters that are compared,
+`paper` the simulated experiments, `mounting` one of ours, `real` the recordings. `tables` summarizes results beside the
+paper's figures, `document` is their file, and `page` writes the pages with `figures` and templates/validation.md.j2.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from . import gains, mounting, paper, real
-from .contenders import Contender, contenders
-from .document import Document, document_text, read_document
-from .jobs import Job, Result, Skipped, run
-from .tables import Row, summary
+from .contenders import Contender, list_contenders
+from .document import Document, format_document, read_document
+from .jobs import Job, Result, Skipped, run_jobs
+from .tables import Row, summarize
 
 __all__ = [
     "Contender",
@@ -22,20 +22,20 @@ __all__ = [
     "Result",
     "Row",
     "Skipped",
-    "contenders",
-    "document_text",
-    "experiments",
+    "format_document",
+    "list_contenders",
+    "list_experiments",
     "read_document",
-    "run",
-    "summary",
+    "run_jobs",
+    "summarize",
 ]
 
 
-def experiments(quick: bool = False, data: Path | None = None) -> dict[str, list[Job]]:
-    """Name → its trials, a job each; `data`: the folder of the real recordings."""
-    jobs = paper.experiments(quick) | mounting.experiments(quick)
+def list_experiments(quick: bool = False, data: Path | None = None) -> dict[str, list[Job]]:
+    """List the trials of each experiment, one job a trial; `data` is the folder of the real recordings."""
+    jobs = paper.list_experiments(quick) | mounting.list_experiments(quick)
     if data is not None:
-        jobs |= real.experiments(data, quick)
+        jobs |= real.list_experiments(data, quick)
     if not quick:
-        jobs |= gains.experiments(data)
+        jobs |= gains.list_experiments(data)
     return jobs

@@ -41,7 +41,7 @@ class Contender(NamedTuple):
     method: str | None = None
 
 
-def contenders(setting: str, trial: str = "") -> list[Contender]:
+def list_contenders(setting: str, trial: str = "") -> list[Contender]:
     """Who takes part, ours first, then NCF and GDC, tuned and as they come, then the peers that are installed.
 
     `setting`: "real" or a key of `gains.STATED`; `trial`: the name of a real one (see `make_gains`).

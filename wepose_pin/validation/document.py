@@ -28,7 +28,7 @@ class Document(NamedTuple):
     skipped: list[Skipped] = []  # trials that could not be scored  # noqa: RUF012
 
 
-def document_text(
+def format_document(
     results: Sequence[Result], quick: bool, versions: Mapping[str, str], skipped: Sequence[Skipped] = ()
 ) -> str:
     """The file's text: a line a result. No time stamp, so that two runs give the same file.
@@ -72,10 +72,10 @@ def read_document(path: Path) -> Document:
         content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise BadData(f"{path}: is no JSON: {error}") from error
-    return as_document(content, str(path))
+    return parse_document(content, str(path))
 
 
-def as_document(content: Any, where: str) -> Document:
+def parse_document(content: Any, where: str) -> Document:
     """A run from what JSON gave.
 
     Raises

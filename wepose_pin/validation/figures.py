@@ -21,11 +21,11 @@ from .tables import (
     SPLIT,
     TARGETS,
     Row,
-    error_budget,
-    figures,
-    name_and_unit,
-    paper_figures,
-    summary,
+    collect_figures,
+    compute_error_budget,
+    find_paper_figures,
+    split_unit,
+    summarize,
 )
 
 COLOURS = {
@@ -42,12 +42,12 @@ OTHERS = ("#b23a48", "#6c757d", "#7a9e1f", "#5f4bb6")
 WINDOWS = 60  # of the running root mean square, over a curve's time
 
 
-def pictures(document: Document, failures: list[str] | None = None) -> Iterator[tuple[str, Picture]]:
+def draw_pictures(document: Document, failures: list[str] | None = None) -> Iterator[tuple[str, Picture]]:
     """Experiment and chart, in the order of the page; what cannot be drawn from the results is left out.
 
     `failures` takes a line for each chart whose drawing fails.
     """
-    rows = summary(document.results)
+    rows = summarize(document.results)
     for experiment in dict.fromkeys(row.experiment for row in rows):
         of = [row for row in rows if row.experiment == experiment]
         results = [result for result in document.results if result.experiment == experiment]
@@ -71,12 +71,12 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Pi
     names = next((names for names in quantities if all(name in row.figures for row in rows for name in names)), None)
     if names is None or experiment == ERROR_BUDGET:
         return None
-    paper = {row.method: paper_figures(experiment, row.method) for row in rows if row.method in COLOURS}
+    paper = {row.method: find_paper_figures(experiment, row.method) for row in rows if row.method in COLOURS}
     limits = TARGETS.get(experiment, ("", {}))[1]
     methods = [row.method for row in rows]
     panels: list[Panel] = []
     for name in names:
-        title, unit = name_and_unit(name)
+        title, unit = split_unit(name)
         panel = Panel(f"{FROM.get(name, title)} [{unit}]", shown_y=not panels)
         bars = []  # place, mean, with whisker
         for at, row in zip(category_rows(panel, methods), rows, strict=True):
@@ -117,7 +117,9 @@ def _trials(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> 
         panel = Panel(f"{name} [°]", shown_y=not panels)
         places = category_rows(panel, [trial.replace("_", " ") for trial in trials])
         place = dict(zip(trials, places, strict=True))
-        points = [(r.method, place[r.trial], value) for r in results if (value := figures(r).get(name)) is not None]
+        points = [
+            (r.method, place[r.trial], value) for r in results if (value := collect_figures(r).get(name)) is not None
+        ]
         values = np.array([value for _, _, value in points])
         panel.grid = "xy"
         panel.log_x = bool(values.min() > 0.0 and values.max() > 12.0 * values.min())
@@ -191,7 +193,7 @@ def _path(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pictu
 
 def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Picture | None:
     """What each imperfection adds to the hand's error."""
-    budget = error_budget(results)
+    budget = compute_error_budget(results)
     if experiment != ERROR_BUDGET or budget is None:
         return None
     lines = [("all on", budget.full, "ink"), *((part.name, part.added, "accent") for part in budget.parts)]

@@ -20,12 +20,12 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..errors import BadOption
 from ..filters import Gdc, GdcParams, Ncf, NcfParams
-from ..filters.noise import SensorNoise, noise_of
+from ..filters.noise import SensorNoise, estimate_noise
 from ..filters.static import StaticTest
 from ..readers.trials import read_broad
-from ..simulation import PERFECT_WORLD, REALISTIC, Imperfections, paper_dynamic, simulate, simulated_person
+from ..simulation import IDEAL_PRESET, MILD_PRESET, Imperfections, simulate, simulate_paper_dynamic, simulate_person
 from .jobs import Job, Result
-from .series import aligned
+from .series import align_rotation
 
 # The grid: zero, which leaves the term out, and steps of a quarter or half a decade.
 PROPORTIONAL = (0.0, *np.logspace(-3.0, 0.5, 15))  # [1/s] k_P
@@ -36,7 +36,7 @@ DYNAMIC_SEEDS = range(100, 106)  # the experiments have 0 to 11
 PERSON_SEEDS = range(100, 103)  # of five sensors each; the experiments have 0 to 9
 HALVES = ({"01", "05", "09", "14", "21", "27", "31", "35"}, {"03", "07", "11", "16", "25", "29", "33"})  # of BROAD
 RATES = {"simulated 100 Hz": 100.0, "simulated 1 kHz": 1000.0}
-WORLDS = {"upper body, MTi-3 noise alone": PERFECT_WORLD, "upper body, realistic": REALISTIC}
+WORLDS = {"upper body, MTi-3 noise alone": IDEAL_PRESET, "upper body, realistic": MILD_PRESET}
 BROAD = {"BROAD, first half": HALVES[0], "BROAD, second half": HALVES[1], "BROAD": HALVES[0] | HALVES[1]}
 
 _SCORED_HZ = 25.0  # samples a second that count: errors are slow
@@ -104,31 +104,31 @@ def make_gains(setting: str, trial: str = "") -> Gains:
     return STATED["BROAD, first half" if number in HALVES[1] else "BROAD"]
 
 
-def search(trials: Sequence[TuningTrial]) -> tuple[list[Score], list[Score]]:
+def search_gains(trials: Sequence[TuningTrial]) -> tuple[list[Score], list[Score]]:
     """The grids of NCF and GDC on these trials, every point scored."""
     ncf = [NcfParams(float(p), float(i)) for p, i in product(PROPORTIONAL, INTEGRAL)]
     gdc = [GdcParams(float(gain)) for gain in DESCENT]
     return (
-        [Score(params, float(np.mean([total_rmse(trial, params) for trial in trials]))) for params in ncf],
-        [Score(params, float(np.mean([total_rmse(trial, params) for trial in trials]))) for params in gdc],
+        [Score(params, float(np.mean([compute_rmse(trial, params) for trial in trials]))) for params in ncf],
+        [Score(params, float(np.mean([compute_rmse(trial, params) for trial in trials]))) for params in gdc],
     )
 
 
-def best(scores: Sequence[Score]) -> Score:
+def find_best(scores: Sequence[Score]) -> Score:
     return min(scores, key=lambda score: score.total_rmse)
 
 
-def total_rmse(trial: TuningTrial, params: NcfParams | GdcParams) -> float:
+def compute_rmse(trial: TuningTrial, params: NcfParams | GdcParams) -> float:
     """[deg] over what of a trial is scored."""
     quat_start = rotations.quat_from_gravity(trial.accel_S[: StaticTest().samples(trial.rate_hz)].mean(axis=0))
     filter_ = (Ncf if isinstance(params, NcfParams) else Gdc)(trial.noise, trial.rate_hz, quat_start, params)  # type: ignore[arg-type]
     quat = filter_.run(trial.gyro_S, trial.accel_S, np.zeros(len(trial.gyro_S), dtype=bool)).quat_WS
-    R_VS = aligned(Rotation.from_quat(quat[trial.at]), trial.R_WS, trial.rest)
+    R_VS = align_rotation(Rotation.from_quat(quat[trial.at]), trial.R_WS, trial.rest)
     angle = (R_VS[trial.scored] * trial.R_WS[trial.scored].inv()).magnitude()
     return float(np.degrees(np.sqrt(np.mean(angle**2))))
 
 
-def trials(setting: str, data: Path | None = None) -> list[TuningTrial]:
+def list_trials(setting: str, data: Path | None = None) -> list[TuningTrial]:
     """On which the gains of a key of `STATED` are found; `data`: the folder of the real recordings."""
     if setting in RATES:
         return [_dynamic(seed, RATES[setting]) for seed in DYNAMIC_SEEDS]
@@ -141,7 +141,7 @@ def trials(setting: str, data: Path | None = None) -> list[TuningTrial]:
 
 
 def _dynamic(seed: int, rate_hz: float) -> TuningTrial:
-    sensor = paper_dynamic(seed, rate_hz)
+    sensor = simulate_paper_dynamic(seed, rate_hz)
     rest = (sensor.time >= sensor.static[0][0] + 0.5) & (sensor.time <= sensor.static[0][1] - 0.5)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
     return _trial(sensor.gyro_S, sensor.accel_S, rate_hz, sensor.quat_WS, rest, moving)
@@ -149,7 +149,7 @@ def _dynamic(seed: int, rate_hz: float) -> TuningTrial:
 
 def _person(seed: int, imperfections: Imperfections) -> list[TuningTrial]:
     """Its sensors, over clasp and circles, against their own true orientation (soft tissue is no filter's matter)."""
-    simulation = simulate(simulated_person(seed).lengths, seed=seed, imperfections=imperfections)
+    simulation = simulate(simulate_person(seed).lengths, seed=seed, imperfections=imperfections)
     recording = simulation.recording()
     rest, moving = (np.zeros(len(recording.time), dtype=bool) for _ in range(2))
     rest[recording.span(recording.phases["start"][0])] = True
@@ -182,11 +182,11 @@ def _trial(
     looked_at = np.zeros(len(gyro_S), dtype=bool)
     looked_at[:: max(1, round(rate_hz / _SCORED_HZ))] = True
     at = np.flatnonzero(looked_at & (rest | scored) & known)
-    noise = noise_of(gyro_S[rest], accel_S[rest], rate_hz)
+    noise = estimate_noise(gyro_S[rest], accel_S[rest], rate_hz)
     return TuningTrial(gyro_S, accel_S, rate_hz, noise, at, Rotation.from_quat(quat_WS[at]), rest[at], scored[at])
 
 
-def experiments(data: Path | None = None) -> dict[str, list[Job]]:
+def list_experiments(data: Path | None = None) -> dict[str, list[Job]]:
     """The grid searches as jobs, one a setting: gains found, their score, and every point of the grid."""
     settings = [*RATES, *WORLDS, *(BROAD if data is not None and any((data / "broad").glob("*.mat")) else ())]
     return {"gains": [Job("gains", setting, _search_experiment, (data,)) for setting in settings]}
@@ -195,8 +195,8 @@ def experiments(data: Path | None = None) -> dict[str, list[Job]]:
 def _search_experiment(experiment: str, setting: str, data: Path | None) -> list[Result]:
     results = []
     stated = STATED[setting]
-    for name, scores, params in zip(("ncf", "gdc"), search(trials(setting, data)), stated, strict=True):
-        gains, rmse = best(scores)
+    for name, scores, params in zip(("ncf", "gdc"), search_gains(list_trials(setting, data)), stated, strict=True):
+        gains, rmse = find_best(scores)
         at_stated = next(score.total_rmse for score in scores if score.gains == params)
         gain, integral = (*vars(gains).values(), 0.0)[:2]
         grid = [[*vars(score.gains).values(), score.total_rmse] for score in scores]

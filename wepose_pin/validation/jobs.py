@@ -49,7 +49,7 @@ class Job(NamedTuple):
         return self.function(self.experiment, self.trial, *self.arguments)
 
 
-def run(jobs: Sequence[Job], workers: int | None = None) -> Iterator[list[Result] | Skipped]:
+def run_jobs(jobs: Sequence[Job], workers: int | None = None) -> Iterator[list[Result] | Skipped]:
     """Results of each job in the order of the jobs, whatever the number of `workers` (None: one a core).
 
     A job that fails, for example on an unreadable recording, is reported and does not stop the others.

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ..calibration import calibrate_lengths
 from ..evaluation import evaluate
-from ..simulation import REALISTIC, Person, Simulation, simulate, simulated_person
+from ..simulation import MILD_PRESET, Person, Simulation, simulate, simulate_person
 from ..subject import LENGTHS, Subject, mount_rows
 from ..tracking import track
 from .jobs import Job, Result
@@ -18,7 +18,7 @@ from .tables import ARBITRARY_MOUNTING
 METHODS = ("amekf", "smekf")
 
 
-def experiments(quick: bool = False) -> dict[str, list[Job]]:
+def list_experiments(quick: bool = False) -> dict[str, list[Job]]:
     """Name → jobs; `quick`: one trial."""
     trials = range(1 if quick else 10)
     return {ARBITRARY_MOUNTING: [Job(ARBITRARY_MOUNTING, str(k), _arbitrary_mounting, (k,)) for k in trials]}
@@ -26,8 +26,8 @@ def experiments(quick: bool = False) -> dict[str, list[Job]]:
 
 def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
     """Calibration without stated mounts, with measured shoulder width and trunk, then six circles."""
-    person = simulated_person(seed)
-    simulation = simulate(person.lengths, seed=seed, imperfections=replace(REALISTIC, mount="any"))
+    person = simulate_person(seed)
+    simulation = simulate(person.lengths, seed=seed, imperfections=replace(MILD_PRESET, mount="any"))
     recording, truth = simulation.recording(), simulation.truth()
     results = []
     for method in METHODS:

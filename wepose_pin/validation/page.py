@@ -12,16 +12,16 @@ from markupsafe import Markup
 from ..report.chart import Picture
 from ..report.page import Page, load_template
 from .document import Document
-from .figures import pictures
+from .figures import draw_pictures
 from .tables import (
-    experiment_table,
-    gains_table,
-    imperfections_table,
-    noise_table,
-    overview_table,
-    summary,
-    table_note,
-    targets_table,
+    describe_table,
+    make_experiment_table,
+    make_gains_table,
+    make_imperfections_table,
+    make_noise_table,
+    make_overview_table,
+    make_targets_table,
+    summarize,
 )
 
 TEMPLATE = "validation/templates/validation.md.j2"
@@ -38,28 +38,28 @@ def write_pages(folder: Path, document: Document) -> list[str]:
         A line for each chart that could not be drawn.
     """
     failures: list[str] = []
-    drawn = list(pictures(document, failures))
+    drawn = list(draw_pictures(document, failures))
     (folder / FOLDER).mkdir()
     chart: Any = load_template("report/templates/chart.svg.j2").module
     for _, picture in drawn:
         svg = chart.svg(picture, standalone=True)
         (folder / FOLDER / f"{picture.stem}.svg").write_text(svg.strip() + "\n", encoding="utf-8")
-    text = markdown(document, drawn)
+    text = render_markdown(document, drawn)
     (folder / "validation.md").write_text(text, encoding="utf-8")
-    (folder / "validation.html").write_text(as_html(text, drawn, failures), encoding="utf-8")
+    (folder / "validation.html").write_text(render_html(text, drawn, failures), encoding="utf-8")
     return failures
 
 
-def markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str:
+def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str:
     """The page as Markdown: the template's text with the document's tables and charts."""
-    rows = summary(document.results)
+    rows = summarize(document.results)
     experiments = {}
     for name in dict.fromkeys(row.experiment for row in rows):
         of = [row for row in rows if row.experiment == name]
         experiments[name] = {
             "trials": len({result.trial for result in document.results if result.experiment == name}),
-            "table": experiment_table(of, True),
-            "note": table_note(of),
+            "table": make_experiment_table(of, True),
+            "note": describe_table(of),
             "pictures": [picture for experiment, picture in drawn if experiment == name],
         }
     text = load_template(TEMPLATE).render(
@@ -67,17 +67,17 @@ def markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str:
         folder=FOLDER,
         document=document,
         experiments=experiments,
-        targets=targets_table(rows),
-        overview=overview_table(rows),
-        noise=noise_table(document.noise),
-        imperfections=imperfections_table(document.worlds),
-        gains=gains_table(document.gains),
+        targets=make_targets_table(rows),
+        overview=make_overview_table(rows),
+        noise=make_noise_table(document.noise),
+        imperfections=make_imperfections_table(document.worlds),
+        gains=make_gains_table(document.gains),
     )
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
 
 
-def as_html(text: str, drawn: list[tuple[str, Picture]], failures: list[str] | None = None) -> str:
-    """The page as one HTML file with its charts in it; `text` as of `markdown`."""
+def render_html(text: str, drawn: list[tuple[str, Picture]], failures: list[str] | None = None) -> str:
+    """The page as one HTML file with its charts in it; `text` as of `render_markdown`."""
     chart: Any = load_template("report/templates/chart.svg.j2").module
     svgs = {f"{FOLDER}/{picture.stem}.svg": chart.svg(picture) for _, picture in drawn}
     rules = MarkdownIt("commonmark", {"html": False}).enable("table")

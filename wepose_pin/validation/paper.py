@@ -18,33 +18,33 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..calibration import calibrate_lengths
 from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
-from ..filters.noise import noise_of
+from ..filters.noise import estimate_noise
 from ..recording import OrientationSensor, Recording
 from ..simulation import (
-    PERFECT_WORLD,
-    REALISTIC,
+    IDEAL_PRESET,
+    MILD_PRESET,
     Imperfections,
     Person,
     Simulation,
     SingleSensor,
-    paper_drift,
-    paper_dynamic,
     simulate,
-    simulated_person,
+    simulate_paper_drift,
+    simulate_paper_dynamic,
+    simulate_person,
 )
 from ..subject import LENGTHS, Subject, mount_rows
 from ..tracking import track
-from .contenders import Contender, contenders
+from .contenders import Contender, list_contenders
 from .jobs import Job, Result
-from .series import aligned, over_time
+from .series import align_rotation, decimate_curves
 from .tables import ERROR_BUDGET
 
 RATES = {"100 Hz": 100.0, "1 kHz": 1000.0}
-WORLDS = {"MTi-3 noise alone": PERFECT_WORLD, "realistic": REALISTIC}
+WORLDS = {"MTi-3 noise alone": IDEAL_PRESET, "realistic": MILD_PRESET}
 KNOWN_MOUNT_STD = np.deg2rad(0.5)  # stated for mounts that are exact
 # What is switched off in turn: imperfections as in a perfect world, or a part of the chain known exactly.
 SWITCHED: dict[str, dict[str, Any]] = {
-    label: {name: getattr(PERFECT_WORLD, name) for name in names.split()}
+    label: {name: getattr(IDEAL_PRESET, name) for name in names.split()}
     for label, names in {
         "all on": "",
         "orientations exact": "",
@@ -62,7 +62,7 @@ SWITCHED: dict[str, dict[str, Any]] = {
 }
 
 
-def experiments(quick: bool = False) -> dict[str, list[Job]]:
+def list_experiments(quick: bool = False) -> dict[str, list[Job]]:
     """Name → jobs; `quick`: one trial of each, and no error budget."""
     jobs = {}
     for rate, rate_hz in RATES.items():
@@ -79,17 +79,17 @@ def experiments(quick: bool = False) -> dict[str, list[Job]]:
 
 def _dynamic(experiment: str, trial: str, seed: int, rate: str, rate_hz: float) -> list[Result]:
     """5 s static, 50 s of free motion, 5 s static; errors over the motion."""
-    sensor = paper_dynamic(seed, rate_hz)
+    sensor = simulate_paper_dynamic(seed, rate_hz)
     results = []
     for method, scored, error in _single(sensor, f"simulated {rate}"):
-        series = over_time(sensor.time, total_deg=np.degrees(error.magnitude())) if seed == 0 else {}
+        series = decimate_curves(sensor.time, total_deg=np.degrees(error.magnitude())) if seed == 0 else {}
         results.append(Result(experiment, trial, method, scored._asdict(), series))
     return results
 
 
 def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
     """25 s static, 10 s of shaking and rotating, 25 s static; the heading error after the motion, against before it."""
-    sensor = paper_drift(seed)
+    sensor = simulate_paper_drift(seed)
     after = sensor.time > sensor.moving[1] + 1.0
     results = []
     for method, _, error in _single(sensor, "simulated 1 kHz"):
@@ -97,7 +97,7 @@ def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
         heading = np.degrees(np.unwrap(rotations.heading(error.as_quat())))
         slope = np.polyfit(sensor.time[after], heading[after], 1)[0]
         figures = {"roll": roll.mean(), "pitch": pitch.mean(), "yaw": yaw.mean(), "drift_deg_min": 60.0 * abs(slope)}
-        series = over_time(sensor.time, heading_deg=heading) if seed == 0 else {}
+        series = decimate_curves(sensor.time, heading_deg=heading) if seed == 0 else {}
         results.append(Result(experiment, trial, method, {k: float(v) for k, v in figures.items()}, series))
     return results
 
@@ -107,16 +107,16 @@ def _single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, AttitudeE
     rest = (sensor.time >= sensor.static[0][0] + 0.5) & (sensor.time <= sensor.static[0][1] - 0.5)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
     true = Rotation.from_quat(sensor.quat_WS)
-    noise = noise_of(sensor.gyro_S[rest], sensor.accel_S[rest], sensor.rate_hz)
-    for contender in contenders(setting):
+    noise = estimate_noise(sensor.gyro_S[rest], sensor.accel_S[rest], sensor.rate_hz)
+    for contender in list_contenders(setting):
         quat = contender.orient(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise)
-        R_WS = aligned(Rotation.from_quat(quat), true, rest)
+        R_WS = align_rotation(Rotation.from_quat(quat), true, rest)
         yield contender.label, attitude_error(R_WS[moving], true[moving], sensor.time[moving]), R_WS * true.inv()
 
 
 @lru_cache(maxsize=1)
 def _simulated(seed: int, imperfections: Imperfections) -> tuple[Person, Simulation]:
-    person = simulated_person(seed)
+    person = simulate_person(seed)
     return person, simulate(person.lengths, seed=seed, imperfections=imperfections)
 
 
@@ -125,10 +125,10 @@ def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfect
     person, simulation = _simulated(seed, imperfections)
     recorded, truth = simulation.recording(), simulation.truth()
     circles = simulation.phases["circles"][0]
-    prior = with_exact_mounts(person.prior, simulation)
+    prior = set_exact_mounts(person.prior, simulation)
     results = []
-    for contender in contenders(experiment):
-        recording, method = oriented(recorded, contender)
+    for contender in list_contenders(experiment):
+        recording, method = orient_recording(recorded, contender)
         subject = _calibrated(recording, person, prior, method)
         pose = track(recording, subject, method=method).pose
         series = {}
@@ -137,7 +137,7 @@ def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfect
             off = pose.points["right_palm"][inside] - truth.points["right_palm"][inside]
             paths = {f"{axis}_mm": 1e3 * pose.points["right_palm"][inside, k] for k, axis in enumerate("xyz")}
             paths |= {f"true_{axis}_mm": 1e3 * truth.points["right_palm"][inside, k] for k, axis in enumerate("xyz")}
-            series = over_time(recording.time[inside], error_mm=1e3 * np.linalg.norm(off, axis=1), **paths)
+            series = decimate_curves(recording.time[inside], error_mm=1e3 * np.linalg.norm(off, axis=1), **paths)
         figures = _hand(evaluate(pose, truth, circles)) | {"lengths_rms_mm": _lengths_rms(subject, person)}
         results.append(Result(experiment, trial, contender.label, figures, series))
     return results
@@ -147,9 +147,9 @@ def _error_budget(experiment: str, trial: str, seed: int) -> list[Result]:
     """smekf on the realistic subject, each imperfection switched off or each part known exactly, in turn."""
     results = []
     for label, off in SWITCHED.items():
-        person, simulation = _simulated(seed, replace(REALISTIC, **off))
+        person, simulation = _simulated(seed, replace(MILD_PRESET, **off))
         recording = simulation.recording()
-        prior = person.prior if label == "mounts as stated" else with_exact_mounts(person.prior, simulation)
+        prior = person.prior if label == "mounts as stated" else set_exact_mounts(person.prior, simulation)
         if label == "orientations exact":
             sensors = {
                 name: OrientationSensor(simulation.quat_WS[name], sensor.stated_quat_LS, sensor.gap)
@@ -192,21 +192,21 @@ def _lengths_rms(subject: Subject, person: Person) -> float:
     )
 
 
-def with_exact_mounts(subject: Subject, simulation: Simulation) -> Subject:
+def set_exact_mounts(subject: Subject, simulation: Simulation) -> Subject:
     """The subject with the simulation's exact mounts, stated as known to `KNOWN_MOUNT_STD`."""
     rows = [row for segment in simulation.quat_LS for row in mount_rows(segment)]
     covariance = block_diag(subject.covariance, KNOWN_MOUNT_STD**2 * np.eye(len(rows)))
     return replace(subject, mounts=simulation.quat_LS, order=(*subject.order, *rows), covariance=covariance)
 
 
-def oriented(recording: Recording, contender: Contender) -> tuple[Recording, str]:
+def orient_recording(recording: Recording, contender: Contender) -> tuple[Recording, str]:
     """What `track` takes to run a contender: the recording and a method, or one of measured orientations."""
     if contender.method is not None:
         return recording, contender.method
     sensors = {}
     rest = recording.span(recording.phases["start"][0])
     for segment, sensor in recording.imus.items():
-        noise = noise_of(sensor.gyro_S[rest], sensor.accel_S[rest], recording.rate_hz)
+        noise = estimate_noise(sensor.gyro_S[rest], sensor.accel_S[rest], recording.rate_hz)
         quat_WS = contender.orient(sensor.gyro_S, sensor.accel_S, recording.rate_hz, noise)
         sensors[segment] = OrientationSensor(quat_WS, sensor.stated_quat_LS)
     return replace(recording, sensors=sensors), "smekf"

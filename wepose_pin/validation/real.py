@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import MissingFile
 from ..evaluation import attitude_error
-from ..filters.noise import SensorNoise, noise_of
+from ..filters.noise import SensorNoise, estimate_noise
 from ..readers.trials import (
     RING_MOUNTS,
     RING_SEGMENTS,
@@ -37,17 +37,17 @@ from ..readers.trials import (
     read_ur5,
 )
 from ..simulation.imu import GRAVITY, MTI_3
-from .contenders import contenders
+from .contenders import list_contenders
 from .jobs import Job, Result
-from .registration import Registration, register
-from .series import aligned, over_time
+from .registration import Registration, register_sensors
+from .series import align_rotation, decimate_curves
 
 UNSCORED_S = 10.0  # of RING and UR5: where clocks, frames and headings are aligned
 FOUND_BIAS_STD = np.deg2rad(0.05)  # [rad/s] of the biases found on RING's ten seconds against its whole record
 UR5_OFF = {("circle-100", "radius")}  # left out: its clock is 20 ms off where the other sensors' are within 10
 
 
-def experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
+def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
     """Name → jobs, for what of the real recordings lies in `data`.
 
     Raises
@@ -105,7 +105,7 @@ def _broad(experiment: str, name: str, path: Path, first: bool) -> list[Result]:
     at_rest[trial.static] = known[trial.static]
     true = Rotation.from_quat(np.where(known[:, None], trial.quat_true, [0.0, 0.0, 0.0, 1.0]))
     return [
-        Result(experiment, name, label, *_score(aligned(R_VS, true, at_rest), true, trial, first))
+        Result(experiment, name, label, *_score(align_rotation(R_VS, true, at_rest), true, trial, first))
         for label, R_VS in _run_contenders(trial)
     ]
 
@@ -127,8 +127,8 @@ def _authors(experiment: str, name: str, path: Path) -> list[Result]:
 
 
 def _run_contenders(trial: Trial) -> Iterator[tuple[str, Rotation]]:
-    noise = noise_of(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
-    for contender in contenders("real", trial.name):
+    noise = estimate_noise(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
+    for contender in list_contenders("real", trial.name):
         yield contender.label, Rotation.from_quat(contender.orient(trial.gyro_S, trial.accel_S, trial.rate_hz, noise))
 
 
@@ -143,14 +143,14 @@ def _make_errors(
     """Figures, and the curve where it is to be kept."""
     angle = np.degrees((estimated * true.inv()).magnitude())
     figures = {**attitude_error(estimated, true, time)._asdict(), "mean_angle": float(angle.mean())}
-    return figures, over_time(time, total_deg=angle) if keep else {}
+    return figures, decimate_curves(time, total_deg=angle) if keep else {}
 
 
 def _ring(experiment: str, name: str, files: RingFiles, segment: str, mount: str, bias_known: bool) -> list[Result]:
     """Errors of one segment from 10 s on."""
     chain, registered = _registered_ring(files.folder)
     sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
-    noise = assumed_noise(sensor.rate_hz, registration.gyro_bias if bias_known else None)
+    noise = assume_noise(sensor.rate_hz, registration.gyro_bias if bias_known else None)
     return _score_reference(experiment, name, sensor, registration, noise, segment == RING_SEGMENTS[0])
 
 
@@ -161,8 +161,8 @@ def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result
     accelerometers are in it, and in the inclinations.
     """
     trial = read_ur5(files)
-    (registration,) = register([trial], (0.0, UNSCORED_S))
-    noise = noise_of(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
+    (registration,) = register_sensors([trial], (0.0, UNSCORED_S))
+    noise = estimate_noise(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
     return _score_reference(experiment, name, trial, registration, noise, keep)
 
 
@@ -174,11 +174,11 @@ def _compare_links(experiment: str, name: str, files: RingFiles, mount: str) -> 
     orientations = []
     for segment in ("seg2", "seg3", "seg4"):
         sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
-        noise = assumed_noise(sensor.rate_hz, registration.gyro_bias)
+        noise = assume_noise(sensor.rate_hz, registration.gyro_bias)
         orientations.append(dict(_run_orientations(sensor, registration, noise)))
     tip_W = Rotation.from_quat(registered[mount, "seg2"].quat_WV).apply(links.tip_V)
     results = []
-    for contender in contenders("real"):
+    for contender in list_contenders("real"):
         of = [each[contender.label] for each in orientations]
         fitted = fit_links(tip_W[of[0].scored], *(each.estimated[each.scored] for each in of))
         figures: dict[str, float] = {}
@@ -237,7 +237,9 @@ def _registered_ring(folder: Path) -> tuple[Chain, dict[tuple[str, str], Registr
     """The chain, and all ten sensors registered together: one clock, one optical world."""
     (files,) = [files for files in find_ring(folder) if files.folder == folder]
     chain = read_ring(files)
-    return chain, dict(zip(chain.sensors, register(list(chain.sensors.values()), (0.0, UNSCORED_S)), strict=True))
+    return chain, dict(
+        zip(chain.sensors, register_sensors(list(chain.sensors.values()), (0.0, UNSCORED_S)), strict=True)
+    )
 
 
 class Compared(NamedTuple):
@@ -258,13 +260,13 @@ def _run_orientations(
     R_VB = Rotation.from_quat(np.where(known[:, None], sensor.quat_VB, [0.0, 0.0, 0.0, 1.0]))
     true, R_SB = Rotation.from_quat(registration.quat_WV) * R_VB, Rotation.from_quat(registration.quat_BS).inv()
     early = sensor.time <= UNSCORED_S
-    for contender in contenders("real"):
+    for contender in list_contenders("real"):
         R_WS = Rotation.from_quat(contender.orient(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise))
         R_WB = Slerp(clock, R_WS)(np.clip(time, 0.0, clock[-1])) * R_SB
-        yield contender.label, Compared(aligned(R_WB, true, known & early), true, known & ~early)
+        yield contender.label, Compared(align_rotation(R_WB, true, known & early), true, known & ~early)
 
 
-def assumed_noise(rate_hz: float, gyro_bias: np.ndarray | None = None) -> SensorNoise:
+def assume_noise(rate_hz: float, gyro_bias: np.ndarray | None = None) -> SensorNoise:
     """Noise of a sensor that is never still, by the MTi-3's data sheet.
 
     `gyro_bias` (3,) [rad/s]: as found on ten seconds, right to `FOUND_BIAS_STD`; None: zero, with the usual turn-on

@@ -1,7 +1,7 @@
 """How a reference lies to a sensor: clock, body frame and world, found on a stretch that is not scored.
 
 No filter takes part: the gyroscope is integrated over the stretch, so what is found is the same for all that are
-compared. Only the heading, which each filter has of its own, is left to `series.aligned`.
+compared. Only the heading, which each filter has of its own, is left to `series.align_rotation`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Registration(NamedTuple):
         }
 
 
-def register(sensors: Sequence[Referenced], stretch: tuple[float, float]) -> list[Registration]:
+def register_sensors(sensors: Sequence[Referenced], stretch: tuple[float, float]) -> list[Registration]:
     """Registrations of sensors that share a clock and a reference, from the time `stretch` [s] of the reference.
 
     One offset of the clocks: where the correlations of ‖gyro‖ with the body's rate have their greatest sum. A mount

@@ -10,13 +10,13 @@ from .. import rotations
 POINTS_DRAWN = 600
 
 
-def aligned(R_VS: Rotation, R_WS: Rotation, where: np.ndarray) -> Rotation:
+def align_rotation(R_VS: Rotation, R_WS: Rotation, where: np.ndarray) -> Rotation:
     """R_VS turned about the vertical such that its heading is that of R_WS where `where`."""
     psi = rotations.heading((R_WS[where] * R_VS[where].inv()).mean().as_quat())
     return Rotation.from_rotvec([0.0, 0.0, float(psi)]) * R_VS
 
 
-def over_time(time: np.ndarray, **curves: np.ndarray) -> dict[str, list[float]]:
+def decimate_curves(time: np.ndarray, **curves: np.ndarray) -> dict[str, list[float]]:
     """`time` (n,) [s] and curves (n,), every so many samples, rounded for a file."""
     stride = max(1, len(time) // POINTS_DRAWN)
     return {name: np.round(curve[::stride], 4).tolist() for name, curve in {"time": time, **curves}.items()}

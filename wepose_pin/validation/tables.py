@@ -89,7 +89,7 @@ UNITS = {"_deg_min": "deg/min", "_deg_s": "deg/s", "_deg": "deg", "_percent": "%
 class Row(NamedTuple):
     """One contender in one experiment: means over its trials.
 
-    `figures`: "name"; beside it, where there is one, "name std": the mean deviation over time, and "name between": the
+    `figures` has "name", and where they exist "name std", the mean deviation over time, and "name between", the
     deviation between the trials.
     """
 
@@ -103,17 +103,17 @@ class Row(NamedTuple):
         return [name for name in self.figures if not name.endswith((" std", " between"))]
 
 
-def summary(results: Sequence[Result]) -> list[Row]:
+def summarize(results: Sequence[Result]) -> list[Row]:
     """A row a contender and experiment, in the order in which they came."""
     rows = []
     for experiment in dict.fromkeys(result.experiment for result in results):
         for method in dict.fromkeys(result.method for result in results if result.experiment == experiment):
-            of = [figures(r) for r in results if r.experiment == experiment and r.method == method]
-            rows.append(Row(experiment, method, _mean(of), paper_text(experiment, method)))
+            of = [collect_figures(r) for r in results if r.experiment == experiment and r.method == method]
+            rows.append(Row(experiment, method, _mean(of), format_paper(experiment, method)))
     return rows
 
 
-def figures(result: Result) -> dict[str, float]:
+def collect_figures(result: Result) -> dict[str, float]:
     """What a table shows of one trial: name → value, "name std" → its deviation over time where there is one."""
     experiment, values = result.experiment, result.figures
     if experiment.startswith("dynamic"):
@@ -125,7 +125,7 @@ def figures(result: Result) -> dict[str, float]:
     }
 
 
-def paper_figures(experiment: str, method: str) -> dict[str, tuple[float, float]]:
+def find_paper_figures(experiment: str, method: str) -> dict[str, tuple[float, float]]:
     """Name → the paper's mean and deviation; a filter's second row ("ncf, default gains") stands beside the same."""
     filter_ = method.removesuffix(DEFAULTS)
     if experiment.startswith("dynamic"):
@@ -136,16 +136,16 @@ def paper_figures(experiment: str, method: str) -> dict[str, tuple[float, float]
     return {}
 
 
-def paper_text(experiment: str, method: str) -> str:
+def format_paper(experiment: str, method: str) -> str:
     """The paper's figures in a few words; empty where it has none."""
     if experiment == "drift":
         return PAPER_DRIFT.get(method.removesuffix(DEFAULTS), "")
-    values = paper_figures(experiment, method).values()
+    values = find_paper_figures(experiment, method).values()
     texts = list(dict.fromkeys(f"{mean:.2f} ± {std:.2f}" for mean, std in values))
     return texts[0] if len(texts) == 1 else "  ".join(text.replace(" ", "") for text in texts)
 
 
-def name_and_unit(name: str) -> tuple[str, str]:
+def split_unit(name: str) -> tuple[str, str]:
     """A figure's name for readers, and its unit; empty where it has none."""
     if name in DEGREES:
         return name, "deg"
@@ -160,14 +160,14 @@ def name_and_unit(name: str) -> tuple[str, str]:
 # Tables ---------------------------------------------------------------------------------------------------------------
 
 
-def experiment_table(rows: Sequence[Row], whole: bool) -> Table:
+def make_experiment_table(rows: Sequence[Row], whole: bool) -> Table:
     """An experiment's rows as text; `whole`: with the deviation between trials and all columns, the best in bold."""
     names = list(dict.fromkeys(name for row in rows for name in row.names()))
     if not whole:
         names = [name for name in names if name not in SHORT.values()]
-    units = {name: name_and_unit(name) for name in names}
+    units = {name: split_unit(name) for name in names}
     experiment = rows[0].experiment
-    papers = [paper_figures(experiment, row.method) for row in rows]
+    papers = [find_paper_figures(experiment, row.method) for row in rows]
     compared = [name for name in names if any(name in paper for paper in papers)] if whole else []
     if len({str(paper.get(name)) for paper in papers[:1] for name in compared}) < len(compared):
         compared = []  # one figure for all columns
@@ -192,35 +192,35 @@ def experiment_table(rows: Sequence[Row], whole: bool) -> Table:
     return Table(header, cells)
 
 
-def shared_unit(rows: Sequence[Row]) -> str:
+def find_shared_unit(rows: Sequence[Row]) -> str:
     """The unit that all columns of a short table share; empty where they differ."""
     names = dict.fromkeys(name for row in rows for name in row.names() if name not in SHORT.values())
-    units = {name_and_unit(name)[1] for name in names}
+    units = {split_unit(name)[1] for name in names}
     return units.pop() if len(units) == 1 else ""
 
 
-def targets_table(rows: Sequence[Row]) -> Table:
+def make_targets_table(rows: Sequence[Row]) -> Table:
     """The project's targets as far as they were measured."""
     cells = []
     for row in rows:
         method, limits = TARGETS.get(row.experiment, ("", {}))
         for name, (least, most) in limits.items():
             if row.method == method and name in row.figures:
-                value, (text, unit) = row.figures[name], name_and_unit(name)
+                value, (text, unit) = row.figures[name], split_unit(name)
                 target = f"at most {most:g} {unit}" if least == 0.0 else f"{least:g} to {most:g} {unit}"
                 met = "met" if least <= value <= most else "**missed**"
                 cells.append([row.experiment, method, text, f"{value:.2f} {unit}".strip(), target.strip(), met])
     return Table(["experiment", "filter", "figure", "value", "target", ""], cells)
 
 
-def overview_table(rows: Sequence[Row]) -> Table:
+def make_overview_table(rows: Sequence[Row]) -> Table:
     """smekf beside the paper's smekf and beside the best of all filters; bold where ours is larger than the paper's."""
     cells = []
     for experiment in dict.fromkeys(row.experiment for row in rows if row.experiment != ERROR_BUDGET):
         of = {row.method: row.figures for row in rows if row.experiment == experiment}
-        paper = paper_figures(experiment, OURS)
+        paper = find_paper_figures(experiment, OURS)
         for name in (name for name in of.get(OURS, {}) if name in ERRORS and name != "mean angle"):
-            ours, (text, unit) = of[OURS][name], name_and_unit(name)
+            ours, (text, unit) = of[OURS][name], split_unit(name)
             best = min((m for m in of if name in of[m]), key=lambda m, name=name: (round(of[m][name], 2), m != OURS))  # type: ignore[misc]
             shown = f"{ours:.2f}"
             if name in paper and round(ours, 2) > paper[name][0]:
@@ -230,7 +230,7 @@ def overview_table(rows: Sequence[Row]) -> Table:
     return Table(["experiment", "mean error", "smekf", "the paper's smekf", "best", "by"], cells)
 
 
-def imperfections_table(worlds: Mapping[str, Mapping[str, Any]]) -> Table:
+def make_imperfections_table(worlds: Mapping[str, Mapping[str, Any]]) -> Table:
     """What is off in each simulated world, and by how much."""
     sizes = {world: of.get("imperfections", {}) for world, of in worlds.items()}
     cells = [
@@ -240,7 +240,7 @@ def imperfections_table(worlds: Mapping[str, Mapping[str, Any]]) -> Table:
     return Table(["imperfection", *sizes], cells)
 
 
-def noise_table(noise: Mapping[str, float]) -> Table:
+def make_noise_table(noise: Mapping[str, float]) -> Table:
     """The simulated sensors' noise in the units of data sheets."""
     cells = [
         [words, f"{factor * noise[name]:.3g}{unit}"] for name, (words, factor, unit) in _NOISE.items() if name in noise
@@ -248,7 +248,7 @@ def noise_table(noise: Mapping[str, float]) -> Table:
     return Table(["Xsens MTi-3", "one standard deviation"], cells)
 
 
-def gains_table(gains: Mapping[str, Mapping[str, Any]]) -> Table:
+def make_gains_table(gains: Mapping[str, Mapping[str, Any]]) -> Table:
     """The gains of ncf and gdc in each setting."""
     cells = [
         [setting, *(", ".join(f"{k} {v:.3g}" for k, v in of.get(name, {}).items()) for name in ("ncf", "gdc"))]
@@ -257,7 +257,7 @@ def gains_table(gains: Mapping[str, Mapping[str, Any]]) -> Table:
     return Table(["setting", "ncf", "gdc"], cells)
 
 
-def table_note(rows: Sequence[Row]) -> str:
+def describe_table(rows: Sequence[Row]) -> str:
     """What the signs of the table mean."""
     keys = [key for row in rows for key in row.figures]
     notes = []
@@ -296,7 +296,7 @@ class ErrorBudget(NamedTuple):
     more: list[Part]  # what is not in it, and what that would add
 
 
-def error_budget(results: Sequence[Result]) -> ErrorBudget | None:
+def compute_error_budget(results: Sequence[Result]) -> ErrorBudget | None:
     """What each imperfection adds to the hand's error; None without a run that has all of them on."""
     rms: dict[str, dict[str, float]] = {}
     for method in dict.fromkeys(result.method for result in results if result.experiment == ERROR_BUDGET):

@@ -11,7 +11,7 @@ from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, WrongOption
 from ..kinematics import Pose, compute_pose
 from ..model import BodyModel
-from ..recording import span_text
+from ..recording import format_span
 
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
@@ -80,7 +80,7 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
     if samples > max(_FEW, _MOST_NEW * len(old)):
         jump = int(np.argmax(np.diff(old)))
         raise BadData(
-            f"{motion.where}: time jumps from {span_text((old[jump], old[jump + 1]))} in row {jump + 2} of "
+            f"{motion.where}: time jumps from {format_span((old[jump], old[jump + 1]))} in row {jump + 2} of "
             f"pose.parquet; at {rate_hz:g} Hz that is {samples} samples of {len(old)}"
         )
     time = old[0] + np.arange(samples) / rate_hz

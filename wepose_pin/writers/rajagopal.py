@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..model.chains import Chain, solve
-from ..readers.opensim import PRONATION, R_GW, in_n_pose
+from ..readers.opensim import PRONATION, R_GW, compute_n_pose
 from ..rotations import conjugate, multiply, rotation_about
 
 # Segment → body. The model has no head of its own.
@@ -56,7 +56,7 @@ def orientations(quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     for segment, body in BODIES.items():
         if segment in quat_WL:
             moved = multiply(multiply(_QUAT_GW, quat_WL[segment]), conjugate(_QUAT_GW))
-            bodies[body] = multiply(moved, in_n_pose(body).as_quat())
+            bodies[body] = multiply(moved, compute_n_pose(body).as_quat())
     return bodies
 
 

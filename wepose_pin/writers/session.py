@@ -8,7 +8,7 @@ import polars as pl
 
 from ..documents import toml_key, toml_string, toml_strings
 from ..kinematics import Pose, pose_table
-from ..recording import ImuSensor, Recording, axes_from_mount
+from ..recording import ImuSensor, Recording, find_mount_axes
 from .result import write_table
 
 
@@ -47,7 +47,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
         if sensor.aligned:
             lines.append("aligned = true")
         if sensor.stated_quat_LS is not None:
-            up, forward = axes_from_mount(sensor.stated_quat_LS)
+            up, forward = find_mount_axes(sensor.stated_quat_LS)
             lines.append(f'mount = {{ up = "{up}", forward = "{forward}" }}')
     write_table(folder / "recording.parquet", pl.DataFrame(table))
     if truth is not None:

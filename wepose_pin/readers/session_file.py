@@ -10,7 +10,7 @@ import numpy as np
 
 from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadPhase, BadSession, MissingFile, one_of
-from ..recording import CONFIGURATION, Intervals, mount_from_axes
+from ..recording import CONFIGURATION, Intervals, compute_mount
 from ..recording.sensors import read_axes
 from .device import Device
 
@@ -47,17 +47,17 @@ def read_session_file(path: Path) -> TomlTable:
             f"{path}: is a table of data by its name; a session file is wanted here, which names the table (`wepose "
             f"info {path.name} --write` writes one)"
         )
-    return session_keys(read_toml(path, "a session file"), path)
+    return check_session_keys(read_toml(path, "a session file"), path)
 
 
-def session_keys(values: Mapping[str, Any], path: Path) -> TomlTable:
+def check_session_keys(values: Mapping[str, Any], path: Path) -> TomlTable:
     """What a session file holds, with keys that are all known."""
     keys = TomlTable(values, str(path))
     keys.allow(*SESSION_KEYS, renamed=_RENAMED)
     return keys
 
 
-def sensor_stated(keys: TomlTable) -> Stated:
+def read_sensor_keys(keys: TomlTable) -> Stated:
     """Columns by signal, the mount, and whether the orientations are the segment's own."""
     keys.allow(
         *("gyro", "accel", "orientation", "mount", "file", "time", "time_unit", "rate_hz", "offset_s"),
@@ -86,7 +86,7 @@ def _names(keys: TomlTable, signal: str) -> list[str]:
     return [value] if isinstance(value, str) and value else keys.names(signal, WIDTHS[signal])
 
 
-def label_stated(keys: TomlTable, device: Device, segment: str, path: Path) -> str:
+def choose_label(keys: TomlTable, device: Device, segment: str, path: Path) -> str:
     """Which of the file's sensors is strapped to the segment: as stated, the only one, or the one that is named so."""
     label = keys.text("label", None)
     if label is not None:
@@ -101,10 +101,10 @@ def label_stated(keys: TomlTable, device: Device, segment: str, path: Path) -> s
 
 def _mount(keys: TomlTable) -> np.ndarray:
     keys.allow("up", "forward")
-    return mount_from_axes(*read_axes(keys))
+    return compute_mount(*read_axes(keys))
 
 
-def phases_stated(keys: TomlTable) -> dict[str, Intervals]:
+def read_phases(keys: TomlTable) -> dict[str, Intervals]:
     keys.allow(*keys.values, renamed=_RENAMED_PHASES)
     phases: dict[str, Intervals] = {}
     for name, value in keys.values.items():
@@ -120,7 +120,7 @@ def phases_stated(keys: TomlTable) -> dict[str, Intervals]:
     return phases
 
 
-def joints_stated(top: TomlTable, start_pose: str) -> dict[str, float]:
+def read_joints(top: TomlTable, start_pose: str) -> dict[str, float]:
     """Values of joints in the start pose of a chain that is not a person's arms."""
     if "joints" in top and start_pose != CONFIGURATION:
         raise BadSession(
@@ -132,7 +132,7 @@ def joints_stated(top: TomlTable, start_pose: str) -> dict[str, float]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def truth_stated(path: Path, data: TomlTable) -> Path | None:
+def find_truth(path: Path, data: TomlTable) -> Path | None:
     name = data.text("truth", None)
     if name is None:
         return None
