@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import MOVED_MOUNT, check_mounts, compute_heading, mount_advice
+from wepose_pin.alignment import MOVED_MOUNT, check_mounts, compute_heading, suggest_mounts
 from wepose_pin.calibration import load_protocol
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
@@ -251,7 +251,7 @@ def test_it_says_which_calibration_finds_a_mount() -> None:
     """And of which segments none does: what is said of the protocols is what they look at."""
     protocols = {name: load_protocol(name) for name in ("clasp", "handle", "poses", "touch_left", "touch_right")}
     for segment in SEGMENTS:
-        advice = mount_advice([segment])
+        advice = suggest_mounts([segment])
         assert 'mount = { up = "+x"' in advice
         finding = {name for name, protocol in protocols.items() if segment in protocol.segments}
         said = {name for name in protocols if name in advice}

@@ -349,7 +349,7 @@ def test_after_a_long_silence_ticks_come_in_pieces() -> None:
     whole, parts = (Aligner(NAMES, RATE, BEGIN) for _ in range(2))
     made = []
     for t in [tick_time(0), *(tick_time(6000 + k) for k in range(5))]:
-        ticks, pieces = whole.push(at(t)), list(parts.pieces(at(t)))
+        ticks, pieces = whole.push(at(t)), list(parts.iterate_ticks(at(t)))
         assert sum(len(piece.time) for piece in pieces) == len(ticks.time)
         for field in Ticks._fields[1:] if pieces else ():
             np.testing.assert_array_equal(np.concatenate([getattr(p, field) for p in pieces]), getattr(ticks, field))

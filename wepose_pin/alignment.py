@@ -100,7 +100,7 @@ _FOUND_BY = {
 
 def check_mounts(recording: Recording, subject: Subject | None) -> None:
     """Raises `BadSession` where neither the subject nor the session knows the mount of a sensor."""
-    missing = [segment for segment in recording.sensors if nominal_mount(recording, segment, subject) is None]
+    missing = [segment for segment in recording.sensors if find_nominal_mount(recording, segment, subject) is None]
     if missing:
         of = f"sensors.{missing[0]}.mount is not known"
         if len(missing) > 1:
@@ -109,10 +109,10 @@ def check_mounts(recording: Recording, subject: Subject | None) -> None:
             of += " (remounted = true: the subject's are of another mounting)"
         elif subject is not None and subject.mounts:
             of += f"; the subject '{subject.name}' has none for it"
-        raise BadSession(f"{recording.where()}: {of}: {mount_advice(missing)}")
+        raise BadSession(f"{recording.where()}: {of}: {suggest_mounts(missing)}")
 
 
-def mount_advice(segments: Sequence[str]) -> str:
+def suggest_mounts(segments: Sequence[str]) -> str:
     """What to do where mounts of these segments' sensors are not known: state them, or which calibration finds them."""
     do = 'state it, as in mount = { up = "+x", forward = "-z" }'
     by_protocols: dict[str, list[str]] = {}
@@ -150,7 +150,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
             turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi_aligned])
             mount[segment], heading[segment] = Rotation.identity(), psi_aligned
             continue
-        stated = nominal_mount(recording, segment, subject)
+        stated = find_nominal_mount(recording, segment, subject)
         assert stated is not None
         R_stated = Rotation.from_quat(stated)
         psi = compute_heading(at_start, R_stated)
@@ -173,7 +173,7 @@ def align(recording: Recording, subject: Subject | None, filtered: FilteredRecor
         if off > STATED_WARNING_DEG:
             value, limit = float(np.deg2rad(off)), float(np.deg2rad(STATED_WARNING_DEG))
             diagnostics.append(Diagnostic("mount-contradicts-gravity", WARNING, segment, value, limit, facts))
-        known = mount_covariance(recording, segment, subject)
+        known = find_mount_covariance(recording, segment, subject)
         if known is not None:
             # The tilt's misfit is the pose's error and the mount's together; each takes its share. Of the heading,
             # which was made to fit, the start pose says nothing but through the mount's own correlations.
@@ -225,7 +225,7 @@ def compute_heading(R_VS: Rotation, R_WS: Rotation) -> float:
     return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
 
 
-def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
+def find_nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
     """The mount `quat_LS` (4,) xyzw as calibrated, else as stated, else that of a measured segment; None: unknown."""
     if subject is not None and segment in subject.mounts and not recording.remounted:
         return subject.mounts[segment]
@@ -235,7 +235,7 @@ def nominal_mount(recording: Recording, segment: str, subject: Subject | None) -
     return stated
 
 
-def heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
+def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
     """(n,) [rad²]: variance about the vertical of errors on the right (n, 3, 3), in S."""
     up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
     return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
@@ -255,7 +255,7 @@ def compute_segment_covariance(
     cov_W = R @ orientation.attitude_cov @ R.swapaxes(1, 2)
     # Each rest measures the tilt anew with the same accelerometer bias, which averaging does not take away.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
-    known = mount_covariance(recording, segment, subject)
+    known = find_mount_covariance(recording, segment, subject)
     if known is not None:
         # A mount's error ε in L turns R_WL by R_WL ε. Its heading was taken for the world's, so that it turns R_WL
         # into Rz(δ) R_WL Rz(δ)ᵀ, which is nothing in the start pose; the pose weighed in on its tilt.
@@ -264,20 +264,20 @@ def compute_segment_covariance(
         tilt = known[:2]
         left = known - tilt.T @ np.linalg.solve(tilt[:, :2] + START_POSE_STD**2 * np.eye(2), tilt)
         cov_W += lever @ left @ lever.swapaxes(1, 2)
-        cov_W[:, 2, 2] += start_heading_var(recording, segment, subject)
+        cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject)
     return cov_W
 
 
-def start_heading_var(recording: Recording, segment: str, subject: Subject | None) -> float:
+def compute_start_heading_var(recording: Recording, segment: str, subject: Subject | None) -> float:
     """Variance [rad²] of the heading that a segment's start pose gives its sensor's world: nobody stands exactly so.
 
     The torso's is zero: it says where x points. Nor does it count where the mount is stated, since what a person means
     by it is the start pose.
     """
-    calibrated = mount_covariance(recording, segment, subject) is not None
+    calibrated = find_mount_covariance(recording, segment, subject) is not None
     return START_POSE_STD**2 if calibrated and segment != "torso" else 0.0
 
 
-def mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
+def find_mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
     """Covariance (3, 3) [rad²] of a calibrated mount's error in L, where it holds for this mounting and is known."""
     return None if subject is None or recording.remounted else subject.mount_covariance(segment)

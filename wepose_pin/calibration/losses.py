@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..alignment import heading_variance
+from ..alignment import compute_heading_variance
 from ..errors import BadPhase
 from ..filters import Orientation
 from ..filters.smekf import HOLD_S, UNSEEN_RATE_STD
@@ -62,7 +62,7 @@ def find_unknown_tilt(orientation: Orientation, samples: np.ndarray) -> np.ndarr
     if orientation.attitude_cov is None:
         return np.zeros(len(samples), dtype=bool)
     cov = orientation.attitude_cov[samples]
-    heading_var = heading_variance(orientation.quat_WS[samples], cov)
+    heading_var = compute_heading_variance(orientation.quat_WS[samples], cov)
     return np.trace(cov, axis1=1, axis2=2) - heading_var > 2.0 * TILT_STD**2
 
 

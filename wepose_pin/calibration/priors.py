@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import START_POSE_STD, mount_covariance
+from ..alignment import START_POSE_STD, find_mount_covariance
 from ..errors import BadSubject
 from ..subject import LENGTHS, Subject
 from .initial_headings import estimate_headings
@@ -97,7 +97,7 @@ def _mount_prior(problem: CalibrationProblem, segment: str, heading: float | Non
 def _mount_information(problem: CalibrationProblem, segment: str) -> np.ndarray:
     """Information (3, 3) [1/rad²] of the nominal mount's error in L."""
     recording, prior = problem.recording, problem.prior
-    covariance = mount_covariance(recording, segment, prior)
+    covariance = find_mount_covariance(recording, segment, prior)
     if covariance is not None:
         return np.linalg.inv(covariance + 1e-12 * np.eye(3))
     calibrated = segment in prior.mounts and not recording.remounted

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG, compute_heading, nominal_mount
+from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG, compute_heading, find_nominal_mount
 from ..errors import BadPhase
 from ..filters.sensors import FilteredRecording
 from ..recording import Recording
@@ -47,7 +47,7 @@ class CalibrationProblem:
 
     def mount(self, segment: str) -> np.ndarray | None:
         """The mount `quat_LS` (4,) xyzw of the prior or the session; None where neither has one."""
-        return nominal_mount(self.recording, segment, self.prior)
+        return find_nominal_mount(self.recording, segment, self.prior)
 
     def stated_headings(self, segments: Collection[str]) -> dict[str, float]:
         """Segment → ψ [rad] at which its sensor is nearest to its mount, of those that have a mount."""

@@ -146,7 +146,7 @@ def estimate_orientation(
         raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
     scan = scan_sensor(np.arange(len(gyro)) / rate_hz, gyro, accel)
     for fault in find_faults({"": scan}).get("", []):
-        raise BadData(f"{fault.described(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
+        raise BadData(f"{fault.describe(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
     noise, start = TYPICAL, None
     diagnostics: tuple[Diagnostic, ...] = ()
     if static is None:

@@ -54,7 +54,7 @@ def find_reference_phases(recording: Recording) -> tuple[tuple[float, float], tu
         if samples < FEWEST_AT_START:
             raise BadPhase(f"{place} holds {samples} samples; it needs at least {FEWEST_AT_START}, better two seconds")
         for segment in recording.sensors:
-            measured = len(recording.measured(segment, interval))
+            measured = len(recording.find_measured(segment, interval))
             if measured < max(FEWEST_AT_START, LEAST_SHARE_AT_START * samples):
                 raise BadPhase(
                     f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: nothing "
@@ -78,7 +78,7 @@ def check_common_rotation(
     up_S = {}
     for segment in noises:
         accel_S = recording.imus[segment].accel_S
-        mean_S = accel_S[recording.measured(segment, interval)].mean(axis=0)
+        mean_S = accel_S[recording.find_measured(segment, interval)].mean(axis=0)
         up_S[segment] = mean_S / np.linalg.norm(mean_S)
     rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
     if len(rates) == 0:
@@ -109,7 +109,7 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
 
     The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
     """
-    sensor, measured = recording.sensors[segment], recording.measured(segment, interval)
+    sensor, measured = recording.sensors[segment], recording.find_measured(segment, interval)
     if isinstance(sensor, OrientationSensor):
         R = Rotation.from_quat(sensor.quat_WS[measured])
         rate = (R[:-1].inv() * R[1:]).as_rotvec() * recording.rate_hz

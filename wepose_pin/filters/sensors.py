@@ -61,7 +61,7 @@ class SensorFilters:
                 self.diagnostics += check_motion(first, segment, self.static_phase, "static")
             if isinstance(sensor, OrientationSensor):
                 continue
-            at_rest = first.measured(segment, self.static_phase)
+            at_rest = first.find_measured(segment, self.static_phase)
             try:
                 worn = self.static_phase == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
                 noise = estimate_noise(sensor.gyro_S[at_rest], sensor.accel_S[at_rest], first.rate_hz, worn)
@@ -127,7 +127,7 @@ def combine_chunk(
 ) -> FilteredRecording:
     """A chunk that `filters` gave, if the start pose is in it."""
     R_VS = collect_rotations(chunk, orientation)
-    at_start = {segment: R[chunk.measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
+    at_start = {segment: R[chunk.find_measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
     return FilteredRecording(
         R_VS, at_start, dict(orientation), filters.start, filters.static_phase, filters.diagnostics
     )

@@ -192,15 +192,15 @@ class LiveLoop:
             return
         for some in samples:
             self._newest[some.sensor] = max(self._newest[some.sensor], float(some.time[-1]))
-        came = order_arrivals(samples, self.source.sensors)
+        arrivals = order_arrivals(samples, self.source.sensors)
         if self.log is not None:
-            self.log.samples(came)
+            self.log.samples(arrivals)
         if self._search is None:
-            self._waiting.append(came)
+            self._waiting.append(arrivals)
             self._begin_ticks()
             return
         pose = None
-        for ticks in self._search.aligner.pieces(came):
+        for ticks in self._search.aligner.iterate_ticks(arrivals):
             pose = self._process(ticks, self._search) or pose
             self._flush_log()
         if pose is not None:
@@ -233,8 +233,8 @@ class LiveLoop:
         if self.log is not None:
             self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self._wait)
         waiting, self._waiting = self._waiting, []
-        for came in waiting:
-            self._process(aligner.push(came), self._search)
+        for arrivals in waiting:
+            self._process(aligner.push(arrivals), self._search)
 
     # Ticks to poses --------------------------------------------------------------------------------------------------
 

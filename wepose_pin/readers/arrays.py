@@ -74,7 +74,7 @@ class ArrayFile:
             raise BadData(f"{self.path}: the arrays of a sensor and its time differ in length: {listed}")
         return pl.DataFrame(found)
 
-    def expanded(self, name: str, width: int, place: str) -> list[str]:
+    def expand(self, name: str, width: int, place: str) -> list[str]:
         """The `width` columns of an array that is named as a whole."""
         path = self._find(name, place)
         shape = self.shapes[path]

@@ -97,17 +97,17 @@ def describe_file(path: Path, folder: Path | None = None) -> Description:
     folder = folder or path.absolute().parent
     format = detect_format(path)
     if format:
-        return _described(path, folder, _of_devices(path, folder, format))
+        return _propose_session(path, folder, _of_devices(path, folder, format))
     if is_array_file(path):
         arrays = ArrayFile(path)
-        return _described(
+        return _propose_session(
             path, folder, _of_columns(path, folder, guess_arrays(arrays.shapes), list(arrays.shapes), arrays)
         )
     if path.suffix.lower() in TABLES:
         names = Rows(path).names
         if any(re.fullmatch(r"(left|right)_(elbow|wrist|hand)_x", name) for name in names):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
-        return _described(path, folder, _of_columns(path, folder, guess_columns(names), names, None))
+        return _propose_session(path, folder, _of_columns(path, folder, guess_columns(names), names, None))
     known = (
         ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose; a result's folder, an "
         "x-IMU3's folder"
@@ -175,7 +175,7 @@ def _toml(path: Path) -> Description:
 # Data: a session is proposed ---------------------------------------------------------------------------------------
 
 
-def _described(path: Path, folder: Path, proposal: _Proposal) -> Description:
+def _propose_session(path: Path, folder: Path, proposal: _Proposal) -> Description:
     """The description of data for which a session is proposed; what can be read by it is said of it."""
     what, diagnostics = f"{path}: {proposal.title}", tuple(proposal.diagnostics)
     if not proposal.tables:

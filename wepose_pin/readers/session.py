@@ -37,7 +37,7 @@ from .device import Device
 from .formats import FORMATS, USES, detect_format, read_device
 from .session_file import (
     WIDTHS,
-    Stated,
+    SensorKeys,
     check_session_keys,
     choose_label,
     find_truth,
@@ -279,7 +279,7 @@ class SessionReader:
                 table = table.with_columns(time=time - np.nanmin(time) + (first[path] - origin))
             self._tables[str(path)] = table
 
-    def _plan(self, keys: TomlTable, data: TomlTable, stated: Stated) -> _Plan:
+    def _plan(self, keys: TomlTable, data: TomlTable, stated: SensorKeys) -> _Plan:
         path, segment = self._file(keys, data), keys.place.removeprefix("sensors.")[:-1]
         device = self.devices.get(path) if stated.signals is None else None
         # A file of its own has a clock of its own beside that of [data], or where [data] names no file that of all.
@@ -355,7 +355,7 @@ class SessionReader:
             self._array_files[path] = ArrayFile(path)
         file = self._array_files[path]
         named = {
-            signal: file.expanded(names[0], WIDTHS[signal], keys.at(signal)) if len(names) == 1 else names
+            signal: file.expand(names[0], WIDTHS[signal], keys.at(signal)) if len(names) == 1 else names
             for signal, names in signals.items()
         }
         wanted = {name: keys.at(signal) for signal, names in named.items() for name in names}

@@ -25,7 +25,7 @@ _RENAMED = {"strapping": 'is called remounted now: write remounted = true where 
 WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
 
 
-class Stated(NamedTuple):
+class SensorKeys(NamedTuple):
     """What a sensor's table says of its values."""
 
     signals: Mapping[str, list[str]] | None  # columns, or one array; None where the file's own format knows them
@@ -57,7 +57,7 @@ def check_session_keys(values: Mapping[str, Any], path: Path) -> TomlTable:
     return keys
 
 
-def read_sensor_keys(keys: TomlTable) -> Stated:
+def read_sensor_keys(keys: TomlTable) -> SensorKeys:
     """Columns by signal, the mount, and whether the orientations are the segment's own."""
     keys.allow(
         *("gyro", "accel", "orientation", "mount", "file", "time", "time_unit", "rate_hz", "offset_s"),
@@ -67,17 +67,17 @@ def read_sensor_keys(keys: TomlTable) -> Stated:
     aligned = keys.flag("aligned") if "aligned" in keys else None
     named = [key for key in WIDTHS if key in keys]
     if not named:
-        return Stated(None, mount, aligned)
+        return SensorKeys(None, mount, aligned)
     for key in ("label", "format"):
         if key in keys:
             raise BadSession(
                 f"{keys.at(key)} stands beside {named[0]}; a known format has a {key}, a table has columns"
             )
     if "orientation" not in keys:
-        return Stated({"gyro": _names(keys, "gyro"), "accel": _names(keys, "accel")}, mount, aligned)
+        return SensorKeys({"gyro": _names(keys, "gyro"), "accel": _names(keys, "accel")}, mount, aligned)
     if "gyro" in keys or "accel" in keys:
         raise BadSession(f"{keys.at('orientation')} stands beside gyro or accel; a sensor has one or the other")
-    return Stated({"orientation": _names(keys, "orientation")}, mount, aligned)
+    return SensorKeys({"orientation": _names(keys, "orientation")}, mount, aligned)
 
 
 def _names(keys: TomlTable, signal: str) -> list[str]:

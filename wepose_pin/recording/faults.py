@@ -75,7 +75,7 @@ class Fault(NamedTuple):
     last: float  # [s], the last that was not
     value: tuple[float, ...]  # at which it stood, SI
 
-    def described(self, since: float) -> str:
+    def describe(self, since: float) -> str:
         """In words, from the time [s] `since`."""
         value = ", ".join(f"{v:.4g}" for v in self.value[:3])
         unit = "m/s^2" if self.signals.startswith("accel") else "rad/s"
@@ -98,7 +98,7 @@ class _Run:
     distinct: int  # rows in which the other axes of the signal are not those of the row before
     first_row: bool  # of the recording
 
-    def joined(self, after: _Run) -> _Run:
+    def join(self, after: _Run) -> _Run:
         """Both as one; the last row of this is the first of the one after it."""
         low, high = np.minimum(self.low, after.low), np.maximum(self.high, after.high)
         rows, tipped = self.rows + after.rows - 1, self.tipped + after.tipped
@@ -176,7 +176,7 @@ class SensorScan:
         for a, b in spans[((length >= FROZEN_SAMPLES) & (seconds >= _least_s(name))) | edge]:
             run = _run(block[a : b + 1], name, first_row and a == 0)
             if open_ is not None and a == 0:
-                run, open_ = open_.joined(run), None
+                run, open_ = open_.join(run), None
             if b == len(same):
                 self._open[name] = run
             else:
@@ -418,7 +418,7 @@ class Scan:
                 if whole or (start is not None and first <= start[0] and last >= start[1]):
                     when = "all along" if whole else "through the start pose"
                     raise BadData(
-                        f"{where}: sensors.{name}: {fault.described(first)}, {when}: it does not measure; take "
+                        f"{where}: sensors.{name}: {fault.describe(first)}, {when}: it does not measure; take "
                         f"[sensors.{name}] out to track the others" + ("" if whole else ", or name another start pose")
                     )
 

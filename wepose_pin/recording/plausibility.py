@@ -85,7 +85,7 @@ def check_signals(recording: Recording, *, whole: bool = True, units: bool = Tru
 def _gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, whole: bool) -> list[Diagnostic]:
     name = next((name for name in ("static", "start") if recording.phases.get(name)), "")
     if name:
-        static, when = recording.measured(segment, recording.phases[name][0]), f"in phases.{name}"
+        static, when = recording.find_measured(segment, recording.phases[name][0]), f"in phases.{name}"
     elif whole:
         static, when = _most_static_second(recording, sensor), "in the second in which it turns most evenly"
     else:

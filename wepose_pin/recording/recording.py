@@ -93,7 +93,7 @@ class Recording:
         first, last = np.searchsorted(self.time, [interval[0] - 1e-9, interval[1] + 1e-9])
         return slice(int(first), int(last))
 
-    def measured(self, segment: str, interval: tuple[float, float]) -> np.ndarray:
+    def find_measured(self, segment: str, interval: tuple[float, float]) -> np.ndarray:
         """Return the samples (k,) within the interval [s] that the sensor measured; samples in gaps are bridged."""
         span, gap = self.span(interval), self.sensors[segment].gap
         samples = np.arange(len(self))[span]

@@ -19,8 +19,8 @@ from ..alignment import (
     align,
     check_mounts,
     compute_heading,
+    compute_heading_variance,
     compute_segment_covariance,
-    heading_variance,
     orient_segments,
 )
 from ..compilation import kernel
@@ -221,7 +221,7 @@ class SegmentFollower:
         covs = {name: of.attitude_cov for name, of in orientation.items() if of.attitude_cov is not None}
         if covs:
             last = np.stack([covs[name][-1] for name in self.names])
-            self._run_var = heading_variance(quat_VS[-1], last)
+            self._run_var = compute_heading_variance(quat_VS[-1], last)
             covariance_W = {name: self._covariance_W(i, quat_VS[:, i], covs[name]) for i, name in enumerate(self.names)}
         return replace(
             self.start,
@@ -250,7 +250,7 @@ class SegmentFollower:
     def heading_var(self) -> np.ndarray | None:
         """(k,) [rad²] variance of each heading by its filter alone, after a step; None where the filter has none."""
         cov = self._bank.attitude_cov
-        return None if cov is None else heading_variance(self._recent[self._oldest - 1], cov)
+        return None if cov is None else compute_heading_variance(self._recent[self._oldest - 1], cov)
 
     def heading_std(self) -> np.ndarray:
         """(k,) [rad] one standard deviation of each segment's heading, as `track` states it: the mounts' part too.
@@ -281,7 +281,7 @@ class SegmentFollower:
         mount = Rotation.from_quat(self._mount[i])
         cov = compute_segment_covariance(self._so_far, self.names[i], self._subject, R_WS, mount, of)
         if self._var_at_reset is not None:
-            var = heading_variance(quat_VS, attitude_cov)
+            var = compute_heading_variance(quat_VS, attitude_cov)
             grown = np.maximum(0.0, var - self._var_at_reset[i])
             # The mount's part of the heading stays: the reset has set that of the start pose alone.
             share = np.sqrt((np.maximum(cov[:, 2, 2] - var, 0.0) + grown + START_POSE_STD**2) / cov[:, 2, 2])

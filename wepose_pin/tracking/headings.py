@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import ATTITUDE_STD, SLIP_STD, START_POSE_STD, Segments, start_heading_var
+from ..alignment import ATTITUDE_STD, SLIP_STD, START_POSE_STD, Segments, compute_start_heading_var
 from ..recording import SEGMENTS, Recording
 from ..subject import Subject
 
@@ -130,7 +130,7 @@ class HeadingCorrector:
             if filter_cov is not None:
                 variance = np.interp(chunk.time, self._middle, self._cov[:, i, i])
                 with_heading, filter_var = filter_cov
-                start = start_heading_var(chunk, name, self._subject)
+                start = compute_start_heading_var(chunk, name, self._subject)
                 covariance[name] = _narrow_covariance(covariance[name], with_heading, filter_var + start, variance)
         result = replace(segments, quat_WL=corrected, covariance_W=covariance)
         time, quats = self._decimate(chunk, result, 1)
