@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadPhase
-from wepose_pin.filters.noise import ACCEL_FLOOR, GYRO_FLOOR, QUIET_S, estimate_noise, find_static_window
+from wepose_pin.filters.noise import ACCEL_FLOOR, GYRO_FLOOR, WINDOW_S, estimate_noise, find_static_window
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 
 RATE = 100.0
@@ -113,4 +113,4 @@ def test_the_quietest_window_is_found(ready: bool) -> None:
     first, last = find_static_window(Recording("r", time, RATE, {"torso": sensor}))
     assert first >= 106.95
     assert last <= 109.55
-    assert last - first == pytest.approx(QUIET_S, abs=0.02)
+    assert last - first == pytest.approx(WINDOW_S, abs=0.02)

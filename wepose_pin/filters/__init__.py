@@ -81,12 +81,12 @@ class Orientation(NamedTuple):
 
 
 def check_method(method: str) -> str:
-    """`method`, if there is one of that name.
+    """Check that a method of that name exists, and return it.
 
     Raises
     ------
     BadOption
-        There is none.
+        It does not.
     """
     if method not in METHODS:
         raise BadOption(f"method '{method}' is not known; {one_of(METHODS, method)}")
@@ -103,16 +103,16 @@ def estimate_orientation(
     params: Any = None,
     static_test: StaticTest | None = None,
 ) -> Orientation:
-    """Orientation of a sensor from its gyroscope and accelerometer.
+    """Estimate the orientation of a sensor from its gyroscope and accelerometer.
 
     Parameters
     ----------
     gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample
-    accel_S : (n, 3) [m/s²], specific force, +g up at rest
+    accel_S : (n, 3) [m/s²], specific force, +g up of a static sensor
     rate_hz : samples a second, uniform
     method : a key of `METHODS`
-    static : from, to [s] after the first sample: the sensor is static; noise and bias are measured there. None:
-        nothing is known to be; noise is then `TYPICAL`, and the bias starts at zero
+    static : from, to [s] after the first sample: the sensor is static there, and noise and bias are measured. None:
+        no static phase; noise is `TYPICAL`, and the bias starts at zero
     params : the filter's own frozen parameters; None for its defaults
     static_test : when the sensor counts as static; None for the default values
 
@@ -164,7 +164,7 @@ def estimate_orientation(
 
 
 def add_range(method: str, params: Any, gyro_range: float) -> Any:
-    """The filter's parameters with the range [rad/s] at which gyro is cut off, for those filters that know of one."""
+    """Add the range [rad/s] at which gyro saturates to a filter's parameters, where the filter has such a parameter."""
     kinds: dict[str, type] = {"amekf": AmekfParams, "smoother": AmekfParams, "smekf": SmekfParams}
     if method not in kinds:
         return params
@@ -173,22 +173,22 @@ def add_range(method: str, params: Any, gyro_range: float) -> Any:
 
 
 def chunk_multiple(method: str, rate_hz: float) -> int:
-    """Number of samples of which the chunks of a recording are a multiple, the last one excepted."""
+    """Return the number of samples of which chunks must be a multiple, except for the last chunk."""
     return max(1, round(AmekfParams().block_s * rate_hz)) if method in OFFLINE else 1
 
 
 class SensorRun:
-    """`run_filter` of a recording that comes in chunks; its results, put together, are those of the whole.
+    """`run_filter` of a recording in chunks; the joined results are those of the whole recording.
 
-    The filter starts with the tilt of the start phase and goes forward from its first sample; what lies before is
-    filtered backward from there, so that a recording may begin in motion. The smoother goes forward over all, from
-    where the way back has ended; it alone looks ahead, by one chunk: `push` returns the chunk before. Its chunks are
-    multiples of `chunk_multiple`. Parameters as `run_filter`; the start phase is in the first chunk.
+    The filter starts with the tilt of the start phase and runs forward from its first sample, and backward over earlier
+    samples, so that a recording may begin in motion. The smoother runs forward over all samples, from the end of the
+    backward run. The smoother alone uses the next chunk: its `push` returns the chunk before. Its chunks are multiples
+    of `chunk_multiple`. Parameters as in `run_filter`; the start phase is in the first chunk.
 
     Raises
     ------
     BadData
-        The start phase has no gravity in it.
+        The start phase has no gravity.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class SensorRun:
         self._detector = StaticDetector(noise, rate_hz, self.test)
         self._filter: Any = None
         self._before: Orientation | None = None  # before the start phase, until it is returned
-        self._static: np.ndarray | None = None  # of the smoother's chunk
+        self._static = np.zeros(0, dtype=np.bool_)  # of the smoother's chunk
 
     def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation | None:
         """Take a chunk (n, 3) [rad/s], (n, 3) [m/s²]; returns it filtered, or the one before it smoothed."""
@@ -219,37 +219,36 @@ class SensorRun:
         static = self._detector.run(gyro_S, accel_S)
         if self._method in OFFLINE:
             smoothed, self._static, before = self._filter.push(gyro_S, accel_S, static), static, self._static
-            return None if smoothed is None or before is None else self._orientation(smoothed, before)
+            return None if smoothed is None else self._orientation(smoothed, before)
         return self._orientation(self._filter.run(gyro_S, accel_S, static), static)
 
     def finish(self) -> Orientation:
-        """The smoother's last chunk."""
-        assert self._static is not None
+        """Return the smoother's last chunk."""
         return self._orientation(self._filter.finish(), self._static)
 
     def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> int:
-        """Make the filter, and filter the samples before the start phase; returns the filter's first sample."""
+        """Create the filter, and filter the samples before the start phase; returns the filter's first sample."""
         phase = self._start or slice(0, self.test.samples(self._rate_hz))
         first = phase.start
         start = estimate_start_tilt(gyro_S[phase], accel_S[phase], self._noise, self._rate_hz)
-        if self._start is None:  # it may move there
+        if self._start is None:  # the sensor may move there
             static = StaticDetector(self._noise, self._rate_hz, self.test).run(gyro_S[phase], accel_S[phase])
             if not static[-1]:
                 start = start._replace(tilt_std=MOVING_TILT_STD)
         if first > 0:
-            before = self._backward(start, gyro_S[: first + 1], accel_S[:first])
-            if self._method in OFFLINE:  # goes forward over all, from where the way back has ended
+            before = self._run_backward(start, gyro_S[: first + 1], accel_S[:first])
+            if self._method in OFFLINE:  # forward over all samples, from the end of the backward run
                 turn = np.nan_to_num(gyro_S[0] - before.gyro_bias[0]) / self._rate_hz
                 quat_WS = (Rotation.from_quat(before.quat_WS[0]) * Rotation.from_rotvec(-turn)).as_quat()
-                start, first = StartTilt(quat_WS, MOVING_TILT_STD), 0  # the samples count once, on the way forward
+                start, first = StartTilt(quat_WS, MOVING_TILT_STD), 0  # the forward run alone uses these samples
             self._before = before
         self._filter = self._create_filter(self._method, self._noise, start)
         return first
 
-    def _backward(self, start: StartTilt, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation:
-        """Orientation at the samples `accel_S` before the start phase; `gyro_S` has the first of the phase as well.
+    def _run_backward(self, start: StartTilt, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation:
+        """Filter the samples `accel_S` before the start phase; `gyro_S` has the first sample of the phase as well.
 
-        Backward in time rates change their sign, the bias' too; specific forces do not.
+        Backward in time, rates and bias change their sign; specific forces do not.
         """
         turn = np.nan_to_num(gyro_S[-1] - self._noise.gyro_bias) / self._rate_hz
         quat_WS = (Rotation.from_quat(start.quat_WS) * Rotation.from_rotvec(turn)).as_quat()
@@ -277,8 +276,8 @@ class SensorRun:
         before, self._before = self._before, None
         if before is not None and self._method in OFFLINE:
             # The smoother's heading is exact where the recording begins; the headings are aligned in the start phase.
-            assert run.attitude_cov is not None
-            run.attitude_cov[: len(before.static)] = before.attitude_cov
+            if run.attitude_cov is not None:
+                run.attitude_cov[: len(before.static)] = before.attitude_cov
         elif before is not None:
             run = FilterRun(
                 np.concatenate([before.quat_WS, run.quat_WS]),
@@ -300,7 +299,7 @@ def run_filter(
     measured_start: bool = False,
     start: slice | None = None,
 ) -> Orientation:
-    """`estimate_orientation` once the noise is known and the arrays are checked.
+    """Run a filter as `estimate_orientation`, with known noise and checked arrays.
 
     `measured_start`: without `params`, smekf takes P₀ from `noise` in place of the paper's (`smekf.starting_params`).
     `start`: samples of the start phase; None: the first window of `static_test`, static or not.

@@ -1,4 +1,4 @@
-"""Sensor noise and bias from a phase in which the sensor lies still (Lisini Baldi 2019, the Σ̂ of the static test)."""
+"""Sensor noise and bias from a static phase (Lisini Baldi 2019, the Σ̂ of the static test)."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ import numpy as np
 from ..errors import BadPhase
 from ..recording import ImuSensor, Recording
 
-# A quantised signal can stand still to the last bit; below these standard deviations no MEMS sensor is believed, and
-# the covariances stay invertible.
+# Smallest standard deviations: a quantised signal may be constant, but no MEMS sensor is more precise, and the
+# covariances stay invertible.
 GYRO_FLOOR = 1e-5  # [rad/s]
 ACCEL_FLOOR = 1e-5  # [g]
 BIAS_FLOOR = 1e-6  # [rad/s] of the bias itself, that is 0.2 deg/h
 
-# Blocks for the covariance of the mean: long against the sensor's noise, short against a person's sway.
+# Length of blocks for the covariance of the mean: long against the sensor's noise, short against a person's sway.
 BLOCK_S = 0.5
 
-# A person who stands sways at 0.3 to 0.5 deg/s (rms) below 0.5 Hz and tilts by 0.2 to 0.4 deg; a hanging arm and a
-# breathing chest turn faster. What a sensor's mean rate over T seconds is off by is that rate, and at most what such a
-# tilt allows: √2 σ/(ω T).
+# A standing person sways at 0.3 to 0.5 deg/s (rms) below 0.5 Hz and tilts by 0.2 to 0.4 deg; a hanging arm and a
+# breathing chest turn faster. The error of a sensor's mean rate over T seconds is that rate, and at most √2 σ/(ω T),
+# which the tilt allows.
 SWAY_RATE_STD = float(np.deg2rad(0.7))  # [rad/s] of a worn sensor
-SWAY_RATE = 2.0 * np.pi * 0.2  # [rad/s] ω, of the slower sways
-PRIOR_BLOCKS = 4.0
-SWAY_CORRELATION_S = 2.0  # half a sway: so long half-second means go on alike
-STEADY_TURN_S = 20.0  # so long may a person turn steadily, as on an office chair
-LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks, beyond white noise: less is no person
+SWAY_RATE = 2.0 * np.pi * 0.2  # [rad/s] ω, of slow sway
+PRIOR_BLOCKS = 4.0  # weight of `SWAY_RATE_STD` as a number of blocks
+SWAY_CORRELATION_S = 2.0  # half a sway period: half-second means are correlated for so long
+STEADY_TURN_S = 20.0  # longest steady rotation of a person, as on an office chair
+LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks beyond white noise; a person sways more
 
-# Without stated phases: the find_static_window stretch of this length within the beginning is taken.
-QUIET_S = 2.0
+# Without stated phases the most static window of this length in the beginning is used.
+WINDOW_S = 2.0
 BEGINNING_S = 20.0
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """What a static phase says of one sensor.
+    """Noise and bias of one sensor from a static phase.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class SensorNoise:
     accel_cov : (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
     bias_step_cov : (3, 3) Σ_b, covariance of the first differences of gyro [rad²/s²], as in the authors' software
     gravity : mean norm of accel [m/s²]: the gravity scale
-    gyro_half_second_cov : (3, 3) covariance of gyro's means over `BLOCK_S` [rad²/s²]: a person sways; None: white noise
+    gyro_half_second_cov : (3, 3) covariance of gyro's means over `BLOCK_S` [rad²/s²], with sway; None: white noise
     """
 
     gyro_bias: np.ndarray
@@ -57,57 +57,58 @@ class SensorNoise:
     gyro_half_second_cov: np.ndarray | None = None
 
     def sway_density(self, rate_hz: float) -> float:
-        """Density [rad²/s] of slow motion at rest, each axis: the variance of the mean rate over T s is 1/T of it."""
+        """Compute the density [rad²/s] of sway on each axis; the mean rate over T s has 1/T of it as variance."""
         if self.gyro_half_second_cov is None:
             return 0.0
         white = float(np.trace(self.gyro_cov)) / 3.0 / (BLOCK_S * rate_hz)
         total, bias = float(np.trace(self.gyro_half_second_cov)) / 3.0, float(np.trace(self.gyro_bias_cov)) / 3.0
         if total <= white:
             return 0.0
-        # Where the bias is hardly better known than the sway, a steady turn is as likely as a bias, while it lasts.
-        lasts_s = STEADY_TURN_S * min(1.0, bias / total) if bias > 0.3 * total else SWAY_CORRELATION_S
-        return (total - white) * lasts_s
+        # Where the bias is hardly more certain than the sway, a steady rotation is as likely as a bias, while it lasts.
+        duration_s = STEADY_TURN_S * min(1.0, bias / total) if bias > 0.3 * total else SWAY_CORRELATION_S
+        return (total - white) * duration_s
 
 
 def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool = False) -> SensorNoise:
-    """Noise and bias from samples at rest: `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²].
+    """Estimate noise and bias from static samples: `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²].
 
-    `worn`: a person wears the sensor and sways, which a phase of a second or two does not show: the bias is then as
-    uncertain as sway makes it.
+    `worn`: a person wears the sensor and sways. A phase of a second or two does not show sway, so its uncertainty is
+    added to that of the bias.
 
     Raises
     ------
     BadPhase
-        Fewer than 10 samples, or no gravity in them.
+        Fewer than 10 samples, or accel without gravity.
     """
     if len(gyro_S) < 10:
         raise BadPhase(f"the static phase holds {len(gyro_S)} samples; at least 10 are needed to measure noise")
     gravity = float(np.linalg.norm(accel_S, axis=1).mean())
     if not gravity > 0.0:
         raise BadPhase(
-            "the static phase holds no gravity: accel is zero; the filter needs specific force, +g up at rest"
+            "the static phase holds no gravity: accel is zero; the filter needs specific force, +g up when static"
         )
-    half_second_cov, bias_cov = _cov_of_half_seconds(gyro_S, rate_hz), _cov_of_mean(gyro_S, rate_hz)
+    half_second_cov, bias_cov = _compute_half_second_cov(gyro_S, rate_hz), _compute_mean_cov(gyro_S, rate_hz)
     if worn:
-        half_second_cov = _sway_cov(gyro_S, rate_hz, half_second_cov)
+        half_second_cov = _estimate_sway_cov(gyro_S, rate_hz, half_second_cov)
         allowed = min(1.0, 2.0 / (SWAY_RATE * len(gyro_S) / rate_hz) ** 2)
         bias_cov = bias_cov + float(np.trace(half_second_cov)) / 3.0 * allowed * np.eye(3)
     return SensorNoise(
         gyro_bias=gyro_S.mean(axis=0),
         gyro_bias_cov=bias_cov,
-        gyro_cov=_floored(np.cov(gyro_S.T), GYRO_FLOOR),
-        accel_cov=_floored(np.cov(accel_S.T / gravity), ACCEL_FLOOR),
-        bias_step_cov=_floored(np.cov(np.diff(gyro_S, axis=0).T), GYRO_FLOOR),
+        gyro_cov=_apply_floor(np.cov(gyro_S.T), GYRO_FLOOR),
+        accel_cov=_apply_floor(np.cov(accel_S.T / gravity), ACCEL_FLOOR),
+        bias_step_cov=_apply_floor(np.cov(np.diff(gyro_S, axis=0).T), GYRO_FLOOR),
         gravity=gravity,
         gyro_half_second_cov=half_second_cov,
     )
 
 
-def _sway_cov(gyro_S: np.ndarray, rate_hz: float, measured: np.ndarray | None) -> np.ndarray:
-    """Covariance (3, 3) [rad²/s²] of a worn sensor's half-second means by sway: as `measured`, with `SWAY_RATE_STD`
-    counted as `PRIOR_BLOCKS` more of them, or as none where they vary by no more than white noise.
+def _estimate_sway_cov(gyro_S: np.ndarray, rate_hz: float, measured: np.ndarray | None) -> np.ndarray:
+    """Estimate the covariance (3, 3) [rad²/s²] of a worn sensor's half-second means by sway.
 
-    Of fewer than two seconds, in which half a sway is a steady turn, nothing can be told: it is `SWAY_RATE_STD`.
+    It is the `measured` one with `SWAY_RATE_STD` as a prior of `PRIOR_BLOCKS` blocks, or without the prior where the
+    means vary like white noise. A phase of less than two seconds gives no estimate (half a sway looks like a steady
+    rotation): the result is `SWAY_RATE_STD`.
     """
     if measured is None:
         return SWAY_RATE_STD**2 * np.eye(3)
@@ -119,16 +120,16 @@ def _sway_cov(gyro_S: np.ndarray, rate_hz: float, measured: np.ndarray | None) -
     return (prior * SWAY_RATE_STD**2 * np.eye(3) + degrees * measured) / (prior + degrees)
 
 
-def _cov_of_mean(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray:
-    """Covariance of the mean from the means of blocks: white noise averages out in them, sway stays and is counted."""
-    of_blocks = _cov_of_half_seconds(gyro_S, rate_hz)
-    if of_blocks is None:  # too short to see sway: the white part is all that can be said
-        return _floored(np.cov(gyro_S.T) / len(gyro_S), BIAS_FLOOR)
-    return _floored(of_blocks / (len(gyro_S) // max(1, round(BLOCK_S * rate_hz))), BIAS_FLOOR)
+def _compute_mean_cov(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Compute the covariance of the mean from the means of blocks, which average white noise out and keep sway."""
+    blocks_cov = _compute_half_second_cov(gyro_S, rate_hz)
+    if blocks_cov is None:  # too short for sway: the white part alone
+        return _apply_floor(np.cov(gyro_S.T) / len(gyro_S), BIAS_FLOOR)
+    return _apply_floor(blocks_cov / (len(gyro_S) // max(1, round(BLOCK_S * rate_hz))), BIAS_FLOOR)
 
 
-def _cov_of_half_seconds(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray | None:
-    """Covariance of the means of blocks; None where there are fewer than four."""
+def _compute_half_second_cov(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray | None:
+    """Compute the covariance of the means of blocks; None with fewer than four blocks."""
     size = max(1, round(BLOCK_S * rate_hz))
     blocks = len(gyro_S) // size
     if blocks < 4:
@@ -136,23 +137,23 @@ def _cov_of_half_seconds(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray | Non
     return np.cov(gyro_S[: blocks * size].reshape(blocks, size, 3).mean(axis=1).T)
 
 
-def _floored(cov: np.ndarray, std: float) -> np.ndarray:
+def _apply_floor(cov: np.ndarray, std: float) -> np.ndarray:
     return cov if np.linalg.eigvalsh(cov)[0] >= std**2 else cov + std**2 * np.eye(3)
 
 
 def find_static_window(recording: Recording) -> tuple[float, float]:
-    """Interval [s] of `QUIET_S` within the first `BEGINNING_S` in which all sensors measure and together move least.
+    """Find the interval [s] of `WINDOW_S` in the first `BEGINNING_S` in which all sensors measure and move least.
 
-    A steady rotation about the vertical varies nothing: what all sensors have of it in common counts as motion.
+    A steady rotation about the vertical has no variance: the mean rate that all sensors share counts as motion.
 
     Raises
     ------
     BadPhase
-        In each of them a sensor was lost.
+        Every window has a lost sensor.
     """
     time, rate_hz = recording.time, recording.rate_hz
     n = int(np.searchsorted(time, time[0] + BEGINNING_S, side="right"))
-    window = min(max(round(QUIET_S * rate_hz), 10), n)
+    window = min(max(round(WINDOW_S * rate_hz), 10), n)
     stride = max(1, window // 40)  # the windows need not begin at every sample
     motion = np.zeros(len(range(0, n - window + 1, stride)))
     vertical_rate = np.zeros((0, len(motion)))
@@ -170,14 +171,14 @@ def find_static_window(recording: Recording) -> tuple[float, float]:
             up = np.lib.stride_tricks.sliding_window_view(sensor.accel_S[:n], window, axis=0)[::stride].mean(axis=-1)
             rate = np.einsum("ni,ni->n", windows.mean(axis=-1), up) / np.linalg.norm(up, axis=1)
             vertical_rate = np.vstack([vertical_rate, rate])
-        if sensor.gap is not None:  # what was bridged is quieter than any person
+        if sensor.gap is not None:  # a bridge has no motion
             motion[np.lib.stride_tricks.sliding_window_view(sensor.gap[:n], window)[::stride].any(axis=-1)] = np.inf
     if len(vertical_rate):
         motion += len(vertical_rate) * vertical_rate.mean(axis=0) ** 2
     if not np.isfinite(motion).any():
         lost = [name for name, sensor in recording.sensors.items() if sensor.gap is not None and sensor.gap[:n].any()]
         raise BadPhase(
-            f"{recording.where()}: no {QUIET_S:g} s in the first {BEGINNING_S:g} s in which all sensors measure: "
+            f"{recording.where()}: no {WINDOW_S:g} s in the first {BEGINNING_S:g} s in which all sensors measure: "
             f"{', '.join(f'sensors.{name}' for name in lost)} are lost there; take them out, or name the start pose, "
             f"[phases] start = [[from, to]]"
         )

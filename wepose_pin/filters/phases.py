@@ -1,4 +1,4 @@
-"""The intervals that filters and headings start from, and whether the person keeps still in them."""
+"""The intervals from which filters and headings start, and checks that the person is static in them."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ from ..errors import BadPhase
 from ..recording import OrientationSensor, Recording, format_span, format_time
 from .noise import SensorNoise, find_static_window
 
-# Turning in the start pose: root mean square of the rate, and largest turn from its mean. A person who stands sways
-# below 3 deg/s and 3 deg; at the limits the mean pose is no longer the pose that was meant.
+# Motion in the start pose: root mean square of the rate, and largest rotation from the mean. A standing person sways
+# below 3 deg/s and 3 deg. Above `MOVES` the mean pose is not the start pose; above `SWAYS` it is a warning.
 MOVES_DEG_S, MOVES_DEG = 20.0, 15.0
 SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
-# Sensors that all turn about the vertical at the same rate are on a person who turns: rates [rad/s] above the first, by
-# chance once in a thousand times. Of one or two sensors, a rate above what data sheets give for a bias.
+# All sensors rotate about the vertical at one rate when the person rotates: a mean rate [rad/s] above `COMMON_RATE`
+# with a probability by chance below `COMMON_RATE_CHANCE`. With one or two sensors the limit is above any bias in data
+# sheets.
 COMMON_RATE, COMMON_RATE_CHANCE = float(np.deg2rad(0.5)), 1e-3
 LARGEST_BIAS = float(np.deg2rad(5.0))
 
 
-# Samples of a phase at rest, and the share of them that each sensor must have measured.
+# Samples of a static phase, and the share of them that each sensor must have measured.
 FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 
 
 def find_reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[Diagnostic]]:
-    """The start pose's interval [s], that of noise and bias, and the recording's diagnostics with those of both."""
+    """Find the intervals [s] of the start pose and of noise and bias; with the recording's diagnostics and theirs."""
     diagnostics = list(recording.diagnostics)
     if recording.phases.get("start"):
         start = recording.phases["start"][0]
         if len(recording.phases["start"]) > 1:
-            diagnostics.append(_ignored_intervals("start", start))
+            diagnostics.append(_report_ignored_intervals("start", start))
         if recording.start_is_guessed:
             diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
     elif recording.phases.get("static"):
@@ -45,10 +46,10 @@ def find_reference_phases(recording: Recording) -> tuple[tuple[float, float], tu
     else:
         start = find_static_window(recording)
         diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
-    still = recording.phases.get("static", ())
-    if len(still) > 1:
-        diagnostics.append(_ignored_intervals("static", still[0]))
-    for name, interval in (("start", start), *(("static", span) for span in still[:1])):
+    static = recording.phases.get("static", ())
+    if len(static) > 1:
+        diagnostics.append(_report_ignored_intervals("static", static[0]))
+    for name, interval in (("start", start), *(("static", span) for span in static[:1])):
         place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
         if samples < FEWEST_AT_START:
@@ -57,23 +58,28 @@ def find_reference_phases(recording: Recording) -> tuple[tuple[float, float], tu
             measured = len(recording.find_measured(segment, interval))
             if measured < max(FEWEST_AT_START, LEAST_SHARE_AT_START * samples):
                 raise BadPhase(
-                    f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: nothing "
-                    f"there says how it sits; name seconds in which it measures, or take [sensors.{segment}] out"
+                    f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: its tilt "
+                    f"is not known; name seconds in which it measures, or take [sensors.{segment}] out"
                 )
-    return start, still[0] if still else start, diagnostics
+    return start, static[0] if static else start, diagnostics
 
 
-def _ignored_intervals(phase: str, first: tuple[float, float]) -> Diagnostic:
+def _report_ignored_intervals(phase: str, first: tuple[float, float]) -> Diagnostic:
     return Diagnostic("phase-intervals-ignored", WARNING, phase, facts={"start": first[0], "end": first[1]})
 
 
 def check_common_rotation(
     recording: Recording, noises: dict[str, SensorNoise], interval: tuple[float, float]
 ) -> list[Diagnostic]:
-    """A warning if the person turns in a phase, whose mean rate is the gyroscopes' bias then; an error if by much.
+    """Check that the person does not rotate in a phase: the mean rate there is taken for the gyroscopes' biases.
 
-    The biases of several sensors about the vertical are as different as sensors are; the same rate in all is the
-    person's (one-sample t-test). What it may be stays in the biases' covariance, in place.
+    Biases about the vertical differ from sensor to sensor; a common rate is the person's (one-sample t-test). A slow
+    rotation gives a warning and is added to the biases' covariance in `noises`.
+
+    Raises
+    ------
+    BadPhase
+        The person rotates by more than `MOVES_DEG`.
     """
     up_S = {}
     for segment in noises:
@@ -105,9 +111,14 @@ def check_common_rotation(
 
 
 def check_motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[Diagnostic]:
-    """A warning if the sensor sways in the phase, an error if it moves.
+    """Check that a sensor is static in a phase; sway gives a warning.
 
-    The turn is taken without the mean rate, in which the gyroscope's bias cannot be told from a steady turn.
+    The rotation excludes the mean rate, in which the gyroscope's bias and a steady rotation cannot be separated.
+
+    Raises
+    ------
+    BadPhase
+        The sensor moves.
     """
     sensor, measured = recording.sensors[segment], recording.find_measured(segment, interval)
     if isinstance(sensor, OrientationSensor):
@@ -123,7 +134,7 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
     if rms > MOVES_DEG_S or turn > MOVES_DEG:
         raise BadPhase(
             f"{recording.where()}: sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} "
-            f"({format_span(interval)}); name seconds in which it keeps still, up to {MOVES_DEG_S:g} deg/s and "
+            f"({format_span(interval)}); name seconds in which it is static, up to {MOVES_DEG_S:g} deg/s and "
             f"{MOVES_DEG:g} deg"
         )
     if rms > SWAYS_DEG_S or turn > SWAYS_DEG:

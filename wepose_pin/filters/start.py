@@ -1,4 +1,4 @@
-"""Where a filter starts: the tilt of the start phase, forward from its first sample and backward before it."""
+"""Start of a filter: the tilt in the start phase, from which it runs forward, and backward over earlier samples."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .. import rotations
 from ..errors import BadData
 from .noise import BLOCK_S, SensorNoise
 
-ACCEL_BIAS_STD = 0.003  # [rad] tilt error that a calibrated MEMS accelerometer's bias makes (3 mg: our assumption)
+ACCEL_BIAS_STD = 0.003  # [rad] tilt error from the bias of a calibrated MEMS accelerometer (3 mg: our assumption)
 MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
 
 
@@ -23,10 +23,10 @@ class StartTilt(NamedTuple):
 
 
 def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise, rate_hz: float) -> StartTilt:
-    """Tilt before the first of some samples at rest, from their mean specific force.
+    """Estimate the tilt before the first of some static samples from their mean specific force.
 
-    The gyroscope turns each sample's force into the sensor frame of the first, so that sway does not blur the mean.
-    Samples that are no numbers are left out.
+    The gyroscope rotates each sample's force into the sensor frame of the first, so that sway does not blur the mean.
+    NaN samples are left out.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNo
     Raises
     ------
     BadData
-        No gravity in them.
+        The samples have no gravity.
     """
     rate = np.where(np.isfinite(gyro_S), gyro_S - noise.gyro_bias, 0.0)
     force = Rotation.from_quat(rotations.integrate(rate / rate_hz)[1:]).apply(np.nan_to_num(accel_S))
@@ -50,6 +50,6 @@ def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNo
     if blocks >= 4:
         means = across[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
         variance = float(means.var(axis=0, ddof=1).sum()) / 2.0 / blocks
-    else:  # too short to see how sway averages out: as if it did not
+    else:  # too short for sway to average out
         variance = float(across.var(axis=0).sum()) / 2.0
     return StartTilt(rotations.quat_from_gravity(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm)))

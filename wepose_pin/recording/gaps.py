@@ -1,8 +1,8 @@
-"""Lost samples: which are bridged in silence, which are marked, and what stands in their place.
+"""Lost samples: short gaps are bridged silently, long gaps are bridged and marked.
 
-A sample is lost where its row is not there (a step in time) or its cells are empty. Up to `clocks.LONGEST_GAP_S` of
-lost samples are bridged: the rate and the specific force linearly, measured orientations along the shortest rotation.
-What is longer is an error, or is bridged and marked where the user allows it.
+A sample is lost when its row is missing (a long step in time) or its cells are empty. Gaps of up to
+`clocks.LONGEST_GAP_S` are bridged: rate and specific force linearly, measured orientations along the shortest rotation.
+A longer gap is an error, or is bridged and marked where the user allows it.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from .clocks import Clock
 
-# In a long gap the rate falls to the static sensor's rate within this time [s]: a person's motion goes on no longer.
+# In a long gap the rate fades to the static sensor's rate within this time [s]: a movement lasts no longer.
 FADE_S = 0.1
 
 GOOD, BRIDGED, LONG = 0, 1, 2
 
 
 def mark_lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
-    """`GOOD`, `BRIDGED` or `LONG` for every sample (n,), of the runs that are not `good` (n,)."""
+    """Mark every sample (n,) as `GOOD`, `BRIDGED` or `LONG`, by the length of the runs that are not `good` (n,)."""
     marks = np.zeros(len(good), dtype=np.int8)
     for first, last in find_runs(~good):
         marks[first:last] = LONG if (last - first) * clock.step > clock.longest_bridge else BRIDGED
@@ -27,17 +27,16 @@ def mark_lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
 
 
 def find_runs(which: np.ndarray) -> list[tuple[int, int]]:
-    """First and one past the last index of each run of true values."""
+    """Find the runs of true values; returns the first and one past the last index of each."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = False) -> np.ndarray:
-    """`values` (n, k) with lost samples filled linearly in time; before the first and after the last they stay.
+    """Fill lost samples of `values` (n, k) linearly in time; at the ends with the nearest value.
 
-    Where all are lost, as in a piece of a recording, they are zero.
-
-    With `rate` these are angular rates, which in long gaps fall to the rate of a static sensor: the bias.
+    Where all samples are lost, as in a chunk of a recording, they are zero. With `rate` the values are angular rates,
+    which in long gaps fade to the rate of the static sensor, its bias.
     """
     lost = marks != GOOD
     if not lost.any():
@@ -48,7 +47,7 @@ def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = 
     for k in range(values.shape[1]):
         filled[lost, k] = np.interp(time[lost], time[~lost], values[~lost, k])
     if rate and (marks == LONG).any():
-        static = _static_rate(values, ~lost, clock)
+        static = _estimate_static_rate(values, ~lost, clock)
         for first, last in find_runs(marks == LONG):
             edges = [edge for edge in (first - 1, last) if 0 <= edge < len(time)]
             near = [np.clip(1.0 - np.abs(time[first:last] - time[edge]) / FADE_S, 0.0, None) for edge in edges]
@@ -66,9 +65,10 @@ def bridge_quat(
     before: tuple[float, np.ndarray] | None = None,
     after: tuple[float, np.ndarray] | None = None,
 ) -> np.ndarray:
-    """Unit quaternions (n, 4) with lost ones filled along the shortest rotation.
+    """Fill lost unit quaternions of `quat` (n, 4) along the shortest rotation.
 
-    `before` and `after` are the time [s] and the quaternion (4,) last and next measured beyond a piece of a recording.
+    `before` and `after` are the time [s] and quaternion (4,) of the last measurement before a chunk and the next one
+    after it.
     """
     filled = quat.copy()
     for first, last in find_runs(marks != GOOD):
@@ -85,8 +85,8 @@ def bridge_quat(
     return filled
 
 
-def _static_rate(gyro_S: np.ndarray, good: np.ndarray, clock: Clock) -> np.ndarray:
-    """Mean rate (3,) of the second in which it varies least; zero where no second is whole."""
+def _estimate_static_rate(gyro_S: np.ndarray, good: np.ndarray, clock: Clock) -> np.ndarray:
+    """Estimate the static sensor's rate (3,): the mean of the complete second with least variance; zero without one."""
     size = max(2, round(1.0 / clock.step))
     blocks = len(gyro_S) // size
     whole = good[: blocks * size].reshape(blocks, size).all(axis=1)

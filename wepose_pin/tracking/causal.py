@@ -277,9 +277,8 @@ class SegmentFollower:
         As `alignment.compute_segment_covariance`; after a reset the heading's error is that of the pose, plus drift.
         """
         R_WS = Rotation.from_rotvec([0.0, 0.0, self.heading[i]]) * Rotation.from_quat(quat_VS)
-        of = self.start.orientation[self.names[i]]._replace(attitude_cov=attitude_cov)
         mount = Rotation.from_quat(self._mount[i])
-        cov = compute_segment_covariance(self._so_far, self.names[i], self._subject, R_WS, mount, of)
+        cov = compute_segment_covariance(self._so_far, self.names[i], self._subject, R_WS, mount, attitude_cov)
         if self._var_at_reset is not None:
             var = compute_heading_variance(quat_VS, attitude_cov)
             grown = np.maximum(0.0, var - self._var_at_reset[i])
