@@ -1,4 +1,4 @@
-"""Noise and bias of a static phase, and the find_static_window window."""
+"""Noise and bias of a static phase, and the most static window."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What readers of devices' own files share: a table in SI with a clock, and text with lines before its table."""
+"""Common parts of the readers of device files: a table in SI with a clock, and text with lines before its table."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..errors import BadData, MissingFile
 from ..recording.limits import LARGEST_NUMBER
 from .tables import NO_VALUE, read_columns
 
-# A table begins within this many lines of a file; what comes before it is about the device.
+# A table begins within this many lines of a file; the lines before it describe the device.
 PREAMBLE_LINES = 100
 SEPARATORS = "\t,; "
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
@@ -22,19 +22,19 @@ AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 
 @dataclass(frozen=True)
 class Device:
-    """What a device wrote, in SI.
+    """The contents of a device's file, in SI.
 
     Parameters
     ----------
     format : its name, a key of `wepose_pin.readers.formats.FORMATS`
     table : `time` [s] on the device's clock, and the columns of `name_columns`
-    labels : the file's name of each sensor or segment → our segment, None where the name does not say
+    labels : the file's name of each sensor or segment → our segment, None where the name is not clear
     kind : "raw" for gyro and accel, "orientation"
-    since_power_on : the clock counts from when the device was switched on, or another moment that says nothing
-    wraps_s : such a clock begins anew after so long [s]; None where it does not
+    since_power_on : the clock starts at power-on, or at another arbitrary moment
+    wraps_s : [s] after which such a clock wraps; None: it does not
     aligned : the orientations are the segments' own, in one world
     mounts : label → (4,) xyzw, sensor to segment, where the file states it
-    diagnostics : what was assumed, or is missing
+    diagnostics : assumptions, and missing data
     """
 
     format: str
@@ -48,44 +48,45 @@ class Device:
     diagnostics: tuple[Diagnostic, ...] = ()
 
     def signals(self, label: str) -> dict[str, list[str]]:
-        """Columns by signal."""
+        """Return signal → columns."""
         return {
             name: name_columns(label, name) for name in (("gyro", "accel") if self.kind == "raw" else ("orientation",))
         }
 
 
 def name_columns(label: str, signal: str) -> list[str]:
+    """Name the columns of a sensor's signal, one an axis."""
     return [f"{label} {signal} {axis}" for axis in AXES[signal]]
 
 
 def make_table(time: np.ndarray, values: Mapping[str, Mapping[str, np.ndarray]]) -> pl.DataFrame:
-    """The table of `Device` from times (n,) [s] and label → signal → (n, 3 or 4)."""
-    found = {"time": time}
+    """Make the table of a `Device` from times (n,) [s] and label → signal → (n, 3 or 4)."""
+    columns = {"time": time}
     for label, signals in values.items():
         for signal, array in signals.items():
-            found |= dict(zip(name_columns(label, signal), array.T, strict=True))
-    return pl.DataFrame(found)
+            columns |= dict(zip(name_columns(label, signal), array.T, strict=True))
+    return pl.DataFrame(columns)
 
 
 def check_measured(path: Path, values: np.ndarray, what: str) -> None:
     """Raise an error on numbers (n, k) beyond `LARGEST_NUMBER`."""
-    huge = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
-    if huge.size:
-        found = np.nanmax(np.abs(values[huge[0]]))
-        raise BadData(f"{path}: {what} holds {found:.3g} in row {huge[0] + 1}; no device measures as much")
+    too_large = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
+    if too_large.size:
+        largest = np.nanmax(np.abs(values[too_large[0]]))
+        raise BadData(f"{path}: {what} holds {largest:.3g} in row {too_large[0] + 1}; no device measures as much")
 
 
 def read_first_lines(path: Path, most: int = PREAMBLE_LINES) -> list[str]:
-    """The first lines of a text file, as text whatever the bytes.
+    """Read the first lines of a text file; bytes that are not UTF-8 are replaced.
 
     Raises
     ------
     MissingFile
-        Not there, or not readable.
+        The file is missing or not readable.
     """
     try:
         with path.open("rb") as file:
-            # A line that never ends is no line of text.
+            # The limit bounds the memory for a file without line ends.
             return [file.readline(2**16).decode("utf-8-sig", errors="replace").rstrip("\r\n") for _ in range(most)]
     except FileNotFoundError:
         raise MissingFile(f"{path}: no such file") from None
@@ -100,34 +101,34 @@ class Text:
     Parameters
     ----------
     path : the file
-    about : what stands before the table, `name: value` of each line that has that form
-    cells : the table, without a last line that was cut off
+    about : name → value of the lines `name: value` before the table
+    cells : the table, without an incomplete last line
     """
 
     path: Path
     about: Mapping[str, str]
     cells: pl.DataFrame
 
-    def __contains__(self, wanted: Sequence[str]) -> bool:
-        return all(name in self.cells.columns and self.cells[name].is_not_null().any() for name in wanted)
+    def __contains__(self, names: Sequence[str]) -> bool:
+        return all(name in self.cells.columns and self.cells[name].is_not_null().any() for name in names)
 
-    def numbers(self, wanted: Sequence[str]) -> np.ndarray:
-        """Columns (n, k); empty cells are NaN."""
-        values = read_columns(self.cells, wanted, str(self.path), str(self.path))
-        check_measured(self.path, values, ", ".join(wanted))
+    def numbers(self, names: Sequence[str]) -> np.ndarray:
+        """Return columns (n, k); empty cells are NaN."""
+        values = read_columns(self.cells, names, str(self.path), str(self.path))
+        check_measured(self.path, values, ", ".join(names))
         return values
 
 
 def read_text(path: Path, first: str, what: str) -> Text:
-    """The table whose line of names holds the column `first`, separated by tabs, commas, semicolons or single spaces.
+    """Read the table whose header has the column `first`, separated by tabs, commas, semicolons or single spaces.
 
     Raises
     ------
     MissingFile, BadData
-        Not there; no such line in it; no line of numbers after it.
+        The file is missing, or has no such header, or no line of numbers after it.
     """
     lines = read_first_lines(path)
-    head, separator = _line_of_names(lines, first)
+    head, separator = _find_header(lines, first)
     if head is None:
         raise BadData(f"{path}: no line of names with '{first}' in its first {PREAMBLE_LINES} lines; {what} has one")
     about = {}
@@ -141,30 +142,30 @@ def read_text(path: Path, first: str, what: str) -> Text:
         rest = file.read()
     rest = rest.removeprefix(b"\xef\xbb\xbf")
     header, _, body = rest.partition(b"\n")
-    wanted = [cell.strip(' "\r') for cell in header.decode("utf-8", errors="replace").split(separator)]
-    while wanted and not wanted[-1]:
-        wanted.pop()
-    return Text(path, about, parse_rows(path, body, wanted, separator, head + 1, what))
+    names = [cell.strip(' "\r') for cell in header.decode("utf-8", errors="replace").split(separator)]
+    while names and not names[-1]:
+        names.pop()
+    return Text(path, about, parse_rows(path, body, names, separator, head + 1, what))
 
 
 def parse_rows(
-    path: Path, body: bytes, wanted: Sequence[str], separator: str, names_line: int, what: str
+    path: Path, body: bytes, names: Sequence[str], separator: str, names_line: int, what: str
 ) -> pl.DataFrame:
-    """The rows after the line of names, number `names_line` of the file: all cells text, null where there is no value.
+    """Parse the rows after the header in line `names_line` of the file: cells are text, null without a value.
 
     Raises
     ------
     BadData
         Two columns of one name; zero bytes; no rows.
     """
-    if len(set(wanted)) < len([name for name in wanted if name]) or b"\0" in body:
-        why = "zero bytes in it" if b"\0" in body else "two columns of one name"
-        raise BadData(f"{path}: is no {what}: there are {why}")
+    if len(set(names)) < len([name for name in names if name]) or b"\0" in body:
+        reason = "zero bytes in it" if b"\0" in body else "two columns of one name"
+        raise BadData(f"{path}: is no {what}: there are {reason}")
     if not body.strip():
         raise BadData(
             f"{path}: has no line of numbers after its names in line {names_line}; the export is empty or cut off"
         )
-    schema = {name or f"column {k}": pl.String for k, name in enumerate(wanted)}
+    schema = {name or f"column {k}": pl.String for k, name in enumerate(names)}
     try:
         cells = pl.read_csv(
             body,
@@ -184,11 +185,12 @@ def parse_rows(
     filled = cells.select(pl.any_horizontal(pl.all().is_not_null()))[:, 0]
     cells = cells.filter(filled)
     if cells.height and not body.endswith(b"\n") and cells[-1, cells.width - 1] is None:
-        cells = cells.head(-1)  # the writer was stopped within its last line
+        cells = cells.head(-1)  # the last line is incomplete
     return cells
 
 
-def _line_of_names(lines: Sequence[str], first: str) -> tuple[int | None, str]:
+def _find_header(lines: Sequence[str], first: str) -> tuple[int | None, str]:
+    """Find the line of column names that has `first`, and its separator."""
     for k, line in enumerate(lines):
         if line.startswith("//"):
             continue
@@ -199,18 +201,18 @@ def _line_of_names(lines: Sequence[str], first: str) -> tuple[int | None, str]:
 
 
 def compute_counted_time(counter: np.ndarray, rate_hz: float, wraps: float) -> tuple[np.ndarray, float]:
-    """Times (n,) [s] of packets that are counted, and after how long [s] the counter begins anew."""
+    """Compute times (n,) [s] from a packet counter, and the time [s] after which the counter wraps."""
     packets = unwrap_counter(counter, wraps)
     usual = max(1.0, float(np.median(np.diff(packets)))) if len(packets) > 1 else 1.0
     return packets / (usual * rate_hz), wraps / (usual * rate_hz)
 
 
 def unwrap_counter(counter: np.ndarray, wraps: float) -> np.ndarray:
-    """A counter (n,) that begins anew at `wraps`, going on instead; NaN stay."""
+    """Unwrap a counter (n,) that starts again at `wraps`; NaN stay."""
     filled = np.where(np.isfinite(counter), counter, 0.0)
     good = np.isfinite(counter)
     steps = np.diff(filled[good])
-    turns = np.cumsum(np.concatenate([[0], np.where(steps < -wraps / 2, 1, 0)]))
+    count = np.cumsum(np.concatenate([[0], np.where(steps < -wraps / 2, 1, 0)]))
     result = np.full(len(counter), np.nan)
-    result[good] = filled[good] + wraps * turns
+    result[good] = filled[good] + wraps * count
     return result

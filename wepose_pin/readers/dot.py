@@ -39,7 +39,7 @@ def read_dot(path: Path, use: str | None = None, rate_hz: float | None = None) -
         Not there; no DOT CSV; no time in it; not what `use` asks for.
     """
     text = read_text(path, "PacketCounter", "a CSV of a DOT")
-    time, wraps_s = _time(text, rate_hz)
+    time, wraps_s = _compute_time(text, rate_hz)
     increments = next((names for names in INCREMENTS if names in text), None)
     kind = "orientation" if use == "orientation" or (RAW not in text and increments is None) else "raw"
     if use == "raw" and kind != "raw":
@@ -49,13 +49,12 @@ def read_dot(path: Path, use: str | None = None, rate_hz: float | None = None) -
         )
     if kind == "orientation":
         values = {"orientation": read_orientation(text)}
-    elif RAW in text:
+    elif RAW not in text and increments is not None:
+        values = _compute_rates(text.numbers(increments), _find_usual_step(text, time))
+    else:
         numbers = text.numbers(RAW)
         values = {"accel": numbers[:, :3], "gyro": np.deg2rad(numbers[:, 3:])}
-    else:
-        assert increments is not None
-        values = _rates(text.numbers(increments), _usual_step(text, time))
-    # Nobody sets a clock by sensors that were not: each has run since it was switched on.
+    # Clocks of devices that were not synchronized start at power-on.
     status = text.about.get("SyncStatus", "synced").lower()
     unsynced = Diagnostic("device-not-synchronized", WARNING, path.name)
     diagnostics = () if status.startswith("synced") else (unsynced,)
@@ -65,8 +64,8 @@ def read_dot(path: Path, use: str | None = None, rate_hz: float | None = None) -
     return Device("dot", table, labels, kind, since_power_on=True, wraps_s=wraps_s, diagnostics=diagnostics)
 
 
-def _rates(increments: np.ndarray, step: float) -> dict[str, np.ndarray]:
-    """Mean rate and mean specific force over each sample of `step` [s], from dq (w x y z) and dv."""
+def _compute_rates(increments: np.ndarray, step: float) -> dict[str, np.ndarray]:
+    """Compute mean rate and mean specific force over each sample of `step` [s], from dq (w x y z) and dv."""
     turn = np.full((len(increments), 3), np.nan)
     good = np.isfinite(increments[:, :4]).all(axis=1) & (np.linalg.norm(increments[:, :4], axis=1) > 0.5)
     if good.any():
@@ -74,16 +73,16 @@ def _rates(increments: np.ndarray, step: float) -> dict[str, np.ndarray]:
     return {"gyro": turn / step, "accel": increments[:, 4:] / step}
 
 
-def _usual_step(text: Text, time: np.ndarray) -> float:
+def _find_usual_step(text: Text, time: np.ndarray) -> float:
     steps = np.diff(time)
     step = float(np.median(steps[np.isfinite(steps)])) if np.isfinite(steps).any() else 0.0
     if not step > 0.0:
-        raise BadData(f"{text.path}: its time does not grow from row to row, so that dq and dv tell no rate")
+        raise BadData(f"{text.path}: its time does not grow from row to row, so that dq and dv give no rate")
     return step
 
 
-def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
-    """Times (n,) [s] on the device's clock, and after how long it begins anew."""
+def _compute_time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
+    """Compute times (n,) [s] on the device's clock, and the time [s] after which its counter wraps."""
     if ["SampleTimeFine"] in text and rate_hz is None:
         time = FINE_S * unwrap_counter(text.numbers(["SampleTimeFine"])[:, 0], WRAPS)
         return time, FINE_S * WRAPS
@@ -91,7 +90,7 @@ def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
     rate = rate_hz or (float(number[0]) if number else 0.0)
     if rate <= 0.0:
         raise BadData(
-            f"{text.path}: no SampleTimeFine and no OutputRate to tell the time by; state the output rate as rate_hz "
-            f"in [data], or export one of the two"
+            f"{text.path}: no SampleTimeFine and no OutputRate, so that times are not known; state the output rate as "
+            f"rate_hz in [data], or export one of the two"
         )
     return compute_counted_time(text.numbers(["PacketCounter"])[:, 0], rate, WRAPS)[0], None

@@ -1,4 +1,4 @@
-"""The files of devices and other programs that are read as they are, and how one is told from another."""
+"""The formats of devices and other programs, and their detection."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ USES = ("raw", "orientation")
 
 
 def detect_format(path: Path) -> str | None:
-    """The key of `FORMATS` for a file or folder, by its ending and its first lines; None if it is none of these.
+    """Detect the format of a file or folder, a key of `FORMATS`, from its suffix and first lines; None: none of them.
 
     Raises
     ------
     MissingFile
-        Not there, or not readable.
+        The file is not readable.
     """
     if path.is_dir():
         return "ximu3" if any((path / name).is_file() for name in (INERTIAL, QUATERNION)) else None
@@ -71,17 +71,19 @@ def detect_format(path: Path) -> str | None:
         return "dot"
     if start.startswith("//") or any(name in start for name in ("Quat_q0", "Mat[1][1]")):
         return "mt_manager"
-    # Rates without a word on their maker could be in deg/s (DOT) or rad/s (MT Manager): data.format must say.
+    # Rates without another hint could be in deg/s (DOT) or rad/s (MT Manager): data.format must be stated.
     return "dot" if any(name in start for name in ("dq_W", "Quat_W", "FreeAcc_X")) and suffix == ".csv" else None
 
 
 def read_device(path: Path, format: str, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """The file read as `format`; `use` "raw" or "orientation" where it holds both, `rate_hz` in place of its own clock.
+    """Read a file of this format.
+
+    `use` selects "raw" or "orientation" of a file with both; `rate_hz` replaces its own clock.
 
     Raises
     ------
     MissingFile, BadData
-        Not there; damaged, or not of this format.
+        The file is missing, damaged, or of another format.
     """
     if not path.exists():
         raise MissingFile(f"{path}: no such file or folder; a {TITLES[format]} is wanted here")

@@ -1,4 +1,4 @@
-"""The session file: what the user writes about a recording (TOML), and the files that it names."""
+"""The session file, in which the user describes a recording (TOML), and the data files that it names."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ from .tables import Rows, read_column, read_columns, read_table
 
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "g": STANDARD_GRAVITY}
-# How far a quaternion's norm may be off 1: decimals that were cut.
-NORM_OFF = 1e-2
+# Allowed error of a quaternion's norm, from rounded decimals.
+NORM_ERROR = 1e-2
 SI = {"gyro": 1.0, "accel": 1.0}
-# Keys of [data] that a session need not have; one that no sensor has a use for is an error.
+# Optional keys of [data]; a key that no sensor uses is an error.
 _FOR_SENSORS = ("file", "time", "time_unit", "rate_hz", "gyro_unit", "accel_unit", "format", "use")
 _NO_ROW = 2**31 - 1
-_BEGINNING_S = 20.0  # [s] of a recording in which somebody stands still for a second
+_BEGINNING_S = 20.0  # [s] a person is static for a second in a beginning of this length
 
 
 def load_session(path: str | Path, gaps: bool = False) -> Recording:
@@ -66,42 +66,42 @@ def load_session(path: str | Path, gaps: bool = False) -> Recording:
     Parameters
     ----------
     path : the session file, or its folder
-    gaps : accept lost samples for longer than 50 ms: they are bridged, and marked in the sensor's `gap`
+    gaps : accept gaps longer than 50 ms: they are bridged, and marked in the sensor's `gap`
 
     Raises
     ------
     WeposeError
-        With one line that names the file, the key or column, the value found and what would be right.
+        One line that names the file, the key or column, its value and what would be right.
     """
     reader = SessionReader(path, gaps=gaps)
     return reader.recording(0, len(reader.time))
 
 
 def iter_session(path: str | Path, seconds: float = 600.0) -> Iterator[Recording]:
-    """A session in pieces of `seconds`, for recordings that do not fit in memory: only its times are held as a whole.
+    """Iterate over a session in chunks of `seconds`, for recordings larger than memory; only the times are in memory.
 
-    Put together, the pieces are what `load_session` gives: to the bit, or to rounding where clocks differ and it is
-    resampled. A piece has the phases that touch it. Units are checked by the first.
+    The joined chunks are bit-identical to the result of `load_session`, or equal to rounding where different clocks are
+    resampled. A chunk has the phases that overlap it. The first chunk alone checks units.
 
     Raises
     ------
     WeposeError
-        As `load_session`, at the piece that it comes from.
+        As `load_session`, at the chunk with the error.
     """
     if not is_number(seconds) or seconds <= 0.0:
-        raise BadOption(f"seconds={seconds!r}: the length of a piece, above 0, is needed")
+        raise BadOption(f"seconds={seconds!r}: the length of a chunk, above 0, is needed")
     reader = SessionReader(path, in_memory=False)
     n = len(reader.time)
     size = max(2, round(seconds * reader.rate_hz))
     first = 0
     while first < n:
-        last = n if n - first < size + 2 else first + size  # no piece of a single sample at the end
+        last = n if n - first < size + 2 else first + size  # the last chunk has more than one sample
         yield reader.recording(first, last)
         first = last
 
 
 def estimate_data_bytes(path: str | Path) -> int:
-    """Size of the CSV and Parquet files that a session names; 0 where that cannot be told, as its reading will say."""
+    """Estimate the size [bytes] of the CSV and Parquet files of a session; 0 where reading it will raise an error."""
     try:
         path = Path(path)
         path = path / "session.toml" if path.is_dir() else path
@@ -116,11 +116,11 @@ def estimate_data_bytes(path: str | Path) -> int:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Where a sensor's values stand: columns by signal, its file, its own clock."""
+    """Source of a sensor's values: columns by signal, the file, the sensor's clock."""
 
     place: str
     path: Path
-    table: str  # which of the reader's tables
+    table: str  # key of the reader's table
     signals: Mapping[str, list[str]]
     units: Mapping[str, float]
     clock: Clock
@@ -129,19 +129,19 @@ class _Plan:
 
 
 class SessionReader:
-    """A session understood, with its clocks read and checked; `recording` then reads values.
+    """A reader of a session: it reads and checks keys and clocks at once, and values in `recording`.
 
     Parameters
     ----------
-    gaps : accept lost samples for longer than 50 ms
-    in_memory : hold CSV and Parquet as a whole; else they are read by rows, each `recording` after the one before
-    values : the session's contents, where they do not stand in the file yet
+    gaps : accept gaps longer than 50 ms
+    in_memory : load CSV and Parquet files whole; otherwise read them by rows, in the order of `recording` calls
+    values : the session's contents, where the file does not exist yet
 
     Attributes
     ----------
     time, rate_hz : the common time base (n,) [s], and its rate
-    phases, start_pose, remounted : as of the `Recording`, whole
-    any_aligned : whether a sensor's orientations are its segment's own
+    phases, start_pose, remounted : as in the whole `Recording`
+    any_aligned : whether the orientations of a sensor are its segment's own
     """
 
     def __init__(
@@ -158,9 +158,9 @@ class SessionReader:
         top = read_session_file(self.path) if values is None else check_session_keys(values, self.path)
         data, sensors = top.table("data"), top.table("sensors", {})
         data.allow(*_FOR_SENSORS, "truth")
-        self._used: set[str] = set()  # which of `_FOR_SENSORS` some sensor had a use for
+        self._used: set[str] = set()  # keys of `_FOR_SENSORS` that a sensor uses
         start_pose = top.choice("start_pose", (*START_POSES, CONFIGURATION), "n_pose")
-        # Of a chain sensors are named by links, of a model that is not known here.
+        # Sensors of a chain are named by links, and the chain's model is not known here.
         tables = sensors.tables(sensors.values if start_pose == CONFIGURATION else SEGMENTS, "segment")
         if not tables:
             raise BadSession(
@@ -180,8 +180,8 @@ class SessionReader:
         )
         stated = {segment: read_sensor_keys(table) for segment, table in tables.items()}
         self._units: Mapping[str, float] = SI
-        if any(said.signals is not None for said in stated.values()):
-            raw = any("gyro" in (said.signals or ()) for said in stated.values())
+        if any(sensor.signals for sensor in stated.values()):
+            raw = any("gyro" in sensor.signals for sensor in stated.values())
             self._units = {
                 signal: known[data.choice(key, known)] if raw or key in data else 1.0
                 for signal, key, known in (("gyro", "gyro_unit", GYRO_UNITS), ("accel", "accel_unit", ACCEL_UNITS))
@@ -193,14 +193,14 @@ class SessionReader:
         self._in_memory = in_memory
         self.devices: dict[Path, Device] = {}
         self._device_rates: dict[Path, float | None] = {}
-        for segment, said in stated.items():
-            if said.signals is None:
+        for segment, sensor in stated.items():
+            if not sensor.signals:
                 self._read_device(tables[segment], data)
-        self._on_one_clock()
-        self._plans = {segment: self._plan(tables[segment], data, said) for segment, said in stated.items()}
+        self._synchronize_devices()
+        self._plans = {segment: self._make_plan(tables[segment], data, sensor) for segment, sensor in stated.items()}
         unused = [key for key in _FOR_SENSORS if key in data and key not in self._used]
         if unused:
-            raise BadSession(f"{data.at(unused[0])}: {_useless(unused[0])}; leave it out")
+            raise BadSession(f"{data.at(unused[0])}: {_explain_unused(unused[0])}; leave it out")
         clocks = {segment: plan.clock for segment, plan in self._plans.items()}
         self.time, resampled = find_common_time(str(self.path), clocks)
         self._resampled = bool(resampled)
@@ -218,7 +218,7 @@ class SessionReader:
         self._scanned: Scan | None = None
 
     def _refuse_shared_columns(self) -> None:
-        """Two sensors that are read from the same columns are one."""
+        """Raise an error where two sensors have a column in common."""
         owner: dict[tuple[Path, str], str] = {}
         for segment, plan in self._plans.items():
             for signal, name in ((signal, name) for signal, names in plan.signals.items() for name in names):
@@ -229,7 +229,7 @@ class SessionReader:
                         f"of sensors.{other}; each sensor has columns of its own"
                     )
 
-    def _file(self, keys: TomlTable, data: TomlTable) -> Path:
+    def _find_file(self, keys: TomlTable, data: TomlTable) -> Path:
         file = (keys if "file" in keys else data).text("file", None)
         if file is None:
             raise BadSession(f"{data.at('file')} is missing; the .csv or .parquet file beside {self.path}")
@@ -238,37 +238,39 @@ class SessionReader:
         return self.path.parent / file
 
     def _read_device(self, keys: TomlTable, data: TomlTable) -> None:
-        """A file whose format says where its values stand."""
-        path = self._file(keys, data)
+        """Read a file of a known format, which defines its columns."""
+        path = self._find_file(keys, data)
         own = keys if "format" in keys else data
         format = own.choice("format", FORMATS) if "format" in own else detect_format(path) if path.exists() else None
         self._used |= {"format", "use"} if own is data else {"use"}
         if format is None:
             if not path.exists():
                 raise MissingFile(f"{path}: no such file or folder")
-            keys.names("gyro", 3)  # a table of which the session must say what it holds
+            keys.names("gyro", 3)  # an error: the session must name the columns of a table
         else:
             use = data.choice("use", USES) if "use" in data else None
-            # The rate of [data] is that of its file; where it names none, of all.
-            of_rate = keys if "rate_hz" in keys or ("file" in keys and "file" in data) else data
-            rate_hz = of_rate.number("rate_hz", None, positive=True)
-            if of_rate is data:
+            # The rate in [data] holds for the file in [data], or for all files where it names none.
+            rate_table = keys if "rate_hz" in keys or ("file" in keys and "file" in data) else data
+            rate_hz = rate_table.number("rate_hz", None, positive=True)
+            if rate_table is data:
                 self._used.add("rate_hz")
             for key in ("time", "time_unit"):
                 if key in keys:
-                    raise BadSession(f"{keys.at(key)}: {_useless(key)}; leave it out")
+                    raise BadSession(f"{keys.at(key)}: {_explain_unused(key)}; leave it out")
             if path in self.devices and rate_hz != self._device_rates[path]:
-                raise BadSession(f"{of_rate.at('rate_hz')}: {path.name} is read with another rate for another sensor")
+                raise BadSession(
+                    f"{rate_table.at('rate_hz')}: {path.name} is read with another rate for another sensor"
+                )
             if path not in self.devices:
                 self.devices[path] = read_device(path, format, use, rate_hz)
                 self._device_rates[path] = rate_hz
 
-    def _on_one_clock(self) -> None:
-        """Times of devices that count since they were switched on begin at zero, with the earliest of them."""
+    def _synchronize_devices(self) -> None:
+        """Shift the times of devices whose clocks start at power-on, so that the earliest one begins at zero."""
         running = {path: device for path, device in self.devices.items() if device.since_power_on}
         first = {path: float(np.nanmin(device.table["time"].to_numpy())) for path, device in running.items()}
         for path, device in running.items():
-            if device.wraps_s:  # the counter of one began anew before it started, the other's did not
+            if device.wraps_s:  # one device's counter wrapped before the recording, the other's did not
                 reference = next(iter(first.values()))
                 first[path] += device.wraps_s * round((reference - first[path]) / device.wraps_s)
         origin = min(first.values(), default=0.0)
@@ -279,10 +281,10 @@ class SessionReader:
                 table = table.with_columns(time=time - np.nanmin(time) + (first[path] - origin))
             self._tables[str(path)] = table
 
-    def _plan(self, keys: TomlTable, data: TomlTable, stated: SensorKeys) -> _Plan:
-        path, segment = self._file(keys, data), keys.place.removeprefix("sensors.")[:-1]
-        device = self.devices.get(path) if stated.signals is None else None
-        # A file of its own has a clock of its own beside that of [data], or where [data] names no file that of all.
+    def _make_plan(self, keys: TomlTable, data: TomlTable, stated: SensorKeys) -> _Plan:
+        path, segment = self._find_file(keys, data), keys.place.removeprefix("sensors.")[:-1]
+        device = None if stated.signals else self.devices[path]
+        # A sensor with its own file has its own clock, or that of [data] where [data] names no file.
         states = any(key in keys for key in ("time", "time_unit", "rate_hz"))
         own = keys if states or ("file" in keys and "file" in data) else data
         name, rate_hz = own.text("time", None), own.number("rate_hz", None, positive=True)
@@ -293,7 +295,7 @@ class SessionReader:
             if own is data:
                 self._used |= {"time", "rate_hz"} | ({"time_unit"} if name is not None else set())
             elif "time_unit" in keys and rate_hz is not None:
-                raise BadSession(f"{keys.at('time_unit')}: {_useless('time_unit')}; leave it out")
+                raise BadSession(f"{keys.at('time_unit')}: {_explain_unused('time_unit')}; leave it out")
         if (name is None) == (rate_hz is None):
             found = "neither" if name is None else "both"
             raise BadSession(
@@ -306,14 +308,13 @@ class SessionReader:
             label = choose_label(keys, device, segment, path)
             signals: Mapping[str, list[str]] = device.signals(label)
         else:
-            assert stated.signals is not None
             signals = stated.signals
             if is_array_file(path):
                 which = f"{path} {segment}"
-                self._tables[which], signals = self._arrays(keys, path, signals, name, own)
+                self._tables[which], signals = self._read_arrays(keys, path, signals, name, own)
             else:
-                for signal, named in signals.items():
-                    if len(named) == 1:  # one array, which a table of columns has not
+                for signal, names in signals.items():
+                    if len(names) == 1:  # an error: one array, but the file is a table of columns
                         keys.names(signal, WIDTHS[signal])
         if which not in self._tables:
             self._tables[which] = read_table(path) if self._in_memory else Rows(path)
@@ -332,7 +333,8 @@ class SessionReader:
                 before, after = lost[0][0] - 1, lost[0][1]
                 raise BadData(
                     f"{path}: rows are missing after row {clock.row[before] + 1}: time steps by "
-                    f"{clock.time[after] - clock.time[before]:.3f} s at {clock.time[before]:.3f} s; {_too_long(clock)}"
+                    f"{clock.time[after] - clock.time[before]:.3f} s at {clock.time[before]:.3f} s; "
+                    f"{_explain_gap_limit(clock)}"
                 )
         aligned = stated.aligned if stated.aligned is not None else device is not None and device.aligned
         if aligned and stated.mount is not None:
@@ -347,10 +349,10 @@ class SessionReader:
         mount = stated.mount if device is None or stated.mount is not None else device.mounts.get(label)
         return _Plan(place, path, which, signals, units, self._clocks[key], mount, aligned)
 
-    def _arrays(
+    def _read_arrays(
         self, keys: TomlTable, path: Path, signals: Mapping[str, list[str]], time: str | None, own: TomlTable
     ) -> tuple[pl.DataFrame, Mapping[str, list[str]]]:
-        """The columns of an HDF5 or MATLAB file that a sensor and its clock need, and their names by signal."""
+        """Read the columns of an HDF5 or MATLAB file that a sensor and its clock need; with their names by signal."""
         if path not in self._array_files:
             self._array_files[path] = ArrayFile(path)
         file = self._array_files[path]
@@ -364,7 +366,7 @@ class SessionReader:
         return file.table(wanted), named
 
     def _scan(self) -> Scan:
-        """What all rows say of the sensors, in a pass over them; once.
+        """Scan all rows of the sensors for faults, in one pass at the first call.
 
         Raises
         ------
@@ -375,7 +377,8 @@ class SessionReader:
             return self._scanned
         clocks = {id(plan.clock): plan.clock for plan in self._plans.values()}
         times = {
-            key: clock.time if clock.row[-1] == len(clock.row) - 1 else clock.time[clock.row >= 0]  # no copy of a day
+            # Without lost rows no copy is made.
+            key: clock.time if clock.row[-1] == len(clock.row) - 1 else clock.time[clock.row >= 0]
             for key, clock in clocks.items()
         }
         scan = Scan()
@@ -396,18 +399,18 @@ class SessionReader:
         return scan
 
     def recording(self, first: int, last: int) -> Recording:
-        """The recording from sample `first` of the common time to before `last`, checked."""
+        """Read and check the recording from sample `first` of the common time to before `last`."""
         scan = self._scan()
         time = self.time[first:last]
         windows = {segment: self._window(plan, first, last) for segment, plan in self._plans.items()}
         rows: dict[str, slice] = {}
         for segment, (low, high) in windows.items():
             plan = self._plans[segment]
-            there = plan.clock.row[low:high]
-            begin, end = int(there[there >= 0].min(initial=_NO_ROW)), int(there.max(initial=-1)) + 1
+            row = plan.clock.row[low:high]
+            begin, end = int(row[row >= 0].min(initial=_NO_ROW)), int(row.max(initial=-1)) + 1
             so_far = rows.get(plan.table, slice(begin, end))
             rows[plan.table] = slice(min(begin, so_far.start), max(end, so_far.stop))
-        tables = {which: self._tables[which][span] for which, span in rows.items()}
+        tables = {key: self._tables[key][span] for key, span in rows.items()}
 
         sensors: dict[str, Sensor] = {}
         bridged: list[Diagnostic] = []
@@ -419,26 +422,26 @@ class SessionReader:
                 sensors[segment] = sensor.part(slice(first - low, last - low))
                 marks = marks[first - low : last - low]
             else:
-                before = 1 if first else 0  # a rate needs the sample before it
+                before = 1 if first else 0  # the first rate needs the sample before it
                 sensor = resample(sensor, clock.time, self.time[first - before : last])
                 sensors[segment] = sensor.part(slice(before, last - first + before))
-            bridged += _bridged_gaps(segment, marks, clock.step)
+            bridged += _report_bridged_gaps(segment, marks, clock.step)
         whole = last - first == len(self.time)
         recording = replace(
             self._head,
             time=time,
             rate_hz=self.rate_hz,
             sensors=sensors,
-            phases=self._head.phases if whole else _within(self._head.phases, time),
+            phases=self._head.phases if whole else _cut_phases(self._head.phases, time),
             diagnostics=(*self._diagnostics, *scan.diagnostics(), *bridged),
         )
         check_recording(recording)
         begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
-        doubtful = check_signals(recording, whole=begins, units=first == 0)
-        return replace(recording, diagnostics=(*recording.diagnostics, *doubtful))
+        warnings = check_signals(recording, whole=begins, units=first == 0)
+        return replace(recording, diagnostics=(*recording.diagnostics, *warnings))
 
     def _window(self, plan: _Plan, first: int, last: int) -> tuple[int, int]:
-        """The samples on a sensor's own clock that the piece needs, neighbours for bridging and resampling included."""
+        """Find the samples on a sensor's clock that the chunk needs, with neighbours for bridging and resampling."""
         clock = plan.clock
         margin = int(np.ceil(clock.longest_bridge / clock.step)) + 2
         if self._resampled:
@@ -448,22 +451,20 @@ class SessionReader:
         return max(0, first - margin), min(len(clock.time), last + margin)
 
     def _sensor(self, plan: _Plan, clock: Clock, table: pl.DataFrame, first_row: int) -> tuple[Sensor, np.ndarray]:
-        """A stretch of a sensor on its own clock with its gaps bridged, and their marks."""
-        found = {
-            name: self._signal(plan, name, clock, table, first_row) for name in plan.signals
-        }  # (values, good) each
+        """Read a span of a sensor on its own clock and bridge its gaps; with the gaps' marks."""
+        signals = {name: self._read_signal(plan, name, clock, table, first_row) for name in plan.signals}
         marks = {}
         segment = plan.place.removeprefix("sensors.")
         faults = self._scan().faults.get(segment, [])
         frozen = np.zeros(len(clock.time), dtype=bool)
         for fault in faults:
             frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
-        for name, (_, good) in found.items():
+        for name, (_, good) in signals.items():
             place = f"{plan.path}: {plan.place}.{name}"
-            lost_a_while = self.gaps and len(clock.time) < len(plan.clock.time)
+            in_gap = self.gaps and len(clock.time) < len(plan.clock.time)
             if name == "orientation":
-                lost_a_while &= self._scan().orientations[segment].rows > 0
-            if not good.any() and not lost_a_while:
+                in_gap &= self._scan().orientations[segment].rows > 0
+            if not good.any() and not in_gap:
                 columns_ = ", ".join(plan.signals[name])
                 raise BadData(f"{place}: no numbers from {format_span(clock.time[[0, -1]])} in {columns_}")
             marks[name] = mark_lost_samples(clock, good)
@@ -471,84 +472,85 @@ class SessionReader:
                 first, last = find_runs(marks[name] == LONG)[0]
                 raise BadData(
                     f"{place}: {last - first} samples without numbers, {(last - first) * clock.step:.3f} s from "
-                    f"{clock.time[first]:.3f} s; {_too_long(clock)}"
+                    f"{clock.time[first]:.3f} s; {_explain_gap_limit(clock)}"
                 )
             if frozen.any():
                 marks[name] = mark_lost_samples(clock, good & ~frozen)
-        every = np.max(list(marks.values()), axis=0)
-        gap = every == LONG if self.gaps or faults else None
-        if "orientation" in found:
-            edges = self._scan().orientations[segment].around(clock, marks["orientation"])
-            quat = bridge_quat(found["orientation"][0], marks["orientation"], clock, *edges)
-            return OrientationSensor(quat, plan.mount, gap, plan.aligned), every
-        gyro_S = bridge(found["gyro"][0], marks["gyro"], clock, rate=True)
-        accel_S = bridge(found["accel"][0], marks["accel"], clock)
-        marked = np.where(frozen, GOOD, every)  # what is told as gaps
+        all_marks = np.max(list(marks.values()), axis=0)
+        gap = all_marks == LONG if self.gaps or faults else None
+        if "orientation" in signals:
+            edges = self._scan().orientations[segment].find_neighbours(clock, marks["orientation"])
+            quat = bridge_quat(signals["orientation"][0], marks["orientation"], clock, *edges)
+            return OrientationSensor(quat, plan.mount, gap, plan.aligned), all_marks
+        gyro_S = bridge(signals["gyro"][0], marks["gyro"], clock, rate=True)
+        accel_S = bridge(signals["accel"][0], marks["accel"], clock)
+        gap_marks = np.where(frozen, GOOD, all_marks)  # frozen samples have a diagnostic of their own
         gyro_range = self._scan().sensors[segment].gyro_range
-        return ImuSensor(gyro_S, accel_S, plan.mount, gap, gyro_range), marked
+        return ImuSensor(gyro_S, accel_S, plan.mount, gap, gyro_range), gap_marks
 
-    def _signal(
+    def _read_signal(
         self, plan: _Plan, name: str, clock: Clock, table: pl.DataFrame, first_row: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Values (n, k) in SI on the clock, and which of them are there (n,)."""
+        """Read the values (n, k) in SI on the clock, and a mask (n,) of the samples that exist."""
         place = f"{self.path}: {plan.place}.{name}"
-        read = read_columns(table, plan.signals[name], str(plan.path), place, first_row)
-        there = clock.row >= 0
-        if there.all() and len(read) == len(clock.row):
-            values = read
+        rows = read_columns(table, plan.signals[name], str(plan.path), place, first_row)
+        exists = clock.row >= 0
+        if exists.all() and len(rows) == len(clock.row):
+            values = rows
         else:
-            values = np.full((len(clock.row), read.shape[1]), np.nan)
-            values[there] = read[clock.row[there] - first_row]
+            values = np.full((len(clock.row), rows.shape[1]), np.nan)
+            values[exists] = rows[clock.row[exists] - first_row]
         good = np.isfinite(values).all(axis=1)
-        huge = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
-        if huge.size:
+        too_large = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
+        if too_large.size:
             raise BadData(
-                f"{plan.path}: {plan.place}.{name} holds {np.nanmax(np.abs(values[huge[0]])):.3g} in row "
-                f"{clock.row[huge[0]] + 1}; no sensor measures as much, leave cells of lost samples empty"
+                f"{plan.path}: {plan.place}.{name} holds {np.nanmax(np.abs(values[too_large[0]])):.3g} in row "
+                f"{clock.row[too_large[0]] + 1}; no sensor measures as much, leave cells of lost samples empty"
             )
         if name != "orientation":
             return plan.units[name] * values, good
         norm = np.linalg.norm(values, axis=1)
-        good &= norm > 0.0  # zeros stand for "not seen" in many exports
-        odd = np.flatnonzero(good & (np.abs(norm - 1.0) > NORM_OFF))
-        if odd.size:
+        good &= norm > 0.0  # many exports write zeros for a lost sample
+        not_unit = np.flatnonzero(good & (np.abs(norm - 1.0) > NORM_ERROR))
+        if not_unit.size:
             raise BadData(
-                f"{plan.path}: {plan.place}.orientation has length {norm[odd[0]]:.3g} in row "
-                f"{clock.row[odd[0]] + 1}; a unit quaternion is needed, columns in the order x, y, z, w"
+                f"{plan.path}: {plan.place}.orientation has length {norm[not_unit[0]]:.3g} in row "
+                f"{clock.row[not_unit[0]] + 1}; a unit quaternion is needed, columns in the order x, y, z, w"
             )
         return values / np.where(good, norm, np.nan)[:, None], good
 
 
-def _useless(key: str) -> str:
-    """Why a key that is known does nothing here."""
+def _explain_unused(key: str) -> str:
+    """Explain why a known key has no effect in this session."""
     if key in ("time", "time_unit"):
-        return "no sensor here has times in a column: the format knows its own, or rate_hz stands for them"
+        return "no sensor here has times in a column: the format has its own, or rate_hz replaces them"
     return {
         "file": "every sensor names a file of its own",
         "rate_hz": "every sensor has a time of its own",
-        "gyro_unit": "the format of every sensor here knows its units",
-        "accel_unit": "the format of every sensor here knows its units",
+        "gyro_unit": "the format of every sensor here has its own units",
+        "accel_unit": "the format of every sensor here has its own units",
         "format": "no sensor here is read by it: they state columns, or a format of their own",
-        "use": "no sensor here is of a format that holds both; state the columns that are wanted",
+        "use": "no sensor here has a format with both; state the columns to read",
     }[key]
 
 
-def _within(phases: Mapping[str, Intervals], time: np.ndarray) -> dict[str, Intervals]:
-    """The phases cut to a piece; those that do not touch it are not in it."""
+def _cut_phases(phases: Mapping[str, Intervals], time: np.ndarray) -> dict[str, Intervals]:
+    """Cut the phases to a chunk; phases that do not overlap it are left out."""
     low, high = float(time[0]), float(time[-1])
-    cut = {name: tuple((max(a, low), min(b, high)) for a, b in spans) for name, spans in phases.items()}
-    return {name: kept for name, spans in cut.items() if (kept := tuple(s for s in spans if s[0] < s[1]))}
+    clipped = {name: tuple((max(a, low), min(b, high)) for a, b in spans) for name, spans in phases.items()}
+    overlaps = {name: tuple(span for span in spans if span[0] < span[1]) for name, spans in clipped.items()}
+    return {name: spans for name, spans in overlaps.items() if spans}
 
 
-def _too_long(clock: Clock) -> str:
+def _explain_gap_limit(clock: Clock) -> str:
     return (
         f"up to {1e3 * clock.longest_bridge:.0f} ms are bridged; cut the recording there, or accept gaps by --gaps "
         f"(gaps=True)"
     )
 
 
-def _bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterator[Diagnostic]:
-    """The gaps of a sensor that were bridged, from the marks (n,) of its samples and their usual step [s]."""
+def _report_bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterator[Diagnostic]:
+    """Report the bridged gaps of a sensor, from the marks (n,) of its samples and their usual step [s]."""
     for mark, code, severity in ((LONG, "long-gaps-bridged", WARNING), (BRIDGED, "short-gaps-bridged", INFO)):
         spans = [last - first for first, last in find_runs(marks == mark)]
         if spans:

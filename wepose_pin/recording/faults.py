@@ -490,7 +490,7 @@ class OrientationScan:
         self.constant &= bool((quat_WS == self._first).all())
         self._last = float(time[-1]), quat_WS[-1].copy()
 
-    def around(self, clock: Clock, marks: np.ndarray) -> tuple[_Sample | None, _Sample | None]:
+    def find_neighbours(self, clock: Clock, marks: np.ndarray) -> tuple[_Sample | None, _Sample | None]:
         """The samples last measured before a stretch of the clock and next after it, where its ends are lost."""
         before, after = (
             next(
