@@ -1,20 +1,18 @@
-"""Sensors that do not measure: dead, stuck or frozen at one value, cut off at their range, or copies of one another.
+"""Faults of sensors: dead, stuck or frozen at one value, saturated, or copies of one another.
 
-A value that repeats says little by itself: a coarse sensor on a table repeats for minutes, and data without noise do.
-It is a fault where physics contradicts it, or where the sensor shows noise whenever it does not repeat:
+A repeated value alone is no fault: a coarse sensor on a table repeats for minutes, and so do data without noise. It is
+a fault where it contradicts physics, or where the sensor is noisy whenever it does not repeat:
 
-- specific force that stays the same in the sensor while it turns about a horizontal axis;
-- a rate that stays the same while the specific force changes as only motion does;
-- both the same, of a sensor whose noise is finer than its digits: then two samples in a row are never alike.
+- constant specific force in the sensor while it rotates about a horizontal axis;
+- a constant rate while the specific force changes as in motion;
+- constant rate and force of a sensor with noise larger than its digits: two consecutive samples are never equal.
 
-So it is with a single axis, which stays the same in motion about another as well. Two things tell that it does not
-measure:
+A single axis may be constant during motion about another axis. It is a fault where
 
-- it has the noise of the other axes, and by that would not repeat so often;
-- the mean specific force of some seconds, turned by the gyroscope, points up, and seconds later again; where an axis
-  of either is missing it does not.
+- the noise of the other axes makes so many repetitions improbable; or
+- the mean specific force over some seconds, rotated by the gyroscope, does not point up, since an axis is missing.
 
-All is gathered block by block, so that a recording in pieces is judged as the whole is.
+The scan works block by block, so that a recording in chunks has the same faults as the whole.
 """
 
 from __future__ import annotations
@@ -37,46 +35,49 @@ from .intervals import format_time
 from .limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE, STANDARD_GRAVITY
 from .plausibility import ROUNDING, find_cut_off
 
-FROZEN_S, FROZEN_SAMPLES = 0.2, 5  # of rate and force both at one value: longer than gaps that are bridged in silence
-STUCK_S = 1.0  # of one of them alone, or of one axis
-# While accel stays the same: how fast gyro tips it [rad/s], beyond any bias, and by how much in all [rad], one alone.
+# Shortest constant rate and force [s], [samples] of a frozen sensor: longer than gaps that are bridged silently.
+FROZEN_S, FROZEN_SAMPLES = 0.2, 5
+STUCK_S = 1.0  # [s] the same for rate or force alone, or for one axis
+# While accel is constant: rate [rad/s] at which gyro tilts it, above any bias, and total tilt [rad].
 TIPS, TIPPED = 0.2, 1.0
-MOVES = 2.0  # [m/s²] by which accel changes on an axis only where the sensor moves
-# Noise turns back at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
+MOVES = 2.0  # [m/s²] change of accel on an axis that proves motion
+# Noise reverses at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
 TURNS_BACK, TURNS_BACK_HZ = 0.3, 15.0
-NOISY_S = 1.5  # [s] of noise that show a sensor to be noisy
-COARSE = 1e-4  # share of runs of equal samples that are longer than twice the usual, from which the digits are coarse
+NOISY_S = 1.5  # [s] of noise that prove a sensor to be noisy
+COARSE = 1e-4  # share of long runs (twice the usual length) of equal samples from which the digits are coarse
 
-# An axis does not measure that repeats so often that the noise of its neighbours makes it as improbable as e^-60.
-# Digits count up to these sizes [rad/s], [m/s²]: tremor may be wider than coarser ones about one axis alone.
+# An axis is stuck when the noise of its neighbours gives its repetitions a probability below e^-60. Only digits up to
+# these sizes [rad/s], [m/s²] count: with coarser ones a tremor may be visible on one axis alone.
 IMPROBABLE = 60.0
 COARSEST = np.repeat([np.deg2rad(0.25), 0.05], 3)
-WIDE = 1.5  # digits from which on a step is wider than one
+WIDE = 1.5  # [digits] a step above this is wider than one digit
 FEWEST_WIDE = 10  # steps
-ENOUGH_NOISE_S = 30.0  # [s] of it that are looked at
-# Up is the mean specific force of so many seconds; that of two windows on it is off by less, wherever the arm has been.
+ENOUGH_NOISE_S = 30.0  # [s] of noise that are evaluated
+# Up is the mean specific force over `UP_S`; for a measuring sensor it changes by less than `UP_OFF` over two windows.
 UP_S, UP_OFF = 2.0, 0.8  # [s], [rad]
-UP_FORCE = 0.3  # share by which its norm may be off gravity
+UP_FORCE = 0.3  # allowed relative error of its norm against gravity
 
-# Rows that repeat for so long [s], so many times as long as any others, are reported though no noise shows a fault.
+# Rows that repeat for so long [s], and so many times longer than any others, are reported without proof of a fault.
 REPEATED_S, REPEATED_TIMES = 2.0, 10
 
-ROWS = 1 << 16  # that are looked at together
-SAME_RANGE = 0.1  # share by which the ranges of a sensor's axes may differ: each has its own scale
-COPIED = 0.5  # share of a sensor's rows, those that repeat aside, that another has as well only if it is a copy
-AT_RANGE = 0.02  # share below its range from which on a sample counts as cut off: resampled ones mix with others
+ROWS = 1 << 16  # rows in a block
+SAME_RANGE = 0.1  # relative difference between the ranges of a sensor's axes, which have different scales
+COPIED = 0.5  # share of a sensor's changing rows from which equal rows in another sensor prove a copy
+AT_RANGE = (
+    0.02  # relative distance below the range at which a sample counts as saturated, since resampling mixes samples
+)
 
 
 class Fault(NamedTuple):
-    """A stretch in which a sensor gave one value over and over."""
+    """An interval in which a sensor repeated one value and did not measure."""
 
-    signals: str  # which: "gyro", "accel", "gyro and accel", or an axis of one, "gyro x"
-    first: float  # [s], the last sample that was measured
-    last: float  # [s], the last that was not
-    value: tuple[float, ...]  # at which it stood, SI
+    signals: str  # "gyro", "accel", "gyro and accel", or an axis, "gyro x"
+    first: float  # [s] the last measured sample
+    last: float  # [s] the last faulty sample
+    value: tuple[float, ...]  # the repeated value, SI
 
     def describe(self, since: float) -> str:
-        """In words, from the time [s] `since`."""
+        """Describe the fault from the time [s] `since` on."""
         value = ", ".join(f"{v:.4g}" for v in self.value[:3])
         unit = "m/s^2" if self.signals.startswith("accel") else "rad/s"
         stands = "stand still, gyro" if "and" in self.signals else "stands still"
@@ -85,7 +86,7 @@ class Fault(NamedTuple):
 
 @dataclass
 class _Run:
-    """Rows that are equal in some signals, with what the others do meanwhile."""
+    """Consecutive rows with equal values of a signal, and the other signals meanwhile."""
 
     rows: int
     first: float  # [s]
@@ -94,12 +95,12 @@ class _Run:
     low: np.ndarray  # (3,) of accel
     high: np.ndarray  # (3,)
     tipped: float  # [rad], ∫ |gyro × up|
-    up_off: float  # [rad] by which up changes, as the whole sensor sees it; 0 where it is not looked at
-    distinct: int  # rows in which the other axes of the signal are not those of the row before
-    first_row: bool  # of the recording
+    up_off: float  # [rad] change of up by the whole sensor; 0: not computed
+    distinct: int  # rows in which other axes of the signal differ from the row before
+    first_row: bool  # the run begins with the recording
 
     def join(self, after: _Run) -> _Run:
-        """Both as one; the last row of this is the first of the one after it."""
+        """Join this run and the one after it, which have one row in common."""
         low, high = np.minimum(self.low, after.low), np.maximum(self.high, after.high)
         rows, tipped = self.rows + after.rows - 1, self.tipped + after.tipped
         up_off, distinct = max(self.up_off, after.up_off), self.distinct + after.distinct
@@ -111,19 +112,19 @@ class _Run:
 
     @property
     def tips(self) -> float:
-        """How fast gyro tips accel [rad/s]."""
+        """Mean rate [rad/s] at which gyro tilts accel."""
         return self.tipped / max(self.seconds, 1e-9)
 
 
-_Sample = tuple[float, np.ndarray]  # when [s], what
-_LONGEST = 1000  # rows of a run that are counted
+_Sample = tuple[float, np.ndarray]  # time [s], value
+_LONGEST = 1000  # longest run in the histogram of lengths [rows]
 _AXES = {f"{name} {axis}": slice(k, k + 1) for k, (name, axis) in enumerate(product(("gyro", "accel"), "xyz"))}
 _SIGNALS = {"gyro and accel": slice(0, 6), "gyro": slice(0, 3), "accel": slice(3, 6), **_AXES}
 
 
 @dataclass
 class SensorScan:
-    """What a sensor's rows show of its faults, gathered block by block, in SI and in the order of time."""
+    """Statistics of a sensor's rows that prove faults, from blocks in SI and in the order of time."""
 
     rows: int = 0
     first: float = 0.0  # [s]
@@ -132,14 +133,14 @@ class SensorScan:
     _long: dict[str, list[_Run]] = field(default_factory=lambda: {name: [] for name in _SIGNALS})
     _open: dict[str, _Run | None] = field(default_factory=lambda: dict.fromkeys(_SIGNALS))
     _lengths: np.ndarray = field(default_factory=lambda: np.zeros(_LONGEST + 1, dtype=np.int64))  # rows → runs
-    _noisy_s: float = 0.0  # [s] in which it turns back as noise does
-    _noise_steps: np.ndarray = field(default_factory=lambda: np.zeros(6))  # of each axis then, from sample to sample
-    _wide_steps: np.ndarray = field(default_factory=lambda: np.zeros(6))  # of them, those by more than a digit
-    _peak: float = 0.0  # [rad/s] the largest of all axes
-    _levels: list[float] = field(default_factory=list)  # [rad/s] at which an axis seems cut off
+    _noisy_s: float = 0.0  # [s] with reversals as in noise
+    _noise_steps: np.ndarray = field(default_factory=lambda: np.zeros(6))  # number of steps of each axis in that time
+    _wide_steps: np.ndarray = field(default_factory=lambda: np.zeros(6))  # number of these steps wider than a digit
+    _peak: float = 0.0  # [rad/s] largest rate of all axes
+    _levels: list[float] = field(default_factory=list)  # [rad/s] levels at which an axis seems saturated
 
     def push(self, time: np.ndarray, values: np.ndarray) -> None:
-        """The next rows: times (n,) [s], gyro and accel (n, 6)."""
+        """Add the next rows: times (n,) [s], gyro and accel (n, 6)."""
         if not len(time):
             return
         block = np.column_stack([time, values])
@@ -154,13 +155,13 @@ class SensorScan:
             return
         equal = np.stack([axis[1:] == axis[:-1] for axis in block[:, 1:].T])
         for name, axes in _SIGNALS.items():
-            self._gather(name, block, np.logical_and.reduce(equal[axes]), first_row)
+            self._collect_runs(name, block, np.logical_and.reduce(equal[axes]), first_row)
         changing = block[np.concatenate([[True], ~np.logical_and.reduce(equal)])]
         if self._noisy_s < ENOUGH_NOISE_S:
-            self._noise(changing)
-        self._cut_off(changing[:, 1:])
+            self._count_noise(changing)
+        self._find_levels(changing[:, 1:])
 
-    def _gather(self, name: str, block: np.ndarray, same: np.ndarray, first_row: bool) -> None:
+    def _collect_runs(self, name: str, block: np.ndarray, same: np.ndarray, first_row: bool) -> None:
         spans = np.array(find_runs(same), dtype=np.int64).reshape(-1, 2)
         length = spans[:, 1] - spans[:, 0] + 1
         if name == "gyro and accel":
@@ -174,7 +175,7 @@ class SensorScan:
             self._close(name, open_)
             open_ = None
         for a, b in spans[((length >= FROZEN_SAMPLES) & (seconds >= _least_s(name))) | edge]:
-            run = _run(block[a : b + 1], name, first_row and a == 0)
+            run = _make_run(block[a : b + 1], name, first_row and a == 0)
             if open_ is not None and a == 0:
                 run, open_ = open_.join(run), None
             if b == len(same):
@@ -186,8 +187,8 @@ class SensorScan:
         if run.rows >= FROZEN_SAMPLES and run.seconds >= _least_s(name):
             self._long[name].append(run)
 
-    def _noise(self, distinct: np.ndarray) -> None:
-        """Count the seconds in which all axes turn back as noise does: while it is static, motion being small."""
+    def _count_noise(self, distinct: np.ndarray) -> None:
+        """Count the seconds in which all axes reverse as in noise, which happens with little motion."""
         if len(distinct) < 2 * FROZEN_SAMPLES:
             return
         usual = max(float(np.median(np.diff(distinct[:, 0]))), 1e-9)
@@ -197,26 +198,26 @@ class SensorScan:
         count = (len(steps) - 1) // size
         turns = (np.sign(steps[1:]) * np.sign(steps[:-1]) < 0.0)[: count * size].reshape(count, size, 6).mean(axis=1)
         varies = (steps[1:] != 0.0)[: count * size].reshape(count, size, 6).any(axis=1)
-        share = np.where(varies, turns, np.inf).min(axis=1)  # of all axes: in motion some go on
+        share = np.where(varies, turns, np.inf).min(axis=1)  # least of all axes: in motion some do not reverse
         share[~varies.any(axis=1)] = 0.0
         noise = share > min(TURNS_BACK, TURNS_BACK_HZ * usual)
         self._noisy_s += float(np.count_nonzero(noise)) * size * usual
-        self._digits(np.abs(steps[1:])[: count * size].reshape(count, size, 6)[noise])
+        self._count_wide_steps(np.abs(steps[1:])[: count * size].reshape(count, size, 6)[noise])
 
-    def _digits(self, steps: np.ndarray) -> None:
-        """Count steps (m, size, 6) of noise, and those wider than one digit: than the smallest step of their time."""
+    def _count_wide_steps(self, steps: np.ndarray) -> None:
+        """Count steps (m, size, 6) of noise, and those wider than a digit, the smallest step of their second."""
         digit = np.where(steps > 0.0, steps, np.inf).min(axis=1)  # (m, 6)
         fine = digit < COARSEST
         for signal in (_SIGNALS["gyro"], _SIGNALS["accel"]):
-            measured = (steps[:, :, signal] > 0.0).any(axis=2).sum(axis=1)  # a signal may be slower than the other
+            measured = (steps[:, :, signal] > 0.0).any(axis=2).sum(axis=1)  # a signal may have a lower rate
             self._noise_steps[signal] += measured @ fine[:, signal]
         self._wide_steps += ((steps > WIDE * digit[:, None]) & fine[:, None]).sum(axis=(0, 1))
 
     def repeats(self, axis: int) -> float:
-        """Probability that a sample of this axis is at most the one before, by the noise of the signal's other axes.
+        """Return a bound on the probability that this axis repeats a sample, from the noise of the signal's other axes.
 
-        A step wider than a digit is a change of noise by more than a digit, wherever between two digits the sensor
-        stands: that bounds the noise from below, and how often it stays within one digit from above.
+        A step wider than a digit is a change of the noise by more than a digit, whatever the value between two digits.
+        The share of such steps gives a lower bound on the noise, and so an upper bound on repetitions.
         """
         first = 3 * (axis // 3)
         others = [k for k in range(first, first + 3) if k != axis and self._noise_steps[k] > 0]
@@ -228,8 +229,8 @@ class SensorScan:
         std = -1.0 / (np.sqrt(2.0) * float(ndtri(min(wide, 1.0) / 2.0)))  # [digits]
         return float(2.0 * ndtr(0.5 / std) - 1.0)
 
-    def _cut_off(self, values: np.ndarray) -> None:
-        """The levels at which an axis of gyro stays though something else changes."""
+    def _find_levels(self, values: np.ndarray) -> None:
+        """Find the levels at which an axis of gyro is constant while another signal changes."""
         gyro = values[:, :3]
         self._peak = max(self._peak, float(np.abs(gyro).max()))
         cut = find_cut_off(gyro, NARROWEST_GYRO_RANGE)
@@ -241,18 +242,18 @@ class SensorScan:
 
     @property
     def gyro_range(self) -> float:
-        """[rad/s] from which on an axis counts as cut off; infinite where none was. A sensor's axes have one range."""
+        """Rate [rad/s] from which an axis counts as saturated; infinite: none is. A sensor's axes have one range."""
         return (1.0 - AT_RANGE) * min((v for v in self._levels if v > (1.0 - SAME_RANGE) * self._peak), default=np.inf)
 
     def long_runs(self, name: str) -> list[_Run]:
-        """Runs of rows that are equal in the signal, as far as they have come."""
+        """Return the runs of equal rows of a signal so far."""
         open_, known = self._open[name], self._long[name]
         if open_ is None or open_.rows < FROZEN_SAMPLES or open_.seconds < _least_s(name):
             return known
         return [*known, open_]
 
     def noisy(self) -> bool:
-        """Whether two samples in a row are never alike but by a fault: there is noise, and the digits show it."""
+        """Return whether only a fault makes two samples in a row equal: the noise is larger than the digits."""
         if self._noisy_s < NOISY_S:
             return False
         long_ = sum(run.rows >= FROZEN_SAMPLES for run in self.long_runs("gyro and accel"))
@@ -262,7 +263,7 @@ class SensorScan:
         return longer <= 2 * long_ + COARSE * short.sum()
 
     def long_repeats(self) -> list[_Run]:
-        """Runs of equal rows that are far longer than all others of the sensor."""
+        """Return the runs of equal rows that are much longer than all others of the sensor."""
         counts = self._lengths.copy()
         runs_ = [run for run in self.long_runs("gyro and accel") if run.seconds >= REPEATED_S]
         for run in runs_:
@@ -271,12 +272,12 @@ class SensorScan:
         return [run for run in runs_ if run.rows > REPEATED_TIMES * usual]
 
     def constant(self, name: str) -> bool:
-        """Whether the signal has one value in all rows."""
+        """Return whether the signal has one value in all rows."""
         return any(run.rows == self.rows for run in self.long_runs(name))
 
 
 def scan_sensor(time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> SensorScan:
-    """What the rows of one sensor show: times (n,) [s], (n, 3) [rad/s], (n, 3) [m/s²]."""
+    """Scan the rows of one sensor for faults: times (n,) [s], (n, 3) [rad/s], (n, 3) [m/s²]."""
     scan = SensorScan()
     for first in range(0, len(time), ROWS):
         rows = slice(first, first + ROWS)
@@ -285,11 +286,11 @@ def scan_sensor(time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> Se
 
 
 def _least_s(name: str) -> float:
-    """[s] from which on equal samples are a run that is kept."""
+    """Return the shortest duration [s] of a run of equal samples of the signal."""
     return (FROZEN_S if name == "gyro and accel" else STUCK_S) * (1.0 - 1e-6)
 
 
-def _run(rows: np.ndarray, name: str, first_row: bool) -> _Run:
+def _make_run(rows: np.ndarray, name: str, first_row: bool) -> _Run:
     time, gyro, accel = rows[:, 0], rows[1:, 1:4], rows[1:, 4:]
     up = accel / np.maximum(np.linalg.norm(accel, axis=1), 1e-9)[:, None]
     tipped = float(np.sum(np.linalg.norm(np.cross(gyro, up), axis=1) * np.diff(time)))
@@ -297,16 +298,16 @@ def _run(rows: np.ndarray, name: str, first_row: bool) -> _Run:
     up_off, distinct = 0.0, 0
     if name in _AXES:
         signal = rows[:, 1:4] if name.startswith("gyro") else rows[:, 4:]
-        up_off, distinct = _up_off(rows), int(np.count_nonzero((np.diff(signal, axis=0) != 0.0).any(axis=1)))
+        up_off, distinct = _compute_up_change(rows), int(np.count_nonzero((np.diff(signal, axis=0) != 0.0).any(axis=1)))
     value = rows[0, 1:].copy()
     return _Run(len(rows), float(time[0]), float(time[-1]), value, low, high, tipped, up_off, distinct, first_row)
 
 
-def _up_off(rows: np.ndarray) -> float:
-    """[rad] by which the mean specific force of `UP_S` differs from that of two such windows on, in the world."""
+def _compute_up_change(rows: np.ndarray) -> float:
+    """Compute the largest angle [rad] between mean specific forces over `UP_S` two windows apart, in the world."""
     time, gyro, accel = rows[:, 0], rows[1:, 1:4], rows[:, 4:]
     window = np.floor((time - time[0]) / UP_S).astype(int)
-    count = int(window[-1])  # whole ones
+    count = int(window[-1])  # complete windows
     if count < 3:
         return 0.0
     force = Rotation.from_quat(rotations.integrate(gyro * np.diff(time)[:, None])).apply(accel)
@@ -322,62 +323,62 @@ def _up_off(rows: np.ndarray) -> float:
 
 
 def find_faults(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
-    """Sensor → the stretches in which it was frozen or stuck, in the order of time; none where all measure."""
+    """Find the intervals in which sensors were frozen or stuck: sensor → faults in the order of time."""
     noisy = {name: scan.noisy() for name, scan in scans.items()}
-    found = {}
+    all_faults = {}
     for name, scan in scans.items():
         others = [other for other in scans if other != name]
         faults = []
         for run in scan.long_runs("gyro and accel"):
-            # One that never gave anything else shows no noise of its own; the others are of its kind.
+            # A sensor that is constant from the beginning shows no noise; the others are of the same kind.
             fine = any(noisy[other] for other in others) if run.rows == scan.rows else noisy[name]
             if fine or run.tips > TIPS:
-                faults.append(_fault("gyro and accel", run))
+                faults.append(_make_fault("gyro and accel", run))
         whole = [(fault.first, fault.last) for fault in faults]
         for run in scan.long_runs("gyro"):
             dead = scan.constant("gyro") and not scan.constant("accel") and noisy[name]
             dead &= any(not scans[other].constant("gyro") for other in others)
-            if (dead or np.max(run.high - run.low) > MOVES) and not _within(run, whole):
-                faults.append(_fault("gyro", run))
+            if (dead or np.max(run.high - run.low) > MOVES) and not _is_within(run, whole):
+                faults.append(_make_fault("gyro", run))
         for run in scan.long_runs("accel"):
-            if run.tipped > TIPPED and run.tips > TIPS and not _within(run, whole):
-                faults.append(_fault("accel", run))
+            if run.tipped > TIPPED and run.tips > TIPS and not _is_within(run, whole):
+                faults.append(_make_fault("accel", run))
         whole = [(fault.first, fault.last) for fault in faults]
         for axis, signals in enumerate(_AXES):
             repeats = -np.log(max(scan.repeats(axis), 1e-300))
             limit = scan.gyro_range if axis < 3 else NARROWEST_ACCEL_RANGE
             for run in scan.long_runs(signals):
                 stuck = run.distinct * repeats > IMPROBABLE or run.up_off > UP_OFF
-                # What stays at the end of its range is cut off there.
-                if stuck and abs(run.value[axis]) < limit and not _within(run, whole):
-                    faults.append(_fault(signals, run))
+                # A constant value at the end of the range is saturation.
+                if stuck and abs(run.value[axis]) < limit and not _is_within(run, whole):
+                    faults.append(_make_fault(signals, run))
         if faults:
-            found[name] = sorted(faults, key=lambda fault: fault.first)
-    return found
+            all_faults[name] = sorted(faults, key=lambda fault: fault.first)
+    return all_faults
 
 
-def _within(run: _Run, spans: list[tuple[float, float]]) -> bool:
+def _is_within(run: _Run, spans: list[tuple[float, float]]) -> bool:
     return any(first <= run.first and run.last <= last for first, last in spans)
 
 
-def _fault(signals: str, run: _Run) -> Fault:
-    # What a sensor begins with was not measured either.
+def _make_fault(signals: str, run: _Run) -> Fault:
+    # At the beginning of the recording the first sample is faulty, too.
     first = float(np.nextafter(run.first, -np.inf)) if run.first_row else run.first
     return Fault(signals, first, run.last, tuple(run.value[_SIGNALS[signals]].tolist()))
 
 
 @dataclass
 class Scan:
-    """All sensors of a recording, gathered block by block: what is wrong with them as a whole."""
+    """Scan of all sensors of a recording, from blocks of rows, for faults and copies."""
 
-    sensors: dict[str, SensorScan] = field(default_factory=dict)  # those with gyro and accel
+    sensors: dict[str, SensorScan] = field(default_factory=dict)  # sensors with gyro and accel
     orientations: dict[str, OrientationScan] = field(default_factory=dict)
-    _alike: dict[tuple[str, str], int] = field(default_factory=dict)  # rows that are equal in both and change
+    _equal: dict[tuple[str, str], int] = field(default_factory=dict)  # changing rows that are equal in both sensors
     _changes: dict[str, int] = field(default_factory=dict)  # rows that change
-    faults: dict[str, list[Fault]] = field(default_factory=dict)  # known when all was pushed
+    faults: dict[str, list[Fault]] = field(default_factory=dict)  # set by `finish`
 
     def push(self, blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
-        """The next rows of each sensor: times (n,) [s] and values (n, 6), gyro and accel, or (n, 4), an orientation."""
+        """Add the next rows of each sensor: times (n,) [s], and gyro and accel (n, 6) or orientations (n, 4)."""
         changed = {}
         for name, (time, values) in blocks.items():
             changed[name] = np.concatenate([[True], (np.diff(values, axis=0) != 0.0).any(axis=1)])[: len(values)]
@@ -385,7 +386,7 @@ class Scan:
             good = np.isfinite(values).all(axis=1)
             if values.shape[1] == 4:
                 norm = np.linalg.norm(values, axis=1)
-                good &= norm > 0.0  # zeros stand for "not seen"
+                good &= norm > 0.0  # zeros mark a lost sample
                 quat_WS = values[good] / norm[good, None]
                 self.orientations.setdefault(name, OrientationScan()).push(time[good], quat_WS)
             else:
@@ -393,20 +394,20 @@ class Scan:
         for name, other in combinations(blocks, 2):
             a, b = blocks[name][1], blocks[other][1]
             if a.shape == b.shape:
-                alike = int(((a == b).all(axis=1) & changed[name]).sum())
-                self._alike[name, other] = self._alike.get((name, other), 0) + alike
+                equal = int(((a == b).all(axis=1) & changed[name]).sum())
+                self._equal[name, other] = self._equal.get((name, other), 0) + equal
 
     def finish(self, where: str, start: tuple[float, float] | None) -> None:
-        """Judge what was pushed; `start` [s] is the start pose, where it is stated.
+        """Find the faults after the last block; `start` [s] is the stated start pose.
 
         Raises
         ------
         BadData
-            Two sensors with the same values; one that is dead all along, or in the start pose.
+            Two sensors have the same values, or one is dead in the whole recording or in the start pose.
         """
-        for name, other in self._copies(self.sensors):
+        for name, other in self._find_copies(self.sensors):
             raise BadData(
-                f"{where}: sensors.{name} and sensors.{other} hold the same values in {self._alike[name, other]} rows: "
+                f"{where}: sensors.{name} and sensors.{other} hold the same values in {self._equal[name, other]} rows: "
                 f"one is a copy of the other; name the file and columns in which each was recorded"
             )
         self.faults = find_faults(self.sensors)
@@ -422,34 +423,34 @@ class Scan:
                         f"[sensors.{name}] out to track the others" + ("" if whole else ", or name another start pose")
                     )
 
-    def _copies(self, among: Iterable[str]) -> list[tuple[str, str]]:
+    def _find_copies(self, names: Iterable[str]) -> list[tuple[str, str]]:
         return [
             pair
-            for pair, alike in self._alike.items()
-            if pair[0] in among and alike >= FROZEN_SAMPLES and alike > COPIED * self._changes[pair[0]]
+            for pair, equal in self._equal.items()
+            if pair[0] in names and equal >= FROZEN_SAMPLES and equal > COPIED * self._changes[pair[0]]
         ]
 
     def diagnostics(self) -> list[Diagnostic]:
-        """What `finish` found and did not refuse."""
-        found = []
+        """Return the diagnostics of the faults that `finish` accepted."""
+        diagnostics = []
         for name, faults in self.faults.items():
             begin = max(faults[0].first, self.sensors[name].first)
             lost_s = sum(fault.last - max(fault.first, self.sensors[name].first) for fault in faults)
             facts: dict[str, float | str] = {"signals": faults[0].signals, "intervals": len(faults)}
             facts |= {"start": begin, "end": faults[0].last}
-            found.append(Diagnostic("sensor-frozen", WARNING, name, lost_s, facts=facts))
-        found += self._repeats()
+            diagnostics.append(Diagnostic("sensor-frozen", WARNING, name, lost_s, facts=facts))
+        diagnostics += self._find_repeats()
         for name, scan in self.orientations.items():
             if scan.rows >= FROZEN_SAMPLES and scan.constant:
-                found.append(Diagnostic("orientation-constant", WARNING, name, scan.rows))
-        for name, other in self._copies(self.orientations):
-            found.append(Diagnostic("orientations-copied", WARNING, name, facts={"other": other}))
-        return found
+                diagnostics.append(Diagnostic("orientation-constant", WARNING, name, scan.rows))
+        for name, other in self._find_copies(self.orientations):
+            diagnostics.append(Diagnostic("orientations-copied", WARNING, name, facts={"other": other}))
+        return diagnostics
 
-    def _repeats(self) -> list[Diagnostic]:
-        """Sensors that repeat their values for seconds while others change: at rest on a table, or not measuring."""
+    def _find_repeats(self) -> list[Diagnostic]:
+        """Find sensors that repeat their values for seconds while others change: static on a table, or faulty."""
         repeats = {name: scan.long_runs("gyro and accel") for name, scan in self.sensors.items()}
-        found = []
+        diagnostics = []
         for name, scan in self.sensors.items():
             faults = [(fault.first, fault.last) for fault in self.faults.get(name, [])]
             for run in scan.long_repeats():
@@ -458,15 +459,15 @@ class Scan:
                     for other, runs_ in repeats.items()
                     if sum(max(0.0, min(run.last, r.last) - max(run.first, r.first)) for r in runs_) < 0.5 * run.seconds
                 ]
-                if moving and not _within(run, faults):
+                if moving and not _is_within(run, faults):
                     facts: dict[str, float | str] = {"start": run.first, "end": run.last}
-                    found.append(Diagnostic("sensor-repeats", WARNING, name, run.seconds, facts=facts))
-        return found
+                    diagnostics.append(Diagnostic("sensor-repeats", WARNING, name, run.seconds, facts=facts))
+        return diagnostics
 
 
 @dataclass
 class OrientationScan:
-    """What the rows of measured orientations show; between which samples nothing was measured for a while."""
+    """Statistics of measured orientations, and the long gaps between them."""
 
     rows: int = 0
     constant: bool = True
@@ -475,7 +476,7 @@ class OrientationScan:
     _gaps: list[tuple[_Sample | None, _Sample | None]] = field(default_factory=list)  # last before, first after
 
     def push(self, time: np.ndarray, quat_WS: np.ndarray) -> None:
-        """The next rows: times (n,) [s], orientations (n, 4) xyzw."""
+        """Add the next rows: times (n,) [s], orientations (n, 4) xyzw."""
         if not len(time):
             return
         if self._first is None:
@@ -491,7 +492,7 @@ class OrientationScan:
         self._last = float(time[-1]), quat_WS[-1].copy()
 
     def find_neighbours(self, clock: Clock, marks: np.ndarray) -> tuple[_Sample | None, _Sample | None]:
-        """The samples last measured before a stretch of the clock and next after it, where its ends are lost."""
+        """Find the last sample before a span of the clock and the next one after it, where its ends are lost."""
         before, after = (
             next(
                 (
