@@ -1,4 +1,4 @@
-"""What makes reality hard: each imperfection of subject and sensors with its size, its source and its switch."""
+"""Imperfections of subject and sensors, each with its size, source and switch."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..errors import BadOption
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Sizes of all that a perfect world lacks; the defaults are a perfect world, `MILD_PRESET` is a usual one.
+    """Sizes of the imperfections; the defaults are `IDEAL_PRESET`, without any, and `MILD_PRESET` has usual sizes.
 
-    The switch of each is its own off value: zero, or infinity for a range. Each draws from a stream of random numbers
-    of its own, in numbers that do not depend on the sizes: switching one off, or making it larger, leaves the draws of
-    all others, of the motion, of the mounts and of the noise as they are.
+    An imperfection is off at zero, or a range at infinity. Each has its own stream of random numbers, and the number of
+    draws does not depend on the size: a change of one imperfection does not change the draws of the others, of the
+    motion, the mounts or the noise.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ NOISE_FREE = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Readings(NamedTuple):
-    """What a sensor gives, and its true biases."""
+    """A sensor's samples and its true biases."""
 
     gyro_S: np.ndarray  # (n, 3) [rad/s]
     accel_S: np.ndarray  # (n, 3) [m/s^2]
@@ -64,7 +64,7 @@ class Device:
 
     @staticmethod
     def sample(rng: np.random.Generator, imperfections: Imperfections) -> Device:
-        """A sensor at random."""
+        """Sample a sensor's errors."""
         scale, tilt, g = rng.standard_normal((2, 3)), rng.standard_normal((2, 3, 3)), rng.standard_normal((3, 3))
         tilt *= np.deg2rad(imperfections.misalignment_deg) * (1.0 - np.eye(3))
         return Device(
@@ -82,11 +82,11 @@ class Device:
         imperfections: Imperfections,
         rng: np.random.Generator,
     ) -> Readings:
-        """What the sensor gives of the true rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2]."""
+        """Measure the true rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2] with the sensor's errors."""
         n = len(rate_S)
         decay = np.exp(-1.0 / (noise.correlation_s * rate_hz))
-        gyro_bias = _bias(rng, (n, 3), noise.gyro_bias_std, noise.gyro_bias_instability, decay)
-        accel_bias = _bias(rng, (n, 3), noise.accel_bias_std, noise.accel_bias_instability, decay)
+        gyro_bias = _draw_bias(rng, (n, 3), noise.gyro_bias_std, noise.gyro_bias_instability, decay)
+        accel_bias = _draw_bias(rng, (n, 3), noise.accel_bias_std, noise.accel_bias_instability, decay)
         white = rng.standard_normal((2, n, 3)) * np.sqrt(rate_hz)
         gyro_S, accel_S = rate_S, force_S
         # A product with the identity, or with zeros, would not keep the last bit.
@@ -99,22 +99,24 @@ class Device:
         gyro_S = gyro_S + gyro_bias + noise.gyro_density * white[0]
         accel_S = accel_S + accel_bias + noise.accel_density * white[1]
         return Readings(
-            _digits(gyro_S, np.deg2rad(imperfections.gyro_range_deg_s), imperfections.bits),
-            _digits(accel_S, imperfections.accel_range_g * GRAVITY, imperfections.bits),
+            _quantise(gyro_S, np.deg2rad(imperfections.gyro_range_deg_s), imperfections.bits),
+            _quantise(accel_S, imperfections.accel_range_g * GRAVITY, imperfections.bits),
             gyro_bias,
             accel_bias,
         )
 
 
-def _bias(rng: np.random.Generator, shape: tuple[int, int], turn_on: float, in_run: float, decay: float) -> np.ndarray:
-    """Turn-on bias plus Gauss-Markov process of standard deviation `in_run`, which keeps `decay` a sample."""
+def _draw_bias(
+    rng: np.random.Generator, shape: tuple[int, int], turn_on: float, in_run: float, decay: float
+) -> np.ndarray:
+    """Draw turn-on bias plus a Gauss-Markov process of standard deviation `in_run` and factor `decay` a sample."""
     white = rng.standard_normal(shape) * np.sqrt(1.0 - decay**2)
     white[0] /= np.sqrt(1.0 - decay**2)  # stationary from the first sample
     return turn_on * rng.standard_normal(shape[1]) + in_run * lfilter([1.0], [1.0, -decay], white, axis=0)
 
 
-def _digits(values: np.ndarray, full_scale: float, bits: int) -> np.ndarray:
-    """Cut off at ± `full_scale`, rounded to its digits."""
+def _quantise(values: np.ndarray, full_scale: float, bits: int) -> np.ndarray:
+    """Limit values to ± `full_scale` and round them to digits."""
     if not bits:
         return np.clip(values, -full_scale, full_scale) if np.isfinite(full_scale) else values
     count = 2 ** (bits - 1)
@@ -122,7 +124,7 @@ def _digits(values: np.ndarray, full_scale: float, bits: int) -> np.ndarray:
 
 
 def jitter_time(rng: np.random.Generator, time: np.ndarray, rate_hz: float, std: float) -> np.ndarray:
-    """When a clock samples that means to at `time` (n,) [s]: off by `std` [s], in order all the same.
+    """Draw the sampling times of a clock with nominal times `time` (n,) [s] and jitter `std` [s], in order.
 
     Raises
     ------
@@ -135,10 +137,10 @@ def jitter_time(rng: np.random.Generator, time: np.ndarray, rate_hz: float, std:
 
 
 def draw_lost(rng: np.random.Generator, n: int, rate_hz: float, share: float) -> np.ndarray:
-    """Which of n samples are lost (n,): runs of 20 ms in the mean and 50 ms at most, ends and neighbours kept."""
+    """Draw a mask (n,) of lost samples: runs of 20 ms on average and at most 50 ms, never at the ends or adjacent."""
     mask = np.zeros(n, dtype=bool)
     longest = max(1, int(LONGEST_RUN_S * rate_hz + 1e-9))
-    # Unit draws first: another share is the same runs closer together.
+    # Draws do not depend on the share: another share gives the same runs at other distances.
     waits, lengths = rng.exponential(size=n), rng.exponential(size=n)
     runs = np.clip(np.round(lengths * _MEAN_RUN_S * rate_hz).astype(int), 1, longest)
     if share <= 0.0:

@@ -1,7 +1,7 @@
 """The subject's motion: a closed form of continuous time.
 
-It is known exactly between the samples as well, and shares no code with the model room: what the tests compare against
-is written here and nowhere else. The torso frame T shares its origin with W: the torso turns about it.
+It is exact between the samples as well, and shares no code with the model room, since tests compare the two. The torso
+frame T has the origin of W: the torso rotates about it.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ class BodyPose(NamedTuple):
 
 
 def make_step(t: np.ndarray, start: float, duration: float) -> np.ndarray:
-    """0 before `start`, 1 after `start + duration`, four derivatives continuous: (n,)."""
+    """Make a step (n,): 0 before `start`, 1 after `start + duration`, with four continuous derivatives."""
     x = np.clip((t - start) / duration, 0.0, 1.0)
     return x**5 * (126.0 + x * (-420.0 + x * (540.0 + x * (-315.0 + x * 70.0))))
 
 
 def make_pulse(t: np.ndarray, start: float, stop: float, ramp: float) -> np.ndarray:
-    """1 between `start + ramp` and `stop - ramp`, exactly 0 outside `start` and `stop`: (n,)."""
+    """Make a pulse (n,): 1 between `start + ramp` and `stop - ramp`, exactly 0 outside `start` and `stop`."""
     return make_step(t, start, ramp) * (1.0 - make_step(t, stop - ramp, ramp))
 
 
 class Wander:
-    """A smooth wandering between -1 and 1: four sinusoids of 0.1 to 0.6 Hz, pressed to the limits by tanh."""
+    """A smooth random signal between -1 and 1: four sinusoids of 0.1 to 0.6 Hz, limited by tanh."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        # One frequency from each part of the band: no seed gives a motion without slow or without fast parts.
+        # One frequency from each part of the band: every seed gives slow and fast parts.
         self.frequency_hz = np.array((0.1, 0.2, 0.33, 0.46)) + rng.uniform(0.0, 0.13, 4)
         self.phase = rng.uniform(0.0, 2.0 * np.pi, 4)
 
@@ -64,7 +64,7 @@ class Wander:
 
 
 class Sway:
-    """A slow sway about x and y: three sinusoids of 0.3 to 0.5 Hz each, of unit rms rate [rad/s] together."""
+    """A slow sway about x and y: three sinusoids of 0.3 to 0.5 Hz each, with a total rms rate of 1 rad/s."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.omega = 2.0 * np.pi * (np.array((0.3, 0.37, 0.44)) + rng.uniform(0.0, 0.06, (2, 3)))  # [rad/s]
@@ -77,7 +77,7 @@ class Sway:
 
 
 class Flaws:
-    """What the subject does imperfectly, drawn: all draws are made, the sizes only scale them."""
+    """Random imperfections of the subject's motion; the sizes scale draws that do not depend on them."""
 
     def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator]) -> None:
         self.sizes = sizes
@@ -91,12 +91,12 @@ class Flaws:
         turn = np.deg2rad(sizes.start_segment_deg) / np.sqrt(3.0)
         self.start = {name: turn * rngs["start_segment"].standard_normal(3) for name in SEGMENTS[1:]}  # (3,) [rad]
         self.sway = {name: Sway(rngs["sway"]) for name in ("torso", *SIDES)}
-        # The stretched arms need room for what comes on top of the perfect motion.
+        # The arms need slack for palm slip and shoulder motion.
         self.slack = max(0.012, sizes.palm_slip + sizes.shoulder_wander) if self.stretches else 0.0
 
     @property
     def stretches(self) -> bool:
-        """Palms and shoulders leave the places of the perfect motion."""
+        """True where palms or shoulders deviate from the ideal motion."""
         return self.sizes.palm_slip > 0.0 or self.sizes.shoulder_wander > 0.0
 
 
@@ -112,11 +112,11 @@ class _Circle:
 
     @property
     def stop(self) -> float:
-        """When the hand is back on the table [s]."""
+        """Time [s] at which the hand is back on the table."""
         return self.start + self.duration + 2.0 * _LIFT_S - 1.0  # turn, lift and return overlap by 0.5 s each
 
     def offset_W(self, t: np.ndarray, table_W: np.ndarray) -> np.ndarray:
-        """From the table point to the hand: (n, 3) [m]."""
+        """Return the vector from the table point to the hand (n, 3) [m]."""
         angle = 2.0 * np.pi * self.sense * make_step(t, self.start + _LIFT_S - 0.5, self.duration)
         circle_W = self.centre_W + np.cos(angle)[:, None] * self.axes_W[0] + np.sin(angle)[:, None] * self.axes_W[1]
         return make_pulse(t, self.start, self.stop, _LIFT_S)[:, None] * (circle_W - table_W)
@@ -129,10 +129,10 @@ class Motion:
     lean_deg: float | np.ndarray = 15.0  # yaw, pitch, roll of the torso in the clasp
 
     def prepare(self, rng: np.random.Generator, pose_deg: float) -> None:
-        """What another protocol draws beyond the clasp; `pose_deg`: how far poses are off, each axis."""
+        """Draw what a protocol needs beyond the clasp; `pose_deg` is the error of poses about each axis."""
 
     def phases(self) -> dict[str, list[tuple[float, float]]]:
-        """What is done between start and circles: phase → intervals [s]."""
+        """Return the phases between start and circles: phase → intervals [s]."""
         return {self.phase: [(self.clasp[0] + MARGIN_S, self.clasp[1] - MARGIN_S)]}
 
     def __init__(
@@ -171,12 +171,12 @@ class Motion:
         self.slip_gain = flaws.sizes.palm_slip / np.sqrt(3.0) / rms
 
     def activity(self, t: np.ndarray) -> np.ndarray:
-        """1 in the free motion of clasp and circles, 0 where the segments are static: (n,)."""
+        """Return the activity (n,): 1 in the free motion of clasp and circles, 0 where the segments are static."""
         moving = make_pulse(t, *self.clasp, _RAMP_S)
         return moving + sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
 
     def _clasp_point(self, t: np.ndarray, moving: np.ndarray) -> np.ndarray:
-        """Where the palms meet, from midway between the shoulders in T: (n, 3) [m], in reach of both arms."""
+        """Return the point where the palms meet (n, 3) [m] in T, from midway between the shoulders, in reach."""
         azimuth = np.deg2rad(38.0) * moving * self.wander["azimuth"](t)
         elevation = np.deg2rad(-4.0 + 46.0 * moving * self.wander["elevation"](t))
         fraction = 0.5 + 0.5 * moving * self.wander["radius"](t)
@@ -192,7 +192,7 @@ class Motion:
         side = self.half_width * np.sqrt(ray[:, 1] ** 2 + 0.01)
         upper = np.sqrt(side**2 + longest**2 - self.half_width**2) - side
         lower = np.sqrt(side**2 + max(shortest**2 - self.half_width**2, 0.0)) + side
-        chest = 0.3 * self.reach / ray[:, 0]  # hands stay before the chest
+        chest = 0.3 * self.reach / ray[:, 0]  # hands stay in front of the chest
         lower = (lower**8 + chest**8) ** 0.125  # a smooth maximum
         return (lower + fraction * (upper - lower))[:, None] * ray
 
@@ -200,18 +200,18 @@ class Motion:
         return make_pulse(t, *self.clasp, _RAMP_S)  # 0 at both ends of the clasp
 
     def _torso(self, _t: np.ndarray, lean: np.ndarray) -> Rotation:
-        """R_WT, `lean` (n, 3) [rad] yaw, pitch, roll."""
+        """Return R_WT from `lean` (n, 3) [rad]: yaw, pitch, roll."""
         return Rotation.from_euler("ZYX", lean)
 
     def _palms(
         self, _t: np.ndarray, _motion_share: np.ndarray, clasp_T: np.ndarray, _R_WT: Rotation
     ) -> dict[str, np.ndarray]:
-        """Where each palm is before the right one goes to the table: (n, 3) [m] in T."""
+        """Return the position (n, 3) [m] in T of each palm before the right one moves to the table."""
         return {"left": clasp_T, "right": clasp_T}
 
     def _lead_share(self, _t: np.ndarray, led: np.ndarray, table: np.ndarray) -> dict[str, np.ndarray]:
-        """How far each arm is led by its palm, 0 where it hangs: (n,)."""
-        return {"left": led * (1.0 - table), "right": led}  # the left arm goes back to hang
+        """Return the share (n,) by which each palm leads its arm; 0: the arm hangs."""
+        return {"left": led * (1.0 - table), "right": led}  # the left arm returns to hanging
 
     def _arm(self, side: str, palm_T: np.ndarray, swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:
         """Upper arm in T and elbow flexion [rad] to bring the palm to `palm_T` (n, 3) [m], from the shoulder.
@@ -239,7 +239,7 @@ class Motion:
         return Rotation.from_matrix(np.stack((x, np.cross(n, m), -u), axis=2)), flexion
 
     def __call__(self, t: np.ndarray, sides: Collection[str] = tuple(SIDES)) -> BodyPose:
-        """The pose of torso and arms of these sides at the times `t` (n,) [s], exact."""
+        """Return the exact pose of the torso and of the arms of these sides at the times `t` (n,) [s]."""
         moving = self._motion_share(t)
         circling = sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
         led = make_step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
@@ -302,7 +302,7 @@ class Motion:
 
 
 def place_sensors(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """Where each sensor sits in L [m]: on the sternum, half-way along the outer side of the arm segments."""
+    """Place each sensor in L [m]: on the sternum, and half-way along the outer side of the arm segments."""
     places = {"torso": np.array((0.11, 0.0, 0.8 * lengths["trunk"]))}
     for side, y in SIDES.items():
         places[f"{side}_upper_arm"] = np.array((0.0, 0.045 * y, -0.5 * lengths[f"{side}_upper_arm"]))
@@ -311,7 +311,7 @@ def place_sensors(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
 
 
 def locate_sensor(pose: BodyPose, segment: str, p_LS: np.ndarray) -> np.ndarray:
-    """The sensor's place in W: (n, 3) [m]."""
+    """Compute the sensor's position (n, 3) [m] in W."""
     p_W = pose.R_WL[segment].apply(p_LS)
     if segment == "torso":
         return p_W

@@ -1,4 +1,4 @@
-"""The paper's experiments with one sensor in the hand: known orientation, and the IMU data that it gives."""
+"""The paper's experiments with one sensor in the hand: exact orientation and IMU data."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .imu import GRAVITY, MTI_3, Device, ImuNoise, jitter_time
 from .motion import E_Z, make_pulse
 
 _STENCIL_S = 1e-3
-_GRID_HZ = 200.0  # at which the motion is scaled to its peaks
+_GRID_HZ = 200.0  # sampling rate for the scaling of the motion to its peaks
 
 
 @dataclass(frozen=True)
 class SingleSensor:
-    """One sensor, moved in the hand.
+    """One sensor that a hand moves.
 
     `gyro_S[k]` is the rate over (k−1, k], `accel_S[k]` the specific force at k; both with noise, bias and the sensor's
     imperfections.
@@ -36,7 +36,7 @@ class SingleSensor:
 
 
 class _HandMotion:
-    """Rest, a burst of turning and translation, rest where it began."""
+    """A static phase, a burst of rotation and translation, and a static phase in the first pose."""
 
     def __init__(
         self,
@@ -49,10 +49,10 @@ class _HandMotion:
     ) -> None:
         self.span, self.ramp = span, ramp
         self.R_W0 = Rotation.random(random_state=rng)
-        # One frequency near each of those named; slower waves are larger, so that each has its share in the rate.
+        # One frequency near each of these; slower waves are larger, so that all contribute to the rate.
         self.omega = [2.0 * np.pi * np.array(hz) * rng.uniform(0.85, 1.15, (3, len(hz))) for hz in (turn_hz, shake_hz)]
         self.phase = [rng.uniform(0.0, 2.0 * np.pi, omega.shape) for omega in self.omega]
-        # A hand does not go on evenly: its vigour swells and falls between a third and one.
+        # A hand's motion is uneven: its amplitude varies between a third and one.
         self.vigour = 2.0 * np.pi * rng.uniform(0.04, 0.12, 2), rng.uniform(0.0, 2.0 * np.pi, 2)
         self.gain = [1.0, 1.0]
         # Peaks of rate [rad/s] and acceleration [m/s^2]. The rate is not linear in the angles: a few rounds.
@@ -82,7 +82,7 @@ class _HandMotion:
         return (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
 
     def rates(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angular rate in S (n, 3) [rad/s] and acceleration in W (n, 3) [m/s^2]."""
+        """Return the angular rate in S (n, 3) [rad/s] and the acceleration in W (n, 3) [m/s^2]."""
         h = _STENCIL_S
         turn = (self.orientation(t - h).inv() * self.orientation(t + h)).as_rotvec()
         return turn / (2.0 * h), self.acceleration(t)
@@ -125,7 +125,7 @@ def simulate_paper_dynamic(
     noise: ImuNoise = MTI_3,
     imperfections: Imperfections = IDEAL_PRESET,
 ) -> SingleSensor:
-    """One trial of the paper's dynamic experiment: 5 s static, 50 s of free motion in the hand, 5 s static.
+    """Simulate a trial of the paper's dynamic experiment: 5 s static, 50 s of free motion in the hand, 5 s static.
 
     Turns of 0.15 to 1.5 Hz with a peak of 6 to 8 rad/s, translation with a peak of 15 to 20 m/s^2, without pauses. Of
     `imperfections` those of a single sensor count: scale, misalignment, g-sensitivity, range, bits and jitter.
@@ -143,7 +143,7 @@ def simulate_paper_drift(
     noise: ImuNoise = MTI_3,
     imperfections: Imperfections = IDEAL_PRESET,
 ) -> SingleSensor:
-    """One trial of the paper's drift experiment: 25 s static, 10 s of fast shaking and rotating, 25 s static.
+    """Simulate a trial of the paper's drift experiment: 25 s static, 10 s of fast shaking and rotating, 25 s static.
 
     Turns of 0.5 to 4 Hz with a peak of 13 to 15 rad/s, shaking of 2 to 5 Hz with a peak of 40 to 50 m/s^2;
     `imperfections` as in `simulate_paper_dynamic`.

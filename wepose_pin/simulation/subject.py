@@ -1,4 +1,4 @@
-"""`simulate`: the paper's upper-body experiment with known truth, and what its sensors give."""
+"""`simulate`: the paper's upper-body experiment with known truth and its IMU data."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from .motion import (
 )
 from .tasks import TASKS
 
-MOUNT = ("+x", "-z")  # sensor axes that point up and forward, but for the tilt of the strap
+MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
 _STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
 _GAIN_RATE_HZ = 20.0  # at which soft-tissue motion is scaled to its rms
@@ -56,7 +56,7 @@ _STREAMS = (
 
 @dataclass(frozen=True)
 class Simulation:
-    """What `simulate` gives: exact motion, IMU data, and what the session file would state.
+    """The result of `simulate`: exact motion, IMU data, and the contents of the session file.
 
     `quat_LS` is R_LS = Swing @ N, where N takes the axes of `stated_mount` to z (up) and x (forward) of the
     segment and Swing turns by 2 to 10 deg about a horizontal axis. So, in an exact N-pose, the stated axes and gravity
@@ -86,13 +86,13 @@ class Simulation:
     quat_WS: dict[str, np.ndarray]  # sensor -> (n, 4) xyzw, its own true orientation
     soft_tissue: dict[str, np.ndarray]  # sensor -> (n, 3) [rad], rotation vector in L
     device: dict[str, Device]  # sensor -> its own errors
-    sample_time: dict[str, np.ndarray]  # sensor -> (n,) [s], when it did sample; the file states `time`
+    sample_time: dict[str, np.ndarray]  # sensor -> (n,) [s], true sampling times; the file states `time`
 
     def recording(self, name: str = "simulated") -> Recording:
-        """What a user would have recorded of it: sensors, stated mounts and phases, no truth.
+        """Return the recording that a user would have: sensors, stated mounts and phases, without truth.
 
-        On the stated time: what clocks are off by stays in the data, as with a file. Lost samples are bridged by the
-        readers' own code.
+        It has the stated times, so that clock errors stay in the data as in a file. The readers' code bridges lost
+        samples.
         """
         clock = Clock(self.time, np.arange(len(self.time)), 1.0 / self.rate_hz)
         sensors = {}
@@ -108,40 +108,40 @@ class Simulation:
         return check_recording(Recording(name, self.time, self.rate_hz, sensors, phases))
 
     def truth(self) -> Pose:
-        """The exact pose."""
+        """Return the exact pose."""
         return Pose(self.time, self.quat_WL, self.points)
 
 
 class _Moved(NamedTuple):
-    """A segment with its sensor's place at n times."""
+    """The motion of a segment and of its sensor's position at n times."""
 
     time: np.ndarray  # (n,) [s]
     R_WL: Rotation
-    p_ddot: np.ndarray  # (n, 3) [m/s^2] in W, of the sensor's place
+    p_ddot: np.ndarray  # (n, 3) [m/s^2] in W, of the sensor's position
     rate_L: np.ndarray  # (n, 3) [rad/s] of the segment
 
 
 class _Sampled:
-    """The motion at n times, and beside them for derivatives by differences."""
+    """The motion at n times, and at neighbouring times for numerical derivatives."""
 
     def __init__(self, motion: Motion, t: np.ndarray, segment: str = "") -> None:
-        """Of all segments, or of one and what carries it."""
+        """Sample all segments, or one segment and those that carry it."""
         sides = [side for side in SIDES if not segment or segment.startswith(side)]
         self.time = t
         self.pose: BodyPose = motion(t, sides)
-        self.beside = [motion(t + k * _STENCIL_S, sides) for k in (-2, -1, 1, 2)]
+        self.neighbours = [motion(t + k * _STENCIL_S, sides) for k in (-2, -1, 1, 2)]
 
     def segment(self, segment: str, p_LS: np.ndarray) -> _Moved:
-        # Differences to the middle first: where nothing moves they are exactly zero.
+        # Differences to the middle first: for a static segment they are exactly zero.
         p_W = locate_sensor(self.pose, segment, p_LS)
-        far, near, near_after, far_after = (locate_sensor(b, segment, p_LS) - p_W for b in self.beside)
+        far, near, near_after, far_after = (locate_sensor(b, segment, p_LS) - p_W for b in self.neighbours)
         p_ddot = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
-        turn = self.beside[1].R_WL[segment].inv() * self.beside[2].R_WL[segment]
+        turn = self.neighbours[1].R_WL[segment].inv() * self.neighbours[2].R_WL[segment]
         return _Moved(self.time, self.pose.R_WL[segment], p_ddot, turn.as_rotvec() / (2.0 * _STENCIL_S))
 
 
 class _SoftTissue:
-    """How a sensor turns on its segment: a mixture of specific force and rate, and a wandering while it moves."""
+    """Soft-tissue rotation of a sensor on its segment: a mixture of specific force and rate, and a slow wandering."""
 
     def __init__(self, rng: np.random.Generator, rms_deg: float) -> None:
         self.mixture = rng.standard_normal((6, 3))
@@ -150,20 +150,20 @@ class _SoftTissue:
         self.gains = np.zeros((2, 3))  # of the two parts, of each axis
 
     def scale(self, moved: _Moved, activity: np.ndarray) -> None:
-        """Sets the gains so that it has its rms over these samples."""
+        """Set the gains so that the rotation has its rms over these samples."""
         follows, wanders = self._parts(moved, activity)
         each = np.array([1.0 / np.sqrt(np.mean(part**2, axis=0)) for part in (follows, wanders)])
         total = each[0] * follows + each[1] * wanders
         self.gains = each * self.rms / np.sqrt(np.mean(total**2, axis=0))
 
     def _parts(self, moved: _Moved, activity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # In units of g and of 3 rad/s, about what free motion of the arms has; zero in a static N-pose.
+        # In units of g and of 3 rad/s, typical of free arm motion; zero in a static N-pose.
         force_L = moved.R_WL.inv().apply(moved.p_ddot / GRAVITY + E_Z) - E_Z
         follows = np.column_stack((force_L, moved.rate_L / 3.0)) @ self.mixture
         return follows, activity[:, None] * np.column_stack([wander(moved.time) for wander in self.wander])
 
     def __call__(self, moved: _Moved, activity: np.ndarray) -> np.ndarray:
-        """Rotation vectors (n, 3) [rad] in L."""
+        """Return rotation vectors (n, 3) [rad] in L."""
         if not self.rms:
             return np.zeros((len(activity), 3))
         follows, wanders = self._parts(moved, activity)
@@ -182,7 +182,7 @@ def simulate(
     protocol: str = "clasp",
     pose_deg: NonNegative = 0.0,
 ) -> Simulation:
-    """A recording of the paper's upper-body experiment with known truth.
+    """Simulate the paper's upper-body experiment with known truth.
 
     0 to 5 s static in the N-pose; 2.5 s to the clasp; `clasp_s` of free motion with the palms together while
     the torso leans and twists; 2.5 s in which the left arm returns to hang and the right hand goes to a
@@ -197,8 +197,8 @@ def simulate(
     rate_hz : samples a second.
     noise : of gyroscope and accelerometer; `NOISE_FREE` for none.
     imperfections : of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for usual ones.
-    clasp_s : how long the palms stay together [s], at least 5.
-    circles : how many circles, 0 or more.
+    clasp_s : [s] duration of the clasp, palms together, at least 5.
+    circles : number of circles, 0 or more.
     protocol : what is done in place of the clasp, one of `TASKS`; "handle": 0.4 m between the palms; "touch_left" and
         "touch_right": the palm on a fixed point while the trunk leans and turns; "poses": T-pose and bow, no circles.
     pose_deg : how far T-pose and bow are off, standard deviation of each axis [deg].
@@ -305,7 +305,7 @@ def simulate(
 
 
 class Person(NamedTuple):
-    """A random person, and the lengths that a user would measure."""
+    """A random person, with the lengths that a user would measure."""
 
     lengths: dict[str, float]  # [m], true
     stature: float  # [m]
@@ -316,7 +316,7 @@ class Person(NamedTuple):
 
 
 def simulate_person(seed: int, measured_std: float = 0.003) -> Person:
-    """A random person of the population, with measured shoulder width and trunk."""
+    """Sample a person of the population, with measured shoulder width and trunk."""
     rng = np.random.default_rng([seed, 7])
     sex = SEXES[int(rng.integers(2))]
     mean, std = {"f": (1.63, 0.064), "m": (1.756, 0.069)}[sex]  # [m], ANSUR II (Gordon et al. 2014)

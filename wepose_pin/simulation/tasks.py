@@ -1,4 +1,4 @@
-"""The motions of other protocols than the clasp: a handle, a palm on a fixed point, poses and a bow."""
+"""Motions of the protocols other than the clasp: a handle, a palm on a fixed point, poses and a bow."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _TURN_S = 2.5  # into the T-pose, and back
 
 
 def _is_in_reach(motion: Motion, side: str, distance: np.ndarray) -> bool:
-    """Whether the arm reaches through distances (n,) [m] from shoulder to palm."""
+    """Return whether the arm reaches all distances (n,) [m] from shoulder to palm."""
     upper, lower = motion.arm[side]
     span = np.sqrt(upper**2 + lower**2 + 2.0 * upper * lower * np.cos(np.deg2rad((12.0, 140.0))))
     return bool(np.all((span[1] < distance) & (distance < span[0] - motion.flaws.slack)))
 
 
 class Handle(Motion):
-    """Both hands on a bar that tilts and turns."""
+    """Both hands on a bar that tilts and rotates."""
 
     phase = "handle"
     length = 0.40  # [m] between the palms
@@ -31,7 +31,7 @@ class Handle(Motion):
         self.bar = [Wander(rng) for _ in range(2)]
         t = np.arange(*self.clasp, 0.05)
         moving, none = self._motion_share(t), Rotation.identity()
-        for share in np.arange(1.0, 0.1, -0.05):  # as far as the arms allow
+        for share in np.arange(1.0, 0.1, -0.05):  # the largest motion in reach of the arms
             self.share = share
             palm_T = self._palms(t, moving, self._clasp_point(t, moving), none)
             if all(
@@ -55,7 +55,7 @@ class Handle(Motion):
 
 
 class Touch(Motion):
-    """One palm on a fixed point of W, from the clasp's beginning to the end; the trunk leans and turns."""
+    """One palm on a fixed point of W, from the clasp's beginning to its end; the trunk leans and rotates."""
 
     phase = "touch"
     side = "right"
@@ -64,7 +64,7 @@ class Touch(Motion):
         y = SIDES[self.side]
         shoulder_W = np.array((0.0, y * self.half_width, self.lengths["trunk"]))
         self.point_W = shoulder_W + self.reach * np.array((0.60, 0.05 * y, -0.35))
-        # As far as the arm allows: the shoulder's way is scaled down until the palm stays in reach.
+        # The shoulder's motion is scaled down until the palm stays in reach.
         most = np.array((25.0, 15.0, 12.0))
         t = np.arange(*self.clasp, 0.05)
         for share in np.arange(1.0, 0.2, -0.05):
@@ -88,7 +88,7 @@ class TouchLeft(Touch):
 
 
 class Poses(Motion):
-    """T-pose, then a bow, each as well as a person does it."""
+    """T-pose, then a bow, each with a person's errors."""
 
     def prepare(self, rng: np.random.Generator, pose_deg: float) -> None:
         self.clasp = (_T_POSE_S[0], _BOW_S[1])
