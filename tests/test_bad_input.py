@@ -188,7 +188,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "a ready sensor in motion": (
         lambda f: (setattr(f, "session", QUATS), f.say("[[0.5, 2.5]]", "[[4.0, 6.0]]")),
-        "deg/s rms in phases.start (4 to 6 s); name seconds in which it keeps still",
+        "deg/s rms in phases.start (4 to 6 s); name seconds in which it is static",
     ),
     # the table
     "a missing table": (lambda f: f.say("arm.csv", "amr.csv"), "amr.csv: no such file; did you mean 'arm.csv'?"),

@@ -73,7 +73,7 @@ def test_registration_finds_what_lies_between(moving: SingleSensor, still: slice
     up_W = (Rotation.from_quat(found.quat_WV) * R_VW).apply([0.0, 0.0, 1.0])
     assert np.degrees(np.arccos(up_W[2])) < 0.35  # 3 mg of accelerometer bias are 0.17 deg
     assert np.degrees(np.abs(found.gyro_bias - moving.gyro_bias.mean(axis=0)).max()) < 0.02
-    assert found.left_deg < 0.2
+    assert found.residual_deg < 0.2
 
 
 def test_what_cannot_be_registered_is_said(moving: SingleSensor) -> None:
@@ -131,8 +131,8 @@ def test_ring_registration_is_consistent(data: Path) -> None:
     assert one.tilt_deg == pytest.approx(0.9, abs=0.3)
     for segment in RING_SEGMENTS:
         rigid = registered["rigid", segment]
-        assert rigid.left_deg < 0.5
-        assert rigid.left_deg < registered["loose", segment].left_deg
+        assert rigid.residual_deg < 0.5
+        assert rigid.residual_deg < registered["loose", segment].left_deg
         (alone,) = register_sensors([chain.sensors["rigid", segment]], (0.0, 10.0))
         assert alone.offset_s == pytest.approx(rigid.offset_s, abs=2e-3)
         mounts = Rotation.from_quat(alone.quat_BS) * Rotation.from_quat(rigid.quat_BS).inv()

@@ -1,4 +1,4 @@
-"""The filters as they are compared: ours, those of others, and how each was set.
+"""The filters of the comparison with their settings: ours, NCF and GDC, and other packages.
 
 All start from the same static phase: its bias is removed (but for "default gains"), and where a start can be given it
 is the tilt measured at the beginning. The heading is aligned by the experiments, for all alike.
@@ -42,14 +42,14 @@ class Contender(NamedTuple):
 
 
 def list_contenders(setting: str, trial: str = "") -> list[Contender]:
-    """Who takes part, ours first, then NCF and GDC, tuned and as they come, then the peers that are installed.
+    """List the contenders: ours, then NCF and GDC, tuned and with default gains, then the installed peers.
 
     `setting`: "real" or a key of `gains.STATED`; `trial`: the name of a real one (see `make_gains`).
     """
     tuned = make_gains(setting, trial)._asdict()
     filters = [_make_ours(method) for method in METHODS if method not in tuned]
     filters += [_make_tuned(method, params) for method, params in tuned.items()]
-    filters += [_default_gains(method, params) for method, params in DEFAULT_GAINS.items()]
+    filters += [_make_default(method, params) for method, params in DEFAULT_GAINS.items()]
     return filters + [Contender(label, orient) for label, (module, orient) in _PEERS.items() if find_spec(module)]
 
 
@@ -67,7 +67,7 @@ def _make_tuned(method: str, params: Any) -> Contender:
     return Contender(method, orient)
 
 
-def _default_gains(method: str, params: Any) -> Contender:
+def _make_default(method: str, params: Any) -> Contender:
     """Published gains without a static phase: the bias starts at zero."""
 
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
@@ -86,7 +86,7 @@ def _vqf(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorN
 
 
 def _run_offline_vqf(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-    """Forward and backward over the whole recording, as a smoother."""
+    """Run VQF forward and backward over the whole recording, as a smoother."""
     gyro, accel = np.ascontiguousarray(gyro_S - noise.gyro_bias), np.ascontiguousarray(accel_S, dtype=float)
     return rotations.xyzw_from_wxyz(import_module("vqf").offlineVQF(gyro, accel, None, 1.0 / rate_hz)["quat6D"])
 
@@ -103,14 +103,14 @@ def _imufusion(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: S
             sample_rate=rate_hz, gain=0.5, gyroscope_range=2000.0, acceleration_rejection=10.0, rejection_timeout=5.0
         )
     )
-    # The start that the others have; its own would hold the heading for three seconds.
+    # The same start as the others; its own would fix the heading for three seconds.
     quat_start = rotations.quat_from_gravity(accel_S[: StaticTest().samples(rate_hz)].mean(axis=0))
     ahrs.set_quaternion(rotations.wxyz_from_xyzw(quat_start)).skip_startup()
     gyro, accel = np.degrees(gyro_S), accel_S / noise.gravity  # [deg/s], [g]
     quat_wxyz = np.empty((len(gyro), 4))
     for k in range(len(gyro)):
         quat_wxyz[k] = ahrs.update_no_magnetometer(bias.update(gyro[k]), accel[k]).get_quaternion()
-    # It counts in single precision: the norm is off by 1e-7.
+    # The package computes in single precision: the norm has an error of 1e-7.
     return rotations.xyzw_from_wxyz(quat_wxyz / np.linalg.norm(quat_wxyz, axis=1, keepdims=True))
 
 

@@ -1,4 +1,4 @@
-"""``validation.json``: every trial of a run, and what it was run with."""
+"""``validation.json``: every trial of a run, and the run's settings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .paper import WORLDS
 
 
 class Document(NamedTuple):
-    """A run as its file holds it."""
+    """The contents of a run's file."""
 
     results: list[Result]
     quick: bool
@@ -31,7 +31,7 @@ class Document(NamedTuple):
 def format_document(
     results: Sequence[Result], quick: bool, versions: Mapping[str, str], skipped: Sequence[Skipped] = ()
 ) -> str:
-    """The file's text: a line a result. No time stamp, so that two runs give the same file.
+    """Format the file's text, one line a result, without a time stamp: two runs give the same file.
 
     JSON has no infinity and no NaN: an unbounded range and a NaN are null.
     """
@@ -57,7 +57,7 @@ def format_document(
 
 
 def read_document(path: Path) -> Document:
-    """The run in `path`.
+    """Read the run in `path`.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def read_document(path: Path) -> Document:
 
 
 def parse_document(content: Any, where: str) -> Document:
-    """A run from what JSON gave.
+    """Parse a run from decoded JSON.
 
     Raises
     ------

@@ -43,7 +43,7 @@ WINDOWS = 60  # of the running root mean square, over a curve's time
 
 
 def draw_pictures(document: Document, failures: list[str] | None = None) -> Iterator[tuple[str, Picture]]:
-    """Experiment and chart, in the order of the page; what cannot be drawn from the results is left out.
+    """Draw the charts, each with its experiment, in the order of the page; without those that lack results.
 
     `failures` takes a line for each chart whose drawing fails.
     """
@@ -64,7 +64,7 @@ def draw_pictures(document: Document, failures: list[str] | None = None) -> Iter
 
 
 def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Picture | None:
-    """A bar a filter and figure, the paper's hatched below it."""
+    """Draw a bar for each filter and figure, with the paper's hatched below it."""
     quantities = [AXES, tuple(HAND.values())]
     if len({result.trial for result in results}) == 1:
         quantities.append(tuple(name.replace("_", " ") for name in SPLIT[:3]))
@@ -91,7 +91,7 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Pi
         limit = limits.get(name, (0.0, 0.0))[1]
         panel.x = 0.0, _end_of_bars(bars, max([limit, *(sum(of[name]) for of in paper.values() if name in of)]))
         for place, mean, _ in bars:
-            if mean > panel.x[1]:  # too large for the scale: as text
+            if mean > panel.x[1]:  # beyond the scale: text
                 panel.text(panel.x[1], place, f"{mean:.1f} →", "halo", "end", dx=-3.0)
         if limit:
             panel.rule("ink dashed", x=limit)
@@ -107,7 +107,7 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Pi
 
 
 def _trials(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Picture | None:
-    """A marker a filter and trial, for recordings whose error is split into inclination, heading and total."""
+    """Draw a marker for each filter and trial, where the error is split into inclination, heading and total."""
     names = [name.replace("_", " ") for name in SPLIT[:3]]
     trials = list(dict.fromkeys(result.trial for result in results))
     if len(trials) < 2 or not all(name in row.figures for row in rows for name in names):
@@ -136,7 +136,7 @@ def _trials(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> 
 
 
 def _over_time(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Picture | None:
-    """The error of the first trial, a line a filter."""
+    """Draw the error of the first trial over time, one line a filter."""
     trial = next((r.trial for r in results if r.series), "")
     series = {r.method: r.series for r in results if r.series and r.trial == trial}
     name = next((n for n in ("total_deg", "error_mm", "heading_deg") if all(n in of for of in series.values())), None)
@@ -167,7 +167,7 @@ def _over_time(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> 
 
 
 def _path(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Picture | None:
-    """The hand's path against the truth, from behind and from above, of smekf and of the worse of NCF and GDC."""
+    """Draw the hand's path and the truth, from behind and from above, of smekf and of the worse of NCF and GDC."""
     needed = [f"{true}{axis}_mm" for true in ("", "true_") for axis in "xyz"]
     trial = next((r.trial for r in results if r.series), "")
     series = {r.method: r.series for r in results if r.trial == trial and all(name in r.series for name in needed)}
@@ -192,7 +192,7 @@ def _path(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pictu
 
 
 def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Picture | None:
-    """What each imperfection adds to the hand's error."""
+    """Draw the error budget of the hand."""
     budget = compute_error_budget(results)
     if experiment != ERROR_BUDGET or budget is None:
         return None
@@ -223,11 +223,11 @@ def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pic
     return Picture("parts", f"{caption}.", Chart([panels], [28.0 * len(lines) + 6.0]))
 
 
-# How they look --------------------------------------------------------------------------------------------------------
+# Style ----------------------------------------------------------------------------------------------------------------
 
 
 def _running_rms(error: np.ndarray, over: int) -> np.ndarray:
-    """(n,) → (n,): root mean square of `over` samples around each; what is missing stays missing."""
+    """Compute the root mean square (n,) of `over` samples around each sample; NaN stay NaN."""
     known = np.isfinite(error)
     kernel = np.ones(over)
     total = np.convolve(np.where(known, error, 0.0) ** 2, kernel, "same")
@@ -236,7 +236,7 @@ def _running_rms(error: np.ndarray, over: int) -> np.ndarray:
 
 
 def _end_of_bars(bars: Sequence[tuple[float, float, float]], least: float) -> float:
-    """Where the axis ends: before bars (place, mean, with whisker) that dwarf the others."""
+    """Find the end of the axis, before bars (place, mean, with whisker) that are much longer than the others."""
     reach = np.array([whole for _, _, whole in bars])
     most = 3.0 * float(np.percentile(reach, 75))
     end = float(reach.max())
@@ -246,7 +246,7 @@ def _end_of_bars(bars: Sequence[tuple[float, float, float]], least: float) -> fl
 
 
 def _colour(method: str) -> str:
-    """A filter's colour, the same in every chart; lighter with default gains."""
+    """Choose a filter's colour, the same in every chart; lighter with default gains."""
     name = method.removesuffix(DEFAULTS)
     colour = COLOURS.get(name) or OTHERS[sum(map(ord, name)) % len(OTHERS)]
     if name == method:

@@ -1,4 +1,4 @@
-"""Gains of NCF and GDC: a grid search on trials that are scored nowhere else.
+"""Gains of NCF and GDC: a grid search on trials that no experiment scores.
 
 Each setting has its own grid search, so that no filter runs with gains of another kind of motion. The score is the mean
 over trials of the total RMSE over the motion, which the experiments report too. Heading, bias, noise and initial tilt
@@ -39,18 +39,18 @@ RATES = {"simulated 100 Hz": 100.0, "simulated 1 kHz": 1000.0}
 WORLDS = {"upper body, MTi-3 noise alone": IDEAL_PRESET, "upper body, realistic": MILD_PRESET}
 BROAD = {"BROAD, first half": HALVES[0], "BROAD, second half": HALVES[1], "BROAD": HALVES[0] | HALVES[1]}
 
-_SCORED_HZ = 25.0  # samples a second that count: errors are slow
+_SCORED_HZ = 25.0  # [Hz] rate of the scored samples: errors are slow
 
 
 class Gains(NamedTuple):
-    """What a grid search found."""
+    """The gains of a setting, from a grid search."""
 
     ncf: NcfParams
     gdc: GdcParams
 
 
 def _grid_points(proportional: float, integral: float, descent: float) -> Gains:
-    """The points of the grid that these round."""
+    """Find the grid points of these rounded values."""
     nearest = [
         float(min(axis, key=lambda point: abs(point - rounded)))
         for axis, rounded in ((PROPORTIONAL, proportional), (INTEGRAL, integral), (DESCENT, descent))
@@ -72,15 +72,15 @@ STATED = {
 
 
 class TuningTrial(NamedTuple):
-    """A trial and its truth; the samples at which it is aligned and scored are thinned to `_SCORED_HZ`."""
+    """A trial and its truth; samples for alignment and score are decimated to `_SCORED_HZ`."""
 
     gyro_S: np.ndarray  # (n, 3) [rad/s]
     accel_S: np.ndarray  # (n, 3) [m/s²]
     rate_hz: float
     noise: SensorNoise
-    at: np.ndarray  # (m,) samples that are looked at
-    R_WS: Rotation  # (m,) true, there
-    rest: np.ndarray  # (m,) bool, where the heading is aligned
+    samples: np.ndarray  # (m,) indices of the decimated samples
+    R_WS: Rotation  # (m,) true orientation at these samples
+    static: np.ndarray  # (m,) bool, where the heading is aligned
     scored: np.ndarray  # (m,) bool
 
 
@@ -92,7 +92,7 @@ class Score(NamedTuple):
 
 
 def make_gains(setting: str, trial: str = "") -> Gains:
-    """The stated gains of a `setting`: a key of `STATED`, or "real".
+    """Return the stated gains of a `setting`: a key of `STATED`, or "real".
 
     `trial`: its name; one of BROAD gets what was found on the half that it is not in.
     """
@@ -105,7 +105,7 @@ def make_gains(setting: str, trial: str = "") -> Gains:
 
 
 def search_gains(trials: Sequence[TuningTrial]) -> tuple[list[Score], list[Score]]:
-    """The grids of NCF and GDC on these trials, every point scored."""
+    """Score every grid point of NCF and GDC on these trials."""
     ncf = [NcfParams(float(p), float(i)) for p, i in product(PROPORTIONAL, INTEGRAL)]
     gdc = [GdcParams(float(gain)) for gain in DESCENT]
     return (
@@ -119,75 +119,77 @@ def find_best(scores: Sequence[Score]) -> Score:
 
 
 def compute_rmse(trial: TuningTrial, params: NcfParams | GdcParams) -> float:
-    """[deg] over what of a trial is scored."""
+    """Compute the total RMSE [deg] over the scored samples of a trial."""
     quat_start = rotations.quat_from_gravity(trial.accel_S[: StaticTest().samples(trial.rate_hz)].mean(axis=0))
     filter_ = (Ncf if isinstance(params, NcfParams) else Gdc)(trial.noise, trial.rate_hz, quat_start, params)  # type: ignore[arg-type]
     quat = filter_.run(trial.gyro_S, trial.accel_S, np.zeros(len(trial.gyro_S), dtype=bool)).quat_WS
-    R_VS = align_rotation(Rotation.from_quat(quat[trial.at]), trial.R_WS, trial.rest)
+    R_VS = align_rotation(Rotation.from_quat(quat[trial.samples]), trial.R_WS, trial.static)
     angle = (R_VS[trial.scored] * trial.R_WS[trial.scored].inv()).magnitude()
     return float(np.degrees(np.sqrt(np.mean(angle**2))))
 
 
 def list_trials(setting: str, data: Path | None = None) -> list[TuningTrial]:
-    """On which the gains of a key of `STATED` are found; `data`: the folder of the real recordings."""
+    """List the tuning trials of a key of `STATED`; `data` is the folder of the real recordings."""
     if setting in RATES:
-        return [_dynamic(seed, RATES[setting]) for seed in DYNAMIC_SEEDS]
+        return [_make_dynamic_trial(seed, RATES[setting]) for seed in DYNAMIC_SEEDS]
     if setting in WORLDS:
-        return [trial for seed in PERSON_SEEDS for trial in _person(seed, WORLDS[setting])]
+        return [trial for seed in PERSON_SEEDS for trial in _make_person_trials(seed, WORLDS[setting])]
     if data is None:
         raise BadOption(f"{setting}: its trials need the folder of the real recordings")
     paths = sorted((data / "broad").glob("*.mat"))
-    return [_broad(path) for path in paths if path.stem.split("_")[0] in BROAD[setting]]
+    return [_make_broad_trial(path) for path in paths if path.stem.split("_")[0] in BROAD[setting]]
 
 
-def _dynamic(seed: int, rate_hz: float) -> TuningTrial:
+def _make_dynamic_trial(seed: int, rate_hz: float) -> TuningTrial:
     sensor = simulate_paper_dynamic(seed, rate_hz)
-    rest = (sensor.time >= sensor.static[0][0] + 0.5) & (sensor.time <= sensor.static[0][1] - 0.5)
+    static = (sensor.time >= sensor.static[0][0] + 0.5) & (sensor.time <= sensor.static[0][1] - 0.5)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
-    return _trial(sensor.gyro_S, sensor.accel_S, rate_hz, sensor.quat_WS, rest, moving)
+    return _make_trial(sensor.gyro_S, sensor.accel_S, rate_hz, sensor.quat_WS, static, moving)
 
 
-def _person(seed: int, imperfections: Imperfections) -> list[TuningTrial]:
-    """Its sensors, over clasp and circles, against their own true orientation (soft tissue is no filter's matter)."""
+def _make_person_trials(seed: int, imperfections: Imperfections) -> list[TuningTrial]:
+    """Make the trials of a person's sensors over clasp and circles; the truth is the sensors' own orientation."""
     simulation = simulate(simulate_person(seed).lengths, seed=seed, imperfections=imperfections)
     recording = simulation.recording()
-    rest, moving = (np.zeros(len(recording.time), dtype=bool) for _ in range(2))
-    rest[recording.span(recording.phases["start"][0])] = True
+    static, moving = (np.zeros(len(recording.time), dtype=bool) for _ in range(2))
+    static[recording.span(recording.phases["start"][0])] = True
     for phase in ("clasp", "circles"):
         moving[recording.span(recording.phases[phase][0])] = True
     trials = []
     for segment, sensor in recording.imus.items():
         true = simulation.quat_WS[segment]
-        trials.append(_trial(sensor.gyro_S, sensor.accel_S, recording.rate_hz, true, rest, moving))
+        trials.append(_make_trial(sensor.gyro_S, sensor.accel_S, recording.rate_hz, true, static, moving))
     return trials
 
 
-def _broad(path: Path) -> TuningTrial:
+def _make_broad_trial(path: Path) -> TuningTrial:
     trial = read_broad(path)
-    rest = np.zeros(len(trial.scored), dtype=bool)
-    rest[trial.static] = True
+    static = np.zeros(len(trial.scored), dtype=bool)
+    static[trial.static] = True
     known = np.isfinite(trial.quat_true).all(axis=1)
-    return _trial(trial.gyro_S, trial.accel_S, trial.rate_hz, trial.quat_true, rest, trial.scored, known)
+    return _make_trial(trial.gyro_S, trial.accel_S, trial.rate_hz, trial.quat_true, static, trial.scored, known)
 
 
-def _trial(
+def _make_trial(
     gyro_S: np.ndarray,
     accel_S: np.ndarray,
     rate_hz: float,
     quat_WS: np.ndarray,
-    rest: np.ndarray,
+    static: np.ndarray,
     scored: np.ndarray,
     known: np.ndarray | bool = True,
 ) -> TuningTrial:
-    looked_at = np.zeros(len(gyro_S), dtype=bool)
-    looked_at[:: max(1, round(rate_hz / _SCORED_HZ))] = True
-    at = np.flatnonzero(looked_at & (rest | scored) & known)
-    noise = estimate_noise(gyro_S[rest], accel_S[rest], rate_hz)
-    return TuningTrial(gyro_S, accel_S, rate_hz, noise, at, Rotation.from_quat(quat_WS[at]), rest[at], scored[at])
+    decimated = np.zeros(len(gyro_S), dtype=bool)
+    decimated[:: max(1, round(rate_hz / _SCORED_HZ))] = True
+    samples = np.flatnonzero(decimated & (static | scored) & known)
+    noise = estimate_noise(gyro_S[static], accel_S[static], rate_hz)
+    return TuningTrial(
+        gyro_S, accel_S, rate_hz, noise, samples, Rotation.from_quat(quat_WS[samples]), static[samples], scored[samples]
+    )
 
 
 def list_experiments(data: Path | None = None) -> dict[str, list[Job]]:
-    """The grid searches as jobs, one a setting: gains found, their score, and every point of the grid."""
+    """List the grid searches as jobs, one a setting: best gains, their score, and every grid point."""
     settings = [*RATES, *WORLDS, *(BROAD if data is not None and any((data / "broad").glob("*.mat")) else ())]
     return {"gains": [Job("gains", setting, _search_experiment, (data,)) for setting in settings]}
 

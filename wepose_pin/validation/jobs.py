@@ -1,4 +1,4 @@
-"""Trials as jobs: each is a function of its arguments and nothing else, so that they run side by side."""
+"""Trials as jobs: pure functions of their arguments, which run in parallel."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Job(NamedTuple):
 
 
 def run_jobs(jobs: Sequence[Job], workers: int | None = None) -> Iterator[list[Result] | Skipped]:
-    """Results of each job in the order of the jobs, whatever the number of `workers` (None: one a core).
+    """Run the jobs and iterate over their results in order, for any number of `workers` (None: one a core).
 
     A job that fails, for example on an unreadable recording, is reported and does not stop the others.
     """

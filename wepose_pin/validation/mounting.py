@@ -1,4 +1,4 @@
-"""Sensors mounted in any rotation: what a minute of joined hands finds of lengths, mounts and headings."""
+"""Arbitrary sensor mounting: errors of lengths, mounts and headings from a minute of joined hands."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ METHODS = ("amekf", "smekf")
 
 
 def list_experiments(quick: bool = False) -> dict[str, list[Job]]:
-    """Name → jobs; `quick`: one trial."""
+    """List the jobs of each experiment; `quick`: one trial."""
     trials = range(1 if quick else 10)
     return {ARBITRARY_MOUNTING: [Job(ARBITRARY_MOUNTING, str(k), _arbitrary_mounting, (k,)) for k in trials]}
 
 
 def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
-    """Calibration without stated mounts, with measured shoulder width and trunk, then six circles."""
+    """Calibrate without stated mounts, with measured shoulder width and trunk, then track six circles."""
     person = simulate_person(seed)
     simulation = simulate(person.lengths, seed=seed, imperfections=replace(MILD_PRESET, mount="any"))
     recording, truth = simulation.recording(), simulation.truth()
@@ -35,7 +35,7 @@ def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
             recording, measured=person.measured, prior=person.prior, method=method, measured_std=person.measured_std
         ).subject
         errors = evaluate(track(recording, subject, method=method).pose, truth, simulation.phases["circles"][0])
-        figures = _calibration_errors(subject, person, simulation) | {
+        figures = _compute_calibration_errors(subject, person, simulation) | {
             "hand_mm": errors.position["right_palm"]._asdict(),
             "hand_from_shoulders_mm": errors.position_from_shoulders["right_palm"]._asdict(),
         }
@@ -43,9 +43,9 @@ def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
     return results
 
 
-def _calibration_errors(subject: Subject, person: Person, simulation: Simulation) -> dict[str, float]:
-    """Errors of the calibration; all of them by the standard deviations that it states, too."""
-    names = [name for name in LENGTHS if name != "trunk"]  # which joined hands do not show
+def _compute_calibration_errors(subject: Subject, person: Person, simulation: Simulation) -> dict[str, float]:
+    """Compute errors of the calibration, also as multiples of its standard deviations."""
+    names = [name for name in LENGTHS if name != "trunk"]  # joined hands do not observe the trunk
     lengths = np.array([subject.lengths[name] - person.lengths[name] for name in names])
     order = list(simulation.quat_LS)
     mounts = np.array(

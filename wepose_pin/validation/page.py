@@ -1,4 +1,4 @@
-"""The pages of a validation run: Markdown with its charts beside it, and one HTML file that opens offline."""
+"""The pages of a validation run: Markdown with its charts in a folder, and one HTML file for offline use."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FOLDER = "validation"  # of the Markdown page's charts
 
 
 def write_pages(folder: Path, document: Document) -> list[str]:
-    """``validation.md`` with its charts in ``validation/``, and ``validation.html``.
+    """Write ``validation.md`` with its charts in ``validation/``, and ``validation.html``.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def write_pages(folder: Path, document: Document) -> list[str]:
 
 
 def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str:
-    """The page as Markdown: the template's text with the document's tables and charts."""
+    """Render the page as Markdown: the template's text with the document's tables and charts."""
     rows = summarize(document.results)
     experiments = {}
     for name in dict.fromkeys(row.experiment for row in rows):
@@ -77,7 +77,7 @@ def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str
 
 
 def render_html(text: str, drawn: list[tuple[str, Picture]], failures: list[str] | None = None) -> str:
-    """The page as one HTML file with its charts in it; `text` as of `render_markdown`."""
+    """Render the page as one HTML file with its charts; `text` is the result of `render_markdown`."""
     chart: Any = load_template("report/templates/chart.svg.j2").module
     svgs = {f"{FOLDER}/{picture.stem}.svg": chart.svg(picture) for _, picture in drawn}
     rules = MarkdownIt("commonmark", {"html": False}).enable("table")

@@ -41,8 +41,8 @@ from .tables import ERROR_BUDGET
 
 RATES = {"100 Hz": 100.0, "1 kHz": 1000.0}
 WORLDS = {"MTi-3 noise alone": IDEAL_PRESET, "realistic": MILD_PRESET}
-KNOWN_MOUNT_STD = np.deg2rad(0.5)  # stated for mounts that are exact
-# What is switched off in turn: imperfections as in a perfect world, or a part of the chain known exactly.
+KNOWN_MOUNT_STD = np.deg2rad(0.5)  # stated standard deviation of exact mounts
+# Parts of the error budget: imperfections switched off, or parts of the chain known exactly.
 SWITCHED: dict[str, dict[str, Any]] = {
     label: {name: getattr(IDEAL_PRESET, name) for name in names.split()}
     for label, names in {
@@ -63,7 +63,7 @@ SWITCHED: dict[str, dict[str, Any]] = {
 
 
 def list_experiments(quick: bool = False) -> dict[str, list[Job]]:
-    """Name → jobs; `quick`: one trial of each, and no error budget."""
+    """List the jobs of each experiment; `quick`: one trial of each, and no error budget."""
     jobs = {}
     for rate, rate_hz in RATES.items():
         name = f"dynamic {rate}"
@@ -78,21 +78,24 @@ def list_experiments(quick: bool = False) -> dict[str, list[Job]]:
 
 
 def _dynamic(experiment: str, trial: str, seed: int, rate: str, rate_hz: float) -> list[Result]:
-    """5 s static, 50 s of free motion, 5 s static; errors over the motion."""
+    """Run the dynamic experiment: 5 s static, 50 s of free motion, 5 s static; errors over the motion."""
     sensor = simulate_paper_dynamic(seed, rate_hz)
     results = []
-    for method, scored, error in _single(sensor, f"simulated {rate}"):
+    for method, scored, error in _run_single(sensor, f"simulated {rate}"):
         series = decimate_curves(sensor.time, total_deg=np.degrees(error.magnitude())) if seed == 0 else {}
         results.append(Result(experiment, trial, method, scored._asdict(), series))
     return results
 
 
 def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
-    """25 s static, 10 s of shaking and rotating, 25 s static; the heading error after the motion, against before it."""
+    """Run the drift experiment: 25 s static, 10 s of shaking and rotating, 25 s static.
+
+    The heading error is the change from before the motion to after it.
+    """
     sensor = simulate_paper_drift(seed)
     after = sensor.time > sensor.moving[1] + 1.0
     results = []
-    for method, _, error in _single(sensor, "simulated 1 kHz"):
+    for method, _, error in _run_single(sensor, "simulated 1 kHz"):
         yaw, pitch, roll = np.abs(error.as_euler("ZYX", degrees=True)[after]).T
         heading = np.degrees(np.unwrap(rotations.heading(error.as_quat())))
         slope = np.polyfit(sensor.time[after], heading[after], 1)[0]
@@ -102,8 +105,11 @@ def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
     return results
 
 
-def _single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, AttitudeError, Rotation]]:
-    """Label, error over the motion, and error rotation of each sample; headings are aligned in the static phase."""
+def _run_single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, AttitudeError, Rotation]]:
+    """Run the contenders; iterates over label, error over the motion, and error rotation of each sample.
+
+    Headings are aligned in the static phase.
+    """
     rest = (sensor.time >= sensor.static[0][0] + 0.5) & (sensor.time <= sensor.static[0][1] - 0.5)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
     true = Rotation.from_quat(sensor.quat_WS)
@@ -115,21 +121,21 @@ def _single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, AttitudeE
 
 
 @lru_cache(maxsize=1)
-def _simulated(seed: int, imperfections: Imperfections) -> tuple[Person, Simulation]:
+def _simulate_person(seed: int, imperfections: Imperfections) -> tuple[Person, Simulation]:
     person = simulate_person(seed)
     return person, simulate(person.lengths, seed=seed, imperfections=imperfections)
 
 
 def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfections) -> list[Result]:
-    """Clasp calibration by each filter with measured shoulder width and trunk and known mounts, then six circles."""
-    person, simulation = _simulated(seed, imperfections)
+    """Calibrate by each filter with measured shoulder width and trunk and known mounts, then track six circles."""
+    person, simulation = _simulate_person(seed, imperfections)
     recorded, truth = simulation.recording(), simulation.truth()
     circles = simulation.phases["circles"][0]
     prior = set_exact_mounts(person.prior, simulation)
     results = []
     for contender in list_contenders(experiment):
         recording, method = orient_recording(recorded, contender)
-        subject = _calibrated(recording, person, prior, method)
+        subject = _calibrate(recording, person, prior, method)
         pose = track(recording, subject, method=method).pose
         series = {}
         if seed == 0:
@@ -138,16 +144,18 @@ def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfect
             paths = {f"{axis}_mm": 1e3 * pose.points["right_palm"][inside, k] for k, axis in enumerate("xyz")}
             paths |= {f"true_{axis}_mm": 1e3 * truth.points["right_palm"][inside, k] for k, axis in enumerate("xyz")}
             series = decimate_curves(recording.time[inside], error_mm=1e3 * np.linalg.norm(off, axis=1), **paths)
-        figures = _hand(evaluate(pose, truth, circles)) | {"lengths_rms_mm": _lengths_rms(subject, person)}
+        figures = _collect_hand_errors(evaluate(pose, truth, circles)) | {
+            "lengths_rms_mm": _compute_lengths_rms(subject, person)
+        }
         results.append(Result(experiment, trial, contender.label, figures, series))
     return results
 
 
 def _error_budget(experiment: str, trial: str, seed: int) -> list[Result]:
-    """smekf on the realistic subject, each imperfection switched off or each part known exactly, in turn."""
+    """Run smekf on the mild preset with one imperfection switched off, or one part known exactly, at a time."""
     results = []
     for label, off in SWITCHED.items():
-        person, simulation = _simulated(seed, replace(MILD_PRESET, **off))
+        person, simulation = _simulate_person(seed, replace(MILD_PRESET, **off))
         recording = simulation.recording()
         prior = person.prior if label == "mounts as stated" else set_exact_mounts(person.prior, simulation)
         if label == "orientations exact":
@@ -156,26 +164,31 @@ def _error_budget(experiment: str, trial: str, seed: int) -> list[Result]:
                 for name, sensor in recording.sensors.items()
             }
             recording = replace(recording, sensors=sensors)
-        subject = _calibrated(recording, person, prior, "smekf")
+        subject = _calibrate(recording, person, prior, "smekf")
         if label == "lengths exact":
             subject = replace(subject, lengths=person.lengths)
         errors = evaluate(
             track(recording, subject, method="smekf").pose, simulation.truth(), simulation.phases["circles"][0]
         )
         results.append(
-            Result(experiment, trial, label, _hand(errors) | {"lengths_rms_mm": _lengths_rms(subject, person)})
+            Result(
+                experiment,
+                trial,
+                label,
+                _collect_hand_errors(errors) | {"lengths_rms_mm": _compute_lengths_rms(subject, person)},
+            )
         )
     return results
 
 
-def _calibrated(recording: Recording, person: Person, prior: Subject, method: str) -> Subject:
+def _calibrate(recording: Recording, person: Person, prior: Subject, method: str) -> Subject:
     found = calibrate_lengths(
         recording, measured=person.measured, prior=prior, method=method, measured_std=person.measured_std
     )
     return found.subject
 
 
-def _hand(errors: Evaluation) -> dict[str, dict[str, float]]:
+def _collect_hand_errors(errors: Evaluation) -> dict[str, dict[str, float]]:
     figures = {
         "hand_mm": errors.position["right_palm"]._asdict(),
         "hand_from_shoulders_mm": errors.position_from_shoulders["right_palm"]._asdict(),
@@ -185,22 +198,22 @@ def _hand(errors: Evaluation) -> dict[str, dict[str, float]]:
     return figures
 
 
-def _lengths_rms(subject: Subject, person: Person) -> float:
-    """[mm] of the lengths that the closed chain sees: all but the trunk."""
+def _compute_lengths_rms(subject: Subject, person: Person) -> float:
+    """Compute the rms error [mm] of the lengths that the closed chain observes: all but the trunk."""
     return 1e3 * float(
         np.sqrt(np.mean([(subject.lengths[n] - person.lengths[n]) ** 2 for n in LENGTHS if n != "trunk"]))
     )
 
 
 def set_exact_mounts(subject: Subject, simulation: Simulation) -> Subject:
-    """The subject with the simulation's exact mounts, stated as known to `KNOWN_MOUNT_STD`."""
+    """Return the subject with the simulation's exact mounts and the standard deviation `KNOWN_MOUNT_STD`."""
     rows = [row for segment in simulation.quat_LS for row in mount_rows(segment)]
     covariance = block_diag(subject.covariance, KNOWN_MOUNT_STD**2 * np.eye(len(rows)))
     return replace(subject, mounts=simulation.quat_LS, order=(*subject.order, *rows), covariance=covariance)
 
 
 def orient_recording(recording: Recording, contender: Contender) -> tuple[Recording, str]:
-    """What `track` takes to run a contender: the recording and a method, or one of measured orientations."""
+    """Prepare a contender for `track`: the recording and a method, or a recording of measured orientations."""
     if contender.method is not None:
         return recording, contender.method
     sensors = {}

@@ -42,13 +42,13 @@ from .jobs import Job, Result
 from .registration import Registration, register_sensors
 from .series import align_rotation, decimate_curves
 
-UNSCORED_S = 10.0  # of RING and UR5: where clocks, frames and headings are aligned
-FOUND_BIAS_STD = np.deg2rad(0.05)  # [rad/s] of the biases found on RING's ten seconds against its whole record
-UR5_OFF = {("circle-100", "radius")}  # left out: its clock is 20 ms off where the other sensors' are within 10
+UNSCORED_S = 10.0  # [s] of RING and UR5 for the alignment of clocks, frames and headings
+BIAS_STD = np.deg2rad(0.05)  # [rad/s] error of biases from RING's ten seconds against its whole recording
+UR5_EXCLUDED = {("circle-100", "radius")}  # its clock has an error of 20 ms, the other sensors' at most 10 ms
 
 
 def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
-    """Name → jobs, for what of the real recordings lies in `data`.
+    """List the jobs of each experiment, for the real recordings in `data`.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
         found[name] = [
             Job(name, ring.folder.name, _compare_links, (ring, mount)) for ring in rings if mount in ring.imu
         ]
-    ur5 = [files for files in find_ur5(data) if (files.recording, files.sensor) not in UR5_OFF]
+    ur5 = [files for files in find_ur5(data) if (files.recording, files.sensor) not in UR5_EXCLUDED]
     found["UR5"] = [
         Job("UR5", f"{files.recording} {files.sensor}", _ur5, (files, n == 0))
         for n, files in enumerate(ur5[: 1 if quick else None])
@@ -98,7 +98,7 @@ def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
 
 
 def _broad(experiment: str, name: str, path: Path, first: bool) -> list[Result]:
-    """Errors over the marked motion, the heading aligned in the static phase."""
+    """Compute errors over the marked motion; the heading is aligned in the static phase."""
     trial = read_broad(path)
     known = np.isfinite(trial.quat_true).all(axis=1)
     at_rest = np.zeros(len(known), dtype=bool)
@@ -111,7 +111,9 @@ def _broad(experiment: str, name: str, path: Path, first: bool) -> list[Result]:
 
 
 def _authors(experiment: str, name: str, path: Path) -> list[Result]:
-    """Vicon's world is not level to a degree: aligned in full, on the world's side, at the first Vicon sample.
+    """Compute errors of the authors' trial, with worlds aligned in full at the first Vicon sample.
+
+    Vicon's world is level to a degree only.
 
     What stays in the errors of every filter: the sensor's samples are some 10 to 15 ms late against Vicon's, and it
     sits 2.5 deg askew in Vicon's body. Both can be seen, but in 17 s there is no stretch to spare for them: with both
@@ -140,22 +142,22 @@ def _score(R_WS: Rotation, true: Rotation, trial: Trial, keep: bool) -> tuple[di
 def _make_errors(
     estimated: Rotation, true: Rotation, time: np.ndarray, keep: bool
 ) -> tuple[dict[str, Any], dict[str, list[float]]]:
-    """Figures, and the curve where it is to be kept."""
+    """Compute figures, and the curve with `keep`."""
     angle = np.degrees((estimated * true.inv()).magnitude())
     figures = {**attitude_error(estimated, true, time)._asdict(), "mean_angle": float(angle.mean())}
     return figures, decimate_curves(time, total_deg=angle) if keep else {}
 
 
 def _ring(experiment: str, name: str, files: RingFiles, segment: str, mount: str, bias_known: bool) -> list[Result]:
-    """Errors of one segment from 10 s on."""
-    chain, registered = _registered_ring(files.folder)
+    """Compute errors of one segment from 10 s on."""
+    chain, registered = _register_ring(files.folder)
     sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
     noise = assume_noise(sensor.rate_hz, registration.gyro_bias if bias_known else None)
     return _score_reference(experiment, name, sensor, registration, noise, segment == RING_SEGMENTS[0])
 
 
 def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result]:
-    """Errors from 10 s on, noise and bias from the 0.6 s to 4 s before the arm moves.
+    """Compute errors from 10 s on; noise and bias are from the 0.6 s to 4 s before the arm moves.
 
     The tilt of the world comes out as 1.0 to 2.6 deg where it is one robot on one base: some 20 mg of error of the
     accelerometers are in it, and in the inclinations.
@@ -167,8 +169,8 @@ def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result
 
 
 def _compare_links(experiment: str, name: str, files: RingFiles, mount: str) -> list[Result]:
-    """Lengths of the chain's links from each contender's orientations and the optical tip, beside the optical ones."""
-    chain, registered = _registered_ring(files.folder)
+    """Compare lengths of the chain's links, from contenders' orientations and the optical tip, with optical ones."""
+    chain, registered = _register_ring(files.folder)
     links = fit_optical_links(chain)
     optical = (links.lengths["seg2"] + links.lengths["seg3"], links.lengths["seg4"])
     orientations = []
@@ -197,7 +199,7 @@ class Links(NamedTuple):
 
 
 def fit_optical_links(chain: Chain) -> Links:
-    """Lengths and tip from the joints' centres, the points that two neighbours agree on best (least squares).
+    """Fit lengths and tip to the joints' centres, the points on which two neighbours agree best (least squares).
 
     A hinge leaves the point open along its own axis. About y and z (seg3 to seg5) that does not touch the lengths,
     which are counted along the links; about x, the link itself (seg2 to seg3), the split is what the hinge's play
@@ -212,7 +214,7 @@ def fit_optical_links(chain: Chain) -> Links:
         solution = np.linalg.lstsq(A, b, rcond=1e-6)[0]
         centres[near, "end"], centres[far, "begin"] = solution[:3], solution[3:]
     lengths = {s: float(centres[s, "end"][0] - centres[s, "begin"][0]) for s in ("seg2", "seg3", "seg4")}
-    # The hinge of seg4 and seg5 leaves the joint's z in seg4 open: that of the link's other end is taken.
+    # The hinge of seg4 and seg5 does not determine the joint's z in seg4: that of the link's other end is used.
     end = np.array([*centres["seg4", "end"][:2], centres["seg4", "begin"][2]])
     tip_V = np.full_like(chain.origin_V["seg4"], np.nan)
     tip_V[known] = chain.origin_V["seg4"][known] + R_VB["seg4"] @ end
@@ -221,7 +223,7 @@ def fit_optical_links(chain: Chain) -> Links:
 
 
 def fit_links(tip_W: np.ndarray, R_W2: Rotation, R_W3: Rotation, R_W4: Rotation) -> np.ndarray:
-    """Lengths (2,) [m] of seg2 and seg3 together, and of seg4: tip = l₂₃ x₂₃ + l₄ x₄, least squares.
+    """Fit the lengths (2,) [m] of seg2 and seg3 together, and of seg4: tip = l₂₃ x₂₃ + l₄ x₄, least squares.
 
     seg3 turns on seg2 about the link itself: both have one axis x₂₃, the mean of the two, and only their sum is seen.
     `tip_W` (n, 3) [m]; n orientations of each segment.
@@ -233,8 +235,8 @@ def fit_links(tip_W: np.ndarray, R_W2: Rotation, R_W3: Rotation, R_W4: Rotation)
 
 
 @lru_cache(maxsize=1)
-def _registered_ring(folder: Path) -> tuple[Chain, dict[tuple[str, str], Registration]]:
-    """The chain, and all ten sensors registered together: one clock, one optical world."""
+def _register_ring(folder: Path) -> tuple[Chain, dict[tuple[str, str], Registration]]:
+    """Register all ten sensors of the chain together: one clock, one optical world."""
     (files,) = [files for files in find_ring(folder) if files.folder == folder]
     chain = read_ring(files)
     return chain, dict(
@@ -243,17 +245,17 @@ def _registered_ring(folder: Path) -> tuple[Chain, dict[tuple[str, str], Registr
 
 
 class Compared(NamedTuple):
-    """A contender's orientations beside the truth, at the truth's times."""
+    """A contender's orientations and the truth, at the truth's times."""
 
     estimated: Rotation  # body to W, of m samples; the heading aligned
-    true: Rotation  # of m samples; where not seen, the identity
+    true: Rotation  # of m samples; identity where missing
     scored: np.ndarray  # (m,) bool
 
 
 def _run_orientations(
     sensor: Referenced, registration: Registration, noise: SensorNoise
 ) -> Iterator[tuple[str, Compared]]:
-    """Label and orientations of each contender."""
+    """Run each contender; iterates over label and orientations."""
     time = sensor.time + registration.offset_s
     clock = np.arange(len(sensor.gyro_S)) / sensor.rate_hz
     known = np.isfinite(sensor.quat_VB).all(axis=1) & (time >= 0.0) & (time <= clock[-1])
@@ -267,16 +269,16 @@ def _run_orientations(
 
 
 def assume_noise(rate_hz: float, gyro_bias: np.ndarray | None = None) -> SensorNoise:
-    """Noise of a sensor that is never still, by the MTi-3's data sheet.
+    """Assume the noise of a sensor without static phases, from the MTi-3's data sheet.
 
-    `gyro_bias` (3,) [rad/s]: as found on ten seconds, right to `FOUND_BIAS_STD`; None: zero, with the usual turn-on
+    `gyro_bias` (3,) [rad/s]: as found on ten seconds, right to `BIAS_STD`; None: zero, with the usual turn-on
     bias of 0.2 deg/s for its standard deviation (that of RING's sensors is 0.2 to 0.9 deg/s in all).
     """
     gyro = MTI_3.gyro_density**2 * rate_hz * np.eye(3)
     known = gyro_bias is not None
     return SensorNoise(
         gyro_bias=np.array(gyro_bias) if known else np.zeros(3),
-        gyro_bias_cov=(FOUND_BIAS_STD if known else MTI_3.gyro_bias_std) ** 2 * np.eye(3),
+        gyro_bias_cov=(BIAS_STD if known else MTI_3.gyro_bias_std) ** 2 * np.eye(3),
         gyro_cov=gyro,
         accel_cov=(MTI_3.accel_density / GRAVITY) ** 2 * rate_hz * np.eye(3),
         bias_step_cov=2.0 * gyro,

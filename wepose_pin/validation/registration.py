@@ -1,4 +1,4 @@
-"""How a reference lies to a sensor: clock, body frame and world, found on a stretch that is not scored.
+"""Registration of a reference to a sensor: clock, body frame and world, from an interval that is not scored.
 
 No filter takes part: the gyroscope is integrated over the stretch, so what is found is the same for all that are
 compared. Only the heading, which each filter has of its own, is left to `series.align_rotation`.
@@ -18,40 +18,40 @@ from ..errors import BadData
 from ..readers.trials import Referenced
 
 LARGEST_OFFSET_S = 0.3  # of the clocks
-# Turns are compared over this time: long against what foam and a flexing arm add, short against the gyroscope's drift.
+# Rotations are compared over this time: long against errors of foam and a flexing arm, short against gyroscope drift.
 TURN_S = 0.5
-_LARGEST_TURN = 2.8  # [rad] beyond it the axis of a turn may flip
-_LEAST_TURN = 0.02  # [rad] and [rad/s], rms: about a second axis, and of the rate; with less nothing is found
+_LARGEST_TURN = 2.8  # [rad] beyond it the axis of a rotation may flip
+_LEAST_TURN = 0.02  # [rad], [rad/s] least rms rotation about a second axis, and least rms rate, for a registration
 
 
 class Registration(NamedTuple):
-    """What brings a reference to a sensor, and how well it does."""
+    """The registration of a reference to a sensor, with its residuals."""
 
     offset_s: float  # the sensor's clock at the reference's zero [s]
     quat_BS: np.ndarray  # (4,) xyzw, sensor to the reference's body
     quat_WV: np.ndarray  # (4,) xyzw, the reference's world to a level one, without heading
     gyro_bias: np.ndarray  # (3,) [rad/s]
     correlation: float  # of the magnitudes of the two rates, at that offset
-    left_deg: float  # rms of the integrated gyroscope's orientation about the reference's, over the stretch
+    residual_deg: float  # rms of the integrated gyroscope's orientation against the reference's, over the interval
 
     @property
     def tilt_deg(self) -> float:
-        """How far the reference's world leans [deg]."""
+        """Tilt [deg] of the reference's world."""
         return float(np.degrees(Rotation.from_quat(self.quat_WV).magnitude()))
 
     def figures(self) -> dict[str, float]:
-        """For the table of trials."""
+        """Return the figures for the table of trials."""
         return {
             "clock_offset_ms": 1e3 * self.offset_s,
             "mount_deg": float(np.degrees(Rotation.from_quat(self.quat_BS).magnitude())),
             "world_tilt_deg": self.tilt_deg,
             "gyro_bias_deg_s": float(np.degrees(np.linalg.norm(self.gyro_bias))),
-            "registration_left_deg": self.left_deg,
+            "registration_left_deg": self.residual_deg,
         }
 
 
 def register_sensors(sensors: Sequence[Referenced], stretch: tuple[float, float]) -> list[Registration]:
-    """Registrations of sensors that share a clock and a reference, from the time `stretch` [s] of the reference.
+    """Register sensors that share a clock and a reference, from the interval `stretch` [s] of the reference.
 
     One offset of the clocks: where the correlations of ‖gyro‖ with the body's rate have their greatest sum. A mount
     each: the rotation that brings the sensor's turns over half a second to the body's (Wahba's problem, on rotation
@@ -90,7 +90,7 @@ class _Fit(NamedTuple):
 
 
 class _Span:
-    """A sensor and its reference over the stretch."""
+    """A sensor and its reference over the interval."""
 
     def __init__(self, sensor: Referenced, stretch: tuple[float, float]) -> None:
         self.sensor = sensor
@@ -115,30 +115,30 @@ class _Span:
             raise BadData(f"{sensor.name}: its body does not turn in the stretch that is to align it, {stretch} s")
 
     def _rotation_vectors(self, first: np.ndarray, n: int) -> np.ndarray:
-        """Rotation vectors (k, 3) of the body from `first` to n samples later, in its frame."""
+        """Compute rotation vectors (k, 3) of the body from `first` to n samples later, in its frame."""
         begin, end = (Rotation.from_quat(self.sensor.quat_VB[k]) for k in (first, first + n))
         return (begin.inv() * end).as_rotvec()
 
     def correlation(self, offset: float) -> float:
-        """Of the magnitudes of the sensor's rate and the body's."""
+        """Compute the correlation of the magnitudes of the sensor's rate and the body's."""
         begin, end = (
             np.column_stack([np.interp(self.sensor.time[k] + offset, self.clock, angle) for angle in self.angle.T])
             for k in (self.first, self.first + 1)
         )
         return float(np.corrcoef(np.linalg.norm(end - begin, axis=1) / self.interval, self.rate)[0, 1])
 
-    def integrated(self, bias: np.ndarray) -> Rotation:
-        """R_IS of all samples, I the sensor's frame at the beginning."""
+    def integrate(self, bias: np.ndarray) -> Rotation:
+        """Integrate the rate to R_IS of all samples; I is the sensor's frame at the beginning."""
         rate = self.sensor.gyro_S[self.samples] - bias
         return Rotation.from_quat(rotations.integrate(np.ascontiguousarray(rate / self.sensor.rate_hz))[1:])
 
     def mount(self, offset: float) -> Rotation:
-        """R_BS from turns over `TURN_S`."""
+        """Estimate R_BS from rotations over `TURN_S`."""
         n = max(1, round(TURN_S / float(np.median(np.diff(self.sensor.time)))))
         first = self.seen[np.isin(self.seen + n, self.seen)]
         if len(first) < 10:
             raise BadData(f"{self.sensor.name}: the reference is not seen for {TURN_S:g} s on end in the stretch")
-        at = Slerp(self.clock, self.integrated(self.bias))
+        at = Slerp(self.clock, self.integrate(self.bias))
         begin, end = (at(self.sensor.time[k] + offset) for k in (first, first + n))
         true, turned = self._rotation_vectors(first, n), (begin.inv() * end).as_rotvec()
         use = np.maximum(np.linalg.norm(true, axis=1), np.linalg.norm(turned, axis=1)) < _LARGEST_TURN
@@ -148,11 +148,11 @@ class _Span:
         return Rotation.align_vectors(true, turned)[0]
 
     def fit(self, offset: float) -> _Fit:
-        """The mount, and the bias where it is not known, with which the integrated gyroscope follows the body."""
+        """Fit the mount, and an unknown bias, so that the integrated gyroscope follows the body."""
         R_BS, time = self.mount(offset), self.sensor.time[self.seen] + offset
 
         def off(x: np.ndarray) -> np.ndarray:
-            turned = Slerp(self.clock, self.integrated(self.bias + x[3:] if len(x) > 3 else self.bias))(time)
+            turned = Slerp(self.clock, self.integrate(self.bias + x[3:] if len(x) > 3 else self.bias))(time)
             R_VI = self.R_VB * R_BS * Rotation.from_rotvec(x[:3]) * turned.inv()
             return (R_VI.mean().inv() * R_VI).as_rotvec().ravel()
 
@@ -162,8 +162,8 @@ class _Span:
         return _Fit(R_BS * Rotation.from_rotvec(solution.x[:3]), bias, rms)
 
     def up(self, offset: float, fit: _Fit) -> np.ndarray:
-        """The vertical (3,) in the reference's world."""
-        time, R_IS = self.sensor.time[self.seen] + offset, self.integrated(fit.bias)
+        """Estimate the vertical (3,) in the reference's world."""
+        time, R_IS = self.sensor.time[self.seen] + offset, self.integrate(fit.bias)
         R_VI = (self.R_VB * fit.R_BS * Slerp(self.clock, R_IS)(time).inv()).mean()
         within = (self.clock >= time[0]) & (self.clock <= time[-1])
         force_V = (R_VI * R_IS[within]).apply(self.sensor.accel_S[self.samples][within])

@@ -1,4 +1,4 @@
-"""Means over trials beside the paper's figures, and the tables that the pages and the command show."""
+"""Means over trials and the paper's figures, and the tables of the pages and the command."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..simulation import GRAVITY
 from .jobs import Result
 
 OURS = "smekf"  # the paper's filter
-DEFAULTS = ", default gains"  # ends the label of a filter's second row
+DEFAULTS = ", default gains"  # suffix of the label of a filter's second row
 ERROR_BUDGET = "error budget"
 ARBITRARY_MOUNTING = "arbitrary sensor mounting"
 
@@ -38,8 +38,8 @@ SHORT = {
 }
 FROM = {"hand": "from the root", "from shoulders": "from the middle of the shoulders"}
 DEGREES = {*AXES, *(name.replace("_", " ") for name in SPLIT)}
-ERRORS = {*DEGREES, *HAND.values(), "drift_deg_min"}  # figures of which less is better
-# What the error of the project must not exceed, from and to, by experiment, filter and figure.
+ERRORS = {*DEGREES, *HAND.values(), "drift_deg_min"}  # figures for which less is better
+# The project's targets: allowed errors, from and to, by experiment, filter and figure.
 TARGETS: dict[str, tuple[str, dict[str, tuple[float, float]]]] = {
     "upper body, MTi-3 noise alone": (OURS, {"hand": (0.0, 12.0), "from shoulders": (0.0, 12.0)}),
     "upper body, realistic": (OURS, {"hand": (0.0, 18.0), "from shoulders": (0.0, 18.0)}),
@@ -96,15 +96,15 @@ class Row(NamedTuple):
     experiment: str
     method: str
     figures: dict[str, float]
-    paper: str  # the paper's own figures, as text; empty where it has none
+    paper: str  # the paper's figures as text; empty: none
 
     def names(self) -> list[str]:
-        """Figures without what stands beside them."""
+        """Return the names of figures, without their deviations."""
         return [name for name in self.figures if not name.endswith((" std", " between"))]
 
 
 def summarize(results: Sequence[Result]) -> list[Row]:
-    """A row a contender and experiment, in the order in which they came."""
+    """Summarize results: one row for each contender and experiment, in their order."""
     rows = []
     for experiment in dict.fromkeys(result.experiment for result in results):
         for method in dict.fromkeys(result.method for result in results if result.experiment == experiment):
@@ -114,7 +114,7 @@ def summarize(results: Sequence[Result]) -> list[Row]:
 
 
 def collect_figures(result: Result) -> dict[str, float]:
-    """What a table shows of one trial: name → value, "name std" → its deviation over time where there is one."""
+    """Collect the figures of one trial: name → value, "name std" → its deviation over time where it exists."""
     experiment, values = result.experiment, result.figures
     if experiment.startswith("dynamic"):
         return _flat({name: values[name] for name in AXES if name in values})
@@ -126,18 +126,18 @@ def collect_figures(result: Result) -> dict[str, float]:
 
 
 def find_paper_figures(experiment: str, method: str) -> dict[str, tuple[float, float]]:
-    """Name → the paper's mean and deviation; a filter's second row ("ncf, default gains") stands beside the same."""
+    """Find the paper's figures: name → mean and deviation; a filter's row with default gains has the same."""
     filter_ = method.removesuffix(DEFAULTS)
     if experiment.startswith("dynamic"):
         rate = 1000 if "1 kHz" in experiment else 100
         return dict(zip(AXES, PAPER_DYNAMIC.get((filter_, rate), ()), strict=False))
     if experiment.startswith("upper body") and filter_ in PAPER_HAND:
-        return dict.fromkeys(HAND.values(), PAPER_HAND[filter_])  # it does not say from where it counts
+        return dict.fromkeys(HAND.values(), PAPER_HAND[filter_])  # the paper does not state the origin
     return {}
 
 
 def format_paper(experiment: str, method: str) -> str:
-    """The paper's figures in a few words; empty where it has none."""
+    """Format the paper's figures; empty: it has none."""
     if experiment == "drift":
         return PAPER_DRIFT.get(method.removesuffix(DEFAULTS), "")
     values = find_paper_figures(experiment, method).values()
@@ -146,7 +146,7 @@ def format_paper(experiment: str, method: str) -> str:
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """A figure's name for readers, and its unit; empty where it has none."""
+    """Split a figure's name into a name for readers and its unit, which may be empty."""
     if name in DEGREES:
         return name, "deg"
     if name in HAND.values():
@@ -161,7 +161,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def make_experiment_table(rows: Sequence[Row], whole: bool) -> Table:
-    """An experiment's rows as text; `whole`: with the deviation between trials and all columns, the best in bold."""
+    """Make the table of an experiment; `whole`: with deviations between trials and all columns, the best in bold."""
     names = list(dict.fromkeys(name for row in rows for name in row.names()))
     if not whole:
         names = [name for name in names if name not in SHORT.values()]
@@ -193,14 +193,14 @@ def make_experiment_table(rows: Sequence[Row], whole: bool) -> Table:
 
 
 def find_shared_unit(rows: Sequence[Row]) -> str:
-    """The unit that all columns of a short table share; empty where they differ."""
+    """Find the unit that all columns of a short table share; empty: they differ."""
     names = dict.fromkeys(name for row in rows for name in row.names() if name not in SHORT.values())
     units = {split_unit(name)[1] for name in names}
     return units.pop() if len(units) == 1 else ""
 
 
 def make_targets_table(rows: Sequence[Row]) -> Table:
-    """The project's targets as far as they were measured."""
+    """Make the table of the project's targets for the measured figures."""
     cells = []
     for row in rows:
         method, limits = TARGETS.get(row.experiment, ("", {}))
@@ -214,7 +214,7 @@ def make_targets_table(rows: Sequence[Row]) -> Table:
 
 
 def make_overview_table(rows: Sequence[Row]) -> Table:
-    """smekf beside the paper's smekf and beside the best of all filters; bold where ours is larger than the paper's."""
+    """Make the overview: smekf, the paper's smekf and the best of all filters; bold where ours exceeds the paper's."""
     cells = []
     for experiment in dict.fromkeys(row.experiment for row in rows if row.experiment != ERROR_BUDGET):
         of = {row.method: row.figures for row in rows if row.experiment == experiment}
@@ -231,7 +231,7 @@ def make_overview_table(rows: Sequence[Row]) -> Table:
 
 
 def make_imperfections_table(worlds: Mapping[str, Mapping[str, Any]]) -> Table:
-    """What is off in each simulated world, and by how much."""
+    """Make the table of the imperfections of each preset."""
     sizes = {world: of.get("imperfections", {}) for world, of in worlds.items()}
     cells = [
         [words, *(_size(of.get(name), factor, unit) for of in sizes.values())]
@@ -241,7 +241,7 @@ def make_imperfections_table(worlds: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def make_noise_table(noise: Mapping[str, float]) -> Table:
-    """The simulated sensors' noise in the units of data sheets."""
+    """Make the table of the simulated sensors' noise in the units of data sheets."""
     cells = [
         [words, f"{factor * noise[name]:.3g}{unit}"] for name, (words, factor, unit) in _NOISE.items() if name in noise
     ]
@@ -249,7 +249,7 @@ def make_noise_table(noise: Mapping[str, float]) -> Table:
 
 
 def make_gains_table(gains: Mapping[str, Mapping[str, Any]]) -> Table:
-    """The gains of ncf and gdc in each setting."""
+    """Make the table of the gains of ncf and gdc in each setting."""
     cells = [
         [setting, *(", ".join(f"{k} {v:.3g}" for k, v in of.get(name, {}).items()) for name in ("ncf", "gdc"))]
         for setting, of in gains.items()
@@ -258,7 +258,7 @@ def make_gains_table(gains: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def describe_table(rows: Sequence[Row]) -> str:
-    """What the signs of the table mean."""
+    """Explain the signs of the table."""
     keys = [key for row in rows for key in row.figures]
     notes = []
     if any(key.endswith(" std") for key in keys):
@@ -279,7 +279,7 @@ def describe_table(rows: Sequence[Row]) -> str:
 
 
 class Part(NamedTuple):
-    """What one imperfection adds to the hand's error: all on less this one off, as root of the mean squares [mm].
+    """A part of the hand's error from one imperfection: all on less this one off, as root of the mean squares [mm].
 
     Below zero: the error grows without it.
     """
@@ -289,15 +289,15 @@ class Part(NamedTuple):
 
 
 class ErrorBudget(NamedTuple):
-    """Root-mean-square errors of the hand [mm] with all imperfections, and what each adds."""
+    """Root-mean-square errors of the hand [mm] with all imperfections, and the part of each."""
 
     full: dict[str, float]
-    parts: list[Part]  # the largest first
-    more: list[Part]  # what is not in it, and what that would add
+    parts: list[Part]  # largest first
+    more: list[Part]  # imperfections that are not in the total, with their additional error
 
 
 def compute_error_budget(results: Sequence[Result]) -> ErrorBudget | None:
-    """What each imperfection adds to the hand's error; None without a run that has all of them on."""
+    """Compute the part of each imperfection in the hand's error; None without a run with all of them."""
     rms: dict[str, dict[str, float]] = {}
     for method in dict.fromkeys(result.method for result in results if result.experiment == ERROR_BUDGET):
         of = [r.figures for r in results if r.experiment == ERROR_BUDGET and r.method == method]
@@ -316,13 +316,13 @@ def compute_error_budget(results: Sequence[Result]) -> ErrorBudget | None:
         if method.endswith(" as stated"):  # known in the budget
             more.append(Part(method, {name: -value for name, value in added.items()}))
         elif added:
-            parts.append(Part(_part(method), added))
+            parts.append(Part(_name_part(method), added))
     parts.sort(key=lambda part: -next(iter(part.added.values())))
     return ErrorBudget(full, parts, more)
 
 
-def _part(method: str) -> str:
-    """What is switched off: "soft tissue off", "lengths known" → "soft tissue", "lengths"."""
+def _name_part(method: str) -> str:
+    """Name the part of a method's label: "soft tissue off", "lengths known" → "soft tissue", "lengths"."""
     name = method.removesuffix(" off").removesuffix(" known").removesuffix(" exact")
     return {"orientations": "orientation filter", "clocks exact, none lost": "clocks, lost samples"}.get(name, name)
 
@@ -336,7 +336,7 @@ def _cell(row: Row, name: str, whole: bool) -> str:
 
 
 def _size(value: Any, factor: float, unit: str) -> str:
-    """A size in its unit; "–" for none, as of a range without end."""
+    """Format a size in its unit; "–" for none, as for an infinite range."""
     return f"{factor * value:.4g}{unit}" if isinstance(value, int | float) and value else "–"
 
 
