@@ -1,8 +1,8 @@
-"""Checks where a public function is called: each argument is what the function's annotation says.
+"""Checks of the arguments of public functions against their annotations.
 
-``check_arguments(track, locals())`` is the first line of such a function. Annotations say it all: a `Positive` number,
-a bool, a path, names → lengths. The method `check` of an object, if it has one, is called; of other dataclasses each
-field is checked as an argument is. Inside, everything is trusted.
+``check_arguments(track, locals())`` is the first line of such a function. The annotation defines the check: a
+`Positive` number, a bool, a path, names → lengths. An object with a method `check` is checked by it; of other
+dataclasses each field is checked like an argument. Inner functions do no checks.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LONGEST = 60  # letters of a value in a message
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers above `low`, or from it on where `closed`, up to `high`, that are finite."""
+    """Finite numbers above `low`, or at least `low` where `closed`, and at most `high`."""
 
     low: float
     closed: bool
@@ -46,43 +46,43 @@ Count = Annotated[int, Range(0.0, closed=True)]
 
 
 def check_arguments(function: Any, arguments: Mapping[str, Any]) -> None:
-    """Every argument, by its name, is what the annotation of that name says of a function, or of a class' making.
+    """Check every argument against the annotation of its name in a function, or in the constructor of a class.
 
     Raises
     ------
     BadOption
-        One that is not, named with its value and what is needed.
+        An argument does not fit; the text has its name, its value and what is needed.
     WeposeError
-        What the `check` of an argument that has one raises.
+        An argument's own `check` fails.
     """
-    made_by = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
-    for name, hint in _hints(made_by).items():
+    signature = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
+    for name, hint in _read_hints(signature).items():
         if name not in arguments:
             continue
         value = arguments[name]
         nan = isinstance(value, float) and math.isnan(value)
-        if not (nan and float in _options(hint)):  # which the function's own range refuses
+        if not (nan and float in _list_options(hint)):  # the function's own range refuses NaN
             check_value(name, value, hint)
 
 
 def check_fields(value: Any, place: str, kind: type | None = None) -> None:
-    """Every field of a dataclass or named tuple is what its annotation says; those of the base `kind` where given."""
-    for name, hint in _hints(kind or type(value)).items():
+    """Check every field of a dataclass or named tuple against its annotation, or those of its base class `kind`."""
+    for name, hint in _read_hints(kind or type(value)).items():
         check_value(f"{place}{name}", getattr(value, name), hint)
 
 
 def check_value(place: str, value: Any, hint: Any) -> None:
-    """A value is what an annotation says, and so is what it holds; `place` begins the error's text."""
+    """Check a value and its contents against an annotation; `place` begins the error's text."""
     if not _fits(value, hint):
-        raise BadOption(f"{place} = {_shown(value)}: {_needed(hint)} is needed")
-    hint = next((option for option in _options(hint) if _fits(value, option)), hint)
+        raise BadOption(f"{place} = {_format_value(value)}: {_describe_hint(hint)} is needed")
+    hint = next((option for option in _list_options(hint) if _fits(value, option)), hint)
     parts = get_args(hint)
     if get_origin(hint) is Annotated:
         if value not in parts[1]:
-            raise BadOption(f"{place} = {_shown(value)}: {parts[1]} is needed")
+            raise BadOption(f"{place} = {_format_value(value)}: {parts[1]} is needed")
     elif get_origin(hint) is Literal:
         if value not in parts:
-            raise BadOption(f"{place} = {_shown(value)} is not known; {one_of(parts, value)}")
+            raise BadOption(f"{place} = {_format_value(value)} is not known; {one_of(parts, value)}")
     elif isinstance(value, Mapping):
         for name, entry in value.items() if parts else ():
             check_value(f"{place}: name", name, parts[0])
@@ -90,15 +90,15 @@ def check_value(place: str, value: Any, hint: Any) -> None:
     elif get_origin(hint) in (tuple, Sequence):
         each = [parts[0]] * len(value) if parts[-1] is ... or len(parts) == 1 else list(parts)
         if len(value) != len(each):
-            raise BadOption(f"{place} = {_shown(value)}: {len(each)} values are needed, not {len(value)}")
-        for k, (entry, of) in enumerate(zip(value, each, strict=True)):
-            check_value(f"{place}[{k}]", entry, of)
+            raise BadOption(f"{place} = {_format_value(value)}: {len(each)} values are needed, not {len(value)}")
+        for k, (entry, entry_hint) in enumerate(zip(value, each, strict=True)):
+            check_value(f"{place}[{k}]", entry, entry_hint)
     elif hint is not Any and (is_dataclass(value) or hasattr(value, "_fields")):
         value.check() if hasattr(value, "check") else check_fields(value, f"{place}.")
 
 
 def check_array(place: str, values: Any, shape: tuple[int, ...], kinds: str = "fiu", rows: str = "") -> None:
-    """`values` is an array of that shape, whose type is of NumPy's `kinds`; `rows` says what a row is for.
+    """Check that `values` is an array of that shape with a type of NumPy's `kinds`; `rows` ends the error's text.
 
     Raises
     ------
@@ -106,14 +106,14 @@ def check_array(place: str, values: Any, shape: tuple[int, ...], kinds: str = "f
         It is not.
     """
     if not isinstance(values, np.ndarray) or values.dtype.kind not in kinds:
-        of = "bool" if kinds == "b" else "real numbers"
-        raise BadData(f"{place} = {_shown(values)}: a NumPy array of {of}, {shape}, is needed")
+        kind = "bool" if kinds == "b" else "real numbers"
+        raise BadData(f"{place} = {_format_value(values)}: a NumPy array of {kind}, {shape}, is needed")
     if values.shape != shape:
         raise BadData(f"{place} has the shape {values.shape}; {shape} is needed{rows}")
 
 
 def check_finite(place: str, values: np.ndarray, *, missing: bool = False) -> None:
-    """Numbers are finite; where they may be `missing`, NaN is passed over."""
+    """Check that numbers are finite; NaN is accepted where they may be `missing`."""
     wrong = np.isinf(values) if missing else ~np.isfinite(values)
     if wrong.any():
         k = tuple(int(i) for i in np.argwhere(wrong)[0])
@@ -121,7 +121,7 @@ def check_finite(place: str, values: np.ndarray, *, missing: bool = False) -> No
 
 
 def check_unit(place: str, quat: np.ndarray, tolerance: float) -> None:
-    """Quaternions (…, 4) are of length 1; those that are missing, NaN, are passed over."""
+    """Check that quaternions (…, 4) have length 1; NaN, a missing one, is accepted."""
     length = np.linalg.norm(quat, axis=-1)
     off = np.abs(np.nan_to_num(length, nan=1.0) - 1.0)
     if np.max(off, initial=0.0) > tolerance:
@@ -129,7 +129,7 @@ def check_unit(place: str, quat: np.ndarray, tolerance: float) -> None:
 
 
 def check_covariance(place: str, matrices: np.ndarray) -> None:
-    """Matrices (…, k, k) are symmetric and positive semidefinite; those with NaN are passed over."""
+    """Check that matrices (…, k, k) are symmetric and positive semidefinite; those with NaN are accepted."""
     known = matrices[np.isfinite(matrices).all(axis=(-2, -1))]
     scale = np.max(np.abs(known), axis=(-2, -1), initial=0.0)
     skew = np.max(np.abs(known - np.swapaxes(known, -2, -1)), axis=(-2, -1), initial=0.0)
@@ -138,12 +138,12 @@ def check_covariance(place: str, matrices: np.ndarray) -> None:
 
 
 def check_names(place: str, names: Collection[str], known: Collection[str], otherwise: str = "") -> None:
-    """Each name is one of those that are known; `otherwise` says what else it may need.
+    """Check that each name is known; `otherwise` ends the error's text.
 
     Raises
     ------
     BadOption
-        One is not.
+        A name is not known.
     """
     for name in names:
         if name not in known:
@@ -151,20 +151,20 @@ def check_names(place: str, names: Collection[str], known: Collection[str], othe
 
 
 @cache
-def _hints(of: Any) -> dict[str, Any]:
-    hints = get_type_hints(of, include_extras=True)
+def _read_hints(function: Any) -> dict[str, Any]:
+    hints = get_type_hints(function, include_extras=True)
     return {name: hint for name, hint in hints.items() if name != "return" and not name.startswith("_")}
 
 
-def _options(hint: Any) -> tuple[Any, ...]:
+def _list_options(hint: Any) -> tuple[Any, ...]:
     return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of the kind that an annotation says; what it holds is not looked at."""
+    """Return whether a value has the kind of an annotation; its contents are not checked."""
     origin = get_origin(hint)
-    if len(_options(hint)) > 1:
-        return any(_fits(value, option) for option in _options(hint))
+    if len(_list_options(hint)) > 1:
+        return any(_fits(value, option) for option in _list_options(hint))
     if origin is Annotated:
         return _fits(value, get_args(hint)[0])
     if hint is Any:
@@ -178,10 +178,10 @@ def _fits(value: Any, hint: Any) -> bool:
     return isinstance(value, kind.get(origin or hint, origin or hint))
 
 
-def _needed(hint: Any) -> str:
-    """What an annotation asks for, in words."""
-    if len(_options(hint)) > 1:
-        return ", or ".join(dict.fromkeys(_needed(option) for option in _options(hint)))
+def _describe_hint(hint: Any) -> str:
+    """Describe an annotation in words."""
+    if len(_list_options(hint)) > 1:
+        return ", or ".join(dict.fromkeys(_describe_hint(option) for option in _list_options(hint)))
     if get_origin(hint) is Annotated:
         return str(get_args(hint)[1])
     words = {
@@ -201,6 +201,6 @@ def _needed(hint: Any) -> str:
     return words.get(kind) or f"an object of class {kind.__name__}"
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     text = f"array {value.shape} of {value.dtype}" if isinstance(value, np.ndarray) else " ".join(repr(value).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} …"

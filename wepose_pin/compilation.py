@@ -1,4 +1,4 @@
-"""Functions compiled by numba: bit-identical wherever they are called from, and kept for the next start."""
+"""Functions compiled by numba, with bit-identical results for all callers, and cached for the next start."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from numba.core.options import DefaultOptions
 # No fastmath: the same bits from a batch, from a sample at a time and from a bank of sensors need strict IEEE steps.
 # The numpy error model spares each division a branch; nogil lets several sensors run in threads.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-# What allocates nothing needs no reference counts; numba leaves some in, atomic ones, several a sample. Its option has
-# no public name: where it is gone, kernels are slower and as right.
+# A function that allocates nothing needs no reference counts, but numba leaves some atomic ones in, several a sample.
+# Its option has no public name: without it kernels are slower, with the same results.
 _BARE = _OPTIONS | ({"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {})
 
 
-class _SayOnce(Listener):  # type: ignore[misc]
-    """One line on a terminal when the first of our functions is compiled, since that takes seconds; never again."""
+class _CompilationNotice(Listener):  # type: ignore[misc]
+    """Prints one line on a terminal when the first of our functions is compiled, which takes seconds."""
 
-    said = False
+    printed = False
 
     def on_start(self, event: Event) -> None:
-        if self.said or not event.data["dispatcher"].py_func.__module__.startswith("wepose_pin."):
+        if self.printed or not event.data["dispatcher"].py_func.__module__.startswith("wepose_pin."):
             return
-        self.said = True
+        self.printed = True
         if sys.stderr.isatty():
             print("compiling for this machine: some ten seconds, kept for the next time …", file=sys.stderr, flush=True)
 
@@ -35,21 +35,21 @@ class _SayOnce(Listener):  # type: ignore[misc]
         pass
 
 
-register("numba:compile", _SayOnce())
+register("numba:compile", _CompilationNotice())
 
 
-def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
+def _compile_cached(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
     try:
         dispatcher = njit(cache=True, **options)(function)
-    except RuntimeError:  # neither the package's folder nor a home can be written to
+    except RuntimeError:  # neither the package's folder nor a home is writable
         return njit(**options)(function)
     cache = getattr(dispatcher, "_cache", None)
-    if cache is not None:  # a full disk is no reason to fail: it compiles again the next time
-        cache.save_overload = _unless_full(cache.save_overload)
+    if cache is not None:  # with a full disk it compiles again the next time
+        cache.save_overload = _ignore_full_disk(cache.save_overload)
     return dispatcher
 
 
-def _unless_full(save: Callable[..., None]) -> Callable[..., None]:
+def _ignore_full_disk(save: Callable[..., None]) -> Callable[..., None]:
     def try_to_save(*args: Any) -> None:
         with contextlib.suppress(OSError):
             save(*args)
@@ -58,15 +58,15 @@ def _unless_full(save: Callable[..., None]) -> Callable[..., None]:
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function compiled by numba, and kept for the next start where there is a place to keep it."""
-    return _cached(function, _OPTIONS)
+    """Compile a function by numba and cache it for the next start, where a folder is writable."""
+    return _compile_cached(function, _OPTIONS)
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`compiled` for a function that makes no array, only fills those it is given: no reference counting in it."""
-    return _cached(function, _BARE | {"forceinline": True})
+    """Compile as `compiled`, for a function that allocates no array: without reference counts."""
+    return _compile_cached(function, _BARE | {"forceinline": True})
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A piece of kernels and of nothing else, always a part of its caller's code; it makes no array."""
+    """Compile a part of kernels, which is always inlined in its caller and allocates no array."""
     return njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_BARE)(function)

@@ -1,7 +1,7 @@
-"""TOML read with checks and written; output folders and files that appear whole or not at all.
+"""Reading of TOML with checks, writing of TOML, and atomic output of folders and files.
 
-The checks are ours: msgspec's errors name the kind that was expected, and neither the value that was found, nor the
-choices, nor which of several tables (`$.sensors[...]`); a user needs all three.
+The checks are ours: an error of msgspec names the expected kind, but not the value, the choices or the table among
+several (`$.sensors[...]`); a user needs all three.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from .errors import BadSession, ExistingOutput, MissingFile, WeposeError, one_of
 
 
 def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> dict[str, Any]:
-    """The contents of a TOML file; `what` is wanted there, for the error's text.
+    """Read a TOML file; `what` names the expected contents in an error's text.
 
     Raises
     ------
     MissingFile
-        Not there, or not readable as text.
+        The file is missing, or not readable as text.
     WeposeError
-        Not TOML; of the kind `error`.
+        It is not TOML; an error of the kind `error`.
     """
     if path.exists() and not path.is_file():
         raise MissingFile(f"{path}: is {'a folder' if path.is_dir() else 'no regular file'}; {what} is wanted here")
@@ -52,23 +52,23 @@ def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> d
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The contents of a TOML text; raises ValueError, whatever is wrong with it."""
+    """Parse a TOML text; any error is a ValueError."""
     try:
-        return tomllib.loads(text.removeprefix("\ufeff"))  # which some editors put before
+        return tomllib.loads(text.removeprefix("\ufeff"))  # some editors write a byte-order mark
     except RecursionError:
         raise ValueError("tables or lists within each other to no end") from None
 
 
 @dataclass(frozen=True)
 class TomlTable:
-    """A TOML table with its place, so that each error says where in which file the trouble is.
+    """A TOML table with its place, which begins each error's text.
 
     Parameters
     ----------
-    values : what it holds
-    file : the file, or what else begins an error's text
+    values : key → value
+    file : the file, or another beginning of an error's text
     place : its name in the file with a dot at the end, such as ``sensors.torso.``
-    error : the kind of error that is raised
+    error : the kind of error to raise
     """
 
     values: Mapping[str, Any]
@@ -80,7 +80,7 @@ class TomlTable:
         return key in self.values
 
     def at(self, key: str) -> str:
-        """File and place of a key, for the beginning of an error's text."""
+        """Return file and place of a key, for the beginning of an error's text."""
         return f"{self.file}: {self.place}{key}"
 
     @property
@@ -89,7 +89,7 @@ class TomlTable:
         return self.at("").removesuffix(".")
 
     def allow(self, *known: str, renamed: Mapping[str, str] | None = None) -> None:
-        """Refuse keys that are not known; `renamed` says what to write in place of those of an earlier version."""
+        """Refuse unknown keys; `renamed` has the advice for keys of an earlier version."""
         for key in self.values:
             if renamed and key in renamed:
                 raise self.error(f"{self.at(key)} {renamed[key]}")
@@ -97,30 +97,30 @@ class TomlTable:
                 raise self.error(f"{self.at(key)} is not a known key; {one_of(known, key)}")
 
     def table(self, key: str, default: Mapping[str, Any] | None = None) -> TomlTable:
-        """The table of that name; an error where there is none and no `default`."""
+        """Return the table of that name; an error without it and without `default`."""
         value = self.values.get(key, default)
         if value is None:
-            raise self.error(f"{self.at(key)} is missing; a table [{self.place}{key}] is needed{self._closest(key)}")
+            raise self.error(f"{self.at(key)} is missing; a table [{self.place}{key}] is needed{self._suggest(key)}")
         if not isinstance(value, Mapping):
             raise self.error(f"{self.at(key)} = {value!r} is not a table; write [{self.place}{key}]")
         return replace(self, values=value, place=f"{self.place}{key}.")
 
     def tables(self, names: Collection[str], kind: str) -> dict[str, TomlTable]:
-        """Name → table of all that it holds; a name that is none of `names` is not a `kind`."""
+        """Return name → table of all its tables; a name that is not in `names` is not a `kind`."""
         for name in self.values:
             if name not in names:
                 raise self.error(f"{self.at(name)} is not a {kind}; {one_of(names, name)}")
         return {name: self.table(name) for name in self.values}
 
     def text(self, key: str, default: str | None) -> str | None:
-        """A text that is not empty; `default` where the key is missing."""
+        """Return a text that is not empty; `default` where the key is missing."""
         value = self.values.get(key, default)
         if value is not None and (not isinstance(value, str) or not value):
             raise self.error(f"{self.at(key)} = {value!r} is not a text; write it in quotes")
         return value
 
     def choice(self, key: str, choices: Iterable[str], default: str | None = None) -> str:
-        """One of the choices."""
+        """Return one of the choices."""
         choices = list(choices)
         value = self.text(key, default)
         if value is None:
@@ -130,59 +130,61 @@ class TomlTable:
         return value
 
     def flag(self, key: str) -> bool:
-        """True or false; false where the key is missing."""
+        """Return true or false; false where the key is missing."""
         value = self.values.get(key, False)
         if not isinstance(value, bool):
             raise self.error(f"{self.at(key)} = {value!r} is neither true nor false")
         return value
 
     def number(self, key: str, default: float | None, positive: bool = False) -> float | None:
-        """A finite number; `default` where the key is missing."""
+        """Return a finite number; `default` where the key is missing."""
         value = self.values.get(key, default)
         if value is None:
             return None
         if not is_number(value):
-            raise self.error(f"{self.at(key)} = {_shown(value)} is not a number")
+            raise self.error(f"{self.at(key)} = {_format_value(value)} is not a number")
         if positive and value <= 0:
             raise self.error(f"{self.at(key)} = {value!r} must be greater than 0")
         return float(value)
 
     def numbers(self, *names: str, most: float = 1e6) -> list[float]:
-        """The finite numbers of these keys, all of which are needed; a standard deviation is not negative."""
+        """Return the finite numbers of these keys, which are all required; a standard deviation is not negative."""
         values: list[float] = []
         for name in names:
             value = self.values.get(name)
             if not is_number(value) or abs(value) > most or (name.startswith("std") and value < 0.0):
-                found = f"{name} = {_shown(value)}" if name in self else f"no {name}"
+                entry = f"{name} = {_format_value(value)}" if name in self else f"no {name}"
                 raise self.error(
-                    f"{self.where} has {found}; it needs {', '.join(names)}: numbers up to {most:g}, std from 0 on"
+                    f"{self.where} has {entry}; it needs {', '.join(names)}: numbers up to {most:g}, std from 0 on"
                 )
             values.append(float(value))
         return values
 
     def names(self, key: str, count: int) -> list[str]:
-        """A list of so many different names of columns."""
+        """Return a list of `count` different names of columns."""
         value = self.values.get(key)
         if not isinstance(value, list) or len(value) != count or not all(isinstance(v, str) for v in value):
-            found = "missing" if value is None else _shown(value)
-            closest = self._closest(key) if value is None else ""
-            raise self.error(f"{self.at(key)} is {found}; a list of {count} column names is needed{closest}")
+            entry = "missing" if value is None else _format_value(value)
+            closest = self._suggest(key) if value is None else ""
+            raise self.error(f"{self.at(key)} is {entry}; a list of {count} column names is needed{closest}")
         if len(set(value)) < count:
-            raise self.error(f"{self.at(key)} names a column twice: {_shown(value)}; {count} different ones are needed")
+            raise self.error(
+                f"{self.at(key)} names a column twice: {_format_value(value)}; {count} different ones are needed"
+            )
         return value
 
-    def _closest(self, key: str) -> str:
-        """For a missing key: what stands in its place, where that is close."""
-        found = one_of(self.values, key)
-        return f"; {found}" if found.startswith("did") else ""
+    def _suggest(self, key: str) -> str:
+        """Suggest a similar key for a missing one; empty: there is none."""
+        suggestion = one_of(self.values, key)
+        return f"; {suggestion}" if suggestion.startswith("did") else ""
 
 
 def is_number(value: Any, below: float = 1e300) -> TypeGuard[float]:
-    """A finite int or float smaller than `below`; a boolean is none."""
+    """Return whether a value is a finite int or float smaller than `below`, and no boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < below
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
@@ -190,57 +192,57 @@ def _shown(value: Any) -> str:
 
 
 def toml_string(text: str) -> str:
-    """A text as TOML has it: as JSON, but for what cannot be encoded and for DEL, which TOML wants escaped."""
+    """Format a text for TOML: as JSON, with characters replaced that cannot be encoded, and DEL escaped."""
     sound = text.encode("utf-8", "replace").decode("utf-8")
     return json.dumps(sound, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def toml_strings(texts: Iterable[str]) -> str:
-    """A list of texts as TOML has it."""
+    """Format a list of texts for TOML."""
     return f"[{', '.join(map(toml_string, texts))}]"
 
 
 def toml_key(name: str) -> str:
-    """A key as TOML has it: links and joints of a URDF may be called anything."""
+    """Format a key for TOML: names of links and joints in a URDF may have any characters."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_string(name)
 
 
-# Whole or not at all -------------------------------------------------------------------------------------------------
+# Atomic output -------------------------------------------------------------------------------------------------------
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-written: list[Path] = []  # the folders that appeared, for whoever is stopped and says what there is
+written: list[Path] = []  # complete output folders, for the message of a command that is interrupted
 
 
 @contextmanager
 def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
-    """A new folder to write into; its files move to `out` when the block ends well, and vanish when it does not.
+    """Create a new folder to write into; its files move to `out` when the block succeeds, and are deleted otherwise.
 
-    With `force`, files of the same name are replaced and all others stay. A process that is killed leaves at most a
-    hidden folder, ``.NAME.partial-…``, beside `out`, or in it where it was there already; nobody looks into it, and it
-    can be deleted. Where `out` was not there, it appears at once with all that is in it; else file by file, each whole.
+    With `force`, files of the same name are replaced and all others stay. A killed process leaves at most a hidden
+    folder, ``.NAME.partial-…``, beside `out`, or in an existing `out`; it is never read and can be deleted. A new `out`
+    appears at once with all its files; in an existing one they appear one by one, each complete.
 
     Raises
     ------
     ExistingOutput
-        `out` holds something and `force` is not given, or it is no folder, or cannot be written.
+        `out` is not empty and `force` is false, or it is no folder, or cannot be written.
     """
     _check(out, force)
-    # Inside `out` where it exists: it may be a file system of its own, or the only place that can be written to.
+    # Inside an existing `out`: it may be a separate file system, or the only writable place.
     existing = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
     if not existing.is_dir():
         raise ExistingOutput(f"{out}: cannot be made: {existing} is a file")
     own: Path | None = None
     try:
         try:
-            with _undisturbed():
+            with _defer_signals():
                 own = Path(tempfile.mkdtemp(prefix=_prefix(out), dir=existing))
-            partial = own / "whole"  # which others may read, as far as the user lets them
+            partial = own / "whole"  # with the user's usual permissions
             partial.mkdir()
         except OSError as error:
             raise ExistingOutput(f"{out}: cannot be written: {error.strerror}") from error
-        with _full_told(out):
+        with _report_full_disk(out):
             yield partial
-        with _undisturbed():
+        with _defer_signals():
             _move(partial, out, force)
             written.append(out)
     finally:
@@ -250,17 +252,17 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
-    """A path beside `file` to write to; what stands there becomes `file` when the block ends well, else vanishes.
+    """Create a path beside `file` to write to; it becomes `file` when the block succeeds, and is deleted otherwise.
 
     Raises
     ------
     ExistingOutput
-        `file` is there and `force` is not given, or it cannot be written.
+        `file` exists and `force` is false, or it cannot be written.
     """
     check_file(file, force)
     partial = file.with_name(f".{file.name}.partial")
     try:
-        with _full_told(file):
+        with _report_full_disk(file):
             yield partial
         partial.replace(file)
     finally:
@@ -268,7 +270,7 @@ def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
 
 
 def check_file(file: Path, force: bool = False) -> None:
-    """Raise `ExistingOutput` where `file` is there and `force` is not given, or it cannot be a file."""
+    """Raise `ExistingOutput` where `file` exists and `force` is false, or it cannot be a file."""
     if file.exists() and not force:
         raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
     if file.is_dir() or not file.absolute().parent.is_dir():
@@ -276,12 +278,12 @@ def check_file(file: Path, force: bool = False) -> None:
 
 
 @contextmanager
-def _full_told(out: Path) -> Iterator[None]:
-    """A disk that is full in a line that names the output: the system's own error names no file, or an input."""
+def _report_full_disk(out: Path) -> Iterator[None]:
+    """Raise an error that names the output when the disk is full; the system's error names no file, or an input."""
     try:
         yield
     except OSError as error:
-        # polars gives the system's words and no number.
+        # An error of polars has the system's text but no number.
         if error.errno in _FULL or "No space left" in str(error):
             reason = error.strerror or str(error)
             raise ExistingOutput(f"{out}: cannot be written: {reason}; nothing was written") from error
@@ -289,22 +291,22 @@ def _full_told(out: Path) -> Iterator[None]:
 
 
 def _move(partial: Path, out: Path, force: bool) -> None:
-    made = sorted(partial.rglob("*"))
+    paths = sorted(partial.rglob("*"))
     _check(out, force)  # again: another run may have written there meanwhile
-    for path in made:
+    for path in paths:
         target = out / path.relative_to(partial)
         if target.exists() and target.is_dir() != path.is_dir():
             raise ExistingOutput(f"{target}: is in the way; nothing was written, move it or name another folder")
     if not out.exists():
         out.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(OSError):  # somebody made it just now
+        with contextlib.suppress(OSError):  # another process has just created it
             partial.rename(out)
             return
         _check(out, force)
-    for path in made:
+    for path in paths:
         if path.is_dir():
             (out / path.relative_to(partial)).mkdir(parents=True, exist_ok=True)
-    for path in made:
+    for path in paths:
         if path.is_file():
             path.replace(out / path.relative_to(partial))
 
@@ -323,23 +325,23 @@ def _check(out: Path, force: bool) -> None:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Signals that stop a command wait until the block has ended; only the main thread has them."""
+def _defer_signals() -> Iterator[None]:
+    """Defer signals that stop a command until the block has ended; only the main thread receives them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    came: list[tuple[int, FrameType | None]] = []
+    deferred: list[tuple[int, FrameType | None]] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         for number in before:
             if callable(before[number]):
-                signal.signal(number, lambda number, frame: came.append((number, frame)))
+                signal.signal(number, lambda number, frame: deferred.append((number, frame)))
         yield
     finally:
         for number, handler in before.items():
             if callable(handler):
                 signal.signal(number, handler)
-        for which, frame in came[:1]:
-            handler = before[signal.Signals(which)]
+        for signal_number, frame in deferred[:1]:
+            handler = before[signal.Signals(signal_number)]
             if callable(handler):
-                handler(which, frame)
+                handler(signal_number, frame)
