@@ -1,4 +1,4 @@
-"""What columns of an unknown table are, by their names: a proposal for the user to check, never read by itself."""
+"""Guesses from the column names of an unknown table: a proposal that the user checks, never applied by itself."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 from ..recording.segments import guess_segment
 
 AXIS = re.compile(r"(?P<stem>.*?)[ _.\-\[(]*(?P<axis>[xyzw0-3])[\])]?\s*(?P<unit>[\[(].*[\])])?", re.IGNORECASE)
-# What is measured, in the order in which the words are looked for; (?![a-z]) for names such as gx, ax.
+# Signals in the order of the search; (?![a-z]) for names such as gx, ax.
 SIGNALS = (
     ("gyro", r"gyr|ang(ular)?[ _]?vel|omega|rot(ation)?[ _]?rate|(^|[^a-z])[gw]$"),
     ("accel", r"acc|(^|[^a-z])a$"),
@@ -29,17 +29,17 @@ ORDER = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 
 
 class Guess(NamedTuple):
-    """What the names of columns say."""
+    """The guess from the names of columns."""
 
     time: str | None
-    time_unit: str | None  # "s", "ms", "us" or "ns", where the name says it
+    time_unit: str | None  # "s", "ms", "us" or "ns", where the name has it
     sensors: Mapping[str, Mapping[str, list[str]]]  # segment, or ?name where it is not known → signal → columns
-    degrees: bool  # a name said deg/s
-    g: bool  # a name said g
+    degrees: bool  # a name has deg/s
+    g: bool  # a name has g
 
 
 def guess_columns(names: Iterable[str]) -> Guess:
-    """Groups of three or four columns that differ in their axis alone."""
+    """Guess signals from groups of three or four columns that differ only in the axis."""
     names = list(names)
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for name in names:
@@ -47,7 +47,7 @@ def guess_columns(names: Iterable[str]) -> Guess:
         signal = guess_signal(match["stem"]) if match else None
         if match and signal:
             groups.setdefault((match["stem"], signal), {})[match["axis"].lower()] = name
-    found: dict[str, dict[str, list[str]]] = {}
+    by_sensor: dict[str, dict[str, list[str]]] = {}
     for (stem, signal), axes in groups.items():
         order = ORDER[signal]
         if set("0123") <= set(axes) and signal == "orientation":
@@ -55,24 +55,26 @@ def guess_columns(names: Iterable[str]) -> Guess:
         elif not set(order) <= set(axes) and set("012") <= set(axes) and signal != "orientation":
             order = "012"
         if set(order) <= set(axes):
-            found.setdefault(_owner(stem), {}).setdefault(signal, [axes[axis] for axis in order])
-    return _guess(names, found)
+            by_sensor.setdefault(_find_owner(stem), {}).setdefault(signal, [axes[axis] for axis in order])
+    return _make_guess(names, by_sensor)
 
 
 def guess_arrays(shapes: Mapping[str, tuple[int, ...]]) -> Guess:
-    """Arrays (n, 3) and (n, 4) whose path says what they are."""
-    found: dict[str, dict[str, list[str]]] = {}
+    """Guess signals from the paths of arrays (n, 3) and (n, 4)."""
+    by_sensor: dict[str, dict[str, list[str]]] = {}
     for path, shape in shapes.items():
         signal = guess_signal(path)
         if signal and len(shape) == 2 and len(ORDER[signal]) in shape:
-            found.setdefault(_owner(path), {}).setdefault(signal, [path])
-    times = {path.rpartition("/")[2]: path for path, shape in shapes.items() if max(shape, default=0) == _size(shape)}
-    guess = _guess(list(times), found)
+            by_sensor.setdefault(_find_owner(path), {}).setdefault(signal, [path])
+    times = {
+        path.rpartition("/")[2]: path for path, shape in shapes.items() if max(shape, default=0) == _compute_size(shape)
+    }
+    guess = _make_guess(list(times), by_sensor)
     return guess._replace(time=times.get(guess.time or ""))
 
 
 def guess_signal(stem: str) -> str | None:
-    """The signal that a column's name without its axis speaks of."""
+    """Guess the signal from a column's name without its axis."""
     text = stem.lower()
     if re.search(NOT, text):
         return None
@@ -80,25 +82,25 @@ def guess_signal(stem: str) -> str | None:
 
 
 def _is_time(name: str) -> bool:
-    words = _words(name)
+    words = _split_words(name)
     rest = [word for word in words if word not in TIME and word not in TIME_UNIT]
-    says = any(word in TIME for word in words) or (len(words) == 1 and words[0] in TIME_UNIT and words[0] != "s")
-    return says and all(word in BESIDE_TIME or word.isdigit() for word in rest)
+    named = any(word in TIME for word in words) or (len(words) == 1 and words[0] in TIME_UNIT and words[0] != "s")
+    return named and all(word in BESIDE_TIME or word.isdigit() for word in rest)
 
 
-def _words(name: str) -> list[str]:
+def _split_words(name: str) -> list[str]:
     return re.sub(r"(?<=[a-z])(?=[A-Z])|[\W_]+", " ", name).lower().split()
 
 
-def _size(shape: tuple[int, ...]) -> int:
+def _compute_size(shape: tuple[int, ...]) -> int:
     size = 1
     for k in shape:
         size *= k
     return size
 
 
-def _owner(stem: str) -> str:
-    """The segment, or what is left of the name without its signal: one sensor's signals have it in common."""
+def _find_owner(stem: str) -> str:
+    """Return the segment, or the name without its signal, which one sensor's signals have in common."""
     segment = guess_segment(stem)
     if segment:
         return segment
@@ -108,21 +110,21 @@ def _owner(stem: str) -> str:
     return f"?{text.strip(' _./-')}"
 
 
-def _guess(names: list[str], found: dict[str, dict[str, list[str]]]) -> Guess:
+def _make_guess(names: list[str], by_sensor: dict[str, dict[str, list[str]]]) -> Guess:
     time = next((name for name in names if _is_time(name)), None)
-    whole = {who: signals for who, signals in found.items() if "orientation" in signals or len(signals) == 2}
+    complete = {name: signals for name, signals in by_sensor.items() if "orientation" in signals or len(signals) == 2}
     sensors = {
-        who: {
+        name: {
             k: v
             for k, v in signals.items()
             if (k == "orientation") == ("gyro" not in signals or "accel" not in signals)
         }
-        for who, signals in whole.items()
+        for name, signals in complete.items()
     }
     text = " ".join(names).lower()
     return Guess(
         time,
-        next((TIME_UNIT[word] for word in _words(time or "") if word in TIME_UNIT), None),
+        next((TIME_UNIT[word] for word in _split_words(time or "") if word in TIME_UNIT), None),
         sensors,
         bool(re.search(r"dps|deg ?/ ?s|deg_s|deg/s", text)),
         bool(re.search(r"[\[( ]g[\]) ]", f"{text} ")),

@@ -1,9 +1,9 @@
-"""The recording of a live session: everything that decided its poses, and the poses, in a file that may break off.
+"""The recording of a live session: its inputs and its poses, in a file that is readable when it ends early.
 
 A file is the magic `MAGIC` and blocks: a tag of four bytes, the payload's length and its CRC-32 (both u32), payload.
-All little-endian. A last block that is not whole is left out, so a session that was killed can be read up to there.
+All little-endian. An incomplete last block is left out, so that the recording of a killed session is readable.
 
-- ``HEAD``: JSON, what was known before the first sample: sensors, stated mounts, subject, method
+- ``HEAD``: JSON, the settings before the first sample: sensors, stated mounts, subject, method
 - ``SMPL``: samples in the order of arrival: u32 m, then sensor u8 (m), time f64 (m), gyro f64 (m, 3), accel f64 (m, 3)
 - ``EVNT``: JSON, ``{"kind": "clock", …}`` when ticks began, ``{"kind": "start", "begin": tick, "end": tick}`` the start
   pose, ``{"kind": "reset", "tick": tick}`` headings anew before that tick
@@ -38,24 +38,24 @@ FORMAT = 2  # of the header
 BLOCK = struct.Struct("<4sII")
 HEAD, SAMPLES, EVENT, POSES = b"HEAD", b"SMPL", b"EVNT", b"POSE"
 _NUMBERS = ((1, 1), (3, 9), (3, 33))  # of a block of samples: numbers a sample, bytes a sample before them
-LONGEST_BLOCK = 1 << 28  # [bytes] none that we write is so long
-# Ticks in which no sample came: more than in eight hours at 100 Hz, and times of samples are no times.
+LONGEST_BLOCK = 1 << 28  # [bytes] longer than any block that we write
+# Ticks without a sample: with more than in eight hours at 100 Hz, times of samples are wrong.
 MOST_SILENT = 3_000_000
 MOST_RATE, MOST_WAIT_S = 10_000.0, 10.0
 
 
 class LiveRecording(NamedTuple):
-    """What a live session left."""
+    """The contents of a live session's recording."""
 
     recording: Recording  # on its ticks, with its start pose and resets
     header: dict[str, Any]  # as `HEAD`
     first: int  # tick of the first pose
-    quat_WL: np.ndarray  # (n, k, 4) xyzw, the poses as they were shown, in the order of the header's sensors
+    quat_WL: np.ndarray  # (n, k, 4) xyzw, the live poses, in the order of the header's sensors
 
 
 def is_live_log(path: Path) -> bool:
-    """Whether the file is the recording of a live session."""
-    if not path.is_file():  # a pipe would hold us up
+    """Return whether the file is the recording of a live session."""
+    if not path.is_file():  # a pipe would block
         return False
     try:
         with path.open("rb") as file:
@@ -65,12 +65,12 @@ def is_live_log(path: Path) -> bool:
 
 
 def read_live_log(path: Path) -> LiveRecording:
-    """Read a live session's recording; its ticks are made anew from the arrivals, to the bit.
+    """Read a live session's recording; its ticks are computed from the arrivals, bit-identical to the live ones.
 
     Raises
     ------
     MissingFile, BadData
-        Not there; no such file; it broke off before the start pose was held.
+        The file is missing, is no such recording, or ends before the start pose.
     """
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; `wepose live --record FILE` writes one")
@@ -105,11 +105,13 @@ def read_live_log(path: Path) -> LiveRecording:
         elif tag == POSES:
             poses.append(_poses(path, payload, len(header["sensors"])))
         while aligner is not None and waiting:
-            came, far = waiting[0], waiting.pop(0).time > end_s
+            arrivals, far = waiting[0], waiting.pop(0).time > end_s
             late += int(far.sum())
-            if late > 3:  # as many in a row are a clock that went on
-                raise BadData(f"{path}: samples at {came.time[far][0]:g} s, where the file holds no as long recording")
-            ticks.append(aligner.push(Arrivals(*(part[~far] for part in came)) if far.any() else came))
+            if late > 3:  # as many in a row are a clock that jumped
+                raise BadData(
+                    f"{path}: samples at {arrivals.time[far][0]:g} s, where the file holds no as long recording"
+                )
+            ticks.append(aligner.push(Arrivals(*(column[~far] for column in arrivals)) if far.any() else arrivals))
     if header is None or aligner is None or start is None:
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     resets = [tick for tick in resets if tick < aligner.next_tick]
@@ -124,12 +126,12 @@ def read_live_log(path: Path) -> LiveRecording:
 
 
 def read_live_device(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """What `read_live_log` reads, for a session that names the file and adds phases; lost samples are NaN.
+    """Read a live recording as a device, for a session that names the file and adds phases; lost samples are NaN.
 
     Raises
     ------
     MissingFile, BadData
-        As `read_live_log`; orientations or another rate asked for.
+        As `read_live_log`; orientations or another rate are requested.
     """
     if use == "orientation" or rate_hz is not None:
         what = 'use = "orientation"' if rate_hz is None else f"rate_hz = {rate_hz:g}"
@@ -162,7 +164,7 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
 
 
 def read_blocks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Tag and payload of each whole block; at the end an empty one where nothing is left over."""
+    """Iterate over tag and payload of each complete block; an empty one ends a file without remaining bytes."""
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         while True:
@@ -214,7 +216,7 @@ def _json(path: Path, payload: bytes) -> dict[str, Any]:
 
 
 def _event(path: Path, payload: bytes) -> tuple[str, dict[str, float]]:
-    """Kind and numbers of an event; of one that is not known, no numbers."""
+    """Read kind and numbers of an event; an unknown kind has no numbers."""
     event = _json(path, payload)
     kind = str(event.get("kind"))
     wanted = {"clock": ("rate_hz", "begin", "wait_s"), "start": ("begin", "end"), "reset": ("tick",)}.get(kind, ())
@@ -231,7 +233,7 @@ def _event(path: Path, payload: bytes) -> tuple[str, dict[str, float]]:
 
 
 def _poses(path: Path, payload: bytes, sensors: int) -> tuple[int, np.ndarray]:
-    """Tick of the first pose, and the poses (m, k, 4) xyzw."""
+    """Read the tick of the first pose, and the poses (m, k, 4) xyzw."""
     first, count = struct.unpack_from("<QI", payload) if len(payload) >= 12 else (0, 0)
     if len(payload) != 12 + 32 * count * sensors:
         raise BadData(f"{path}: a block of {count} poses has {len(payload)} bytes; the file is damaged")
@@ -258,18 +260,18 @@ def build_recording(
     resets: tuple[int, ...] = (),
     last: int | None = None,
 ) -> Recording:
-    """Ticks that follow each other as a recording, up to the tick `last`; what was lost is bridged and marked.
+    """Build a recording from consecutive ticks, up to the tick `last`; lost samples are bridged and marked.
 
     Parameters
     ----------
     header : name, sensors, mounts, phases, start_pose, remounted, as in `HEAD`
     start : first and last tick of the start pose
-    resets : ticks before which headings were set anew
+    resets : ticks before which the headings were reset
 
     Raises
     ------
     BadData
-        A sensor that never sent a sample.
+        A sensor never sent a sample.
     """
     ticks = [t for t in ticks if len(t.time)]
     first = ticks[0].first
@@ -282,7 +284,7 @@ def build_recording(
         lost = ~np.isfinite(gyro[:, i]).all(axis=1)
         if lost.all():
             raise BadData(f"{source or header['name']}: sensors.{name} never sent a sample")
-        marks = np.where(lost, LONG, GOOD).astype(np.int8)  # short holes were bridged when they were live
+        marks = np.where(lost, LONG, GOOD).astype(np.int8)  # the live session bridged short gaps
         stated = header["mounts"].get(name)
         sensors[name] = ImuSensor(
             gyro_S=bridge(np.ascontiguousarray(gyro[:, i]), marks, clock, rate=True),

@@ -20,59 +20,59 @@ from .parquet import Contents, read_contents
 
 FORMATS = (".csv", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
-# Lines of a CSV that are parsed at once where it is read in pieces.
+# Lines of a CSV in a block.
 BLOCK_ROWS = 50_000
-# Rows of a Parquet file's column that are read at once.
+# Rows of a Parquet column in a block.
 COLUMN_ROWS = 1_000_000
-# A packed file holds at most so many bytes of numbers, or this many times its own: sensors' noise packs to a tenth.
+# A compressed file has at most so many bytes of numbers, or so many times its own size: sensor noise packs to a tenth.
 MOST_BYTES, MOST_GROWTH = 1 << 28, 50
-# What a line without any value consists of.
+# Characters of a line without values.
 EMPTY = b", \t\r\n"
 
 
 def read_table(path: Path) -> pl.DataFrame:
-    """The table in a ``.csv`` or ``.parquet`` file. Lines of a CSV that begin with ``#`` are comments.
+    """Read the table in a ``.csv`` or ``.parquet`` file. Lines of a CSV that begin with ``#`` are comments.
 
     Raises
     ------
     MissingFile
-        Not there, a folder, or of another format.
+        The file is missing, a folder, or of another format.
     BadData
-        Not readable as what its ending says: damaged, separated by something else than commas, rows of unlike length.
+        The file is damaged, has another separator than commas, or rows of different lengths.
     """
-    _must_be_table(path)
+    _check_table(path)
     if _is_parquet(path):
-        _parquet(path)
+        _check_parquet(path)
         with _polars_errors(path):
-            return pl.read_parquet(_source(path))
-    table = _parsed(path, _header(path))
-    return table.head(table.height - _empty_end(path)) if table.height else table
+            return pl.read_parquet(_open_source(path))
+    table = _parse_csv(path, _read_header(path))
+    return table.head(table.height - _count_empty_end(path)) if table.height else table
 
 
 def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str, first_row: int = 0) -> np.ndarray:
-    """Columns of numbers as a C-contiguous float array (n, len(names)); empty cells are NaN.
+    """Read columns of numbers as a C-contiguous float array (n, len(names)); empty cells are NaN.
 
-    `file` and `place` (such as ``sensors.torso.gyro``) begin the error's text; `first_row` is the row of the file that
-    the table begins with.
+    `file` and `place` (such as ``sensors.torso.gyro``) begin the error's text; `first_row` is the row of the file at
+    which the table begins.
 
     Raises
     ------
     UnknownColumn
         A name is not in the table.
     BadData
-        A column holds something else than numbers, or its name stands twice in the file.
+        A column has other values than numbers, or its name occurs twice in the file.
     """
-    numbers = [_numbers(table, name, file, place, first_row) for name in names]
+    numbers = [_read_numbers(table, name, file, place, first_row) for name in names]
     return np.ascontiguousarray(pl.DataFrame(numbers).to_numpy().reshape(table.height, len(names)))
 
 
-def _no_column(name: str, names: list[str], file: str, place: str) -> UnknownColumn:
+def _make_column_error(name: str, names: list[str], file: str, place: str) -> UnknownColumn:
     return UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(names, name)}")
 
 
-def _numbers(table: pl.DataFrame, name: str, file: str, place: str, first_row: int) -> pl.Series:
+def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str, first_row: int) -> pl.Series:
     if name not in table.columns:
-        raise _no_column(name, table.columns, file, place)
+        raise _make_column_error(name, table.columns, file, place)
     if f"{name}_duplicated_0" in table.columns:
         raise BadData(f"{file}: column '{name}' stands there more than once; each column needs a name of its own")
     series = table[name]
@@ -101,83 +101,83 @@ def _numbers(table: pl.DataFrame, name: str, file: str, place: str, first_row: i
 
 @dataclass
 class Rows:
-    """A table of which stretches of rows are asked for; a CSV is read anew for one that begins before the last one.
+    """A table that is read by ranges of rows; a CSV is read again for a range before the last one.
 
-    Holds what was asked for and one block of a CSV, or the row groups that a stretch of a Parquet file touches.
+    Memory holds the range and one block of a CSV, or the row groups of a Parquet file that the range overlaps.
     """
 
     path: Path
 
     def __post_init__(self) -> None:
-        _must_be_table(self.path)
-        self.names = list(_parquet(self.path).sizes) if _is_parquet(self.path) else _header(self.path)
-        self._from_the_top()
+        _check_table(self.path)
+        self.names = list(_check_parquet(self.path).sizes) if _is_parquet(self.path) else _read_header(self.path)
+        self._restart()
 
-    def _from_the_top(self) -> None:
-        self._blocks = iter(()) if _is_parquet(self.path) else _csv_blocks(self.path, self.names)
-        self._held, self._first = pl.DataFrame(), 0
+    def _restart(self) -> None:
+        self._blocks = iter(()) if _is_parquet(self.path) else _iterate_csv_blocks(self.path, self.names)
+        self._rows, self._first = pl.DataFrame(), 0
 
     def __getitem__(self, rows: slice) -> pl.DataFrame:
         if rows.stop <= rows.start:
             return pl.DataFrame(schema=dict.fromkeys(self.names, pl.Float64))
         if _is_parquet(self.path):
             with _polars_errors(self.path):
-                return pl.scan_parquet(_source(self.path)).slice(rows.start, rows.stop - rows.start).collect()
+                return pl.scan_parquet(_open_source(self.path)).slice(rows.start, rows.stop - rows.start).collect()
         if rows.start < self._first:
-            self._from_the_top()
-        while self._first + self._held.height < rows.stop and (block := next(self._blocks, None)) is not None:
-            kept = self._held.slice(max(0, rows.start - self._first))
-            self._first += self._held.height - kept.height
-            self._held = pl.concat([kept, block], how="vertical_relaxed") if kept.height else block
-        return self._held.slice(rows.start - self._first, rows.stop - rows.start)
+            self._restart()
+        while self._first + self._rows.height < rows.stop and (block := next(self._blocks, None)) is not None:
+            rest = self._rows.slice(max(0, rows.start - self._first))
+            self._first += self._rows.height - rest.height
+            self._rows = pl.concat([rest, block], how="vertical_relaxed") if rest.height else block
+        return self._rows.slice(rows.start - self._first, rows.stop - rows.start)
 
 
 def read_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.ndarray, int]:
-    """A column (n,) of a table that is not held as a whole, and the number of rows; without a name an empty array."""
-    _must_be_table(path)
+    """Read a column (n,) of a large table by blocks, with the number of rows; without a name an empty array."""
+    _check_table(path)
     if _is_parquet(path):
-        height, sizes = _parquet(path)
+        height, sizes = _check_parquet(path)
         if name is None:
             return np.empty(0), height
         if name not in sizes:
-            raise _no_column(name, list(sizes), file, place)
+            raise _make_column_error(name, list(sizes), file, place)
         with _polars_errors(path):
-            values, lazy = np.empty(height), pl.scan_parquet(_source(path)).select(name)
-            for first in range(0, height, COLUMN_ROWS):  # what polars took to read stays with it
+            values, lazy = np.empty(height), pl.scan_parquet(_open_source(path)).select(name)
+            for first in range(0, height, COLUMN_ROWS):  # polars keeps the memory of its largest read
                 part = lazy.slice(first, COLUMN_ROWS).collect()
                 values[first : first + part.height] = read_columns(part, [name], file, place, first)[:, 0]
         return values, height
     parts, height = [np.empty(0)], 0
-    for block in _csv_blocks(path, _header(path)):
+    for block in _iterate_csv_blocks(path, _read_header(path)):
         if name is not None:
             parts.append(read_columns(block, [name], file, place, height)[:, 0])
         height += block.height
     return np.concatenate(parts), height
 
 
-def _csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
+def _iterate_csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
     with path.open("rb") as lines:
         rows = (line for line in lines if not line.startswith(b"#"))
         header = next(line for line in rows if line.strip())
         done = 0
-        empty: list[bytes] = []  # kept back until something follows them
+        empty: list[bytes] = []  # empty lines, which count only if a row follows
         while new := list(itertools.islice(rows, BLOCK_ROWS)):
             block, empty = empty[::-1] + new, []
             while block and not block[-1].strip(EMPTY):
                 empty.append(block.pop())
             if not block:
                 continue
-            table = _parsed(path, names, b"".join([header, *block]), done)
+            table = _parse_csv(path, names, b"".join([header, *block]), done)
             done += table.height
-            # A column of whole numbers in one block and of decimals in the next is one column.
+            # A column may have whole numbers in one block and decimals in the next.
             yield table.with_columns(pl.col(pl.Int64, pl.Null).cast(pl.Float64))
 
 
-# What a file can be wrong in ---------------------------------------------------------------------------------------
+# Checks of files ---------------------------------------------------------------------------------------------------
 
 
-def _source(path: Path) -> Path | bytes:
-    """The file as polars takes it, which knows no paths but those in UTF-8."""
+def _open_source(path: Path) -> Path | bytes:
+    """Return the file as a path, or its contents where the path is not UTF-8, which polars cannot open."""
     try:
         os.fspath(path).encode("utf-8")
     except UnicodeEncodeError:
@@ -190,17 +190,17 @@ def _is_parquet(path: Path) -> bool:
 
 
 def limit_bytes(path: Path) -> int:
-    """How many bytes of numbers a packed file may hold."""
+    """Return the largest number of bytes of numbers in a compressed file."""
     return max(MOST_BYTES, MOST_GROWTH * path.stat().st_size)
 
 
 def explain_size(path: Path) -> str:
-    """For an error's end: what a packed file says it holds is more than `limit_bytes`."""
+    """Explain, at an error's end, that a compressed file states more bytes than `limit_bytes`."""
     return f"in a file of {path.stat().st_size} bytes: no recording packs so well; write it anew without compression"
 
 
-def _parquet(path: Path) -> Contents:
-    """What a Parquet file holds, before polars sees it: on some that are damaged polars ends the whole process."""
+def _check_parquet(path: Path) -> Contents:
+    """Read the contents of a Parquet file before polars does: some damaged files make polars end the process."""
     found = read_contents(path)
     if max(8 * found.rows, sum(found.sizes.values())) > limit_bytes(path):
         rows, width = found.rows, len(found.sizes)
@@ -208,7 +208,7 @@ def _parquet(path: Path) -> Contents:
     return found
 
 
-def _must_be_table(path: Path) -> None:
+def _check_table(path: Path) -> None:
     if path.is_dir():
         raise MissingFile(f"{path}: is a folder; a {' or '.join(FORMATS)} file is wanted here")
     if path.suffix.lower() not in FORMATS:
@@ -219,11 +219,11 @@ def _must_be_table(path: Path) -> None:
 
 
 class _polars_errors:
-    """polars' own errors as one line of ours."""
+    """Turns errors of polars into one line of ours."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # polars prints what its panics say, line upon line.
+        # polars prints its panics on several lines.
         self._quiet = native_stderr_muted() if _is_parquet(path) else contextlib.nullcontext()
 
     def __enter__(self) -> None:
@@ -231,15 +231,15 @@ class _polars_errors:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._quiet.__exit__(None, None, None)
-        # A panic is no Exception: polars came upon what it had taken for impossible.
+        # A panic, an internal error of polars, is no Exception.
         if isinstance(error, pl.exceptions.PolarsError | pl.exceptions.PanicException | OSError):
             what = "Parquet file" if _is_parquet(self.path) else "table"
             reason = " ".join(str(error).split("\n")[0].split())
             raise BadData(f"{self.path}: cannot be read as a {what}: {reason}") from error
 
 
-def _header(path: Path) -> list[str]:
-    """Column names of a CSV, as they stand there."""
+def _read_header(path: Path) -> list[str]:
+    """Read the column names of a CSV."""
     try:
         with path.open("rb") as lines:
             first = next((line for line in lines if line.strip() and not line.startswith(b"#")), b"")
@@ -259,19 +259,19 @@ def _header(path: Path) -> list[str]:
         raise BadData(f"{path}: its line of names cannot be read: {error}; save it as CSV in UTF-8") from error
 
 
-def _parsed(path: Path, names: list[str], part: bytes = b"", first_row: int = 0) -> pl.DataFrame:
-    """A CSV, or a `part` of it that begins with the line of names and goes on with `first_row`."""
-    source: Path | bytes = part or _source(path)
+def _parse_csv(path: Path, names: list[str], part: bytes = b"", first_row: int = 0) -> pl.DataFrame:
+    """Parse a CSV, or a `part` of it with the header and the rows from `first_row` on."""
+    source: Path | bytes = part or _open_source(path)
     options: dict[str, Any] = {"null_values": NO_VALUE, "comment_prefix": "#"}
     numbers: dict[str, Any] = dict.fromkeys(names, pl.Float64)
     table = None
     if len(numbers) == len(names):
-        # Most tables hold numbers and nothing else. What does not is read with care below.
+        # Most tables have numbers alone. Others are read below.
         with contextlib.suppress(pl.exceptions.PolarsError):
             table = pl.read_csv(source, schema=numbers, **options)
     try:
         if table is None:
-            # Columns are typed over the whole file, so that text deep down is found as text and can be named.
+            # Types are inferred from the whole file, so that an error can name text in any row.
             table = pl.read_csv(source, infer_schema_length=None, **options)
     except (pl.exceptions.PolarsError, OSError) as error:
         if "more fields" in str(error):
@@ -280,14 +280,14 @@ def _parsed(path: Path, names: list[str], part: bytes = b"", first_row: int = 0)
             raise BadData(f"{path}: is not UTF-8 text; save it as CSV in UTF-8") from error
         with _polars_errors(path):
             raise
-    # polars fills short rows in silence.
+    # polars fills short rows silently.
     if table.width > 1 and table[table.columns[-1]].null_count():
         _find_ragged(path, len(names), part, first_row)
     return table
 
 
-def _empty_end(path: Path) -> int:
-    """How many lines without any value a CSV ends with, as editors and spreadsheets leave them."""
+def _count_empty_end(path: Path) -> int:
+    """Count the lines without values at the end of a CSV, which editors and spreadsheets leave."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - 2**16))
         lines = file.read().splitlines()
@@ -295,7 +295,7 @@ def _empty_end(path: Path) -> int:
 
 
 def _find_ragged(path: Path, width: int, part: bytes, first_row: int) -> None:
-    """Raise an error on the first row of a CSV that has not `width` fields; empty lines pass as rows without values."""
+    """Raise an error on the first row of a CSV without `width` fields; empty lines are rows without values."""
     with io.BytesIO(part) if part else path.open("rb") as lines:
         text = io.TextIOWrapper(lines, encoding="utf-8-sig", errors="replace", newline="")
         rows = csv.reader(line for line in text if not line.startswith("#"))
