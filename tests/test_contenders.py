@@ -80,7 +80,7 @@ def test_the_bias_is_removed_for_all_but_as_it_comes(contender: Contender, senso
 
 
 def test_a_tuning_trial_is_scored_as_the_experiments_do() -> None:
-    trial = tuning._dynamic(tuning.DYNAMIC_SEEDS[0], 100.0)
+    trial = tuning._make_dynamic_trial(tuning.DYNAMIC_SEEDS[0], 100.0)
     sensor = simulate_paper_dynamic(tuning.DYNAMIC_SEEDS[0], 100.0)
     true, rest = Rotation.from_quat(sensor.quat_WS), at_rest(sensor)
     moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])

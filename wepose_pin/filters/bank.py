@@ -13,7 +13,7 @@ from .static import StaticDetector, StaticState
 
 
 class LiveBank:
-    """k sensors that are sampled together, each with a filter and a detector made (and perhaps run) on its own.
+    """k sensors that are sampled together, each with its own filter and detector, which may have run before.
 
     The bank continues from their states, on a copy, with bit-identical results. `update` allocates nothing: the next
     one overwrites its result and the arrays named here.
@@ -56,7 +56,7 @@ class LiveBank:
         self.gyro_bias = self._states["gyro_bias"]
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """`quat_WS` (k, 4) after one sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²].
+        """Take a sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²]; returns `quat_WS` (k, 4).
 
         A sensor whose sample did not come has NaN in its row: its rate is held and fades, its covariance grows.
         """
@@ -68,7 +68,7 @@ class LiveBank:
 
     @property
     def attitude_cov(self) -> np.ndarray:
-        """(k, 3, 3) [rad²] of the error on the right, in S; a copy."""
+        """Covariance (k, 3, 3) [rad²] of the error on the right, in S; a copy."""
         return symmetric(self._states["attitude_cov"])
 
 
@@ -95,6 +95,6 @@ class OneByOne:
 
 
 def create_bank(filters: Sequence[Any], detectors: Sequence[StaticDetector]) -> LiveBank | OneByOne:
-    """A `LiveBank` if the filters have a kernel for it, else `OneByOne`."""
+    """Create a `LiveBank` if the filters have a kernel for it, else `OneByOne`."""
     kind = LiveBank if all(hasattr(filter_, "live") for filter_ in filters) else OneByOne
     return kind(filters, detectors)

@@ -14,7 +14,7 @@ __all__ = ["estimate_data_bytes", "is_live_log", "iter_session", "load_session",
 
 
 def load_session(path: str | Path, gaps: bool = False) -> Recording:
-    """Read ``session.toml`` and the data it names, or what `wepose live` recorded.
+    """Read ``session.toml`` and the data it names, or a recording of `wepose live`.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ UNITS = {"accel": {"m/s^2": 1.0, "m/s²": 1.0}, "gyro": {"rad/s": 1.0, "deg/s": 
 
 
 def is_apdm(lines: Sequence[str]) -> bool:
-    """Whether a file that begins with these lines is one of APDM's."""
+    """Return whether a file that begins with these lines is one of APDM's."""
     names = lines[2] if len(lines) > 2 else ""
     return lines[0].startswith("Format=7,") or (
         lines[0].startswith("Test Name:") and names.startswith("Time,") and "/Acceleration/X" in names
@@ -42,9 +42,9 @@ def is_apdm(lines: Sequence[str]) -> bool:
 
 
 def read_apdm(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """The sensors' raw data where all have them, else their orientations; `use` asks for one of the two.
+    """Read the sensors' raw data where all have them, else their orientations; `use` selects one of the two.
 
-    `rate_hz` goes before the file's own times.
+    `rate_hz` replaces the file's own times.
 
     Raises
     ------

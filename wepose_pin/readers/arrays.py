@@ -1,7 +1,7 @@
 """HDF5 and MATLAB files: arrays by their path, as ``/imu/torso/gyro``, and single columns of them, ``/imu/gyro[0]``.
 
 An array is (n,), (n, k) or (k, n) with n samples; the fields of a MATLAB struct are a path's parts. HDF5, and with it
-MATLAB's v7.3, is read by h5py, which is optional; what lies in other files, by links or otherwise, is not read.
+MATLAB's v7.3, needs h5py, which is optional. Arrays in other files, by links or otherwise, are not read.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ from .tables import explain_size, limit_bytes
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-# More columns than this is no signal of a sensor.
+# A sensor's signal has at most so many columns.
 MOST_COLUMNS = 16
 
 
 def is_array_file(path: Path) -> bool:
+    """Return whether the suffix is that of an HDF5 or MATLAB file."""
     return path.suffix.lower() in SUFFIXES
 
 
 @dataclass
 class ArrayFile:
-    """The arrays of numbers in a file; an HDF5 file's are read when they are asked for.
+    """The arrays of numbers in a file; those of an HDF5 file are read on demand.
 
     Raises
     ------
     MissingFile, BadData
-        Not there; neither HDF5 nor MATLAB's, or damaged; h5py is needed and missing.
+        The file is missing, neither HDF5 nor MATLAB's, or damaged; or h5py is missing.
     """
 
     path: Path
@@ -55,39 +56,39 @@ class ArrayFile:
         self._level_5 = is_level_5(start)
         self._most = limit_bytes(self.path)
         self._loaded: dict[str, np.ndarray] = {}
-        self.shapes = self._hdf5_shapes() if self._hdf5 else self._matlab_shapes()
+        self.shapes = self._read_hdf5_shapes() if self._hdf5 else self._read_matlab_shapes()
         if not self.shapes:
             raise BadData(f"{self.path}: no arrays of numbers in it")
 
     def table(self, wanted: Mapping[str, str]) -> pl.DataFrame:
-        """Columns by name, ``path`` of an array (n,) or ``path[k]``; `wanted` has for each what begins an error's text.
+        """Read columns by name, ``path`` of an array (n,) or ``path[k]``; `wanted` maps each to an error's beginning.
 
         Raises
         ------
         UnknownColumn, BadData
-            No such array, or no such column of it; arrays of unlike length.
+            An array or its column does not exist; arrays have different lengths.
         """
-        found = {name: self._column(name, place) for name, place in wanted.items()}
-        lengths = {name: len(values) for name, values in found.items()}
+        columns = {name: self._read_column(name, place) for name, place in wanted.items()}
+        lengths = {name: len(values) for name, values in columns.items()}
         if len(set(lengths.values())) > 1:
             listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
             raise BadData(f"{self.path}: the arrays of a sensor and its time differ in length: {listed}")
-        return pl.DataFrame(found)
+        return pl.DataFrame(columns)
 
     def expand(self, name: str, width: int, place: str) -> list[str]:
-        """The `width` columns of an array that is named as a whole."""
+        """List the `width` columns of an array."""
         path = self._find(name, place)
         shape = self.shapes[path]
         if len(shape) != 2 or width not in shape:
             raise BadData(f"{place}: {name} in {self.path.name} has shape {shape}; (n, {width}) is needed")
         return [f"{name}[{k}]" for k in range(width)]
 
-    def _column(self, name: str, place: str) -> np.ndarray:
+    def _read_column(self, name: str, place: str) -> np.ndarray:
         part = re.fullmatch(r"(.*)\[(\d+)\]", name)
         path = self._find(part[1] if part else name, place)
-        values = self._array(path)
+        values = self._read_array(path)
         if values.ndim == 2 and (values.shape[1] > MOST_COLUMNS or values.shape[0] == 1):
-            values = values.T  # MATLAB's v7.3 turns arrays round
+            values = values.T  # MATLAB's v7.3 transposes arrays
         if part is None:
             if values.ndim == 2 and values.shape[1] == 1:
                 values = values[:, 0]
@@ -105,39 +106,39 @@ class ArrayFile:
             raise UnknownColumn(f"{place}: no array '{name}' in {self.path.name}; {one_of(self.shapes, path)}")
         return path
 
-    def _array(self, path: str) -> np.ndarray:
+    def _read_array(self, path: str) -> np.ndarray:
         if path not in self._loaded:
             self._most -= 8 * int(np.prod(self.shapes[path], dtype=object))
             if self._most < 0:
                 raise BadData(f"{self.path}: {path} is {self.shapes[path]}, {explain_size(self.path)}")
-            with _reading(self.path), _h5py(self.path).File(self.path) as file:
+            with _reading(self.path), _import_h5py(self.path).File(self.path) as file:
                 self._loaded[path] = np.asarray(file[path], dtype=float)
         return self._loaded[path]
 
-    def _hdf5_shapes(self) -> dict[str, tuple[int, ...]]:
-        h5py = _h5py(self.path)
+    def _read_hdf5_shapes(self) -> dict[str, tuple[int, ...]]:
+        h5py = _import_h5py(self.path)
         shapes: dict[str, tuple[int, ...]] = {}
 
-        def visit(name: str, thing: Any) -> None:
-            if not isinstance(thing, h5py.Dataset) or thing.external or thing.is_virtual:
-                return  # its numbers stand in another file
-            if thing.dtype.kind in "fiu" and 1 <= len(thing.shape) <= 2:
-                shapes[f"/{name}"] = tuple(int(size) for size in thing.shape)
+        def visit(name: str, node: Any) -> None:
+            if not isinstance(node, h5py.Dataset) or node.external or node.is_virtual:
+                return  # the numbers are in another file
+            if node.dtype.kind in "fiu" and 1 <= len(node.shape) <= 2:
+                shapes[f"/{name}"] = tuple(int(size) for size in node.shape)
 
         with _reading(self.path), h5py.File(self.path) as file:
             file.visititems(visit)
         return shapes
 
-    def _matlab_shapes(self) -> dict[str, tuple[int, ...]]:
+    def _read_matlab_shapes(self) -> dict[str, tuple[int, ...]]:
         with _reading(self.path):
             if not self._level_5:
                 raise BadData(f"{self.path}: is neither HDF5 nor a MATLAB file of version 5 to 7.3; save it anew")
-            found = read_mat5(self.path, self._most)
-        self._loaded = {name: np.asarray(values, dtype=float) for name, values in found.items() if values.ndim}
+            arrays = read_mat5(self.path, self._most)
+        self._loaded = {name: np.asarray(values, dtype=float) for name, values in arrays.items() if values.ndim}
         return {name: values.shape for name, values in self._loaded.items()}
 
 
-def _h5py(path: Path) -> Any:
+def _import_h5py(path: Path) -> Any:
     try:
         import h5py
     except ImportError:
@@ -148,7 +149,7 @@ def _h5py(path: Path) -> Any:
 
 
 class _reading:
-    """A library's errors on a damaged file as one line of ours."""
+    """Turns a library's errors on a damaged file into one line of ours."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -158,6 +159,6 @@ class _reading:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if isinstance(error, Exception) and not isinstance(error, BadData):
-            # h5py and SciPy raise many kinds: what is wrong is in the text.
+            # h5py and SciPy raise errors of many kinds; the text has the reason.
             reason = " ".join(str(error).split())[:120]
             raise BadData(f"{self.path}: is damaged, cut off, or no MATLAB or HDF5 file: {reason}") from error

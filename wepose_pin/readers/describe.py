@@ -30,38 +30,38 @@ from .session import SessionReader
 from .tables import FORMATS as TABLES
 from .tables import Rows, read_columns, read_table
 
-# A sensor is static where over `BLOCK_S` its rate varies by less [rad/s] and its specific force [m/s²]: a person who
-# stands sways below.
+# A sensor is static where its rate [rad/s] and specific force [m/s²] vary by less over `BLOCK_S`; the sway of a
+# standing person is below.
 BLOCK_S, STATIC_GYRO, STATIC_ACCEL = 0.25, np.deg2rad(3.0), 0.4
 SHORTEST_STATIC_S = 1.0
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
-# Segments whose sensors' mounts `wepose calibrate` finds.
+# Segments with sensor mounts that `wepose calibrate` estimates.
 ARMS = frozenset(SEGMENTS[:5])
 
 
 class Description(NamedTuple):
-    """What `wepose info` says of a file."""
+    """The description of a file for `wepose info`."""
 
-    what: str  # in a line
-    facts: tuple[str, ...]  # a line each
-    sensors: tuple[tuple[str, ...], ...]  # segment, its name in the file, what it holds, rate, time, gaps
-    session: str | None  # a ready session file, for data
-    then: str = ""  # what to do with that session
+    what: str  # one line
+    facts: tuple[str, ...]  # one line each
+    sensors: tuple[tuple[str, ...], ...]  # segment, its name in the file, signals, rate, time, gaps
+    session: str | None  # the proposed session file, for data
+    then: str = ""  # advice on that session
     diagnostics: tuple[Diagnostic, ...] = ()
 
 
 @dataclass(frozen=True)
 class _Proposal:
-    """What the session of a data file is to hold, before it is read.
+    """The contents of a proposed session for a data file.
 
     Parameters
     ----------
-    title : what the file is
+    title : kind of file
     head : lines of [data], and of [phases] where the file states them
     tables : segment, or "?" and a name of the file → lines of its [sensors.…]
     labels : segment → its name in the file
-    facts : what the file says besides, a line each
+    facts : other facts from the file, one line each
     """
 
     title: str
@@ -73,17 +73,17 @@ class _Proposal:
 
 
 def describe_file(path: Path, folder: Path | None = None) -> Description:
-    """What a file or folder is; a session that is proposed is to stand in `folder`, the file's own by default.
+    """Describe a file or folder; a proposed session is for `folder`, by default that of the file.
 
     Raises
     ------
     WeposeError
-        Not there, damaged, or of no kind that is known here.
+        The file is missing, damaged, or of an unknown kind.
     """
     if not path.exists():
         raise MissingFile(f"{path}: no such file or folder")
     if path.is_dir() and (path / "pose.parquet").is_file():
-        return _result(path)
+        return _describe_result(path)
     if path.is_dir() and detect_format(path) is None:
         named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
         if named is None:
@@ -93,21 +93,21 @@ def describe_file(path: Path, folder: Path | None = None) -> Description:
             )
         path = named
     if path.suffix.lower() == ".toml":
-        return _toml(path)
+        return _describe_toml(path)
     folder = folder or path.absolute().parent
     format = detect_format(path)
     if format:
-        return _propose_session(path, folder, _of_devices(path, folder, format))
+        return _propose_session(path, folder, _propose_from_device(path, folder, format))
     if is_array_file(path):
         arrays = ArrayFile(path)
         return _propose_session(
-            path, folder, _of_columns(path, folder, guess_arrays(arrays.shapes), list(arrays.shapes), arrays)
+            path, folder, _propose_from_names(path, folder, guess_arrays(arrays.shapes), list(arrays.shapes), arrays)
         )
     if path.suffix.lower() in TABLES:
         names = Rows(path).names
         if any(re.fullmatch(r"(left|right)_(elbow|wrist|hand)_x", name) for name in names):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
-        return _propose_session(path, folder, _of_columns(path, folder, guess_columns(names), names, None))
+        return _propose_session(path, folder, _propose_from_names(path, folder, guess_columns(names), names, None))
     known = (
         ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose; a result's folder, an "
         "x-IMU3's folder"
@@ -118,18 +118,18 @@ def describe_file(path: Path, folder: Path | None = None) -> Description:
 # Files that hold no data -------------------------------------------------------------------------------------------
 
 
-def _result(path: Path) -> Description:
+def _describe_result(path: Path) -> Description:
     try:
         summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         summary = None
     if not isinstance(summary, dict):
         return Description(f"{path}: a result of `wepose track`, without a summary.json that can be read", (), (), None)
-    said = {key: summary.get(key) for key in ("recording", "method", "rate_hz", "duration_s", "samples")}
+    run = {key: summary.get(key) for key in ("recording", "method", "rate_hz", "duration_s", "samples")}
     facts = [
-        f"of {said['recording']}, by {said['method']}: {said['samples']} samples, {said['duration_s']} s at "
-        f"{said['rate_hz']} Hz",
-        *_diagnostics(summary.get("diagnostics")),
+        f"of {run['recording']}, by {run['method']}: {run['samples']} samples, {run['duration_s']} s at "
+        f"{run['rate_hz']} Hz",
+        *_read_diagnostics(summary.get("diagnostics")),
     ]
     if (path / "joints.parquet").is_file():
         facts[1:1] = [f"of a chain, sensors on: {', '.join(_texts(summary.get('orientation_residual_rms_deg')))}"]
@@ -142,21 +142,21 @@ def _result(path: Path) -> Description:
     return Description(f"{path}: a result of `wepose track`", tuple(facts), (), None)
 
 
-def _diagnostics(value: object) -> list[str]:
-    """The texts of a summary's diagnostics, as they stand there: another version may have written them."""
-    told = []
+def _read_diagnostics(value: object) -> list[str]:
+    """Read the texts of a summary's diagnostics, which another version may have written."""
+    texts = []
     for each in value if isinstance(value, list) else []:
         text = each.get("text") if isinstance(each, dict) else None
         if isinstance(text, dict):
-            told.append(f"{each.get('severity')}: {text.get('what')}")
-    return told
+            texts.append(f"{each.get('severity')}: {text.get('what')}")
+    return texts
 
 
 def _texts(value: object) -> list[str]:
     return [str(item) for item in value] if isinstance(value, list | dict) else []
 
 
-def _toml(path: Path) -> Description:
+def _describe_toml(path: Path) -> Description:
     values = read_toml(path, "a session or a subject")
     if "data" in values or "sensors" in values:
         recording = SessionReader(path, gaps=True)
@@ -176,7 +176,7 @@ def _toml(path: Path) -> Description:
 
 
 def _propose_session(path: Path, folder: Path, proposal: _Proposal) -> Description:
-    """The description of data for which a session is proposed; what can be read by it is said of it."""
+    """Describe data and propose a session; the description has what this session reads."""
     what, diagnostics = f"{path}: {proposal.title}", tuple(proposal.diagnostics)
     if not proposal.tables:
         return Description(what, tuple(proposal.facts), (), None, diagnostics=diagnostics)
@@ -185,15 +185,15 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal) -> Descripti
     recording: Recording | None = None
     for _ in range(3):
         try:
-            # All sensors are read, those too of which nobody knows yet where they were worn.
+            # All sensors are read, also those on unknown segments.
             values = parse_toml("\n".join(["[data]", *head]))
             values["start_pose"] = CONFIGURATION
-            values["sensors"] = {who: parse_toml("\n".join(table)) for who, table in proposal.tables.items()}
+            values["sensors"] = {segment: parse_toml("\n".join(table)) for segment, table in proposal.tables.items()}
             reader = SessionReader(folder / "session.toml", gaps=True, values=values)
             recording = reader.recording(0, len(reader.time))
             break
         except WeposeError as error:
-            # What is wrong with a unit the reader knows better than any guess from names.
+            # The reader's check of units is better than a guess from names.
             if not isinstance(error, WrongUnit):
                 unread = Diagnostic("session-unreadable", ERROR, path.name, facts={"reason": str(error)})
                 diagnostics = (*diagnostics, unread)
@@ -207,17 +207,17 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal) -> Descripti
     comments = {segment: _mount_comment(recording, segment, static) for segment in proposal.tables}
     text = _session_text(path, head, phases or _start_lines(static), proposal.tables, comments)
     facts, rows = (*proposal.facts, *_facts(recording)), _rows(recording, proposal.labels)
-    # A sensor whose segment is not known goes by its name in the file.
+    # A sensor on an unknown segment has its name in the file.
     read = (replace(each, place=each.place.removeprefix("?")) for each in recording.diagnostics)
-    return Description(what, facts, rows, text, _then(recording), (*diagnostics, *read))
+    return Description(what, facts, rows, text, _advise(recording), (*diagnostics, *read))
 
 
-def _then(recording: Recording) -> str:
-    """What a session of these sensors can be used for, once its lines marked CHECK are right."""
-    worn = {who: sensor for who, sensor in recording.sensors.items() if who in SEGMENTS}
+def _advise(recording: Recording) -> str:
+    """Advise on the use of a session with these sensors, once its lines marked CHECK are right."""
+    worn = {segment: sensor for segment, sensor in recording.sensors.items() if segment in SEGMENTS}
     if not worn:
         return "name the segment of each sensor in place of SEGMENT"
-    without = [who for who, sensor in worn.items() if not sensor.aligned and sensor.stated_quat_LS is None]
+    without = [segment for segment, sensor in worn.items() if not sensor.aligned and sensor.stated_quat_LS is None]
     if not without:
         return "wepose track SESSION -o result"
     if set(worn) >= ARMS and set(without) <= ARMS:
@@ -263,14 +263,14 @@ def _session_text(
     return "\n".join(lines) + "\n"
 
 
-def _of_devices(path: Path, folder: Path, format: str) -> _Proposal:
-    """What a known format's file holds; with those beside it where the device wrote one a sensor."""
+def _propose_from_device(path: Path, folder: Path, format: str) -> _Proposal:
+    """Propose a session for a file of a known format, with the files beside it where each sensor has one."""
     device, rate = _read(path, format)
     title = (
         f"{TITLES[format]}, {'gyroscope and accelerometer' if device.kind == 'raw' else 'orientations, no raw data'}"
     )
     if format == "wepose_live":
-        facts, phases = _of_live(path)
+        facts, phases = _describe_live(path)
         worn = {str(segment): list[str]() for segment in device.labels.values()}
         return _Proposal(title, [f"file = {_relative(path, folder)}", *phases], worn, facts=facts)
     if len(device.labels) > 1 or format in ("mvnx", "opensim", "apdm"):
@@ -295,7 +295,7 @@ def _of_devices(path: Path, folder: Path, format: str) -> _Proposal:
         tables[where] = [f"file = {_relative(file, folder)}", *its_rate]
         labels[where] = label
         rates.append(its_rate)
-    if all(rates):  # one line says it for all
+    if all(rates):  # one line holds for all
         tables = {where: lines[:1] for where, lines in tables.items()}
     else:
         rate = []
@@ -311,20 +311,20 @@ def _unknown_segments(path: Path, sensors: Sequence[str]) -> list[Diagnostic]:
     return [Diagnostic("sensor-segments-unknown", WARNING, path.name, len(sensors), facts=facts)] if sensors else []
 
 
-def _of_live(path: Path) -> tuple[list[str], list[str]]:
-    """What is said of a recording of `wepose live`, and the phases of a session for it."""
+def _describe_live(path: Path) -> tuple[list[str], list[str]]:
+    """Describe a recording of `wepose live`: facts, and the phases of a session for it."""
     log = read_live_log(path)
     recording, header = log.recording, log.header
     subject = header["subject"]
     first, last = recording.phases["start"][0]
-    names = {who: "stated" for who, sensor in recording.sensors.items() if sensor.stated_quat_LS is not None}
+    names = {segment: "stated" for segment, sensor in recording.sensors.items() if sensor.stated_quat_LS is not None}
     about: dict[str, Any] = {}
     if subject:
-        with contextlib.suppress(ValueError):  # of a file that somebody else wrote
+        with contextlib.suppress(ValueError):  # another program may have written the file
             about = parse_toml(subject)
         calibrated = _texts(about.get("mounts"))
-        names |= {who: "calibrated" for who in recording.sensors if who in calibrated}
-    mounts = ", ".join(f"{who} {how}" for who, how in names.items())
+        names |= {segment: "calibrated" for segment in recording.sensors if segment in calibrated}
+    mounts = ", ".join(f"{segment} {origin}" for segment, origin in names.items())
     facts = [
         f"of {header['name']}, live by {header['method']}: {len(log.quat_WL)} poses were shown",
         f"subject: {about.get('name') or 'without a name'}" if subject else "no subject",
@@ -333,14 +333,14 @@ def _of_live(path: Path) -> tuple[list[str], list[str]]:
     ]
     if recording.resets:
         times = ", ".join(f"{recording.time[tick]:.1f}" for tick in recording.resets)
-        facts.append(f"headings set anew at [s]: {times}")
+        facts.append(f"headings reset at [s]: {times}")
     facts.append(f"track it as it was: wepose track {path} -o result; to add phases, for wepose calibrate: --write")
     first, last = np.ceil(1e3 * first) / 1e3, np.floor(1e3 * last) / 1e3
     return facts, [f"start = [[{first:.3f}, {last:.3f}]]   # as it was held live"]
 
 
 def _siblings(path: Path, format: str) -> list[Path]:
-    """The file, and those beside it of the same format: one recording's files lie together."""
+    """List the file and those of the same format beside it: the files of one recording are in one folder."""
     if path.is_dir() or path.name in ("Inertial.csv", "Quaternion.csv"):
         own = path if path.is_dir() else path.parent
         beside = [folder for folder in sorted(own.absolute().parent.iterdir()) if folder.is_dir()]
@@ -352,15 +352,17 @@ def _siblings(path: Path, format: str) -> list[Path]:
 
 
 def _read(path: Path, format: str) -> tuple[Device, list[str]]:
-    """The device's file, and the line that states a rate for it to be read, where it has none."""
+    """Read a device's file; with the line that states a rate, where the file has none."""
     try:
         return read_device(path, format), []
     except MissingRate:
         return read_device(path, format, None, 100.0), [f"rate_hz = 100.0{CHECK}the file does not say its rate"]
 
 
-def _of_columns(path: Path, folder: Path, guess: Guess, names: list[str], arrays: ArrayFile | None) -> _Proposal:
-    """A table whose columns, or arrays, are told by their names."""
+def _propose_from_names(
+    path: Path, folder: Path, guess: Guess, names: list[str], arrays: ArrayFile | None
+) -> _Proposal:
+    """Propose a session for a table or arrays by their names."""
     kind = {".parquet": "Parquet table", ".csv": "CSV table", ".mat": "MATLAB file"}.get(
         path.suffix.lower(), "HDF5 file"
     )
@@ -369,7 +371,7 @@ def _of_columns(path: Path, folder: Path, guess: Guess, names: list[str], arrays
         listed = one_of(names).removeprefix("there is: ")
         fact = f"no gyroscope and accelerometer, and no quaternions, by their names: {listed}"
         return _Proposal(title, facts=[fact])
-    time, facts = _time(path, guess, arrays)
+    time, facts = _propose_time(path, guess, arrays)
     raw = any("gyro" in signals for signals in guess.sensors.values())
     head = [f"file = {_relative(path, folder)}", *time]
     if raw:
@@ -391,8 +393,8 @@ def _of_columns(path: Path, folder: Path, guess: Guess, names: list[str], arrays
     return _Proposal(title, head, tables, facts=facts, diagnostics=_unknown_segments(path, unknown))
 
 
-def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str], list[str]]:
-    """The lines that say the time, `time` and its unit or `rate_hz`, and what to tell of it."""
+def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str], list[str]]:
+    """Propose the lines of the time, `time` and its unit or `rate_hz`; with facts about it."""
     name = guess.time
     if name is None:
         return [f"rate_hz = 100.0{CHECK}no column looks like time"], ["no column looks like time: state the rate"]
@@ -403,21 +405,21 @@ def _time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str]
         return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {error}"]
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
-    said = guess.time_unit
-    fits = said if said is not None and 0.0 < step * TIME_UNITS[said] < LONGEST_STEP_S else guess_time_unit(step)
+    named = guess.time_unit
+    unit = named if named is not None and 0.0 < step * TIME_UNITS[named] < LONGEST_STEP_S else guess_time_unit(step)
     line = f"time = {toml_string(name)}"
-    if fits in (None, "s"):
+    if unit in (None, "s"):
         return [line], []
-    by = "its name says" if fits == said else f"it grows by {step:g} from row to row"
-    note = f"'{name}' is in {fits}, as {by}: {1.0 / (step * TIME_UNITS[fits]):g} Hz"
-    return [line, f'time_unit = "{fits}"' + ("" if fits == said else f"{CHECK}{by}")], [note]
+    reason = "its name says" if unit == named else f"it grows by {step:g} from row to row"
+    fact = f"'{name}' is in {unit}, as {reason}: {1.0 / (step * TIME_UNITS[unit]):g} Hz"
+    return [line, f'time_unit = "{unit}"' + ("" if unit == named else f"{CHECK}{reason}")], [fact]
 
 
-# What a recording holds --------------------------------------------------------------------------------------------
+# Contents of a recording -------------------------------------------------------------------------------------------
 
 
 def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
-    """Intervals [s] of at least `SHORTEST_STATIC_S` in which all sensors are static."""
+    """Find the intervals [s] of at least `SHORTEST_STATIC_S` in which all sensors are static."""
     size = max(2, round(BLOCK_S * recording.rate_hz))
     blocks = len(recording) // size
     static = np.ones(blocks, dtype=bool)
@@ -425,7 +427,7 @@ def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
         rate = compute_rate(sensor, recording.rate_hz)[: blocks * size].reshape(blocks, size, 3)
         about = rate - rate.mean(axis=1, keepdims=True) if isinstance(sensor, ImuSensor) else rate
         static &= np.sqrt((about**2).sum(axis=2).mean(axis=1)) < STATIC_GYRO
-        # A bias is below the rate of whoever turns evenly.
+        # A bias is below the rate of a person who rotates evenly.
         static &= np.linalg.norm(rate.mean(axis=1), axis=1) < 3.0 * STATIC_GYRO
         if isinstance(sensor, ImuSensor):
             static &= (
@@ -438,7 +440,7 @@ def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
 
 
 def _mount_comment(recording: Recording, segment: str, static: list[tuple[float, float]]) -> list[str]:
-    """A mount to be filled in; which axis is up, gravity says."""
+    """Write a comment with a mount to complete; gravity shows the axis that points up."""
     sensor = recording.sensors.get(segment)
     if sensor is None or sensor.aligned:
         return []
@@ -449,10 +451,10 @@ def _mount_comment(recording: Recording, segment: str, static: list[tuple[float,
         )
         up = max(AXES, key=lambda axis: float(AXES[axis] @ force.mean(axis=0)))
     forward = "-z" if up[1] != "z" else "+x"
-    said = f"up as gravity says {'where it is static' if static else 'in the first second'}; which axis is forward?"
+    hint = f"up as gravity says {'where it is static' if static else 'in the first second'}; which axis is forward?"
     if isinstance(sensor, OrientationSensor):
-        said = "which sensor axis is up, which forward, in the start pose? none: the segment's own orientation"
-    return [f'# mount = {{ up = "{up}", forward = "{forward}" }}   # {said}']
+        hint = "which sensor axis is up, which forward, in the start pose? none: the segment's own orientation"
+    return [f'# mount = {{ up = "{up}", forward = "{forward}" }}   # {hint}']
 
 
 def _facts(recording: Recording) -> tuple[str, ...]:

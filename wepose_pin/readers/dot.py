@@ -29,7 +29,7 @@ INCREMENTS = (
 
 
 def read_dot(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """The sensor's rates or increments where the file has them, else its orientation; `use` asks for one of the two.
+    """Read the sensor's rates or increments where the file has them, else its orientation; `use` selects one.
 
     `rate_hz` is the output rate; it goes before SampleTimeFine.
 

@@ -27,7 +27,7 @@ class _Element(NamedTuple):
 
 
 def is_level_5(start: bytes) -> bool:
-    """Whether a file's first 128 bytes are those of such a file."""
+    """Return whether a file's first 128 bytes are those of such a file."""
     return len(start) >= HEADER and start[126:128] in (b"IM", b"MI") and start[124:126] in (b"\0\1", b"\1\0")
 
 
@@ -87,7 +87,7 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
 
 
 def _walk(at: str, data: memoryview, order: str, found: dict[str, np.ndarray], depth: int, name: str = "") -> None:
-    """The arrays of a matrix that stands at the path `at`; `name` is that of a struct's field."""
+    """Collect the arrays of a matrix at the path `at`; `name` is that of a struct's field."""
     parts = _elements(data, order)
     flags, shape, own = (_numbers(next(parts, None), order) for _ in range(3))
     whole = all(part.dtype.kind in "iu" for part in (flags, shape, own))
@@ -112,7 +112,7 @@ def _walk(at: str, data: memoryview, order: str, found: dict[str, np.ndarray], d
 
 
 def _fields(parts: Iterator[_Element], order: str) -> list[str]:
-    """Names of a struct's fields."""
+    """Read the names of a struct's fields."""
     longest, names = _numbers(next(parts, None), order), next(parts, None)
     if len(longest) != 1 or not 0 < longest[0] < 4096 or names is None:
         raise ValueError("the fields of a struct are damaged")

@@ -34,7 +34,7 @@ MATRIX = tuple(f"Mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2,
 
 
 def read_mt_manager(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """The sensor's raw data where the export has them, else its orientation; `use` asks for one of the two.
+    """Read the sensor's raw data where the export has them, else its orientation; `use` selects one of the two.
 
     `rate_hz` is the update rate, where the export does not state it or states another.
 
@@ -61,7 +61,7 @@ def read_mt_manager(path: Path, use: str | None = None, rate_hz: float | None = 
 
 
 def read_orientation(text: Text) -> np.ndarray:
-    """`quat_WS` (n, 4) xyzw of an Xsens export, from a quaternion, a matrix or angles; NaN where it has none.
+    """Read `quat_WS` (n, 4) xyzw of an Xsens export, from a quaternion, a matrix or angles; NaN where it has none.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def read_orientation(text: Text) -> np.ndarray:
 
 
 def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
-    """Times (n,) [s] on the device's clock, and after how long it begins anew.
+    """Compute times (n,) [s] on the device's clock, and the time [s] after which its counter wraps.
 
     The counter over the rate where the rate is stated: it is the same for all sensors of a station, and shows what was
     lost on the air.
@@ -112,6 +112,6 @@ def _time(text: Text, rate_hz: float | None) -> tuple[np.ndarray, float | None]:
     if ["SampleTimeFine"] in text:
         return FINE_S * unwrap_counter(text.numbers(["SampleTimeFine"])[:, 0], FINE_WRAPS), FINE_S * FINE_WRAPS
     raise MissingRate(
-        f"{text.path}: no line '// Update Rate: …' and no SampleTimeFine to tell the time by; state the update rate "
+        f"{text.path}: no line '// Update Rate: …' and no SampleTimeFine: times are not known; state the update rate "
         f"as rate_hz in [data], or export one of the two"
     )

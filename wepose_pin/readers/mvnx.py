@@ -1,4 +1,4 @@
-"""Xsens MVNX: what MVN Studio and MVN Analyze export as XML, versions 2 to 4.
+"""Xsens MVNX, the XML export of MVN Studio and MVN Analyze, versions 2 to 4.
 
 Each frame of type `normal` holds the segments' orientations (w x y z, to a world with z up) and, in exports before MVN
 2018, the sensors' `sensorAcceleration` [m/s²] and `sensorAngularVelocity` [rad/s]. An Xsens segment's frame is the
@@ -47,7 +47,7 @@ ALONG_DEG = 5.0
 
 
 class Frames(NamedTuple):
-    """What the frames of a file say, as it stands there."""
+    """The frames of a file, in its own units and order."""
 
     time: np.ndarray  # (n,) [s]
     segments: list[str]
@@ -56,7 +56,7 @@ class Frames(NamedTuple):
 
 
 def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """The sensors' raw data where the file has them, else the segments' orientations; `use` asks for one of the two.
+    """Read the sensors' raw data where the file has them, else the segments' orientations; `use` selects one.
 
     `rate_hz` goes before the file's frameRate.
 
@@ -157,7 +157,7 @@ def _segment_quat(label: str, quat_WB: np.ndarray, pose: str) -> np.ndarray:
 
 
 def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
-    """All frames of type `normal`; `rate_hz` goes before the file's frameRate.
+    """Read all frames of type `normal`; `rate_hz` replaces the file's frameRate.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
     own_rate_hz = 0.0
     try:
         with path.open("rb") as file:
-            # Nothing is expanded and nothing fetched: a file can neither grow in memory nor name others.
+            # Entities are not expanded and other files not fetched, so that a file cannot grow in memory.
             events = etree.iterparse(
                 file, events=("start", "end"), resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
             )
@@ -217,7 +217,7 @@ def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
 
 
 def _name(element: Any) -> str:
-    """An element's name without its namespace; none for comments and the like."""
+    """Return an element's name without its namespace; empty for comments and the like."""
     return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
 
 
@@ -241,7 +241,7 @@ def _number(path: Path, element: Any, name: str) -> float:
 
 
 def _values(path: Path, tag: str, rows: list[str], count: int, frames: int) -> np.ndarray:
-    """(frames, count, width) of an element's numbers."""
+    """Read an element's numbers (frames, count, width)."""
     size = WIDTH[tag] * count
     if len(rows) != frames:
         raise BadData(f"{path}: <{tag}> stands in {len(rows)} of {frames} frames; it is needed in all")

@@ -29,7 +29,7 @@ PRONATION = np.array([0.05639803, 0.99840646, 0.001952])
 
 
 def compute_n_pose(body: str) -> Rotation:
-    """A body of the model to G while the person stands in the N-pose, palms to the thighs: 90° of `pro_sup`."""
+    """Compute a body's rotation to G in the N-pose, palms to the thighs: 90° of `pro_sup`."""
     if not body.startswith(("radius", "hand")):
         return Rotation.identity()
     mirror = np.array([-1.0, -1.0, 1.0]) if body.endswith("_l") else 1.0
@@ -37,7 +37,7 @@ def compute_n_pose(body: str) -> Rotation:
 
 
 def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """The orientations of each column but time; `rate_hz` goes before the file's own times.
+    """Read the orientations of all columns but time; `rate_hz` replaces the file's own times.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = Non
 
 
 def _segment_quat(body: str, quat_GB: np.ndarray) -> np.ndarray:
-    """`quat_WL` (n, 4) xyzw of our segment from that of the model's body; a lost sample stays one."""
+    """Compute `quat_WL` (n, 4) xyzw of our segment from that of the model's body; lost samples stay lost."""
     quat_WL = np.full(quat_GB.shape, np.nan)
     known = np.linalg.norm(np.nan_to_num(quat_GB), axis=1) > 0.5
     quat_WL[known] = (R_GW.inv() * Rotation.from_quat(quat_GB[known]) * compute_n_pose(body).inv() * R_GW).as_quat()
@@ -96,7 +96,7 @@ def _segment_quat(body: str, quat_GB: np.ndarray) -> np.ndarray:
 
 
 def _quat(path: Path, label: str, cells: list[str]) -> np.ndarray:
-    """(n, 4) xyzw of cells ``w,x,y,z``; ``nan`` is a lost sample."""
+    """Read quaternions (n, 4) xyzw from cells ``w,x,y,z``; ``nan`` is a lost sample."""
     quat = np.empty((len(cells), 4))
     for k, cell in enumerate(cells):
         try:

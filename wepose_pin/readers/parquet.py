@@ -1,4 +1,4 @@
-"""What a Parquet file says of itself, checked before polars reads it: on some damaged ones polars ends the process.
+"""Checks of Parquet files before polars reads them: some damaged ones make polars end the process.
 
 Walks the footer and the header of every page; the values themselves, which may be packed, are polars'. What is read is
 written in Thrift's compact protocol. Sources: github.com/apache/parquet-format, README.md, Encodings.md and
@@ -25,7 +25,7 @@ _NESTED = "lists or structs; each number needs a cell of its own"
 
 
 class Contents(NamedTuple):
-    """What a file holds, by its own words.
+    """The contents of a file, as it states them.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class Contents(NamedTuple):
 
 
 def read_contents(path: Path) -> Contents:
-    """What a Parquet file of flat columns holds, once its footer and the headers of its pages agree with each other.
+    """Read the contents of a Parquet file of flat columns, and check that its footer and page headers agree.
 
     Raises
     ------
@@ -117,12 +117,12 @@ def _leaves(schema: list[Any]) -> list[_Leaf]:
 
 
 def _chunk(file: int, end: int, leaf: _Leaf, rows: int, chunk: Any, where: str) -> tuple[int, int]:
-    """How many bytes a column of a row group takes, and how many its pages unpack to; the footer begins at `end`."""
+    """Compute the bytes of a column of a row group, packed and unpacked; the footer begins at `end`."""
     about = _field(chunk, 3, dict, where)
     if chunk.get(1):
         raise ValueError(f"{where} lies in another file")
     kind, codec, values, size, first = (_field(about, number, int, where) for number in (1, 4, 5, 7, 9))
-    at = _field(about, 11, int, where, first)  # with a dictionary it is there that polars begins
+    at = _field(about, 11, int, where, first)  # with a dictionary polars begins there
     if kind != leaf.type:
         raise ValueError(f"{where} is of type {kind}, the schema says {leaf.type}")
     if values != rows:
@@ -166,7 +166,7 @@ def _count(page: Any, number: int, most: int, where: str) -> int:
 
 
 def _page_header(file: int, at: int, until: int, where: str) -> tuple[dict[int, Any], int]:
-    """A page's header, and where its data begin."""
+    """Read a page's header, and the position of its data."""
     length = HEADER
     while True:
         data = os.pread(file, min(length, until - at), at)
@@ -184,7 +184,7 @@ def _page_header(file: int, at: int, until: int, where: str) -> tuple[dict[int, 
 
 
 def _field(struct: Any, number: int, kind: type, where: str, default: Any = None) -> Any:
-    """A field of a struct, which is of this kind; without a default it must be there."""
+    """Return a field of a struct, of this kind; without a default it is required."""
     value = struct.get(number, default) if type(struct) is dict else None
     if type(value) is not kind:
         raise ValueError(f"{where} is damaged")
@@ -192,7 +192,7 @@ def _field(struct: Any, number: int, kind: type, where: str, default: Any = None
 
 
 def _struct(data: bytes, at: int, depth: int) -> tuple[dict[int, Any], int]:
-    """The struct that begins at `at`, by the numbers of its fields, and where it ends; IndexError: it is cut off."""
+    """Read the struct at `at`, by the numbers of its fields, and its end; IndexError: it is cut off."""
     fields: dict[int, Any] = {}
     number = 0
     while head := data[at]:
@@ -204,7 +204,7 @@ def _struct(data: bytes, at: int, depth: int) -> tuple[dict[int, Any], int]:
         if number in fields:
             raise ValueError("a value in its footer or a page's header stands there twice")
         kind = head & 15
-        if kind in (1, 2):  # true and false stand in the head itself
+        if kind in (1, 2):  # true and false are in the head itself
             fields[number] = kind == 1
         else:
             fields[number], at = _value(kind, data, at, depth)

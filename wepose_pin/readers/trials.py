@@ -31,13 +31,13 @@ class Trial(NamedTuple):
     rate_hz: float
     gyro_S: np.ndarray  # (n, 3) [rad/s]
     accel_S: np.ndarray  # (n, 3) [m/s²]
-    quat_true: np.ndarray  # (n, 4) xyzw, sensor to the truth's world; NaN where it was not seen
+    quat_true: np.ndarray  # (n, 4) xyzw, sensor to the truth's world; NaN where missing
     static: slice  # samples before the motion, in which the sensor is static
     scored: np.ndarray  # (n,) bool, samples that count and have a truth
 
 
 def read_broad(path: Path) -> Trial:
-    """A trial of the BROAD benchmark, a ``.mat`` file (Laidig et al. 2021, doi 10.3390/data6070072).
+    """Read a trial of the BROAD benchmark, a ``.mat`` file (Laidig et al. 2021, doi 10.3390/data6070072).
 
     Raises
     ------
@@ -69,7 +69,7 @@ def read_broad(path: Path) -> Trial:
 
 
 def read_authors_trial(path: Path) -> Trial:
-    """The paper authors' trial ``prova_HR.txt``: 1 kHz, static for a second, then moved before Vicon.
+    """Read the paper authors' trial ``prova_HR.txt``: 1 kHz, static for a second, then motion with Vicon.
 
     Columns: time [1e-4 s], gyro [rad/s], accel [m/s²], 3 empty, 4 unused, Vicon quaternion x y z w (zeros before it
     begins), Vicon position [mm].
@@ -94,14 +94,14 @@ def read_authors_trial(path: Path) -> Trial:
 
 
 class Referenced(NamedTuple):
-    """One sensor on a body, and the body as a reference saw it: on a clock, in a frame and in a world of its own."""
+    """One sensor on a body, and a reference of the body, which has its own clock, frame and world."""
 
     name: str
     rate_hz: float
     gyro_S: np.ndarray  # (n, 3) [rad/s]; sample k is at k / rate_hz of the sensor's clock
     accel_S: np.ndarray  # (n, 3) [m/s²]
     time: np.ndarray  # (m,) [s], the reference's clock
-    quat_VB: np.ndarray  # (m, 4) xyzw, body to the reference's world V, whose z is up but for a tilt; NaN: not seen
+    quat_VB: np.ndarray  # (m, 4) xyzw, body to the reference's world V, z up apart from a tilt; NaN: missing
     static: slice  # samples before the motion, in which the sensor is static; empty where there are none
 
 
@@ -115,12 +115,12 @@ class Chain(NamedTuple):
 
     sensors: dict[tuple[str, str], Referenced]  # by mount (of `RING_MOUNTS`) and segment
     time: np.ndarray  # (m,) [s], the optical clock
-    origin_V: dict[str, np.ndarray]  # segment → (m, 3) [m], the segment's origin; NaN: not seen
-    quat_VB: dict[str, np.ndarray]  # segment → (m, 4) xyzw; NaN: not seen
+    origin_V: dict[str, np.ndarray]  # segment → (m, 3) [m], the segment's origin; NaN: missing
+    quat_VB: dict[str, np.ndarray]  # segment → (m, 4) xyzw; NaN: missing
 
 
 class RingFiles(NamedTuple):
-    """The files of a trial of the RING chain, wherever they lie."""
+    """The files of a trial of the RING chain."""
 
     folder: Path
     omc: Path
@@ -128,7 +128,7 @@ class RingFiles(NamedTuple):
 
 
 class Ur5Files(NamedTuple):
-    """The two files of an IMU on a UR5 arm, wherever they lie."""
+    """The two files of an IMU on a UR5 arm."""
 
     recording: str
     sensor: str
@@ -137,7 +137,7 @@ class Ur5Files(NamedTuple):
 
 
 def find_ring(data: Path) -> list[RingFiles]:
-    """Trials of the RING chain below a folder, told by their columns: a folder with one optical file and IMU files.
+    """Find trials of the RING chain below a folder by their columns: a folder with one optical file and IMU files.
 
     Which of two IMU files is that of the loose mounts their names say (``nonrigid``, ``loose`` or ``foam``).
     """
@@ -156,7 +156,7 @@ def find_ring(data: Path) -> list[RingFiles]:
 
 
 def find_ur5(data: Path) -> list[Ur5Files]:
-    """IMUs on a UR5 arm below a folder, told by their columns, each with the encoders' file of its sensor.
+    """Find IMUs on a UR5 arm below a folder by their columns, each with the encoders' file of its sensor.
 
     The pair shares the recording's folder name and how the sensor's name begins: ``…/circle-100/carpus_adx.csv`` and
     ``…/circle-100/carpus.csv``, in one folder or in two of that name.
@@ -168,14 +168,14 @@ def find_ur5(data: Path) -> list[Ur5Files]:
     found = []
     for imu in imus:
         same = [e for e in encoders if e.parent.name == imu.parent.name and imu.stem.startswith(e.stem)]
-        if same:  # the nearest, where several data sets lie there
+        if same:  # the nearest of several data sets
             nearest = max(same, key=lambda e: sum(a == b for a, b in zip(e.parts, imu.parts, strict=False)))
             found.append(Ur5Files(imu.parent.name, nearest.stem, imu, nearest))
     return found
 
 
 def _by_folder(data: Path) -> dict[Path, dict[Path, set[str]]]:
-    """Folder → CSV file → its columns, of all below a folder, in the order of their names."""
+    """List folder → CSV file → its columns, of all below a folder, in the order of their names."""
     found: dict[Path, dict[Path, set[str]]] = {}
     for file in sorted(data.rglob("*.csv")):
         found.setdefault(file.parent, {})[file] = _column_names(file)
@@ -183,9 +183,9 @@ def _by_folder(data: Path) -> dict[Path, dict[Path, set[str]]]:
 
 
 def _column_names(path: Path) -> set[str]:
-    """Of a CSV's first line that is no comment; empty where it cannot be read."""
+    """Read the column names of a CSV; empty: it cannot be read."""
     try:
-        if not path.is_file():  # a pipe would wait
+        if not path.is_file():  # a pipe would block
             return set()
         with path.open(encoding="utf-8", errors="replace") as lines:
             for _ in range(5):
@@ -198,7 +198,7 @@ def _column_names(path: Path) -> set[str]:
 
 
 def read_ring(files: RingFiles) -> Chain:
-    """A trial of the RING chain: ``imu_rigid.csv``, ``imu_nonrigid.csv`` (40 Hz), ``omc.csv`` (30 Hz).
+    """Read a trial of the RING chain: ``imu_rigid.csv``, ``imu_nonrigid.csv`` (40 Hz), ``omc.csv`` (30 Hz).
 
     The optical system lost all segments at once, some 0.35 s each two or three seconds. The file has straight lines in
     place of the markers there, NaN in place of the quaternions, but of one segment whose quaternions are made of those
@@ -238,7 +238,7 @@ def read_ring(files: RingFiles) -> Chain:
 
 
 def _stated_rate(path: Path) -> float:
-    """The rate in the first line, ``# sampling frequency: 40``."""
+    """Read the rate in the first line, ``# sampling frequency: 40``."""
     with path.open(encoding="utf-8", errors="replace") as lines:
         line = lines.readline(200)
     try:
@@ -257,7 +257,7 @@ def _complete(samples: np.ndarray, path: Path) -> np.ndarray:
 
 
 def read_ur5(files: Ur5Files) -> Referenced:
-    """An IMU on a UR5 arm, and the encoders' orientations of the link that carries it.
+    """Read an IMU on a UR5 arm, and the encoders' orientations of its link.
 
     Line k of the one was taken with line k of the other, 125 times a second. The static phase ends 0.1 s before the
     body has turned by 0.3 deg (the encoders' own jitter is a tenth of that).

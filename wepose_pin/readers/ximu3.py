@@ -24,7 +24,7 @@ UNITS = ("(deg/s)",) * 3 + ("(g)",) * 3
 
 
 def read_ximu3(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """A device's folder, or one of its two files; Inertial.csv where it is there, unless `use` asks for "orientation".
+    """Read a device's folder, or one of its two files; Inertial.csv where it exists, unless `use` is "orientation".
 
     `rate_hz` goes before the file's own times.
 
