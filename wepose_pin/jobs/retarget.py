@@ -16,8 +16,8 @@ from .fields import field_values
 class RetargetJob:
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
-    Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (of example-robot-data). Any other by its URDF with a map
-    beside it that says which links are shoulder, elbow and hand (docs/retargeting.md).
+    Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (from the package example-robot-data). Any other by its
+    URDF with a map beside it, a TOML that says which links are shoulder, elbow and hand (docs/retargeting.md).
 
     Parameters
     ----------
@@ -28,23 +28,24 @@ class RetargetJob:
     out : DIR
         Write trajectory.parquet and .csv, joint_trajectory.json and .yaml, summary.json and view.html to this folder.
     arm
-        Move only this arm, or both. Without it all arms that the robot has.
+        Move only this arm of the robot, or both. Without it all arms that the robot has.
     rate_hz : HZ
-        Sample the trajectory at the rate that the controller needs.
+        Sample the trajectory at this rate, 10 to 2000 Hz: that of the robot's own controller.
     task
         Follow the position of the person's hands, their orientation, or both.
     scale : FACTOR
-        Scale the person's distances by this factor. Without it a straight arm becomes a straight arm of the robot.
+        Scale the distance from shoulder to hand by this factor. Without it the ratio of the reach of the robot's arm to the
+        length of the person's arm (docs/retargeting.md).
     smoothing_hz : HZ
-        Low-pass filter the measured motion at this frequency; 0 does not filter it.
+        Low-pass filter the person's motion at this frequency; 0 does not filter it.
     strict
         Refuse a motion that is too fast for the robot, instead of slowing it down.
     episode
-        Write episode/ too: a data set of one episode as LeRobot reads it.
+        Write episode/ too: a data set of one episode in the format of LeRobot.
     view
-        Write view.html, the robot beside the person.
+        Write view.html, the animation of the robot beside the person.
     force
-        Replace the files of an earlier run.
+        Replace the files of an earlier run in DIR.
     """
 
     result: Path
