@@ -34,8 +34,8 @@ class RetargetJob:
     task
         Follow the position of the person's hands, their orientation, or both.
     scale : FACTOR
-        Scale the distance from shoulder to hand by this factor. Without it the ratio of the reach of the robot's arm to the
-        length of the person's arm (docs/retargeting.md).
+        Scale the distance from shoulder to hand by this factor. Without it the ratio of the reach of the robot's arm to
+        the length of the person's (docs/retargeting.md).
     smoothing_hz : HZ
         Low-pass filter the person's motion at this frequency; 0 does not filter it.
     strict
@@ -106,13 +106,14 @@ def run_retarget(
     from ..documents import whole_folder
     from ..report.page import PageWriter
     from ..report.viewer import retarget_html
+    from ..retargeting.trajectory import STAGES
     from ..writers import read_result
     from ..writers.provenance import collect_provenance
     from ..writers.result import as_json
 
     job.check()
     without = [task for task in ("position", "orientation") if job.task not in ("both", task)]
-    tasks = replace(retargeting.Tasks(), **dict.fromkeys(without, 0.0))
+    params = replace(retargeting.ControllerParams(), **dict.fromkeys(without, 0.0))
     with whole_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
         pose, body, about = read_result(job.result)
@@ -121,16 +122,16 @@ def run_retarget(
             pose,
             robot,
             rate_hz=job.rate_hz,
-            tasks=tasks,
+            params=params,
             scale=job.scale,
             smoothing_hz=job.smoothing_hz,
             strict=job.strict,
-            progress=lambda text, share: progress(text, 0.48 * share + (0.48 if text == "solving" else 0.0)),
+            progress=lambda text, fraction: progress(text, 0.48 * (fraction + STAGES.index(text))),
         )
         progress("checking", 0.96)
         table, limits = retargeting.build_table(trajectory), robot.map
         check = retargeting.check_limits(table, limits.urdf, limits.acceleration, limits.jerk)
-        collisions = retargeting.find_self_collisions(robot, trajectory.time, trajectory.u)
+        collisions = retargeting.find_self_collisions(robot, trajectory.time, trajectory.joint_position)
         progress("writing", 0.98)
         retargeting.write_trajectory(folder, trajectory)
         if job.episode:
