@@ -103,7 +103,7 @@ def test_it_gives_the_sensors_in_numbers(page: str, pose: TrackedRecording) -> N
         of = pose.segments.orientation[name]
         recorded, noise = [row for row in table if row[0] == label][:2]
         assert recorded[1] == f"{np.degrees(np.linalg.norm(sensor.gyro_S, axis=1)).max():.0f} °/s"
-        assert recorded[3:6] == ["no", "no", f"{100 * of.static.mean():.0f} %"]
+        assert recorded[3:6] == ["0 s", "0 s", f"{100 * of.static.mean():.0f} %"]
         start = [float(part.replace("−", "-")) for part in noise[1].split(" / ")]
         assert start == pytest.approx(np.degrees(of.noise.gyro_bias), abs=0.0051)
         assert noise[3] == f"{of.noise.gravity:.3f} m/s²"
@@ -118,7 +118,7 @@ def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedRecord
         assert line[1:3] == [f"{values[since].max():.1f}°", f"{values[-1]:.1f}°"]
         assert line[4].endswith("°/min")
     worst = max(std, key=lambda name: float(std[name][since].max()))
-    assert f"The {worst.replace('_', ' ')}'s heading may be off by ± {std[worst][since].max():.1f}°" in text_of(page)
+    assert f"that of the {worst.replace('_', ' ')}'s heading: ± {std[worst][since].max():.1f}°" in text_of(page)
     elbow = np.hypot(std["right_upper_arm"], std["right_forearm"])[since]
     assert ["right elbow", f"{np.median(elbow):.1f}°", f"{elbow.max():.1f}°"] in table
 
@@ -130,7 +130,7 @@ def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedReco
     assert '<section class="banner poor">' in text
     first = text.index(render(guessed).what)
     assert first < text.index("Let the person hold the hands together") < text.index("<h2") < text.index("<figure")
-    assert '<section class="banner note">' in page  # lengths of the population prior are only a note
+    assert '<section class="banner info">' in page  # lengths of the population prior are only worth knowing
     assert "The person's lengths are not known." in text_of(page)
 
 
@@ -499,7 +499,7 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
     assert not any(each.code.endswith("-before-start") for each in looked_at(late))
     text = text_of(track_report(peak, view="<p>"))
     assert "No warnings" not in text
-    assert "leave out the 7 s before" in text
+    assert "the 7 s before its end are left out" in text
 
 
 def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackedRecording) -> None:

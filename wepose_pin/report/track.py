@@ -1,4 +1,4 @@
-"""The report of a tracked recording: what was recorded, how far to trust it, what the person did."""
+"""The report of a tracked recording: the recording, the uncertainty of the result, the motion."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from .words import degrees, intervals, listed, plain, versions, whole
 TEMPLATE = "report/templates/track.html.j2"
 FRAMES_A_SECOND = 20.0  # of the 3D view
 MOST_FRAMES = 5000  # of the 3D view
-LARGEST_VIEW = 3_000_000  # of a view that comes ready, in characters
+LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 
 
 def track_report(
@@ -47,16 +47,16 @@ def track_report(
     totals: Totals | None = None,
     failures: list[str] | None = None,
 ) -> str:
-    """``report.html``: one page that opens offline and prints; equal arguments give equal text.
+    """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic.
 
     Its size does not grow with the recording's length.
 
     Parameters
     ----------
     tracked : of `track`
-    view : the page of `pose_html` where it exists, shown here unless it is large; None: it is made here
-    totals : of a `tracked` that `Decimator` made
-    failures : takes a line for each section that cannot be made; the page has the line in its place
+    view : the page of `pose_html`, embedded up to `LARGEST_VIEW`; None: a view is made here
+    totals : of all samples, if `tracked` was decimated by `Decimator`; None: those of `tracked`
+    failures : gets a line for each section that cannot be made; the page has the line in place of the section
     """
     recording = tracked.recording
     totals = totals or compute_totals(tracked)
@@ -73,7 +73,7 @@ def track_report(
     page.add(
         "first",
         lambda: _diagnostics_section(diagnose_pose(tracked, measures, totals.diagnostics)),
-        name="What to look at",
+        name="Diagnostics",
     )
     page.add("short", lambda: _summary_section(tracked, totals, budgets), name="In short")
     page.add("recorded", lambda: _recorded_section(recording, totals), "What was recorded")
@@ -90,16 +90,17 @@ def track_report(
 
 
 def _diagnostics_section(diagnostics: Sequence[Diagnostic]) -> dict[str, Any]:
-    grave = any(diagnostic.severity != INFO for diagnostic in diagnostics)
-    kind = "poor" if grave else "note" if diagnostics else "pass"
-    return {"kind": kind, "entries": lines(diagnostics, titled=True)}
+    has_warning = any(diagnostic.severity != INFO for diagnostic in diagnostics)
+    return {"has_warning": has_warning, "entries": lines(diagnostics, titled=True)}
 
 
 def _summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = tracked.recording
-    since = mask_from_start(tracked)
-    headings = {joint: float(np.degrees(finite_max(std[since]))) for joint, std in joint_heading_stds(budgets).items()}
-    stds = {name: axis_std(cov[since]) for name, cov in tracked.pose.point_cov.items()}
+    after_start = mask_from_start(tracked)
+    headings = {
+        joint: float(np.degrees(finite_max(std[after_start]))) for joint, std in joint_heading_stds(budgets).items()
+    }
+    stds = {name: axis_std(cov[after_start]) for name, cov in tracked.pose.point_cov.items()}
     return {
         "duration": _format_duration(float(recording.time[-1] - recording.time[0])),
         "rate_hz": totals.rate_hz,
@@ -107,7 +108,7 @@ def _summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping
         "worst": max(headings.items(), key=lambda item: item[1]) if headings else None,
         "hands": {name: 1e3 * finite_median(stds[name]) for name in ("left_palm", "right_palm") if name in stds},
         "lengths": plain(tracked.subject.note or tracked.subject.name),
-        "shown": len(recording),
+        "shown_samples": len(recording),
         "samples": totals.samples,
     }
 
@@ -129,10 +130,10 @@ def _recorded_section(recording: Recording, totals: Totals) -> dict[str, Any]:
         "sensor",
         "fastest rotation",
         "largest acceleration",
-        "cut off",
+        "saturated",
         "lost",
         "static",
-        "longest without static phase",
+        "longest motion without static phase",
     ]
     low, high = (f"{step:.2f}" for step in totals.steps_ms)
     return {
@@ -162,18 +163,18 @@ def _noise_section(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
 def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = tracked.recording
     if not budgets:
-        return {"method": tracked.options.method if recording.imus else None, "known": False}
-    since = mask_from_start(tracked)
-    stds = {name: np.nan_to_num(np.where(since, budget.std, 0.0)) for name, budget in budgets.items()}
+        return {"method": tracked.options.method if recording.imus else None, "has_covariance": False}
+    after_start = mask_from_start(tracked)
+    stds = {name: np.nan_to_num(np.where(after_start, budget.std, 0.0)) for name, budget in budgets.items()}
     worst = max(stds, key=lambda name: float(stds[name].max()))
-    at = int(np.argmax(stds[worst]))
+    worst_sample = int(np.argmax(stds[worst]))
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     fastest = max(growth, key=growth.__getitem__) if growth else None
-    clasped = tracked.correction is not None and tracked.correction.clasp_mm is not None
+    has_clasp = tracked.correction is not None and tracked.correction.clasp_mm is not None
     segments = [
         [
             plain(name),
-            degrees(float(np.degrees(finite_max(budget.std[since])))),
+            degrees(float(np.degrees(finite_max(budget.std[after_start])))),
             degrees(float(np.degrees(budget.std[-1]))),
             degrees(float(np.degrees(budget.filter_end))),
             f"{np.degrees(budget.growth):.2f} °/min" if np.isfinite(budget.growth) else "never in motion",
@@ -183,59 +184,67 @@ def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> 
     joints = [
         [
             joint,
-            degrees(float(np.degrees(finite_median(std[since])))),
-            degrees(float(np.degrees(finite_max(std[since])))),
+            degrees(float(np.degrees(finite_median(std[after_start])))),
+            degrees(float(np.degrees(finite_max(std[after_start])))),
         ]
         for joint, std in joint_heading_stds(budgets).items()
     ]
-    header = ["segment, ±", "largest", "at the end", "at the end, filter alone", "filter's growth, a minute of motion"]
+    header = [
+        "segment, ±",
+        "largest",
+        "at the end",
+        "at the end, filter alone",
+        "growth per minute of motion, filter alone",
+    ]
     return {
         "method": tracked.options.method,
-        "known": True,
+        "has_covariance": True,
         "worst": (
             worst,
-            float(np.degrees(stds[worst][at])),
-            _format_duration(float(tracked.time[at] - tracked.time[0])),
+            float(np.degrees(stds[worst][worst_sample])),
+            _format_duration(float(tracked.time[worst_sample] - tracked.time[0])),
         ),
         "fastest": (fastest, float(np.degrees(growth[fastest]))) if fastest else None,
-        "advice": heading_remedy(tracked),
+        "remedy": heading_remedy(tracked),
         "corrected": max(tracked.correction.largest_deg.values(), default=0.0)
         if tracked.correction is not None
         else None,
-        "clasped": clasped,
-        "without": [plain(name) for name in recording.sensors if name not in budgets],
-        "before": _format_time_before(tracked),
-        "stated": stated_mounts(tracked),
+        "has_clasp": has_clasp,
+        "segments_without_covariance": [plain(name) for name in recording.sensors if name not in budgets],
+        "time_before_start": _format_time_before(tracked),
+        "has_stated_mounts": stated_mounts(tracked),
         "picture": headings_picture(
             recording.time,
             {name: np.degrees(budget.std) for name, budget in budgets.items()},
-            recording.phases.get("clasp", ()) if clasped else (),
+            recording.phases.get("clasp", ()) if has_clasp else (),
         ),
         "segments": Table(header, segments),
-        "joints": Table(["joint, ±", "half of the time under", "largest"], joints) if joints else None,
+        "joints": Table(["joint, ±", "median", "largest"], joints) if joints else None,
     }
 
 
 def _hands_section(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, Any] | None:
     if not hands:
         return None
-    since = mask_from_start(tracked)
+    after_start = mask_from_start(tracked)
     rows = []
     for name, hand in hands.items():
         low, high = np.nanpercentile(100 * hand.reach, [1.0, 99.0], axis=0)
-        half, most = ("not known", "not known")
+        usual, largest = ("not known", "not known")
         if hand.std is not None:
-            half, most = (f"± {whole(1e3 * of(hand.std[since]))} mm" for of in (finite_median, finite_max))
+            usual, largest = (
+                f"± {whole(1e3 * statistic(hand.std[after_start]))} mm" for statistic in (finite_median, finite_max)
+            )
         ranges = [f"{whole(a)} to {whole(b)}" for a, b in zip(low, high, strict=True)]
-        rows.append([plain(name), *ranges, f"{hand.peak_speed:.1f} m/s", half, most])
-    header = ["", "forwards [cm]", "to the left [cm]", "above shoulders [cm]", "fastest", "usual ±", "largest ±"]
+        rows.append([plain(name), *ranges, f"{hand.peak_speed:.1f} m/s", usual, largest])
+    header = ["", "forwards [cm]", "to the left [cm]", "above shoulders [cm]", "highest speed", "median ±", "largest ±"]
     lengths = tracked.subject.lengths
     return {
-        "rigid": [plain(name) for name in hands if name not in tracked.quat_WL],
+        "rigid_hands": [plain(name) for name in hands if name not in tracked.quat_WL],
         "paths": paths_picture(hands, lengths["shoulder_width"], lengths["trunk"]),
         "reach": reach_picture(tracked.time, hands),
         "ranges": Table(header, rows),
-        "before": _format_time_before(tracked),
+        "time_before_start": _format_time_before(tracked),
     }
 
 
@@ -266,7 +275,7 @@ def _run_section(tracked: TrackedRecording) -> dict[str, Any]:
         rows += [
             (
                 f"{plain(name)}, orientation residual",
-                f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° (the model's joints are too few or end too soon)",
+                f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° (the joints have too few axes, or reach their limits)",
             )
             for name, angle in orientation_residuals(tracked.model, tracked.q, tracked.quat_WL).items()
         ]
@@ -284,13 +293,13 @@ def _format_duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.1f} min"
 
 
-def _format_seconds(which: np.ndarray, rate_hz: float) -> str:
-    return f"{np.count_nonzero(which) / rate_hz:.2f} s" if which.any() else "no"
+def _format_seconds(mask: np.ndarray, rate_hz: float) -> str:
+    return f"{np.count_nonzero(mask) / rate_hz:.2f} s" if mask.any() else "0 s"
 
 
 def _format_lost(sensor: Sensor, signal: Signal, rate_hz: float) -> str:
-    """Where long gaps were not allowed there are none."""
-    return _format_seconds(signal.gap, rate_hz) if sensor.gap is not None else "no"
+    """Return the time of long gaps; 0 s where they were not allowed."""
+    return _format_seconds(signal.gap, rate_hz) if sensor.gap is not None else "0 s"
 
 
 def _format_axes(values: np.ndarray) -> str:
@@ -298,6 +307,6 @@ def _format_axes(values: np.ndarray) -> str:
 
 
 def _format_time_before(tracked: TrackedRecording) -> str | None:
-    """The time before the end of the start pose, over which uncertainties are not summed up; None where it is short."""
+    """Return the time before the end of the start pose, which the summaries leave out; None where it is below 1 s."""
     seconds = float(tracked.time[np.argmax(mask_from_start(tracked))] - tracked.time[0])
     return _format_duration(seconds) if seconds >= 1.0 else None
