@@ -158,7 +158,7 @@ def test_it_does_not_grow_with_the_recording() -> None:
     simulation = simulate(simulate_person(3).lengths, seed=3, rate_hz=50.0, clasp_s=600.0, circles=0)
     page = track_report(track(simulation.recording("long")))
     assert len(page) < 5e6
-    assert re.search(r"thinned to 8\.\d pictures a second", page)
+    assert re.search(r"at 8\.\d frames a second", page)
 
 
 # What is missing ------------------------------------------------------------------------------------------------------
