@@ -213,7 +213,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "pose": (*THING, None),
         "robot": (*THING, None, "pandas", "nowhere.urdf"),
         "rate_hz": (*POSITIVE, None, 1e9),
-        "tasks": THING,
+        "params": THING,
         "scale": POSITIVE,
         "smoothing_hz": (*NUMBER, None, -1.0),
         "strict": (*FLAG, None),

@@ -12,25 +12,25 @@ from ..kinematics import axis_std, orientation_residuals
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
 from .decimation import Totals, compute_totals
-from .joints import joint_angles_section
+from .joints import build_joint_angles_section
 from .measures import (
     Budget,
     Hand,
     Measures,
     Signal,
+    compute_heading_uncertainties,
+    compute_joint_heading_stds,
+    find_samples_after_start,
     finite_max,
     finite_median,
-    heading_budgets,
-    joint_heading_stds,
+    has_stated_mounts,
     longest_run_s,
-    mask_from_start,
     measure_elbow,
     measure_hands,
-    stated_mounts,
 )
 from .page import Page, Table
-from .track_diagnostics import GRAVITY_OFF, diagnose_pose, heading_remedy
-from .track_figures import headings_picture, noise_picture, paths_picture, reach_picture, timeline_picture
+from .track_diagnostics import GRAVITY_OFF, describe_heading_remedy, diagnose_pose
+from .track_figures import draw_headings, draw_noise, draw_paths, draw_reach, draw_timeline
 from .viewer import pose_html
 from .words import degrees, intervals, listed, plain, versions, whole
 
@@ -40,7 +40,7 @@ MOST_FRAMES = 5000  # of the 3D view
 LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 
 
-def track_report(
+def render_track_report(
     tracked: TrackedRecording,
     *,
     view: str | None = None,
@@ -61,7 +61,7 @@ def track_report(
     recording = tracked.recording
     totals = totals or compute_totals(tracked)
     signals = totals.signals
-    budgets = heading_budgets(tracked)
+    budgets = compute_heading_uncertainties(tracked)
     sides = {side: measure_elbow(tracked.pose, side, tracked.subject) for side in ("left", "right")}
     elbows = {side: elbow for side, elbow in sides.items() if elbow is not None}
     hands = {
@@ -72,33 +72,34 @@ def track_report(
     page = Page(TEMPLATE, f"Motion of {recording.name or 'a recording'}", failures)
     page.add(
         "first",
-        lambda: _diagnostics_section(diagnose_pose(tracked, measures, totals.diagnostics)),
+        lambda: _build_diagnostics_section(diagnose_pose(tracked, measures, totals.diagnostics)),
         name="Diagnostics",
     )
-    page.add("short", lambda: _summary_section(tracked, totals, budgets), name="In short")
-    page.add("recorded", lambda: _recorded_section(recording, totals), "What was recorded")
-    page.add("noise", lambda: _noise_section(signals), "Noise and bias")
-    page.add("drift", lambda: _drift_section(tracked, budgets), "Drift of the headings")
-    page.add("hands", lambda: _hands_section(tracked, hands), "The hands")
-    page.add("angles", lambda: joint_angles_section(tracked), "Joint angles")
-    page.add("view", lambda: _view_section(tracked, view), "The motion in 3D")
-    page.add("run", lambda: _run_section(tracked), "What was run")
+    page.add("short", lambda: _build_summary_section(tracked, totals, budgets), name="In short")
+    page.add("recorded", lambda: _build_recorded_section(recording, totals), "What was recorded")
+    page.add("noise", lambda: _build_noise_section(signals), "Noise and bias")
+    page.add("drift", lambda: _build_drift_section(tracked, budgets), "Drift of the headings")
+    page.add("hands", lambda: _build_hands_section(tracked, hands), "The hands")
+    page.add("angles", lambda: build_joint_angles_section(tracked), "Joint angles")
+    page.add("view", lambda: _build_view_section(tracked, view), "The motion in 3D")
+    page.add("run", lambda: _build_run_section(tracked), "What was run")
     return page.html(f"Motion of {recording.name}" if recording.name else "Motion")
 
 
 # The sections: the values that the macros of the template take --------------------------------------------------------
 
 
-def _diagnostics_section(diagnostics: Sequence[Diagnostic]) -> dict[str, Any]:
+def _build_diagnostics_section(diagnostics: Sequence[Diagnostic]) -> dict[str, Any]:
     has_warning = any(diagnostic.severity != INFO for diagnostic in diagnostics)
     return {"has_warning": has_warning, "entries": lines(diagnostics, titled=True)}
 
 
-def _summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping[str, Budget]) -> dict[str, Any]:
+def _build_summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = tracked.recording
-    after_start = mask_from_start(tracked)
+    after_start = find_samples_after_start(tracked)
     headings = {
-        joint: float(np.degrees(finite_max(std[after_start]))) for joint, std in joint_heading_stds(budgets).items()
+        joint: float(np.degrees(finite_max(std[after_start])))
+        for joint, std in compute_joint_heading_stds(budgets).items()
     }
     stds = {name: axis_std(cov[after_start]) for name, cov in tracked.pose.point_cov.items()}
     return {
@@ -113,7 +114,7 @@ def _summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping
     }
 
 
-def _recorded_section(recording: Recording, totals: Totals) -> dict[str, Any]:
+def _build_recorded_section(recording: Recording, totals: Totals) -> dict[str, Any]:
     rows = [
         [
             plain(name),
@@ -143,12 +144,12 @@ def _recorded_section(recording: Recording, totals: Totals) -> dict[str, Any]:
         "end": recording.time[-1],
         "step": low if low == high else f"{low} to {high}",
         "phases": [f"{name} {intervals(spans)}" for name, spans in recording.phases.items()],
-        "picture": timeline_picture(recording.time, totals.signals, recording.phases),
+        "picture": draw_timeline(recording.time, totals.signals, recording.phases),
         "sensors": Table(header, rows),
     }
 
 
-def _noise_section(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
+def _build_noise_section(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
     rows = []
     for name, signal in signals.items():
         if signal.bias is not None:
@@ -157,14 +158,14 @@ def _noise_section(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
     if not rows:
         return None
     header = ["sensor", "bias in the static phase, x / y / z [°/s]", "bias at the end [°/s]", "gravity"]
-    return {"percent": 100 * GRAVITY_OFF, "picture": noise_picture(signals), "sensors": Table(header, rows)}
+    return {"percent": 100 * GRAVITY_OFF, "picture": draw_noise(signals), "sensors": Table(header, rows)}
 
 
-def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, Any]:
+def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = tracked.recording
     if not budgets:
         return {"method": tracked.options.method if recording.imus else None, "has_covariance": False}
-    after_start = mask_from_start(tracked)
+    after_start = find_samples_after_start(tracked)
     stds = {name: np.nan_to_num(np.where(after_start, budget.std, 0.0)) for name, budget in budgets.items()}
     worst = max(stds, key=lambda name: float(stds[name].max()))
     worst_sample = int(np.argmax(stds[worst]))
@@ -187,7 +188,7 @@ def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> 
             degrees(float(np.degrees(finite_median(std[after_start])))),
             degrees(float(np.degrees(finite_max(std[after_start])))),
         ]
-        for joint, std in joint_heading_stds(budgets).items()
+        for joint, std in compute_joint_heading_stds(budgets).items()
     ]
     header = [
         "segment, ±",
@@ -205,15 +206,15 @@ def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> 
             _format_duration(float(tracked.time[worst_sample] - tracked.time[0])),
         ),
         "fastest": (fastest, float(np.degrees(growth[fastest]))) if fastest else None,
-        "remedy": heading_remedy(tracked),
+        "remedy": describe_heading_remedy(tracked),
         "corrected": max(tracked.correction.largest_deg.values(), default=0.0)
         if tracked.correction is not None
         else None,
         "has_clasp": has_clasp,
         "segments_without_covariance": [plain(name) for name in recording.sensors if name not in budgets],
         "time_before_start": _format_time_before(tracked),
-        "has_stated_mounts": stated_mounts(tracked),
-        "picture": headings_picture(
+        "has_stated_mounts": has_stated_mounts(tracked),
+        "picture": draw_headings(
             recording.time,
             {name: np.degrees(budget.std) for name, budget in budgets.items()},
             recording.phases.get("clasp", ()) if has_clasp else (),
@@ -223,10 +224,10 @@ def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> 
     }
 
 
-def _hands_section(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, Any] | None:
+def _build_hands_section(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, Any] | None:
     if not hands:
         return None
-    after_start = mask_from_start(tracked)
+    after_start = find_samples_after_start(tracked)
     rows = []
     for name, hand in hands.items():
         low, high = np.nanpercentile(100 * hand.reach, [1.0, 99.0], axis=0)
@@ -241,14 +242,14 @@ def _hands_section(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict
     lengths = tracked.subject.lengths
     return {
         "rigid_hands": [plain(name) for name in hands if name not in tracked.quat_WL],
-        "paths": paths_picture(hands, lengths["shoulder_width"], lengths["trunk"]),
-        "reach": reach_picture(tracked.time, hands),
+        "paths": draw_paths(hands, lengths["shoulder_width"], lengths["trunk"]),
+        "reach": draw_reach(tracked.time, hands),
         "ranges": Table(header, rows),
         "time_before_start": _format_time_before(tracked),
     }
 
 
-def _view_section(tracked: TrackedRecording, view: str | None) -> dict[str, Any]:
+def _build_view_section(tracked: TrackedRecording, view: str | None) -> dict[str, Any]:
     if view is not None and len(view) <= LARGEST_VIEW:
         return {"page": view, "fps": None}
     fps = min(FRAMES_A_SECOND, MOST_FRAMES / max(float(tracked.time[-1] - tracked.time[0]), 1e-3))
@@ -258,7 +259,7 @@ def _view_section(tracked: TrackedRecording, view: str | None) -> dict[str, Any]
     return {"page": page, "fps": fps if fps < FRAMES_A_SECOND else None}
 
 
-def _run_section(tracked: TrackedRecording) -> dict[str, Any]:
+def _build_run_section(tracked: TrackedRecording) -> dict[str, Any]:
     recording, subject = tracked.recording, tracked.subject
     lengths = ", ".join(f"{plain(name)} {1e3 * value:.0f} mm" for name, value in subject.lengths.items())
     rows = [
@@ -268,7 +269,7 @@ def _run_section(tracked: TrackedRecording) -> dict[str, Any]:
         ("static phase", intervals([tracked.segments.static_phase])),
         ("person", f"{subject.name}; {subject.note}" if subject.note else subject.name),
         ("lengths", lengths),
-        ("mounts", "as the session states them" if stated_mounts(tracked) else "as calibrated"),
+        ("mounts", "as the session states them" if has_stated_mounts(tracked) else "as calibrated"),
         ("body model", tracked.model.robot.name),
     ]
     if tracked.q is not None:
@@ -308,5 +309,5 @@ def _format_axes(values: np.ndarray) -> str:
 
 def _format_time_before(tracked: TrackedRecording) -> str | None:
     """Return the time before the end of the start pose, which the summaries leave out; None where it is below 1 s."""
-    seconds = float(tracked.time[np.argmax(mask_from_start(tracked))] - tracked.time[0])
+    seconds = float(tracked.time[np.argmax(find_samples_after_start(tracked))] - tracked.time[0])
     return _format_duration(seconds) if seconds >= 1.0 else None
