@@ -384,4 +384,4 @@ def test_the_command_says_what_it_wrote(result: Path, tmp_path: Path, capsys: py
     assert stop.value.code == 0
     said = capsys.readouterr()
     assert said.out == f"Written: {tmp_path / 'x.mot'}  (mot)\n"
-    assert said.err.startswith("warning: The OpenSim model misses the orientation of ")
+    assert said.err.startswith("warning: The orientation of ")

@@ -92,8 +92,8 @@ class Session:
                 observed = self.observer.observe(pose.quat_WL, pose.points, pose.std, pose.lost)
                 self._came = now if self.stream.push(pose.time, observed) else self._came
             self.commands.append(self.stream.step(now, now - self._came))
-            self.stream._controller.set_joints(self.commands[-1].u)
-            self.hand.append(self.stream._controller.arm_pose(0).hand)
+            self.stream._controller.update_kinematics(self.commands[-1].u)
+            self.hand.append(self.stream._controller.get_arm_pose(0).hand)
         return self
 
     def states(self, begin: float = 0.0, end: float = math.inf) -> list[str]:

@@ -18,7 +18,7 @@ from wepose_pin.batch.plan import Item, Plan, step_options
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import as_json
 from wepose_pin.recording import ImuSensor, Recording, check_recording, compute_mount
-from wepose_pin.report import track_report, write_decimated_pages
+from wepose_pin.report import render_track_report, write_decimated_pages
 from wepose_pin.report.decimation import Decimator
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import TrackedRecording, track
@@ -100,7 +100,7 @@ def test_an_arm_that_hangs_throughout_is_tracked(
 def test_a_report_of_nothing_that_moves(sensors: str, seconds: float, noise: float) -> None:
     failures: list[str] = []
     found = track(recorded({}, seconds=seconds, noise=noise, sensors=sensors))
-    page = track_report(found, view="<p>", failures=failures)
+    page = render_track_report(found, view="<p>", failures=failures)
     assert failures == []
     assert "nan" not in page.split("<body>")[1].replace("svg", "")
 
@@ -124,7 +124,7 @@ def test_a_report_where_segments_are_not_known(pose: TrackedRecording, rows: sli
         point_cov={k: nowhere(v, rows) for k, v in pose.pose.point_cov.items()},
     )
     failures: list[str] = []
-    track_report(replace(pose, pose=changed), view="<p>", failures=failures)
+    render_track_report(replace(pose, pose=changed), view="<p>", failures=failures)
     assert failures == []
 
 
@@ -141,9 +141,9 @@ def test_a_study_whose_figures_are_all_one_up_to_rounding() -> None:
 # What fails all the same ----------------------------------------------------------------------------------------------
 
 BROKEN = {
-    "wepose_pin.report.track.timeline_picture": ("report.html", {"view.html", "report.html"}),
+    "wepose_pin.report.track.draw_timeline": ("report.html", {"view.html", "report.html"}),
     "wepose_pin.report.track.diagnose_pose": ("report.html", {"view.html", "report.html"}),
-    "wepose_pin.report.pages.track_report": ("report.html", {"view.html"}),
+    "wepose_pin.report.pages.render_track_report": ("report.html", {"view.html"}),
     "wepose_pin.report.pages.pose_html": ("view.html", {"report.html"}),
 }
 
@@ -206,9 +206,9 @@ def test_the_result_is_there_when_the_page_is_stopped(
 @pytest.mark.parametrize(
     ("broken", "left"),
     [
-        ("wepose_pin.report.calibration.lengths_picture", {"report.html"}),
+        ("wepose_pin.report.calibration.draw_lengths", {"report.html"}),
         ("wepose_pin.report.calibration.track", {"report.html"}),
-        ("wepose_pin.report.calibration.calibration_report", set()),
+        ("wepose_pin.report.calibration.render_calibration_report", set()),
     ],
 )
 def test_a_calibration_outlasts_its_report(

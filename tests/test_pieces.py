@@ -25,7 +25,7 @@ from wepose_pin.kinematics import pose_table
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
-from wepose_pin.report import track_report
+from wepose_pin.report import render_track_report
 from wepose_pin.report.decimation import Decimator, compute_totals
 from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.subject import Subject
@@ -283,6 +283,6 @@ def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monk
         np.testing.assert_array_equal(ours.bias, signal.bias)
     for name, speed in wanted.peak_speed.items():
         assert 0.8 * speed < totals.peak_speed[name] <= speed
-    page = track_report(thin, totals=totals)
+    page = render_track_report(thin, totals=totals)
     assert "5698 samples at 100 Hz" in text_of(page)
     assert "for 317 samples, one in 18" in text_of(page)

@@ -200,7 +200,7 @@ def test_python_hands_out_no_subject_of_a_failed_calibration_in_silence(anywhere
     with warnings.catch_warnings():
         warnings.simplefilter("error", WeposeWarning)
         assert calibrate(recording, **known, measured_std=person.measured_std).mounts
-    with pytest.raises(CalibrationFailed, match="left upper arm and left forearm look exchanged") as failed:
+    with pytest.raises(CalibrationFailed, match="left upper arm and left forearm seem to be exchanged") as failed:
         calibrate(exchanged(recording, ("left_upper_arm", "left_forearm")), **known)
     assert failed.value.quality.quality == "fail"
     assert failed.value.calibration.subject.lengths

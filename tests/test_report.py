@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate_lengths
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import Recording
-from wepose_pin.report import calibration_report
+from wepose_pin.report import render_calibration_report
 from wepose_pin.report.calibration_figures import broken, direction, smoothed
 from wepose_pin.report.words import plus_minus
 from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
@@ -40,7 +40,7 @@ def poor(found: Calibration) -> CalibrationQuality:
 
 @pytest.fixture(scope="module")
 def page(made: Made) -> str:
-    return calibration_report(made[0], made[1], quality=poor(made[0]), tracked=made[2])
+    return render_calibration_report(made[0], made[1], quality=poor(made[0]), tracked=made[2])
 
 
 def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) -> None:
@@ -66,7 +66,9 @@ def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) 
 
 
 def test_the_quality_comes_first_with_its_reasons(made: Made, page: str) -> None:
-    failed = calibration_report(made[0], made[1], quality=replace(poor(made[0]), quality="fail"), tracked=made[2])
+    failed = render_calibration_report(
+        made[0], made[1], quality=replace(poor(made[0]), quality="fail"), tracked=made[2]
+    )
     for text, word, said in ((page, "poor", "Poor:"), (failed, "fail", "Fail:")):
         text = without_frame(text)
         assert text.index(f'<section class="banner {word}">') < text.index(said)
@@ -75,7 +77,7 @@ def test_the_quality_comes_first_with_its_reasons(made: Made, page: str) -> None
 
 def test_the_quality_with_its_checks(made: Made) -> None:
     quality = assess(made[0])
-    page = without_frame(calibration_report(made[0], made[1], quality=quality, tracked=made[2]))
+    page = without_frame(render_calibration_report(made[0], made[1], quality=quality, tracked=made[2]))
     assert f'<section class="banner {quality.quality}">' in page
     assert "Behind the quality" in headings(page)
     for diagnostic in quality.reasons:
@@ -87,7 +89,7 @@ def test_the_quality_with_its_checks(made: Made) -> None:
 def test_diagnostics_stand_above_the_figures_in_words(made: Made) -> None:
     facts = {"intervals": "12 to 14 s", "variant": "coincide"}
     warned = replace(made[0], diagnostics=(Diagnostic("closure-open", INFO, "clasp", 0.12, 0.1, facts),))
-    page = without_frame(calibration_report(warned, made[1], tracked=made[2]))
+    page = without_frame(render_calibration_report(warned, made[1], tracked=made[2]))
     assert page.index("The palms were apart for 12 % of the phase") < page.index("<figure")
     assert 'class="banner p' not in page  # nobody assessed it
 
@@ -125,16 +127,16 @@ def test_it_prints(page: str) -> None:
 
 
 def test_equal_arguments_give_equal_text(made: Made, page: str) -> None:
-    assert calibration_report(made[0], made[1], quality=poor(made[0]), tracked=made[2]) == page
+    assert render_calibration_report(made[0], made[1], quality=poor(made[0]), tracked=made[2]) == page
 
 
 def test_hands_that_came_apart_are_shown(made: Made) -> None:
     found = made[0]
     kept, gap = found.contact.copy(), found.gap.copy()
     kept[40:60], gap[40:60] = 0.01, 0.3
-    page = calibration_report(replace(found, contact=kept, gap=gap), made[1], tracked=made[2])
+    page = render_calibration_report(replace(found, contact=kept, gap=gap), made[1], tracked=made[2])
     assert "Crosses: apart." in page
-    nowhere = calibration_report(replace(found, contact=np.zeros_like(kept)), made[1], tracked=made[2])
+    nowhere = render_calibration_report(replace(found, contact=np.zeros_like(kept)), made[1], tracked=made[2])
     assert "Palm to palm over time" in headings(nowhere)
     assert "Where the motion was informative" not in headings(nowhere)
 
@@ -154,7 +156,7 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
         hinge_rms={},
         information_shares={},
     )
-    page = calibration_report(bare, made[1], tracked=made[2])
+    page = render_calibration_report(bare, made[1], tracked=made[2])
     assert headings(page) == ["Lengths", "Sensors", "The motion in 3D", "What was run"]
     assert "± not known" in page
     assert "nan" not in re.sub(r'"data:[^"]*"', "", without_frame(page)).split("</style>")[1]
@@ -166,12 +168,12 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
         information_shares={name: share[:1] for name, share in found.information_shares.items()},
         start_pose_offset={},
     )
-    assert "Palm to palm over time" not in headings(calibration_report(few, made[1], tracked=made[2]))
+    assert "Palm to palm over time" not in headings(render_calibration_report(few, made[1], tracked=made[2]))
 
 
 def test_without_a_mount_it_says_why_there_is_no_motion(made: Made) -> None:
     found = replace(made[0], subject=replace(made[0].subject, mounts={}))
-    page = calibration_report(found, made[1])
+    page = render_calibration_report(found, made[1])
     assert "The report lacks the positions of the hands and the 3D view." in page
     assert "mount is not known" in page
     assert headings(page) == [
@@ -184,7 +186,7 @@ def test_without_a_mount_it_says_why_there_is_no_motion(made: Made) -> None:
 
 
 def test_one_hand_at_a_point(made: Made) -> None:
-    page = calibration_report(made[0], made[1], tracked=made[2], protocol="touch_left")
+    page = render_calibration_report(made[0], made[1], tracked=made[2], protocol="touch_left")
     assert "Palm to its point over time" in headings(page)
     assert "The left palm went from" in text_of(page)
     assert "Not in the chain, known by the population prior's proportions" in text_of(page)
@@ -228,7 +230,7 @@ def test_a_line_breaks_where_time_jumps() -> None:
 
 def test_the_effective_sample_size_stands_as_itself_beside_its_limits(made: Made) -> None:
     found = replace(made[0], effective_sample_size=18.2)
-    page = calibration_report(found, made[1], quality=assess(found), tracked=made[2])
+    page = render_calibration_report(found, made[1], quality=assess(found), tracked=made[2])
     text = re.sub(r"<[^>]+>", "|", without_frame(page))
     assert re.search(r"effective sample size[^|]*\|+18\|+at least 6\|+at least 2\|+pass", text)
     for size, wanted in ((6.0, "pass"), (5.9, "poor"), (2.0, "poor"), (1.9, "fail")):

@@ -22,12 +22,12 @@ from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.kinematics import Pose, axis_std
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.plausibility import find_cut_off
-from wepose_pin.report import track_report
+from wepose_pin.report import render_track_report
 from wepose_pin.report.chart import COLUMNS, envelope
 from wepose_pin.report.measures import (
     Measures,
-    heading_budgets,
-    joint_heading_stds,
+    compute_heading_uncertainties,
+    compute_joint_heading_stds,
     longest_run_s,
     measure_elbow,
     measure_hands,
@@ -58,7 +58,7 @@ def pose(simulation: Simulation) -> TrackedRecording:
 
 @pytest.fixture(scope="module")
 def page(pose: TrackedRecording) -> str:
-    return track_report(pose)
+    return render_track_report(pose)
 
 
 def changed(recording: Recording, name: str, **signals: np.ndarray) -> Recording:
@@ -75,7 +75,7 @@ def looked_at(pose: TrackedRecording, known: Sequence[Diagnostic] = ()) -> list[
     found = {side: measure_elbow(pose.pose, side, pose.subject) for side in ("left", "right")}
     elbows = {side: elbow for side, elbow in found.items() if elbow is not None}
     hands = measure_hands(pose.pose, pose.recording.rate_hz)
-    return diagnose_pose(pose, Measures(signals, heading_budgets(pose), elbows, hands), known)
+    return diagnose_pose(pose, Measures(signals, compute_heading_uncertainties(pose), elbows, hands), known)
 
 
 def the(code: str, pose: TrackedRecording, place: str | None = None) -> Diagnostic:
@@ -103,7 +103,7 @@ def test_it_gives_the_sensors_in_numbers(page: str, pose: TrackedRecording) -> N
         of = pose.segments.orientation[name]
         recorded, noise = [row for row in table if row[0] == label][:2]
         assert recorded[1] == f"{np.degrees(np.linalg.norm(sensor.gyro_S, axis=1)).max():.0f} °/s"
-        assert recorded[3:6] == ["no", "no", f"{100 * of.static.mean():.0f} %"]
+        assert recorded[3:6] == ["0 s", "0 s", f"{100 * of.static.mean():.0f} %"]
         start = [float(part.replace("−", "-")) for part in noise[1].split(" / ")]
         assert start == pytest.approx(np.degrees(of.noise.gyro_bias), abs=0.0051)
         assert noise[3] == f"{of.noise.gravity:.3f} m/s²"
@@ -118,7 +118,7 @@ def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedRecord
         assert line[1:3] == [f"{values[since].max():.1f}°", f"{values[-1]:.1f}°"]
         assert line[4].endswith("°/min")
     worst = max(std, key=lambda name: float(std[name][since].max()))
-    assert f"The {worst.replace('_', ' ')}'s heading may be off by ± {std[worst][since].max():.1f}°" in text_of(page)
+    assert f"that of the {worst.replace('_', ' ')}'s heading: ± {std[worst][since].max():.1f}°" in text_of(page)
     elbow = np.hypot(std["right_upper_arm"], std["right_forearm"])[since]
     assert ["right elbow", f"{np.median(elbow):.1f}°", f"{elbow.max():.1f}°"] in table
 
@@ -126,18 +126,18 @@ def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedRecord
 def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedRecording, page: str) -> None:
     guessed = Diagnostic("start-pose-guessed", WARNING, facts={"start": 0.5, "end": 2.5})
     warned = replace(pose, segments=replace(pose.segments, diagnostics=(guessed,)))
-    text = without_frame(track_report(warned))
+    text = without_frame(render_track_report(warned))
     assert '<section class="banner poor">' in text
     first = text.index(render(guessed).what)
     assert first < text.index("Let the person hold the hands together") < text.index("<h2") < text.index("<figure")
-    assert '<section class="banner note">' in page  # lengths of the population prior are only a note
+    assert '<section class="banner info">' in page  # lengths of the population prior are only worth knowing
     assert "The person's lengths are not known." in text_of(page)
 
 
 def test_a_known_person_and_nothing_to_say(pose: TrackedRecording) -> None:
     quiet = replace(pose, subject=replace(pose.subject, name="anna", note=""))
     assert looked_at(quiet) == []
-    assert "No warnings." in text_of(track_report(quiet))
+    assert "No warnings." in text_of(render_track_report(quiet))
 
 
 def test_it_opens_offline_prints_and_has_no_nan(page: str) -> None:
@@ -150,22 +150,22 @@ def test_it_opens_offline_prints_and_has_no_nan(page: str) -> None:
 
 
 def test_equal_arguments_give_equal_text_and_a_ready_view_is_taken(pose: TrackedRecording, page: str) -> None:
-    assert track_report(pose) == page
-    assert 'srcdoc="&lt;p&gt;mine&lt;/p&gt;"' in track_report(pose, view="<p>mine</p>")
+    assert render_track_report(pose) == page
+    assert 'srcdoc="&lt;p&gt;mine&lt;/p&gt;"' in render_track_report(pose, view="<p>mine</p>")
 
 
 def test_it_does_not_grow_with_the_recording() -> None:
     simulation = simulate(simulate_person(3).lengths, seed=3, rate_hz=50.0, clasp_s=600.0, circles=0)
-    page = track_report(track(simulation.recording("long")))
+    page = render_track_report(track(simulation.recording("long")))
     assert len(page) < 5e6
-    assert re.search(r"thinned to 8\.\d pictures a second", page)
+    assert re.search(r"at 8\.\d frames a second", page)
 
 
 # What is missing ------------------------------------------------------------------------------------------------------
 
 
 def test_without_a_covariance_it_says_so(simulation: Simulation) -> None:
-    page = track_report(track(simulation.recording("ncf"), method="ncf"))
+    page = render_track_report(track(simulation.recording("ncf"), method="ncf"))
     assert headings(page) == SECTIONS
     assert "The filter ncf has no covariance: the uncertainty of the headings is not known" in text_of(page)
     assert "± nan" not in page
@@ -177,7 +177,7 @@ def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedRec
         name: OrientationSensor(quat_WS=pose.quat_WL[name]) for name in ("torso", "right_upper_arm", "right_forearm")
     }  # orientations of segments
     ready = track(replace(recording, sensors=sensors))
-    page = track_report(ready)
+    page = render_track_report(ready)
     assert headings(page) == [name for name in SECTIONS if name != "Noise and bias"]
     assert "The device gave orientations without an uncertainty" in text_of(page)
     assert the("measured-orientations", ready).facts["segments"] == "torso, right_upper_arm, right_forearm"
@@ -188,9 +188,9 @@ def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedRec
 def test_a_torso_alone_has_no_hands(simulation: Simulation) -> None:
     recording = simulation.recording("torso")
     alone = track(replace(recording, sensors={"torso": recording.sensors["torso"]}))
-    page = track_report(alone)
+    page = render_track_report(alone)
     assert headings(page) == [name for name in SECTIONS if name != "The hands"]
-    head = track_report(
+    head = render_track_report(
         track(replace(recording, sensors={"head": recording.sensors["torso"]}, phases={"start": ((0.5, 4.5),)}))
     )
     assert headings(head) == [name for name in SECTIONS if name not in ("The hands", "Joint angles")]
@@ -210,7 +210,7 @@ def test_motion_beyond_the_range(simulation: Simulation) -> None:
     saturated = the("signal-saturated", pose)
     assert (saturated.severity, saturated.place) == (WARNING, "right_forearm")
     assert saturated.value == pytest.approx(count / 100)
-    page = track_report(pose)
+    page = render_track_report(pose)
     assert f"{count / 100:.2f} s" in next(row for row in rows(page) if row[0] == "right forearm")
     told = Diagnostic("signal-saturated", WARNING, "right_forearm", 0.4, facts={"variant": "gyro", "range": 2.1})
     assert [each for each in looked_at(pose, [told]) if each.code == told.code] == [told]  # the reader has said it
@@ -220,7 +220,7 @@ def test_gaps(simulation: Simulation) -> None:
     recording = simulation.recording("gaps")
     gap = np.zeros(len(recording), dtype=bool)
     gap[3000:3400] = True
-    page = track_report(pose := track(changed(recording, "torso", gap=gap)))
+    page = render_track_report(pose := track(changed(recording, "torso", gap=gap)))
     lost = the("samples-lost", pose)
     assert (lost.place, lost.value) == ("torso", pytest.approx(400 / len(gap)))
     assert next(row for row in rows(page) if row[0] == "torso")[4] == "4.00 s"
@@ -274,7 +274,7 @@ def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
     assert {d.severity for d in uncertain} == {WARNING}
     assert "calibrate the person" in render(uncertain[0]).do
     assert [d.value for d in uncertain] == sorted((d.value for d in uncertain), reverse=True)  # type: ignore[type-var]
-    assert len(joint_heading_stds(heading_budgets(wide))) == 4
+    assert len(compute_joint_heading_stds(compute_heading_uncertainties(wide))) == 4
     assert the("method-needs-static", replace(wide, options=TrackOptions("smekf"))).severity == WARNING
 
 
@@ -370,7 +370,7 @@ def test_the_elbows_uncertainty_against_draws() -> None:
 
 
 def test_heading_budgets_are_those_of_the_covariance(pose: TrackedRecording) -> None:
-    for name, budget in heading_budgets(pose).items():
+    for name, budget in compute_heading_uncertainties(pose).items():
         of = pose.segments.orientation[name]
         assert of.attitude_cov is not None
         R = Rotation.from_quat(of.quat_WS).as_matrix()
@@ -493,13 +493,13 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
 
     late = replace(pose, segments=replace(pose.segments, start=(begin, begin + 2.0)))
     peak = with_pose(late, point_cov={name: wider(cov, 60.0) for name, cov in late.pose.point_cov.items()})
-    assert rows_of_hands(track_report(peak, view="<p>")) == rows_of_hands(track_report(late, view="<p>"))
+    assert rows_of_hands(render_track_report(peak, view="<p>")) == rows_of_hands(render_track_report(late, view="<p>"))
     most = max(float(axis_std(peak.pose.point_cov[name]).max()) for name in ("left_palm", "right_palm"))
     assert the("position-uncertain-before-start", peak).value == pytest.approx(most)
     assert not any(each.code.endswith("-before-start") for each in looked_at(late))
-    text = text_of(track_report(peak, view="<p>"))
+    text = text_of(render_track_report(peak, view="<p>"))
     assert "No warnings" not in text
-    assert "leave out the 7 s before" in text
+    assert "the 7 s before its end are left out" in text
 
 
 def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackedRecording) -> None:

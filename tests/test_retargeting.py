@@ -31,7 +31,7 @@ from wepose_pin.retargeting import (
 )
 from wepose_pin.retargeting.checks import AT_REST, SelfCollisions
 from wepose_pin.retargeting.collision import CollisionModel
-from wepose_pin.retargeting.controller import HandTarget, JointState, QpController, Tasks
+from wepose_pin.retargeting.controller import ControllerParams, HandTarget, JointState, QpController
 from wepose_pin.retargeting.error_attribution import assess_reachability, attribute_errors
 from wepose_pin.retargeting.limits import compute_acceleration_bounds, read_joint_limits, reduce_acceleration_limits
 from wepose_pin.retargeting.targets import CLAMP_FROM, CLAMP_TO, clamp_to_reach
@@ -59,13 +59,13 @@ def is_sound(trajectory: Trajectory) -> None:
     robot = trajectory.robot
     found = checked(trajectory)
     assert found.passed, found
-    assert find_self_collisions(robot, trajectory.time, trajectory.u).samples == 0
-    assert np.isfinite(trajectory.u).all()
+    assert find_self_collisions(robot, trajectory.time, trajectory.joint_position).samples == 0
+    assert np.isfinite(trajectory.joint_position).all()
 
 
 def error(trajectory: Trajectory, side: str = "right") -> np.ndarray:
     target = trajectory.targets[[arm.side for arm in trajectory.robot.arms].index(side)]
-    return np.linalg.norm(trajectory.hand[side] - target.position, axis=1)[trajectory.approach :]
+    return np.linalg.norm(trajectory.hand[side] - target.position, axis=1)[trajectory.approach_samples :]
 
 
 # Limits ------------------------------------------------------------------------------------------------------------
@@ -161,7 +161,7 @@ def test_the_robot_follows_hand_turn_and_elbow(swung: Trajectory) -> None:
     assert np.median(error(swung)) < 5e-3
     assert np.quantile(error(swung), 0.95) < 0.02
     found = summarize(swung, checked(swung), find_self_collisions(
-        swung.robot, swung.time, swung.u))["arms"]["right"]  # fmt: skip
+        swung.robot, swung.time, swung.joint_position))["arms"]["right"]  # fmt: skip
     assert found["hand_error_deg"]["median"] < 3.0
     assert found["swivel_error_deg"]["median"] < 15.0
     assert found["inside_reach_share"] == 1.0
@@ -175,11 +175,11 @@ def test_what_can_be_reached_is_reached(swung: Trajectory) -> None:
 
 
 def test_it_begins_and_ends_at_rest_and_shows_the_recording_to_its_end(swung: Trajectory) -> None:
-    assert np.array_equal(swung.u[0], swung.robot.rest)
-    assert not swung.run.v[0].any()
-    assert np.abs(swung.run.v[-1]).max() < 1e-12
+    assert np.array_equal(swung.joint_position[0], swung.robot.rest)
+    assert not swung.run.joint_velocity[0].any()
+    assert np.abs(swung.run.joint_velocity[-1]).max() < 1e-12
     assert (np.diff(swung.recorded_time) >= -1e-12).all()
-    assert swung.recorded_time[0] == swung.recorded_time[swung.approach - 1] == 0.0
+    assert swung.recorded_time[0] == swung.recorded_time[swung.approach_samples - 1] == 0.0
     assert swung.recorded_time[-1] == pytest.approx(7.99, abs=0.02)
 
 
@@ -187,7 +187,7 @@ def test_a_small_person_and_a_tall_one_move_the_robot_alike(arm) -> None:
     small, tall = (retarget(person(4.0, size=size), arm) for size in (0.8, 1.2))
     assert small.arm_targets.scale["right"] == pytest.approx(1.5 * tall.arm_targets.scale["right"])
     n = min(len(small.time), len(tall.time))
-    assert np.abs(small.u[:n] - tall.u[:n]).max() < 1e-6
+    assert np.abs(small.joint_position[:n] - tall.joint_position[:n]).max() < 1e-6
 
 
 def test_a_link_may_have_the_name_of_its_fixed_joint(tmp_path: Path) -> None:
@@ -195,18 +195,18 @@ def test_a_link_may_have_the_name_of_its_fixed_joint(tmp_path: Path) -> None:
     plain = retarget(person(2.0), str(urdf))
     text = urdf.read_text(encoding="utf-8").replace('joint name="stand"', 'joint name="base"')
     urdf.write_text(text, encoding="utf-8")
-    np.testing.assert_array_equal(retarget(person(2.0), str(urdf)).u, plain.u)
+    np.testing.assert_array_equal(retarget(person(2.0), str(urdf)).joint_position, plain.joint_position)
 
 
 def test_turned_bases_move_alike(arm, tmp_path: Path) -> None:
     straight = retarget(person(4.0), arm)
     turned = load_robot(find_map(str(write_arm(tmp_path, turned=(0.5 * np.pi, 0.2, -1.1)))))
     found = retarget(person(4.0), turned)
-    assert np.abs(found.u - straight.u).max() < 1e-6
+    assert np.abs(found.joint_position - straight.joint_position).max() < 1e-6
     # Said of the root's axes in place of the base's: y of the root is where z of the base points to −z, z up is +y.
     (tmp_path / "root").mkdir()
     by_root = load_robot(find_map(str(write_arm(tmp_path / "root", turned=(0.5 * np.pi, 0.0, 0.0), base="", up="-y"))))
-    assert np.abs(retarget(person(4.0), by_root).u - straight.u).max() < 1e-6
+    assert np.abs(retarget(person(4.0), by_root).joint_position - straight.joint_position).max() < 1e-6
 
 
 def test_a_joint_without_end_and_one_that_copies_another(tmp_path: Path) -> None:
@@ -222,17 +222,17 @@ def test_a_joint_without_end_and_one_that_copies_another(tmp_path: Path) -> None
     found = retarget(person(4.0), copied)
     is_sound(found)
     assert np.median(error(found)) < 5e-3
-    q = copied.configuration(found.u[-1])
+    q = copied.configuration(found.joint_position[-1])
     joint = copied.model.names.tolist().index("elbow") - 1
-    assert q[joint] == q[joint + 1] == found.u[-1][JOINTS.index("elbow")]
+    assert q[joint] == q[joint + 1] == found.joint_position[-1][JOINTS.index("elbow")]
 
 
 @pytest.mark.parametrize("only", ["position", "orientation"])
 def test_a_task_can_be_left_out(arm, only: str) -> None:
     other = {"position": "orientation", "orientation": "position"}[only]
-    found = retarget(person(4.0), arm, tasks=replace(Tasks(), **{other: 0.0}))
+    found = retarget(person(4.0), arm, params=replace(ControllerParams(), **{other: 0.0}))
     is_sound(found)
-    target, begin = found.targets[0], found.approach
+    target, begin = found.targets[0], found.approach_samples
     asked = Rotation.from_matrix(target.rotation[begin:])
     turn = (Rotation.from_matrix(found.run.rotation[0, begin:]).inv() * asked).magnitude()
     if only == "position":
@@ -248,29 +248,29 @@ def test_the_programme_is_that_of_pink(arm) -> None:
     import pinocchio as pin
 
     free = replace(arm, geometry=pin.GeometryModel(), arms=(replace(arm.arms[0], elbow=-1),))
-    tasks = Tasks(
-        joint_acceleration=0.0,
-        singular_below=0.0,
-        curvature=0.0,
+    params = ControllerParams(
+        joint_velocity_change=0.0,
+        singular_value_limit=0.0,
+        curvature_damping=0.0,
         joint_velocity=0.0,
         posture=1e-3,
-        gain=10.0,
+        task_gain=10.0,
         posture_gain=10.0,
-        deceleration=1e9,
+        max_correction_deceleration=1e9,
     )
-    stepper = QpController(free, CollisionModel(free), 0.01, tasks, limit_factor=1e6)
+    stepper = QpController(free, CollisionModel(free), 0.01, params, limit_factor=1e6)
     state = JointState(arm.rest + 0.1, np.zeros(7), np.zeros(7))
-    stepper.set_joints(state.u)
-    hand, turn, _ = stepper.arm_pose(0)
+    stepper.update_kinematics(state.position)
+    hand, turn, _ = stepper.get_arm_pose(0)
     goal = pin.SE3(turn @ pin.exp3(np.array([0.02, -0.01, 0.03])), hand + [0.01, -0.02, 0.015])
     aim = HandTarget(goal.translation, np.zeros(3), goal.rotation, np.zeros(3), np.zeros(3), 1.0)
-    ours = 0.01 * stepper.step(state, (aim,)).a  # the programme's velocity: half a step on, from rest
-    configuration = pink.Configuration(arm.model, arm.model.createData(), arm.configuration(state.u))
-    task = pink.tasks.FrameTask(arm.model.frames[arm.arms[0].hand].name, 1.0, float(np.sqrt(tasks.orientation)))
+    ours = 0.01 * stepper.step(state, (aim,)).acceleration  # the programme's velocity: half a step on, from rest
+    configuration = pink.Configuration(arm.model, arm.model.createData(), arm.configuration(state.position))
+    task = pink.tasks.FrameTask(arm.model.frames[arm.arms[0].hand].name, 1.0, float(np.sqrt(params.orientation)))
     task.set_target(goal)
-    posture = pink.tasks.PostureTask(cost=float(np.sqrt(tasks.posture)))
+    posture = pink.tasks.PostureTask(cost=float(np.sqrt(params.posture)))
     posture.set_target(arm.configuration(arm.rest))
-    task.gain = posture.gain = tasks.gain * 0.01
+    task.gain = posture.gain = params.task_gain * 0.01
     theirs = pink.solve_ik(configuration, [task, posture], 0.01, solver="daqp", limits=[], damping=0.0)
     # Pink's error is the logarithm in SE(3), ours that of place and turn apart: alike to the product of both.
     assert np.abs(ours).max() > 0.1
@@ -306,12 +306,12 @@ def test_five_seconds_out_of_reach(arm, swung: Trajectory) -> None:
     is_sound(found)
     target = found.targets[0]
     outside = np.linalg.norm(target.position - target.unclamped, axis=1) > 1e-3
-    assert outside[found.approach :].mean() > 0.3
+    assert outside[found.approach_samples :].mean() > 0.3
     why = attribute_errors(found, 0)
-    assert why["beyond the reach"] == pytest.approx(outside[found.approach :].mean(), abs=0.1)
+    assert why["beyond the reach"] == pytest.approx(outside[found.approach_samples :].mean(), abs=0.1)
     settled = (found.recorded_time > 5.5) & (found.recorded_time < 7.5)
-    assert np.abs(found.run.v[settled]).max() < 0.02  # still at the reach: it does not shake
-    assert np.abs(np.diff(found.run.a[settled], axis=0)).max() < 0.05 * 12.0
+    assert np.abs(found.run.joint_velocity[settled]).max() < 0.02  # still at the reach: it does not shake
+    assert np.abs(np.diff(found.run.joint_acceleration[settled], axis=0)).max() < 0.05 * 12.0
     back = found.recorded_time > 9.5
     assert np.linalg.norm(found.hand["right"] - target.position, axis=1)[back].max() < 0.02
 
@@ -320,9 +320,12 @@ def test_no_jerk_where_a_moving_target_passes_the_reach(arm, swung: Trajectory) 
     inside = retarget(person(6.0, flexion=20.0, swing=15.0), arm, scale=0.9 * swung.arm_targets.scale["right"])
     across = retarget(person(6.0, flexion=20.0, swing=15.0), arm, scale=1.12 * swung.arm_targets.scale["right"])
     drawn = np.linalg.norm(across.targets[0].position - across.targets[0].unclamped, axis=1) > 1e-3
-    assert drawn[across.approach :].mean() > 0.1
+    assert drawn[across.approach_samples :].mean() > 0.1
     is_sound(across)
-    jerk = [np.abs(np.diff(found.run.a[found.approach :], axis=0)).max() * 100.0 for found in (inside, across)]
+    jerk = [
+        np.abs(np.diff(found.run.joint_acceleration[found.approach_samples :], axis=0)).max() * 100.0
+        for found in (inside, across)
+    ]
     assert jerk[1] < 3.0 * max(jerk[0], 100.0)
 
 
@@ -338,7 +341,7 @@ def test_a_jump_of_a_metre_is_no_jump_of_the_robot(arm) -> None:
     at = np.searchsorted(found.recorded_time, 4.0)
     speed = np.linalg.norm(np.diff(found.hand["right"], axis=0), axis=1) * 100.0
     assert speed[at - 100 : at + 100].max() < 3.0
-    assert found.targets[0].lost[found.approach :].any()
+    assert found.targets[0].lost[found.approach_samples :].any()
 
 
 def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
@@ -357,9 +360,9 @@ def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
         assert during > 2 * usual
         assert np.quantile(error(found), 0.95) < 0.03
     assert attribute_errors(gone, 0)["not measured"] == pytest.approx(
-        np.mean((error(gone) > 0.02) & gone.targets[0].lost[gone.approach :]), abs=1e-3
+        np.mean((error(gone) > 0.02) & gone.targets[0].lost[gone.approach_samples :]), abs=1e-3
     )
-    assert summarize(gone, checked(gone), find_self_collisions(arm, gone.time, gone.u))[
+    assert summarize(gone, checked(gone), find_self_collisions(arm, gone.time, gone.joint_position))[
         "arms"]["right"]["lost_share"] > 0.1  # fmt: skip
 
 
@@ -392,7 +395,7 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     found = retarget(replace(pose, points=points), arm)
     is_sound(found)
     assert error(found)[-1] > 0.05  # it could not get there
-    assert found.counts.near > 0
+    assert found.counts.near_clearance > 0
     why = attribute_errors(found, 0)
     assert why["self-collision"] > 0.2
     assert why["self-collision"] > 0.9 * sum(why.values())
@@ -405,9 +408,9 @@ def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
     pose = person(4.0, swing=45.0)
     found = retarget(pose, slow)
     is_sound(found)
-    assert found.time[-1] - found.time[found.approach] > 1.3 * 4.0
-    assert found.slowest is not None
-    assert found.slowest.joint in JOINTS
+    assert found.time[-1] - found.time[found.approach_samples] > 1.3 * 4.0
+    assert found.limiting_joint is not None
+    assert found.limiting_joint.joint in JOINTS
     with pytest.raises(NoSolution, match=r"too fast at \d.*s of the recording: \w+ would need"):
         retarget(pose, slow, strict=True)
 
@@ -502,7 +505,7 @@ def test_a_robot_is_taken_by_its_file_too(tmp_path: Path, arm) -> None:
     urdf = write_arm(tmp_path)
     pose = person(1.0)
     for robot in (str(urdf), urdf):
-        np.testing.assert_array_equal(retarget(pose, robot).u, retarget(pose, arm).u)
+        np.testing.assert_array_equal(retarget(pose, robot).joint_position, retarget(pose, arm).joint_position)
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
@@ -531,7 +534,7 @@ def test_the_files_say_the_same(swung: Trajectory, tmp_path: Path) -> None:
     assert message["joint_names"] == list(JOINTS)
     times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
     assert np.allclose(times, swung.time)
-    assert np.allclose([p["positions"] for p in message["points"]], swung.u, atol=1e-8)
+    assert np.allclose([p["positions"] for p in message["points"]], swung.joint_position, atol=1e-8)
     write_episode(tmp_path / "episode", swung, "swing")
     data = pl.read_parquet(tmp_path / "episode" / "data" / "chunk-000" / "episode_000000.parquet")
     state, action = (np.array(data[name].to_list()) for name in ("observation.state", "action"))
@@ -606,7 +609,7 @@ def test_the_exit_code_says_that_no_robot_should_run_it(
     monkeypatch.setattr("wepose_pin.retargeting.find_self_collisions", lambda *_: hit)
     code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
     assert code == 3
-    assert "touches itself in 3 samples, first hand_0 and base_0 at 2.00 s" in " ".join(text.split())
+    assert "touch each other in 3 samples, first hand_0 and base_0 at 2.00 s" in " ".join(text.split())
     assert (tmp_path / "out" / "trajectory.parquet").is_file()
 
 

@@ -38,7 +38,7 @@ def is_sound(found: Trajectory) -> None:
     of = found.robot.map
     held = check_limits(build_table(found), of.urdf, of.acceleration, of.jerk)
     assert held.passed, held
-    touched = find_self_collisions(found.robot, found.time, found.u)
+    touched = find_self_collisions(found.robot, found.time, found.joint_position)
     assert touched.samples == 0, touched.first
     assert touched.pairs > 10
     assert touched.excluded[AT_REST] == []
@@ -55,7 +55,7 @@ def test_every_robot_follows_and_keeps_its_limits(name: str) -> None:
     found = retarget(both_arms(4.0), robot)
     is_sound(found)
     for arm, target in zip(robot.arms, found.targets, strict=True):
-        error = np.linalg.norm(found.hand[arm.side] - target.position, axis=1)[found.approach :]
+        error = np.linalg.norm(found.hand[arm.side] - target.position, axis=1)[found.approach_samples :]
         assert np.median(error) < 0.02, arm.side
 
 
@@ -105,7 +105,9 @@ def test_what_cannot_stop_in_time_is_slowed_and_strict_refuses_it() -> None:
 
 def test_python_takes_a_robot_by_its_name() -> None:
     pose = both_arms(2.0)
-    np.testing.assert_array_equal(retarget(pose, "panda").u, retarget(pose, load_robot(find_map("panda"))).u)
+    np.testing.assert_array_equal(
+        retarget(pose, "panda").joint_position, retarget(pose, load_robot(find_map("panda"))).joint_position
+    )
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5", "baxter", "tiago_dual"])
@@ -116,13 +118,13 @@ def test_no_jerk_where_the_reach_ends(name: str) -> None:
     whole = max(arm.reach / compute_target_reach(robot, arm) for arm in robot.arms)
     found = retarget(pose, robot, scale=whole * min(compute_arm_targets(pose, robot).scale.values()))
     is_sound(found)
-    dt, settled = 0.01, found.approach + 100
+    dt, settled = 0.01, found.approach_samples + 100
     for arm, target in zip(robot.arms, found.targets, strict=True):
         outside = np.linalg.norm(target.position - target.unclamped, axis=1) > 1e-3
         edges = settled + np.flatnonzero(np.diff(outside[settled:]))
         assert len(edges) >= 4
         near = np.abs(found.time[:, None] - found.time[edges]).min(axis=1) < 0.2
-        jerk = np.abs(np.diff(found.run.a, axis=0))[:, arm.joints] / dt / robot.j_max[arm.joints]
+        jerk = np.abs(np.diff(found.run.joint_acceleration, axis=0))[:, arm.joints] / dt / robot.j_max[arm.joints]
         close, elsewhere = jerk[settled:][near[settled + 1 :]], jerk[settled:][~near[settled + 1 :]]
         assert close.max() < 0.5
         assert np.sqrt(np.mean(close**2)) < 1.5 * np.sqrt(np.mean(elsewhere**2))
@@ -149,4 +151,4 @@ def test_the_real_recording(tracked: Pose, name: str) -> None:
     robot = load_robot(find_map(name))
     found = retarget(pose, robot)
     is_sound(found)
-    assert np.isfinite(found.u).all()
+    assert np.isfinite(found.joint_position).all()

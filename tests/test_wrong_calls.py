@@ -24,7 +24,7 @@ from arms import write_arm
 import wepose_pin as wp
 from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.filters import AmekfParams
-from wepose_pin.retargeting import Tasks
+from wepose_pin.retargeting import ControllerParams
 from wepose_pin.simulation import Imperfections, ImuNoise
 from wepose_pin.subject import HeadingDrift, Hinge, StartPoseOffset
 
@@ -213,7 +213,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "pose": (*THING, None),
         "robot": (*THING, None, "pandas", "nowhere.urdf"),
         "rate_hz": (*POSITIVE, None, 1e9),
-        "tasks": THING,
+        "params": THING,
         "scale": POSITIVE,
         "smoothing_hz": (*NUMBER, None, -1.0),
         "strict": (*FLAG, None),
@@ -418,8 +418,8 @@ def wrong_options() -> Iterator[tuple[str, str, str, Any]]:
             for function in ("estimate_orientation", "track") if name == "window_s" else ("estimate_orientation",):
                 yield function, "static_test", name, test
     for value in (*NUMBER, None, -1.0):
-        yield "retarget", "tasks", "position", changed(Tasks(), position=value)
-        yield "retarget", "tasks", "gain", changed(Tasks(), gain=value)
+        yield "retarget", "params", "position", changed(ControllerParams(), position=value)
+        yield "retarget", "params", "task_gain", changed(ControllerParams(), task_gain=value)
         yield "simulate", "noise", "gyro_density", changed(ImuNoise(), gyro_density=value)
         yield "simulate", "imperfections", "soft_tissue_deg", changed(Imperfections(), soft_tissue_deg=value)
     for value in ("nonsense", 3, None):

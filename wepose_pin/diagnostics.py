@@ -250,7 +250,8 @@ def document() -> str:
         "severity, a place, a value and its limit. The severities are *info* (good to know), *warning* (results may be",
         "wrong or uncertain by it) and *error* (do not use the results). Results hold their diagnostics under",
         "`diagnostics` in `summary.json` and `calibration.json`, in SI units and with their text. This page lists all",
-        "codes; the numbers in the texts are examples.",
+        "codes; the numbers in the texts are examples. After ± stands one standard deviation. What a word means:",
+        "[glossary.md](glossary.md).",
         "",
         "Made by `python -m wepose_pin.diagnostics > docs/diagnostics.md` from `wepose_pin/diagnostics.toml`.",
     ]

@@ -15,8 +15,8 @@ from .stopping import catch_signals, ignore_signals, is_stopped, whats_written
 
 # In the order of `wepose --help`; each is a module here.
 COMMANDS = (
-    *("demo", "simulate", "calibrate", "track", "live", "view", "retarget", "export", "info", "evaluate", "validate"),
-    *("batch", "reproduce"),
+    *("demo", "info", "simulate", "calibrate", "track", "view", "evaluate", "export", "retarget", "live", "batch"),
+    *("reproduce", "validate"),
 )
 
 
@@ -92,4 +92,5 @@ Upper-body pose from wearable IMUs without magnetometers. `wepose demo` shows al
 commands:
 {commands}
 
-wepose COMMAND --help says what a command does, with all its options and an example."""
+wepose COMMAND --help says what a command does, with all its options and an example.
+wepose --version prints the version. Exit code: 0 success, 2 invalid options or input. Terms: docs/glossary.md."""

@@ -35,7 +35,7 @@ def run(job: BatchJob) -> int:
     reused = f", {study.reused} of them before" if study.reused else ""
     say(f"{study.table.height - failed.height} of {study.table.height} items done{reused}")
     place = job.out.rstrip("/")
-    say(f"Report to look at:  {place}/report.html")
+    say(f"Report: {place}/report.html")
     say(f"Table: {place}/results.parquet")
     return 3 if failed.height else 0
 
@@ -45,5 +45,5 @@ COMMAND = Command(
     run,
     example="batch plan.toml -o study",
     arguments=("plan",),
-    exit_codes="0 all items are done, 3 some are not. 2: the plan or a place is wrong, and nothing is done.",
+    exit_codes="0 all items are done, 3 some are not; 2 invalid plan or folder, nothing is run.",
 )

@@ -32,7 +32,7 @@ def run(job: CalibrateJob) -> int:
         say(f"{gap}: {1e3 * calibration.rms_gap:.1f} mm rms, {prior_mm}")
         say(f"Effective sample size of the motion: {calibration.effective_sample_size:.0f}")
     if job.report:
-        say_pages(job.out, {"Report to look at": "report.html"})
+        say_pages(job.out, {"Report": "report.html"})
     say(f"Subject: {job.out / 'subject.toml'}  {job.out / 'subject.urdf'}  {job.out / 'calibration.json'}")
     _print_quality(quality)
     return EXIT_CODES[quality.quality]
@@ -70,6 +70,6 @@ COMMAND = Command(
     run,
     example="calibrate session.toml --measured shoulder_width=0.385 --stature 1.78 --sex f -o anna",
     arguments=("session",),
-    exit_codes="0 the quality is pass, 3 poor, 4 fail; the files are written in each case and carry the quality. "
-    "2: the input is wrong, and nothing is written.",
+    exit_codes="0 quality pass, 3 poor, 4 fail, by the limits in the README; the files are written in all three cases; "
+    "2 invalid input, nothing is written.",
 )

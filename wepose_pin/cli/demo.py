@@ -27,11 +27,12 @@ def run(job: DemoJob) -> int:
         ],
     )
     say("One person, one motion: the order of the filters changes with both, see --seed. Each filter tracks with the")
-    say("lengths that it calibrated. Errors from the root include the trunk, whose length joined hands do not show.")
+    say("lengths that it calibrated. Errors from the root include the trunk's length, which joined hands do not")
+    say("determine.")
     print_diagnostics(outcome.page_failures)
     out = job.out
-    say_pages(out / "result", {"Motion to look at": "view.html"})
-    say(f"Session, subject, result, figures:  {out}/session  {out}/subject  {out}/result  {out}/demo.json")
+    say_pages(out / "result", {"Motion": "view.html"})
+    say(f"Session, subject, result, numbers:  {out}/session  {out}/subject  {out}/result  {out}/demo.json")
     return 0
 
 

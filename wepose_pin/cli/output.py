@@ -61,7 +61,7 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
 def progress_bar() -> Iterator[Progress]:
     """A bar that shows what is being done and how much of it; none when not on a terminal. A signal ends the job."""
     if not sys.stderr.isatty():
-        yield lambda _text, _share: check_stopped()
+        yield lambda _text, _fraction: check_stopped()
         check_stopped()
         return
     from rich.console import Console
@@ -71,9 +71,9 @@ def progress_bar() -> Iterator[Progress]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=1.0)
 
-        def show(text: str, share: float) -> None:
+        def show(text: str, fraction: float) -> None:
             check_stopped()
-            bar.update(task, description=text, completed=share)
+            bar.update(task, description=text, completed=fraction)
 
         yield show
         check_stopped()

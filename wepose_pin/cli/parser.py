@@ -17,6 +17,7 @@ from ..errors import BadOption, one_of
 from ..jobs.fields import REQUIRED, choices_of, field_defaults, field_types
 
 WIDEST = 100  # columns of a help text
+EXIT_CODES = "0 success, 2 invalid input."
 _EXAMPLE = "Example: "
 
 
@@ -30,7 +31,7 @@ class Command:
     run : does the job, prints what came of it and returns the exit code
     example : a line that works, without the program's name
     arguments : fields that are given by position; all others are options
-    exit_codes : what they mean, where there are others than 0 and 2
+    exit_codes : what they mean; empty: `EXIT_CODES`
     """
 
     job: type
@@ -144,12 +145,12 @@ class _Option:
 
 def _parser(name: str, command: Command, options: Sequence[_Option]) -> argparse.ArgumentParser:
     required = " ".join(option.shown for option in options if option.required)
-    texts = [_description(command.job), command.exit_codes and f"Exit code: {command.exit_codes}"]
+    texts = [_description(command.job), f"Exit code: {command.exit_codes or EXIT_CODES}"]
     parser = argparse.ArgumentParser(
         prog=f"wepose {name}",
         usage=" ".join(f"wepose {name} {required} [options]".split()),
         description="\n\n".join(filter(None, texts)),
-        epilog=f"{_EXAMPLE}wepose {command.example}",
+        epilog=f"{_EXAMPLE}wepose {command.example}\n\nTerms: docs/glossary.md.",
         formatter_class=_Formatter,
         allow_abbrev=False,
         exit_on_error=False,

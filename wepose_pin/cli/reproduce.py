@@ -26,5 +26,5 @@ COMMAND = Command(
     run,
     example="reproduce result",
     arguments=("result",),
-    exit_codes="0 the same, 3 different. 2: it cannot be made again, as an input is gone or has changed.",
+    exit_codes="0 bit-identical, 3 different; 2 it cannot be run again: an input is missing or has changed.",
 )

@@ -21,7 +21,7 @@ def run(job: RetargetJob) -> int:
     out = job.out
     say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
     if job.view:
-        say_pages(out, {"Motion to look at": "view.html"})
+        say_pages(out, {"Motion": "view.html"})
     return 0 if outcome.runnable else 3
 
 
@@ -44,10 +44,10 @@ def _print_arms(summary: Mapping[str, Any]) -> None:
             )
         )
         reasons.append((side, *(f"{100 * share:.1f}" for share in of["error_attribution"].values())))
-    hand = ("hand [mm] median", "90 %", "where it can: median", "90 %")
+    hand = ("hand [mm] median", "90 %", "where reachable: median", "90 %")
     print_table(
         f"{summary['robot']}: {summary['duration_s']:.1f} s for {summary['recorded_s']:.1f} s recorded",
-        ("arm", "scale", *hand, "orientation [deg]", "elbow swivel [deg]", "can reach [%]"),
+        ("arm", "scale", *hand, "orientation [deg]", "elbow swivel [deg]", "reachable [%]"),
         rows,
     )
     print_table("Hand more than 20 mm off [% of the time], for", ("arm", *of["error_attribution"]), reasons)
@@ -72,7 +72,6 @@ COMMAND = Command(
     run,
     example="retarget result --robot panda -o panda",
     arguments=("result",),
-    exit_codes="0 the trajectory keeps the robot's limits and does not touch itself, as the check of what was written "
-    "says; 3 it does not: the files are there to be looked at, no robot should run them. 2: the input is wrong, and "
-    "nothing is written.",
+    exit_codes="0 the trajectory keeps the robot's limits and has no self-collision (checked on what is written); 3 it "
+    "does not: the files are written, but no robot may run them; 2 invalid input, nothing is written.",
 )

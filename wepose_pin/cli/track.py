@@ -35,8 +35,8 @@ def _print_pose(job: TrackJob, outcome: TrackOutcome) -> None:
         [(segment, *_sensor_cells(about)) for segment, about in summary["sensors"].items()],
     )
     print_diagnostics(outcome.page_failures)
-    motion = "Motion to look at" + (f", {rate_hz:.2g} pictures a second" if rate_hz else "")
-    pages = {"Report to look at": "report.html"} if job.report else {}
+    motion = "Motion" + (f", {rate_hz:.2g} frames a second" if rate_hz else "")
+    pages = {"Report": "report.html"} if job.report else {}
     say_pages(job.out, pages | ({motion: "view.html"} if job.view else {}))
     say(f"Pose: {job.out / 'pose.parquet'}  ({len(summary['sensors'])} segments, {len(summary['points'])} points)")
     if job.torques:

@@ -12,7 +12,7 @@ def run(job: ViewJob) -> int:
     """Show the page; say where it lies."""
     with progress_bar() as progress:
         outcome = run_view(job, progress)
-    say(f"Motion to look at:  {outcome.page}")
+    say(f"Motion:  {outcome.page}")
     if job.open and not outcome.opened:
         print_diagnostics([Diagnostic("browser-not-started", INFO)])
     return 0

@@ -15,11 +15,11 @@ from typing import Literal
 Method = Literal["amekf", "smoother", "smekf", "ncf", "gdc"]
 LiveMethod = Literal["amekf", "smekf", "ncf", "gdc"]
 Arms = Literal["left", "right", "both"]
-Progress = Callable[[str, float], None]  # what is being done, and the share of the whole job that is done; may raise
+Progress = Callable[[str, float], None]  # the current step, and the fraction of the job that is done; may raise
 
 
-def no_progress(_text: str, _share: float) -> None:
-    """Progress that nobody looks at."""
+def no_progress(_text: str, _fraction: float) -> None:
+    """Progress that is not shown."""
 
 
 def arm_sides(arms: Arms | None) -> tuple[str, ...] | None:

@@ -10,15 +10,16 @@ from ..errors import BadOption
 
 @dataclass(frozen=True)
 class BatchJob:
-    """Work through many recordings by a plan, on all processors or on a Dask cluster.
+    """Run the same steps on many recordings, on all processors of this machine or on a Dask cluster.
 
-    An item that fails leaves its error in the table, and the others continue. The same command continues a run that was
-    stopped and repeats nothing that is done. Sessions and DIR may lie on s3:// (docs/batch.md).
+    An item is one session of the plan with its steps. If it fails, its error stands in the table, and the others
+    continue. The same command continues a run that was stopped and repeats nothing that is done. Sessions and DIR may
+    lie on s3:// (docs/batch.md).
 
     Parameters
     ----------
     plan : PLAN.toml
-        The plan: which sessions, whose, and the steps calibrate, track, retarget, export, evaluate with their options.
+        The plan: the sessions, their subjects, and the steps calibrate, track, retarget, export, evaluate with options.
     out : DIR|URL
         Write items/, one folder per item, results.parquet and report.html to this folder or below this URL.
     scheduler : ADDRESS
@@ -26,7 +27,8 @@ class BatchJob:
     workers : NUMBER
         Start this number of workers here. Without it one per processor.
     force
-        Make those items again whose inputs, options or version have changed since they were made.
+        Run those items again whose inputs, options or package version have changed. Without it they are kept, with the
+        status changed.
     """
 
     plan: Path

@@ -21,36 +21,38 @@ if TYPE_CHECKING:
 class CalibrateJob:
     """Calibrate arm lengths and sensor mounts from a recording with joined hands.
 
-    Joined hands fix the proportions of the arms and not their scale. Measure one length, such as the shoulder width,
-    and give it by --measured; without one the scale is that of the population prior, and the output says how uncertain
-    it is.
+    Joined hands determine the proportions of the arms and not their scale. Measure one length, such as the shoulder
+    width, and give it by --measured. Without one the scale is that of the population prior, and the output says how
+    uncertain it is.
 
     Parameters
     ----------
     session : SESSION
-        The recording: session.toml with the phases of the protocol, such as clasp, in which the palms are held
-        together; or the folder that holds it.
+        The recording: session.toml, or the folder that holds it. It names the phases of the protocol, such as clasp, in
+        which the palms are held together.
     out : DIR
-        Write subject.toml, subject.urdf, calibration.json (the quality and all figures) and report.html to this folder.
+        Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     protocol : NAME|FILE.toml
-        Calibrate by this protocol: clasp (hands together), clasp_measured (the same with a measured
-        length), handle (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), poses
-        (T-pose and bow: headings only), or a file of your own made like those in calibration/.
+        Calibrate by this protocol: clasp (hands together), clasp_measured (the same with a measured length), handle
+        (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), poses (T-pose and bow:
+        determines headings and no lengths), or a file of your own, made like those in calibration/.
     measured : NAME=METRES
-        Take this length as measured, such as shoulder_width=0.385; may be given several times. With the protocol
-        handle also handle=0.42, the bar between the palms.
+        Use this measured length, such as shoulder_width=0.385; may be given several times. With --protocol handle also
+        handle=0.42, the distance of the palms on the bar.
     stature : METRES
         Narrow the population prior to people of this body height.
     sex
         Narrow the population prior to women or men.
     method
-        Filter the sensors by this method.
+        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
+        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases), ncf
+        (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011).
     gaps
-        Accept lost samples for longer than 50 ms and bridge them.
+        Accept gaps of more than 50 ms and bridge them. Without it such a gap is an error.
     report
-        Write report.html: the quality with what to do, lengths, mounts, the gap between the palms.
+        Write report.html, which shows the quality with what to do, lengths, mounts and the gap between the palms.
     force
-        Replace the files of an earlier run.
+        Replace the files of an earlier run in DIR.
     """
 
     session: Path

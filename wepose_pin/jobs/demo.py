@@ -22,17 +22,19 @@ if TYPE_CHECKING:
 class DemoJob:
     """Run the whole chain on a simulated recording: simulate, calibrate, track, evaluate, view.
 
-    A person of random size stands in the N-pose, moves the joined hands for a minute, then draws six circles in the air
-    with rests on a table, with five Xsens MTi-3 on. All of it is simulated, so that the truth is known.
+    A person of random size wears five Xsens MTi-3, stands in the N-pose (upright, arms hanging, palms to the thighs),
+    moves the joined hands for a minute, then draws six circles in the air with the right hand and rests it on a table
+    in between. All of it is simulated, so the truth is known. Printed are lengths and errors of each filter beside the
+    truth.
 
     Parameters
     ----------
     out : DIR
-        Write session, subject, result, its page and the figures to this folder.
+        Write session/, subject/, result/ with its page, and demo.json with all numbers to this folder.
     seed : NUMBER
-        Draw the person and the motion from this seed.
+        Sample the person and the motion by this seed.
     force
-        Replace the files of an earlier run.
+        Replace the files of an earlier run in DIR.
     """
 
     out: Path = Path("wepose-demo")

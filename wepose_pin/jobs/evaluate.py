@@ -18,12 +18,17 @@ if TYPE_CHECKING:
 class EvaluateJob:
     """Compare a result with a reference: attitude, drift, positions, stated uncertainty.
 
+    Prints for each segment the attitude error (roll, pitch, yaw about the axes of W), inclination, heading and total
+    RMSE [deg] and the drift of the heading [deg/min]; for each point the position error [mm], relative to the root and
+    to the middle of the shoulders; and whether the stated standard deviations are consistent with the errors. Headings
+    are compared as they are, without alignment. Nothing is written.
+
     Parameters
     ----------
     result : RESULT
         Folder that `wepose track` wrote.
     truth : TRUTH
-        Table (.parquet or .csv) with columns as in pose.parquet, or a session file that names one.
+        Table (.parquet or .csv) with the columns of pose.parquet, or a session that names one (data.truth).
     interval : FROM TO
         Compare only from this to this time, in seconds.
     """

@@ -25,16 +25,16 @@ class ExportJob:
     result : RESULT
         Folder that `wepose track` wrote.
     out : FILE
-        Write this file.
+        Write this file. Its suffix selects the format.
     format : FORMAT
-        Write this format instead of that of the file's suffix: csv, parquet (pose and joint angles), mot (joint
-        angles for OpenSim), sto (orientations for OpenSense), placement (the sample for its IMU Placer), trc, c3d
-        (points), bvh (skeleton and motion), urdf (the subject).
+        Write this format instead of that of the suffix: csv, parquet (pose and joint angles), mot (joint angles for
+        OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU Placer),
+        trc, c3d (points, as of markers), bvh (skeleton and motion, for animation), urdf (the subject).
     names
-        Name the columns of a .mot by the coordinates of OpenSim's Rajagopal model, or by the angles of the ISB.
-        Without it opensim.
+        Only for .mot: name the columns by the coordinates of OpenSim's Rajagopal model (opensim), or by the joint
+        angles of the International Society of Biomechanics (isb). Without it opensim.
     rate_hz : HZ
-        Resample the motion to this many samples a second.
+        Resample the motion at this rate.
     force
         Replace an existing file.
     """

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 class InfoJob:
     """Describe a file, its sensors, rates and gaps, and propose a session file for it.
 
-    Known are Xsens MVNX, MT Manager's text, Movella DOT, x-IMU3, APDM, OpenSim .sto of orientations, CSV, Parquet,
-    HDF5, MATLAB (docs/formats/), recordings of `wepose live`, and sessions, subjects and results. What is marked CHECK
-    in the session is guessed.
+    Prints both, and writes nothing without --write or -o. Reads Xsens MVNX, MT Manager's text, Movella DOT, x-IMU3,
+    APDM, OpenSim .sto of orientations, CSV, Parquet, HDF5, MATLAB (docs/formats/), recordings of `wepose live`, and
+    sessions, subjects and results. Entries of the proposed session that are guesses are marked CHECK.
 
     Parameters
     ----------

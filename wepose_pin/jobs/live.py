@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LiveJob:
-    """Track a stream live: to a page in the browser, the terminal, other programs and a file.
+    """Track a person live: show the pose in the browser and the terminal, send it to programs or a robot, record it.
 
-    Stand still in the start pose until you are told that it is ready. After that r resets the headings, while you stand
-    in the start pose again, and q or Ctrl-C ends. Whatever ends it, the file of --record lacks its last second at most.
+    Stand still in the start pose until the message says that it is ready. After that, stand in the start pose again and
+    press r to reset the headings. With --robot, r also lets a stopped robot move again. q or Ctrl-C ends the session.
+    If it is killed, at most the last second of --record is lost.
 
     Parameters
     ----------
@@ -36,35 +37,38 @@ class LiveJob:
     record : FILE
         Write all that is received and the poses to this file; `wepose track FILE` gives the same poses again.
     method
-        Filter the sensors by this method.
+        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smekf (Kalman filter of
+        Lisini Baldi et al. 2019, corrected in static phases), ncf (complementary filter, Mahony et al. 2008), gdc
+        (gradient descent, Madgwick et al. 2011).
     model : URDF|TOML
         Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md).
     speed : FACTOR
-        Replay at this speed: 1 its own, 4 four times that, max as fast as possible.
+        With --source replay: replay at this speed; 1 that of the recording, 4 four times that, max as fast as possible.
     page
-        Serve the page that shows the pose, to this machine only.
+        Serve the page that shows the pose (which only this machine can open).
     open
         Open the page in the browser.
     port : PORT
-        Serve the page at this port; 0: at any that is free.
+        Serve the page at this port; 0 takes any that is free.
     udp : [HOST:]PORT
-        Send each pose as JSON to this port, of this machine where no host is named (docs/live-page.md).
+        Send each pose as JSON to this UDP port (docs/live-page.md). Without HOST to this machine.
     lsl : NAME
         Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
     robot : NAME|FILE.urdf
-        Send commands by which this robot (as of `wepose retarget`) follows the person (docs/live-robot.md).
+        Send joint commands that let this robot follow the person (docs/live-robot.md). Names are those of `wepose
+        retarget --robot`. Bring the robot into the rest posture of its map before.
     arm
-        Move only this arm of the robot, or both. Without it all arms that it has.
+        Move only this arm of the robot, or both. Without it all arms that it has. Needs --robot.
     map : TOML
-        Use this map of the URDF in --robot, where none lies beside it.
+        Use this map of the URDF in --robot, if none lies beside it. Needs --robot.
     to : [HOST:]PORT
-        Send the robot's commands to this port, as JSON. Without it to port 9002 of this machine.
+        Send the robot's commands as JSON to this UDP port. Without it to port 9002 of this machine. Needs --robot.
     robot_hz : HZ
-        Send commands at this rate.
+        Send this many robot commands a second.
     hold_after : SECONDS
-        Brake the robot after this time without a pose.
+        Brake the robot after this time without a pose. It continues by itself, slowly at first, when poses come again.
     stop_after : SECONDS
-        Stop the robot, until r is pressed, after this time without a pose.
+        Stop the robot after this time without a pose. It moves again only after r is pressed.
     force
         Replace the file of --record.
     """

@@ -8,9 +8,9 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ReproduceJob:
-    """Make a result again from its provenance and compare: tables must be bit-identical.
+    """Run a result again from its recorded provenance and check that its tables are bit-identical.
 
-    Nothing is changed: the result is made again in a folder that is removed afterwards.
+    RESULT is not changed: the new one is written to a temporary folder, which is removed afterwards.
 
     Parameters
     ----------

@@ -16,8 +16,8 @@ from .fields import field_values
 class RetargetJob:
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
-    Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (of example-robot-data). Any other by its URDF with a map
-    beside it that says which links are shoulder, elbow and hand (docs/retargeting.md).
+    Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (from the package example-robot-data). Any other by its
+    URDF with a map beside it, a TOML that says which links are shoulder, elbow and hand (docs/retargeting.md).
 
     Parameters
     ----------
@@ -28,23 +28,24 @@ class RetargetJob:
     out : DIR
         Write trajectory.parquet and .csv, joint_trajectory.json and .yaml, summary.json and view.html to this folder.
     arm
-        Move only this arm, or both. Without it all arms that the robot has.
+        Move only this arm of the robot, or both. Without it all arms that the robot has.
     rate_hz : HZ
-        Sample the trajectory at the rate that the controller needs.
+        Sample the trajectory at this rate, 10 to 2000 Hz: that of the robot's own controller.
     task
         Follow the position of the person's hands, their orientation, or both.
     scale : FACTOR
-        Scale the person's distances by this factor. Without it a straight arm becomes a straight arm of the robot.
+        Scale the distance from shoulder to hand by this factor. Without it the ratio of the reach of the robot's arm to
+        the length of the person's (docs/retargeting.md).
     smoothing_hz : HZ
-        Low-pass filter the measured motion at this frequency; 0 does not filter it.
+        Low-pass filter the person's motion at this frequency; 0 does not filter it.
     strict
         Refuse a motion that is too fast for the robot, instead of slowing it down.
     episode
-        Write episode/ too: a data set of one episode as LeRobot reads it.
+        Write episode/ too: a data set of one episode in the format of LeRobot.
     view
-        Write view.html, the robot beside the person.
+        Write view.html, the animation of the robot beside the person.
     force
-        Replace the files of an earlier run.
+        Replace the files of an earlier run in DIR.
     """
 
     result: Path
@@ -105,13 +106,14 @@ def run_retarget(
     from ..documents import whole_folder
     from ..report.page import PageWriter
     from ..report.viewer import retarget_html
+    from ..retargeting.trajectory import STAGES
     from ..writers import read_result
     from ..writers.provenance import collect_provenance
     from ..writers.result import as_json
 
     job.check()
     without = [task for task in ("position", "orientation") if job.task not in ("both", task)]
-    tasks = replace(retargeting.Tasks(), **dict.fromkeys(without, 0.0))
+    params = replace(retargeting.ControllerParams(), **dict.fromkeys(without, 0.0))
     with whole_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
         pose, body, about = read_result(job.result)
@@ -120,16 +122,16 @@ def run_retarget(
             pose,
             robot,
             rate_hz=job.rate_hz,
-            tasks=tasks,
+            params=params,
             scale=job.scale,
             smoothing_hz=job.smoothing_hz,
             strict=job.strict,
-            progress=lambda text, share: progress(text, 0.48 * share + (0.48 if text == "solving" else 0.0)),
+            progress=lambda text, fraction: progress(text, 0.48 * (fraction + STAGES.index(text))),
         )
         progress("checking", 0.96)
         table, limits = retargeting.build_table(trajectory), robot.map
         check = retargeting.check_limits(table, limits.urdf, limits.acceleration, limits.jerk)
-        collisions = retargeting.find_self_collisions(robot, trajectory.time, trajectory.u)
+        collisions = retargeting.find_self_collisions(robot, trajectory.time, trajectory.joint_position)
         progress("writing", 0.98)
         retargeting.write_trajectory(folder, trajectory)
         if job.episode:

@@ -21,8 +21,9 @@ CIRCLES = 6  # drawn by the right hand after the protocol
 class SimulateJob:
     """Simulate a person with five sensors and a known truth.
 
-    The sensors have the noise and bias of an Xsens MTi-3 in either preset. `wepose calibrate DIR --measured ...` and
-    `wepose track DIR` go on from there.
+    The person stands in the start pose, does the motion of the protocol, then draws circles with the right hand (not
+    after poses). The sensors have the noise and bias of an Xsens MTi-3. Continue with `wepose calibrate DIR --measured
+    ...` and `wepose track DIR`.
 
     Parameters
     ----------
@@ -30,22 +31,24 @@ class SimulateJob:
         Write session.toml, recording.parquet, truth.parquet (columns as in pose.parquet) and subject.toml (the true
         lengths and mounts) to this folder.
     seed : NUMBER
-        Draw the person and the motion from this seed.
+        Sample the person and the motion by this seed.
     rate_hz : HZ
-        Sample at this rate.
+        Sample the sensors at this rate, 20 to 2000 Hz.
     protocol
-        Simulate this calibration protocol, as of `wepose calibrate --protocol`. The right hand then draws circles,
-        except after poses.
+        Simulate the motion of this calibration protocol (see `wepose calibrate --help`).
     preset
-        Simulate no imperfection but the sensors' noise and bias (ideal), or soft tissue, slip, sway and sensor errors
-        of a usual size too (mild), as stated with their sources in wepose_pin/simulation/imperfections.py.
+        Simulate only the sensors' noise and bias (ideal), or also soft-tissue artefacts, slip, sway and sensor errors
+        (mild); their sizes and sources are in wepose_pin/simulation/imperfections.py.
     imperfection : NAME=VALUE
-        Simulate one imperfection at this size; may be given several times. mount=any: sensors in any rotation, nothing
-        stated. The others are numbers, 0 for off: soft_tissue_deg, palm_slip [m], shoulder_wander [m], start_elbow_deg,
-        start_segment_deg, sway_deg_s, gyro_scale, accel_scale, misalignment_deg, g_sensitivity_deg_s,
-        gyro_range_deg_s, accel_range_g, bits, clock_jitter [s], clock_offset [s], dropped.
+        Simulate one imperfection at this size; may be given several times. mount=any: arbitrary sensor mounting, which
+        the session does not state. All others are numbers; 0 is off, for the two ranges inf. Of the body, rms:
+        soft_tissue_deg, palm_slip [m] in the clasp, sway_deg_s, start_segment_deg (arm segments off the start pose);
+        mean: start_elbow_deg (flexion in the start pose), shoulder_wander [m] (translation at 90 deg of elevation). Of
+        the sensors, standard deviation: gyro_scale, accel_scale (of the scale factors, 0.01 is 1 %), misalignment_deg,
+        g_sensitivity_deg_s (per g), clock_jitter [s], clock_offset [s]; full scale: gyro_range_deg_s, accel_range_g;
+        bits: of a sample over the full scale; dropped: fraction of samples lost, at most 0.2.
     force
-        Replace the files of an earlier run.
+        Replace the files of an earlier run in DIR.
     """
 
     out: Path

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 class TrackJob:
     """Estimate the pose of a recording: segment orientations and joint centres.
 
-    A recording of `wepose live` gives the poses that were shown, bit-identical: it is tracked with its own subject and
-    method, and causally, unless one of these is given here.
+    A recording of `wepose live` is tracked causally, with the subject and the method of that session, and gives the
+    displayed poses again, bit-identical. With --subject or --method it is tracked as any other recording.
 
     Parameters
     ----------
@@ -34,30 +34,35 @@ class TrackJob:
         Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
         Without it lengths are those of the population prior, and mounts those that the session states.
     model : URDF|TOML
-        Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md). Where the sensors are on the
-        links of another chain (start_pose = "configuration"), the URDF of that chain.
+        Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md). For sensors on a robot or
+        another chain (start_pose = "configuration"), its URDF.
     method : METHOD
-        Filter the sensors by this method. Without it amekf, or the method of the live session.
+        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
+        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases), ncf
+        (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011). Without it amekf, or
+        the method of the live session.
     causal
-        Begin at the end of the start pose and use no later sample, as `wepose live` does.
+        Use only past samples, as `wepose live` does. Poses begin at the end of the start pose.
     gaps
-        Accept lost samples for longer than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap).
+        Accept gaps of more than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap). Without it such a gap
+        is an error.
     covariance
-        Write the covariances of orientations and points too, not only their standard deviations.
+        Write the covariance of each orientation and point too, not only the standard deviations.
     limits
-        Keep elbows and wrists of one or two axes within the limits of the model's joints.
+        Keep elbows and wrists with one or two axes within the joint limits of the model.
     torques
-        Write torques.parquet too: joint torques estimated from the model's inertias and the smoothed motion.
+        Write torques.parquet too: joint torques by inverse dynamics. Assumed are a fixed base, gravity as the only
+        external force and no load in the hands; the motion is low-pass filtered at 6 Hz.
     view
-        Write view.html, the motion to look at.
+        Write view.html, the animation of the motion.
     report
-        Write report.html: diagnostics and what to do, noise, drift, hands, joint angles.
+        Write report.html, which shows diagnostics with what to do, noise, drift, hands and joint angles.
     chunk_seconds : SECONDS
-        Track in chunks of this length, in a memory that does not grow with the recording (docs/long-recordings.md).
-        Recordings of 500 MB and more are always tracked so, in chunks of 120 s (smoother: 600 s); 0 tracks them as a
-        whole.
+        Track in chunks of this length, so that the memory does not grow with the recording (docs/long-recordings.md).
+        Without it recordings of 500 MB and more are tracked in chunks of 120 s (smoother: 600 s), others as a whole; 0
+        tracks any as a whole.
     force
-        Replace the files of an earlier run.
+        Replace the files of an earlier run in DIR.
     """
 
     session: Path

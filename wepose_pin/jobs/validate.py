@@ -17,24 +17,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ValidateJob:
-    """Run the paper's experiments on simulated subjects and compare with the paper's figures.
+    """Repeat the experiments of Lisini Baldi et al. 2019 on simulated subjects and compare with the published errors.
 
-    On two cores a quick run takes under a minute, a full one about ten.
+    Prints a table of each experiment; without -o nothing is written. On two cores a quick run takes under a minute, a
+    full one about ten. The paper: doi 10.1109/JSEN.2019.2940612.
 
     Parameters
     ----------
     out : DIR
-        Write validation.json with every trial, and the page with tables and figures to this folder: validation.html,
+        Write validation.json with every trial, and a page with tables and plots to this folder: validation.html, and
         validation.md with validation/*.svg.
     data : DIR
-        Run on the real recordings in this folder too (broad/, wepose_hr/, ring/, ur5/).
+        Run on the real recordings in this folder too; its folders are broad/, wepose_hr/, ring/, ur5/
+        (docs/validation.md).
     quick
-        Run one trial of each experiment, and two of BROAD, instead of all; without the error budget and without the
-        search for gains.
+        Run one trial of each experiment, and two of the BROAD data set, instead of all. The error budget and the tuning
+        of the gains of ncf and gdc are left out.
     from_ : FILE
-        Make tables and pages anew from the validation.json of an earlier run, and run nothing.
+        Make tables and pages from the validation.json of an earlier run, and run nothing.
     force
-        Replace the files of an earlier run.
+        Replace the files of an earlier run in DIR.
     """
 
     out: Path | None = None

@@ -19,12 +19,11 @@ class ViewJob:
     result : RESULT
         Folder that `wepose track` wrote.
     out : FILE
-        Write the page to this file. Without it view.html in the folder of the result is opened, and made if it is
-        missing.
+        Write the page to this file. Without it view.html in RESULT is used, and written if it is missing.
     open
         Open the page in the browser.
     force
-        Replace an existing page.
+        Write the page again if it exists.
     """
 
     result: Path

@@ -7,15 +7,15 @@ from typing import Any
 
 # Loaded on first use: tracking does not need the calibration's imports.
 _WHERE = {
-    "calibration_report": "calibration",
-    "track_report": "track",
+    "render_calibration_report": "calibration",
+    "render_track_report": "track",
     "write_calibration_page": "calibration",
     "write_decimated_pages": "pages",
     "write_track_pages": "pages",
 }
 __all__ = [
-    "calibration_report",
-    "track_report",
+    "render_calibration_report",
+    "render_track_report",
     "write_calibration_page",
     "write_decimated_pages",
     "write_track_pages",

@@ -28,11 +28,11 @@ from .calibration_figures import (
     Length,
     Sensor,
     direction,
-    gap_picture,
-    hands_picture,
-    lengths_picture,
-    posture_picture,
-    sensors_picture,
+    draw_gap,
+    draw_hands,
+    draw_lengths,
+    draw_posture,
+    draw_sensors,
     smoothed,
 )
 from .page import Page, PageWriter, Table
@@ -60,7 +60,7 @@ def write_calibration_page(
     writer = PageWriter(folder, ["report.html"])
     writer.write(
         "report.html",
-        lambda failures: calibration_report(
+        lambda failures: render_calibration_report(
             calibration, recording, method=method, protocol=protocol, quality=quality, failures=failures
         ),
     )
@@ -68,7 +68,7 @@ def write_calibration_page(
     return writer.diagnostics
 
 
-def calibration_report(
+def render_calibration_report(
     calibration: Calibration,
     recording: Recording,
     *,
@@ -97,21 +97,21 @@ def calibration_report(
             if not isinstance(error, WeposeError) and failures is not None:
                 failures.append(f"the motion cannot be tracked: {reason(error)}")
     page = Page(TEMPLATE, f"Calibration of {recording.name or 'a recording'}", failures)
-    page.add("first", lambda: _diagnostics_section(calibration, quality, untracked), name="The quality")
-    page.add("short", lambda: _summary_section(calibration, contact), name="In short")
-    page.add("lengths", lambda: _lengths_section(calibration, contact), "Lengths")
-    page.add("sensors", lambda: _sensors_section(calibration, recording), "Sensors")
-    page.add("gap", lambda: _gap_section(calibration, contact), f"{capital(contact.gap)} over time")
+    page.add("first", lambda: _build_diagnostics_section(calibration, quality, untracked), name="The quality")
+    page.add("short", lambda: _build_summary_section(calibration, contact), name="In short")
+    page.add("lengths", lambda: _build_lengths_section(calibration, contact), "Lengths")
+    page.add("sensors", lambda: _build_sensors_section(calibration, recording), "Sensors")
+    page.add("gap", lambda: _build_gap_section(calibration, contact), f"{capital(contact.gap)} over time")
     page.add(
         "hands",
-        lambda: _hands_section(calibration, contact, None if tracked is None else tracked.pose),
+        lambda: _build_hands_section(calibration, contact, None if tracked is None else tracked.pose),
         "Where the motion was informative",
     )
-    page.add("posture", lambda: _posture_section(calibration), "The start pose")
-    page.add("elbows", lambda: _elbows_section(calibration), "The elbows as hinges")
-    page.add("view", lambda: _view_section(calibration, recording, tracked), "The motion in 3D")
-    page.add("checks", lambda: _checks_section(quality, contact), "Behind the quality")
-    page.add("run", lambda: _run_section(calibration, recording, contact, method), "What was run")
+    page.add("posture", lambda: _build_posture_section(calibration), "The start pose")
+    page.add("elbows", lambda: _build_elbows_section(calibration), "The elbows as hinges")
+    page.add("view", lambda: _build_view_section(calibration, recording, tracked), "The motion in 3D")
+    page.add("checks", lambda: _build_checks_section(quality, contact), "Behind the quality")
+    page.add("run", lambda: _build_run_section(calibration, recording, contact, method), "What was run")
     return page.html(f"Calibration of {recording.name}" if recording.name else "Calibration")
 
 
@@ -138,7 +138,7 @@ def _describe_contact(protocol: Protocol) -> _Contact:
 # The sections: the values that the macros of the template take --------------------------------------------------------
 
 
-def _diagnostics_section(
+def _build_diagnostics_section(
     calibration: Calibration, quality: CalibrationQuality | None, untracked: Sequence[Diagnostic]
 ) -> dict[str, Any]:
     further = calibration.diagnostics if quality is None else quality.further
@@ -149,7 +149,7 @@ def _diagnostics_section(
     }
 
 
-def _summary_section(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
+def _build_summary_section(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
     subject = calibration.subject
     scaling = [name for name in calibration.measured if name in contact.chain or name not in subject.lengths]
     tilts = {name: _mount_stds(subject, name) for name in subject.mounts}
@@ -166,7 +166,7 @@ def _summary_section(calibration: Calibration, contact: _Contact) -> dict[str, A
     }
 
 
-def _lengths_section(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
+def _build_lengths_section(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
     subject, prior = calibration.subject, calibration.prior
     rows, lines = [], []
     for parts in _ROWS:
@@ -191,12 +191,12 @@ def _lengths_section(calibration: Calibration, contact: _Contact) -> dict[str, A
         "hands": any(f"{side}_hand" in contact.chain for side in SIDES),
         "outside": [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.measured],
         "learned": bool(calibration.information_shares),
-        "picture": lengths_picture(rows),
+        "picture": draw_lengths(rows),
         "lengths": Table(header, lines),
     }
 
 
-def _sensors_section(calibration: Calibration, recording: Recording) -> dict[str, Any] | None:
+def _build_sensors_section(calibration: Calibration, recording: Recording) -> dict[str, Any] | None:
     subject = calibration.subject
     rows, lines = [], []
     for name, quat_LS in subject.mounts.items():
@@ -221,11 +221,11 @@ def _sensors_section(calibration: Calibration, recording: Recording) -> dict[str
     if not rows:
         return None
     header = ["sensor", "nearest axes in the start pose", "stated before", "tilt ±", "heading ±", "heading drift"]
-    picture = sensors_picture(rows, float(np.degrees(START_POSE_STD)), float(np.degrees(DRIFT_STD)) * 60.0)
+    picture = draw_sensors(rows, float(np.degrees(START_POSE_STD)), float(np.degrees(DRIFT_STD)) * 60.0)
     return {"picture": picture, "sensors": Table(header, lines)}
 
 
-def _gap_section(calibration: Calibration, contact: _Contact) -> dict[str, Any] | None:
+def _build_gap_section(calibration: Calibration, contact: _Contact) -> dict[str, Any] | None:
     order = _closure_order(calibration)
     if len(order) < 2:
         return None
@@ -242,7 +242,7 @@ def _gap_section(calibration: Calibration, contact: _Contact) -> dict[str, Any] 
     gap, prior_gap = calibration.gap[order], calibration.prior_gap[order]
     apart = _open_spans(time, calibration.contact[order])
     return {
-        "picture": gap_picture(time, gap, prior_gap, apart, learned, contact.gap),
+        "picture": draw_gap(time, gap, prior_gap, apart, learned, contact.gap),
         "gap": contact.gap,
         "before_mm": 1e3 * calibration.prior_rms_gap,
         "after_mm": 1e3 * calibration.rms_gap,
@@ -252,7 +252,7 @@ def _gap_section(calibration: Calibration, contact: _Contact) -> dict[str, Any] 
     }
 
 
-def _hands_section(calibration: Calibration, contact: _Contact, pose: Pose | None) -> dict[str, Any] | None:
+def _build_hands_section(calibration: Calibration, contact: _Contact, pose: Pose | None) -> dict[str, Any] | None:
     """Where the motion was informative."""
     if pose is None:
         return None
@@ -309,12 +309,12 @@ def _hands_section(calibration: Calibration, contact: _Contact, pose: Pose | Non
         "up": [_format_side(end[2], "below", "above") for end in (low, high)],
         "stretch": [near, away],
         "rare": rare if both else [],
-        "picture": hands_picture(hands, contact.noun),
+        "picture": draw_hands(hands, contact.noun),
         "zones": Table(header, lines),
     }
 
 
-def _posture_section(calibration: Calibration) -> dict[str, Any] | None:
+def _build_posture_section(calibration: Calibration) -> dict[str, Any] | None:
     tilt = {name: np.asarray(t, dtype=float) for name, t in calibration.start_pose_offset.items()}
     tilt = {name: t for name, t in tilt.items() if np.isfinite(t).all()}
     if not tilt:
@@ -333,12 +333,12 @@ def _posture_section(calibration: Calibration) -> dict[str, Any] | None:
             elbows[side] = float(np.degrees(np.arccos(np.clip(down[0] @ down[1], -1.0, 1.0))))
     return {
         "elbows": elbows,
-        "picture": posture_picture(tilt, observed, calibration.subject.lengths),
+        "picture": draw_posture(tilt, observed, calibration.subject.lengths),
         "tilts": Table(["segment", "sideways", "forwards or backwards"], lines),
     }
 
 
-def _elbows_section(calibration: Calibration) -> dict[str, Any] | None:
+def _build_elbows_section(calibration: Calibration) -> dict[str, Any] | None:
     lines = []
     for joint, axis in calibration.hinge_axes.items():
         side = joint.removesuffix("_elbow")
@@ -355,7 +355,7 @@ def _elbows_section(calibration: Calibration) -> dict[str, Any] | None:
     return {"elbows": Table(header, lines)} if lines else None
 
 
-def _view_section(
+def _build_view_section(
     calibration: Calibration, recording: Recording, tracked: TrackedRecording | None
 ) -> dict[str, Any] | None:
     if tracked is None or not len(calibration.time):
@@ -377,7 +377,9 @@ def _view_section(
     return {"page": pose_html(tracked.model, cut, phases=phases, title=recording.name, fps=FRAMES_A_SECOND)}
 
 
-def _run_section(calibration: Calibration, recording: Recording, contact: _Contact, method: str) -> dict[str, Any]:
+def _build_run_section(
+    calibration: Calibration, recording: Recording, contact: _Contact, method: str
+) -> dict[str, Any]:
     lengths = {name: calibration.measured_lengths[name] for name in calibration.measured}
     measured = [f"{plain(n)} {1e3 * v.metres:.0f} ± {1e3 * v.measured_std:.0f} mm" for n, v in lengths.items()]
     imu, fused = len(recording.imus), len(recording.sensors) - len(recording.imus)
@@ -397,7 +399,7 @@ def _run_section(calibration: Calibration, recording: Recording, contact: _Conta
     return {"rows": rows}
 
 
-def _checks_section(quality: CalibrationQuality | None, contact: _Contact) -> dict[str, Any] | None:
+def _build_checks_section(quality: CalibrationQuality | None, contact: _Contact) -> dict[str, Any] | None:
     if quality is None:
         return None
     rows = []
@@ -468,9 +470,9 @@ def _describe_check(check: Check, contact: _Contact) -> tuple[str, str]:
         "arm-motion-implausible": ("doubt of the sensors' places, by anatomy", "number"),
         "sensors-exchanged": ("doubt of the sensors' places, by anatomy", "number"),
         "mount-not-used": (f"stated mount that was not used, {place}", "deg"),
-        "upper-arm-length-uncertain": ("± upper arm, the scale apart", "mm"),
-        "forearm-length-uncertain": ("± forearm + hand, the scale apart", "mm"),
-        "shoulder-width-uncertain": ("± shoulder width, the scale apart", "mm"),
+        "upper-arm-length-uncertain": ("± upper arm, without the common scale", "mm"),
+        "forearm-length-uncertain": ("± forearm + hand, without the common scale", "mm"),
+        "shoulder-width-uncertain": ("± shoulder width, without the common scale", "mm"),
         "mount-heading-uncertain": (f"± heading, {place}", "deg"),
         "scale-uncertain": ("± scale, all lengths together", "percent"),
         "scale-from-prior": ("± scale, all lengths together", "percent"),

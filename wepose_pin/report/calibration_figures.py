@@ -49,7 +49,7 @@ class Hands(NamedTuple):
     trunk: float  # [m]
 
 
-def lengths_picture(rows: Sequence[Length]) -> Picture:
+def draw_lengths(rows: Sequence[Length]) -> Picture:
     """Each length beside the population prior, with intervals."""
     panel = Panel(x_label="longer than the population prior [mm]", right=110.0)
     for at, row in zip(category_rows(panel, [row.label for row in rows]), rows, strict=True):
@@ -77,7 +77,7 @@ def lengths_picture(rows: Sequence[Length]) -> Picture:
     )
 
 
-def sensors_picture(rows: Sequence[Sensor], tilt_before_deg: float, drift_before: float) -> Picture:
+def draw_sensors(rows: Sequence[Sensor], tilt_before_deg: float, drift_before: float) -> Picture:
     """The uncertainty of each mount, and the drift of its heading."""
     names = [row.label for row in rows]
     columns = [[row.tilt_std for row in rows], [row.heading_std for row in rows], [r.drift_deg_min for r in rows]]
@@ -106,7 +106,7 @@ def sensors_picture(rows: Sequence[Sensor], tilt_before_deg: float, drift_before
     return Picture("sensors", caption, Chart([panels], [26.0 * len(rows) + 6.0], keys))
 
 
-def gap_picture(
+def draw_gap(
     time: np.ndarray,
     gap: np.ndarray,
     prior_gap: np.ndarray,
@@ -152,7 +152,7 @@ def gap_picture(
     return Picture("gap", caption, Chart([[panel] for panel in panels], [170.0, 120.0][: len(panels)], keys))
 
 
-def hands_picture(hands: Hands, noun: str) -> Picture:
+def draw_hands(hands: Hands, noun: str) -> Picture:
     """Where the hands were, and how much they showed there: from the front, from the right, from above."""
     reach = 100 * hands.reach
     views = body_views(50 * hands.shoulder_width, 100 * hands.trunk)
@@ -171,7 +171,7 @@ def hands_picture(hands: Hands, noun: str) -> Picture:
     return Picture("hands", caption, Chart([[panel for panel, _, _ in views]], [260.0], keys))
 
 
-def posture_picture(
+def draw_posture(
     tilt: Mapping[str, np.ndarray], observed: Mapping[str, Sequence[bool]], lengths: Mapping[str, float]
 ) -> Picture:
     """The start pose from the front and from both sides, with its tilts drawn larger than they are.

@@ -47,7 +47,7 @@ def compute_totals(tracked: TrackedRecording) -> Totals:
 
 
 class Decimator:
-    """Takes the chunks of `tracking.track_session`; `decimated` is for `track_report` and the page.
+    """Takes the chunks of `tracking.track_session`; `decimated` is for `render_track_report` and the page.
 
     Parameters
     ----------

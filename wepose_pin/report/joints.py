@@ -9,15 +9,15 @@ import numpy as np
 from ..angles import JointAngles, joint_angles, summary
 from ..errors import BadData
 from ..tracking import TrackedRecording
-from .measures import finite_median, stated_mounts
+from .measures import finite_median, has_stated_mounts
 from .page import Table
-from .track_figures import over_time_picture
+from .track_figures import draw_over_time
 from .words import plain, whole
 
 FULL_TURN = 2.0 * np.pi - 1e-9
 
 
-def joint_angles_section(tracked: TrackedRecording) -> dict[str, Any] | None:
+def build_joint_angles_section(tracked: TrackedRecording) -> dict[str, Any] | None:
     """Charts and table; None where no joint has both of its segments."""
     try:
         angles = joint_angles(tracked.pose)
@@ -37,7 +37,7 @@ def joint_angles_section(tracked: TrackedRecording) -> dict[str, Any] | None:
         caption = f"The {group if len(members) == 1 else group + 's'} over time."
         if any((angles[joint].near_lock | angles[joint].gap).any() for joint in members):
             caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
-        pictures.append(over_time_picture(angles.time, panels, f"angles-{group}", caption))
+        pictures.append(draw_over_time(angles.time, panels, f"angles-{group}", caption))
     rows = []
     for joint, ranges in summary(angles).items():
         stds = angles[joint].std
@@ -58,7 +58,7 @@ def joint_angles_section(tracked: TrackedRecording) -> dict[str, Any] | None:
                 ]
             )
     header = ["angle", "least", "most", "range", "fastest", "usual ±", "near gimbal lock"]
-    return {"stated": stated_mounts(tracked), "pictures": pictures, "ranges": Table(header, rows)}
+    return {"stated": has_stated_mounts(tracked), "pictures": pictures, "ranges": Table(header, rows)}
 
 
 def _break_line(joint: JointAngles, k: int) -> np.ndarray:

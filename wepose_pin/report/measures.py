@@ -85,7 +85,7 @@ def finite_median(values: np.ndarray) -> float:
     return float(np.median(known)) if len(known) else float("nan")
 
 
-def mask_from_start(tracked: TrackedRecording) -> np.ndarray:
+def find_samples_after_start(tracked: TrackedRecording) -> np.ndarray:
     """(n,) bool, the samples after the start pose, which the summaries of uncertainty are of.
 
     Before it the filters have not converged, and headings are extrapolated backwards.
@@ -99,7 +99,7 @@ def longest_run_s(mask: np.ndarray, rate_hz: float) -> float:
     return max((b - a for a, b in find_runs(mask)), default=0) / rate_hz
 
 
-def stated_mounts(tracked: TrackedRecording) -> bool:
+def has_stated_mounts(tracked: TrackedRecording) -> bool:
     """Whether the mounts are the session's and not calibrated ones."""
     return not tracked.subject.mounts or tracked.recording.remounted
 
@@ -133,7 +133,7 @@ class Budget(NamedTuple):
     growth: float  # of the filter's, a minute of motion; NaN where it was never in motion
 
 
-def heading_budgets(tracked: TrackedRecording) -> dict[str, Budget]:
+def compute_heading_uncertainties(tracked: TrackedRecording) -> dict[str, Budget]:
     """Segment → its budget, from the covariances; none where the filter has none."""
     budgets = {}
     for name, cov_W in tracked.pose.segment_cov.items():
@@ -150,7 +150,7 @@ def heading_budgets(tracked: TrackedRecording) -> dict[str, Budget]:
     return budgets
 
 
-def joint_heading_stds(budgets: Mapping[str, Budget]) -> dict[str, np.ndarray]:
+def compute_joint_heading_stds(budgets: Mapping[str, Budget]) -> dict[str, np.ndarray]:
     """Joint → (n,) [rad], one standard deviation of the heading between its segments, as if they were independent."""
     return {
         joint: np.hypot(budgets[above].std, budgets[below].std)

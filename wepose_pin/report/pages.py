@@ -11,7 +11,7 @@ from ..recording import Intervals
 from ..tracking import TrackedRecording
 from .decimation import Decimator, Totals
 from .page import PageWriter, page_incomplete
-from .track import track_report
+from .track import render_track_report
 from .viewer import pose_html
 
 PAGES = ("view.html", "report.html")
@@ -48,7 +48,9 @@ def write_track_pages(
             lambda _: pose_html(model, tracked.pose, phases=recording.phases, title=recording.name, fps=fps),
         )
     if report:
-        writer.write("report.html", lambda failures: track_report(tracked, view=page, totals=totals, failures=failures))
+        writer.write(
+            "report.html", lambda failures: render_track_report(tracked, view=page, totals=totals, failures=failures)
+        )
     writer.save_diagnostics("summary.json")
     return writer.diagnostics
 

@@ -1,4 +1,4 @@
-"""The report of a tracked recording: what was recorded, how far to trust it, what the person did."""
+"""The report of a tracked recording: the recording, the uncertainty of the result, the motion."""
 
 from __future__ import annotations
 
@@ -12,56 +12,56 @@ from ..kinematics import axis_std, orientation_residuals
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
 from .decimation import Totals, compute_totals
-from .joints import joint_angles_section
+from .joints import build_joint_angles_section
 from .measures import (
     Budget,
     Hand,
     Measures,
     Signal,
+    compute_heading_uncertainties,
+    compute_joint_heading_stds,
+    find_samples_after_start,
     finite_max,
     finite_median,
-    heading_budgets,
-    joint_heading_stds,
+    has_stated_mounts,
     longest_run_s,
-    mask_from_start,
     measure_elbow,
     measure_hands,
-    stated_mounts,
 )
 from .page import Page, Table
-from .track_diagnostics import GRAVITY_OFF, diagnose_pose, heading_remedy
-from .track_figures import headings_picture, noise_picture, paths_picture, reach_picture, timeline_picture
+from .track_diagnostics import GRAVITY_OFF, describe_heading_remedy, diagnose_pose
+from .track_figures import draw_headings, draw_noise, draw_paths, draw_reach, draw_timeline
 from .viewer import pose_html
 from .words import degrees, intervals, listed, plain, versions, whole
 
 TEMPLATE = "report/templates/track.html.j2"
 FRAMES_A_SECOND = 20.0  # of the 3D view
 MOST_FRAMES = 5000  # of the 3D view
-LARGEST_VIEW = 3_000_000  # of a view that comes ready, in characters
+LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 
 
-def track_report(
+def render_track_report(
     tracked: TrackedRecording,
     *,
     view: str | None = None,
     totals: Totals | None = None,
     failures: list[str] | None = None,
 ) -> str:
-    """``report.html``: one page that opens offline and prints; equal arguments give equal text.
+    """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic.
 
     Its size does not grow with the recording's length.
 
     Parameters
     ----------
     tracked : of `track`
-    view : the page of `pose_html` where it exists, shown here unless it is large; None: it is made here
-    totals : of a `tracked` that `Decimator` made
-    failures : takes a line for each section that cannot be made; the page has the line in its place
+    view : the page of `pose_html`, embedded up to `LARGEST_VIEW`; None: a view is made here
+    totals : of all samples, if `tracked` was decimated by `Decimator`; None: those of `tracked`
+    failures : gets a line for each section that cannot be made; the page has the line in place of the section
     """
     recording = tracked.recording
     totals = totals or compute_totals(tracked)
     signals = totals.signals
-    budgets = heading_budgets(tracked)
+    budgets = compute_heading_uncertainties(tracked)
     sides = {side: measure_elbow(tracked.pose, side, tracked.subject) for side in ("left", "right")}
     elbows = {side: elbow for side, elbow in sides.items() if elbow is not None}
     hands = {
@@ -72,34 +72,36 @@ def track_report(
     page = Page(TEMPLATE, f"Motion of {recording.name or 'a recording'}", failures)
     page.add(
         "first",
-        lambda: _diagnostics_section(diagnose_pose(tracked, measures, totals.diagnostics)),
-        name="What to look at",
+        lambda: _build_diagnostics_section(diagnose_pose(tracked, measures, totals.diagnostics)),
+        name="Diagnostics",
     )
-    page.add("short", lambda: _summary_section(tracked, totals, budgets), name="In short")
-    page.add("recorded", lambda: _recorded_section(recording, totals), "What was recorded")
-    page.add("noise", lambda: _noise_section(signals), "Noise and bias")
-    page.add("drift", lambda: _drift_section(tracked, budgets), "Drift of the headings")
-    page.add("hands", lambda: _hands_section(tracked, hands), "The hands")
-    page.add("angles", lambda: joint_angles_section(tracked), "Joint angles")
-    page.add("view", lambda: _view_section(tracked, view), "The motion in 3D")
-    page.add("run", lambda: _run_section(tracked), "What was run")
+    page.add("short", lambda: _build_summary_section(tracked, totals, budgets), name="In short")
+    page.add("recorded", lambda: _build_recorded_section(recording, totals), "What was recorded")
+    page.add("noise", lambda: _build_noise_section(signals), "Noise and bias")
+    page.add("drift", lambda: _build_drift_section(tracked, budgets), "Drift of the headings")
+    page.add("hands", lambda: _build_hands_section(tracked, hands), "The hands")
+    page.add("angles", lambda: build_joint_angles_section(tracked), "Joint angles")
+    page.add("view", lambda: _build_view_section(tracked, view), "The motion in 3D")
+    page.add("run", lambda: _build_run_section(tracked), "What was run")
     return page.html(f"Motion of {recording.name}" if recording.name else "Motion")
 
 
 # The sections: the values that the macros of the template take --------------------------------------------------------
 
 
-def _diagnostics_section(diagnostics: Sequence[Diagnostic]) -> dict[str, Any]:
-    grave = any(diagnostic.severity != INFO for diagnostic in diagnostics)
-    kind = "poor" if grave else "note" if diagnostics else "pass"
-    return {"kind": kind, "entries": lines(diagnostics, titled=True)}
+def _build_diagnostics_section(diagnostics: Sequence[Diagnostic]) -> dict[str, Any]:
+    has_warning = any(diagnostic.severity != INFO for diagnostic in diagnostics)
+    return {"has_warning": has_warning, "entries": lines(diagnostics, titled=True)}
 
 
-def _summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping[str, Budget]) -> dict[str, Any]:
+def _build_summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = tracked.recording
-    since = mask_from_start(tracked)
-    headings = {joint: float(np.degrees(finite_max(std[since]))) for joint, std in joint_heading_stds(budgets).items()}
-    stds = {name: axis_std(cov[since]) for name, cov in tracked.pose.point_cov.items()}
+    after_start = find_samples_after_start(tracked)
+    headings = {
+        joint: float(np.degrees(finite_max(std[after_start])))
+        for joint, std in compute_joint_heading_stds(budgets).items()
+    }
+    stds = {name: axis_std(cov[after_start]) for name, cov in tracked.pose.point_cov.items()}
     return {
         "duration": _format_duration(float(recording.time[-1] - recording.time[0])),
         "rate_hz": totals.rate_hz,
@@ -107,12 +109,12 @@ def _summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping
         "worst": max(headings.items(), key=lambda item: item[1]) if headings else None,
         "hands": {name: 1e3 * finite_median(stds[name]) for name in ("left_palm", "right_palm") if name in stds},
         "lengths": plain(tracked.subject.note or tracked.subject.name),
-        "shown": len(recording),
+        "shown_samples": len(recording),
         "samples": totals.samples,
     }
 
 
-def _recorded_section(recording: Recording, totals: Totals) -> dict[str, Any]:
+def _build_recorded_section(recording: Recording, totals: Totals) -> dict[str, Any]:
     rows = [
         [
             plain(name),
@@ -129,10 +131,10 @@ def _recorded_section(recording: Recording, totals: Totals) -> dict[str, Any]:
         "sensor",
         "fastest rotation",
         "largest acceleration",
-        "cut off",
+        "saturated",
         "lost",
         "static",
-        "longest without static phase",
+        "longest motion without static phase",
     ]
     low, high = (f"{step:.2f}" for step in totals.steps_ms)
     return {
@@ -142,12 +144,12 @@ def _recorded_section(recording: Recording, totals: Totals) -> dict[str, Any]:
         "end": recording.time[-1],
         "step": low if low == high else f"{low} to {high}",
         "phases": [f"{name} {intervals(spans)}" for name, spans in recording.phases.items()],
-        "picture": timeline_picture(recording.time, totals.signals, recording.phases),
+        "picture": draw_timeline(recording.time, totals.signals, recording.phases),
         "sensors": Table(header, rows),
     }
 
 
-def _noise_section(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
+def _build_noise_section(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
     rows = []
     for name, signal in signals.items():
         if signal.bias is not None:
@@ -156,24 +158,24 @@ def _noise_section(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
     if not rows:
         return None
     header = ["sensor", "bias in the static phase, x / y / z [°/s]", "bias at the end [°/s]", "gravity"]
-    return {"percent": 100 * GRAVITY_OFF, "picture": noise_picture(signals), "sensors": Table(header, rows)}
+    return {"percent": 100 * GRAVITY_OFF, "picture": draw_noise(signals), "sensors": Table(header, rows)}
 
 
-def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, Any]:
+def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = tracked.recording
     if not budgets:
-        return {"method": tracked.options.method if recording.imus else None, "known": False}
-    since = mask_from_start(tracked)
-    stds = {name: np.nan_to_num(np.where(since, budget.std, 0.0)) for name, budget in budgets.items()}
+        return {"method": tracked.options.method if recording.imus else None, "has_covariance": False}
+    after_start = find_samples_after_start(tracked)
+    stds = {name: np.nan_to_num(np.where(after_start, budget.std, 0.0)) for name, budget in budgets.items()}
     worst = max(stds, key=lambda name: float(stds[name].max()))
-    at = int(np.argmax(stds[worst]))
+    worst_sample = int(np.argmax(stds[worst]))
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     fastest = max(growth, key=growth.__getitem__) if growth else None
-    clasped = tracked.correction is not None and tracked.correction.clasp_mm is not None
+    has_clasp = tracked.correction is not None and tracked.correction.clasp_mm is not None
     segments = [
         [
             plain(name),
-            degrees(float(np.degrees(finite_max(budget.std[since])))),
+            degrees(float(np.degrees(finite_max(budget.std[after_start])))),
             degrees(float(np.degrees(budget.std[-1]))),
             degrees(float(np.degrees(budget.filter_end))),
             f"{np.degrees(budget.growth):.2f} °/min" if np.isfinite(budget.growth) else "never in motion",
@@ -183,63 +185,71 @@ def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> 
     joints = [
         [
             joint,
-            degrees(float(np.degrees(finite_median(std[since])))),
-            degrees(float(np.degrees(finite_max(std[since])))),
+            degrees(float(np.degrees(finite_median(std[after_start])))),
+            degrees(float(np.degrees(finite_max(std[after_start])))),
         ]
-        for joint, std in joint_heading_stds(budgets).items()
+        for joint, std in compute_joint_heading_stds(budgets).items()
     ]
-    header = ["segment, ±", "largest", "at the end", "at the end, filter alone", "filter's growth, a minute of motion"]
+    header = [
+        "segment, ±",
+        "largest",
+        "at the end",
+        "at the end, filter alone",
+        "growth per minute of motion, filter alone",
+    ]
     return {
         "method": tracked.options.method,
-        "known": True,
+        "has_covariance": True,
         "worst": (
             worst,
-            float(np.degrees(stds[worst][at])),
-            _format_duration(float(tracked.time[at] - tracked.time[0])),
+            float(np.degrees(stds[worst][worst_sample])),
+            _format_duration(float(tracked.time[worst_sample] - tracked.time[0])),
         ),
         "fastest": (fastest, float(np.degrees(growth[fastest]))) if fastest else None,
-        "advice": heading_remedy(tracked),
+        "remedy": describe_heading_remedy(tracked),
         "corrected": max(tracked.correction.largest_deg.values(), default=0.0)
         if tracked.correction is not None
         else None,
-        "clasped": clasped,
-        "without": [plain(name) for name in recording.sensors if name not in budgets],
-        "before": _format_time_before(tracked),
-        "stated": stated_mounts(tracked),
-        "picture": headings_picture(
+        "has_clasp": has_clasp,
+        "segments_without_covariance": [plain(name) for name in recording.sensors if name not in budgets],
+        "time_before_start": _format_time_before(tracked),
+        "has_stated_mounts": has_stated_mounts(tracked),
+        "picture": draw_headings(
             recording.time,
             {name: np.degrees(budget.std) for name, budget in budgets.items()},
-            recording.phases.get("clasp", ()) if clasped else (),
+            recording.phases.get("clasp", ()) if has_clasp else (),
         ),
         "segments": Table(header, segments),
-        "joints": Table(["joint, ±", "half of the time under", "largest"], joints) if joints else None,
+        "joints": Table(["joint, ±", "median", "largest"], joints) if joints else None,
     }
 
 
-def _hands_section(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, Any] | None:
+def _build_hands_section(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, Any] | None:
     if not hands:
         return None
-    since = mask_from_start(tracked)
+    after_start = find_samples_after_start(tracked)
     rows = []
     for name, hand in hands.items():
         low, high = np.nanpercentile(100 * hand.reach, [1.0, 99.0], axis=0)
-        half, most = ("not known", "not known")
+        usual, largest = ("not known", "not known")
         if hand.std is not None:
-            half, most = (f"± {whole(1e3 * of(hand.std[since]))} mm" for of in (finite_median, finite_max))
+            usual, largest = (
+                f"± {whole(1e3 * statistic(hand.std[after_start]))} mm" for statistic in (finite_median, finite_max)
+            )
         ranges = [f"{whole(a)} to {whole(b)}" for a, b in zip(low, high, strict=True)]
-        rows.append([plain(name), *ranges, f"{hand.peak_speed:.1f} m/s", half, most])
-    header = ["", "forwards [cm]", "to the left [cm]", "above shoulders [cm]", "fastest", "usual ±", "largest ±"]
+        rows.append([plain(name), *ranges, f"{hand.peak_speed:.1f} m/s", usual, largest])
+    header = ["", "forwards [cm]", "to the left [cm]", "above shoulders [cm]", "highest speed", "median ±", "largest ±"]
     lengths = tracked.subject.lengths
     return {
-        "rigid": [plain(name) for name in hands if name not in tracked.quat_WL],
-        "paths": paths_picture(hands, lengths["shoulder_width"], lengths["trunk"]),
-        "reach": reach_picture(tracked.time, hands),
+        "rigid_hands": [plain(name) for name in hands if name not in tracked.quat_WL],
+        "paths": draw_paths(hands, lengths["shoulder_width"], lengths["trunk"]),
+        "reach": draw_reach(tracked.time, hands),
         "ranges": Table(header, rows),
-        "before": _format_time_before(tracked),
+        "time_before_start": _format_time_before(tracked),
     }
 
 
-def _view_section(tracked: TrackedRecording, view: str | None) -> dict[str, Any]:
+def _build_view_section(tracked: TrackedRecording, view: str | None) -> dict[str, Any]:
     if view is not None and len(view) <= LARGEST_VIEW:
         return {"page": view, "fps": None}
     fps = min(FRAMES_A_SECOND, MOST_FRAMES / max(float(tracked.time[-1] - tracked.time[0]), 1e-3))
@@ -249,7 +259,7 @@ def _view_section(tracked: TrackedRecording, view: str | None) -> dict[str, Any]
     return {"page": page, "fps": fps if fps < FRAMES_A_SECOND else None}
 
 
-def _run_section(tracked: TrackedRecording) -> dict[str, Any]:
+def _build_run_section(tracked: TrackedRecording) -> dict[str, Any]:
     recording, subject = tracked.recording, tracked.subject
     lengths = ", ".join(f"{plain(name)} {1e3 * value:.0f} mm" for name, value in subject.lengths.items())
     rows = [
@@ -259,14 +269,14 @@ def _run_section(tracked: TrackedRecording) -> dict[str, Any]:
         ("static phase", intervals([tracked.segments.static_phase])),
         ("person", f"{subject.name}; {subject.note}" if subject.note else subject.name),
         ("lengths", lengths),
-        ("mounts", "as the session states them" if stated_mounts(tracked) else "as calibrated"),
+        ("mounts", "as the session states them" if has_stated_mounts(tracked) else "as calibrated"),
         ("body model", tracked.model.robot.name),
     ]
     if tracked.q is not None:
         rows += [
             (
                 f"{plain(name)}, orientation residual",
-                f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° (the model's joints are too few or end too soon)",
+                f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° (the joints have too few axes, or reach their limits)",
             )
             for name, angle in orientation_residuals(tracked.model, tracked.q, tracked.quat_WL).items()
         ]
@@ -284,13 +294,13 @@ def _format_duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.1f} min"
 
 
-def _format_seconds(which: np.ndarray, rate_hz: float) -> str:
-    return f"{np.count_nonzero(which) / rate_hz:.2f} s" if which.any() else "no"
+def _format_seconds(mask: np.ndarray, rate_hz: float) -> str:
+    return f"{np.count_nonzero(mask) / rate_hz:.2f} s" if mask.any() else "0 s"
 
 
 def _format_lost(sensor: Sensor, signal: Signal, rate_hz: float) -> str:
-    """Where long gaps were not allowed there are none."""
-    return _format_seconds(signal.gap, rate_hz) if sensor.gap is not None else "no"
+    """Return the time of long gaps; 0 s where they were not allowed."""
+    return _format_seconds(signal.gap, rate_hz) if sensor.gap is not None else "0 s"
 
 
 def _format_axes(values: np.ndarray) -> str:
@@ -298,6 +308,6 @@ def _format_axes(values: np.ndarray) -> str:
 
 
 def _format_time_before(tracked: TrackedRecording) -> str | None:
-    """The time before the end of the start pose, over which uncertainties are not summed up; None where it is short."""
-    seconds = float(tracked.time[np.argmax(mask_from_start(tracked))] - tracked.time[0])
+    """Return the time before the end of the start pose, which the summaries leave out; None where it is below 1 s."""
+    seconds = float(tracked.time[np.argmax(find_samples_after_start(tracked))] - tracked.time[0])
     return _format_duration(seconds) if seconds >= 1.0 else None

@@ -17,10 +17,10 @@ from .measures import (
     Hand,
     Measures,
     Signal,
+    compute_joint_heading_stds,
+    find_samples_after_start,
     finite_max,
-    joint_heading_stds,
     longest_run_s,
-    mask_from_start,
 )
 
 GRAVITY_OFF = 0.02
@@ -120,15 +120,17 @@ def _diagnose_method(
 
 def _find_uncertain_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, float]:
     """Joint → uncertainty [rad] of the heading between its segments, of those beyond the limit."""
-    since = mask_from_start(tracked)
+    since = find_samples_after_start(tracked)
     return {
-        joint: most for joint, std in joint_heading_stds(budgets).items() if (most := finite_max(std[since])) > HEADING
+        joint: most
+        for joint, std in compute_joint_heading_stds(budgets).items()
+        if (most := finite_max(std[since])) > HEADING
     }
 
 
 def _find_uncertain_hands(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, float]:
     """Point → uncertainty [m], of those beyond the limit."""
-    since = mask_from_start(tracked)
+    since = find_samples_after_start(tracked)
     stds = {name: finite_max(hand.std[since]) for name, hand in hands.items() if hand.std is not None}
     return {name: most for name, most in stds.items() if most > PLACE}
 
@@ -137,7 +139,7 @@ def _diagnose_time_before_start(
     tracked: TrackedRecording, budgets: Mapping[str, Budget], hands: Mapping[str, Hand]
 ) -> Iterator[Diagnostic]:
     """Headings and hands that are less certain before the start pose than after it, longer than filters converge."""
-    since, before = mask_from_start(tracked), tracked.time < tracked.segments.start[0]
+    since, before = find_samples_after_start(tracked), tracked.time < tracked.segments.start[0]
     rate_hz = tracked.recording.rate_hz
     facts = {"before": float(tracked.segments.start[0] - tracked.time[0])}
 
@@ -145,7 +147,7 @@ def _diagnose_time_before_start(
         wide = [std[before & (std > max(limit, finite_max(std[since])))] for std in stds]
         return max((finite_max(std) for std in wide if len(std) / rate_hz > LASTING_S), default=0.0)
 
-    heading = widest(list(joint_heading_stds(budgets).values()), HEADING)
+    heading = widest(list(compute_joint_heading_stds(budgets).values()), HEADING)
     if heading:
         yield Diagnostic("heading-uncertain-before-start", INFO, "", heading, HEADING, facts)
     hand = widest([hand.std for hand in hands.values() if hand.std is not None], PLACE)
@@ -160,7 +162,7 @@ def _remedy_variant(tracked: TrackedRecording) -> dict[str, str]:
     return {} if tracked.recording and tracked.recording.phases.get("clasp") else {"variant": "no-clasp"}
 
 
-def heading_remedy(tracked: TrackedRecording) -> str:
+def describe_heading_remedy(tracked: TrackedRecording) -> str:
     """The advice on drifting headings."""
     return render(Diagnostic("heading-uncertain", INFO, facts=_remedy_variant(tracked))).do
 

@@ -16,7 +16,7 @@ PATH_POINTS = 3000
 Spans = Sequence[tuple[float, float]]
 
 
-def timeline_picture(time: np.ndarray, signals: Mapping[str, Signal], phases: Mapping[str, Spans]) -> Picture:
+def draw_timeline(time: np.ndarray, signals: Mapping[str, Signal], phases: Mapping[str, Spans]) -> Picture:
     """Each sensor over time: how fast it rotated, where it was static, lost, or cut off by its range."""
     ends = _ends(time)
     most = 1.08 * max(1.0, max(float(np.degrees(signal.rate.max())) for signal in signals.values()))
@@ -50,7 +50,7 @@ def timeline_picture(time: np.ndarray, signals: Mapping[str, Signal], phases: Ma
     return Picture("timeline", caption, Chart([[row] for row in rows], heights, legend))
 
 
-def noise_picture(signals: Mapping[str, Signal]) -> Picture:
+def draw_noise(signals: Mapping[str, Signal]) -> Picture:
     """Noise and bias of each sensor that has them."""
     rows = {plain(name): signal for name, signal in signals.items() if signal.bias is not None}
     panels: list[Panel] = []
@@ -80,7 +80,7 @@ def noise_picture(signals: Mapping[str, Signal]) -> Picture:
     return Picture("noise", caption, Chart([panels], [26.0 * len(rows) + 6.0], keys))
 
 
-def headings_picture(time: np.ndarray, std_deg: Mapping[str, np.ndarray], clasps: Spans) -> Picture:
+def draw_headings(time: np.ndarray, std_deg: Mapping[str, np.ndarray], clasps: Spans) -> Picture:
     """What each segment's heading may be off by, over time; `clasps`: spans of joined hands [s]."""
     most = 1.06 * max(0.1, *(finite_max(values) for values in std_deg.values()))
     panel = Panel("heading, ± [°]", TIME, x=_ends(time), y=(0.0, most))
@@ -93,7 +93,7 @@ def headings_picture(time: np.ndarray, std_deg: Mapping[str, np.ndarray], clasps
     return Picture("headings", caption, Chart([[panel]], [230.0], keys))
 
 
-def paths_picture(hands: Mapping[str, Hand], shoulder_width: float, trunk: float) -> Picture:
+def draw_paths(hands: Mapping[str, Hand], shoulder_width: float, trunk: float) -> Picture:
     """Where the hands went, seen from the torso: from the front, from the right, from above."""
     panels = []
     for panel, across, up in body_views(50.0 * shoulder_width, 100.0 * trunk):
@@ -134,17 +134,17 @@ def body_views(half: float, trunk: float) -> list[tuple[Panel, int, int]]:
     return views
 
 
-def reach_picture(time: np.ndarray, hands: Mapping[str, Hand]) -> Picture:
+def draw_reach(time: np.ndarray, hands: Mapping[str, Hand]) -> Picture:
     """The hands over time, along the torso's axes."""
     panels = {
         label: {name: 100.0 * hand.reach[:, k] for name, hand in hands.items()}
         for k, label in enumerate(("forwards [cm]", "to the left [cm]", "above the shoulders [cm]"))
     }
     caption = "The hands over time, from the middle of the shoulders along the torso's axes."
-    return over_time_picture(time, panels, "reach", caption)
+    return draw_over_time(time, panels, "reach", caption)
 
 
-def over_time_picture(
+def draw_over_time(
     time: np.ndarray, panels: Mapping[str, Mapping[str, np.ndarray]], stem: str, caption: str
 ) -> Picture:
     """A panel for each title, with its lines by name: left in full, right dashed; NaN breaks a line."""

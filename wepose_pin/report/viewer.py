@@ -117,7 +117,7 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
         placed | {f"robot {joint}": at for joint, at in moved.items()},
         meshes=[Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in drawn],
         trails=trails,
-        phases={"approach": [(0.0, float(trajectory.time[trajectory.approach]))]},
+        phases={"approach": [(0.0, float(trajectory.time[trajectory.approach_samples]))]},
         title=title,
         fps=fps,
     )

@@ -5,7 +5,7 @@ coordinates in T to B. `u` holds the values of the independent joints, `q` is Pi
 """
 
 from .checks import LimitCheck, SelfCollisions, check_limits, find_self_collisions
-from .controller import Tasks
+from .controller import ControllerParams
 from .files import build_table, summarize, write_episode, write_trajectory
 from .maps import ROBOTS, RobotMap, find_map, read_map
 from .robot import Robot, load_robot
@@ -15,11 +15,11 @@ from .trajectory import Trajectory, retarget
 __all__ = [
     "ROBOTS",
     "ArmTargets",
+    "ControllerParams",
     "LimitCheck",
     "Robot",
     "RobotMap",
     "SelfCollisions",
-    "Tasks",
     "Trajectory",
     "build_table",
     "check_limits",

@@ -1,11 +1,11 @@
 """One control step: current hand poses, their targets, the next joint velocities by one quadratic programme.
 
-The tasks are those of differential inverse kinematics (hand, elbow swivel, posture, damping), written for the joint
-velocity w half a step after the coming sample, if the acceleration a' at that sample stays: w = v + dt (½ a + a').
+The tasks are those of differential inverse kinematics (hand, elbow swivel, posture, damping). Their unknown is w, the
+joint velocity half a step after the next sample if the acceleration a' of that sample stays: w = v + dt (½ a + a').
 Over a step the jerk is constant, and a' = (w - v) / dt - ½ a is the law that reaches a given velocity in two steps
 without oscillating about it. Every limit on a' is a simple bound (`limits.compute_acceleration_bounds`). Each near pair
-of shapes adds a linear constraint. The sums are those of Pink (a test compares them), whose limits on acceleration and
-position together make its programme infeasible sooner or later.
+of shapes adds a linear constraint. The sums are those of Pink (a test compares them); its simultaneous limits of
+acceleration and position become infeasible sooner or later.
 """
 
 from __future__ import annotations
@@ -24,29 +24,34 @@ from .objective import add_arm_tasks
 from .robot import Arm, Robot
 from .targets import HandPath
 
-HAND_JOINTS = 6  # joints that the hand's pose needs: with no more, a swivel task would pull the hand away
-HALT_GAIN = 30.0  # [1/s] at which the last of a velocity fades
-_MIN_LEVER = 1e-3  # [m/rad] below which a joint has no part in a distance
-_SOFT = 8  # daqp's flag for a soft constraint
+HAND_POSE_DOF = 6  # an arm with no more joints has no redundancy for a swivel task
+HALT_VELOCITY_GAIN = 30.0  # [1/s] at which the remaining velocity decays while halting
+NEAR_CLEARANCE_M = 0.01  # [m] to the clearance: pairs nearer than that are counted
+_MIN_DISTANCE_JACOBIAN = 1e-3  # [m/rad] below it a joint does not change a distance
+_DAQP_SOFT = 8  # daqp's flag for a soft constraint
+_DAQP_INFINITY = 1e30  # a bound that daqp ignores
 _NO_JACOBIAN = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
-class Tasks:
-    """Weights of the tasks against 1 m/s of the hand, and gains at which errors are corrected."""
+class ControllerParams:
+    """Weights of the squared errors of the tasks, gains, and damping.
+
+    A weight w counts an error e as √w e, against a hand's velocity error of 1 m/s with the weight 1.
+    """
 
     position: NonNegative = 1.0  # velocity of a hand [m/s]
     orientation: NonNegative = 0.02  # its angular velocity [rad/s]: 1 rad/s counts as 0.14 m/s
     swivel: NonNegative = 0.05  # velocity of the elbow about the line shoulder-hand [m/s]
     posture: NonNegative = 2e-4  # joint velocity [rad/s] towards the rest posture
     joint_velocity: NonNegative = 5e-4  # joint velocity [rad/s]
-    joint_acceleration: NonNegative = 2e-3  # change of a joint's velocity step [rad/s] from the last
-    gain: NonNegative = 12.0  # [1/s] of hand and elbow
+    joint_velocity_change: NonNegative = 2e-3  # change of a joint's velocity step [rad/s] from the last
+    task_gain: NonNegative = 12.0  # [1/s] at which errors of hand and elbow are corrected
     posture_gain: NonNegative = 0.5  # [1/s]
-    deceleration: NonNegative = 8.0  # [m/s², rad/s²] that a correction may need to stop within its error
-    singular_below: NonNegative = 0.06  # [m] of the hand per rad/s: below it the arm is near singular and damped
-    damping: NonNegative = 0.05  # largest, at the singularity
-    curvature: NonNegative = 1.0  # damping by the error, for the curvature of the hand's path; 0: none
+    max_correction_deceleration: NonNegative = 8.0  # [m/s², rad/s²] by which a correction stops at zero error
+    singular_value_limit: NonNegative = 0.06  # [m] of the hand per rad: below it the arm is near singular and damped
+    max_damping: NonNegative = 0.05  # at the singularity
+    curvature_damping: NonNegative = 1.0  # in proportion to the error, for the curvature of the hand's path; 0: none
 
 
 class HandTarget(NamedTuple):
@@ -72,30 +77,37 @@ class ActiveConstraints(NamedTuple):
     """Constraints that were active in a step, or in many."""
 
     joints: np.ndarray  # (…, n) bool: a joint at a bound of its own
-    shapes: np.ndarray  # (…, arms) bool: an arm that must not approach another shape
+    arms_near_contact: np.ndarray  # (…, arms) bool: an arm that must not approach another shape
 
 
 @dataclass
 class StepCounts:
-    """Number of steps, and of those with a property."""
+    """Number of steps: all, and those to which a condition applies."""
 
     steps: int = 0
     singular: int = 0  # arms near a singularity
-    near: int = 0  # shapes near their clearance
-    infeasible: int = 0  # the programme had no solution: only the joints' limits were kept
+    near_clearance: int = 0  # a pair of shapes near its clearance
+    infeasible: int = 0  # programmes without a solution: joint limits kept, clearances only as far as possible
 
 
 @dataclass
 class JointState:
-    """Values [rad or m], velocities and accelerations of the joints, (n,) each."""
+    """Positions [rad or m], velocities and accelerations of the independent joints, (n,) each, as in `Robot.names`."""
 
-    u: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
 
     @classmethod
-    def at_rest(cls, u: np.ndarray) -> JointState:
-        return cls(u.copy(), np.zeros(len(u)), np.zeros(len(u)))
+    def at_rest(cls, position: np.ndarray) -> JointState:
+        return cls(position.copy(), np.zeros(len(position)), np.zeros(len(position)))
+
+
+class PostureReference(NamedTuple):
+    """Posture that joints tend to which the hands leave free."""
+
+    position: np.ndarray  # (n,) [rad or m]
+    velocity: np.ndarray | float  # (n,) [rad/s or m/s]; 0.0: at rest
 
 
 @dataclass
@@ -104,21 +116,24 @@ class QpController:
 
     Parameters
     ----------
+    robot, collision : the robot and its pairs of shapes
     dt : [s] of a step
+    params : weights, gains, damping
     limit_factor : widens the limits of velocity, acceleration and jerk
-    posture : posture (n,) and its velocity (n,) in place of the rest posture
+    counts : of the steps so far
+    posture_reference : replaces the rest posture
     min_distance : [m] between hulls in the last step; inf where none were near
-    clearance_share : smallest share of its clearance that a pair had in the last step
+    min_clearance_ratio : smallest ratio of a pair's distance to its clearance in the last step
     active : constraints of the last step
     """
 
     robot: Robot
     collision: CollisionModel
     dt: float
-    tasks: Tasks = field(default_factory=Tasks)
+    params: ControllerParams = field(default_factory=ControllerParams)
     limit_factor: float = 1.0
     counts: StepCounts = field(default_factory=StepCounts)
-    posture: tuple[np.ndarray, np.ndarray] | None = None
+    posture_reference: PostureReference | None = None
     min_distance: float = np.inf
     clearance_share: float = np.inf
     active: ActiveConstraints = field(init=False)
@@ -129,110 +144,130 @@ class QpController:
         except ImportError:
             raise WeposeError("retargeting needs daqp: pip install 'wepose-pin[retarget]'") from None
         self._solve = daqp.solve
-        robot, t = self.robot, self.tasks
+        robot, p = self.robot, self.params
         self.data: Any = robot.model.createData()
         n = len(robot.names)
-        self._low, self._high = np.empty(n), np.empty(n)
+        self._min_accel, self._max_accel = np.empty(n), np.empty(n)
         v_max, a_max, j_max = (self.limit_factor * limit for limit in (robot.v_max, robot.a_max, robot.j_max))
         a_max = reduce_acceleration_limits(a_max, v_max, j_max, robot.upper - robot.lower, self.dt)
         self._limits = (v_max, a_max, j_max)
         self._uncoupled = _is_uncoupled(robot)
-        self._parameters = np.array(
-            [t.position, t.orientation, t.swivel, t.gain, t.deceleration, t.singular_below, t.damping, t.curvature]
-        )
+        self._kernel_params = np.array(
+            [
+                p.position, p.orientation, p.swivel, p.task_gain, p.max_correction_deceleration, p.singular_value_limit,
+                p.max_damping, p.curvature_damping,
+            ]
+        )  # fmt: skip
         self.active = ActiveConstraints(np.zeros(n, dtype=bool), np.zeros(len(robot.arms), dtype=bool))
         self._arms = [_ArmTasks(robot, arm, self.data) for arm in robot.arms]
 
-    def set_joints(self, u: np.ndarray) -> None:
-        """Move the model to `u`, from which `arm_pose` follows."""
-        pin.computeJointJacobians(self.robot.model, self.data, self.robot.configuration(u))
+    def update_kinematics(self, position: np.ndarray) -> None:
+        """Set the joint positions (n,), and compute Jacobians and the poses that `get_arm_pose` returns."""
+        pin.computeJointJacobians(self.robot.model, self.data, self.robot.configuration(position))
         for arm in self._arms:
-            arm.update()
+            arm.update_pose()
 
-    def arm_pose(self, arm: int) -> ArmPose:
-        """Pose of an arm; copies."""
+    def get_arm_pose(self, arm: int) -> ArmPose:
+        """Return a copy of an arm's pose at the positions of `update_kinematics`."""
         tasks = self._arms[arm]
         return ArmPose(tasks.hand.copy(), tasks.rotation.copy(), tasks.elbow.copy())
 
     def step(self, state: JointState, targets: tuple[HandTarget, ...]) -> JointState:
-        """The state one step later."""
-        robot, tasks, dt, n = self.robot, self.tasks, self.dt, len(self.robot.names)
+        """Solve one step towards `targets` and return the next state; update `counts`, `min_distance` and `active`."""
+        robot, params, dt, n = self.robot, self.params, self.dt, len(self.robot.names)
         self.counts.steps += 1
-        self.set_joints(state.u)
+        self.update_kinematics(state.position)
         H, f = np.zeros((n, n)), np.zeros(n)
         for arm, target in zip(self._arms, targets, strict=True):
-            self.counts.singular += arm.add(H, f, target, self._parameters, dt, state.v)
-        decided = state.v + 0.5 * dt * state.a
-        H[np.diag_indices(n)] += tasks.posture + tasks.joint_velocity + tasks.joint_acceleration
-        posture, posture_velocity = (robot.rest, 0.0) if self.posture is None else self.posture
-        f += tasks.posture * (tasks.posture_gain * (posture - state.u) + posture_velocity)
-        f += tasks.joint_acceleration * (decided + dt * state.a)
+            self.counts.singular += arm.add_to_objective(H, f, target, self._kernel_params, dt, state.velocity)
+        velocity_mid = (
+            state.velocity + 0.5 * dt * state.acceleration
+        )  # half a step on; the accelerations so far determine it
+        H[np.diag_indices(n)] += params.posture + params.joint_velocity + params.joint_velocity_change
+        reference = self.posture_reference or PostureReference(robot.rest, 0.0)
+        f += params.posture * (params.posture_gain * (reference.position - state.position) + reference.velocity)
+        f += params.joint_velocity_change * (velocity_mid + dt * state.acceleration)
         self._bound_accelerations(state)
-        low, high = decided + dt * self._low, decided + dt * self._high
+        w_min, w_max = velocity_mid + dt * self._min_accel, velocity_mid + dt * self._max_accel
         rows, bound = self._constrain_distances(state)
-        w = np.clip(self._solve_qp(H, f, rows, bound, low, high), low, high)
-        return integrate(state, np.clip((w - decided) / dt, self._low, self._high), dt)
+        w = np.clip(self._solve_qp(H, f, rows, bound, w_min, w_max), w_min, w_max)
+        return integrate(state, np.clip((w - velocity_mid) / dt, self._min_accel, self._max_accel), dt)
 
-    def halt(self, state: JointState, steps: int) -> JointState:
-        """The state one step later on the way to rest, which is reached exactly when no `steps` are left.
+    def step_to_rest(self, state: JointState, steps_left: int) -> JointState:
+        """Return the state one step later, on the way to rest; after the last of `steps_left` it is exactly at rest.
 
-        For a robot that hardly moves any more: distances between shapes are not constrained.
+        Only for a robot that is almost at rest: distances between shapes are not constrained.
         """
-        dt, decided = self.dt, state.v + 0.5 * self.dt * state.a
-        self.set_joints(state.u)
+        dt, velocity_mid = self.dt, state.velocity + 0.5 * self.dt * state.acceleration
+        self.update_kinematics(state.position)
         self._bound_accelerations(state)
-        w = 0.0 if steps <= 2 else (1.0 - HALT_GAIN * dt) * state.v
-        return integrate(state, np.clip((w - decided) / dt, self._low, self._high), dt)
+        w = 0.0 if steps_left <= 2 else (1.0 - HALT_VELOCITY_GAIN * dt) * state.velocity
+        return integrate(state, np.clip((w - velocity_mid) / dt, self._min_accel, self._max_accel), dt)
 
     def _bound_accelerations(self, state: JointState) -> None:
-        """Fill `_low` and `_high`."""
+        """Fill `_min_accel` and `_max_accel`."""
         lower, upper = self.robot.lower, self.robot.upper
         compute_acceleration_bounds(
-            state.u, state.v, state.a, lower, upper, *self._limits, self.dt, self._low, self._high
+            state.position,
+            state.velocity,
+            state.acceleration,
+            lower,
+            upper,
+            *self._limits,
+            self.dt,
+            self._min_accel,
+            self._max_accel,
         )
 
     def _constrain_distances(self, state: JointState) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (m, n) and bound (m,) of rows @ w ≥ bound: near shapes approach no faster than they can stop."""
+        """Return rows (m, n) and bound (m,) of rows @ w ≥ bound: near shapes approach no faster than they can stop."""
         near = self.collision.find_near_pairs(self.data)
         self.min_distance = float(near.distance.min()) if len(near.distance) else np.inf
-        apart = near.clearance > 0.0  # other hulls overlap in the rest posture; their shapes need not
-        self.clearance_share = float((near.distance[apart] / near.clearance[apart]).min(initial=np.inf))
+        has_clearance = near.clearance > 0.0  # 0 where hulls overlap in the rest posture, as shapes need not
+        ratios = near.distance[has_clearance] / near.clearance[has_clearance]
+        self.min_clearance_ratio = float(ratios.min(initial=np.inf))
         rows = near.jacobian if self._uncoupled else near.jacobian @ self.robot.coupling
         _, a_max, j_max = self._limits
-        self.counts.near += bool((near.distance - near.clearance < 0.01).any())
+        self.counts.near_clearance += bool((near.distance - near.clearance < NEAR_CLEARANCE_M).any())
         bound = compute_separation_bounds(
-            rows, near.distance, near.clearance, state.v, state.a, a_max, j_max, self.dt
+            rows, near.distance, near.clearance, state.velocity, state.acceleration, a_max, j_max, self.dt
         )  # fmt: skip
         return rows, bound
 
     def _solve_qp(
-        self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray, low: np.ndarray, high: np.ndarray
+        self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray, w_min: np.ndarray, w_max: np.ndarray
     ) -> np.ndarray:
-        """w (n,); where nothing solves the programme, with the distances as soft constraints."""
-        n = len(high)
-        upper = np.concatenate([high, np.full(len(rows), 1e30)])
-        lower = np.concatenate([low, bound])
+        """Return w (n,) within `w_min` and `w_max`, with the constraints of the distances.
+
+        Without a solution these become soft constraints: the robot moves on and keeps clearances as far as possible.
+        If the solver fails again, w is as near to zero as `w_min` and `w_max` allow.
+        """
+        n = len(w_max)
+        upper = np.concatenate([w_max, np.full(len(rows), _DAQP_INFINITY)])
+        lower = np.concatenate([w_min, bound])
         sense = np.zeros(len(upper), dtype=np.int32)
         w, _, flag, info = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
         if flag != 1:
-            sense[n:] = _SOFT
+            sense[n:] = _DAQP_SOFT
             w, _, flag, info = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
             self.counts.infeasible += 1
         if flag <= 0 or not np.isfinite(w).all():
             self.active.joints[:] = True
-            return np.clip(0.0, low, high)
+            return np.clip(0.0, w_min, w_max)
         active = info["lam"] != 0.0
         self.active.joints[:] = active[:n]
-        stopping = rows[active[n:]]
+        active_rows = rows[active[n:]]
         for i, arm in enumerate(self.robot.arms):
-            self.active.shapes[i] = len(stopping) > 0 and bool((np.abs(stopping[:, arm.joints]) > _MIN_LEVER).any())
+            part = np.abs(active_rows[:, arm.joints]) > _MIN_DISTANCE_JACOBIAN
+            self.active.arms_near_contact[i] = len(active_rows) > 0 and bool(part.any())
         return np.asarray(w)
 
 
-def integrate(state: JointState, a: np.ndarray, dt: float) -> JointState:
-    """The state one step later, with accelerations `a` there and a constant jerk between."""
-    v = state.v + 0.5 * dt * (state.a + a)
-    return JointState(state.u + dt * (state.v + dt * (state.a / 3.0 + a / 6.0)), v, a)
+def integrate(state: JointState, acceleration: np.ndarray, dt: float) -> JointState:
+    """Return the state one step later, with this acceleration there and a constant jerk between."""
+    velocity = state.velocity + 0.5 * dt * (state.acceleration + acceleration)
+    position = state.position + dt * (state.velocity + dt * (state.acceleration / 3.0 + acceleration / 6.0))
+    return JointState(position, velocity, acceleration)
 
 
 class _ArmTasks:
@@ -245,28 +280,28 @@ class _ArmTasks:
         placement = data.oMi[frame.parentJoint]
         self._R_J, self._p_J = placement.rotation, placement.translation
         self._has_elbow = arm.elbow >= 0
-        self._has_swivel = self._has_elbow and len(arm.joints) > HAND_JOINTS
+        self._has_swivel = self._has_elbow and len(arm.joints) > HAND_POSE_DOF
         if self._has_elbow:
             elbow = robot.model.frames[arm.elbow]
             self._p_JE = elbow.placement.translation.copy()
             placement = data.oMi[elbow.parentJoint]
             self._R_E, self._p_E = placement.rotation, placement.translation
-            self._moves_elbow = _find_ancestors(robot, elbow.parentJoint)
-        self._moves_hand = _find_ancestors(robot, frame.parentJoint)
+            self._moves_elbow = _build_ancestor_mask(robot, elbow.parentJoint)
+        self._moves_hand = _build_ancestor_mask(robot, frame.parentJoint)
         self._uncoupled = _is_uncoupled(robot)
         self.hand, self.rotation, self.elbow = np.zeros(3), np.eye(3), np.full(3, np.nan)
 
-    def update(self) -> None:
+    def update_pose(self) -> None:
         """Take the pose from Pinocchio's data."""
         self.rotation = self._R_J @ self._R_JH
         self.hand = self._R_J @ self._p_JH + self._p_J
         if self._has_elbow:
             self.elbow = self._R_E @ self._p_JE + self._p_E
 
-    def add(
-        self, H: np.ndarray, f: np.ndarray, target: HandTarget, parameters: np.ndarray, dt: float, v: np.ndarray
+    def add_to_objective(
+        self, H: np.ndarray, f: np.ndarray, target: HandTarget, params: np.ndarray, dt: float, v: np.ndarray
     ) -> bool:
-        """Add the arm's tasks to the objective; return whether the arm is near a singularity."""
+        """Add the arm's tasks to H and f; return whether the arm is near a singularity."""
         J_hand = self.data.J * self._moves_hand
         J_elbow = self.data.J * self._moves_elbow if self._has_swivel else _NO_JACOBIAN
         if not self._uncoupled:
@@ -276,14 +311,14 @@ class _ArmTasks:
         return bool(
             add_arm_tasks(
                 H, f, J_hand, J_elbow, self.hand, self.elbow, self.arm.shoulder, rotation_error, target.position,
-                target.velocity, target.angular_velocity, target.swivel, target.weight, v, dt, parameters,
+                target.velocity, target.angular_velocity, target.swivel, target.weight, v, dt, params,
                 self.arm.joints,
             )
         )  # fmt: skip
 
 
 def sample_hand_targets(hands: tuple[HandPath, ...], k: int, dt: float) -> tuple[HandTarget, ...]:
-    """Targets of the step from sample `k`: positions in its middle, velocities half a step after its end."""
+    """Return the targets of the step from sample `k`: positions in its middle, velocities half a step after its end."""
     n = min(k + 1, len(hands[0].weight) - 1)
     after = min(k + 2, len(hands[0].weight) - 1)
     return tuple(
@@ -303,10 +338,10 @@ def _is_uncoupled(robot: Robot) -> bool:
     return np.array_equal(robot.coupling, np.eye(*robot.coupling.shape))
 
 
-def _find_ancestors(robot: Robot, joint: int) -> np.ndarray:
-    """(nv,) 1 where a joint of the model moves `joint`, itself included."""
-    moves = np.zeros(robot.model.nv)
+def _build_ancestor_mask(robot: Robot, joint: int) -> np.ndarray:
+    """Return a mask (nv,): 1 for `joint` and each joint of the model between it and the root."""
+    mask = np.zeros(robot.model.nv)
     while joint > 0:
-        moves[robot.model.idx_vs[joint]] = 1.0
+        mask[robot.model.idx_vs[joint]] = 1.0
         joint = robot.model.parents[joint]
-    return moves
+    return mask

@@ -27,16 +27,16 @@ def attribute_errors(trajectory: Trajectory, arm: int) -> dict[str, float]:
     its position limit; a joint is at a limit of velocity, acceleration or jerk, or was so shortly before; none of
     these: position, orientation and swivel cannot be met together.
     """
-    robot, begin, run = trajectory.robot, trajectory.approach, trajectory.run
+    robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
     joints, target = robot.arms[arm].joints, trajectory.targets[arm]
-    u = run.u[:, joints]
+    u = run.joint_position[:, joints]
     at_limit = (u - robot.lower[joints] < AT_LIMIT) | (robot.upper[joints] - u < AT_LIMIT)
     active, half = run.active.joints[:, joints], round(0.5 * CATCH_UP_S / float(trajectory.time[1]))
     holds = np.stack(
         [
             target.lost,
             np.linalg.norm(target.position - target.unclamped, axis=1) > CLAMPED,
-            run.active.shapes[:, arm],
+            run.active.arms_near_contact[:, arm],
             (active & at_limit).any(axis=1),
             maximum_filter1d(active.any(axis=1), 2 * half + 1, origin=half),
             np.ones(len(u), dtype=bool),
@@ -55,11 +55,16 @@ def assess_reachability(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]
     """
     robot = trajectory.robot
     n, rng = len(robot.names), np.random.default_rng(0)
-    tasks = replace(
-        trajectory.tasks, gain=40.0, deceleration=1e9, joint_acceleration=0.0, posture=1e-5, joint_velocity=1e-4
+    params = replace(
+        trajectory.params,
+        task_gain=40.0,
+        max_correction_deceleration=1e9,
+        joint_velocity_change=0.0,
+        posture=1e-5,
+        joint_velocity=1e-4,
     )
-    controller = QpController(robot, trajectory.collision, 0.01, tasks, limit_factor=1e4)
-    frames = np.linspace(trajectory.approach, len(trajectory.time) - 1, _FRAMES).astype(int)
+    controller = QpController(robot, trajectory.collision, 0.01, params, limit_factor=1e4)
+    frames = np.linspace(trajectory.approach_samples, len(trajectory.time) - 1, _FRAMES).astype(int)
     distance = np.full((len(frames), len(robot.arms)), np.inf)
     for k, frame in enumerate(frames.tolist()):
         targets = tuple(
@@ -67,19 +72,19 @@ def assess_reachability(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]
             for path in trajectory.targets
         )
         best = np.full(len(robot.arms), np.inf)
-        for u in (trajectory.u[frame], robot.rest, *rng.uniform(*robot.bounds, (_STARTS, n))):
+        for u in (trajectory.joint_position[frame], robot.rest, *rng.uniform(*robot.bounds, (_STARTS, n))):
             state = JointState.at_rest(u)
             for _ in range(_STEPS):
                 state = controller.step(state, targets)
-            controller.set_joints(state.u)
+            controller.update_kinematics(state.position)
             near = trajectory.collision.find_near_pairs(controller.data)
             if (near.distance < near.clearance - _PENETRATION).any():
                 continue
             for i, target in enumerate(targets):
-                pose = controller.arm_pose(i)
+                pose = controller.get_arm_pose(i)
                 far = float(np.linalg.norm(pose.hand - target.position))
                 angle = Rotation.from_matrix(pose.rotation.T @ target.rotation).magnitude()
-                cost = tasks.position * far**2 + tasks.orientation * angle**2
+                cost = params.position * far**2 + params.orientation * angle**2
                 if cost < best[i]:
                     best[i], distance[k, i] = cost, far
     return frames, distance

@@ -29,7 +29,11 @@ def build_table(trajectory: Trajectory) -> pl.DataFrame:
     run = trajectory.run
     columns: dict[str, np.ndarray] = {"time": trajectory.time, "recorded_time": trajectory.recorded_time}
     for j, name in enumerate(trajectory.robot.names):
-        columns |= {name: run.u[:, j], f"{name}_velocity": run.v[:, j], f"{name}_acceleration": run.a[:, j]}
+        columns |= {
+            name: run.joint_position[:, j],
+            f"{name}_velocity": run.joint_velocity[:, j],
+            f"{name}_acceleration": run.joint_acceleration[:, j],
+        }
     return pl.DataFrame(columns)
 
 
@@ -49,9 +53,9 @@ def _format_joint_trajectory(trajectory: Trajectory) -> str:
     for k, time in enumerate(trajectory.time.tolist()):
         seconds, nanoseconds = divmod(round(1e9 * time), 10**9)
         point = {
-            "positions": np.round(run.u[k], DIGITS).tolist(),
-            "velocities": np.round(run.v[k], DIGITS).tolist(),
-            "accelerations": np.round(run.a[k], DIGITS).tolist(),
+            "positions": np.round(run.joint_position[k], DIGITS).tolist(),
+            "velocities": np.round(run.joint_velocity[k], DIGITS).tolist(),
+            "accelerations": np.round(run.joint_acceleration[k], DIGITS).tolist(),
             "effort": [],
             "time_from_start": {"sec": seconds, "nanosec": nanoseconds},
         }
@@ -67,7 +71,7 @@ def _format_joint_trajectory(trajectory: Trajectory) -> str:
 def write_episode(folder: Path, trajectory: Trajectory, task: str) -> None:
     """Write a data set of one episode as LeRobot 2.1 reads it: the state, and as action the next state."""
     n, names = len(trajectory.time), list(trajectory.robot.names)
-    state = trajectory.u.astype(np.float32)
+    state = trajectory.joint_position.astype(np.float32)
     action = np.vstack([state[1:], state[-1:]])
     data = pl.DataFrame(
         {
@@ -115,19 +119,19 @@ def write_episode(folder: Path, trajectory: Trajectory, task: str) -> None:
 
 def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:
     """Contents of ``summary.json``."""
-    robot, begin, run = trajectory.robot, trajectory.approach, trajectory.run
+    robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
     frames, reached = assess_reachability(trajectory)
     arms = {
         arm.side: _summarize_arm(trajectory, i, frames - begin, 1e3 * reached[:, i]) for i, arm in enumerate(robot.arms)
     }
     ms, dt = 1e3 * run.solve_s, float(trajectory.time[1] - trajectory.time[0])
     counts, steps = trajectory.counts, max(trajectory.counts.steps, 1)
-    recorded_time, slowest = trajectory.recorded_time, trajectory.slowest
+    recorded_time, limiting = trajectory.recorded_time, trajectory.limiting_joint
     recorded_s = float(recorded_time[-1] - recorded_time[begin])
     shown_s = float(trajectory.time[np.argmax(recorded_time)] - trajectory.time[begin])
     slowdown = shown_s / recorded_s if recorded_s else None
     nearest = float(run.hull_distance.min())
-    jerk = np.abs(np.diff(run.a, axis=0)) / dt
+    jerk = np.abs(np.diff(run.joint_acceleration, axis=0)) / dt
     return {
         "robot": robot.map.name,
         "urdf": robot.map.urdf.name,
@@ -138,7 +142,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "approach_s": round(float(trajectory.time[begin]), 3),
         "recorded_s": round(recorded_s, 3),
         "slowdown": None if slowdown is None else round(slowdown, 3),
-        "slowest": None if slowest is None else slowest._asdict(),
+        "slowest": None if limiting is None else limiting._asdict(),
         "contact_times_s": list(trajectory.contact_times),
         "arms": arms,
         "within_limits": limits.passed,
@@ -161,7 +165,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "steps": {
             "all": counts.steps,
             "singular_share": round(counts.singular / (steps * len(robot.arms)), 4),
-            "near_clearance_share": round(counts.near / steps, 4),
+            "near_clearance_share": round(counts.near_clearance / steps, 4),
             "infeasible_share": round(counts.infeasible / steps, 4),
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
@@ -173,7 +177,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
 
 def _summarize_arm(trajectory: Trajectory, i: int, frames: np.ndarray, reached: np.ndarray) -> dict[str, Any]:
     """One arm's errors; `reached` (m,) [mm] is what unlimited time leaves of the hand's error at samples `frames`."""
-    robot, begin, run = trajectory.robot, trajectory.approach, trajectory.run
+    robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
     arm, target = robot.arms[i], trajectory.targets[i]
     inside = np.linalg.norm(target.position - target.unclamped, axis=1)[begin:] < CLAMPED
     far = 1e3 * np.linalg.norm(run.hand[i] - target.unclamped, axis=1)[begin:]
@@ -213,9 +217,13 @@ def diagnose_trajectory(
     if collisions.samples:
         first = {"first": collisions.first}
         diagnostics.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
-    slowest = trajectory.slowest
-    if slowest is not None and slowdown is not None:
-        moment: dict[str, float | str] = {"joint": slowest.joint, "moment": slowest.time, "quantity": slowest.quantity}
+    limiting = trajectory.limiting_joint
+    if limiting is not None and slowdown is not None:
+        moment: dict[str, float | str] = {
+            "joint": limiting.joint,
+            "moment": limiting.time,
+            "quantity": limiting.quantity,
+        }
         diagnostics.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=moment))
     if trajectory.contact_times:
         moments = ", ".join(map(format_time, trajectory.contact_times[:MAX_MOMENTS]))

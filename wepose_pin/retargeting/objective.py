@@ -6,7 +6,7 @@ import numpy as np
 
 from ..compilation import compiled, inlined
 
-# Places of the parameters of `Tasks` in the array that the kernels get.
+# Places of the parameters of `ControllerParams` in the array that the kernels get.
 POSITION, ORIENTATION, SWIVEL, GAIN, DECELERATION, SINGULAR_BELOW, DAMPING, CURVATURE = range(8)
 _MIN_SWIVEL = 0.01  # [m] below it the elbow has no swivel direction
 _FULL_SWIVEL = 0.05  # [m] above it the swivel task has its full weight

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadData, BadOption
 from ..subject import LENGTHS
 from .collision import CollisionModel
-from .controller import HandTarget, JointState, QpController, StepCounts, Tasks
+from .controller import ControllerParams, HandTarget, JointState, PostureReference, QpController, StepCounts
 from .robot import Arm, Robot
 from .targets import (
     ARM_POINTS,
@@ -323,7 +323,7 @@ class CommandStream:
         self.delay_s = 2.0 / self._omega
         collision = CollisionModel(robot)
         self._controller = QpController(robot, collision, self.dt)
-        braking = Tasks(posture=1.0, joint_velocity=0.0, joint_acceleration=0.0, damping=0.0)
+        braking = ControllerParams(posture=1.0, joint_velocity=0.0, joint_velocity_change=0.0, max_damping=0.0)
         self._brake = QpController(robot, collision, self.dt, braking)
         no_target = HandTarget(np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), 0.0)
         self._no_targets = (no_target,) * len(robot.arms)
@@ -343,7 +343,7 @@ class CommandStream:
 
     @property
     def infeasible(self) -> int:
-        """Steps in which near shapes left the programme no solution: only the joints' limits were kept."""
+        """Steps in which joint limits and clearances could not both be kept: the joint limits were."""
         return self._controller.counts.infeasible + self._brake.counts.infeasible
 
     @property
@@ -394,10 +394,10 @@ class CommandStream:
 
     def _start_references(self) -> list[_Reference]:
         """References at the robot's hands."""
-        self._controller.set_joints(self.state.u)
+        self._controller.update_kinematics(self.state.position)
         references = []
         for i, arm in enumerate(self.robot.arms):
-            pose = self._controller.arm_pose(i)
+            pose = self._controller.get_arm_pose(i)
             max_acceleration = arm.reach * float(np.median(self.robot.a_max[arm.joints]))
             references.append(_Reference(pose.hand, pose.rotation, max_acceleration))
         return references
@@ -418,7 +418,7 @@ class CommandStream:
         self.state = self._controller.step(self.state, limited)
         error = np.empty((len(targets), 2))
         for i, target in enumerate(targets):
-            pose = self._controller.arm_pose(i)
+            pose = self._controller.get_arm_pose(i)
             turn = pin.log3(target.rotation @ pose.rotation.T)
             error[i] = np.linalg.norm(pose.hand - target.position), np.linalg.norm(turn)
         if not all(reference.reached for reference in self._references):
@@ -446,21 +446,21 @@ class CommandStream:
         """A step to rest, within the limits."""
         self._restart_approach(reason)
         state, dt = self.state, self.dt
-        if (np.abs(state.v) > STATIC_SPEED).any() or (np.abs(state.a) > STATIC_SPEED / dt).any():
-            fades = (np.abs(state.v) > STOP_SHARE * self.robot.a_max * dt).any()
-            velocity = max(0.0, 1.0 - dt / BRAKE_S) * state.v if fades else np.zeros_like(state.v)
-            self._brake.posture = (state.u, velocity)
+        if (np.abs(state.velocity) > STATIC_SPEED).any() or (np.abs(state.acceleration) > STATIC_SPEED / dt).any():
+            fades = (np.abs(state.velocity) > STOP_SHARE * self.robot.a_max * dt).any()
+            velocity = max(0.0, 1.0 - dt / BRAKE_S) * state.velocity if fades else np.zeros_like(state.velocity)
+            self._brake.posture_reference = PostureReference(state.position, velocity)
             self.state = self._brake.step(state, self._no_targets)
         else:
-            self.state = JointState.at_rest(state.u)
+            self.state = JointState.at_rest(state.position)
         error = np.full((len(self.robot.arms), 2), np.nan)
-        at_rest = not (self.state.v.any() or self.state.a.any())
+        at_rest = not (self.state.velocity.any() or self.state.acceleration.any())
         return self._command("stopped" if final and at_rest else "hold", reason, error)
 
     def _command(self, state: str, reason: str, error: np.ndarray) -> Command:
         number, self._number = self._number, self._number + 1
         std = np.array([arm.std for arm in self._observed] or [np.nan] * len(self.robot.arms))
-        u, v, a = self.state.u, self.state.v, self.state.a
+        u, v, a = self.state.position, self.state.velocity, self.state.acceleration
         return Command(number, self._time, number * self.dt, state, reason, u, v, a, error, std)
 
 

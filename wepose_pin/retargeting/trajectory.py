@@ -1,8 +1,8 @@
 """From a recorded pose to a trajectory of the robot, slower than the recording where the robot needs it.
 
-The motion is solved twice. The first run has wide limits and shows how fast each joint would have to be where; from
-that follows how much longer each moment takes. The second run has the true limits, on the stretched time, and tracks
-the joint path of the first as its posture.
+The motion is solved twice. The first run, with limits `WIDE_LIMIT_FACTOR` times as wide, gives the velocity,
+acceleration and jerk that each joint needs; from these follows a time scaling. The second run follows the time-scaled
+motion within the true limits, with the joint path of the first run as posture reference.
 """
 
 from __future__ import annotations
@@ -22,7 +22,15 @@ from ..arguments import check_arguments
 from ..errors import NoSolution, WrongOption
 from ..kinematics import Pose
 from .collision import CollisionModel
-from .controller import ActiveConstraints, JointState, QpController, StepCounts, Tasks, sample_hand_targets
+from .controller import (
+    ActiveConstraints,
+    ControllerParams,
+    JointState,
+    PostureReference,
+    QpController,
+    StepCounts,
+    sample_hand_targets,
+)
 from .maps import find_map
 from .robot import Robot, load_robot
 from .targets import (
@@ -37,43 +45,50 @@ from .targets import (
 
 RATE_HZ = 100.0
 MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 2000.0
-WIDE_LIMITS = 8.0  # factor on the limits of the first run
-MAX_SLOWDOWN = 6.0  # of one moment; what is still too fast then lags behind
-VELOCITY_SHARE, ACCELERATION_SHARE, JERK_SHARE = 0.85, 0.6, 0.6  # of the limits; the rest is a reserve to catch up
-SPREAD_S = 0.15  # [s] to each side over which a slow moment slows its surroundings
+WIDE_LIMIT_FACTOR = 8.0  # on the limits of the first run
+MAX_SLOWDOWN = 6.0  # largest time scaling of a sample; the robot lags behind a motion that needs more
+# Fractions of the limits that the time scaling uses. The rest is a reserve to catch up.
+VELOCITY_FRACTION, ACCELERATION_FRACTION, JERK_FRACTION = 0.85, 0.6, 0.6
+SLOWDOWN_SPREAD_S = 0.15  # [s] by which a slowdown extends to both sides
 PATH_SMOOTHING_S = 0.03  # [s] of the first run's joint path
-APPROACH_SPEED, APPROACH_RATE = 0.25, 0.6  # [m/s], [rad/s] of the hands on their way from rest
-APPROACH_MIN_S, SETTLE_S = 2.0, 1.0
-FADE_S = 0.5  # [s] at the end of the motion that take twice as long, to fade to rest
-HALT_S = 0.3  # [s] in which the very last of the motion fades
-MIN_CLEARANCE_SHARE = 0.25  # shapes that come nearer are slowed there
-CONTACT_BEFORE_S, CONTACT_AFTER_S = 0.6, 0.2  # [s] about such a moment that take twice as long, in each run
-CONTACT_RUNS = 3  # runs at most to slow such moments
-STRICT_FACTOR = 1.02  # above this slowdown, `strict` refuses
+APPROACH_SPEED, APPROACH_ANGULAR_SPEED = 0.25, 0.6  # [m/s], [rad/s] largest of the hands on their way from rest
+QUINTIC_PEAK_SPEED = 1.9  # a quintic from rest to rest is 1.875 times as fast in its middle as on average
+APPROACH_MIN_S = 2.0  # [s] of the approach at least
+SETTLE_S = 1.0  # [s] in which the targets rest, after the approach and at the end
+END_S = 0.5  # [s] at the end of the motion that are stretched to twice their duration, to end at rest
+HALT_S = 0.3  # [s] at the very end, in which the remaining velocity decays to zero
+SETTLED = 1e-9  # [rad or m, s] below it a joint's last velocity and acceleration count as zero
+MIN_CLEARANCE_RATIO = 0.25  # of a pair's distance to its clearance; where it is lower, the motion is slowed
+CONTACT_BEFORE_S, CONTACT_AFTER_S = 0.6, 0.2  # [s] about such a sample that take twice as long, in each run
+CONTACT_RUNS = 3  # further runs at most, to slow such samples
+TRACKING_POSTURE_FACTOR, TRACKING_POSTURE_GAIN = 50.0, 8.0  # of the second run: weight, gain [1/s] of its posture
+MAX_STRICT_RATIO = 1.02  # of what a joint needs to its limit; above it `strict` refuses the motion
+PROGRESS_STEPS = 64  # steps between two calls of `progress`
 QUANTITIES = ("velocity", "acceleration", "jerk")
-SELF_CONTACT = "it could not stop before it touches itself"
+STAGES = ("solving with wide limits", "solving with the robot's limits")  # of `progress`; the second may be repeated
+SELF_CONTACT = "the robot could not stop before its links touch"
 
 
-class SlowestMoment(NamedTuple):
-    """The joint that needs the most time, and where."""
+class LimitingJoint(NamedTuple):
+    """The joint that needs the largest slowdown."""
 
     joint: str
     time: float  # [s] of the recording
-    factor: float
+    factor: float  # of what it needs there to its limit
     quantity: str  # of `QUANTITIES`
 
 
-class Run(NamedTuple):
-    """What the controller did, step by step. Over a step the jerk is constant."""
+class ControllerRun(NamedTuple):
+    """States and constraints of the controller at each sample. Over a step the jerk is constant."""
 
-    u: np.ndarray  # (n, joints) [rad or m]
-    v: np.ndarray  # (n, joints)
-    a: np.ndarray  # (n, joints)
+    joint_position: np.ndarray  # (n, joints) [rad or m]
+    joint_velocity: np.ndarray  # (n, joints)
+    joint_acceleration: np.ndarray  # (n, joints)
     hand: np.ndarray  # (arms, n, 3) [m] in B
     rotation: np.ndarray  # (arms, n, 3, 3) of the hand
     swivel: np.ndarray  # (arms, n, 3) [m] elbow swivel direction
     hull_distance: np.ndarray  # (n,) [m] between convex hulls; inf where none were near
-    clearance_share: np.ndarray  # (n,) smallest share of a pair's clearance
+    min_clearance_ratio: np.ndarray  # (n,) smallest ratio of a pair's distance to its clearance
     active: ActiveConstraints  # in the step from each sample
     solve_s: np.ndarray  # (n,) [s] of each step
 
@@ -84,33 +99,35 @@ class Trajectory:
 
     Parameters
     ----------
+    params : of the controller
     arm_targets : of the recording, on its own time
     time : (n,) [s] from 0, at a constant rate
-    recorded_time : (n,) [s] of the recording at each moment; that of its first moment during the approach
-    approach : number of samples that lead from rest to the first moment of the recording
-    targets : of the hands at these times
-    run : joints, hands and constraints at these times; any denser rate keeps the same limits
-    slowest : None where nothing had to be slowed for a limit
-    contact_times : moments [s] of the recording that were slowed to avoid self-collision
+    recorded_time : (n,) [s] of the recording at each sample; during the approach that of its first sample
+    approach_samples : number of samples from rest to the first pose of the recording
+    targets : (arms,) paths of the hands, at `time`
+    run : joints, hands and constraints at `time`; any denser rate keeps the same limits
+    counts : of the controller's steps
+    limiting_joint : None where nothing had to be slowed for a limit
+    contact_times : [s] of the recording at which the motion was slowed to avoid self-collision
     """
 
     robot: Robot
     collision: CollisionModel
-    tasks: Tasks
+    params: ControllerParams
     arm_targets: ArmTargets
     time: np.ndarray
     recorded_time: np.ndarray
-    approach: int
+    approach_samples: int
     targets: tuple[HandPath, ...]
-    run: Run
+    run: ControllerRun
     counts: StepCounts
-    slowest: SlowestMoment | None
+    limiting_joint: LimitingJoint | None
     contact_times: tuple[float, ...] = ()
 
     @property
-    def u(self) -> np.ndarray:
+    def joint_position(self) -> np.ndarray:
         """(n, joints) [rad or m]."""
-        return self.run.u
+        return self.run.joint_position
 
     @property
     def hand(self) -> dict[str, np.ndarray]:
@@ -123,21 +140,22 @@ def retarget(
     robot: Robot | str | Path,
     *,
     rate_hz: float = RATE_HZ,
-    tasks: Tasks | None = None,
+    params: ControllerParams | None = None,
     scale: float | None = None,
     smoothing_hz: float = SMOOTHING_HZ,
     strict: bool = False,
-    progress: Callable[[str, float], None] = lambda _text, _share: None,
+    progress: Callable[[str, float], None] = lambda _text, _fraction: None,
 ) -> Trajectory:
-    """The robot's trajectory for a person's motion, from rest to rest.
+    """Compute the robot's trajectory for a person's motion. It begins and ends at rest.
 
     Parameters
     ----------
     robot : of `load_robot`; or a name such as "panda", or a file, as for `find_map`, then with all its arms
     rate_hz : of the trajectory
+    params : of the controller; None: default weights and gains
     scale, smoothing_hz : as for `compute_arm_targets`
-    strict : refuse a motion that is too fast for the robot, instead of slowing it
-    progress : called with the current stage and the share of it that is done
+    strict : raise `NoSolution` for a motion that is too fast for the robot, instead of slowing it
+    progress : called with the current stage (`STAGES`) and the fraction of it that is done
 
     Raises
     ------
@@ -150,56 +168,61 @@ def retarget(
     if not isinstance(robot, Robot):
         robot = load_robot(find_map(str(robot)))
     check_rate(rate_hz)
-    tasks, dt = tasks or Tasks(), 1.0 / rate_hz
+    params, dt = params or ControllerParams(), 1.0 / rate_hz
     arm_targets = compute_arm_targets(pose, robot, scale=scale, smoothing_hz=smoothing_hz)
     collision = CollisionModel(robot)
-    even = np.arange(0.0, arm_targets.time[-1] - arm_targets.time[0] + 0.5 * dt, dt)
-    motion = resample_targets(arm_targets, arm_targets.time[0] + even, even)
-    motion, approach = _prepend_approach(QpController(robot, collision, dt, tasks), motion)
+    uniform_time = np.arange(0.0, arm_targets.time[-1] - arm_targets.time[0] + 0.5 * dt, dt)
+    motion = resample_targets(arm_targets, arm_targets.time[0] + uniform_time, uniform_time)
+    motion, approach_samples = _prepend_approach(QpController(robot, collision, dt, params), motion)
     n = len(motion.time)
-    wide = QpController(robot, collision, dt, tasks, limit_factor=WIDE_LIMITS)
-    path = _run(wide, motion, None, 0, lambda share: progress("looking at the motion", share)).u
-    path = gaussian_filter1d(path, PATH_SMOOTHING_S / dt, axis=0, mode="nearest")
-    factor, slowest = _compute_slowdown(path, robot, dt, motion, approach)
-    if strict and slowest is not None and slowest.factor > STRICT_FACTOR:
-        raise _too_fast(
-            robot, slowest.time, f"{slowest.joint} would need {slowest.factor:.1f} times its {slowest.quantity} limit"
-        )
+    wide_controller = QpController(robot, collision, dt, params, limit_factor=WIDE_LIMIT_FACTOR)
+    wide_run = _run_controller(wide_controller, motion, None, 0, lambda fraction: progress(STAGES[0], fraction))
+    path = gaussian_filter1d(wide_run.joint_position, PATH_SMOOTHING_S / dt, axis=0, mode="nearest")
+    slowdown, limiting = _compute_slowdown(path, robot, dt, motion, approach_samples)
+    if strict and limiting is not None and limiting.factor > MAX_STRICT_RATIO:
+        reason = f"{limiting.joint} would need {limiting.factor:.1f} times its {limiting.quantity} limit"
+        raise _build_too_fast_error(robot, limiting.time, reason)
     posture_at = CubicSpline(np.arange(n) * dt, path)
+    tracking_params = replace(
+        params, posture=TRACKING_POSTURE_FACTOR * params.posture, posture_gain=TRACKING_POSTURE_GAIN
+    )
     contact_times: tuple[float, ...] = ()
-    settle = SETTLE_S
-    for runs in range(1 + CONTACT_RUNS):
-        stretched = _fade_out(np.concatenate([[0.0], np.cumsum(0.5 * (factor[1:] + factor[:-1])) * dt]))
-        clock = np.arange(0.0, stretched[-1] + settle + HALT_S, dt)
-        index = np.interp(clock, stretched, np.arange(n))
-        targets = _resample_at(motion, index, clock, dt)
+    settle_s = SETTLE_S
+    for attempt in range(1 + CONTACT_RUNS):
+        sample_time = np.concatenate([[0.0], np.cumsum(0.5 * (slowdown[1:] + slowdown[:-1])) * dt])
+        sample_time = _stretch_end(sample_time)  # of the motion's samples, on the robot's time
+        robot_time = np.arange(0.0, sample_time[-1] + settle_s + HALT_S, dt)
+        index = np.interp(robot_time, sample_time, np.arange(n))
+        targets = _resample_motion(motion, index, robot_time, dt)
         posture = posture_at(np.minimum(index, n - 1) * dt)
-        exact = QpController(robot, collision, dt, replace(tasks, posture=50.0 * tasks.posture, posture_gain=8.0))
-        run = _run(exact, targets, posture, round(HALT_S / dt), lambda share: progress("solving", share))
-        near = np.flatnonzero(run.clearance_share < MIN_CLEARANCE_SHARE)
-        settled = float(np.abs([run.v[-1], run.a[-1]]).max()) < 1e-9  # a robot that lags far behind needs longer
-        if (settled and not len(near)) or runs == CONTACT_RUNS:
+        controller = QpController(robot, collision, dt, tracking_params)
+        halt_steps = round(HALT_S / dt)
+        run = _run_controller(controller, targets, posture, halt_steps, lambda fraction: progress(STAGES[1], fraction))
+        near_contact = np.flatnonzero(run.min_clearance_ratio < MIN_CLEARANCE_RATIO)
+        # A robot that lags far behind needs longer to come to rest.
+        settled = float(np.abs([run.joint_velocity[-1], run.joint_acceleration[-1]]).max()) < SETTLED
+        if (settled and not len(near_contact)) or attempt == CONTACT_RUNS:
             break
-        settle += 0.0 if settled else SETTLE_S
-        if not len(near):
+        settle_s += 0.0 if settled else SETTLE_S
+        if not len(near_contact):
             continue
-        moments = index[near[np.diff(near, prepend=-2) > 1]]
+        begins = index[near_contact[np.diff(near_contact, prepend=-2) > 1]].astype(int)
         if strict:
-            raise _too_fast(robot, motion.time[int(moments[0])], SELF_CONTACT)
-        contact_times = tuple(sorted({*contact_times, *np.round(motion.time[moments.astype(int)], 2).tolist()}))
-        factor = factor * _contact_slowdown(index[near], n, dt)
+            raise _build_too_fast_error(robot, motion.time[begins[0]], SELF_CONTACT)
+        contact_times = tuple(sorted({*contact_times, *np.round(motion.time[begins], 2).tolist()}))
+        slowdown = slowdown * _compute_contact_slowdown(index[near_contact], n, dt)
     return Trajectory(
         robot=robot,
         collision=collision,
-        tasks=tasks,
+        params=params,
         arm_targets=arm_targets,
-        time=clock,
+        time=robot_time,
         recorded_time=targets.time,
-        approach=int(np.searchsorted(clock, stretched[approach])),
+        approach_samples=int(np.searchsorted(robot_time, sample_time[approach_samples])),
         targets=targets.hands,
         run=run,
-        counts=exact.counts,
-        slowest=slowest,
+        counts=controller.counts,
+        limiting_joint=limiting,
         contact_times=contact_times,
     )
 
@@ -210,24 +233,24 @@ def check_rate(rate_hz: float) -> None:
         raise WrongOption("rate-hz", f"{rate_hz:g}", f"from {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} samples a second")
 
 
-def _too_fast(robot: Robot, moment: float, reason: str) -> NoSolution:
+def _build_too_fast_error(robot: Robot, time_s: float, reason: str) -> NoSolution:
     return NoSolution(
-        f"{robot.map.name}: too fast at {moment:.2f} s of the recording: {reason}; "
+        f"{robot.map.name}: too fast at {time_s:.2f} s of the recording: {reason}; "
         "without --strict the motion is slowed there"
     )
 
 
-def _run(
+def _run_controller(
     controller: QpController,
     targets: ArmTargets,
     posture: np.ndarray | None,
-    halts: int,
+    halt_steps: int,
     progress: Callable[[float], None],
-) -> Run:
-    """Follow the targets from rest, with a posture (n, joints) at each sample; halt in the last `halts` steps."""
+) -> ControllerRun:
+    """Follow the targets from rest, with a posture reference (n, joints); come to rest in the last `halt_steps`."""
     robot, n = controller.robot, len(targets.time)
     arms, joints = len(robot.arms), len(robot.names)
-    run = Run(
+    run = ControllerRun(
         np.zeros((n, joints)), np.zeros((n, joints)), np.zeros((n, joints)), np.empty((arms, n, 3)),
         np.empty((arms, n, 3, 3)), np.empty((arms, n, 3)), np.full(n, np.inf), np.full(n, np.inf),
         ActiveConstraints(np.zeros((n, joints), dtype=bool), np.zeros((n, arms), dtype=bool)), np.zeros(n),
@@ -235,50 +258,55 @@ def _run(
     state = JointState.at_rest(robot.rest)
     velocity = np.gradient(posture, controller.dt, axis=0) if posture is not None else None
     for k in range(n):
-        run.u[k], run.v[k], run.a[k] = state.u, state.v, state.a
+        run.joint_position[k], run.joint_velocity[k] = state.position, state.velocity
+        run.joint_acceleration[k] = state.acceleration
         begin = time.perf_counter()
         if posture is not None and velocity is not None:
-            controller.posture = (posture[k], velocity[min(k + 1, n - 1)])
-        left = n - 1 - k
-        if left < halts:
-            state = controller.halt(state, left)
+            controller.posture_reference = PostureReference(posture[k], velocity[min(k + 1, n - 1)])
+        steps_left = n - 1 - k
+        if steps_left < halt_steps:
+            state = controller.step_to_rest(state, steps_left)
         else:
             state = controller.step(state, sample_hand_targets(targets.hands, k, controller.dt))
         run.solve_s[k] = time.perf_counter() - begin
-        run.hull_distance[k], run.clearance_share[k] = controller.min_distance, controller.clearance_share
-        run.active.joints[k], run.active.shapes[k] = controller.active
+        run.hull_distance[k], run.min_clearance_ratio[k] = controller.min_distance, controller.min_clearance_ratio
+        run.active.joints[k], run.active.arms_near_contact[k] = controller.active
         for i in range(arms):
-            run.hand[i, k], run.rotation[i, k], run.swivel[i, k] = controller.arm_pose(i)
-        if k % 64 == 0:
+            run.hand[i, k], run.rotation[i, k], run.swivel[i, k] = controller.get_arm_pose(i)
+        if k % PROGRESS_STEPS == 0:
             progress(k / n)
-    for i, arm in enumerate(robot.arms):  # so far the elbows are there
+    for i, arm in enumerate(robot.arms):  # run.swivel holds the elbows' positions up to here
         run.swivel[i] = compute_swivel(run.swivel[i] - arm.shoulder, run.hand[i] - arm.shoulder)
     return run
 
 
 def _prepend_approach(controller: QpController, motion: ArmTargets) -> tuple[ArmTargets, int]:
-    """The motion after a smooth approach of each hand from rest; and the number of samples of the approach."""
+    """Prepend a smooth approach of each hand from rest; return the motion and the number of samples of the approach."""
     robot, dt = controller.robot, controller.dt
-    controller.set_joints(robot.rest)
-    poses = [controller.arm_pose(i) for i in range(len(robot.arms))]
+    controller.update_kinematics(robot.rest)
+    poses = [controller.get_arm_pose(i) for i in range(len(robot.arms))]
     longest = APPROACH_MIN_S
     for pose, path in zip(poses, motion.hands, strict=True):
-        far = float(np.linalg.norm(path.position[0] - pose.hand))
+        distance = float(np.linalg.norm(path.position[0] - pose.hand))
         angle = (Rotation.from_matrix(pose.rotation).inv() * Rotation.from_matrix(path.rotation[0])).magnitude()
-        longest = max(longest, 1.9 * far / APPROACH_SPEED, 1.9 * float(angle) / APPROACH_RATE)
+        longest = max(
+            longest,
+            QUINTIC_PEAK_SPEED * distance / APPROACH_SPEED,
+            QUINTIC_PEAK_SPEED * float(angle) / APPROACH_ANGULAR_SPEED,
+        )
     n = round(longest / dt)
     x = np.minimum(np.arange(n + round(SETTLE_S / dt)) / n, 1.0)
-    share = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
-    count = len(share)
+    blend = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    count = len(blend)
     hands = []
     for pose, path, arm in zip(poses, motion.hands, robot.arms, strict=True):
-        position = pose.hand + share[:, None] * (path.position[0] - pose.hand)
+        position = pose.hand + blend[:, None] * (path.position[0] - pose.hand)
         ends = Rotation.from_matrix(np.stack([pose.rotation, path.rotation[0]]))
-        rotation = Slerp([0.0, 1.0], ends)(share).as_matrix()
+        rotation = Slerp([0.0, 1.0], ends)(blend).as_matrix()
         swivel = np.zeros(3)
         if arm.elbow >= 0:
             swivel = compute_swivel(pose.elbow - arm.shoulder, pose.hand - arm.shoulder)
-        swivels = swivel + share[:, None] * (path.swivel[0] - swivel)
+        swivels = swivel + blend[:, None] * (path.swivel[0] - swivel)
         lost = np.zeros(count, dtype=bool)
         before = HandPath(position, position, rotation, position, swivels, position, np.ones(count), lost)
         whole = HandPath(*(np.concatenate([a, b]) for a, b in zip(before, path, strict=True)))
@@ -289,48 +317,48 @@ def _prepend_approach(controller: QpController, motion: ArmTargets) -> tuple[Arm
 
 
 def _compute_slowdown(
-    u: np.ndarray, robot: Robot, dt: float, motion: ArmTargets, approach: int
-) -> tuple[np.ndarray, SlowestMoment | None]:
-    """(n,) from 1, how much longer each moment takes for a joint path `u` (n, joints), and the slowest moment."""
-    v = np.gradient(u, dt, axis=0)
+    path: np.ndarray, robot: Robot, dt: float, motion: ArmTargets, approach_samples: int
+) -> tuple[np.ndarray, LimitingJoint | None]:
+    """Return the time scaling (n,) ≥ 1 that a joint path (n, joints) needs, and the limiting joint."""
+    v = np.gradient(path, dt, axis=0)
     a = np.gradient(v, dt, axis=0)
     jerk = np.gradient(a, dt, axis=0)
     needed = np.stack(
         [
-            np.abs(v) / (VELOCITY_SHARE * robot.v_max),
-            np.sqrt(np.abs(a) / (ACCELERATION_SHARE * robot.a_max)),
-            np.cbrt(np.abs(jerk) / (JERK_SHARE * robot.j_max)),
+            np.abs(v) / (VELOCITY_FRACTION * robot.v_max),
+            np.sqrt(np.abs(a) / (ACCELERATION_FRACTION * robot.a_max)),
+            np.cbrt(np.abs(jerk) / (JERK_FRACTION * robot.j_max)),
         ]
     )
     longest = needed.max(axis=(0, 2))
-    slowest = None
-    k = approach + int(np.argmax(longest[approach:]))
+    limiting = None
+    k = approach_samples + int(np.argmax(longest[approach_samples:]))
     if longest[k] > 1.0:
-        which, j = np.unravel_index(int(np.argmax(needed[:, k])), needed[:, k].shape)
-        ratio = (np.abs(v[k]) / robot.v_max, np.abs(a[k]) / robot.a_max, np.abs(jerk[k]) / robot.j_max)[which][j]
-        slowest = SlowestMoment(robot.names[j], float(motion.time[k]), float(ratio), QUANTITIES[which])
-    factor = np.minimum(np.maximum(np.maximum(longest, 1.0), motion.slowdown), MAX_SLOWDOWN)
-    width = max(1, round(SPREAD_S / dt))
-    wide = maximum_filter1d(factor, 2 * width + 1, mode="nearest")
-    return np.asarray(gaussian_filter1d(wide, 0.5 * width, mode="nearest")), slowest
+        quantity, j = np.unravel_index(int(np.argmax(needed[:, k])), needed[:, k].shape)
+        ratio = (np.abs(v[k]) / robot.v_max, np.abs(a[k]) / robot.a_max, np.abs(jerk[k]) / robot.j_max)[quantity][j]
+        limiting = LimitingJoint(robot.names[j], float(motion.time[k]), float(ratio), QUANTITIES[quantity])
+    slowdown = np.minimum(np.maximum(np.maximum(longest, 1.0), motion.slowdown), MAX_SLOWDOWN)
+    width = max(1, round(SLOWDOWN_SPREAD_S / dt))
+    wide = maximum_filter1d(slowdown, 2 * width + 1, mode="nearest")
+    return np.asarray(gaussian_filter1d(wide, 0.5 * width, mode="nearest")), limiting
 
 
-def _contact_slowdown(near: np.ndarray, n: int, dt: float) -> np.ndarray:
-    """(n,) from 1 to 2: factor on the duration of each moment about the samples `near`."""
+def _compute_contact_slowdown(near: np.ndarray, n: int, dt: float) -> np.ndarray:
+    """Return a time scaling (n,) from 1 to 2, above 1 about the samples `near`."""
     slow = np.zeros(n, dtype=bool)
     for k in np.unique(near.astype(int)).tolist():
         slow[max(0, k - round(CONTACT_BEFORE_S / dt)) : k + round(CONTACT_AFTER_S / dt) + 1] = True
-    return 1.0 + np.asarray(gaussian_filter1d(slow.astype(float), 0.5 * SPREAD_S / dt, mode="nearest"))
+    return 1.0 + np.asarray(gaussian_filter1d(slow.astype(float), 0.5 * SLOWDOWN_SPREAD_S / dt, mode="nearest"))
 
 
-def _fade_out(clock: np.ndarray) -> np.ndarray:
-    """Times of the samples, the last `FADE_S` of them stretched so that their speed falls linearly to zero."""
-    share = np.clip((clock - (clock[-1] - FADE_S)) / FADE_S, 0.0, 1.0)
-    return clock + FADE_S * (2.0 * (1.0 - np.sqrt(1.0 - share)) - share)
+def _stretch_end(time: np.ndarray) -> np.ndarray:
+    """Return the times (n,) [s] with the last `END_S` stretched, so that its speed falls linearly to zero."""
+    phase = np.clip((time - (time[-1] - END_S)) / END_S, 0.0, 1.0)
+    return time + END_S * (2.0 * (1.0 - np.sqrt(1.0 - phase)) - phase)
 
 
-def _resample_at(motion: ArmTargets, index: np.ndarray, clock: np.ndarray, dt: float) -> ArmTargets:
-    """The motion at fractional samples `index`, passed at `clock` [s] of the robot; its time stays the recording's."""
-    even = np.arange(len(motion.time)) * dt
-    recorded_time = np.interp(index * dt, even, motion.time)
-    return replace(resample_targets(replace(motion, time=even), index * dt, clock), time=recorded_time)
+def _resample_motion(motion: ArmTargets, index: np.ndarray, robot_time: np.ndarray, dt: float) -> ArmTargets:
+    """Return the motion at fractional samples `index`, velocities on `robot_time` [s], `time` on the recording's."""
+    uniform_time = np.arange(len(motion.time)) * dt
+    recorded_time = np.interp(index * dt, uniform_time, motion.time)
+    return replace(resample_targets(replace(motion, time=uniform_time), index * dt, robot_time), time=recorded_time)

@@ -78,7 +78,7 @@ def compute_placements(
     root = pin.SE3(R, p)
     placements = {joint: (np.empty((len(frames), 4)), np.empty((len(frames), 3))) for joint in joints}
     for k, frame in enumerate(frames.tolist()):
-        pin.forwardKinematics(robot.model, data, robot.configuration(trajectory.u[frame]))
+        pin.forwardKinematics(robot.model, data, robot.configuration(trajectory.joint_position[frame]))
         for joint, (quat, position) in placements.items():
             p_quat = pin.SE3ToXYZQUAT(root * data.oMi[joint])
             quat[k], position[k] = p_quat[3:], p_quat[:3]
