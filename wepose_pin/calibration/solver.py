@@ -7,7 +7,7 @@ damping in a few lines of NumPy, against which the tests and `python -m benchmar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -163,9 +163,9 @@ def _minimise(oracle: _Oracle, steps: int, tolerance: float) -> tuple[Evaluation
     unknowns, multipliers = {"x": (m, 1), "p": (0, 1)}, {"lam:f": (1, 1), "lam:g": (K, 1)}
     values, slopes = {"f": (1, 1), "g": (K, 1)}, {"f": (1, 1), "grad:f:x": (m, 1), "g": (K, 1), "jac:g:x": (K, m)}
     functions = (
-        _Function("nlp", unknowns, values, oracle.values),
-        _Function("nlp_jac_fg", unknowns, slopes, oracle.slopes),
-        _Function("nlp_hess_l", unknowns | multipliers, {"hess:gamma:x:x": (m, m)}, oracle.curvature),
+        _Function(oracle, "nlp", unknowns, values),
+        _Function(oracle, "nlp_jac_fg", unknowns, slopes),
+        _Function(oracle, "nlp_hess_l", unknowns | multipliers, {"hess:gamma:x:x": (m, m)}),
     )
     options: dict[str, Any] = _QUIET | {
         "jac_fg": functions[1],
@@ -187,9 +187,8 @@ def _minimise(oracle: _Oracle, steps: int, tolerance: float) -> tuple[Evaluation
         solution = solver(x0=np.zeros(m), lbg=np.full(K, MIN_LENGTH), ubg=np.inf)
     except RuntimeError:  # of a quadratic program that has no solution, or of an error below
         failed = True
-    for function in functions:
-        if function.error is not None:
-            raise function.error
+    if oracle.error is not None:
+        raise oracle.error
     if failed:
         return oracle.accepted, np.zeros(K)
     z, lam = (np.asarray(solution[name]).ravel() for name in ("x", "lam_g"))
@@ -208,6 +207,7 @@ class _Oracle:
     Attributes
     ----------
     accepted, steps : the evaluation where the last step began, and how many steps there were before
+    error : raised by an evaluation
     """
 
     def __init__(self, start: Evaluation, damping: float) -> None:
@@ -215,6 +215,7 @@ class _Oracle:
         self._z = np.zeros(len(start.x))
         self._x_by_z = np.linalg.inv(np.linalg.cholesky(start.information)).T
         self.damping, self.steps, self._tries = damping, 0, 0
+        self.error: BaseException | None = None
 
     def evaluate(self, z: np.ndarray) -> Evaluation:
         if not np.array_equal(z, self._z):
@@ -253,14 +254,12 @@ _Shapes = Mapping[str, tuple[int, int]]  # by CasADi's names of inputs or output
 
 
 class _Function(ca.Callback):
-    """A Python function z → arrays as a CasADi function, whose inputs after the first are not looked at."""
+    """A function of an oracle, by CasADi's name of it; inputs after the first, z, are not looked at."""
 
-    def __init__(
-        self, name: str, inputs: _Shapes, outputs: _Shapes, function: Callable[[np.ndarray], tuple[Any, ...]]
-    ) -> None:
+    def __init__(self, oracle: _Oracle, name: str, inputs: _Shapes, outputs: _Shapes) -> None:
         ca.Callback.__init__(self)
-        self.error: BaseException | None = None
-        self._inputs, self._outputs, self._function = list(inputs.items()), list(outputs.items()), function
+        self._oracle, self._inputs, self._outputs = oracle, list(inputs.items()), list(outputs.items())
+        self._function = {"nlp": oracle.values, "nlp_jac_fg": oracle.slopes, "nlp_hess_l": oracle.curvature}[name]
         self.construct(name, {})
 
     def get_n_in(self) -> int:
@@ -286,12 +285,12 @@ class _Function(ca.Callback):
 
     def eval_buffer(self, arguments: Sequence[Any], results: Sequence[Any]) -> int:
         """Write the results where CasADi wants them, column by column; 1 after an error, which `_minimise` raises."""
-        if self.error is None:
-            try:
-                values = self._function(np.frombuffer(arguments[0]))
-            except BaseException as error:  # CasADi would keep its text alone, of Ctrl-C too
-                self.error = error
-        if self.error is not None:
+        if self._oracle.error is not None:
+            return 1
+        try:
+            values = self._function(np.frombuffer(arguments[0]))
+        except BaseException as error:  # CasADi would keep its text alone, of Ctrl-C too
+            self._oracle.error = error
             return 1
         for result, value in zip(results, values, strict=True):
             if result is not None:
