@@ -189,11 +189,11 @@ def _minimise(oracle: _Oracle, steps: int, tolerance: float) -> tuple[Evaluation
         failed = True
     if oracle.error is not None:
         raise oracle.error
-    if failed:
-        return oracle.accepted, np.zeros(K)
-    z, lam = (np.asarray(solution[name]).ravel() for name in ("x", "lam_g"))
-    oracle.steps = solver.stats()["iter_count"]
-    return oracle.evaluate(z), lam
+    if not failed:
+        z, lam = (np.asarray(solution[name]).ravel() for name in ("x", "lam_g"))
+        if np.all(np.isfinite(z)):
+            return oracle.evaluate(z), lam
+    return oracle.accepted, np.zeros(K)
 
 
 class _Oracle:
@@ -206,7 +206,7 @@ class _Oracle:
 
     Attributes
     ----------
-    accepted, steps : the evaluation where the last step began, and how many steps there were before
+    accepted, steps : the evaluation where the last step began, and how many steps there were with it
     error : raised by an evaluation
     """
 
@@ -241,8 +241,8 @@ class _Oracle:
         each try that did not lower the cost, and falls with a step that did at once.
         """
         self.accepted = self.evaluate(z)
+        self.steps += 1
         if self._tries:
-            self.steps += 1
             self.damping *= DAMPING_FACTOR ** (self._tries - 2)
             self.damping = min(max(self.damping, LEAST_DAMPING), MOST_DAMPING)
         self._tries = 0
