@@ -29,8 +29,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "kinds",
         nargs="*",
         metavar="KIND",
-        help="filters: speed and accuracy beside VQF and imufusion, two minutes; calibration: its solve beside "
-        "SciPy's; live: five sensors at 1 kHz for five minutes, and again with the page; batch: a study of 500 "
+        help="filters: speed and accuracy beside VQF and imufusion, two minutes; calibration: nlpsol beside "
+        "others; live: five sensors at 1 kHz for five minutes, and again with the page; batch: a study of 500 "
         "sessions on one worker, two, and two of which one is killed (stopped, the same command goes on from there); "
         f"long: recordings of up to 24 hours in chunks. Without any: {' and '.join(DEFAULT)}",
     )

@@ -1,4 +1,4 @@
-"""The least squares of a calibration beside SciPy's: the same residuals, weights, prior and start."""
+"""The least squares of a calibration by `nlpsol`, by a loop in NumPy and by SciPy, from the same start."""
 
 from __future__ import annotations
 
@@ -7,48 +7,151 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from scipy import optimize
 
-from wepose_pin.calibration import least_squares
+from wepose_pin.calibration import least_squares, solver
 from wepose_pin.calibration.contact import find_contact_start
-from wepose_pin.calibration.least_squares import Gaussian, Observations, evaluate_into, residuals, solve
+from wepose_pin.calibration.least_squares import Observations, evaluate_into, residuals
 from wepose_pin.calibration.priors import build_prior
 from wepose_pin.calibration.problem import SAMPLE_RATE_HZ, CalibrationProblem
 from wepose_pin.calibration.protocols import load_protocol
-from wepose_pin.calibration.weights import solve_reweighted
+from wepose_pin.calibration.solver import Fit, LeastSquares, solve, solve_without_bounds
+from wepose_pin.calibration.weights import FINAL_STEPS, solve_reweighted
 from wepose_pin.filters.sensors import filter_recording
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import MILD_PRESET, Person, simulate, simulate_person
 
 from .tables import Column, Section, Table, time_in_turn
 
-OURS = "Gauss-Newton, ours"
+NLPSOL, LOOP = "nlpsol", "Gauss-Newton loop"
+SOLVERS = {NLPSOL: solve, LOOP: solve_without_bounds}
+FINE = 3e-7  # standard deviations to go, at which solutions are compared
 _STATUS = Path("/proc/self/status")
 
 
-class LeastSquares(NamedTuple):
-    """Σ w r² + (x − c)ᵀ Λ (x − c), to be made least from a start."""
+@dataclass(frozen=True)
+class Posed:
+    """A least squares and the x (m,) to start from."""
 
-    observations: Observations
-    prior: Gaussian  # c, Λ
-    weights: np.ndarray  # (n, 5)
-    start: np.ndarray  # (m,)
+    problem: LeastSquares
+    start: np.ndarray
 
 
 def sections(quick: bool) -> dict[str, Section]:
     """Name → a function that measures it; a full run solves at 100 samples a second too."""
     rates_hz = (SAMPLE_RATE_HZ,) if quick else (SAMPLE_RATE_HZ, 100.0)
-    return {"calibration": partial(calibration, 60.0, rates_hz, 3)}
+    return {
+        "calibration": partial(calibration, 60.0, rates_hz, 3),
+        "solvers": partial(solvers_by_case, 30.0 if quick else 60.0, 1 if quick else 3),
+    }
+
+
+def solvers_by_case(seconds: float, rounds: int) -> Table:
+    """`nlpsol` beside the loop on the last least squares of several calibrations."""
+    table = Table(
+        f"Calibration: nlpsol beside the Gauss-Newton loop, {seconds:g} s of each",
+        (
+            Column("unknowns", "unknowns", 0),
+            Column("samples", "samples", 0),
+            Column("nlpsol_s", "nlpsol [s]", 3),
+            Column("loop_s", "loop [s]", 3),
+            Column("ratio", "ratio", 2, True),
+            Column("nlpsol_evaluations", "nlpsol: evaluations", 0),
+            Column("loop_evaluations", "loop: evaluations", 0),
+            Column("difference", "difference [1e-6 std]", 3),
+        ),
+        notes=[
+            f"Processor time from the first start to 1e-4 standard deviations, medians of {rounds}. Difference: of the",
+            f"solutions to {FINE:g} standard deviations, the largest over all unknowns, in units of their own.",
+        ],
+    )
+    for name, posed in pose_cases(seconds).items():
+        runs: dict[str, Callable[[], Any]] = {
+            solver: partial(run, posed.problem, posed.start, FINAL_STEPS) for solver, run in SOLVERS.items()
+        }
+        timings = time_in_turn(runs, rounds, LOOP)
+        fine = {solver: run(posed.problem, posed.start, FINAL_STEPS, False, FINE) for solver, run in SOLVERS.items()}
+        std = np.sqrt(np.diag(np.linalg.inv(fine[LOOP].information)))
+        table.rows[name] = {
+            "unknowns": len(posed.start),
+            "samples": len(posed.problem.observations),
+            "nlpsol_s": timings[NLPSOL].median,
+            "loop_s": timings[LOOP].median,
+            "ratio": timings[NLPSOL].ratio,
+            "nlpsol_evaluations": count_evaluations(runs[NLPSOL]),
+            "loop_evaluations": count_evaluations(runs[LOOP]),
+            "difference": 1e6 * float(np.abs((fine[NLPSOL].x - fine[LOOP].x) / std).max()),
+        }
+    return table
+
+
+def count_evaluations(run: Callable[[], Fit]) -> int:
+    """How many times it evaluates the residuals of all samples."""
+    calls = 0
+
+    def counted(x: np.ndarray, observations: Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        nonlocal calls
+        calls += 1
+        return residuals(x, observations)
+
+    solver.residuals = counted  # type: ignore[attr-defined]
+    try:
+        run()
+    finally:
+        solver.residuals = residuals  # type: ignore[attr-defined]
+    return calls
+
+
+def pose_cases(seconds: float) -> dict[str, Posed]:
+    """What a calibration meets → its least squares."""
+    person = simulate_person(3)
+
+    def recorded(protocol: str = "clasp", mount: Literal["stated", "any"] = "stated") -> Recording:
+        world = replace(MILD_PRESET, mount=mount)
+        return simulate(
+            person.lengths, seed=3, imperfections=world, clasp_s=seconds, circles=0, protocol=protocol
+        ).recording()
+
+    free = recorded(mount="any")
+    begin, end = free.phases["clasp"][0]
+    still = replace(free, phases={**free.phases, "clasp": ((begin, begin + 5.0),)})
+    middle = (begin + end) / 2.0
+    gap = (free.time > middle) & (free.time < middle + 2.0)
+    arm = free.imus["left_upper_arm"]
+    lost = replace(arm, gyro_S=np.where(gap[:, None], 0.0, arm.gyro_S), gap=gap)
+    recordings = {
+        "clasp": ("clasp", recorded()),
+        "clasp, unknown mounts": ("clasp", free),
+        "clasp, samples lost": ("clasp", replace(free, sensors={**free.sensors, "left_upper_arm": lost})),
+        "clasp, 5 s": ("clasp", still),
+        **{protocol: (protocol, recorded(protocol)) for protocol in ("handle", "touch_left", "poses")},
+    }
+    posed = {}
+    for name, (protocol, recording) in recordings.items():
+        filtered = filter_recording(recording)
+        problem = CalibrationProblem(recording, filtered, load_protocol(protocol), person.prior, {})
+        posed[name] = pose(problem, SAMPLE_RATE_HZ)
+    return posed
+
+
+def pose(problem: CalibrationProblem, rate_hz: float) -> Posed:
+    """The last least squares of a calibration."""
+    observations, _ = problem.observe(rate_hz)
+    prior = build_prior(problem, observations)
+    start, contact = find_contact_start(observations, lambda some: build_prior(problem, some).mean)
+    weights = solve_reweighted(observations, prior, start, contact).weights
+    return Posed(LeastSquares(observations, prior, weights), start)
 
 
 def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Table:
-    """The solve of a hands-together calibration beside SciPy's, at each rate of samples."""
+    """The solve of a hands-together calibration by each solver, at each rate of samples."""
     person = simulate_person(3)
     made = simulate(person.lengths, seed=3, imperfections=MILD_PRESET, clasp_s=clasp_s, circles=0)
     table = Table(
@@ -56,8 +159,8 @@ def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Tab
         (
             Column("seconds", "solve [s]", 3),
             Column("spread_s", "± [s]", 3),
-            Column("ratio", "ratio to ours", 2, True),
-            Column("cost", "cost to ours", 4),
+            Column("ratio", "ratio to nlpsol", 2, True),
+            Column("cost", "cost to nlpsol", 4),
             Column("megabytes", "memory [MB]"),
         ),
         notes=[
@@ -67,7 +170,7 @@ def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Tab
         ],
     )
     for posed, calibrate in pose_problems(made.recording(), person, rates_hz):
-        samples = f"{len(posed.weights)} samples"
+        samples = f"{len(posed.problem.weights)} samples"
         table.rows[f"{samples}: building"] = {"seconds": building(posed)}
         costs: dict[str, float] = {}
 
@@ -75,11 +178,11 @@ def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Tab
             costs[name] = run()
 
         cases: dict[str, Callable[[], Any]] = {n: partial(keep_cost, n, run) for n, run in solvers(posed).items()}
-        timings = time_in_turn(cases | {"whole": calibrate}, rounds, OURS, time.process_time)
+        timings = time_in_turn(cases | {"whole": calibrate}, rounds, NLPSOL, time.process_time)
         for name, timing in timings.items():
             row = {"seconds": timing.median, "spread_s": timing.spread, "ratio": timing.ratio}
             if name in cases:
-                row |= {"cost": costs[name] / costs[OURS], "megabytes": 1e-6 * peak_memory(posed, name)}
+                row |= {"cost": costs[name] / costs[NLPSOL], "megabytes": 1e-6 * peak_memory(posed, name)}
             table.rows[f"{samples}: {name}"] = row
     table.rows = table.known_rows()
     return table
@@ -87,39 +190,26 @@ def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Tab
 
 def pose_problems(
     recording: Recording, person: Person, rates_hz: tuple[float, ...]
-) -> list[tuple[LeastSquares, Callable[[], LeastSquares]]]:
+) -> list[tuple[Posed, Callable[[], Posed]]]:
     """The last problem of a hands-together calibration at each rate of samples, and the calibration without filters."""
     measured = {name: (metres, person.measured_std) for name, metres in person.measured.items()}
-    filtered, protocol = filter_recording(recording), load_protocol("clasp")
-    problem = CalibrationProblem(recording, filtered, protocol, person.prior, measured)
-    posed: list[tuple[LeastSquares, Callable[[], LeastSquares]]] = []
-    for rate_hz in rates_hz:
-        observations, _ = problem.observe(rate_hz)
-
-        def calibrate(observations: Observations = observations) -> LeastSquares:
-            prior = build_prior(problem, observations)
-            start, contact = find_contact_start(observations, lambda some: build_prior(problem, some).mean)
-            weights = solve_reweighted(observations, prior, start, contact).weights
-            return LeastSquares(observations, prior, weights, start)
-
-        posed.append((calibrate(), calibrate))
-    return posed
+    problem = CalibrationProblem(recording, filter_recording(recording), load_protocol("clasp"), person.prior, measured)
+    return [(pose(problem, rate_hz), partial(pose, problem, rate_hz)) for rate_hz in rates_hz]
 
 
-def building(posed: LeastSquares) -> float:
+def building(posed: Posed) -> float:
     """Seconds that CasADi's functions take to build, once for a number of samples."""
     least_squares._residual_function.cache_clear()
     least_squares._mapped_residuals.cache_clear()
-    begin = time.perf_counter()
-    least_squares._mapped_residuals(
-        posed.observations.layout, posed.observations.conditions[0], 0, len(posed.observations)
-    )
+    observations, begin = posed.problem.observations, time.perf_counter()
+    least_squares._mapped_residuals(observations.layout, observations.conditions[0], 0, len(observations))
     return time.perf_counter() - begin
 
 
-def solvers(posed: LeastSquares) -> dict[str, Callable[[], float]]:
+def solvers(posed: Posed) -> dict[str, Callable[[], float]]:
     """Name → a function that solves it and gives the cost."""
-    observations, prior, weights, start = posed
+    problem, start = posed.problem, posed.start
+    observations, prior, weights = problem.observations, problem.prior, problem.weights
     root_w, root_prior = np.sqrt(weights), np.linalg.cholesky(prior.information).T
     n, m = len(weights), len(prior.mean)
     sample = least_squares._residual_function(observations.layout, observations.conditions[0], 0)
@@ -141,13 +231,14 @@ def solvers(posed: LeastSquares) -> dict[str, Callable[[], float]]:
         return 2.0 * float(optimize.least_squares(value, start, jacobian, method="trf", x_scale="jac").cost)
 
     return {
-        OURS: lambda: solve(observations, prior, weights, start).cost,
+        NLPSOL: lambda: solve(problem, start).cost,
+        LOOP: lambda: solve_without_bounds(problem, start).cost,
         "least_squares, our Jacobian": lambda: by_scipy(slope),
         "least_squares, 2-point": lambda: by_scipy("2-point"),
     }
 
 
-def peak_memory(posed: LeastSquares, name: str) -> float:
+def peak_memory(posed: Posed, name: str) -> float:
     """By how much solving it raises a new process's resident memory at its highest [bytes]; NaN but on Linux."""
     if not _STATUS.exists():
         return float("nan")
@@ -162,7 +253,7 @@ def peak_memory(posed: LeastSquares, name: str) -> float:
 def _peak(file: object, name: str) -> None:
     posed = pickle.load(file)  # type: ignore[arg-type]
     run = solvers(posed)[name]
-    residuals(posed.start, posed.observations.take(np.arange(10)))  # libraries have loaded what they load
+    residuals(posed.start, posed.problem.observations.take(np.arange(10)))  # libraries have loaded what they load
     before = _resident("VmRSS")
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the highest so far is forgotten
     run()

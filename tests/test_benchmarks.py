@@ -61,11 +61,28 @@ def test_every_method_is_measured() -> None:
 def test_scipy_solves_the_same_calibration() -> None:
     rows = calibration.calibration(10.0, (10.0,), 1).rows
     names = [name.partition(": ")[2] for name in rows]
-    solvers = ["Gauss-Newton, ours", "least_squares, our Jacobian", "least_squares, 2-point"]
+    solvers = ["nlpsol", "Gauss-Newton loop", "least_squares, our Jacobian", "least_squares, 2-point"]
     assert names == ["building", *solvers, "whole"]
     for name, row in rows.items():
         assert "cost" not in row or row["cost"] == pytest.approx(1.0, abs=1e-3), name
     assert len({name.partition(":")[0] for name in rows}) == 1
+
+
+def test_nlpsol_and_the_loop_are_compared_on_every_kind_of_calibration() -> None:
+    rows = calibration.solvers_by_case(15.0, 1).rows
+    assert {
+        "clasp",
+        "clasp, unknown mounts",
+        "clasp, samples lost",
+        "clasp, 5 s",
+        "handle",
+        "touch_left",
+        "poses",
+    } == set(rows)
+    for name, row in rows.items():
+        assert row["difference"] < 1.0, name
+        assert 2 <= row["nlpsol_evaluations"] < 300, name
+        assert row["nlpsol_s"] > 0.0 < row["loop_s"], name
 
 
 @pytest.mark.skipif(not (tables.is_installed("vqf") and tables.is_installed("imufusion")), reason="no peers installed")

@@ -5,20 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate_lengths, load_protocol
-from wepose_pin.calibration.chain import CHAIN, REACHES, links
+from wepose_pin.calibration.chain import CHAIN
 from wepose_pin.calibration.least_squares import Layout, Observations, residuals
 from wepose_pin.calibration.protocols import Closure
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, render, render_all
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
-from wepose_pin.kinematics import compute_pose
-from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (
@@ -113,21 +110,6 @@ def test_what_is_in_the_chain_follows_from_the_points() -> None:
     )
     assert load_protocol("poses").chain == ()
     assert load_protocol("handle").distances == ("handle",)
-
-
-def test_every_point_is_pinocchios() -> None:
-    rng = np.random.default_rng(0)
-    values = np.array([0.5, 0.4, 0.3, 0.25, 0.07, 0.31, 0.24, 0.08])
-    model = load_model(lengths=dict(zip(LENGTHS, values, strict=True)))
-    drawn = {segment: Rotation.random(3, random_state=rng).as_quat() for segment in CHAIN}
-    points = compute_pose(model, np.arange(3.0), drawn).points
-    lengths, quats = ca.SX.sym("l", 8), {segment: ca.SX.sym(segment, 4) for segment in CHAIN}
-    for name, way in REACHES.items():
-        place = sum(links(lengths, quats, way).values(), start=ca.SX.zeros(3))
-        function = ca.Function(name, [lengths, *quats.values()], [place])
-        for k in range(3):
-            found = np.asarray(function(values, *(drawn[segment][k] for segment in CHAIN))).ravel()
-            np.testing.assert_allclose(found, points[name][k], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["clasp", "handle", "touch_right", "poses"])

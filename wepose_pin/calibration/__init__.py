@@ -1,10 +1,11 @@
 """Link lengths, mounts and headings from hands held together, or from another protocol.
 
 `lengths` is the calibration from a recording to a subject. `protocols` describes what a person does, `problem` collects
-inputs and samples, `chain` is the chain in CasADi, `least_squares` the residuals and Gauss-Newton, `priors` what is
-known before. `initial_headings` and `contact` give the start, `joints` adds what accelerations show of headings,
-`losses` what lost samples change, `weights` weighs the samples, `alternatives` searches other minima, `anatomy` checks
-sensors and mounts. `result` is the outcome, `observability` and `quality` assess it.
+inputs and samples, `chain` is the model's chains in CasADi, `least_squares` unknowns and residuals, `solver` the
+problem and its solution by `nlpsol`, `priors` what is known before. `initial_headings` and `contact` give the start,
+`joints` adds what accelerations show of headings, `losses` what lost samples change, `weights` weighs the samples,
+`alternatives` searches other minima, `anatomy` checks sensors and mounts. `result` is the outcome, `observability` and
+`quality` assess it.
 """
 
 from __future__ import annotations

@@ -14,7 +14,8 @@ import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
 from .initial_headings import find_distinct_headings
-from .least_squares import Fit, Gaussian, K, Layout, Observations, place_points, solve
+from .least_squares import Gaussian, K, Layout, Observations, place_points
+from .solver import Fit, LeastSquares, solve
 from .weights import WeightedFit
 
 COMPARED_SAMPLES = 120  # on which solutions are compared
@@ -58,7 +59,7 @@ def find_alternatives(
         start = fit.x.copy()
         start[rows] += np.where(unknown, (psi - start[rows] + np.pi) % (2.0 * np.pi) - np.pi, 0.0)
         start = place_points(start, some)
-        return solve(some, prior_at(start), weights, start, STEPS, strict=False)
+        return solve(LeastSquares(some, prior_at(start), weights), start, STEPS, strict=False)
 
     best = solve_from(fit.x[rows])
     std = np.sqrt(np.diag(np.linalg.inv(fit.information))[rows])

@@ -1,4 +1,4 @@
-"""The least squares of a calibration: the unknowns, the residuals of a sample, Gauss-Newton over all samples.
+"""The unknowns of a calibration and the residuals of its samples, with their Jacobian; `solver` minimises them.
 
 For each sensor i the filter gives R_VS(t) in a world V of its own heading, and Q(t) = R_VS(t) R_VS(start)ᵀ. With a
 start pose that is ε off the N-pose, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
@@ -29,7 +29,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import ATTITUDE_STD
-from ..errors import NoSolution
 from ..subject import LENGTHS
 from .chain import SIDES, about_z, inverse, links, product, rotate, small_turn
 from .protocols import Closure, Condition, Direction, coefficients
@@ -119,18 +118,6 @@ class Gaussian(NamedTuple):
 
     mean: np.ndarray  # (m,)
     information: np.ndarray  # (m, m)
-
-
-class Fit(NamedTuple):
-    """A solution of the least squares."""
-
-    x: np.ndarray
-    closure: np.ndarray  # (n, 3) whitened residuals of the gap
-    hinge: np.ndarray  # (n, 2) of the elbows, in units of `HINGE_STD`
-    gaps: np.ndarray  # (n, 3) [m]
-    jacobian: np.ndarray  # (n, 5, m) of gap and hinge
-    information: np.ndarray  # of x, prior included
-    cost: float
 
 
 @dataclass(frozen=True)
@@ -301,62 +288,3 @@ def _hinge_residuals(layout: Layout, x: Any, quat_WL: Mapping[str, Any]) -> Any:
         axis = ca.vertcat(hinge[2 * i], 1.0, hinge[2 * i + 1])
         residual.append(ca.dot(axis, forearm) / ca.norm_2(axis) / HINGE_STD)
     return ca.vertcat(*residual)
-
-
-def solve(
-    observations: Observations,
-    prior: Gaussian,
-    weights: np.ndarray,
-    start: np.ndarray | Fit,
-    rounds: int = 60,
-    strict: bool = True,
-) -> Fit:
-    """Minimiser of Σ w r² + (x − c)ᵀ Λ (x − c): Gauss-Newton, damped where a step does not lower the cost.
-
-    Parameters
-    ----------
-    prior : c and Λ
-    weights : (n, 5) of the residuals
-    start : x to begin with, or a fit of the same samples with other weights
-    strict : raise where the rounds do not suffice, instead of returning the last x
-
-    Raises
-    ------
-    NoSolution
-        It did not converge.
-    """
-    if isinstance(start, Fit):
-        x, r, J, gaps = start.x, np.hstack((start.closure, start.hinge)), start.jacobian, start.gaps
-    else:
-        x = start
-        r, J, gaps = residuals(x, observations)
-    center, prior_information = prior
-    off = x - center
-    cost = float(np.sum(weights * r**2) + off @ prior_information @ off)
-    damping = 1e-4
-    for _ in range(rounds):
-        WJ = (weights[:, :, None] * J).reshape(-1, J.shape[2])
-        information = WJ.T @ J.reshape(-1, J.shape[2]) + prior_information
-        gradient = WJ.T @ r.ravel() + prior_information @ (x - center)
-        step = np.linalg.solve(information, gradient)
-        # What is left to go, in standard deviations of the result.
-        if gradient @ step < 1e-8:
-            return Fit(x, r[:, :3], r[:, 3:], gaps, J, information, cost)
-        while True:
-            nearer = x - np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
-            r_next, J_next, gaps_next = residuals(nearer, observations)
-            off = nearer - center
-            lower = float(np.sum(weights * r_next**2) + off @ prior_information @ off)
-            if lower <= cost * (1.0 + 1e-12):
-                break
-            damping *= 8.0
-            if damping > 1e8:
-                break
-        x, r, J, gaps, cost = nearer, r_next, J_next, gaps_next, min(lower, cost)
-        damping = max(damping / 8.0, 1e-12)
-    if gradient @ step < 0.05**2 or not strict:
-        return Fit(x, r[:, :3], r[:, 3:], gaps, J, information, cost)
-    raise NoSolution(
-        f"the lengths did not converge ({np.sqrt(gradient @ step):.2g} standard deviations to go); check that the "
-        f"hands do in the phase what the protocol says, and that every sensor sits where the session says"
-    )

@@ -48,6 +48,7 @@ from .priors import build_prior, combine_lengths
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem
 from .protocols import Protocol, load_protocol
 from .result import Calibration
+from .solver import MIN_LENGTH
 from .weights import (
     MIN_CONTACT,
     WeightedFit,
@@ -62,7 +63,6 @@ from .weights import (
 MEASURED_STD = 0.003
 MEASURED_RANGE = 0.02, 1.0  # [m] of lengths and distances that a user may measure
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
-MIN_LENGTH = 0.01  # [m] below which a length has not converged
 
 
 def calibrate_lengths(
@@ -214,7 +214,7 @@ def _solve(problem: CalibrationProblem) -> _Solution:
 
     alternatives = find_alternatives(observations, prior_at, result, headings)
     lengths = result.fit.x[:K]
-    if np.min(lengths) < MIN_LENGTH:
+    if np.min(lengths) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
         raise NoSolution(
             f"the lengths did not converge ({LENGTHS[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm); "
             f"check that the hands do in the phase what the protocol says, and that every sensor sits where the "

@@ -24,7 +24,7 @@ from ..documents import is_number, read_toml
 from ..errors import BadOption, one_of
 from ..recording import SEGMENTS
 from ..subject import LENGTHS
-from .chain import CHAIN, REACHES
+from .chain import CHAIN, default_reaches
 
 PROTOCOLS = ("clasp", "clasp_measured", "handle", "poses", "touch_left", "touch_right")
 KINDS = {"coincide": 2, "distance": 2, "fixed_point": 1}  # how many points each takes
@@ -139,9 +139,10 @@ class Protocol:
 
 def coefficients(closure: Closure) -> dict[str, np.ndarray]:
     """Segment → (3, 8), by which the lengths make its part of the closed chain, in its own frame."""
-    parts = dict(REACHES[closure.points[0]])
+    reaches = default_reaches()
+    parts = dict(reaches[closure.points[0]])
     for other in closure.points[1:]:
-        for segment, part in REACHES[other].items():
+        for segment, part in reaches[other].items():
             parts[segment] = parts.get(segment, 0.0) - part
     return {segment: part for segment, part in parts.items() if np.any(part)}
 
@@ -217,7 +218,7 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
 
 def _closure(entry: dict[str, Any], place: str) -> Closure:
     kind = _among(_get(entry, "kind", place), KINDS, f"{place}: kind")
-    points = tuple(_among(point, REACHES, f"{place}: points") for point in _list(entry, "points", place))
+    points = tuple(_among(point, default_reaches(), f"{place}: points") for point in _list(entry, "points", place))
     if len(points) != KINDS[kind]:
         raise BadOption(f"{place}: points = {list(points)}; kind '{kind}' takes {KINDS[kind]}")
     more: dict[str, Any] = {}

@@ -14,8 +14,9 @@ import numpy as np
 
 from ..subject import LENGTHS, mount_rows
 from .chain import SIDES
-from .least_squares import Fit, Gaussian, K, Layout, Observations, solve
+from .least_squares import Gaussian, K, Layout, Observations
 from .protocols import Closure
+from .solver import STEPS, Fit, LeastSquares, solve
 
 # Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
 LEAST_VARIANCE = 1e-4
@@ -23,7 +24,7 @@ LEAST_VARIANCE = 1e-4
 # of one phase is. Chosen on simulated people, whose joint errors it brings within the covariance.
 LEAST_CORRELATION_S = 3.0
 THIRD_CHI2 = {1: 0.1485, 3: 1.4237}  # 30 % quantile of chi², by degrees of freedom
-ROUNDS, STEPS = 5, 60
+ROUNDS = 5
 FINAL_STEPS = 300  # of the last solve, which must converge: hands that hardly move take a hundred
 QUICK_ROUNDS, QUICK_STEPS = 1, 15
 MANY_SAMPLES = 1000  # from twice as many on, all rounds but the last take every second, third, … sample
@@ -83,10 +84,12 @@ def solve_reweighted(
             weights[span] = 1.0 / (span.stop - span.start)  # the error of a pose is constant: one effective sample
     effective = float(closed.sum())
     if not closed.any():
-        fit = solve(observations, prior, weights, x, steps, not quick)
+        fit = solve(LeastSquares(observations, prior, weights), x, steps, not quick)
         return WeightedFit(fit, weights, contact, effective)
     for k in rounds:
-        x = fit = solve(observations, prior, weights, x, steps, strict=False)  # the last solve is the strict one
+        x = fit = solve(
+            LeastSquares(observations, prior, weights), x, steps, strict=False
+        )  # the last solve is the strict one
         effective = 0.0
         for closure, span in observations.spans():
             if isinstance(closure, Closure):
@@ -97,7 +100,7 @@ def solve_reweighted(
         arms = [SIDES.index(side) for side in observations.layout.arms]
         if arms and not quick:
             weights[closed, 3:] = _weigh(fit.hinge[closed][:, arms], np.ones(int(closed.sum())), correlation)
-    fit = solve(observations, prior, weights, x, steps if quick else FINAL_STEPS, not quick)
+    fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, not quick)
     return WeightedFit(fit, weights, contact, effective)
 
 

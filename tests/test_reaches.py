@@ -1,0 +1,111 @@
+"""The chains read off a model: in CasADi they give Pinocchio's points, for any lengths and orientations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+from test_model import GAZEBO, example_robot_data_human
+
+from wepose_pin.calibration.chain import default_reaches, measure_reaches, point_position
+from wepose_pin.errors import BadModel
+from wepose_pin.model import POINTS, BodyModel, load_model
+from wepose_pin.recording import SEGMENTS
+from wepose_pin.subject import LENGTHS
+
+
+def cosmik(data: Path) -> BodyModel:
+    """A body whose table gives wrists as places on the forearms; it has no hands."""
+    segments, points = {"torso": "torso", "pelvis": "pelvis"}, {}
+    for side, letter in (("left", "L"), ("right", "R")):
+        segments |= {f"{side}_upper_arm": f"upperarm{letter}", f"{side}_forearm": f"lowerarm{letter}"}
+        points[f"{side}_wrist"] = {"link": f"lowerarm{letter}", "at": [0.0, -0.26, 0.0]}
+    path = data / "human_urdf" / "cosmik_human.urdf"
+    return load_model(path, segments=segments, points=points, up="+y", root="pelvis")
+
+
+BODIES: dict[str, Callable[[Path], BodyModel]] = {
+    "ours": lambda _: load_model(),
+    **{name: lambda data, file=file: load_model(data / "human_urdf" / file) for name, file in GAZEBO.items()},
+    "cosmik": cosmik,
+    "example-robot-data": lambda _: load_model(example_robot_data_human()),
+}
+
+
+@pytest.fixture(params=list(BODIES))
+def body(request: pytest.FixtureRequest, data: Path) -> BodyModel:
+    return BODIES[request.param](data)
+
+
+def random_rotations(m: pin.Model, rng: np.random.Generator) -> tuple[pin.Data, dict[str, np.ndarray]]:
+    """Forward kinematics of a configuration drawn at random, and link → its `quat_WK`."""
+    low, high = (np.clip(limit, -np.pi, np.pi) for limit in (m.lowerPositionLimit, m.upperPositionLimit))
+    q = pin.normalize(m, rng.uniform(low, high))
+    kinematics = m.createData()
+    pin.framesForwardKinematics(m, kinematics, q)
+    R_WK = {m.names[joint]: kinematics.oMi[joint].rotation for joint in range(m.njoints)}
+    R_WK |= {s: kinematics.oMf[m.getFrameId(s)].rotation for s in SEGMENTS if m.existFrame(s)}
+    return kinematics, {link: Rotation.from_matrix(R).as_quat() for link, R in R_WK.items()}
+
+
+def test_every_point_is_pinocchios_for_all_lengths_and_orientations(body: BodyModel) -> None:
+    """All known bodies are affine in their lengths; those of others have constant parts and links between segments."""
+    rng, own = np.random.default_rng(0), body.lengths
+    reaches = measure_reaches(body)
+    assert set(reaches) == {point for point, link in POINTS.items() if body.pin.existFrame(link)}
+    lengths = ca.SX.sym("lengths", len(LENGTHS))
+    functions = {}
+    for point, way in reaches.items():
+        quats = {link: ca.SX.sym(link, 4) for link in way}
+        functions[point] = ca.Function("p", [lengths, *quats.values()], [point_position(lengths, quats, way)])
+    for _ in range(5):
+        changed = body.with_lengths({name: value * rng.uniform(0.7, 1.3) for name, value in own.items()})
+        kinematics, quat_WK = random_rotations(changed.pin, rng)
+        values = [changed.lengths.get(name, 0.0) for name in LENGTHS]
+        for point, function in functions.items():
+            place = np.asarray(function(values, *(quat_WK[link] for link in reaches[point]))).ravel()
+            expected = kinematics.oMf[changed.pin.getFrameId(POINTS[point])].translation
+            np.testing.assert_allclose(place, expected, atol=1e-12)
+
+
+def test_the_default_model_is_its_lengths() -> None:
+    """Every number is a whole one or a half: no rounding remains of the measurement."""
+    reaches = default_reaches()
+    assert list(reaches["right_palm"]) == ["torso", "right_upper_arm", "right_forearm", "right_hand"]
+    for way in reaches.values():
+        for segment, by_length in way.items():
+            ends = {"torso": {"trunk", "shoulder_width"}}.get(segment, {segment})
+            assert {LENGTHS[k] for k in np.flatnonzero(by_length.any(axis=0))} == ends
+            assert set(np.abs(by_length).ravel()) <= {0.0, 0.5, 1.0}
+    assert default_reaches() is reaches
+
+
+def test_bodies_of_others_have_links_between_the_segments(data: Path) -> None:
+    way = measure_reaches(load_model(data / "human_urdf" / GAZEBO["48"]))["left_palm"]
+    assert {"pelvis", "torso", "jLeftC7Shoulder_rotx", "left_upper_arm", "left_hand"} <= set(way)
+    assert any(part.constant.any() for part in way.values())
+
+
+@pytest.mark.parametrize("change", ["bend", "slide"])
+def test_a_chain_that_orientations_and_lengths_do_not_give(change: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    body = load_model()
+    if change == "slide":
+        m = body.pin
+        joint = m.addJoint(m.getJointId("left_forearm"), pin.JointModelPZ(), pin.SE3.Identity(), "telescope")
+        m.frames[m.getFrameId("left_palm")].parentJoint = joint
+        with pytest.raises(BadModel, match=r"joint 'telescope' slides: orientations do not tell where left_palm is"):
+            measure_reaches(body)
+        return
+    stretch = BodyModel.with_lengths
+
+    def stretch_wrongly(model: BodyModel, lengths: dict[str, float]) -> BodyModel:
+        return stretch(model, {name: value + 0.5 * (value - 0.3) ** 2 for name, value in lengths.items()})
+
+    monkeypatch.setattr(BodyModel, "with_lengths", stretch_wrongly)
+    with pytest.raises(BadModel, match=r"link torso in the chain to left_shoulder is not affine in the lengths"):
+        measure_reaches(body)
