@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..diagnostics import INFO, Diagnostic, lines
-from ..kinematics import axis_std, orientation_residuals
+from ..kinematics import compute_axis_std, compute_orientation_residuals
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
 from .decimation import Totals, compute_totals
@@ -99,7 +99,7 @@ def _summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping
     recording = tracked.recording
     since = mask_from_start(tracked)
     headings = {joint: float(np.degrees(finite_max(std[since]))) for joint, std in joint_heading_stds(budgets).items()}
-    stds = {name: axis_std(cov[since]) for name, cov in tracked.pose.point_cov.items()}
+    stds = {name: compute_axis_std(cov[since]) for name, cov in tracked.pose.point_cov.items()}
     return {
         "duration": _format_duration(float(recording.time[-1] - recording.time[0])),
         "rate_hz": totals.rate_hz,
@@ -169,7 +169,7 @@ def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> 
     at = int(np.argmax(stds[worst]))
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     fastest = max(growth, key=growth.__getitem__) if growth else None
-    clasped = tracked.correction is not None and tracked.correction.clasp_mm is not None
+    clasped = tracked.correction is not None and tracked.correction.palm_gap_rms_mm is not None
     segments = [
         [
             plain(name),
@@ -199,7 +199,7 @@ def _drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> 
         ),
         "fastest": (fastest, float(np.degrees(growth[fastest]))) if fastest else None,
         "advice": heading_remedy(tracked),
-        "corrected": max(tracked.correction.largest_deg.values(), default=0.0)
+        "corrected": max(tracked.correction.max_correction_deg.values(), default=0.0)
         if tracked.correction is not None
         else None,
         "clasped": clasped,
@@ -268,7 +268,7 @@ def _run_section(tracked: TrackedRecording) -> dict[str, Any]:
                 f"{plain(name)}, orientation residual",
                 f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° (the model's joints are too few or end too soon)",
             )
-            for name, angle in orientation_residuals(tracked.model, tracked.q, tracked.quat_WL).items()
+            for name, angle in compute_orientation_residuals(tracked.model, tracked.q, tracked.quat_WL).items()
         ]
     rows += [
         ("points", listed([plain(name) for name in tracked.points]) or "none"),
