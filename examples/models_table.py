@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
-from wepose_pin.kinematics import configuration, orientation_residuals
+from wepose_pin.kinematics import compute_orientation_residuals, solve_configuration
 from wepose_pin.model import chains
 
 N = 200  # random poses: every segment up to 60 deg from the one above
@@ -25,7 +25,7 @@ for path in sys.argv[1:] or [None]:
         R = Rotation.from_rotvec(np.radians(60.0) * rng.uniform(-0.57, 0.57, (N, 3)))
         R_WA = Rotation.from_quat(quat_WL[above]) if above in quat_WL and above != segment else Rotation.identity()
         quat_WL[segment] = (R_WA * R).as_quat()
-    residuals = orientation_residuals(body, configuration(body, quat_WL), quat_WL)
+    residuals = compute_orientation_residuals(body, solve_configuration(body, quat_WL), quat_WL)
 
     print(f"{path or 'the body that comes with the package'}")
     singles = [name for k, name in enumerate(body.pin.names) if body.pin.nvs[k] == 1]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import MOVED_MOUNT, check_mounts, compute_heading, suggest_mounts
+from wepose_pin.alignment import MOUNT_MOVED_STDS, check_mounts, compute_heading_offset, suggest_mounts
 from wepose_pin.calibration import load_protocol
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
@@ -78,7 +78,7 @@ def test_calibrated_mounts_give_headings_of_any_size() -> None:
     subject = replace(population_subject(), mounts={name: mount.as_quat() for name, mount in mounts.items()})
     segments = estimate_segments(recording, subject)
     for name, psi in headings.items():
-        assert segments.heading[name] == pytest.approx(psi, abs=1e-9)
+        assert segments.heading_offset[name] == pytest.approx(psi, abs=1e-9)
         assert (Rotation.from_quat(segments.quat_WL[name]) * true[name].inv()).magnitude().max() < 1e-9
 
 
@@ -120,7 +120,7 @@ def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
     # Half of the 5 deg is the mount's, and with it 0.9 as much of its heading.
     np.testing.assert_allclose(np.abs(moved), [0.0, 2.5, 2.25], atol=0.06)
     start = Rotation.from_quat(segments.quat_WL["left_forearm"][:100]).mean()
-    assert abs(np.degrees(compute_heading(Rotation.identity(), start))) < 0.01
+    assert abs(np.degrees(compute_heading_offset(Rotation.identity(), start))) < 0.01
 
 
 def test_a_calibrated_mount_that_has_moved_is_said() -> None:
@@ -134,7 +134,7 @@ def test_a_calibrated_mount_that_has_moved_is_said() -> None:
         covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
     )
     (found,) = estimate_segments(recording, subject).diagnostics
-    assert (found.code, found.place, found.limit) == ("mount-moved", "torso", MOVED_MOUNT)
+    assert (found.code, found.place, found.limit) == ("mount-moved", "torso", MOUNT_MOVED_STDS)
     assert found.value == pytest.approx(np.deg2rad(20.0), abs=0.01)
     (found,) = (
         each
@@ -181,8 +181,8 @@ def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
     kept = estimate_segments(replace(recording, sensors=sensors), subject)
     new = estimate_segments(replace(recording, sensors=sensors, remounted=True), subject)
     for name in headings:
-        assert new.heading[name] == pytest.approx(headings[name], abs=1e-9)
-        assert kept.heading[name] == pytest.approx(headings[name] + 1.0, abs=1e-9)
+        assert new.heading_offset[name] == pytest.approx(headings[name], abs=1e-9)
+        assert kept.heading_offset[name] == pytest.approx(headings[name] + 1.0, abs=1e-9)
 
 
 def test_ready_orientations_need_no_mount() -> None:
@@ -198,7 +198,7 @@ def test_heading_is_the_nearest_turn() -> None:
     for _ in range(10):
         R_WS = Rotation.random(random_state=rng)
         tilted = Rotation.from_rotvec([0.1, -0.2, 0.0]) * R_WS
-        psi = compute_heading(Rotation.from_rotvec([0, 0, -0.7]) * tilted, R_WS)
+        psi = compute_heading_offset(Rotation.from_rotvec([0, 0, -0.7]) * tilted, R_WS)
         others = [
             (Rotation.from_rotvec([0, 0, p - 0.7]) * tilted * R_WS.inv()).magnitude() for p in np.arange(0, 6.28, 0.01)
         ]

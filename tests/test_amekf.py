@@ -16,7 +16,7 @@ from wepose_pin import rotations
 from wepose_pin.errors import BadOption, WeposeWarning
 from wepose_pin.evaluation import attitude_error, uncertainty
 from wepose_pin.filters import TYPICAL, Amekf, AmekfParams, FilterRun, Smoother, estimate_orientation, run_filter
-from wepose_pin.filters.amekf import BLOCK, ERROR, STATES, transition_rows
+from wepose_pin.filters.amekf import BLOCK, ERROR, STATES, fill_transition_rows
 from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector
@@ -148,7 +148,7 @@ def test_the_transition_is_the_derivative_of_the_strapdown() -> None:
     force = np.array([turn.inv().apply([0.0, 0.0, GRAVITY]) for turn in turns])
     block = block_of(np.array([turn.as_matrix() for turn in turns[1:]]), rate, moving, dt)
     found = np.empty((7, STATES))
-    transition_rows(block[0], GRAVITY, np.eye(STATES), found)
+    fill_transition_rows(block[0], GRAVITY, np.eye(STATES), found)
     step, expected = 1e-6, np.empty((7, STATES))
     for j in range(STATES):
         ends = [strapdown(sign * step * np.eye(STATES)[j], rate, moving, force, dt) for sign in (1.0, -1.0)]
@@ -175,10 +175,10 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     filter_.state.x[V : P + 2] = 0.1, -0.2, 0.05, 0.02
     x_before, P_start = filter_.state.x.copy(), filter_.state.P.copy()
     blocks = np.empty(1, BLOCK)
-    found = filter_.run_recorded(of.gyro[at], of.accel[at], np.full(25, still), blocks)
+    found = filter_.run_with_blocks(of.gyro[at], of.accel[at], np.full(25, still), blocks)
 
     rows, T = np.empty((7, STATES)), 0.25
-    transition_rows(blocks[0], of.noise.gravity, np.eye(STATES), rows)
+    fill_transition_rows(blocks[0], of.noise.gravity, np.eye(STATES), rows)
     whole = np.eye(STATES)
     whole[:7] = rows
     variance = float(np.trace(of.noise.gyro_cov)) / 3.0

@@ -20,9 +20,9 @@ from wepose_pin.recording.arrivals import (
     REORDER_S,
     TAKEN,
     WAIT_S,
-    Aligner,
     Arrivals,
     Samples,
+    StreamSynchronizer,
     Ticks,
     order_arrivals,
 )
@@ -38,11 +38,11 @@ def signals(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return rng.standard_normal((3, n, 3)), rng.standard_normal((3, n, 3)) + [0.0, 0.0, 9.8]
 
 
-def fed(aligner: Aligner, came: Iterable[tuple[int, float, np.ndarray, np.ndarray]]) -> Ticks:
+def fed(synchronizer: StreamSynchronizer, came: Iterable[tuple[int, float, np.ndarray, np.ndarray]]) -> Ticks:
     """All ticks of single samples (sensor, time, gyro, accel) that come one by one."""
     made = [
-        aligner.push(
-            order_arrivals([Samples(aligner.sensors[i], np.array([t]), g[None], a[None])], aligner.sensors),
+        synchronizer.push(
+            order_arrivals([Samples(synchronizer.sensors[i], np.array([t]), g[None], a[None])], synchronizer.sensors),
         )
         for i, t, g, a in came
     ]
@@ -61,13 +61,13 @@ def in_order(gyro: np.ndarray, accel: np.ndarray) -> list[tuple[int, float, np.n
 
 def test_samples_on_their_ticks_come_out_to_the_bit_and_at_once() -> None:
     gyro, accel = signals(300)
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    ticks = fed(aligner, in_order(gyro, accel))
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    ticks = fed(synchronizer, in_order(gyro, accel))
     assert np.array_equal(ticks.gyro_S, gyro.swapaxes(0, 1))
     assert np.array_equal(ticks.accel_S, accel.swapaxes(0, 1))
     assert not ticks.lost.any()
-    assert aligner.counts[:, TAKEN].tolist() == [300] * 3
-    assert aligner.counts[:, [MISSING, LATE, DUPLICATE, BAD]].sum() == 0
+    assert synchronizer.counts[:, TAKEN].tolist() == [300] * 3
+    assert synchronizer.counts[:, [MISSING, LATE, DUPLICATE, BAD]].sum() == 0
     np.testing.assert_allclose(ticks.time, BEGIN + np.arange(300) / RATE, atol=1e-12)
 
 
@@ -78,11 +78,11 @@ def test_the_same_arrivals_in_blocks_give_the_same_ticks() -> None:
         ((t + rng.exponential(0.02), i, t, g, a) for i, t, g, a in in_order(gyro, accel) if rng.random() > 0.05),
         key=lambda each: each[0],
     )
-    one_by_one = Aligner(NAMES, RATE, BEGIN)
+    one_by_one = StreamSynchronizer(NAMES, RATE, BEGIN)
     first = fed(one_by_one, [each[1:] for each in came])
     which = np.array([each[1] for each in came], dtype=np.uint8)
     parts = [np.array([each[k] for each in came]) for k in (2, 3, 4)]
-    blocks = Aligner(NAMES, RATE, BEGIN)
+    blocks = StreamSynchronizer(NAMES, RATE, BEGIN)
     cuts = [0, 1, 2, 50, 700, len(came)]
     made = [blocks.push(Arrivals(which[a:b], *(part[a:b] for part in parts))) for a, b in pairwise(cuts)]
     for part in ("gyro_S", "accel_S", "lost"):
@@ -96,9 +96,9 @@ def test_what_one_read_gives_is_taken_by_time_and_not_by_sensor() -> None:
     """A loop that was held up reads half a second of every sensor: none of them is lost for coming second."""
     gyro, accel = signals(200)
     times = BEGIN + np.arange(200) / RATE
-    aligner = Aligner(NAMES, RATE, BEGIN)
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
     got = [Samples(name, times, gyro[i], accel[i]) for i, name in enumerate(NAMES)]
-    ticks = aligner.push(order_arrivals(got, NAMES))
+    ticks = synchronizer.push(order_arrivals(got, NAMES))
     assert np.array_equal(ticks.gyro_S, gyro.swapaxes(0, 1))
 
 
@@ -107,14 +107,14 @@ def test_overtaken_samples_find_their_place_and_later_ones_are_late() -> None:
     came = in_order(gyro, accel)
     at = came.index(next(c for c in came if c[0] == 1 and c[1] == tick_time(50)))
     overtaken = came[:at] + came[at + 1 : at + 5] + [came[at]] + came[at + 5 :]
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    assert np.array_equal(fed(aligner, overtaken).gyro_S, gyro.swapaxes(0, 1))
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    assert np.array_equal(fed(synchronizer, overtaken).gyro_S, gyro.swapaxes(0, 1))
 
     behind = 3 * round((REORDER_S + 0.03) * RATE)
     too_late = came[:at] + came[at + 1 : at + behind] + [came[at]] + came[at + behind :]
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    ticks = fed(aligner, too_late)
-    assert aligner.counts[1].tolist() == [0, 1, 0, 0, 99, 0, 0]
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    ticks = fed(synchronizer, too_late)
+    assert synchronizer.counts[1].tolist() == [0, 1, 0, 0, 99, 0, 0]
     np.testing.assert_allclose(ticks.gyro_S[50, 1], 0.5 * (gyro[1, 49] + gyro[1, 51]))  # bridged
     keep = np.ones((100, 3), dtype=bool)
     keep[50, 1] = False
@@ -133,10 +133,10 @@ def test_duplicates_and_what_is_no_measurement_are_counted_and_change_nothing() 
         (0, 1e300, gyro[0, 0], accel[0, 0]),
     ]
     mixed = came[:120] + bad + [came[118], came[119]] + came[120:]
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    assert np.array_equal(fed(aligner, mixed).gyro_S, gyro.swapaxes(0, 1))
-    assert aligner.counts[:, BAD].tolist() == [len(bad), 0, 0]
-    assert aligner.counts[:, DUPLICATE].tolist() == [0, 1, 1]
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    assert np.array_equal(fed(synchronizer, mixed).gyro_S, gyro.swapaxes(0, 1))
+    assert synchronizer.counts[:, BAD].tolist() == [len(bad), 0, 0]
+    assert synchronizer.counts[:, DUPLICATE].tolist() == [0, 1, 1]
 
 
 def stopped(values: np.ndarray, first: int, last: int) -> np.ndarray:
@@ -151,8 +151,8 @@ def stopped(values: np.ndarray, first: int, last: int) -> np.ndarray:
 def test_a_sensor_that_repeats_itself_is_lost_until_it_changes(stops: int, size: float) -> None:
     gyro, accel = signals(900)
     gyro, accel = stopped(size * gyro, stops, stops + 99), stopped([0.0, 0.0, 9.8] + size * accel, stops, stops + 99)
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    ticks = fed(aligner, in_order(gyro, accel))
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    ticks = fed(synchronizer, in_order(gyro, accel))
     measured = np.isfinite(ticks.gyro_S).all(axis=2)
     found = stops + round(LONGEST_GAP_S * RATE)  # the first that is not taken
     assert measured[:, :2].all()
@@ -161,26 +161,26 @@ def test_a_sensor_that_repeats_itself_is_lost_until_it_changes(stops: int, size:
     assert measured[stops + 101 :, 2].all()
     assert ticks.lost[found + 2 : stops + 99, 2].all()
     assert not ticks.lost[:, :2].any()
-    assert aligner.counts[:, FROZEN].tolist() == [0, 0, stops + 100 - found]
-    assert not aligner.frozen.any()
+    assert synchronizer.counts[:, FROZEN].tolist() == [0, 0, stops + 100 - found]
+    assert not synchronizer.frozen.any()
     for i in (0, 1):
         assert np.array_equal(ticks.gyro_S[:, i], gyro[i])
 
 
 def test_a_sensor_that_never_changes_is_lost_where_others_have_noise() -> None:
     gyro, accel = signals(600)
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    ticks = fed(aligner, in_order(stopped(gyro, 1, 599), stopped(accel, 1, 599)))
-    assert aligner.frozen.tolist() == [False, False, True]
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    ticks = fed(synchronizer, in_order(stopped(gyro, 1, 599), stopped(accel, 1, 599)))
+    assert synchronizer.frozen.tolist() == [False, False, True]
     assert not np.isfinite(ticks.gyro_S[300:, 2]).any()
-    alone = Aligner(NAMES[2:], RATE, BEGIN)
+    alone = StreamSynchronizer(NAMES[2:], RATE, BEGIN)
     of_one = [(0, t, g, a) for i, t, g, a in in_order(stopped(gyro, 1, 599), stopped(accel, 1, 599)) if i == 2]
     assert np.isfinite(fed(alone, of_one).gyro_S).all()
 
 
 def test_one_sensor_alone_that_freezes_has_ticks_still() -> None:
     gyro, accel = signals(600)
-    alone = Aligner(NAMES[2:], RATE, BEGIN)
+    alone = StreamSynchronizer(NAMES[2:], RATE, BEGIN)
     came = in_order(stopped(gyro, 400, 599), stopped(accel, 400, 599))
     ticks = fed(alone, [(0, t, g, a) for i, t, g, a in came if i == 2])
     assert len(ticks.time) > 580
@@ -196,15 +196,15 @@ def test_a_rate_that_is_cut_off_is_not_known(digits: float) -> None:
     gyro[1, :, 2] += swing
     gyro[2, :, 0] += 0.6 * swing
     gyro = np.round(np.clip(gyro, -4.0, 4.0) * 1000.0 / digits) / 1000.0 * digits
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    ticks = fed(aligner, in_order(gyro, accel))
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    ticks = fed(synchronizer, in_order(gyro, accel))
     beyond = np.abs(gyro).max(axis=2) > 0.98 * 4.0
     assert beyond[1].sum() > 100
     known = np.isfinite(ticks.gyro_S).all(axis=2).T
     assert known[[0, 2]].all()
     assert known[1][~beyond[1]].all()
     assert np.count_nonzero(known[1][beyond[1]]) < 10  # and those just below it, before it was known
-    assert aligner.counts[:, CUT_OFF].tolist() == [0, np.count_nonzero(~known[1]), 0]
+    assert synchronizer.counts[:, CUT_OFF].tolist() == [0, np.count_nonzero(~known[1]), 0]
     assert not ticks.lost.any()
 
 
@@ -215,7 +215,7 @@ def test_a_peak_that_noise_has_levelled_is_no_range(noise: float, seed: int) -> 
     swing = (2.0 + np.arange(n) / n) * np.sin(2.0 * np.pi * np.arange(n) / RATE)
     gyro, accel = (noise * 0.01 * rng.standard_normal((3, n, 3)) for _ in range(2))
     gyro = np.round((gyro + swing[:, None]) / 0.01) * 0.01
-    assert np.isfinite(fed(Aligner(NAMES, RATE, BEGIN), in_order(gyro, accel)).gyro_S).all()
+    assert np.isfinite(fed(StreamSynchronizer(NAMES, RATE, BEGIN), in_order(gyro, accel)).gyro_S).all()
 
 
 def test_larger_rates_tell_that_it_was_no_range() -> None:
@@ -224,7 +224,7 @@ def test_larger_rates_tell_that_it_was_no_range() -> None:
     gyro[1, 200:210, 0] = 3.0
     gyro[1, 300, 0] = 3.01
     gyro[1, 350:354, 0] = 3.0
-    known = np.isfinite(fed(Aligner(NAMES, RATE, BEGIN), in_order(gyro, accel)).gyro_S).all(axis=2).T
+    known = np.isfinite(fed(StreamSynchronizer(NAMES, RATE, BEGIN), in_order(gyro, accel)).gyro_S).all(axis=2).T
     assert np.flatnonzero(~known[1]).tolist() == list(range(204, 210))
 
 
@@ -234,26 +234,26 @@ def test_coarse_digits_that_repeat_are_measured(digit: float) -> None:
     rng, n = np.random.default_rng(3), 6000
     motion = 40.0 * np.sin(np.arange(n) / 30.0)[None, :, None] * (np.arange(n) % 2000 < 400)[None, :, None]
     gyro, accel = (np.round((rng.standard_normal((3, n, 3)) + motion) / digit / 4.0) for _ in range(2))
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    ticks = fed(aligner, in_order(gyro, accel))
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    ticks = fed(synchronizer, in_order(gyro, accel))
     assert np.array_equal(ticks.gyro_S, gyro.swapaxes(0, 1))
-    assert aligner.counts[:, FROZEN].sum() == 0
+    assert synchronizer.counts[:, FROZEN].sum() == 0
 
 
 def test_what_has_no_noise_may_rest_after_it_has_moved() -> None:
     n = np.arange(900)
     motion = np.sin(n / 9.0) * (n < 400)
     gyro, accel = (np.stack([motion, 0.5 * motion, 0.0 * motion], axis=1)[None].repeat(3, axis=0) for _ in range(2))
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    assert np.array_equal(fed(aligner, in_order(gyro, accel)).gyro_S, gyro.swapaxes(0, 1))
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    assert np.array_equal(fed(synchronizer, in_order(gyro, accel)).gyro_S, gyro.swapaxes(0, 1))
 
 
 @pytest.mark.parametrize("times", [2, 10])
 def test_values_that_are_held_from_sample_to_sample_are_measured(times: int) -> None:
     """A device that samples more slowly than it sends."""
     gyro, accel = (values.repeat(times, axis=1) for values in signals(3000 // times))
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    assert np.array_equal(fed(aligner, in_order(gyro, accel)).gyro_S, gyro.swapaxes(0, 1))
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    assert np.array_equal(fed(synchronizer, in_order(gyro, accel)).gyro_S, gyro.swapaxes(0, 1))
 
 
 @pytest.mark.parametrize(("lost", "bridged"), [(1, True), (5, True), (6, False), (40, False)])
@@ -261,7 +261,7 @@ def test_holes_are_bridged_up_to_a_limit_and_then_nan(lost: int, bridged: bool) 
     assert round(LONGEST_GAP_S * RATE) == 5
     gyro, accel = signals(200)
     came = [c for c in in_order(gyro, accel) if not (c[0] == 2 and 60 <= round((c[1] - BEGIN) * RATE) < 60 + lost)]
-    ticks = fed(Aligner(NAMES, RATE, BEGIN), came)
+    ticks = fed(StreamSynchronizer(NAMES, RATE, BEGIN), came)
     hole = ticks.gyro_S[60 : 60 + lost, 2]
     if bridged:
         share = (np.arange(1, lost + 1) / (lost + 1))[:, None]
@@ -275,20 +275,20 @@ def test_holes_are_bridged_up_to_a_limit_and_then_nan(lost: int, bridged: bool) 
 
 def test_ticks_wait_for_a_silent_sensor_once_and_not_again() -> None:
     gyro, accel = signals(400)
-    aligner = Aligner(NAMES, RATE, BEGIN)
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
     behind = []
     for i, t, g, a in in_order(gyro, accel):
         if i == 1 and 100 <= round((t - BEGIN) * RATE) < 300:
             continue
-        aligner.push(order_arrivals([Samples(NAMES[i], np.array([t]), g[None], a[None])], NAMES))
+        synchronizer.push(order_arrivals([Samples(NAMES[i], np.array([t]), g[None], a[None])], NAMES))
         if i == 2:
-            behind.append(round((t - BEGIN) * RATE) + 1 - aligner.next_tick)
+            behind.append(round((t - BEGIN) * RATE) + 1 - synchronizer.next_tick)
     wait = round(WAIT_S * RATE)
     assert max(behind) <= wait + 1
     assert max(behind[:100]) == 0
     assert max(behind[100 + wait + 1 : 300]) == 0  # lost: none waits for it
     assert max(behind[302:]) == 0  # and back
-    assert aligner.counts[1].tolist() == [200, 0, 0, 0, 200, 0, 0]
+    assert synchronizer.counts[1].tolist() == [200, 0, 0, 0, 200, 0, 0]
 
 
 def test_clocks_that_are_off_the_ticks_lose_no_rotation() -> None:
@@ -298,7 +298,7 @@ def test_clocks_that_are_off_the_ticks_lose_no_rotation() -> None:
     rate = np.sin(2.0 * np.pi * 0.7 * times)[:, None] * [1.0, 0.0, 0.0]
     force = np.cos(2.0 * np.pi * 0.7 * times)[:, None] * [0.0, 0.0, 9.8]
     rows = [(0, float(t), r, f) for t, r, f in zip(times, rate, force, strict=True)]
-    ticks = fed(Aligner(NAMES[:1], RATE, BEGIN), rows)
+    ticks = fed(StreamSynchronizer(NAMES[:1], RATE, BEGIN), rows)
     turned = np.cumsum(ticks.gyro_S[:, 0, 0]) / RATE
     expected = np.interp(ticks.time, times, np.cumsum(rate[:, 0]) / RATE)
     np.testing.assert_allclose(turned - turned[10], expected - expected[10], atol=2e-4)
@@ -310,7 +310,7 @@ def test_a_faster_sensor_is_averaged_over_the_step() -> None:
     times = BEGIN + np.arange(n) / (4.0 * RATE)
     rate = np.random.default_rng(2).standard_normal((n, 3))
     rows = [(0, float(t), r, r) for t, r in zip(times, rate, strict=True)]
-    ticks = fed(Aligner(NAMES[:1], RATE, BEGIN), rows)
+    ticks = fed(StreamSynchronizer(NAMES[:1], RATE, BEGIN), rows)
     means = rate[1 : 4 * ((n - 1) // 4) + 1].reshape(-1, 4, 3).mean(axis=1)
     np.testing.assert_allclose(ticks.gyro_S[1:, 0], means[: len(ticks.time) - 1], atol=1e-9)
 
@@ -319,8 +319,8 @@ def test_a_clock_that_really_went_on_is_followed() -> None:
     """All sensors sleep for a minute: the ticks between are lost ones, and it goes on."""
     gyro, accel = signals(200)
     came = [(i, t + (60.0 if t >= tick_time(100) else 0.0), g, a) for i, t, g, a in in_order(gyro, accel)]
-    aligner = Aligner(NAMES, RATE, BEGIN)
-    ticks = fed(aligner, came)
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    ticks = fed(synchronizer, came)
     assert len(ticks.time) == 6200
     assert np.isnan(ticks.gyro_S[100:6100]).all()
     assert np.array_equal(ticks.gyro_S[6104:], gyro.swapaxes(0, 1)[104:])
@@ -328,14 +328,16 @@ def test_a_clock_that_really_went_on_is_followed() -> None:
 
 def test_random_arrivals_never_stop_the_ticks() -> None:
     rng = np.random.default_rng(3)
-    aligner = Aligner(NAMES, RATE, BEGIN)
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
     made = 0
     for k in range(3000):
         wild = rng.random() < 0.1
         t = float(rng.choice([np.nan, np.inf, -1e9, 1e9, rng.normal(0.0, 1e3)])) if wild else tick_time(k // 3)
         values = rng.standard_normal((2, 3)) * (1e6 if rng.random() < 0.05 else 1.0)
         name = NAMES[int(rng.integers(3))]
-        made += len(aligner.push(order_arrivals([Samples(name, np.array([t]), values[:1], values[1:])], NAMES)).time)
+        made += len(
+            synchronizer.push(order_arrivals([Samples(name, np.array([t]), values[:1], values[1:])], NAMES)).time
+        )
     assert made > 900
 
 
@@ -346,7 +348,7 @@ def test_after_a_long_silence_ticks_come_in_pieces() -> None:
     def at(t: float) -> Arrivals:
         return order_arrivals([Samples(name, np.array([t]), zero, zero) for name in NAMES], NAMES)
 
-    whole, parts = (Aligner(NAMES, RATE, BEGIN) for _ in range(2))
+    whole, parts = (StreamSynchronizer(NAMES, RATE, BEGIN) for _ in range(2))
     made = []
     for t in [tick_time(0), *(tick_time(6000 + k) for k in range(5))]:
         ticks, pieces = whole.push(at(t)), list(parts.iterate_ticks(at(t)))

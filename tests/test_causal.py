@@ -11,13 +11,13 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption, BadPhase
-from wepose_pin.kinematics import pose_table
+from wepose_pin.kinematics import build_pose_table
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import LENGTHS, Subject, mount_rows, population_subject
 from wepose_pin.tracking import Tracker, TrackOptions, track
-from wepose_pin.tracking.causal import SegmentFollower
-from wepose_pin.tracking.start_pose import HOLD_S, StartGuide
+from wepose_pin.tracking.causal import CausalSegmentEstimator
+from wepose_pin.tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +31,14 @@ def first(recording: Recording, n: int, begin: int = 0) -> Recording:
     return replace(recording.cut(slice(begin, n)), phases={"start": recording.phases["start"]})
 
 
-def started(recording: Recording, subject: Subject | None = None, method: str = "amekf") -> tuple[SegmentFollower, int]:
+def started(
+    recording: Recording, subject: Subject | None = None, method: str = "amekf"
+) -> tuple[CausalSegmentEstimator, int]:
     """A causal tracker whose start pose has just ended, and the sample that comes next."""
     begin = recording.span(recording.phases["start"][0]).stop
     tracker = Tracker(subject, options=TrackOptions(method, causal=True))
     assert not tracker.push(recording.cut(slice(0, begin)))
-    return tracker.follower, begin
+    return tracker.segment_estimator, begin
 
 
 def columns(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -103,8 +105,8 @@ def test_causal_chunks_put_together_are_the_whole(recording: Recording) -> None:
         tracker, whole = Tracker(options=TrackOptions(causal=True)), track(of, causal=True)
         chunks = [tracked for chunk in of.chunks(1.7) for tracked in tracker.push(chunk)] + tracker.finish()
         assert len(chunks) > 10
-        table = pl.concat([pose_table(chunk.pose, covariance=True) for chunk in chunks])
-        assert table.equals(pose_table(whole.pose, covariance=True))
+        table = pl.concat([build_pose_table(chunk.pose, covariance=True) for chunk in chunks])
+        assert table.equals(build_pose_table(whole.pose, covariance=True))
 
 
 def test_what_comes_later_changes_nothing(recording: Recording) -> None:
@@ -132,12 +134,12 @@ def test_it_is_close_to_tracking_the_whole_recording(recording: Recording) -> No
 def test_a_reset_turns_headings_to_where_the_person_stands(recording: Recording) -> None:
     """Standing in the start pose with headings that are off by 30 degrees: a reset brings them back."""
     tracker, begin = started(recording)
-    before = tracker.heading.copy()
-    tracker.heading += np.deg2rad(30.0)
-    tracker._turn = Rotation.from_rotvec(tracker.heading[:, None] * [0.0, 0.0, 1.0]).as_quat()
+    before = tracker.heading_offset.copy()
+    tracker.heading_offset += np.deg2rad(30.0)
+    tracker._quat_WV = Rotation.from_rotvec(tracker.heading_offset[:, None] * [0.0, 0.0, 1.0]).as_quat()
     std = tracker.heading_std()
     tracker.reset_headings()
-    np.testing.assert_allclose(tracker.heading, before, atol=np.deg2rad(1.5))  # as the person sways
+    np.testing.assert_allclose(tracker.heading_offset, before, atol=np.deg2rad(1.5))  # as the person sways
     assert (tracker.heading_std() > std).all()  # a person stands to some degrees, a filter drifts by tenths
     gyro, accel = columns(recording)
     np.testing.assert_allclose(np.abs(tracker.step(gyro[begin], accel[begin])[:, 3]), 1.0, atol=0.01)
@@ -166,33 +168,33 @@ def test_a_heading_is_stated_as_track_states_it(recording: Recording, simulation
     assert (after[moved] > np.degrees(np.sqrt(np.maximum(np.square(stated) - var, 0.0)))[moved]).all()
 
 
-def test_the_guide_finds_the_first_stillness_and_says_who_moves() -> None:
+def test_the_detector_finds_the_first_stillness_and_says_who_moves() -> None:
     rng = np.random.default_rng(0)
     rate, n = 100.0, 1500
     gyro = 0.002 * rng.standard_normal((n, 3, 3))
     gyro[:400, 1] += 2.0 * np.sin(np.arange(400) / 10.0)[:, None]
     gyro[600, 2] = np.nan
-    guide = StartGuide(rate, 3)
-    states = [guide.push(tick) for tick in gyro]
+    detector = StartPoseDetector(rate, 3)
+    states = [detector.push(tick) for tick in gyro]
     assert states[50] == "moved"
-    assert guide.moving == (1,)
-    assert "hold" in states[520:600]
+    assert detector.moving == (1,)
+    assert "start_pose" in states[520:600]
     assert states[600] == "waiting"
-    assert states[601] == "hold"
+    assert states[601] == "start_pose"
     assert states[-1] == "ready"
-    assert (guide.begin, guide.end) == (601, 600 + round(HOLD_S * rate))
+    assert (detector.begin, detector.end) == (601, 600 + round(START_POSE_HOLD_S * rate))
 
 
 def test_a_slow_steady_turn_is_no_stillness() -> None:
     gyro = np.full((1000, 1, 3), np.deg2rad(6.0))
-    guide = StartGuide(100.0, 1)
-    assert all(guide.push(tick) != "ready" for tick in gyro)
+    detector = StartPoseDetector(100.0, 1)
+    assert all(detector.push(tick) != "ready" for tick in gyro)
 
 
 def test_without_a_named_start_pose_it_is_found(recording: Recording) -> None:
     found = track(replace(recording, phases={}), causal=True)
     named = track(recording, causal=True)
-    assert found.time[0] == pytest.approx(recording.time[0] + HOLD_S, abs=0.5)
+    assert found.time[0] == pytest.approx(recording.time[0] + START_POSE_HOLD_S, abs=0.5)
     for name, quat in named.quat_WL.items():
         both = found.quat_WL[name][-len(quat) :]
         assert np.degrees((Rotation.from_quat(both).inv() * Rotation.from_quat(quat)).magnitude().max()) < 3.0
@@ -209,5 +211,5 @@ def test_what_cannot_be_causal_is_said(recording: Recording) -> None:
     with pytest.raises(BadPhase, match="ends with the recording"):
         track(recording.cut(slice(0, until)), causal=True)
     moving = {name: replace(of, gyro_S=of.gyro_S + 1.0) for name, of in recording.imus.items()}
-    with pytest.raises(BadPhase, match="nobody stands still for 3 s"):
+    with pytest.raises(BadPhase, match="no start pose of 3 s without motion"):
         track(replace(recording, sensors=moving, phases={}), causal=True)

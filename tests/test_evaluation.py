@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadData
 from wepose_pin.evaluation import evaluate, uncertainty
-from wepose_pin.kinematics import Pose, pose_from_table, pose_table
+from wepose_pin.kinematics import Pose, build_pose_table, parse_pose_table
 
 TIME = np.arange(101) / 10.0
 
@@ -114,11 +114,11 @@ def test_stated_uncertainty_is_judged() -> None:
 def test_uncertainty_goes_through_the_table() -> None:
     cov = np.tile(np.diag([1e-4, 4e-4, 9e-4]), (101, 1, 1))
     stated = replace(pose((0.5, 0.5, 0.5), (0.01, 0.0, 0.0)), segment_cov={"torso": cov}, point_cov={"left_palm": cov})
-    whole = evaluate(pose_from_table(pose_table(stated, covariance=True), "t"), pose())
+    whole = evaluate(parse_pose_table(build_pose_table(stated, covariance=True), "t"), pose())
     assert whole.position_uncertainty["left_palm"].nees == pytest.approx(1.0)
     direct = evaluate(stated, pose()).attitude_uncertainty["torso"]
     assert whole.attitude_uncertainty["torso"] == pytest.approx(direct)
-    rough = evaluate(pose_from_table(pose_table(stated), "t"), pose())
+    rough = evaluate(parse_pose_table(build_pose_table(stated), "t"), pose())
     assert rough.position_uncertainty["left_palm"].nees == pytest.approx(1e-4 / (14e-4 / 3))
     assert evaluate(pose(), pose()).position_uncertainty == {}
 

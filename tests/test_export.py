@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin import cli
 from wepose_pin.angles import joint_angles
 from wepose_pin.errors import BadData, BadOption, ExistingOutput, MissingFile
-from wepose_pin.kinematics import Pose, compute_pose, pose_from_table, pose_table
+from wepose_pin.kinematics import Pose, build_pose_table, compute_pose, parse_pose_table
 from wepose_pin.model import load_model
 from wepose_pin.recording import SEGMENTS
 from wepose_pin.writers import export as writers
@@ -51,7 +51,7 @@ def a_pose(segments: tuple[str, ...] = SEGMENTS, n: int = 301, rate_hz: float = 
 def write_folder(folder: Path, pose: Pose) -> Path:
     """A result folder, as far as an export reads it."""
     folder.mkdir()
-    write_table(folder / "pose.parquet", pose_table(pose, covariance=True))
+    write_table(folder / "pose.parquet", build_pose_table(pose, covariance=True))
     (folder / "subject.urdf").write_text(load_model(lengths=LENGTHS).urdf(), encoding="utf-8")
     (folder / "summary.json").write_text('{"recording": "a = made\\u00b2 one"}', encoding="utf-8")
     return folder
@@ -95,7 +95,7 @@ def test_tables_hold_pose_and_angles(result: Path, pose: Pose, tmp_path: Path, f
     elbow = angles["right_elbow"]
     np.testing.assert_allclose(table["right_elbow_flexion_deg"], np.degrees(elbow.values[:, 0]), atol=1e-9)
     np.testing.assert_allclose(table["right_elbow_pronation_std_deg"], np.degrees(elbow.std[:, 2]), rtol=1e-9)
-    again = pose_from_table(table, str(file))
+    again = parse_pose_table(table, str(file))
     np.testing.assert_array_equal(again.points["left_palm"], pose.points["left_palm"])
 
 

@@ -13,7 +13,12 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.angles.torques import pose_torques
-from wepose_pin.kinematics import configuration, forward_kinematics, orientation_residuals, placements
+from wepose_pin.kinematics import (
+    compute_link_placements,
+    compute_link_poses,
+    compute_orientation_residuals,
+    solve_configuration,
+)
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.fit import find_undetermined_joints, fit, joint_limits
 from wepose_pin.readers import load_session
@@ -46,14 +51,14 @@ def motion(body: BodyModel, n: int, seed: int, off_deg: float, reach: float = 0.
     q[:, at] = (low + high) / 2.0 + reach * (high - low) / 2.0 * swing
     first = body.pin.idx_qs[body.joints["LeftUpperArm"]]
     q[:, first : first + 4] = Rotation.from_rotvec(np.sin(np.outer(t, [1.0, 1.3, 0.7]))).as_quat()
-    quat_WL = {name: quat for name, (quat, _) in placements(body, q, ["torso", *ARM]).items()}
+    quat_WL = {name: quat for name, (quat, _) in compute_link_placements(body, q, ["torso", *ARM]).items()}
     off = {name: Rotation.from_rotvec(np.deg2rad(off_deg) * rng.normal(size=3)) for name in ARM}
     return quat_WL | {name: (Rotation.from_quat(quat_WL[name]) * off[name]).as_quat() for name in ARM}
 
 
 def cost(body: BodyModel, q: np.ndarray, quat_WL: dict[str, np.ndarray], weights: dict[str, float]) -> float:
     """What is to be least, by forward kinematics and SciPy alone."""
-    R, _ = forward_kinematics(body, q[None], ARM)
+    R, _ = compute_link_poses(body, q[None], ARM)
     return sum(
         weights.get(name, 1.0)
         * float((Rotation.from_matrix(R[0, k]).inv() * Rotation.from_quat(quat)).magnitude()) ** 2
@@ -65,7 +70,7 @@ def cost(body: BodyModel, q: np.ndarray, quat_WL: dict[str, np.ndarray], weights
 @pytest.mark.parametrize("limits", [True, False])
 def test_nothing_is_nearer_by_another_minimiser(body: BodyModel, limits: bool, weights: dict[str, float]) -> None:
     quat_WL = motion(body, 40, 1, 15.0, reach=1.3)
-    found = configuration(body, quat_WL, limits=limits, weights=weights)
+    found = solve_configuration(body, quat_WL, limits=limits, weights=weights)
     model, at = body.pin, places(body.pin)
     first = model.idx_vs[body.joints["LeftUpperArm"]]
     columns = [*range(first, first + 3), *(model.idx_vs[model.getJointId(name)] for name in HINGES)]
@@ -87,12 +92,13 @@ def test_nothing_is_nearer_by_another_minimiser(body: BodyModel, limits: bool, w
 
 def test_limits_are_kept_and_the_rest_of_the_arm_takes_its_share(body: BodyModel) -> None:
     quat_WL = motion(body, 200, 2, 5.0, reach=1.5)
-    kept, passed = configuration(body, quat_WL), configuration(body, quat_WL, limits=False)
+    kept, passed = solve_configuration(body, quat_WL), solve_configuration(body, quat_WL, limits=False)
     at, lower, upper = joint_limits(body.pin, [body.pin.getJointId(name) for name in HINGES])
     assert np.all((kept[:, at] >= lower) & (kept[:, at] <= upper))
     assert np.any((passed[:, at] < lower - 0.1) | (passed[:, at] > upper + 0.1))
     free, bound = (
-        {k: np.sqrt(np.mean(v**2)) for k, v in orientation_residuals(body, q, quat_WL).items()} for q in (passed, kept)
+        {k: np.sqrt(np.mean(v**2)) for k, v in compute_orientation_residuals(body, q, quat_WL).items()}
+        for q in (passed, kept)
     )
     assert set(bound) == set(ARM)
     assert all(np.rad2deg(bound[name]) > 2.0 for name in ARM)
@@ -101,17 +107,17 @@ def test_limits_are_kept_and_the_rest_of_the_arm_takes_its_share(body: BodyModel
 
 def test_a_heavy_segment_is_missed_by_less(body: BodyModel) -> None:
     quat_WL = motion(body, 60, 3, 10.0)
-    even = orientation_residuals(body, configuration(body, quat_WL), quat_WL)["left_forearm"]
-    heavy = orientation_residuals(body, configuration(body, quat_WL, weights={"left_forearm": 100.0}), quat_WL)[
-        "left_forearm"
-    ]
+    even = compute_orientation_residuals(body, solve_configuration(body, quat_WL), quat_WL)["left_forearm"]
+    heavy = compute_orientation_residuals(
+        body, solve_configuration(body, quat_WL, weights={"left_forearm": 100.0}), quat_WL
+    )["left_forearm"]
     assert heavy.mean() < 0.1 * even.mean()
 
 
 def test_what_can_be_followed_within_limits_is_followed_exactly(body: BodyModel) -> None:
     quat_WL = motion(body, 200, 4, 0.0, reach=0.9)
-    q = configuration(body, quat_WL)
-    assert max(angle.max() for angle in orientation_residuals(body, q, quat_WL).values()) < 1e-7
+    q = solve_configuration(body, quat_WL)
+    assert max(angle.max() for angle in compute_orientation_residuals(body, q, quat_WL).values()) < 1e-7
     assert np.abs(np.diff(q, axis=0)).max() < 0.2  # it does not jump
 
 
@@ -121,7 +127,7 @@ def test_a_fit_of_its_own_finds_the_configuration_that_made_the_orientations(bod
     joints = [body.joints["LeftUpperArm"], *(body.pin.getJointId(name) for name in HINGES)]
     arm = {name: quat_WL[name] for name in ARM}
     q = fit(body.pin, arm, joints, pin.neutral(body.pin)[None])
-    assert max(angle.max() for angle in orientation_residuals(body, q, arm).values()) < 1e-6
+    assert max(angle.max() for angle in compute_orientation_residuals(body, q, arm).values()) < 1e-6
 
 
 def test_which_joints_the_known_links_leave_open(body: BodyModel) -> None:
@@ -142,7 +148,7 @@ def test_a_person_on_48_degrees_of_freedom(data: Path, body: BodyModel) -> None:
     for interval, most in (((40.2, 44.4), 3.0), ((84.5, 88.0), 15.0)):
         span = recording.span(interval)
         assert pose.q is not None
-        R, _ = forward_kinematics(body, pose.q[span], arms)
+        R, _ = compute_link_poses(body, pose.q[span], arms)
         down = np.degrees(np.arccos(np.clip(R[:, :, 2, 2].mean(axis=0), -1.0, 1.0)))
         print(interval, dict(zip(arms, down.round(1).tolist(), strict=True)))
         assert np.all(down < most)

@@ -364,8 +364,8 @@ def test_a_trial_of_broad_without_a_rate(rate: float, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("column", "row", "value", "says"),
     [
-        ("time", 1, "-1e308", "time does not grow"),
-        ("time", 1, "nan", "time does not grow"),
+        ("time", 1, "-1e308", "time does not increase"),
+        ("time", 1, "nan", "time does not increase"),
         ("time", 3, "1e300", "no pose has such a number"),
         ("left_palm_x", 2, "1e308", "left_palm_x is 1e+308 in row 3"),
         ("torso_std", 0, "-1e308", "torso_std is -1e+308 in row 1"),

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from wepose_pin import rotations
-from wepose_pin.alignment import compute_heading
+from wepose_pin.alignment import compute_heading_offset
 from wepose_pin.calibration import calibrate_lengths, lengths
 from wepose_pin.calibration.joints import (
     MAX_STD,
@@ -40,7 +40,10 @@ def exact() -> tuple[Simulation, Recording, FilteredRecording]:
 
 
 def true_turn(simulation: Simulation, found: FilteredRecording, near: str, far: str) -> float:
-    psi = [compute_heading(found.at_start[name], Rotation.from_quat(simulation.quat_LS[name])) for name in (near, far)]
+    psi = [
+        compute_heading_offset(found.R_VS_start[name], Rotation.from_quat(simulation.quat_LS[name]))
+        for name in (near, far)
+    ]
     return psi[0] - psi[1]
 
 

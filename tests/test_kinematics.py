@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.errors import BadModel
 from wepose_pin.kinematics import (
     LiveKinematics,
+    compute_link_placements,
+    compute_link_poses,
+    compute_orientation_residuals,
     compute_pose,
-    configuration,
     find_known_links,
     find_known_points,
-    forward_kinematics,
-    orientation_residuals,
-    placements,
+    solve_configuration,
 )
 from wepose_pin.model import POINTS, BodyModel, chains, load_model
 from wepose_pin.model.orientation_ik import OrientationIk
@@ -69,19 +69,19 @@ def test_points_are_the_sum_of_turned_lengths(hands: bool) -> None:
 def test_links_have_the_orientations_given() -> None:
     body = load_model()
     quat_WL = orientations(SEGMENTS)
-    q = configuration(body, quat_WL)
+    q = solve_configuration(body, quat_WL)
     assert q.shape == (N, 36)
     np.testing.assert_allclose(np.linalg.norm(q.reshape(N, 9, 4), axis=2), 1.0, atol=1e-14)
-    R, _ = forward_kinematics(body, q, SEGMENTS)
+    R, _ = compute_link_poses(body, q, SEGMENTS)
     for k, segment in enumerate(SEGMENTS):
         np.testing.assert_allclose(R[:, k], Rotation.from_quat(quat_WL[segment]).as_matrix(), atol=1e-12)
-    assert orientation_residuals(body, q, quat_WL) == {}
+    assert compute_orientation_residuals(body, q, quat_WL) == {}
 
 
 def test_the_configuration_does_not_jump() -> None:
     t = np.linspace(0.0, 20.0, 2000)
     turns = {s: Rotation.from_rotvec(np.outer(t, np.roll([1.0, 0.3, -0.5], k))) for k, s in enumerate(SEGMENTS)}
-    q = configuration(
+    q = solve_configuration(
         load_model(), {s: R.as_quat() * np.where(np.sin(7.0 * t) < 0.0, -1.0, 1.0)[:, None] for s, R in turns.items()}
     )
     assert np.abs(np.diff(q, axis=0)).max() < 0.05
@@ -90,7 +90,7 @@ def test_the_configuration_does_not_jump() -> None:
 def test_the_unmeasured_is_rigid_with_what_is_above() -> None:
     body = load_model()
     quat_WL = orientations(CORE)
-    at = placements(body, configuration(body, quat_WL), ["left_hand", "head", "pelvis"])
+    at = compute_link_placements(body, solve_configuration(body, quat_WL), ["left_hand", "head", "pelvis"])
     for segment, above in (("left_hand", "left_forearm"), ("head", "torso"), ("pelvis", "torso")):
         assert angle(at[segment][0], quat_WL[above]).max() < 1e-7
         assert at[segment][1].shape == (N, 3)
@@ -118,17 +118,17 @@ def test_what_is_known() -> None:
 
 def test_a_segment_that_the_model_lacks() -> None:
     with pytest.raises(BadModel, match="no link for segment 'left_foot'"):
-        configuration(load_model(), orientations(["torso", "left_foot"]))
+        solve_configuration(load_model(), orientations(["torso", "left_foot"]))
 
 
 def test_ten_minutes_at_100_hz_take_less_than_a_second() -> None:
     body = load_model()
     quat_WL = orientations(SEGMENTS, n=60_000)
-    q = configuration(body, quat_WL)
+    q = solve_configuration(body, quat_WL)
     links = list(POINTS.values())
-    forward_kinematics(body, q[:10], links)
+    compute_link_poses(body, q[:10], links)
     start = time.process_time()
-    forward_kinematics(body, q, links)
+    compute_link_poses(body, q, links)
     assert time.process_time() - start < 1.0
     start = time.process_time()
     compute_pose(body, np.arange(60_000) / 100.0, quat_WL)
@@ -145,11 +145,11 @@ def test_what_hangs_on_spherical_joints_follows_exactly(data: Path, dof: int) ->
     if dof == 66:
         exact += [segment for segment in SEGMENTS if segment.startswith(("left", "right"))]
     quat_WL = orientations(SEGMENTS)
-    q = configuration(body, quat_WL)
-    R, _ = forward_kinematics(body, q, exact)
+    q = solve_configuration(body, quat_WL)
+    R, _ = compute_link_poses(body, q, exact)
     for k, segment in enumerate(exact):
         np.testing.assert_allclose(R[:, k], Rotation.from_quat(quat_WL[segment]).as_matrix(), atol=1e-12)
-    assert set(orientation_residuals(body, q, quat_WL)) == set(SEGMENTS) - set(exact)
+    assert set(compute_orientation_residuals(body, q, quat_WL)) == set(SEGMENTS) - set(exact)
     for k in body.joints.values():
         first = body.pin.idx_qs[k]
         np.testing.assert_allclose(np.linalg.norm(q[:, first : first + 4], axis=1), 1.0, atol=1e-14)
@@ -181,7 +181,7 @@ def test_two_axes_come_as_near_as_they_can(data: Path) -> None:
     rng = np.random.default_rng(5)
     quat_WL = orientations(SEGMENTS, 5, n=12)
     q, _ = OrientationIk(body, chains(body.pin), quat_WL).stepwise(quat_WL, {})
-    missed = orientation_residuals(body, q, quat_WL)
+    missed = compute_orientation_residuals(body, q, quat_WL)
     grid = np.linspace(-np.pi, np.pi, 61)
     for segment, joints in (
         ("left_forearm", ("jLeftElbow_roty", "jLeftElbow_rotz")),
@@ -192,7 +192,7 @@ def test_two_axes_come_as_near_as_they_can(data: Path) -> None:
             tried = np.repeat(q[k : k + 1], len(grid) ** 2 + 500, axis=0)
             tried[: len(grid) ** 2, at] = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
             tried[len(grid) ** 2 :, at] += rng.normal(scale=0.02, size=(500, 2))  # and close by
-            R, _ = forward_kinematics(body, tried, [segment])
+            R, _ = compute_link_poses(body, tried, [segment])
             left = (Rotation.from_matrix(R[:, 0]).inv() * Rotation.from_quat(quat_WL[segment][k])).magnitude()
             assert left.min() > missed[segment][k] - 1e-9
             assert left.min() < missed[segment][k] + 0.1
@@ -205,10 +205,10 @@ def test_what_two_axes_can_do_they_do_exactly(data: Path) -> None:
     names = [f"j{side}{joint}" for side in ("Left", "Right") for joint in ("Elbow_roty", "Elbow_rotz", "Wrist_rotx")]
     for name in names:
         q[:, body.pin.idx_qs[body.pin.getJointId(name)]] = rng.uniform(-3.0, 3.0, N)
-    at = placements(body, q, SEGMENTS)
+    at = compute_link_placements(body, q, SEGMENTS)
     quat_WL = {segment: at[segment][0] for segment in SEGMENTS}
-    found = configuration(body, quat_WL, limits=False)
-    assert max(missed.max() for missed in orientation_residuals(body, found, quat_WL).values()) < 1e-7
+    found = solve_configuration(body, quat_WL, limits=False)
+    assert max(missed.max() for missed in compute_orientation_residuals(body, found, quat_WL).values()) < 1e-7
     at_hinges = [body.pin.idx_qs[body.pin.getJointId(name)] for name in names]
     np.testing.assert_allclose(found[:, at_hinges], q[:, at_hinges], atol=1e-7)
 
@@ -218,8 +218,8 @@ def test_a_spine_bends_evenly_and_does_not_twist_when_the_person_turns_round(dat
         body = gazebo(data, dof)
         bend, turn = Rotation.from_euler("y", 60.0, degrees=True), Rotation.from_euler("z", 179.0, degrees=True)
         for heading in (Rotation.identity(), turn, turn * turn):
-            q = configuration(body, {"torso": (heading * bend).as_quat()[None]})
-            at = placements(body, q, ["L5", "L3", "T12", "T8", "left_upper_arm", "right_upper_arm"])
+            q = solve_configuration(body, {"torso": (heading * bend).as_quat()[None]})
+            at = compute_link_placements(body, q, ["L5", "L3", "T12", "T8", "left_upper_arm", "right_upper_arm"])
             for k, link in enumerate(("L5", "L3", "T12"), 1):
                 R = heading * Rotation.from_euler("y", 15.0 * k, degrees=True)
                 up = Rotation.from_quat(at[link][0][0]).apply([0.0, 0.0, 1.0])
@@ -232,7 +232,7 @@ def test_a_spine_bends_evenly_and_does_not_twist_when_the_person_turns_round(dat
 
 def test_clavicles_rest(data: Path) -> None:
     body = gazebo(data, 48)
-    q = configuration(body, orientations(CORE))
+    q = solve_configuration(body, orientations(CORE))
     for name in ("jLeftC7Shoulder_rotx", "jRightC7Shoulder_rotx"):
         np.testing.assert_array_equal(q[:, body.pin.idx_qs[body.pin.getJointId(name)]], 0.0)
     known = set(find_known_links(body, ["torso", "left_upper_arm"]))
@@ -243,7 +243,7 @@ def test_clavicles_rest(data: Path) -> None:
 def test_a_pelvis_that_cannot_move_says_by_how_much(data: Path) -> None:
     body = gazebo(data, 66)
     quat_WL = orientations(CORE) | {"pelvis": np.tile(Rotation.from_euler("z", 0.3).as_quat(), (N, 1))}
-    missed = orientation_residuals(body, configuration(body, quat_WL), quat_WL)
+    missed = compute_orientation_residuals(body, solve_configuration(body, quat_WL), quat_WL)
     assert set(missed) == {"pelvis"}
     np.testing.assert_allclose(missed["pelvis"], 0.3)
 
@@ -299,10 +299,10 @@ def test_three_hinges_follow_what_they_reach(apart: str, tmp_path: Path) -> None
     quat_WL = orientations(CORE, 8, n=300)
     bent = Rotation.from_euler("XYZ", rng.uniform([-2.5, -1.4, -2.5], [2.5, 1.4, 2.5], (300, 3)))
     quat_WL["left_forearm"] = (Rotation.from_quat(quat_WL["left_upper_arm"]) * bent).as_quat()
-    missed = orientation_residuals(body, configuration(body, quat_WL, limits=False), quat_WL)
+    missed = compute_orientation_residuals(body, solve_configuration(body, quat_WL, limits=False), quat_WL)
     assert missed["left_forearm"].max() < 1e-7
     quat_WL = orientations(CORE, 9, n=300)  # anything
-    missed = orientation_residuals(body, configuration(body, quat_WL, limits=False), quat_WL)
+    missed = compute_orientation_residuals(body, solve_configuration(body, quat_WL, limits=False), quat_WL)
     assert missed["left_forearm"].max() < 1e-3
 
 
@@ -312,7 +312,7 @@ def test_four_hinges_share_with_small_angles(tmp_path: Path) -> None:
     )
     quat_WL = {s: np.tile([0.0, 0.0, 0.0, 1.0], (1, 1)) for s in CORE}
     quat_WL["left_forearm"] = Rotation.from_euler("y", [-1.2]).as_quat()
-    q = configuration(body, quat_WL)
+    q = solve_configuration(body, quat_WL)
     # The nearest joints that make three axes: the first one rests.
     found = [q[0, body.pin.idx_qs[body.pin.getJointId(f"left_e{k}")]] for k in range(4)]
     np.testing.assert_allclose(found, [0.0, -1.2, 0.0, 0.0], atol=1e-9)
@@ -327,8 +327,8 @@ def test_one_hinge_takes_its_twist_and_a_continuous_one_has_no_end(tmp_path: Pat
     forearm = above * Rotation.from_rotvec(np.outer(turned, [0.0, 0.6, 0.8]))
     hand = forearm * Rotation.from_rotvec(np.outer(2.0 * turned, [1.0, 0.0, 0.0]))
     quat_WL |= {"left_forearm": forearm.as_quat(), "left_hand": hand.as_quat()}
-    q = configuration(body, quat_WL)
-    missed = orientation_residuals(body, q, quat_WL)
+    q = solve_configuration(body, quat_WL)
+    missed = compute_orientation_residuals(body, q, quat_WL)
     assert missed["left_forearm"].max() < 1e-7
     assert missed["left_hand"].max() < 1e-7
     np.testing.assert_allclose(q[:, body.pin.idx_qs[body.pin.getJointId("left_e0")]], turned, atol=1e-9)
@@ -343,7 +343,7 @@ def test_a_body_with_hinges_is_followed_live_as_in_a_recording(data: Path, simul
     pose = track(simulation.recording("live"), model=body, causal=True)
     live = LiveKinematics(body, list(pose.quat_WL))
     rows = range(2000, 2100)
-    points = np.stack([live.points_of(np.array([quat[k] for quat in pose.quat_WL.values()])) for k in rows])
+    points = np.stack([live.compute_points(np.array([quat[k] for quat in pose.quat_WL.values()])) for k in rows])
     assert live.points
     for i, name in enumerate(live.points):
         np.testing.assert_allclose(points[:, i], pose.points[name][rows], atol=1e-6)

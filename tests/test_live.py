@@ -276,7 +276,7 @@ def test_a_sensor_that_freezes_is_lost_and_said_to_be(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:
     """It repeats itself for three seconds in motion; what is stated of it grows, as while it sends nothing."""
-    monkeypatch.setattr("wepose_pin.live.loop.STATUS_S", 1e-3)
+    monkeypatch.setattr("wepose_pin.live.loop.STATUS_PERIOD_S", 1e-3)
     hurt, begin, end = "right_forearm", 1200, 1500
     sensor = recording.sensors[hurt]
     assert sensor.gyro_S is not None
@@ -296,9 +296,7 @@ def test_a_sensor_that_freezes_is_lost_and_said_to_be(
     while_frozen = [s for s in watcher.statuses if recording.time[begin + 10] < s.time < recording.time[end]]
     assert len(while_frozen) > 10
     assert all(status.sensors[i].frozen and status.sensors[i].lost for status in while_frozen)
-    assert {status.message for status in while_frozen} == {
-        "The same values again and again from right forearm: switch it off and on."
-    }
+    assert {status.message for status in while_frozen} == {"Repeated values from right forearm: switch it off and on."}
     assert watcher.statuses[-2].message == "Tracking."
     assert all(lost[i] for t, lost in ((pose.time, pose.lost) for pose in watcher.poses) if 12.4 < t < 14.9)
 

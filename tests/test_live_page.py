@@ -26,7 +26,7 @@ from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from wepose_pin.errors import BadOption
-from wepose_pin.kinematics import LiveKinematics, configuration, placements
+from wepose_pin.kinematics import LiveKinematics, compute_link_placements, solve_configuration
 from wepose_pin.live.encoder import PoseEncoder
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.server import status_json
@@ -54,7 +54,7 @@ class Person:
         quat_WL = np.array(
             [Rotation.from_rotvec(swing.get(s, [0, -0.8 * math.sin(2 * t), 0])).as_quat() for s in self.info.segments]
         )
-        points = self._kinematics.points_of(quat_WL)
+        points = self._kinematics.compute_points(quat_WL)
         gone = np.array([segment in lost for segment in self.info.segments])
         return LivePose(t, quat_WL, points, np.full(len(gone), 0.02), gone, 0.003)
 
@@ -103,8 +103,8 @@ def test_a_frame_places_every_link_as_the_kinematics_do(model: BodyModel, person
     pose = person.pose(0.7, lost=("left_forearm",))
     time_s, placed, hands, lost = unpacked(model, encoder.encode(pose))
     assert time_s == 0.7
-    q = configuration(model, {s: pose.quat_WL[k : k + 1] for k, s in enumerate(SEGMENTS)})
-    for link, (quat_WL, p_WL) in placements(model, q, encoder.links).items():
+    q = solve_configuration(model, {s: pose.quat_WL[k : k + 1] for k, s in enumerate(SEGMENTS)})
+    for link, (quat_WL, p_WL) in compute_link_placements(model, q, encoder.links).items():
         np.testing.assert_allclose(placed[link][:9], Rotation.from_quat(quat_WL[0]).as_matrix().ravel(), atol=1e-6)
         np.testing.assert_allclose(placed[link][9:], p_WL[0], atol=1e-6)
     for k, hand in enumerate(("left_palm", "right_palm")):
@@ -391,8 +391,8 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         browser.errors.clear()
         browser.emulate(prefers_color_scheme="light")
         browser.go(page.url)
-        page.status(person.status("hold", "Stand upright and still: 2 s more."))
-        browser.wait("window.wepose.state() === 'hold' && window.wepose.frames() > 0")
+        page.status(person.status("start_pose", "Stand upright and still: 2 s more."))
+        browser.wait("window.wepose.state() === 'start_pose' && window.wepose.frames() > 0")
         words = box_of(browser, "#say strong")
         assert words["height"] > 40  # readable from where the person stands
         assert box_of(browser, "#stage")["bottom"] <= box_of(browser, "#say")["top"] + 1  # and hides no arm

@@ -26,7 +26,7 @@ from test_retargeting import far_away
 
 from wepose_pin import cli
 from wepose_pin.errors import BadData, BadOption
-from wepose_pin.kinematics import Pose, axis_std, point_covariance
+from wepose_pin.kinematics import Pose, compute_axis_std, compute_point_covariances
 from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, RobotStatusView, TickReplay, command_json
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
@@ -188,14 +188,14 @@ def test_the_low_pass_is_as_late_as_it_says_and_knows_the_rate() -> None:
 
 
 def test_the_hands_uncertainty_is_that_of_the_pose(arm: Robot) -> None:
-    """Where only the arm is uncertain, hand against root is hand against shoulder: `point_covariance` says the same."""
+    """Where only the arm is uncertain, hand against root is hand against shoulder: `compute_point_covariances`."""
     pose = person(0.5)
     std = np.array([0.0, 0.02, 0.05])
     cov = np.zeros((len(LENGTHS), len(LENGTHS)))
     at = [LENGTHS.index(f"right_{name}") for name in ("upper_arm", "forearm", "hand")]
     cov[np.ix_(at, at)] = population_subject().lengths_covariance()[np.ix_(at, at)]
     segment_cov = {name: np.tile(s**2 * np.eye(3), (50, 1, 1)) for name, s in zip(pose.quat_WL, std, strict=True)}
-    true = axis_std(point_covariance(pose.points, pose.quat_WL, segment_cov, cov)["right_palm"])
+    true = compute_axis_std(compute_point_covariances(pose.points, pose.quat_WL, segment_cov, cov)["right_palm"])
     seer = ArmObserver(arm, stream_info(pose).segments, stream_info(pose).points, cov)
     for k, one in enumerate(live_poses(pose)):
         seen = seer.observe(one.quat_WL, one.points, std, one.lost)
@@ -586,7 +586,7 @@ def test_r_goes_on_and_the_person_is_told(robot_out, arm: Robot, receiver: Recei
     ready = Status("ready", "Tracking.", 1.0, 0.0, (), (0.0, 0.0), 0.0, {})
     watched.status(ready)
     assert view.message == "Tracking. arm: stopped (no sound pose for 1 s); r, in the start pose, goes on."
-    watched.status(ready._replace(state="hold"))
+    watched.status(ready._replace(state="start_pose"))
     assert view.message == "Tracking."
     assert watched.take_keys() == []
     out.show(poses[201])

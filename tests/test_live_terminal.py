@@ -71,7 +71,7 @@ def test_what_is_not_known_is_a_dash() -> None:
 
 
 def test_the_start_pose_has_a_bar_and_the_rest_none() -> None:
-    assert "█" * 12 + "░" * 18 in printed(status("hold", "Stand still: 2 s more.", progress=0.4))
+    assert "█" * 12 + "░" * 18 in printed(status("start_pose", "Stand still: 2 s more.", progress=0.4))
     assert "░" not in printed(status())
 
 
@@ -108,13 +108,13 @@ def test_without_a_terminal_a_line_a_change() -> None:
     file = io.StringIO()
     with TerminalView(file, keys=False) as view:
         for left in (3, 2, 1):
-            view.status(status("hold", f"Stand still: {left} s more."))
+            view.status(status("start_pose", f"Stand still: {left} s more."))
         view.status(status(sensors=(sensor(lost=True),), time=20.0))
         view.status(status(sensors=(sensor(lost=True),), time=21.0, problems={"[bad]": 1}))
         view.status(status(time=22.0, problems={"[bad]": 9}))
         view.status(status("ended", "The session has ended.", time=23.0))
     assert file.getvalue().splitlines() == [
-        "12.5 s  hold: Stand still: 3 s more.",
+        "12.5 s  start pose: Stand still: 3 s more.",
         "20.0 s  ready: Tracking.",
         "20.0 s  torso: lost",
         "21.0 s  [bad]: since now",

@@ -108,7 +108,7 @@ def tracked(
     subject = wp.population_subject()
     subject = replace(subject, lengths={**subject.lengths, **{name: float(v) for name, v in lengths.items()}})
     pose = wp.track(wp.load_session(session(tmp_path_factory.mktemp("mvnx"), path, OURS)), subject)
-    turn = Rotation.from_rotvec([0.0, 0.0, pose.segments.heading["torso"]])
+    turn = Rotation.from_rotvec([0.0, 0.0, pose.segments.heading_offset["torso"]])
     return pose, {label: turn.apply(position) for label, position in moving.items()}
 
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
-from wepose_pin.kinematics import Pose, axis_std
+from wepose_pin.kinematics import Pose, compute_axis_std
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.plausibility import find_cut_off
 from wepose_pin.report import render_track_report
@@ -494,7 +494,7 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
     late = replace(pose, segments=replace(pose.segments, start=(begin, begin + 2.0)))
     peak = with_pose(late, point_cov={name: wider(cov, 60.0) for name, cov in late.pose.point_cov.items()})
     assert rows_of_hands(render_track_report(peak, view="<p>")) == rows_of_hands(render_track_report(late, view="<p>"))
-    most = max(float(axis_std(peak.pose.point_cov[name]).max()) for name in ("left_palm", "right_palm"))
+    most = max(float(compute_axis_std(peak.pose.point_cov[name]).max()) for name in ("left_palm", "right_palm"))
     assert the("position-uncertain-before-start", peak).value == pytest.approx(most)
     assert not any(each.code.endswith("-before-start") for each in looked_at(late))
     text = text_of(render_track_report(peak, view="<p>"))

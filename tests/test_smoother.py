@@ -12,7 +12,7 @@ from test_amekf import RATE, Case, case, cov, errors, run, tilt_deg
 from wepose_pin import rotations
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import METHODS, OFFLINE, Amekf, AmekfParams, Smoother
-from wepose_pin.filters.amekf import BLOCK, STATES, transition_rows
+from wepose_pin.filters.amekf import BLOCK, STATES, fill_transition_rows
 
 
 def part(of: Case, samples: slice) -> Case:
@@ -28,14 +28,17 @@ def test_the_backward_pass_is_the_textbook_s() -> None:
     for first in range(0, 600, 25):
         at = slice(first, first + 25)
         blocks = np.empty(1, BLOCK)
-        quats.append(forward.run_recorded(of.gyro[at], of.accel[at], of.static[at], blocks).quat_WS[-1])
+        quats.append(forward.run_with_blocks(of.gyro[at], of.accel[at], of.static[at], blocks).quat_WS[-1])
         P.append(forward.state.P.copy())
         rows, whole = np.empty((7, STATES)), np.eye(STATES)
-        transition_rows(blocks[0], of.noise.gravity, np.eye(STATES), rows)
+        fill_transition_rows(blocks[0], of.noise.gravity, np.eye(STATES), rows)
         whole[:7] = rows
         F.append(whole)
         measurements = blocks["measurements"][0]
-        gains, innovations = blocks["gain"][0, :measurements], blocks["innovation"][0, :measurements]
+        gains, innovations = (
+            blocks["normalized_gain"][0, :measurements],
+            blocks["normalized_innovation"][0, :measurements],
+        )
         P_before.append(P[-1] + gains.T @ gains)
         correction.append(gains.T @ innovations)
     assert 0 < of.static.sum() < len(of.static)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import ATTITUDE_STD, START_POSE_STD
+from wepose_pin.alignment import SEGMENT_ATTITUDE_STD, START_POSE_STD
 from wepose_pin.calibration import load_protocol, weights
 from wepose_pin.calibration.lengths import Calibration, solve_calibration
 from wepose_pin.calibration.priors import (
@@ -109,7 +109,7 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
         for side, x in (("left", common + mirrored), ("right", common - mirrored)):
             R_WL = _hinged(R_WL, side, np.array([x, 1.0, rng.normal(scale=HINGE_TILT_STD)]))
         R_WL["torso"] = R_WL["torso"] * _about_z(rng.normal(scale=SHOULDERS_STD))
-        R_VS, at_start, mounts = {}, {}, {}
+        R_VS, R_VS_start, mounts = {}, {}, {}
         for name in SENSORS:
             psi, drift = rng.uniform(-np.pi, np.pi), rng.normal(scale=DRIFT_STD)
             tilt = Rotation.from_rotvec([*rng.normal(scale=START_POSE_STD, size=2), 0.0])
@@ -117,12 +117,12 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
             turned = R_WL[name]
             for _ in range(8):
                 turned = R_WL[name] * Rotation.from_rotvec((turned.inv().apply(UP) - UP) @ tissue.T).inv()
-            turned = turned * Rotation.from_rotvec(slow(ATTITUDE_STD))
+            turned = turned * Rotation.from_rotvec(slow(SEGMENT_ATTITUDE_STD))
             Q = _about_z(-psi - drift * (time - START[1])) * turned * tilt.inv() * _about_z(psi)
             mounts[name] = Rotation.random(random_state=rng)
-            at_start[name] = _about_z(-psi) * tilt * mounts[name]
-            R_VS[name] = Rotation.concatenate([*[at_start[name]] * len(start_time), Q * at_start[name]])
-        filtered = FilteredRecording(R_VS, at_start, {}, START, START, [])
+            R_VS_start[name] = _about_z(-psi) * tilt * mounts[name]
+            R_VS[name] = Rotation.concatenate([*[R_VS_start[name]] * len(start_time), Q * R_VS_start[name]])
+        filtered = FilteredRecording(R_VS, R_VS_start, {}, START, START, [])
         found = solve_calibration(CalibrationProblem(recording, filtered, protocol, prior, measured))
         error = dict(zip(LENGTHS, np.array([found.subject.lengths[s] for s in LENGTHS]) - mean, strict=True))
         for name in SENSORS:

@@ -12,7 +12,7 @@ import pytest
 
 from wepose_pin.documents import whole_folder
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
-from wepose_pin.kinematics import pose_from_table, pose_table
+from wepose_pin.kinematics import build_pose_table, parse_pose_table
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
@@ -86,7 +86,7 @@ def test_a_session_reads_back_to_the_bit(simulation: Simulation, tmp_path: Path)
     for name, spans in recording.phases.items():
         np.testing.assert_allclose(again.phases[name], spans, atol=1e-3)
     assert again.truth == tmp_path / "truth.parquet"
-    truth = pose_from_table(pl.read_parquet(again.truth), "truth.parquet")
+    truth = parse_pose_table(pl.read_parquet(again.truth), "truth.parquet")
     np.testing.assert_array_equal(truth.points["left_palm"], simulation.points["left_palm"])
 
 
@@ -143,12 +143,12 @@ def test_a_folder_that_is_no_result_is_named(tmp_path: Path) -> None:
 
 
 def test_tables_that_are_no_pose_are_named(simulation: Simulation) -> None:
-    table = pose_table(simulation.truth())
+    table = build_pose_table(simulation.truth())
     with pytest.raises(BadData, match="no column 'time'"):
-        pose_from_table(table.drop("time"), "t.csv")
+        parse_pose_table(table.drop("time"), "t.csv")
     with pytest.raises(BadData, match="neither orientations nor points"):
-        pose_from_table(table.select("time"), "t.csv")
+        parse_pose_table(table.select("time"), "t.csv")
     with pytest.raises(BadData, match="torso_qx … _qw is no unit quaternion in row"):
-        pose_from_table(table.with_columns(pl.lit(2.0).alias("torso_qw")), "t.csv")
+        parse_pose_table(table.with_columns(pl.lit(2.0).alias("torso_qw")), "t.csv")
     with pytest.raises(BadData, match="holds text"):
-        pose_from_table(table.with_columns(pl.lit("a").alias("torso_qw")), "t.csv")
+        parse_pose_table(table.with_columns(pl.lit("a").alias("torso_qw")), "t.csv")

@@ -3,12 +3,21 @@
 Conventions, everywhere:
 
 - SI inside; a value in another unit carries a suffix (`angle_deg`, `rate_hz`).
-- World W: z up, x forward (where the torso faces in the start pose), y left, origin midway between the hips.
-  Segment L, sensor S, robot base B. `R_WS = R_WL @ R_LS`: inner letters cancel.
-- `gyro_S` [rad/s] is the rate over the interval that ends at the sample; `accel_S` [m/s²] is +g up while static.
-- Every segment frame equals W in the N-pose.
-- Quaternions are xyzw, unit norm, named `quat_WS`; `q` is a Pinocchio configuration and nothing else.
-- Perturbations stand on the right: `R_WS @ exp(dtheta_S)`.
+- Frames are letters. World W: z up, x forward (where the torso faces in the start pose), y left, origin at the root,
+  midway between the hips. Segment L, sensor S, robot base B. The other letters are points or links of one formula,
+  named there: torso T, upper arm U, forearm F, elbow E, hand H, joint J.
+- `R_WS` maps coordinates in S to W, and inner letters cancel: `R_WS = R_WL @ R_LS`. The mount is R_LS.
+- World V of one sensor: z up, heading that of its filter's start, unknown in W: `R_WV = Rz(ψ)`, ψ the heading offset.
+  A filter, `estimate_orientation` and `OrientationSensor` know one sensor and no other world: the `quat_WS` that they
+  return or hold is `quat_VS` everywhere else.
+- `gyro_S` [rad/s] is the rate over the interval that ends at the sample; `accel_S` [m/s²] is specific force, +g up
+  while static.
+- Every segment frame equals W in the N-pose (upright, arms hanging, palms to the thighs).
+- Arrays of quaternions are xyzw, unit norm, and named as rotations are (`quat_WL`); `q` is a Pinocchio configuration
+  and nothing else.
+- Attitude errors are rotation vectors [rad], true = estimated with the error on one side. On the right, in S:
+  `R_VS exp(θ_S)`, covariances of filters (`attitude_cov`). On the left, in W: `exp(θ_W) R_WL`, covariances of segments
+  (`covariance_W`, `Pose.segment_cov`) and heading errors δ, θ_W = δ e_z. On the left, in L: `exp(ε_L) R_LS`, mounts.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Sensors to segments: orientations in sensor worlds, mounts and headings from the start pose, segment orientations.
+"""Sensor-to-segment alignment: mounts R_LS and heading offsets ψ from the start pose, then segment orientations.
 
-A sensor's filter estimates the tilt but not the heading: its world V differs from W by the heading ψ, a rotation about
-z. In the N-pose every segment frame equals W, so the mount is R_LS = R_WS = Rz(ψ) R_VS(start). Gravity measures its
-tilt, and ψ brings it nearest to the stated or calibrated mount. A person's start pose is off by a few degrees, so the
-covariance of a calibrated mount is weighed against that error.
+A filter observes the vertical and not the heading: its world V differs from W by a rotation about the vertical,
+R_WV = Rz(ψ). In the N-pose every segment frame equals W, so that the mount is R_LS = R_WS = Rz(ψ) R_VS(start). Gravity
+gives its tilt; ψ is the angle that makes it nearest to the stated or calibrated mount. A calibrated mount is fused with
+the start pose, whose standard deviation is `START_POSE_STD`.
 """
 
 from __future__ import annotations
@@ -23,44 +23,41 @@ from .filters.start import ACCEL_BIAS_STD
 from .recording import SEGMENTS, Recording, format_span
 from .subject import Subject
 
-# Limits [deg] of the angle between a stated mount and gravity or motion: error, warning.
-STATED_LIMIT_DEG = 60.0
-STATED_WARNING_DEG = 35.0
+# Angles [deg] between a stated mount and gravity or motion. Above them the mount is an error or gets a warning.
+MAX_MOUNT_ERROR_DEG = 60.0
+MOUNT_WARNING_DEG = 35.0
 
-# Error [rad] of a person's segments in the start pose, about each axis: elbows are never straight.
-START_POSE_STD = np.deg2rad(4.0)
-# Difference [rad] between two start poses of one person, about each axis. An assumption.
-REPEATED_START_STD = np.deg2rad(2.0)
-# Error [rad] of a sensor's orientation against its segment, about each axis, mainly from soft tissue; and slip [m] of
-# palms held together, on each axis.
-ATTITUDE_STD = np.deg2rad(1.5)
-SLIP_STD = 0.005
-# A calibrated mount that differs from gravity by more than this many standard deviations has moved.
-MOVED_MOUNT = 3.5
+# Standard deviations per axis; assumptions.
+START_POSE_STD = np.deg2rad(4.0)  # [rad] between a segment and the start pose: the elbows are never quite straight
+START_POSE_REPEATABILITY_STD = np.deg2rad(2.0)  # [rad] between two start poses of one person
+SEGMENT_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation in motion, mostly by soft tissue
+PALM_SLIP_STD = 0.005  # [m] by which joined palms slip
+# A calibrated mount has moved where gravity contradicts it by more standard deviations than this.
+MOUNT_MOVED_STDS = 3.5
 
 
 @dataclass(frozen=True)
-class Segments:
+class SegmentOrientations:
     """Orientation of each measured segment.
 
     Parameters
     ----------
     time : (n,) [s]
     quat_WL : segment → (n, 4) xyzw
-    quat_LS : segment → (4,) xyzw, the mount
-    heading : segment → ψ [rad], from the sensor's world to W
-    orientation : segment → the filter's result; none for measured orientations
-    covariance_W : segment → (n, 3, 3) [rad²], of the error on the left of `quat_WL`, in W: the filter's covariance, the
-        accelerometer's bias, and the heading of a calibrated mount. A stated mount counts as exact. Only for filters
-        with a covariance
-    start, static_phase : intervals [s] for headings, and for noise and bias
+    quat_LS : segment → (4,) xyzw, the mount used
+    heading_offset : segment → ψ [rad], heading of its sensor's world V in W
+    orientation : segment → result of its sensor's filter; no entry for measured orientations
+    covariance_W : segment → (n, 3, 3) [rad²] of the error on the left of `quat_WL`, in W: the sum of the filter's
+        covariance, the tilt by the accelerometer's bias, and the uncertainty of a calibrated mount; a
+        stated mount counts as exact. No entry for filters without a covariance (ncf, gdc)
+    start, static_phase : intervals [s]; headings and mounts are from the first, noise and bias from the second
     diagnostics : of the recording, its start pose and its mounts
     """
 
     time: np.ndarray
     quat_WL: Mapping[str, np.ndarray]
     quat_LS: Mapping[str, np.ndarray]
-    heading: Mapping[str, float]
+    heading_offset: Mapping[str, float]
     orientation: Mapping[str, Orientation]
     covariance_W: Mapping[str, np.ndarray]
     start: tuple[float, float]
@@ -69,28 +66,28 @@ class Segments:
 
 
 @dataclass(frozen=True)
-class Alignment:
-    """Mounts of the sensors and headings of their worlds, from one start pose.
+class SensorAlignment:
+    """Mounts of the sensors and heading offsets of their worlds, from one start pose.
 
     Parameters
     ----------
-    mount : segment → R_LS, sensor to segment
-    turn : segment → Rz(ψ), the sensor's world to W
-    heading : segment → ψ [rad]
-    start, static_phase : intervals [s] for headings, and for noise and bias
+    R_LS : segment → mount, sensor to segment
+    R_WV : segment → Rz(ψ), the sensor's world V to W
+    heading_offset : segment → ψ [rad]
+    start, static_phase : intervals [s]; headings and mounts are from the first, noise and bias from the second
     diagnostics : of the recording, its start pose and its mounts
     """
 
-    mount: Mapping[str, Rotation]
-    turn: Mapping[str, Rotation]
-    heading: Mapping[str, float]
+    R_LS: Mapping[str, Rotation]
+    R_WV: Mapping[str, Rotation]
+    heading_offset: Mapping[str, float]
     start: tuple[float, float]
     static_phase: tuple[float, float]
     diagnostics: tuple[Diagnostic, ...]
 
 
-# Segment → protocols in calibration/ that estimate its sensor's mount; no protocol does for other segments.
-_PROTOCOLS = {
+# Segment → protocols of calibration/ that find its sensor's mount. No protocol finds that of another segment.
+_CALIBRATING_PROTOCOLS = {
     "torso": "clasp, handle, poses or touch",
     **{f"{side}_upper_arm": f"clasp, handle, poses or touch_{side}" for side in ("left", "right")},
     **{f"{side}_forearm": f"clasp, handle, poses or touch_{side}" for side in ("left", "right")},
@@ -115,119 +112,125 @@ def collect_nominal_mounts(recording: Recording, subject: Subject | None) -> dic
     mounts = {segment: mount for segment, mount in nominal.items() if mount is not None}
     missing = [segment for segment in nominal if segment not in mounts]
     if missing:
-        text = f"sensors.{missing[0]}.mount is not known"
+        problem = f"sensors.{missing[0]}.mount is not known"
         if len(missing) > 1:
-            text += f", nor that of {', '.join(missing[1:])}"
+            problem += f", nor that of {', '.join(missing[1:])}"
         if subject is not None and recording.remounted and set(missing) & set(subject.mounts):
-            text += " (remounted = true: the subject's are of another mounting)"
+            problem += " (remounted = true: the subject's are of another mounting)"
         elif subject is not None and subject.mounts:
-            text += f"; the subject '{subject.name}' has none for it"
-        raise BadSession(f"{recording.where()}: {text}: {suggest_mounts(missing)}")
+            problem += f"; the subject '{subject.name}' has none for it"
+        raise BadSession(f"{recording.where()}: {problem}: {suggest_mounts(missing)}")
     return mounts
 
 
 def suggest_mounts(segments: Sequence[str]) -> str:
-    """Say what to do about unknown mounts of these segments' sensors: state them, or estimate them by a protocol."""
-    advice = 'state it, as in mount = { up = "+x", forward = "-z" }'
+    """Return what to do where the mounts of these segments' sensors are not known: state them or calibrate."""
+    remedy = 'state it, as in mount = { up = "+x", forward = "-z" }'
     by_protocols: dict[str, list[str]] = {}
     for segment in segments:
-        by_protocols.setdefault(_PROTOCOLS.get(segment, ""), []).append(segment)
-    for protocols, names in by_protocols.items():
+        by_protocols.setdefault(_CALIBRATING_PROTOCOLS.get(segment, ""), []).append(segment)
+    for protocols, calibrated in by_protocols.items():
         if protocols:
-            advice += (
-                f"; or find that of {', '.join(names)} by `wepose calibrate --protocol` {protocols}, and give that "
-                f"subject"
+            remedy += (
+                f"; or find that of {', '.join(calibrated)} by `wepose calibrate --protocol` {protocols}, and "
+                "track with its --subject"
             )
     if "" in by_protocols:
-        advice += f"; no calibration finds that of {', '.join(by_protocols[''])}"
-    return advice
+        remedy += f"; no calibration finds that of {', '.join(by_protocols[''])}"
+    return remedy
 
 
-def align(recording: Recording, subject: Subject | None, filtered: FilteredRecording) -> Alignment:
-    """Compute mounts and headings; `recording` is the filtered recording, or its chunk with the start pose.
+def align_sensors(recording: Recording, subject: Subject | None, filtered: FilteredRecording) -> SensorAlignment:
+    """Compute mounts and heading offsets.
+
+    Parameters
+    ----------
+    recording : that of `filtered`, or its chunk that contains the start pose
 
     Raises
     ------
     BadSession
-        A mount is not known, or gravity contradicts it.
+        A mount that is not known, or that gravity contradicts.
     """
     start, diagnostics = filtered.start, list(filtered.diagnostics)
-    guessed = recording.start_is_guessed or not recording.phases.get("start")
-    facts = {"variant": "guessed"} if guessed else {}
-    nominal = collect_nominal_mounts(recording, subject)
-    mount, turn, heading = {}, {}, {}
+    start_guessed = recording.start_is_guessed or not recording.phases.get("start")
+    facts = {"variant": "guessed"} if start_guessed else {}
+    nominal_mounts = collect_nominal_mounts(recording, subject)
+    mounts, heading_offsets = {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
-        # The torso faces x, or the most central aligned segment without the torso.
-        facing = min(aligned, key=SEGMENTS.index)
-        psi_aligned = compute_heading(filtered.at_start[facing], Rotation.identity())
-    for segment, at_start in filtered.at_start.items():
+        # The torso faces x; without a torso the most central segment does.
+        reference_segment = min(aligned, key=SEGMENTS.index)
+        aligned_heading_offset = compute_heading_offset(filtered.R_VS_start[reference_segment], Rotation.identity())
+    for segment, R_VS_start in filtered.R_VS_start.items():
         if recording.sensors[segment].aligned:
-            turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi_aligned])
-            mount[segment], heading[segment] = Rotation.identity(), psi_aligned
+            mounts[segment], heading_offsets[segment] = Rotation.identity(), aligned_heading_offset
             continue
-        R_stated = Rotation.from_quat(nominal[segment])
-        psi = compute_heading(at_start, R_stated)
-        R_LS = Rotation.from_rotvec([0.0, 0.0, psi]) * at_start
-        off = np.degrees((R_LS * R_stated.inv()).magnitude())
-        if off > STATED_LIMIT_DEG:
+        R_nominal = Rotation.from_quat(nominal_mounts[segment])
+        psi = compute_heading_offset(R_VS_start, R_nominal)
+        R_LS = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS_start
+        tilt_error_deg = np.degrees((R_LS * R_nominal.inv()).magnitude())
+        if tilt_error_deg > MAX_MOUNT_ERROR_DEG:
             calibrated = subject is not None and segment in subject.mounts and not recording.remounted
-            place, advice = ".mount", "check which sensor axis points up and which forward"
-            if guessed:
-                advice = f"name its seconds, or {advice}"
+            name, remedy = ".mount", "check which sensor axis points up and which forward"
+            if start_guessed:
+                remedy = f"state its seconds, or {remedy}"
             if calibrated:
-                place, advice = ": its calibrated mount", "if it was remounted, state remounted = true and the mounts"
-                if guessed:
-                    advice = f"name its seconds; {advice}"
-            why = ", which was only guessed: [phases] start = [[from, to]] is missing" if guessed else ""
+                name, remedy = (
+                    ": its calibrated mount",
+                    "if the sensor was mounted again, state remounted = true and its mount",
+                )
+                if start_guessed:
+                    remedy = f"state its seconds; {remedy}"
+            reason = ", which was only guessed: [phases] start = [[from, to]] is missing" if start_guessed else ""
             raise BadSession(
-                f"{recording.where()}: sensors.{segment}{place} is {off:.0f} deg off gravity in the start pose "
-                f"({format_span(start)}){why}; {advice}"
+                f"{recording.where()}: sensors.{segment}{name} is {tilt_error_deg:.0f} deg off gravity in the start "
+                f"pose ({format_span(start)}){reason}; {remedy}"
             )
-        if off > STATED_WARNING_DEG:
-            value, limit = float(np.deg2rad(off)), float(np.deg2rad(STATED_WARNING_DEG))
+        if tilt_error_deg > MOUNT_WARNING_DEG:
+            value, limit = float(np.deg2rad(tilt_error_deg)), float(np.deg2rad(MOUNT_WARNING_DEG))
             diagnostics.append(Diagnostic("mount-contradicts-gravity", WARNING, segment, value, limit, facts))
-        known = find_mount_covariance(recording, segment, subject)
-        if known is not None:
-            # The misfit of the tilt is the sum of the pose's error and the mount's; it is divided by their covariances.
-            # The heading was fitted: the start pose corrects the mount's heading only through its correlations.
-            misfit = (R_LS * R_stated.inv()).as_rotvec()[:2]
-            both = known[:2, :2] + START_POSE_STD**2 * np.eye(2)
-            R_LS = Rotation.from_rotvec(known[:, :2] @ np.linalg.solve(both, misfit)) * R_stated
-            psi = compute_heading(at_start, R_LS)
-            offset = subject.start_pose_offset.get(segment) if subject is not None else None
-            if offset is not None:
-                # Tilt and mount of the calibration come from one start pose and share its error.
-                misfit, both = misfit - offset.tilt, REPEATED_START_STD**2 * np.eye(2)
-            if misfit @ np.linalg.solve(both, misfit) > MOVED_MOUNT**2:
+        mount_cov = find_mount_covariance(recording, segment, subject)
+        if mount_cov is not None:
+            # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
+            # the mount's heading changes by correlation alone.
+            misfit = (R_LS * R_nominal.inv()).as_rotvec()[:2]
+            misfit_cov = mount_cov[:2, :2] + START_POSE_STD**2 * np.eye(2)
+            R_LS = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_nominal
+            psi = compute_heading_offset(R_VS_start, R_LS)
+            calibrated_offset = subject.start_pose_offset.get(segment) if subject is not None else None
+            if calibrated_offset is not None:
+                # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
+                misfit, misfit_cov = misfit - calibrated_offset.tilt, START_POSE_REPEATABILITY_STD**2 * np.eye(2)
+            if misfit @ np.linalg.solve(misfit_cov, misfit) > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
-                diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOVED_MOUNT, facts))
-        mount[segment], heading[segment] = R_LS, psi
-        turn[segment] = Rotation.from_rotvec([0.0, 0.0, psi])
-    return Alignment(mount, turn, heading, start, filtered.static_phase, tuple(diagnostics))
+                diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOUNT_MOVED_STDS, facts))
+        mounts[segment], heading_offsets[segment] = R_LS, psi
+    R_WV = {segment: Rotation.from_rotvec([0.0, 0.0, psi]) for segment, psi in heading_offsets.items()}
+    return SensorAlignment(mounts, R_WV, heading_offsets, start, filtered.static_phase, tuple(diagnostics))
 
 
 def orient_segments(
-    chunk: Recording, alignment: Alignment, orientation: Mapping[str, Orientation], subject: Subject | None
-) -> Segments:
-    """Compute the segments of a recording, or of a chunk of it, from its sensors' orientations."""
+    chunk: Recording, alignment: SensorAlignment, orientation: Mapping[str, Orientation], subject: Subject | None
+) -> SegmentOrientations:
+    """Return the segment orientations of a recording or a chunk of it, from the results of its sensors' filters."""
     quat_WL, covariance_W = {}, {}
     for segment, R_VS in collect_rotations(chunk, orientation).items():
-        turn, R_LS = alignment.turn[segment], alignment.mount[segment]
+        R_WS, R_LS = alignment.R_WV[segment] * R_VS, alignment.R_LS[segment]
         if chunk.sensors[segment].aligned:
-            quat_WL[segment] = (turn * R_VS).as_quat()
+            quat_WL[segment] = R_WS.as_quat()
             continue
-        quat_WL[segment] = (turn * R_VS * R_LS.inv()).as_quat()
-        result = orientation.get(segment)
-        if result is not None and result.attitude_cov is not None:
+        quat_WL[segment] = (R_WS * R_LS.inv()).as_quat()
+        filtered = orientation.get(segment)
+        if filtered is not None and filtered.attitude_cov is not None:
             covariance_W[segment] = compute_segment_covariance(
-                chunk, segment, subject, turn * R_VS, R_LS, result.attitude_cov
+                chunk, segment, subject, R_WS, R_LS, filtered.attitude_cov
             )
-    return Segments(
+    return SegmentOrientations(
         chunk.time,
         quat_WL,
-        {segment: R_LS.as_quat() for segment, R_LS in alignment.mount.items()},
-        alignment.heading,
+        {segment: R_LS.as_quat() for segment, R_LS in alignment.R_LS.items()},
+        alignment.heading_offset,
         orientation,
         covariance_W,
         alignment.start,
@@ -236,13 +239,13 @@ def orient_segments(
     )
 
 
-def compute_heading(R_VS: Rotation, R_WS: Rotation) -> float:
-    """Compute ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
+def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:
+    """ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
     return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
 
 
 def find_nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
-    """Find the mount `quat_LS` (4,) xyzw: the calibrated, else the stated, else that of a measured segment, or None."""
+    """Find the mount `quat_LS` (4,) xyzw: calibrated, else stated, else that of a measured segment; None: unknown."""
     if subject is not None and segment in subject.mounts and not recording.remounted:
         return subject.mounts[segment]
     stated = recording.sensors[segment].stated_quat_LS
@@ -252,7 +255,7 @@ def find_nominal_mount(recording: Recording, segment: str, subject: Subject | No
 
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
-    """Compute the variance about the vertical (n,) [rad²] of errors on the right (n, 3, 3), in S."""
+    """Compute the variance (n,) [rad²] about the vertical of attitude errors in S, on the right (n, 3, 3)."""
     up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
     return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
 
@@ -265,36 +268,37 @@ def compute_segment_covariance(
     R_LS: Rotation,
     attitude_cov: np.ndarray,
 ) -> np.ndarray:
-    """Compute the covariance (n, 3, 3) [rad²] in W of a segment's orientation, error on the left.
+    """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
 
-    `attitude_cov` (n, 3, 3) [rad²] is the filter's, in S, error on the right; see `Segments.covariance_W`.
+    `attitude_cov` (n, 3, 3) [rad²] is the filter's, in S, error on the right.
     """
     R = R_WS.as_matrix()
     cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
-    # Each static phase measures the tilt with the same accelerometer bias, which does not average out.
+    # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
-    known = find_mount_covariance(recording, segment, subject)
-    if known is not None:
-        # A mount's error ε in L rotates R_WL by R_WL ε. Its heading error δ was put into the world's heading, which
-        # changes R_WL into Rz(δ) R_WL Rz(δ)ᵀ and has no effect in the start pose. The start pose reduced its tilt.
+    mount_cov = find_mount_covariance(recording, segment, subject)
+    if mount_cov is not None:
+        # A mount's error ε in L becomes the error R_WL ε in W. The heading offset ψ, computed with the same mount,
+        # takes off the vertical component ε_z, so that in the start pose the heading has no error.
         R_WL = (R_WS * R_LS.inv()).as_matrix()
-        lever = R_WL - np.array([0.0, 0.0, 1.0])[:, None] * np.array([0.0, 0.0, 1.0])
-        tilt = known[:2]
-        left = known - tilt.T @ np.linalg.solve(tilt[:, :2] + START_POSE_STD**2 * np.eye(2), tilt)
-        cov_W += lever @ left @ lever.swapaxes(1, 2)
+        error_jacobian = R_WL - np.array([0.0, 0.0, 1.0])[:, None] * np.array([0.0, 0.0, 1.0])
+        tilt = mount_cov[:2]
+        # What is left after the start pose has corrected the tilt, as in `align_sensors`.
+        remaining_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + START_POSE_STD**2 * np.eye(2), tilt)
+        cov_W += error_jacobian @ remaining_cov @ error_jacobian.swapaxes(1, 2)
         cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject)
     return cov_W
 
 
 def compute_start_heading_var(recording: Recording, segment: str, subject: Subject | None) -> float:
-    """Compute the variance [rad²] of the heading of a sensor's world, from the error of the segment's start pose.
+    """Compute the variance [rad²] of a segment's heading offset by the inexact start pose.
 
-    It is zero for the torso, which defines x, and for a stated mount, which is defined by the start pose.
+    Zero for the torso, whose heading defines x, and for a stated mount, which is stated relative to the start pose.
     """
     calibrated = find_mount_covariance(recording, segment, subject) is not None
     return START_POSE_STD**2 if calibrated and segment != "torso" else 0.0
 
 
 def find_mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
-    """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L; None: unknown or remounted."""
+    """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L; None: not known for this mounting."""
     return None if subject is None or recording.remounted else subject.mount_covariance(segment)

@@ -155,7 +155,7 @@ def result(folder: Path, data: bytes) -> object:
 
     from wepose_pin.errors import WeposeError
     from wepose_pin.evaluation import evaluate
-    from wepose_pin.kinematics import pose_from_table
+    from wepose_pin.kinematics import parse_pose_table
     from wepose_pin.readers.tables import read_table
     from wepose_pin.report.viewer import pose_html
     from wepose_pin.writers.export import export
@@ -171,7 +171,7 @@ def result(folder: Path, data: bytes) -> object:
     pose, model, _ = read_result(folder)
     pose_html(model, pose, title="a")
     refused: WeposeError | None = None
-    truth = pose_from_table(pl.read_parquet(io.BytesIO(seeds.pose())), "truth")
+    truth = parse_pose_table(pl.read_parquet(io.BytesIO(seeds.pose())), "truth")
     for do in (lambda: evaluate(pose, truth), *(functools.partial(_exported, folder, name) for name in EXPORTS)):
         try:
             do()

@@ -171,10 +171,10 @@ def _checked(data: bytes) -> bytes:
 
 
 def _pose(path: Path) -> object:
-    from wepose_pin.kinematics import pose_from_table
+    from wepose_pin.kinematics import parse_pose_table
     from wepose_pin.readers.tables import read_table
 
-    return pose_from_table(read_table(path), str(path))
+    return parse_pose_table(read_table(path), str(path))
 
 
 def _summary(path: Path) -> object:

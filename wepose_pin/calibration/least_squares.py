@@ -28,7 +28,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import ATTITUDE_STD
+from ..alignment import SEGMENT_ATTITUDE_STD
 from ..subject import LENGTHS
 from .chain import SIDES, about_z, inverse, links, product, rotate, small_turn
 from .protocols import Closure, Condition, Direction, coefficients
@@ -266,7 +266,7 @@ def _closure_residual(
         gap += v
         # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ). Only
         # the ratios of these weights matter here.
-        covariance += ATTITUDE_STD**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
+        covariance += SEGMENT_ATTITUDE_STD**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
     if closure.kind == "distance":
         size = ca.norm_2(gap)
         off = size - x[layout.distances][layout.distance_names.index(closure.distance)]

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG
+from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG
 from ..arguments import Positive, check_arguments
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, BadSession, NoSolution, one_of
@@ -128,7 +128,7 @@ def _check_measured(measured: Mapping[str, tuple[float, float]], protocol: Proto
 def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
     """The calibration without the mounts that gravity or the motion contradicts, and with its labels checked."""
     wrong = problem.mounts_against_gravity()
-    unused = [_diagnose_unused_mount(name, angle, STATED_LIMIT_DEG) for name, angle in wrong.items()]
+    unused = [_diagnose_unused_mount(name, angle, MAX_MOUNT_ERROR_DEG) for name, angle in wrong.items()]
     problem = problem.remove_mounts(wrong)
     problem.check_start_pose()
     stated = solve_calibration(problem, quick=True)
@@ -137,7 +137,7 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
         free = solve_calibration(problem.remove_mounts(problem.filtered.R_VS), quick=True)
         if free.arms().doubt() < min(1.0, BETTER * max(doubt, 1.0 / BETTER)):
             wrong = problem.mounts_against_motion(free.subject.mounts)
-            unused += [_diagnose_unused_mount(n, angle, STATED_WARNING_DEG, "motion") for n, angle in wrong.items()]
+            unused += [_diagnose_unused_mount(n, angle, MOUNT_WARNING_DEG, "motion") for n, angle in wrong.items()]
             problem = problem.remove_mounts(wrong)
             doubt = 0.0 if wrong else doubt
     if doubt > 1.0:
@@ -321,10 +321,10 @@ def _make_subject(
     mounts = {}
     for i, name in enumerate(layout.sensors):
         tilt = Rotation.from_rotvec(-np.append(x[layout.tilt][2 * i : 2 * i + 2], 0.0))
-        mounts[name] = (tilt * _about_z(x[layout.heading][i]) * filtered.at_start[name]).as_quat()
+        mounts[name] = (tilt * _about_z(x[layout.heading][i]) * filtered.R_VS_start[name]).as_quat()
     # The mounts of sensors outside the chain are those of the start pose.
     for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
-        mounts[name] = (_about_z(psi) * filtered.at_start[name]).as_quat()
+        mounts[name] = (_about_z(psi) * filtered.R_VS_start[name]).as_quat()
     order, covariance = project_to_subject(layout, solution.covariance)
     std = np.sqrt(np.diag(solution.covariance))
     offset_stds = np.minimum(std[layout.tilt], np.pi).reshape(-1, 2)  # no angle is more uncertain than half a turn

@@ -86,7 +86,7 @@ def _mount_prior(problem: CalibrationProblem, segment: str, heading: float | Non
         return np.zeros(3), information
     R_mount = Rotation.from_quat(mount)
     turn = Rotation.from_rotvec([0.0, 0.0, heading])
-    misfit = (turn * problem.filtered.at_start[segment] * R_mount.inv()).as_rotvec()
+    misfit = (turn * problem.filtered.R_VS_start[segment] * R_mount.inv()).as_rotvec()
     of_mount, signs = _mount_information(problem, segment), np.diag([-1.0, -1.0, 1.0])
     offset = np.linalg.solve(
         information + signs @ of_mount @ signs + 1e-9 * np.eye(3), -signs @ of_mount @ np.append(misfit[:2], 0.0)

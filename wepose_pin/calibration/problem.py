@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import STATED_LIMIT_DEG, STATED_WARNING_DEG, compute_heading, find_nominal_mount
+from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
 from ..errors import BadPhase
 from ..filters.sensors import FilteredRecording
 from ..recording import Recording
@@ -53,7 +53,7 @@ class CalibrationProblem:
         """Segment → ψ [rad] at which its sensor is nearest to its mount, of those that have a mount."""
         mounts = {segment: self.mount(segment) for segment in segments}
         return {
-            segment: compute_heading(self.filtered.at_start[segment], Rotation.from_quat(mount))
+            segment: compute_heading_offset(self.filtered.R_VS_start[segment], Rotation.from_quat(mount))
             for segment, mount in mounts.items()
             if mount is not None
         }
@@ -83,18 +83,18 @@ class CalibrationProblem:
         return replace(
             self,
             recording=replace(self.recording, sensors=exchange(self.recording.sensors)),
-            filtered=filtered._replace(R_VS=exchange(filtered.R_VS), at_start=exchange(filtered.at_start)),
+            filtered=filtered._replace(R_VS=exchange(filtered.R_VS), R_VS_start=exchange(filtered.R_VS_start)),
         )
 
     def mounts_against_gravity(self) -> dict[str, float]:
         """Segment → angle [deg] between its mount and gravity in the start pose, where it is beyond the limit."""
         angles = {}
-        for segment, at_start in self.filtered.at_start.items():
+        for segment, R_VS_start in self.filtered.R_VS_start.items():
             mount = self.mount(segment)
             if mount is not None and segment in self.recording.imus:
-                up_V = (at_start * Rotation.from_quat(mount).inv()).apply([0.0, 0.0, 1.0])
+                up_V = (R_VS_start * Rotation.from_quat(mount).inv()).apply([0.0, 0.0, 1.0])
                 angles[segment] = float(np.degrees(np.arccos(np.clip(up_V[2], -1.0, 1.0))))
-        return {segment: angle for segment, angle in angles.items() if angle > STATED_LIMIT_DEG}
+        return {segment: angle for segment, angle in angles.items() if angle > MAX_MOUNT_ERROR_DEG}
 
     def mounts_against_motion(self, estimated: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Segment → angle [deg] between its mount and the estimated `quat_LS`, where it is beyond the limit."""
@@ -104,14 +104,14 @@ class CalibrationProblem:
             if mount is not None and segment in self.recording.imus:
                 turn = Rotation.from_quat(quat_LS) * Rotation.from_quat(mount).inv()
                 angles[segment] = float(np.degrees(turn.magnitude()))
-        return {segment: angle for segment, angle in angles.items() if angle > STATED_WARNING_DEG}
+        return {segment: angle for segment, angle in angles.items() if angle > MOUNT_WARNING_DEG}
 
     def orient_segments(self, mounts: Mapping[str, np.ndarray], samples: np.ndarray) -> dict[str, np.ndarray]:
         """Segment → `quat_WL` (n, 4) xyzw at some samples (n,), with mounts `quat_LS`, as tracking gives it."""
         filtered, quat_WL = self.filtered, {}
         for name in (name for name in filtered.R_VS if name in mounts):
             R_LS = Rotation.from_quat(mounts[name])
-            turn = Rotation.from_rotvec([0.0, 0.0, compute_heading(filtered.at_start[name], R_LS)])
+            turn = Rotation.from_rotvec([0.0, 0.0, compute_heading_offset(filtered.R_VS_start[name], R_LS)])
             quat_WL[name] = (turn * filtered.R_VS[name][samples] * R_LS.inv()).as_quat()
         return quat_WL
 
@@ -159,7 +159,9 @@ class CalibrationProblem:
         samples = np.concatenate(parts)
         steps, step_std, beyond = group_steps(losses, samples)
         layout = layout._replace(steps=steps)
-        turns = [(filtered.R_VS[name][samples] * filtered.at_start[name].inv()).as_quat().T for name in layout.sensors]
+        turns = [
+            (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
+        ]
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         data = np.vstack([*turns, beyond, recording.time[samples] - filtered.start[1]])
         return Observations(layout, data, protocol.conditions, condition_index, step_std), samples

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ..alignment import SLIP_STD
+from ..alignment import PALM_SLIP_STD
 from ..assets import asset
 from ..documents import is_number, read_toml
 from ..errors import BadOption, one_of
@@ -47,7 +47,7 @@ class Closure:
     phase: str
     kind: str
     points: tuple[str, ...]
-    slip: float = SLIP_STD
+    slip: float = PALM_SLIP_STD
     distance: str = ""
     metres: float = 0.0
     metres_std: float = 0.003

@@ -68,7 +68,10 @@ TYPICAL = SensorNoise(
 
 
 class Orientation(NamedTuple):
-    """Orientation of one sensor over time, in a world of its own: z up, zero heading where the start phase begins."""
+    """Orientation of one sensor over time.
+
+    W is the sensor's own world, called V outside of the filters: z up, zero heading where the start phase begins.
+    """
 
     quat_WS: np.ndarray  # (n, 4) xyzw
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
@@ -116,9 +119,11 @@ def estimate_orientation(
     params : the filter's own frozen parameters; None for its defaults
     static_test : when the sensor counts as static; None for the default values
 
-    The static phase begins with zero heading and the tilt of the accelerometer, averaged over it (without one: over the
-    first window of `static_test`); the filter goes forward and backward from there. Where gyro_S is cut off by the
-    sensor's range, `attitude_cov` grows by what it may have turned beyond.
+    The W of the returned `quat_WS` is the sensor's own world: z up, and a heading that has no relation to the worlds
+    of other sensors (`wepose_pin.alignment` finds it from a start pose). The static phase begins with zero heading
+    and the tilt of the accelerometer, averaged over it (without one: over the first window of `static_test`); the
+    filter goes forward and backward from there. Where gyro_S is cut off by the sensor's range, `attitude_cov` grows
+    by what it may have turned beyond.
 
     Raises
     ------

@@ -1,20 +1,21 @@
-"""aMEKF: the multiplicative Kalman filter corrected in motion too, by the bound on where a hand can go; causal.
+"""aMEKF: a causal multiplicative extended Kalman filter of one IMU's attitude, corrected in motion as well.
 
-No single acceleration is trusted. The specific force, turned into the almost-inertial frame of the gyroscope, is summed
-to a horizontal velocity and position; a tilt error of a degree would send them off by 8 m in 10 s, and a person's
-segment does not go there. That is the idea of VQF's low-pass in that frame (Laidig and Seel 2023, Information Fusion
-91) as a Kalman filter, so that the same innovations also teach it the gyroscope's own errors: bias, scale and
-misalignment (the usual 3×3), and the difference between the bias in motion and in a static phase. Rotation about
-horizontal axes makes these visible through gravity, and the heading, which nothing measures, is better for it.
+Pseudo-measurements correct it: the horizontal velocity and position of a sensor on a person are bounded. The specific
+force, rotated to the filter's world, is integrated to them (the almost-inertial frame of VQF, Laidig and Seel 2023,
+Information Fusion 91). A tilt error of 1° would give 8 m in 10 s; a segment does not move so far. The same innovations
+estimate the gyroscope's bias, its scale and misalignment (3×3), and the difference of the bias between motion and
+static phases, which rotation about horizontal axes makes observable. The heading is not observed; it improves with
+these parameters.
 
-The 25 error states (`ErrorStates`) are additive but for the attitude, which is on the left (in W), so that one over a
-turn stays what it is. Measured rate = (I + M) true rate + bias. Errors of velocity and position are those of the
-invariant filter (Barrau and Bonnabel 2017, IEEE TAC 62(4)): θ × g e_z alone drives them, so that the bound on them
-never says anything of the heading.
+W is here the sensor's own world, V elsewhere: z up, heading that of the filter's start. The 25 errors (`ErrorStates`)
+are additive except the attitude error, a rotation on the left, in that world: R = exp(θ) R_estimated. It does not
+change when the sensor rotates. Measured rate = (I + M) true rate + bias. Errors of velocity and position are those of
+the invariant filter (Barrau and Bonnabel 2017, IEEE TAC 62(4)): θ × g e_z alone drives them, so that their bound gives
+no information on the heading.
 
 The strapdown runs at each sample, the covariance once a block (`AmekfParams.block_s`): over a block the transition is
-exact in the sums of R_WS and R_WS ω, which is why 25 states cost less than six at each sample. In a static block (the
-paper's static phase, Lisini Baldi 2019) velocity is zero and the gyroscope reads its bias.
+exact in the sums of R_WS and R_WS ω. In a static block (static phase of Lisini Baldi 2019, IEEE Sensors Journal) the
+velocity is zero and the gyroscope measures its bias.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ from .static import static_step
 
 
 class ErrorStates(NamedTuple):
-    """Where each error stands among the 25."""
+    """Index range of each error among the 25."""
 
-    attitude: slice = slice(0, 3)  # θ [rad], in W
+    attitude: slice = slice(0, 3)  # θ [rad], on the left, in W
     velocity: slice = slice(3, 5)  # [m/s], horizontal, in W
     position: slice = slice(5, 7)  # [m], horizontal, in W
     gyro_bias: slice = slice(7, 10)  # [rad/s], in S, in a static phase
@@ -50,17 +51,19 @@ class ErrorStates(NamedTuple):
 
 ERROR = ErrorStates()
 STATES = 25
-PROPAGATED = 7  # θ, velocity and position change over a block, the other states stay
-SMOOTHED = (0, 1, 2, 7, 8, 9, 22, 23, 24)  # the states that the smoother corrects: θ, bias, bias in motion
-MEASUREMENTS = 5  # of a static block: velocity (2) and bias (3); of another: velocity (2) and position (2)
+PROPAGATED_STATES = 7  # θ, velocity and position change over a block, the other states stay
+SMOOTHED_STATES = (0, 1, 2, 7, 8, 9, 22, 23, 24)  # states that the smoother corrects: θ, bias, bias in motion
+MAX_MEASUREMENTS = 5  # of a static block: velocity (2) and bias (3); of another: velocity (2) and position (2)
 VELOCITY, POSITION, GYRO_BIAS = ERROR.velocity.start, ERROR.position.start, ERROR.gyro_bias.start
 
-FADE_S = 0.1  # [s] in which a held rate fades
-LARGEST_LOST_TURN = 4.0  # [rad] of unknown turn are as good as any more
-# Squared Mahalanobis distance beyond which an innovation of two, of three axes is doubted: as rare as 3 σ of one.
-DOUBTED_2, DOUBTED_3 = 11.83, 14.16
+HELD_RATE_FADE_S = 0.1  # [s] in which the last rate before a lost sample fades
+START_HEADING_STD = 1e-5  # [rad] the start defines the heading; above zero, so that P can be inverted
+MAX_LOST_ROTATION_STD = 4.0  # [rad] beyond which the uncertainty of a lost rotation is not increased
+# Squared Mahalanobis distance beyond which an innovation of two or three axes is an outlier: χ² quantiles of 0.9973,
+# which is 3 σ of one axis.
+OUTLIER_CHI2_2, OUTLIER_CHI2_3 = 11.83, 14.16
 
-# What the compiled steps work on are records: one number or array a name.
+# Records of the compiled steps.
 TRANSITION = [
     ("R", float, (3, 3)),  # Σ R_WS dt [s]
     ("R_rate", float, (3, 3, 3)),  # Σ R_WS ω_c dt [rad], for the axes c = x, y, z of S
@@ -71,11 +74,11 @@ SUMS = np.dtype(
         *TRANSITION,  # before dt is applied
         ("gyro", float, 3),  # [rad/s]
         ("rate_squared", float),  # [rad²/s²]
-        ("acceleration", float),  # [m/s²]
-        ("impact", float),  # [m/s²] of it, beyond the limit
-        ("static", float),  # samples
-        ("lost_turn", float),  # [rad²], variance
-        ("lost_force", float),  # [s]
+        ("acceleration_sum", float),  # [m/s²] magnitude
+        ("impact_excess", float),  # [m/s²] magnitude beyond the limit of an impact
+        ("static_samples", float),
+        ("lost_rotation_var", float),  # [rad²]
+        ("lost_accel_s", float),  # [s]
     ],
     align=True,
 )
@@ -84,14 +87,14 @@ BLOCK = np.dtype(
     [
         *TRANSITION,
         ("length", float),  # [s]
-        ("lost_turn", float),  # [rad²], variance of the turn that was lost in it
-        ("measurements", np.int64),  # their number n; of each:
-        ("state", np.int64, MEASUREMENTS),  # the index of the state that it measures
-        ("root", float, MEASUREMENTS),  # 1/√s, s the innovation's variance
-        ("innovation", float, MEASUREMENTS),  # over √s
-        ("gain", float, (MEASUREMENTS, STATES)),  # P h/√s
+        ("lost_rotation_var", float),  # [rad²] of the rotation lost in the block
+        ("measurements", np.int64),  # number n of measurements; the next four have n rows
+        ("state_index", np.int64, MAX_MEASUREMENTS),  # of the measured state
+        ("inv_innovation_std", float, MAX_MEASUREMENTS),  # 1/√s, s the innovation's variance
+        ("normalized_innovation", float, MAX_MEASUREMENTS),  # innovation/√s
+        ("normalized_gain", float, (MAX_MEASUREMENTS, STATES)),  # P h/√s
         ("correction", float, STATES),  # of the states
-        ("P_rows", float, (len(SMOOTHED), STATES)),  # rows `SMOOTHED` of P after it
+        ("P_smoothed_rows", float, (len(SMOOTHED_STATES), STATES)),  # rows `SMOOTHED_STATES` of P after the block
     ],
     align=True,
 )
@@ -99,19 +102,19 @@ BLOCK = np.dtype(
 STATE = np.dtype(
     [
         ("quat_WS", float, 4),  # xyzw
-        ("gyro_bias", float, 3),  # [rad/s] as stated: that in motion where the sample is not static
-        ("attitude_cov", float, 6),  # [rad²] upper triangle, in S
-        ("x", float, STATES),  # the attitude's error stays zero
+        ("gyro_bias", float, 3),  # [rad/s] as returned: with the motion bias where the sample is not static
+        ("attitude_cov", float, 6),  # [rad²] upper triangle, error on the right, in S
+        ("x", float, STATES),  # as `ErrorStates`; the attitude's error is always zero
         ("P", float, (STATES, STATES)),
         ("sums", SUMS),
-        ("held_rate", float, 3),  # [rad/s] the last good one, without bias
-        ("held_s", float),  # [s] since then
+        ("last_rate", float, 3),  # [rad/s] without bias; it fades while samples are lost
+        ("lost_s", float),  # [s] since the last good sample of gyro
         ("samples", np.int64),  # in the open block
-        # room for intermediate values, nothing that lasts
+        # work space
         ("R_WS", float, (3, 3)),
-        ("P_rows", float, (PROPAGATED, STATES)),
-        ("P_columns", float, (STATES, PROPAGATED)),
-        ("P_corner", float, (PROPAGATED, PROPAGATED)),
+        ("FP_rows", float, (PROPAGATED_STATES, STATES)),
+        ("FP_columns", float, (STATES, PROPAGATED_STATES)),
+        ("FPF_corner", float, (PROPAGATED_STATES, PROPAGATED_STATES)),
         ("block", BLOCK),
     ],
     align=True,
@@ -119,27 +122,27 @@ STATE = np.dtype(
 MODEL = np.dtype(
     [
         ("dt", float),  # [s]
-        ("block", np.int64),  # samples
+        ("block_samples", np.int64),
         ("gravity", float),  # [m/s²]
-        ("gyro_noise", float),  # [rad²/s]
-        ("accel_noise", float),  # [m/s²]² s
-        ("speed", float),  # [m²/s²] variance of a block, as the next two
-        ("position", float),  # [m²]
-        ("static_speed", float),  # [m²/s²]
-        ("static_bias", float),  # [rad²/s²] by which gyro over a static block is not the bias
-        ("static_turn", float),  # [rad²/s] heading that a static sensor may turn unseen
-        ("rate_noise", float),
-        ("force_noise", float),
+        ("gyro_noise_psd", float),  # [rad²/s]
+        ("accel_noise_psd", float),  # [m²/s³]
+        ("velocity_var", float),  # [m²/s²] of a block's measurement, as the next three
+        ("position_var", float),  # [m²]
+        ("static_velocity_var", float),  # [m²/s²]
+        ("static_bias_var", float),  # [rad²/s²] of the mean of gyro about the bias
+        ("static_heading_psd", float),  # [rad²/s] of undetected rotation about the vertical in a static phase
+        ("rate_noise_psd", float),  # [1/Hz] of gyro, relative to |ω|
+        ("velocity_error_fraction_sq", float),  # [1] of the summed |acceleration| of a block
         ("bias_walk", float),  # [rad²/s³]
         ("matrix_walk", float),  # [1/s]
-        ("accel_bias_walk", float),
-        ("motion_bias_walk", float),
-        ("lost_rate", float),  # [rad/s] standard deviation
-        ("lost_force", float),  # [m²/s⁴]
+        ("accel_bias_walk", float),  # [m²/s⁵]
+        ("motion_bias_walk", float),  # [rad²/s³]
+        ("lost_rate_std", float),  # [rad/s]
+        ("lost_accel_var", float),  # [m²/s⁴]
         ("gyro_limit", float),  # [rad/s]
         ("accel_limit", float),  # [m/s²]
-        ("impact", float),  # [m/s²]
-        ("accel_matrix", float, (3, 3)),  # measured to true
+        ("impact_limit", float),  # [m/s²]
+        ("accel_correction", float, (3, 3)),  # (I + E)⁻¹, measured to true
     ],
     align=True,
 )
@@ -155,27 +158,29 @@ class AmekfParams:
     """
 
     block_s: float = 0.25  # [s] between corrections; the covariance is propagated over it in one step
-    speed_std: float = 1.0  # [m/s] of the sensor, horizontal, each axis, new each `motion_s`
-    position_std: float = 1.5  # [m] around where it mostly is, horizontal, each axis, new each `motion_s`
-    motion_s: float = 1.0  # [s]
+    speed_std: float = 1.0  # [m/s] of the sensor, horizontal, per axis; independent values every `motion_s`
+    position_std: float = 1.5  # [m] about its mean, horizontal, per axis; independent values every `motion_s`
+    motion_s: float = 1.0  # [s] correlation time of motion
     static_speed_std: float = 0.01  # [m/s] in a static phase
-    rate_noise: float = 3e-4  # [1/√Hz] of gyro in motion, a share of |ω|: what the matrix does not explain
-    force_noise: float = 0.01  # share of the summed |acceleration| by which a block's velocity change is off
-    impact: float = 100.0  # [m/s²] acceleration beyond which is an impact: velocity is off by as much as that adds
-    tilt_std: float = 0.2  # [rad] at the start, which may be in motion; a first rest soon says more
+    rate_noise: float = 3e-4  # [1/√Hz] of gyro in motion, a fraction of |ω|: what the matrix does not explain
+    force_noise: float = 0.01  # error of a block's velocity change, a fraction of the summed |acceleration|
+    impact: float = 100.0  # [m/s²] beyond it is an impact: the excess, integrated, is a velocity error
+    tilt_std: float = 0.2  # [rad] at the start, which may be in motion
     gyro_matrix_std: float = 0.002  # each entry of M
     gyro_matrix_walk: float = 1e-6  # [1/√s]
     gyro_bias_walk: float = 5e-6  # [rad/s/√s], 10 deg/h in 100 s
-    static_bias_std: float = 1e-4  # [rad/s] by which the mean of gyro over a static block is not the bias, sway aside
+    static_bias_std: float = 1e-4  # [rad/s] of the mean of gyro over a static block about the bias, without sway
     static_turn_noise: float = STATIC_TURN_NOISE  # [rad/√s]
     motion_bias_std: float = 1.7e-4  # [rad/s], 0.01 deg/s, bias in motion less that in a static phase
     motion_bias_walk: float = 5e-5  # [rad/s/√s]
     accel_bias_std: float = 0.03  # [m/s²], 3 mg
     accel_bias_walk: float = 1e-4  # [m/s²/√s]
-    gyro_range: float = np.inf  # [rad/s]; a sample at it is clipped: turned by it, but the turn is uncertain
+    gyro_range: float = (
+        np.inf
+    )  # [rad/s] full scale; a saturated sample counts, its rotation is as uncertain as a lost one
     accel_range: float = np.inf  # [m/s²]
-    lost_rate_std: float = 2.0  # [rad/s] of the unknown rate while gyro is lost (NaN) or clipped
-    lost_force_std: float = 5.0  # [m/s²] of the unknown acceleration while accel is lost or clipped
+    lost_rate_std: float = 2.0  # [rad/s] of the unknown rate while gyro is lost (NaN) or saturated
+    lost_force_std: float = 5.0  # [m/s²] of the unknown acceleration while accel is lost or saturated
     gyro_matrix: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))  # M: measured = (I + M) true
     accel_matrix: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))  # measured = (I + this) true + bias
     accel_bias: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [m/s²]
@@ -192,7 +197,7 @@ class AmekfParams:
 
 
 class AmekfState:
-    """Views of the record that the compiled steps work on."""
+    """State of the filter: views of the record of the compiled steps."""
 
     def __init__(self, record: np.ndarray) -> None:
         self.record = record  # (1,) of `STATE`
@@ -203,14 +208,19 @@ class AmekfState:
 
 
 class Amekf:
-    """aMEKF of one sensor. First bias, its covariance, noise and gravity come from `noise`.
+    """aMEKF of one sensor.
 
-    What bad data does: a NaN sample of gyro holds the last rate, which fades in 0.1 s, and the attitude's covariance
-    grows with the time squared; a NaN sample of accel counts as gravity alone, and the velocity's covariance grows; a
-    sample beyond the ranges in `params` does the same, but is used. The velocity that an impact (`AmekfParams.impact`)
-    adds is not trusted. A bias that jumps is taken over in the next static phase at once; until then it tilts by some
-    degrees. Without any static phase all is learned in motion, the tilt in ten seconds, the others in a minute or so.
-    Time is not an input: gaps, repeated and late samples are the readers' to mend.
+    A NaN sample of gyro holds the last rate, which fades in `HELD_RATE_FADE_S`, and the attitude's covariance grows
+    with the time squared. A NaN sample of accel counts as gravity alone, and the velocity's covariance grows. A sample
+    beyond the ranges in `params` is used, and the covariances grow as for a lost one. An impact (`AmekfParams.impact`)
+    increases the velocity's covariance. A jump of the bias is adopted in the next static phase; until then the tilt
+    error reaches some degrees. Without a static phase everything is estimated in motion: the tilt in ten seconds, the
+    other parameters in about a minute. Time is not an input: readers bridge gaps and remove duplicates.
+
+    Parameters
+    ----------
+    noise : first bias, its covariance, noise and gravity
+    quat_WS : (4,) xyzw at the start; its heading defines the filter's world
     """
 
     def __init__(
@@ -219,18 +229,19 @@ class Amekf:
         self.params = params or AmekfParams()
         self.rate_hz = rate_hz
         self.noise = noise
-        self.block = max(1, round(self.params.block_s * rate_hz))
-        self.model = _model(noise, rate_hz, self.block, self.params)
+        self.block_samples = max(1, round(self.params.block_s * rate_hz))
+        self.model = _build_model(noise, rate_hz, self.block_samples, self.params)
         self.state = AmekfState(np.zeros(1, STATE))
         self.state.quat_WS[:], self.state.gyro_bias[:] = quat_WS, noise.gyro_bias
-        self._set_errors()
+        self._initialize_errors()
         self._one = OneSample()
 
-    def _set_errors(self) -> None:
+    def _initialize_errors(self) -> None:
+        """Set the states and their covariance at the start."""
         p, x, std = self.params, self.state.x, np.zeros(STATES)
         x[ERROR.gyro_bias], x[ERROR.gyro_matrix] = self.noise.gyro_bias, p.gyro_matrix.ravel()
         x[ERROR.accel_bias] = p.accel_bias
-        std[ERROR.attitude] = p.tilt_std, p.tilt_std, 1e-5  # the heading of the start is zero by definition
+        std[ERROR.attitude] = p.tilt_std, p.tilt_std, START_HEADING_STD
         std[ERROR.velocity], std[ERROR.position] = p.speed_std, p.position_std
         std[ERROR.gyro_matrix], std[ERROR.accel_bias] = p.gyro_matrix_std, p.accel_bias_std
         std[ERROR.motion_bias] = p.motion_bias_std
@@ -238,59 +249,61 @@ class Amekf:
         self.state.P[ERROR.gyro_bias, ERROR.gyro_bias] = self.noise.gyro_bias_cov
 
     @property
-    def live(self) -> Callable[..., None]:
+    def bank_kernel(self) -> Callable[..., None]:
         """The kernel that steps many sensors at a time (`bank.LiveBank`)."""
-        return _live
+        return _step_bank
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
-        return self.run_recorded(gyro_S, accel_S, static, _NO_BLOCKS)
+        """Filter samples (n, 3), (n, 3), (n,); the state continues from the run before."""
+        return self.run_with_blocks(gyro_S, accel_S, static, _NO_BLOCKS)
 
-    def run_recorded(
+    def run_with_blocks(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, blocks: np.ndarray
     ) -> FilterRun:
-        """`run` that also fills one of `blocks`, an array of `BLOCK`, at the end of each block."""
+        """Filter as `run`, and fill one of `blocks`, an array of `BLOCK`, at the end of each block."""
         gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
         out = np.empty((len(gyro), 4)), np.empty((len(gyro), 3)), np.empty((len(gyro), 3, 3))
         _run(self.state.record, self.model, gyro, accel, is_static, blocks, *out)
         return FilterRun(*out)
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
+        """Filter one sample (3,), (3,); return `quat_WS` (4,) xyzw after it."""
         one = self._one
         sample = one.fill(gyro_S, accel_S, static)
         _run(self.state.record, self.model, *sample, _NO_BLOCKS, one.quat_WS, one.gyro_bias, one.attitude_cov)
         return one.quat_WS[0].copy()
 
 
-def _model(noise: SensorNoise, rate_hz: float, block: int, p: AmekfParams) -> np.ndarray:
-    """(1,) of `MODEL`."""
-    length = block / rate_hz
-    # By how much the mean of gyro over a static block is off: a person who stands still sways.
-    white, sway = float(np.trace(noise.gyro_cov)) / 3.0 / block, noise.sway_density(rate_hz)
+def _build_model(noise: SensorNoise, rate_hz: float, block_samples: int, p: AmekfParams) -> np.ndarray:
+    """Build the coefficients of a block, (1,) of `MODEL`."""
+    length = block_samples / rate_hz
+    # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
+    white, sway = float(np.trace(noise.gyro_cov)) / 3.0 / block_samples, noise.sway_density(rate_hz)
     model = np.zeros(1, MODEL)
     values = {
         "dt": 1.0 / rate_hz,
-        "block": block,
+        "block_samples": block_samples,
         "gravity": noise.gravity,
-        "gyro_noise": float(np.trace(noise.gyro_cov)) / 3.0 / rate_hz,
-        "accel_noise": float(np.trace(noise.accel_cov)) / 3.0 * noise.gravity**2 / rate_hz,
-        "speed": p.speed_std**2 * p.motion_s / length,
-        "position": p.position_std**2 * p.motion_s / length,
-        "static_speed": p.static_speed_std**2,
-        "static_bias": p.static_bias_std**2 + white + sway / length,
-        # Who sways may turn slowly as well: an eighth of what the sway adds up to (our assumption).
-        "static_turn": p.static_turn_noise**2 + sway / 8.0,
-        "rate_noise": p.rate_noise**2,
-        "force_noise": p.force_noise**2,
+        "gyro_noise_psd": float(np.trace(noise.gyro_cov)) / 3.0 / rate_hz,
+        "accel_noise_psd": float(np.trace(noise.accel_cov)) / 3.0 * noise.gravity**2 / rate_hz,
+        "velocity_var": p.speed_std**2 * p.motion_s / length,
+        "position_var": p.position_std**2 * p.motion_s / length,
+        "static_velocity_var": p.static_speed_std**2,
+        "static_bias_var": p.static_bias_std**2 + white + sway / length,
+        # A person who sways may also rotate slowly about the vertical: an eighth of the sway (assumption).
+        "static_heading_psd": p.static_turn_noise**2 + sway / 8.0,
+        "rate_noise_psd": p.rate_noise**2,
+        "velocity_error_fraction_sq": p.force_noise**2,
         "bias_walk": p.gyro_bias_walk**2,
         "matrix_walk": p.gyro_matrix_walk**2,
         "accel_bias_walk": p.accel_bias_walk**2,
         "motion_bias_walk": p.motion_bias_walk**2,
-        "lost_rate": p.lost_rate_std,
-        "lost_force": p.lost_force_std**2,
+        "lost_rate_std": p.lost_rate_std,
+        "lost_accel_var": p.lost_force_std**2,
         "gyro_limit": p.gyro_range,
         "accel_limit": p.accel_range,
-        "impact": p.impact,
-        "accel_matrix": np.linalg.inv(np.eye(3) + p.accel_matrix),
+        "impact_limit": p.impact,
+        "accel_correction": np.linalg.inv(np.eye(3) + p.accel_matrix),
     }
     for name, value in values.items():
         model[name] = value
@@ -298,8 +311,8 @@ def _model(noise: SensorNoise, rate_hz: float, block: int, p: AmekfParams) -> np
 
 
 @kernel
-def transition_rows(block, gravity, P, out):  # type: ignore[no-untyped-def]
-    """Rows of ``F P`` that differ from P's, those of θ, velocity and position, to `out` (7, m); `P` is (25, m).
+def fill_transition_rows(block, gravity, P, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (7, m) with the rows of ``F P`` of θ, velocity and position, which differ from those of `P` (25, m).
 
     θ⁺ = θ − Σ R dt b − Σ R ω dt M − Σ_moving R dt d, v⁺ = v + ∫ θ × g e_z − Σ R dt f, p⁺ = p + ∫ v, the integrals by
     the trapezoid; b, d, f are the errors of bias, bias in motion and accelerometer bias.
@@ -332,29 +345,32 @@ def transition_rows(block, gravity, P, out):  # type: ignore[no-untyped-def]
 
 @inlined
 def _propagate(state, model):  # type: ignore[no-untyped-def]
-    """P ← F P Fᵀ + Q over the block that ends."""
-    P, rows, columns, corner = state.P, state.P_rows, state.P_columns, state.P_corner
+    """Propagate over the block that ends: P ← F P Fᵀ + Q."""
+    P, rows, columns, corner = state.P, state.FP_rows, state.FP_columns, state.FPF_corner
     block, sums = state.block, state.sums
-    transition_rows(block, model.gravity, P, rows)
-    for i in range(PROPAGATED):
-        for j in range(PROPAGATED, STATES):
+    fill_transition_rows(block, model.gravity, P, rows)
+    for i in range(PROPAGATED_STATES):
+        for j in range(PROPAGATED_STATES, STATES):
             P[i, j] = rows[i, j]
             P[j, i] = rows[i, j]
-    # The corner, F's rows against those of F P: with them as columns it is the same product again.
-    for i in range(PROPAGATED):
+    # The corner of (F P) Fᵀ is the transpose of F (F P)ᵀ: the same product, with the rows as columns.
+    for i in range(PROPAGATED_STATES):
         for j in range(STATES):
             columns[j, i] = rows[i, j]
-    transition_rows(block, model.gravity, columns, corner)
-    for i in range(PROPAGATED):
-        for j in range(PROPAGATED):
+    fill_transition_rows(block, model.gravity, columns, corner)
+    for i in range(PROPAGATED_STATES):
+        for j in range(PROPAGATED_STATES):
             P[i, j] = 0.5 * (corner[i, j] + corner[j, i])
 
     dt, length = model.dt, block.length
-    turn = model.gyro_noise * length + model.rate_noise * sums.rate_squared * dt + sums.lost_turn
-    push = model.accel_noise * length + model.force_noise * (sums.acceleration * dt) ** 2 + (sums.impact * dt) ** 2
-    push += model.lost_force * sums.lost_force**2
-    _add_variance(P, ERROR.attitude, turn)
-    _add_variance(P, ERROR.velocity, push)
+    attitude_var = (
+        model.gyro_noise_psd * length + model.rate_noise_psd * sums.rate_squared * dt + sums.lost_rotation_var
+    )
+    velocity_error_var = model.velocity_error_fraction_sq * (sums.acceleration_sum * dt) ** 2
+    velocity_var = model.accel_noise_psd * length + velocity_error_var + (sums.impact_excess * dt) ** 2
+    velocity_var += model.lost_accel_var * sums.lost_accel_s**2
+    _add_variance(P, ERROR.attitude, attitude_var)
+    _add_variance(P, ERROR.velocity, velocity_var)
     _add_variance(P, ERROR.gyro_bias, model.bias_walk * length)
     _add_variance(P, ERROR.gyro_matrix, model.matrix_walk * length)
     _add_variance(P, ERROR.accel_bias, model.accel_bias_walk * length)
@@ -363,49 +379,54 @@ def _propagate(state, model):  # type: ignore[no-untyped-def]
 
 @inlined
 def _add_variance(P, states, variance):  # type: ignore[no-untyped-def]
+    """Add a variance to each of a range of states."""
     for i in range(states.start, states.stop):
         P[i, i] += variance
 
 
 @inlined
 def _correct(state, at, measured, variance):  # type: ignore[no-untyped-def]
-    """Kalman correction by a measurement of state `at`: P ← P − P h hᵀ P/s, what it does to the states is added up."""
+    """Correct by a measurement of state `at`: P ← P − P h hᵀ P/s; the correction of the states is summed up."""
     P, block = state.P, state.block
     m, correction = block.measurements, block.correction
-    gain = block.gain[m]
-    root = 1.0 / np.sqrt(P[at, at] + variance)
-    innovation = (measured - state.x[at] - correction[at]) * root
+    gain = block.normalized_gain[m]
+    inv_std = 1.0 / np.sqrt(P[at, at] + variance)
+    innovation = (measured - state.x[at] - correction[at]) * inv_std
     for j in range(STATES):
-        gain[j] = P[at, j] * root
+        gain[j] = P[at, j] * inv_std
     for j in range(STATES):
         correction[j] += gain[j] * innovation
     for i in range(STATES):
-        share = gain[i]
+        gain_i = gain[i]
         for j in range(STATES):
-            P[i, j] -= share * gain[j]
-    block.state[m], block.root[m], block.innovation[m] = at, root, innovation
+            P[i, j] -= gain_i * gain[j]
+    block.state_index[m], block.inv_innovation_std[m], block.normalized_innovation[m] = at, inv_std, innovation
     block.measurements = m + 1
 
 
 @inlined
-def _doubt_of_pair(state, at, variance):  # type: ignore[no-untyped-def]
-    """Variance to add to that of a measurement, zero, of two axes, so that it is at most `DOUBTED_2` off: an impact."""
+def _compute_added_variance(state, at, variance):  # type: ignore[no-untyped-def]
+    """Compute the variance to add to that of a measurement, zero, of two axes, so that it is no outlier.
+
+    The smallest s ≥ 0 with yᵀ (C + s I)⁻¹ y ≤ `OUTLIER_CHI2_2`, C the innovation's covariance: the larger root of a
+    quadratic equation.
+    """
     P, x, correction = state.P, state.x, state.block.correction
     y0, y1 = -x[at] - correction[at], -x[at + 1] - correction[at + 1]
     a, b, c = P[at, at] + variance, P[at, at + 1], P[at + 1, at + 1] + variance
     size, trace = y0 * y0 + y1 * y1, a + c
     determinant, scaled = a * c - b * b, y0 * y0 * c + y1 * y1 * a - 2.0 * y0 * y1 * b
-    missing = DOUBTED_2 * determinant - scaled
-    if missing >= 0.0:
+    chi2_deficit = OUTLIER_CHI2_2 * determinant - scaled
+    if chi2_deficit >= 0.0:
         return 0.0
-    half = 0.5 * (DOUBTED_2 * trace - size)
-    root = np.sqrt(half * half - DOUBTED_2 * missing)
-    return (root - half) / DOUBTED_2 if half < 0.0 else -missing / (root + half)
+    half = 0.5 * (OUTLIER_CHI2_2 * trace - size)
+    root = np.sqrt(half * half - OUTLIER_CHI2_2 * chi2_deficit)
+    return (root - half) / OUTLIER_CHI2_2 if half < 0.0 else -chi2_deficit / (root + half)
 
 
 @inlined
 def _squared_distance(P, at, variance, y0, y1, y2):  # type: ignore[no-untyped-def]
-    """Squared Mahalanobis distance of an innovation of three axes with `variance` each."""
+    """Compute the squared Mahalanobis distance of an innovation of three axes; the measurement has `variance` each."""
     a, b, c = P[at, at] + variance, P[at, at + 1], P[at, at + 2]
     e, f, i = P[at + 1, at + 1] + variance, P[at + 1, at + 2], P[at + 2, at + 2] + variance
     # Cholesky
@@ -421,13 +442,13 @@ def _squared_distance(P, at, variance, y0, y1, y2):  # type: ignore[no-untyped-d
 
 
 @inlined
-def _widen_if_jumped(state, mean_x, mean_y, mean_z, variance):  # type: ignore[no-untyped-def]
-    """Where gyro over a static block says that the bias has jumped, its covariance grows by as much."""
+def _inflate_jumped_bias(state, mean_x, mean_y, mean_z, variance):  # type: ignore[no-untyped-def]
+    """Add the squared jump to the bias covariance if the mean of gyro over a static block is an outlier."""
     P, x, correction, at = state.P, state.x, state.block.correction, GYRO_BIAS
     y0 = mean_x - x[at] - correction[at]
     y1 = mean_y - x[at + 1] - correction[at + 1]
     y2 = mean_z - x[at + 2] - correction[at + 2]
-    if _squared_distance(P, at, variance, y0, y1, y2) > DOUBTED_3:
+    if _squared_distance(P, at, variance, y0, y1, y2) > OUTLIER_CHI2_3:
         P[at, at] += y0 * y0
         P[at + 1, at + 1] += y1 * y1
         P[at + 2, at + 2] += y2 * y2
@@ -437,8 +458,8 @@ def _widen_if_jumped(state, mean_x, mean_y, mean_z, variance):  # type: ignore[n
 
 
 @inlined
-def _end_block(state, model):  # type: ignore[no-untyped-def]
-    """Propagate P over the block, correct by what bounds the motion, or by the static phase; begin the next block."""
+def _finish_block(state, model):  # type: ignore[no-untyped-def]
+    """Propagate P over the block, correct by the bounds of motion or by the static phase, and begin the next block."""
     x, P, sums, block = state.x, state.P, state.sums, state.block
     count = state.samples
     for i in range(3):
@@ -447,53 +468,55 @@ def _end_block(state, model):  # type: ignore[no-untyped-def]
             block.R_moving[i, c] = sums.R_moving[i, c] * model.dt
             for axis in range(3):
                 block.R_rate[axis, i, c] = sums.R_rate[axis, i, c] * model.dt
-    block.length, block.lost_turn, block.measurements = count * model.dt, sums.lost_turn, 0
+    block.length, block.lost_rotation_var, block.measurements = count * model.dt, sums.lost_rotation_var, 0
     for j in range(STATES):
         block.correction[j] = 0.0
 
     _propagate(state, model)
-    static = sums.static == count
+    static = sums.static_samples == count
     if static:
-        P[2, 2] += model.static_turn * block.length
-    # Pairs and triples of axes are doubted together, so that it does not matter where the sensor's axes point.
+        P[2, 2] += model.static_heading_psd * block.length
+    # Outliers are found in pairs and triples of axes: the directions of the sensor's axes do not matter.
     for group in range(2):
         if group == 0:
             at, axes = VELOCITY, 2
-            variance = model.static_speed if static else model.speed
-            variance += _doubt_of_pair(state, at, variance)
+            variance = model.static_velocity_var if static else model.velocity_var
+            variance += _compute_added_variance(state, at, variance)
         elif static:
-            at, axes, variance = GYRO_BIAS, 3, model.static_bias
-            _widen_if_jumped(state, sums.gyro[0] / count, sums.gyro[1] / count, sums.gyro[2] / count, variance)
+            at, axes, variance = GYRO_BIAS, 3, model.static_bias_var
+            _inflate_jumped_bias(state, sums.gyro[0] / count, sums.gyro[1] / count, sums.gyro[2] / count, variance)
         else:
-            at, axes, variance = POSITION, 2, model.position
-            variance += _doubt_of_pair(state, at, variance)
+            at, axes, variance = POSITION, 2, model.position_var
+            variance += _compute_added_variance(state, at, variance)
         for i in range(axes):
             _correct(state, at + i, sums.gyro[i] / count if axes == 3 else 0.0, variance)
     for i in range(VELOCITY, STATES):
         x[i] += block.correction[i]
     rotate_by_world_vector(state.quat_WS, block.correction[0], block.correction[1], block.correction[2])
     state.samples = 0
-    _clear(sums)
+    _reset_sums(sums)
 
 
 @inlined
-def _clear(sums):  # type: ignore[no-untyped-def]
+def _reset_sums(sums):  # type: ignore[no-untyped-def]
+    """Set all sums to zero."""
     for i in range(3):
         sums.gyro[i] = 0.0
         for c in range(3):
             sums.R[i, c] = sums.R_moving[i, c] = 0.0
             for axis in range(3):
                 sums.R_rate[axis, i, c] = 0.0
-    sums.rate_squared = sums.acceleration = sums.impact = sums.static = sums.lost_turn = sums.lost_force = 0.0
+    sums.rate_squared = sums.acceleration_sum = sums.impact_excess = 0.0
+    sums.static_samples = sums.lost_rotation_var = sums.lost_accel_s = 0.0
 
 
 @inlined
-def _true_rate(state, model, gx, gy, gz, static):  # type: ignore[no-untyped-def]
-    """The sample's rate without the errors that are known, as three floats, and without the bias alone, as three.
+def _correct_rate(state, model, gx, gy, gz, static):  # type: ignore[no-untyped-def]
+    """Correct the sample's rate: w = (I − M) u and u = gyro − bias [rad/s], three floats each.
 
-    A lost sample, and how uncertain the turn of a lost or clipped one is, are taken care of here.
+    A lost sample gets the fading last rate; a lost or saturated one adds to the variance of the lost rotation.
     """
-    x, sums, held = state.x, state.sums, state.held_rate
+    x, sums, last = state.x, state.sums, state.last_rate
     bias, motion_bias, M = x[ERROR.gyro_bias], x[ERROR.motion_bias], x[ERROR.gyro_matrix]
     moving = 0.0 if static else 1.0
     bx, by, bz = bias[0] + moving * motion_bias[0], bias[1] + moving * motion_bias[1], bias[2] + moving * motion_bias[2]
@@ -503,19 +526,19 @@ def _true_rate(state, model, gx, gy, gz, static):  # type: ignore[no-untyped-def
         sums.gyro[0] += gx
         sums.gyro[1] += gy
         sums.gyro[2] += gz
-        sums.static += 1.0 - moving
+        sums.static_samples += 1.0 - moving
     else:
-        fade = 1.0 - min(1.0, model.dt / FADE_S)
-        ux, uy, uz = fade * held[0], fade * held[1], fade * held[2]
+        fade = 1.0 - min(1.0, model.dt / HELD_RATE_FADE_S)
+        ux, uy, uz = fade * last[0], fade * last[1], fade * last[2]
         good = False
-    held[0], held[1], held[2] = ux, uy, uz
+    last[0], last[1], last[2] = ux, uy, uz
     if good:
-        state.held_s = 0.0
+        state.lost_s = 0.0
     else:
-        before = state.held_s
-        if before * model.lost_rate < LARGEST_LOST_TURN:
-            sums.lost_turn += model.lost_rate * model.lost_rate * model.dt * (2.0 * before + model.dt)
-        state.held_s = before + model.dt
+        lost_s = state.lost_s
+        if lost_s * model.lost_rate_std < MAX_LOST_ROTATION_STD:
+            sums.lost_rotation_var += model.lost_rate_std * model.lost_rate_std * model.dt * (2.0 * lost_s + model.dt)
+        state.lost_s = lost_s + model.dt
     state.gyro_bias[0], state.gyro_bias[1], state.gyro_bias[2] = bx, by, bz
     wx = ux - (M[0] * ux + M[1] * uy + M[2] * uz)
     wy = uy - (M[3] * ux + M[4] * uy + M[5] * uz)
@@ -524,14 +547,14 @@ def _true_rate(state, model, gx, gy, gz, static):  # type: ignore[no-untyped-def
 
 
 @inlined
-def _acceleration(state, model, ax, ay, az):  # type: ignore[no-untyped-def]
-    """The sample's horizontal acceleration in W, as two floats; zero for a lost sample."""
-    sums, bias, A, R = state.sums, state.x[ERROR.accel_bias], model.accel_matrix, state.R_WS
+def _compute_horizontal_acceleration(state, model, ax, ay, az):  # type: ignore[no-untyped-def]
+    """Compute the sample's horizontal acceleration in W, two floats [m/s²]; zero for a lost sample."""
+    sums, bias, A, R = state.sums, state.x[ERROR.accel_bias], model.accel_correction, state.R_WS
     if not ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
-        sums.lost_force += model.dt
+        sums.lost_accel_s += model.dt
         return 0.0, 0.0
     if max(abs(ax), abs(ay), abs(az)) >= model.accel_limit:
-        sums.lost_force += model.dt
+        sums.lost_accel_s += model.dt
     ax, ay, az = ax - bias[0], ay - bias[1], az - bias[2]
     fx = A[0, 0] * ax + A[0, 1] * ay + A[0, 2] * az
     fy = A[1, 0] * ax + A[1, 1] * ay + A[1, 2] * az
@@ -540,16 +563,16 @@ def _acceleration(state, model, ax, ay, az):  # type: ignore[no-untyped-def]
     ay = R[1, 0] * fx + R[1, 1] * fy + R[1, 2] * fz
     az = R[2, 0] * fx + R[2, 1] * fy + R[2, 2] * fz - model.gravity
     size = np.sqrt(ax * ax + ay * ay + az * az)
-    sums.acceleration += size
-    sums.impact += max(0.0, size - model.impact)
+    sums.acceleration_sum += size
+    sums.impact_excess += max(0.0, size - model.impact_limit)
     return ax, ay
 
 
 @inlined
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
-    """One sample of one sensor: records of `STATE` and `MODEL`, gyro [rad/s], accel [m/s²]; whether a block ended."""
+    """Filter one sample, gyro [rad/s], accel [m/s²]; records of `STATE` and `MODEL`. Return whether a block ended."""
     dt, x, sums, R = model.dt, state.x, state.sums, state.R_WS
-    wx, wy, wz, ux, uy, uz = _true_rate(state, model, gx, gy, gz, static)
+    wx, wy, wz, ux, uy, uz = _correct_rate(state, model, gx, gy, gz, static)
     sums.rate_squared += wx * wx + wy * wy + wz * wz
     rotate_unit_by_rate(state.quat_WS, wx, wy, wz, dt)
     fill_matrix(state.quat_WS, R)
@@ -561,7 +584,7 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
             sums.R_rate[1, i, c] += R[i, c] * uy
             sums.R_rate[2, i, c] += R[i, c] * uz
             sums.R_moving[i, c] += R[i, c] * moving
-    ax, ay = _acceleration(state, model, ax, ay, az)
+    ax, ay = _compute_horizontal_acceleration(state, model, ax, ay, az)
     velocity, position = x[ERROR.velocity], x[ERROR.position]
     position[0] += dt * velocity[0]
     position[1] += dt * velocity[1]
@@ -569,11 +592,11 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
     velocity[1] += dt * ay
 
     state.samples += 1
-    ended = state.samples == model.block
+    ended = state.samples == model.block_samples
     if ended:
-        _end_block(state, model)
+        _finish_block(state, model)
         fill_matrix(state.quat_WS, R)
-    into_sensor(R, state.P, sums.lost_turn, state.attitude_cov)
+    into_sensor(R, state.P, sums.lost_rotation_var, state.attitude_cov)
     return ended
 
 
@@ -585,9 +608,9 @@ def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, ou
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
         if step(state, model, gx, gy, gz, ax, ay, az, static[k]) and row < len(blocks):
-            for n in range(len(SMOOTHED)):
+            for n in range(len(SMOOTHED_STATES)):
                 for j in range(STATES):
-                    state.block.P_rows[n, j] = state.P[SMOOTHED[n], j]
+                    state.block.P_smoothed_rows[n, j] = state.P[SMOOTHED_STATES[n], j]
             blocks[row] = state.block
             row += 1
         for i in range(4):
@@ -598,8 +621,8 @@ def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, ou
 
 
 @kernel
-def _live(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
-    """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `bank.LiveBank` has them."""
+def _step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+    """Detect and filter one sample of each of k sensors; the arrays of `bank.LiveBank` have one row per sensor."""
     for i in range(len(states)):
         gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]
         ax, ay, az = accel_S[i, 0], accel_S[i, 1], accel_S[i, 2]

@@ -20,7 +20,7 @@ class LiveBank:
 
     Parameters
     ----------
-    filters : one a sensor, all of one kind with a `live` kernel (`Smekf`)
+    filters : one a sensor, all of one kind with a `bank_kernel` (`Smekf`)
     detectors : one a sensor, their windows equally long
 
     Attributes
@@ -38,14 +38,14 @@ class LiveBank:
     def __init__(self, filters: Sequence[Any], detectors: Sequence[StaticDetector]) -> None:
         kinds = {type(filter_).__name__ for filter_ in filters}
         windows = {detector.state.block.shape[1] for detector in detectors}
-        if len(kinds) != 1 or not hasattr(filters[0], "live"):
-            raise BadOption(f"filters of kind {', '.join(sorted(kinds)) or 'none'}: one kind that has a `live` kernel")
+        if len(kinds) != 1 or not hasattr(filters[0], "bank_kernel"):
+            raise BadOption(f"filters of kind {', '.join(sorted(kinds)) or 'none'}: one kind that has a `bank_kernel`")
         if len(windows) != 1 or len(filters) != len(detectors):
             raise BadOption(
                 f"{len(filters)} filters and {len(detectors)} detectors with windows of {sorted(windows)} samples: "
                 "one of each a sensor and one length are needed"
             )
-        self._step = filters[0].live
+        self._step = filters[0].bank_kernel
         self._states = np.concatenate([filter_.state.record for filter_ in filters])
         self._models = np.concatenate([filter_.model for filter_ in filters])
         detector_states = zip(*(detector.state for detector in detectors), strict=True)
@@ -96,5 +96,5 @@ class OneByOne:
 
 def create_bank(filters: Sequence[Any], detectors: Sequence[StaticDetector]) -> LiveBank | OneByOne:
     """Create a `LiveBank` if the filters have a kernel for it, else `OneByOne`."""
-    kind = LiveBank if all(hasattr(filter_, "live") for filter_ in filters) else OneByOne
+    kind = LiveBank if all(hasattr(filter_, "bank_kernel") for filter_ in filters) else OneByOne
     return kind(filters, detectors)

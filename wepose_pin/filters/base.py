@@ -19,7 +19,7 @@ STATIC_TURN_NOISE = 8e-4
 
 
 class FilterRun(NamedTuple):
-    """Results of a run, one row a sample."""
+    """Results of a run, one row a sample; W is the sensor's own world, as in `OrientationFilter`."""
 
     quat_WS: np.ndarray  # (n, 4) xyzw, orientation after the sample
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
@@ -29,8 +29,9 @@ class FilterRun(NamedTuple):
 class OrientationFilter(Protocol):
     """A filter made for one sensor: ``Filter(noise, rate_hz, quat_WS, params)``.
 
-    The world W is the sensor's own: z up, heading as in the `quat_WS` it starts from. `update` and `run` go through
-    the same compiled code, so a run, the same run cut in two, and a run sample by sample give the same bits.
+    W is here the sensor's own world, called V outside of the filters: z up, heading of the `quat_WS` from which the
+    filter starts. `update` and `run` use the same compiled code: a run, the same run cut in two, and a run sample by
+    sample are bit-identical.
     """
 
     def __init__(self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray) -> None: ...

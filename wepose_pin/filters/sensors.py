@@ -22,7 +22,7 @@ class FilteredRecording(NamedTuple):
     """Orientations of every sensor in its own world, without mounts."""
 
     R_VS: dict[str, Rotation]  # segment → n orientations of its sensor
-    at_start: dict[str, Rotation]  # their mean in the start pose
+    R_VS_start: dict[str, Rotation]  # their mean in the start pose
     orientation: dict[str, Orientation]  # the filter's result; none for measured orientations
     start: tuple[float, float]  # [s]
     static_phase: tuple[float, float]  # [s]
@@ -126,9 +126,9 @@ def combine_chunk(
 ) -> FilteredRecording:
     """Combine a chunk that contains the start pose with its orientations from `filters`."""
     R_VS = collect_rotations(chunk, orientation)
-    at_start = {segment: R[chunk.find_measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
+    R_VS_start = {segment: R[chunk.find_measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
     return FilteredRecording(
-        R_VS, at_start, dict(orientation), filters.start, filters.static_phase, filters.diagnostics
+        R_VS, R_VS_start, dict(orientation), filters.start, filters.static_phase, filters.diagnostics
     )
 
 

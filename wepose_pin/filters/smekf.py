@@ -156,9 +156,9 @@ class Smekf:
         self._one = OneSample()
 
     @property
-    def live(self) -> Callable[..., None]:
+    def bank_kernel(self) -> Callable[..., None]:
         """The kernel that steps many sensors at a time (`bank.LiveBank`)."""
-        return _live
+        return _step_bank
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
         gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
@@ -482,7 +482,7 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov): 
 
 
 @kernel
-def _live(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+def _step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
     """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `bank.LiveBank` has them."""
     for i in range(len(states)):
         gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]

@@ -20,12 +20,12 @@ import numpy as np
 from ..compilation import compiled, inlined
 from ..errors import BadData, BadOption
 from ..rotations import fill_matrix, rotate_by_world_vector
-from .amekf import BLOCK, ERROR, POSITION, SMOOTHED, STATES, VELOCITY, Amekf, AmekfParams
+from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, Amekf, AmekfParams
 from .base import FilterRun
 from .covariance import fill_symmetric, into_sensor
 from .noise import SensorNoise
 
-COUNT = len(SMOOTHED)
+COUNT = len(SMOOTHED_STATES)
 
 
 class _Forward(NamedTuple):
@@ -34,7 +34,7 @@ class _Forward(NamedTuple):
     out: FilterRun  # the filter's
     static: np.ndarray  # (n,) bool
     blocks: np.ndarray  # of `amekf.BLOCK`
-    P_rows: np.ndarray  # (9, 25) rows `SMOOTHED` of P before it
+    P_rows: np.ndarray  # (9, 25) rows `SMOOTHED_STATES` of P before it
 
 
 class Smoother:
@@ -69,17 +69,17 @@ class Smoother:
         Raises
         ------
         BadData
-            The chunk before ended within a block of `Amekf.block` samples.
+            The chunk before ended within a block of `Amekf.block_samples` samples.
         """
         is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
-        if self._pending is not None and len(self._pending.static) % self._filter.block:
+        if self._pending is not None and len(self._pending.static) % self._filter.block_samples:
             raise BadData(
                 f"a chunk of {len(self._pending.static)} samples before another: the smoother's must be multiples of "
-                f"{self._filter.block}"
+                f"{self._filter.block_samples}"
             )
-        P_rows = np.ascontiguousarray(self._filter.state.P[list(SMOOTHED)])
-        blocks = np.empty(len(is_static) // self._filter.block, BLOCK)
-        out = self._filter.run_recorded(gyro_S, accel_S, is_static, blocks)
+        P_rows = np.ascontiguousarray(self._filter.state.P[list(SMOOTHED_STATES)])
+        blocks = np.empty(len(is_static) // self._filter.block_samples, BLOCK)
+        out = self._filter.run_with_blocks(gyro_S, accel_S, is_static, blocks)
         done = None if self._pending is None else self._smooth(self._pending, blocks)
         self._pending = _Forward(out, is_static, blocks, P_rows)
         return done
@@ -96,7 +96,7 @@ class Smoother:
         deviation, cov = _backward(np.concatenate([blocks, after]), P_rows, self.noise.gravity)
         deviation, cov = deviation[: len(blocks) + 1], cov[: len(blocks) + 1]
         trace = float(np.trace(P_rows[:3, :3]))
-        _interpolate(blocks, deviation, cov, trace, self._filter.block, chunk.static, *chunk.out)
+        _interpolate(blocks, deviation, cov, trace, self._filter.block_samples, chunk.static, *chunk.out)
         return chunk.out
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:  # noqa: ARG002
@@ -112,7 +112,7 @@ class Smoother:
 
 @compiled
 def _transpose_transition(block, gravity, L):  # type: ignore[no-untyped-def]
-    """In place ``L ← Fᵀ L`` of `L` (25, m), F the transition that `amekf.transition_rows` applies."""
+    """In place ``L ← Fᵀ L`` of `L` (25, m), F the transition that `amekf.fill_transition_rows` applies."""
     bias, moving = L[ERROR.gyro_bias], L[ERROR.motion_bias]
     matrix, force = L[ERROR.gyro_matrix], L[ERROR.accel_bias]
     R, R_moving, R_rate = block.R, block.R_moving, block.R_rate
@@ -135,8 +135,9 @@ def _transpose_transition(block, gravity, L):  # type: ignore[no-untyped-def]
 
 @compiled
 def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
-    """Deviations (blocks + 1, 9) of the smoothed from the filtered states `SMOOTHED` after each block, and the smoothed
-    covariance (blocks + 1, 3, 3) of θ; the first of both is that of the start, whose rows of P are `start_rows`."""
+    """Compute deviations (blocks + 1, 9) of the smoothed from the filtered states `SMOOTHED_STATES` after each block,
+    and the smoothed covariance (blocks + 1, 3, 3) of θ; the first of both is that of the start, whose rows of P are
+    `start_rows`."""
     deviation = np.empty((len(blocks) + 1, COUNT))
     cov = np.empty((len(blocks) + 1, 3, 3))
     lam = np.zeros((STATES, 1))
@@ -148,7 +149,7 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
         for n in range(COUNT):
             s = 0.0
             for j in range(STATES):
-                rows[n, j] = start_rows[n, j] if k == 0 else blocks[k - 1].P_rows[n, j]
+                rows[n, j] = start_rows[n, j] if k == 0 else blocks[k - 1].P_smoothed_rows[n, j]
                 s -= rows[n, j] * lam[j, 0]
             deviation[k, n] = s
         for i in range(3):
@@ -168,7 +169,15 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
             break
         block = blocks[k - 1]
         for n in range(block.measurements - 1, -1, -1):
-            _uncorrect(lam, Lam, block.state[n], block.root[n], block.innovation[n], block.gain[n], u)
+            _uncorrect(
+                lam,
+                Lam,
+                block.state_index[n],
+                block.inv_innovation_std[n],
+                block.normalized_innovation[n],
+                block.normalized_gain[n],
+                u,
+            )
         _transpose_transition(block, gravity, lam)
         _transpose_transition(block, gravity, Lam)
         for i in range(STATES):
@@ -227,11 +236,11 @@ def _interpolate(blocks, deviation, cov, start_trace, size, static, quat, bias, 
             block = blocks[row]
             share = (k % size + 1) / size
             whole = k % size + 1 == size  # the filter has corrected this quaternion, not the bias it stated with it
-            lost = block.lost_turn
+            lost = block.lost_rotation_var
             if lost > 0.0 and not whole:
                 before = start_trace
                 if row > 0:
-                    last = blocks[row - 1].P_rows
+                    last = blocks[row - 1].P_smoothed_rows
                     before = 0.0
                     for i in range(3):
                         before += last[i, i]
@@ -240,7 +249,7 @@ def _interpolate(blocks, deviation, cov, start_trace, size, static, quat, bias, 
                 share = so_far / lost
                 bridge = so_far * (1.0 - share)
             for n in range(COUNT):
-                after = deviation[row + 1, n] + (0.0 if whole and n < 3 else block.correction[SMOOTHED[n]])
+                after = deviation[row + 1, n] + (0.0 if whole and n < 3 else block.correction[SMOOTHED_STATES[n]])
                 e[n] = (1.0 - share) * deviation[row, n] + share * after
             for i in range(3):
                 for j in range(3):

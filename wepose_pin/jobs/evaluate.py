@@ -58,7 +58,7 @@ def run_evaluate(job: EvaluateJob, progress: Progress = no_progress, pose: Pose 
         No result, no reference, or nothing that both have.
     """
     from ..evaluation import evaluate
-    from ..kinematics import pose_from_table
+    from ..kinematics import parse_pose_table
     from ..readers import load_session
     from ..readers.tables import read_table
     from ..writers import read_result
@@ -72,6 +72,6 @@ def run_evaluate(job: EvaluateJob, progress: Progress = no_progress, pose: Pose 
         truth = load_session(job.truth, gaps=True).truth
     if truth is None:
         raise BadOption(f"{job.truth}: data.truth is missing; the session names no reference to compare with")
-    reference = pose_from_table(read_table(truth), str(truth))
+    reference = parse_pose_table(read_table(truth), str(truth))
     progress("comparing", 0.5)
     return evaluate(pose, reference, job.interval)

@@ -74,7 +74,7 @@ class MeasuredLinks:
 
     def place(self, quat_WL: np.ndarray) -> np.ndarray:
         """Placements (m, 12) of the links; NaN where not known."""
-        self._kinematics.points_of(quat_WL)
+        self._kinematics.compute_points(quat_WL)
         placements = _stack(self._views)
         placements[~self.known] = np.nan
         return placements

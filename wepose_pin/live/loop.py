@@ -25,51 +25,53 @@ from ..recording.arrivals import (
     MISSING,
     TAKEN,
     WAIT_S,
-    Aligner,
     Arrivals,
     Samples,
+    StreamSynchronizer,
     Ticks,
     order_arrivals,
 )
 from ..subject import Subject, population_subject
 from ..tracking import Tracker, TrackOptions
-from ..tracking.causal import SegmentFollower
-from ..tracking.start_pose import HOLD_S, StartGuide
+from ..tracking.causal import CausalSegmentEstimator
+from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
 from .setup import SensorSetup
 from .sources.base import Source
 from .state import LivePose, Output, SensorStatus, Status, StreamInfo, join_names
 
-STATUS_S = 0.2  # [s] from status to status
-READ_S = 0.05  # [s] that a read waits at most, so that keys and status are not delayed
-MEASURE_S = 1.0  # [s] over which the rate is measured where the source does not know it
-ABSENT_S = 3.0  # [s] after which ticks begin without a sensor that never came
-SILENT_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
+STATUS_PERIOD_S = 0.2  # [s]
+READ_TIMEOUT_S = 0.05  # [s]; keys and the status wait for a read
+RATE_MEASUREMENT_S = 1.0  # [s] over which the rate is measured if the source does not know it
+MAX_ABSENCE_S = 3.0  # [s] after which ticks begin without a sensor that has sent nothing
+MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
 MAX_LATENCIES = 1000  # newest latencies in the status
-MAX_WAITING = 64  # blocks of ticks kept before those older than the static phase are dropped
+MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
+DEFAULT_RATE_HZ = 100.0  # where none can be measured
 START_POSE = "Stand upright and still, arms hanging, palms to the thighs"
 
 
 class Latencies:
-    """Histogram of latencies with bins of 2 %: its size does not grow."""
+    """Histogram of latencies in bins of 2 %; its size is constant."""
 
-    LEAST_S, STEP = 1e-6, 1.02
+    MIN_LATENCY_S, BIN_RATIO = 1e-6, 1.02
+    BINS = 1024  # up to ten minutes
 
     def __init__(self) -> None:
         self.count = 0
-        self._bins = [0] * 1024  # up to ten minutes
+        self._bins = [0] * self.BINS
 
     def add(self, latency_s: float) -> None:
-        place = int(math.log(max(latency_s, self.LEAST_S) / self.LEAST_S) / math.log(self.STEP))
-        self._bins[min(place, len(self._bins) - 1)] += 1
+        bin_index = int(math.log(max(latency_s, self.MIN_LATENCY_S) / self.MIN_LATENCY_S) / math.log(self.BIN_RATIO))
+        self._bins[min(bin_index, len(self._bins) - 1)] += 1
         self.count += 1
 
-    def quantile(self, share: float) -> float:
-        """[s], to 2 %; NaN before the first."""
+    def quantile(self, probability: float) -> float:
+        """Return the quantile [s], accurate to 2 %; NaN before the first latency."""
         if not self.count:
             return math.nan
-        place = int(np.searchsorted(np.cumsum(self._bins), share * self.count))
-        return self.LEAST_S * self.STEP ** (min(place, len(self._bins) - 1) + 0.5)
+        bin_index = int(np.searchsorted(np.cumsum(self._bins), probability * self.count))
+        return self.MIN_LATENCY_S * self.BIN_RATIO ** (min(bin_index, len(self._bins) - 1) + 0.5)
 
 
 class SessionSummary(NamedTuple):
@@ -78,40 +80,40 @@ class SessionSummary(NamedTuple):
     poses: int
     seconds: float  # [s] from the first pose to the last, on the source's clock
     counts: Mapping[str, Mapping[str, int]]  # segment → each of `arrivals.COUNTS`
-    latency: Latencies  # [s] from the time of the newest sample to its pose, of every tick
+    latency: Latencies  # of every tick: [s] from its time to its pose
     diagnostics: tuple[Diagnostic, ...]
     problem: str  # of the recording; empty where it is complete
 
 
-class StartSearch:
-    """The ticks before tracking, in which the start pose is found: stated by the session, or held for `HOLD_S`."""
+class StartPoseSearch:
+    """Finds the start pose in the ticks before tracking: stated by the session, or held for `START_POSE_HOLD_S`."""
 
-    def __init__(self, aligner: Aligner, sensors: int, stated: tuple[float, float] | None) -> None:
-        self.aligner, self.stated = aligner, stated
-        self.guide = StartGuide(aligner.rate_hz, sensors)
+    def __init__(self, synchronizer: StreamSynchronizer, sensors: int, stated: tuple[float, float] | None) -> None:
+        self.synchronizer, self.stated = synchronizer, stated
+        self.detector = StartPoseDetector(synchronizer.rate_hz, sensors)
         self.ticks: list[Ticks] = []
 
     def push(self, ticks: Ticks) -> tuple[int, int, int] | None:
-        """First and last tick of the start pose, and the row in `ticks` after it; None where it is still to come."""
+        """Add ticks; return the start pose's first and last tick and the row in `ticks` after it; None: not yet."""
         self.ticks.append(ticks)
         for n in range(len(ticks.time)):
             if self.stated is not None:
-                rate_hz = self.aligner.rate_hz
+                rate_hz = self.synchronizer.rate_hz
                 if ticks.time[n] >= self.stated[1] - 0.5 / rate_hz:
-                    begin = max(0, round((self.stated[0] - self.aligner.begin) * rate_hz))
+                    begin = max(0, round((self.stated[0] - self.synchronizer.begin) * rate_hz))
                     return begin, ticks.first + n, n + 1
-            elif self.guide.push(ticks.gyro_S[n]) == "ready":
-                return self.guide.begin, self.guide.end, n + 1
-        if self.stated is None and len(self.ticks) > MAX_WAITING:
-            self.ticks = [t for t in self.ticks if t.first + len(t.time) > self.guide.begin]
+            elif self.detector.push(ticks.gyro_S[n]) == "ready":
+                return self.detector.begin, self.detector.end, n + 1
+        if self.stated is None and len(self.ticks) > MAX_TICK_BLOCKS:
+            self.ticks = [t for t in self.ticks if t.first + len(t.time) > self.detector.begin]
         return None
 
     @property
     def progress(self) -> float:
-        """0 to 1 of the start pose."""
+        """Progress of the start pose, 0 to 1."""
         if self.stated is None:
-            return min(1.0, self.guide.held_s / HOLD_S)
-        return float(np.clip((self.aligner.newest - self.stated[0]) / (self.stated[1] - self.stated[0]), 0.0, 1.0))
+            return min(1.0, self.detector.held_s / START_POSE_HOLD_S)
+        return float(np.clip((self.synchronizer.newest - self.stated[0]) / (self.stated[1] - self.stated[0]), 0.0, 1.0))
 
 
 class LiveLoop:
@@ -119,10 +121,10 @@ class LiveLoop:
 
     Parameters
     ----------
-    source : opened already; `run` closes it
-    model : a body; None: ours with the subject's lengths
+    source : an open source; `run` closes it
+    model : a body; None: the package's, with the subject's lengths
     log : the recording; `run` closes it
-    begin : time [s] of the first tick; None: when every sensor has come
+    begin : time [s] of the first tick; None: when every sensor has sent a sample
 
     Raises
     ------
@@ -146,33 +148,33 @@ class LiveLoop:
         self.setup = setup.as_recorded()
         self.model = build_subject_model(setup.subject, model)
         self.kinematics = LiveKinematics(self.model, source.sensors)
-        self._begin, self._wait = begin, wait_s
-        self._search: StartSearch | None = None  # set when the ticks begin
-        self._tracker: SegmentFollower | None = None  # set when the start pose is found
+        self._begin, self._wait_s = begin, wait_s
+        self._start_search: StartPoseSearch | None = None  # set when the ticks begin
+        self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
         self._waiting: list[Arrivals] = []
-        self._newest = dict.fromkeys(source.sensors, -np.inf)
-        self._heading_time = 0.0
-        self._std, self._std_every = np.full(len(source.sensors), np.nan), 1
+        self._newest_times = dict.fromkeys(source.sensors, -np.inf)
+        self._heading_reset_time = 0.0
+        self._std, self._std_interval_ticks = np.full(len(source.sensors), np.nan), 1
         self._latency = Latencies()
-        self._latest: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s] of the poses that were shown
+        self._recent_latencies: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s] of displayed poses
         self._first_pose = self._last_pose = 0.0
-        self._counted: deque[tuple[float, np.ndarray]] = deque(maxlen=round(1.0 / STATUS_S) + 1)
+        self._count_history: deque[tuple[float, np.ndarray]] = deque(maxlen=round(1.0 / STATUS_PERIOD_S) + 1)
         self._ended = False
 
-    def run(self, until: Callable[[], bool] = lambda: False) -> SessionSummary:
-        """Run until the source ends, someone presses q, or `until` returns True."""
+    def run(self, should_stop: Callable[[], bool] = lambda: False) -> SessionSummary:
+        """Run until the source ends, the user presses q, or `should_stop` returns True."""
         next_status = 0.0
         try:
-            while not until():
-                samples = self.source.read(READ_S)
+            while not should_stop():
+                samples = self.source.read(READ_TIMEOUT_S)
                 if samples is None:
                     break
-                self._receive(samples)
+                self._process_samples(samples)
                 self._flush_log()
                 if not self._handle_keys():
                     break
                 if time.monotonic() >= next_status:
-                    next_status = time.monotonic() + STATUS_S
+                    next_status = time.monotonic() + STATUS_PERIOD_S
                     self._send_status()
             self._ended = True
             self._send_status()
@@ -186,22 +188,23 @@ class LiveLoop:
 
     # Samples to ticks ------------------------------------------------------------------------------------------------
 
-    def _receive(self, samples: list[Samples]) -> None:
-        samples = [some for some in samples if len(some.time)]
+    def _process_samples(self, samples: list[Samples]) -> None:
+        """Record the samples of one read, track the ticks that they complete, and show the last pose."""
+        samples = [chunk for chunk in samples if len(chunk.time)]
         if not samples:
             return
-        for some in samples:
-            self._newest[some.sensor] = max(self._newest[some.sensor], float(some.time[-1]))
+        for chunk in samples:
+            self._newest_times[chunk.sensor] = max(self._newest_times[chunk.sensor], float(chunk.time[-1]))
         arrivals = order_arrivals(samples, self.source.sensors)
         if self.log is not None:
             self.log.samples(arrivals)
-        if self._search is None:
+        if self._start_search is None:
             self._waiting.append(arrivals)
             self._begin_ticks()
             return
         pose = None
-        for ticks in self._search.aligner.iterate_ticks(arrivals):
-            pose = self._process(ticks, self._search) or pose
+        for ticks in self._start_search.synchronizer.iterate_ticks(arrivals):
+            pose = self._track_ticks(ticks, self._start_search) or pose
             self._flush_log()
         if pose is not None:
             for output in self.outputs:
@@ -212,89 +215,89 @@ class LiveLoop:
             self.log.due()
 
     def _begin_ticks(self) -> None:
-        """Begin the ticks when every sensor has come and the rate is known."""
+        """Begin the ticks once every sensor has sent a sample and the rate is known."""
         sensor, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])
         times = {int(i): time_s[sensor == i] for i in np.unique(sensor)}
-        first = np.array([float(own[0]) for own in times.values()])
-        newest = max(self._newest.values())
-        if len(first) < len(self.source.sensors) and newest - first.min() < ABSENT_S:
+        first = np.array([float(sensor_times[0]) for sensor_times in times.values()])
+        newest = max(self._newest_times.values())
+        if len(first) < len(self.source.sensors) and newest - first.min() < MAX_ABSENCE_S:
             return
         rate = self.source.rate_hz
         if rate is None:
-            if newest - first.max() < MEASURE_S:
+            if newest - first.max() < RATE_MEASUREMENT_S:
                 return
             rate = _measure_rate(list(times.values()))
         # A time-stamp outlier must not put all other sensors before the beginning.
         begin = self._begin if self._begin is not None else float(first[first < np.median(first) + JUMP_S].max())
-        aligner = Aligner(self.source.sensors, rate, begin, self._wait)
+        synchronizer = StreamSynchronizer(self.source.sensors, rate, begin, self._wait_s)
         stated = next(iter(self.setup.phases.get("start", ())), None)
-        self._search = StartSearch(aligner, len(self.source.sensors), stated)
-        self._std_every = max(1, round(STATUS_S * rate))
+        self._start_search = StartPoseSearch(synchronizer, len(self.source.sensors), stated)
+        self._std_interval_ticks = max(1, round(STATUS_PERIOD_S * rate))
         if self.log is not None:
-            self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self._wait)
+            self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self._wait_s)
         waiting, self._waiting = self._waiting, []
         for arrivals in waiting:
-            self._process(aligner.push(arrivals), self._search)
+            self._track_ticks(synchronizer.push(arrivals), self._start_search)
 
     # Ticks to poses --------------------------------------------------------------------------------------------------
 
-    def _process(self, ticks: Ticks, search: StartSearch) -> LivePose | None:
-        """The last of the poses of these ticks; None before the start."""
-        tracker, row, quat_WL = self._tracker, 0, None
+    def _track_ticks(self, ticks: Ticks, search: StartPoseSearch) -> LivePose | None:
+        """Track these ticks, log every pose, and return the last one; None before tracking starts."""
+        estimator, row, quat_WL = self._segment_estimator, 0, None
         if not len(ticks.time):
             return None
-        if tracker is None:
+        if estimator is None:
             start = search.push(ticks)
             if start is None:
                 return None
             begin, end, row = start
-            tracker = self._tracker = self._start_tracking(search, begin, end)
+            estimator = self._segment_estimator = self._start_tracking(search, begin, end)
         for n in range(row, len(ticks.time)):
-            quat_WL = tracker.step(ticks.gyro_S[n], ticks.accel_S[n])
-            if (ticks.first + n) % self._std_every == 0:  # by ticks, so that a recording gives the same again
-                self._std = tracker.std()
+            quat_WL = estimator.step(ticks.gyro_S[n], ticks.accel_S[n])
+            if (ticks.first + n) % self._std_interval_ticks == 0:  # by ticks: a recording reproduces the values
+                self._std = estimator.std()
             if self.log is not None:
                 self.log.pose(ticks.first + n, quat_WL)
         if quat_WL is None:
             return None
-        points = self.kinematics.points_of(quat_WL)
+        points = self.kinematics.compute_points(quat_WL)
         self._last_pose = float(ticks.time[-1])
         now = self.source.clock()
         for tick in ticks.time[row:].tolist():
             self._latency.add(now - tick)
         latency = now - self._last_pose
-        self._latest.append(latency)
+        self._recent_latencies.append(latency)
         return LivePose(self._last_pose, quat_WL.copy(), points, self._std, ticks.lost[-1].copy(), latency)
 
-    def _start_tracking(self, search: StartSearch, begin: int, end: int) -> SegmentFollower:
-        """Track from the start pose on, ticks `begin` to `end`."""
-        rate_hz = search.aligner.rate_hz
+    def _start_tracking(self, search: StartPoseSearch, begin: int, end: int) -> CausalSegmentEstimator:
+        """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
+        rate_hz = search.synchronizer.rate_hz
         recording = build_recording(
             self.setup.header(self.source.sensors), rate_hz, search.ticks, (begin, end), last=end
         )
         tracker = Tracker(self.setup.subject, model=self.model, options=TrackOptions(self.method, causal=True))
         tracker.push(recording)
         search.ticks = []
-        self._first_pose = self._heading_time = float(recording.time[-1])
+        self._first_pose = self._heading_reset_time = float(recording.time[-1])
         if self.log is not None:
             self.log.event("start", begin=begin, end=end)
         info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, rate_hz)
         for output in self.outputs:
             output.start(info)
-        return tracker.follower
+        return tracker.segment_estimator
 
     # Keys and status -------------------------------------------------------------------------------------------------
 
     def _handle_keys(self) -> bool:
-        """Do what the keys ask for; False to end."""
+        """Carry out the keys pressed since the last call; return False to end."""
         for key in [key for output in self.outputs for key in output.take_keys()]:
             if key == "q":
                 return False
-            if key == "r" and self._tracker is not None and self._search is not None:
-                self._tracker.reset_headings()
-                self._heading_time = self._search.aligner.newest
+            if key == "r" and self._segment_estimator is not None and self._start_search is not None:
+                self._segment_estimator.reset_headings()
+                self._heading_reset_time = self._start_search.synchronizer.newest
                 if self.log is not None:
-                    self.log.event("reset", tick=self._search.aligner.next_tick)
+                    self.log.event("reset", tick=self._start_search.synchronizer.next_tick)
         return True
 
     def _send_status(self) -> None:
@@ -303,24 +306,25 @@ class LiveLoop:
             output.status(status)
 
     def _build_status(self) -> Status:
-        sensors, tracker = self.source.sensors, self._tracker
-        aligner = None if self._search is None else self._search.aligner
+        """Return the state of the session and of each sensor now."""
+        sensors, estimator = self.source.sensors, self._segment_estimator
+        synchronizer = None if self._start_search is None else self._start_search.synchronizer
         now, k = self.source.clock(), len(sensors)
         counts, frozen = np.zeros((k, len(COUNTS)), dtype=np.int64), np.zeros(k, dtype=bool)
-        lost = np.array([now - self._newest[name] > SILENT_S for name in sensors])
+        lost = np.array([now - self._newest_times[name] > MAX_SILENCE_S for name in sensors])
         recorded_s = 0.0
-        if aligner is not None:
-            counts, frozen = aligner.counts.copy(), aligner.frozen.copy()
-            lost |= aligner.lost | frozen
-            recorded_s = 0.0 if self.log is None else max(0.0, aligner.newest - aligner.begin)
+        if synchronizer is not None:
+            counts, frozen = synchronizer.counts.copy(), synchronizer.frozen.copy()
+            lost |= synchronizer.lost | frozen
+            recorded_s = 0.0 if self.log is None else max(0.0, synchronizer.newest - synchronizer.begin)
         static, bias, heading_std, heading_age = np.zeros(k, dtype=bool), np.zeros((k, 3)), np.full(k, np.nan), 0.0
-        if tracker is not None:
-            static, bias, heading_std = tracker.static, tracker.gyro_bias, tracker.heading_std()
-            heading_age = max(0.0, now - self._heading_time)
-        self._counted.append((now, counts[:, TAKEN]))
-        (then, before), (_, after) = self._counted[0], self._counted[-1]
-        rates = (after - before) / (now - then) if now > then else np.zeros(k)
-        latest = 1e3 * np.array(self._latest or [0.0])
+        if estimator is not None:
+            static, bias, heading_std = estimator.static, estimator.gyro_bias, estimator.heading_std()
+            heading_age = max(0.0, now - self._heading_reset_time)
+        self._count_history.append((now, counts[:, TAKEN]))
+        (first_time, first_count), (_, last_count) = self._count_history[0], self._count_history[-1]
+        rates = (last_count - first_count) / (now - first_time) if now > first_time else np.zeros(k)
+        latencies_ms = 1e3 * np.array(self._recent_latencies or [0.0])
         return Status(
             *self._describe_state(lost, frozen),
             now,
@@ -340,13 +344,13 @@ class LiveLoop:
                 )
                 for i, name in enumerate(sensors)
             ),
-            (float(np.quantile(latest, 0.5)), float(np.quantile(latest, 0.99))),
+            (float(np.quantile(latencies_ms, 0.5)), float(np.quantile(latencies_ms, 0.99))),
             recorded_s,
             self._count_problems(counts),
         )
 
     def _count_problems(self, counts: np.ndarray) -> dict[str, int]:
-        """Problem → count, besides those in a sensor's status."""
+        """Count problems that are not in a sensor's status: problem → count."""
         problems = dict(self.source.problems)
         for name, count in zip(self.source.sensors, counts[:, CUT_OFF].tolist(), strict=True):
             if count:
@@ -356,36 +360,40 @@ class LiveLoop:
         return problems
 
     def _describe_state(self, lost: np.ndarray, frozen: np.ndarray) -> tuple[str, str, float]:
-        """State, message to the person, and progress of the start pose."""
+        """Return the state, the message to the person, and the progress of the start pose."""
         if self._ended:
             return "ended", "The session has ended.", 1.0
-        if self._tracker is not None:
+        if self._segment_estimator is not None:
             return "ready", self._describe_lost(lost, frozen) or "Tracking.", 1.0
-        if self._search is None:
-            absent = [name for name in self.source.sensors if self._newest[name] == -np.inf]
-            return "waiting", f"Waiting for {join_names(absent)}." if absent else "Counting samples.", 0.0
-        search, guide = self._search, self._search.guide
+        if self._start_search is None:
+            missing_sensors = [name for name in self.source.sensors if self._newest_times[name] == -np.inf]
+            if missing_sensors:
+                return "waiting", f"Waiting for {join_names(missing_sensors)}.", 0.0
+            return "waiting", "Measuring the sampling rate.", 0.0
+        search, detector = self._start_search, self._start_search.detector
         if search.stated is not None:
-            return "hold", f"{START_POSE}, until {search.stated[1]:g} s.", search.progress
-        if guide.state == "waiting":
-            missing = np.isin(np.arange(len(lost)), guide.missing)
+            return "start_pose", f"{START_POSE}, until {search.stated[1]:g} s.", search.progress
+        if detector.state == "waiting":
+            missing = np.isin(np.arange(len(lost)), detector.missing)
             text = self._describe_lost(missing & frozen, frozen) or f"Waiting for {self._join_sensors(missing)}."
             return "waiting", text, 0.0
-        if guide.state == "moved":
-            moved = join_names([self.source.sensors[i] for i in guide.moving])
+        if detector.state == "moved":
+            moved = join_names([self.source.sensors[i] for i in detector.moving])
             again = START_POSE[0].lower() + START_POSE[1:]
             return "moved", f"You moved ({moved}). Once more: {again}.", search.progress
-        return "hold", f"{START_POSE}: {max(0.0, HOLD_S - guide.held_s):.0f} s more.", search.progress
+        return (
+            "start_pose",
+            f"{START_POSE}: {max(0.0, START_POSE_HOLD_S - detector.held_s):.0f} s more.",
+            search.progress,
+        )
 
     def _describe_lost(self, lost: np.ndarray, frozen: np.ndarray) -> str:
-        """Message on lost sensors (k,) bool, of them those that are frozen; empty where none is lost."""
+        """Return the message on lost sensors (k,) bool; some of them are frozen. Empty: none is lost."""
         parts = []
         if (lost & ~frozen).any():
             parts.append(f"No samples from {self._join_sensors(lost & ~frozen)}.")
         if (lost & frozen).any():
-            parts.append(
-                f"The same values again and again from {self._join_sensors(lost & frozen)}: switch it off and on."
-            )
+            parts.append(f"Repeated values from {self._join_sensors(lost & frozen)}: switch it off and on.")
         return " ".join(parts)
 
     def _join_sensors(self, mask: np.ndarray) -> str:
@@ -393,19 +401,23 @@ class LiveLoop:
 
     def _summarize(self) -> SessionSummary:
         sensors = self.source.sensors
-        counts = np.zeros((len(sensors), len(COUNTS)), int) if self._search is None else self._search.aligner.counts
+        counts = (
+            np.zeros((len(sensors), len(COUNTS)), int)
+            if self._start_search is None
+            else self._start_search.synchronizer.counts
+        )
         return SessionSummary(
             self._latency.count,
             self._last_pose - self._first_pose if self._latency.count else 0.0,
             {name: dict(zip(COUNTS, row.tolist(), strict=True)) for name, row in zip(sensors, counts, strict=True)},
             self._latency,
-            () if self._tracker is None else self._tracker.start.diagnostics,
+            () if self._segment_estimator is None else self._segment_estimator.start.diagnostics,
             "" if self.log is None else self.log.problem,
         )
 
 
 def build_subject_model(subject: Subject | None, model: BodyModel | None) -> BodyModel:
-    """The body with the subject's lengths; without a subject its own, and for ours those of the population prior."""
+    """Return `model` with the subject's lengths; None: the package's, without a subject of the population prior."""
     body = model or load_model()
     if subject is None and model is not None:
         return body
@@ -414,19 +426,19 @@ def build_subject_model(subject: Subject | None, model: BodyModel | None) -> Bod
 
 
 def _measure_rate(times: Sequence[np.ndarray]) -> float:
-    """Samples a second of the slowest sensor, to a tenth."""
+    """Measure the rate [Hz] of the slowest sensor from times [s] of each, rounded to 0.1 Hz."""
     rates = []
     for time_s in map(np.unique, times):
         if len(time_s) > 2:
-            usual = 1.0 / float(np.median(np.diff(time_s)))
+            median = 1.0 / float(np.median(np.diff(time_s)))
             mean = (len(time_s) - 1) / float(time_s[-1] - time_s[0])
-            # Without loss the mean is more precise; for stamps that come in bursts only the mean is right.
-            rates.append(mean if abs(mean / usual - 1.0) < 0.05 or usual > 3.0 * mean else usual)
-    return max(1.0, round(min(rates), 1)) if rates else 100.0
+            # The mean is more precise unless samples are lost. For time stamps in bursts only the mean is right.
+            rates.append(mean if abs(mean / median - 1.0) < 0.05 or median > 3.0 * mean else median)
+    return max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ
 
 
 def warm_up(method: str) -> None:
-    """Run a tracker once, so that compilation and files do not delay the start pose."""
+    """Run a tracker once: compilation and reading of files must not delay the start pose."""
     n, rng, sensors = 200, np.random.default_rng(0), SEGMENTS[:2]
     recording = Recording(
         "warm",
@@ -444,8 +456,7 @@ def warm_up(method: str) -> None:
     )
     tracker = Tracker(options=TrackOptions(method, causal=True))
     tracker.push(recording)
-    follower = tracker.follower
-    follower.step(np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
-    follower.std()
-    aligner = Aligner(sensors, 100.0, 0.0)
-    aligner.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))
+    tracker.segment_estimator.step(np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
+    tracker.segment_estimator.std()
+    synchronizer = StreamSynchronizer(sensors, 100.0, 0.0)
+    synchronizer.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))

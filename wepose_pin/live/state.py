@@ -46,7 +46,7 @@ class SensorStatus(NamedTuple):
 class Status(NamedTuple):
     """State of the session, a few times a second."""
 
-    state: str  # "waiting" for sensors, "hold" the start pose, "moved" in it, "ready", "ended"
+    state: str  # "waiting" for sensors, "start_pose" the start pose, "moved" in it, "ready", "ended"
     message: str  # the state as a sentence to the person
     progress: float  # 0 to 1 of the start pose; 1 when ready
     time: float  # [s] on the source's clock

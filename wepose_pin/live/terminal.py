@@ -14,7 +14,7 @@ from .state import Output, SensorStatus, Status
 
 REFRESH_HZ = 4
 KEYS = ("r", "q")
-STATES = {"waiting": "…", "hold": "■", "moved": "✕", "ready": "▶", "ended": "■"}
+STATES = {"waiting": "…", "start_pose": "■", "moved": "✕", "ready": "▶", "ended": "■"}
 # Columns, and the width of the terminal from which each is shown.
 COLUMNS = (
     ("sensor", 0),
@@ -94,7 +94,10 @@ class TerminalView(Output):
         changed = [key for key, state in now.items() if self._reported.get(key, "there") != state]
         self._reported |= now
         clock = f"{status.time:.1f} s  "
-        return [clock + (key + now[key] if key else f"{status.state}: {status.message}") for key in changed]
+        return [
+            clock + (key + now[key] if key else f"{status.state.replace('_', ' ')}: {status.message}")
+            for key in changed
+        ]
 
     def _render(self) -> Any:
         from rich.text import Text
@@ -119,10 +122,11 @@ def build_table(status: Status, *, keys: bool = False, width: int = 80) -> Any:
         cells = _sensor_cells(sensor, tracking)
         rows.add_row(*(Text(cells[k]) for k in shown), style="bold red" if sensor.lost else "")
     head = Text.assemble(
-        (f"{STATES.get(status.state, '')} {status.state}  ", "bold"), (status.message, "" if tracking else "bold")
+        (f"{STATES.get(status.state, '')} {status.state.replace('_', ' ')}  ", "bold"),
+        (status.message, "" if tracking else "bold"),
     )
     parts: list[Any] = [head]
-    if status.state in ("hold", "moved"):
+    if status.state in ("start_pose", "moved"):
         done = round(30 * min(max(status.progress, 0.0), 1.0))
         parts.append(Text("█" * done + "░" * (30 - done)))
     p50, p99 = status.latency_ms

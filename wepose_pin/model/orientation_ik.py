@@ -49,7 +49,7 @@ class OrientationIk:
     ----------
     chains : of the model
     segments : the measured ones
-    limits, weights : as in `pose.configuration`
+    limits, weights : as in `kinematics.solve_configuration`
     """
 
     def __init__(
@@ -77,12 +77,11 @@ class OrientationIk:
         self._solved: dict[int, np.ndarray] = {}  # which fit → the last q that it found
 
     def run(
-        self, quat_WL: Mapping[str, np.ndarray], before: np.ndarray | None = None, *, go_on: bool = False
+        self, quat_WL: Mapping[str, np.ndarray], before: np.ndarray | None = None, *, warm_start: bool = False
     ) -> np.ndarray:
         """`q` (n, nq) by segment → (n, 4) xyzw.
 
-        `before` (nq,): the frame before the first; `go_on`: the frames follow those of the last run, and with those
-        make one motion.
+        `before` (nq,): the frame before the first; `warm_start`: the frames continue the motion of the last run.
         """
         kept: dict[int, np.ndarray] = {}
         q, quat_WJ = self.stepwise(quat_WL, kept)
@@ -90,7 +89,7 @@ class OrientationIk:
             rows = np.flatnonzero(self._find_unreached(q, quat_WJ, quat_WL, group, ends))
             if not len(rows):
                 continue
-            begin = self._solved.get(nth) if go_on else before
+            begin = self._solved.get(nth) if warm_start else before
             q[rows] = fit.run({segment: quat_WL[segment][rows] for segment in group.segments}, q[rows], begin)
             self._solved[nth] = q[rows[-1]].copy()
             for joint in group.joints:

@@ -26,7 +26,7 @@ from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable, is_number
 from ..errors import BadData, MissingFile
 from ..recording import SEGMENTS, ImuSensor, Recording, check_recording
-from ..recording.arrivals import Aligner, Arrivals, Ticks
+from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
 from .device import Device, make_table
@@ -77,7 +77,7 @@ def read_live_log(path: Path) -> LiveRecording:
     if not is_live_log(path):
         raise BadData(f"{path}: is not the recording of a live session")
     header: dict[str, Any] | None = None
-    aligner: Aligner | None = None
+    synchronizer: StreamSynchronizer | None = None
     waiting: list[Arrivals] = []
     ticks: list[Ticks] = []
     start: tuple[int, int] | None = None
@@ -96,28 +96,28 @@ def read_live_log(path: Path) -> LiveRecording:
         elif tag == EVENT:
             kind, event = _event(path, payload)
             if kind == "clock":
-                aligner = Aligner(header["sensors"], event["rate_hz"], event["begin"], event["wait_s"])
-                end_s = aligner.begin + (MOST_SILENT + path.stat().st_size / 57) / aligner.rate_hz
+                synchronizer = StreamSynchronizer(header["sensors"], event["rate_hz"], event["begin"], event["wait_s"])
+                end_s = synchronizer.begin + (MOST_SILENT + path.stat().st_size / 57) / synchronizer.rate_hz
             elif kind == "start":
                 start = int(event["begin"]), int(event["end"])
             elif kind == "reset":
                 resets.append(int(event["tick"]))
         elif tag == POSES:
             poses.append(_poses(path, payload, len(header["sensors"])))
-        while aligner is not None and waiting:
+        while synchronizer is not None and waiting:
             arrivals, far = waiting[0], waiting.pop(0).time > end_s
             late += int(far.sum())
             if late > 3:  # as many in a row are a clock that jumped
                 raise BadData(
                     f"{path}: samples at {arrivals.time[far][0]:g} s, where the file holds no as long recording"
                 )
-            ticks.append(aligner.push(Arrivals(*(column[~far] for column in arrivals)) if far.any() else arrivals))
-    if header is None or aligner is None or start is None:
+            ticks.append(synchronizer.push(Arrivals(*(column[~far] for column in arrivals)) if far.any() else arrivals))
+    if header is None or synchronizer is None or start is None:
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
-    resets = [tick for tick in resets if tick < aligner.next_tick]
-    if aligner.next_tick <= start[1] + 1:
+    resets = [tick for tick in resets if tick < synchronizer.next_tick]
+    if synchronizer.next_tick <= start[1] + 1:
         raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
-    recording = check_recording(build_recording(header, aligner.rate_hz, ticks, start, path, tuple(resets)))
+    recording = check_recording(build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets)))
     if broken_off:
         killed = Diagnostic("live-recording-incomplete", WARNING, path.name, facts={"variant": "killed"})
         recording = replace(recording, diagnostics=(killed,))

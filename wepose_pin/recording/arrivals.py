@@ -90,7 +90,7 @@ class Ticks(NamedTuple):
     lost: np.ndarray  # (m, k) bool: the sensor was silent for longer than a tick waits
 
 
-class Aligner:
+class StreamSynchronizer:
     """Makes ticks of one even clock from samples that may arrive out of order, twice, late or not at all.
 
     A tick is complete as soon as every sensor has reached it. It waits `REORDER_S` for a sample that others of its

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..kinematics import Pose, axis_std
+from ..kinematics import Pose, compute_axis_std
 from ..recording import OrientationSensor, Recording
 from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
@@ -232,7 +232,7 @@ def measure_hands(pose: Pose, rate_hz: float) -> dict[str, Hand]:
         size = max(1, round(PEAK_OVER_S * rate_hz))
         moved = reach[size:] - reach[:-size]
         peak = float(np.nan_to_num(np.linalg.norm(moved, axis=1)).max(initial=0.0)) * rate_hz / size
-        std = axis_std(pose.point_cov[name]) if name in pose.point_cov else None
+        std = compute_axis_std(pose.point_cov[name]) if name in pose.point_cov else None
         hands[name] = Hand(reach, std, peak)
     return hands
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..diagnostics import INFO, Diagnostic, lines
-from ..kinematics import axis_std, orientation_residuals
+from ..kinematics import compute_axis_std, compute_orientation_residuals
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
 from .decimation import Totals, compute_totals
@@ -101,7 +101,7 @@ def _build_summary_section(tracked: TrackedRecording, totals: Totals, budgets: M
         joint: float(np.degrees(finite_max(std[after_start])))
         for joint, std in compute_joint_heading_stds(budgets).items()
     }
-    stds = {name: axis_std(cov[after_start]) for name, cov in tracked.pose.point_cov.items()}
+    stds = {name: compute_axis_std(cov[after_start]) for name, cov in tracked.pose.point_cov.items()}
     return {
         "duration": _format_duration(float(recording.time[-1] - recording.time[0])),
         "rate_hz": totals.rate_hz,
@@ -171,7 +171,7 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
     worst_sample = int(np.argmax(stds[worst]))
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     fastest = max(growth, key=growth.__getitem__) if growth else None
-    has_clasp = tracked.correction is not None and tracked.correction.clasp_mm is not None
+    has_clasp = tracked.correction is not None and tracked.correction.palm_gap_rms_mm is not None
     segments = [
         [
             plain(name),
@@ -207,7 +207,7 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
         ),
         "fastest": (fastest, float(np.degrees(growth[fastest]))) if fastest else None,
         "remedy": describe_heading_remedy(tracked),
-        "corrected": max(tracked.correction.largest_deg.values(), default=0.0)
+        "corrected": max(tracked.correction.max_correction_deg.values(), default=0.0)
         if tracked.correction is not None
         else None,
         "has_clasp": has_clasp,
@@ -278,7 +278,7 @@ def _build_run_section(tracked: TrackedRecording) -> dict[str, Any]:
                 f"{plain(name)}, orientation residual",
                 f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° (the joints have too few axes, or reach their limits)",
             )
-            for name, angle in orientation_residuals(tracked.model, tracked.q, tracked.quat_WL).items()
+            for name, angle in compute_orientation_residuals(tracked.model, tracked.q, tracked.quat_WL).items()
         ]
     rows += [
         ("points", listed([plain(name) for name in tracked.points]) or "none"),

@@ -99,7 +99,7 @@ def _diagnose_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget])
         place = joint.replace(" ", "_")
         yield Diagnostic("heading-uncertain", WARNING, place, wide[joint], HEADING, _remedy_variant(tracked))
     if tracked.correction is not None:
-        for name, turned in tracked.correction.largest_deg.items():
+        for name, turned in tracked.correction.max_correction_deg.items():
             if np.deg2rad(turned) > TURNED:
                 yield Diagnostic("heading-corrected-far", WARNING, name, np.deg2rad(turned), TURNED)
 

@@ -19,7 +19,7 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from ..kinematics import Pose, configuration, find_known_links, placements
+from ..kinematics import Pose, compute_link_placements, find_known_links, solve_configuration
 from ..model import BodyModel, Visual
 from .page import load_template
 
@@ -80,13 +80,13 @@ def pose_html(
     if pose.q is not None:
         q = pose.q[frames]
     else:
-        q = configuration(model, {segment: quat_WL[frames] for segment, quat_WL in pose.quat_WL.items()})
+        q = solve_configuration(model, {segment: quat_WL[frames] for segment, quat_WL in pose.quat_WL.items()})
     known = set(find_known_links(model, pose.quat_WL))
     visuals = [visual for visual in model.visuals if visual.link in known]
     return view_html(
         visuals,
         pose.time[frames],
-        placements(model, q, dict.fromkeys(visual.link for visual in visuals)),
+        compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals)),
         trails={name: pose.points[name][frames] for name in ("left_palm", "right_palm") if name in pose.points},
         phases=phases,
         title=title,
@@ -100,10 +100,10 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
 
     frames = frame_indices(trajectory.time, fps)
     nearest = np.abs(pose.time[:, None] - trajectory.recorded_time[frames][None, :]).argmin(axis=0)
-    q = configuration(model, {segment: quat_WL[nearest] for segment, quat_WL in pose.quat_WL.items()})
+    q = solve_configuration(model, {segment: quat_WL[nearest] for segment, quat_WL in pose.quat_WL.items()})
     known = set(find_known_links(model, pose.quat_WL))
     visuals = [visual for visual in model.visuals if visual.link in known]
-    placed = placements(model, q, dict.fromkeys(visual.link for visual in visuals))
+    placed = compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals))
     robot = trajectory.robot
     drawn = build_parts(robot)
     shoulder_z = float(np.nanmedian([pose.points[f"{arm.side}_shoulder"][:, 2] for arm in robot.arms]))

@@ -248,8 +248,8 @@ class ArmObserver:
     def _hand_std(self, i: int, p: np.ndarray, std: np.ndarray) -> float:
         """[m] of the hand against the shoulder: an error of a segment rotates what it carries, one of a length shifts.
 
-        As `pose.point_covariance`, whose hand is against the root: a robot's shoulder does not depend on the trunk. The
-        covariance of a segment is known here only as its mean over the axes.
+        As `kinematics.compute_point_covariances`, whose hand is against the root: a robot's shoulder does not depend on
+        the trunk. The covariance of a segment is known here only as its mean over the axes.
         """
         torso, upper, fore, hand = self._rows[i]
         links = np.diff(p, axis=0)

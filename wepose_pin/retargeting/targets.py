@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import BadData, WrongOption
-from ..kinematics import Pose, axis_std
+from ..kinematics import Pose, compute_axis_std
 from .robot import Arm, Robot
 
 REACH_SHARE = 0.95  # of the robot's reach for a straight arm: its elbow stays flexed, far from the singularity
@@ -249,5 +249,5 @@ def _find_jumps(time: np.ndarray, offset: np.ndarray) -> np.ndarray:
 def _hand_std(pose: Pose, side: str, known: np.ndarray) -> np.ndarray:
     """(n,) [m] of the hand; poor where it is not known."""
     cov = pose.point_cov.get(f"{side}_palm")
-    std = np.zeros(len(known)) if cov is None else np.nan_to_num(axis_std(cov), nan=STD_POOR)
+    std = np.zeros(len(known)) if cov is None else np.nan_to_num(compute_axis_std(cov), nan=STD_POOR)
     return np.where(known, std, STD_POOR)

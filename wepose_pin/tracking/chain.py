@@ -17,7 +17,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..alignment import Segments
+from ..alignment import SegmentOrientations
 from ..arguments import check_arguments
 from ..diagnostics import WARNING, Diagnostic, as_json
 from ..errors import BadOption, BadSession, one_of
@@ -51,7 +51,7 @@ class TrackedChain:
     open: tuple[str, ...]
     model: pin.Model
     recording: Recording
-    segments: Segments
+    segments: SegmentOrientations
     method: str
 
     @property

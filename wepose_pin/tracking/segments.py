@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from ..alignment import Alignment, Segments, align, check_mounts, orient_segments
+from ..alignment import SegmentOrientations, SensorAlignment, align_sensors, check_mounts, orient_segments
 from ..filters import BEST, Orientation
 from ..filters.sensors import SensorFilters, combine_chunk
 from ..filters.static import StaticTest
 from ..recording import Recording
 from ..subject import Subject
 
-Oriented = tuple[Recording, Segments]
+Oriented = tuple[Recording, SegmentOrientations]
 
 
 class SegmentEstimator:
@@ -28,7 +28,7 @@ class SegmentEstimator:
     ) -> None:
         self._subject, self._method, self._static_test = subject, method, static_test
         self._filters: SensorFilters | None = None
-        self._alignment: Alignment | None = None
+        self._alignment: SensorAlignment | None = None
 
     def push(self, chunk: Recording) -> list[Oriented]:
         """Take a chunk; gives it and its segments, or with the smoother those of the chunk before.
@@ -52,7 +52,7 @@ class SegmentEstimator:
 
     def _orient(self, filters: SensorFilters, chunk: Recording, orientation: dict[str, Orientation]) -> Oriented:
         if self._alignment is None:
-            self._alignment = align(chunk, self._subject, combine_chunk(filters, chunk, orientation))
+            self._alignment = align_sensors(chunk, self._subject, combine_chunk(filters, chunk, orientation))
         return chunk, orient_segments(chunk, self._alignment, orientation, self._subject)
 
 
@@ -62,7 +62,7 @@ def estimate_segments(
     *,
     method: str = BEST,
     static_test: StaticTest | None = None,
-) -> Segments:
+) -> SegmentOrientations:
     """Segment orientations of a whole recording; parameters and errors as `SegmentEstimator`."""
     estimator = SegmentEstimator(subject, method=method, static_test=static_test)
     [(_, segments)] = estimator.push(recording) + estimator.finish()

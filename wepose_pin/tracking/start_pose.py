@@ -12,25 +12,25 @@ from ..recording import Intervals, OrientationSensor, Recording, Sensor
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
 
-HOLD_S = 3.0  # [s] of standing still for a start pose that is not stated
-CHECK_S = 0.1  # [s] between two checks whether a person moves
-WINDOW_S = 0.5  # [s] over which a check goes
+START_POSE_HOLD_S = 3.0  # [s] of standing still for a start pose that is not stated
+CHECK_PERIOD_S = 0.1  # [s] between two checks for motion
+CHECK_WINDOW_S = 0.5  # [s] newest samples that a check uses
 
 
-class StartGuide:
-    """Waits for `HOLD_S` in which no sensor moves or is lost: the start pose of a session without `phases.start`.
+class StartPoseDetector:
+    """Detects a start pose that is not stated: `START_POSE_HOLD_S` in which no sensor moves or is lost.
 
     Attributes
     ----------
-    state : "waiting" for sensors, "hold", "moved" (in the last second, and held again since), "ready"
+    state : "waiting" for sensors, "start_pose", "moved" (in the last second), "ready"
     held_s : [s] of standing still so far
-    missing, moving : columns of the sensors that are lost, or that moved last
+    missing, moving : columns of the sensors that are lost, and of those that moved last
     """
 
-    def __init__(self, rate_hz: float, sensors: int, hold_s: float = HOLD_S) -> None:
+    def __init__(self, rate_hz: float, sensors: int, hold_s: float = START_POSE_HOLD_S) -> None:
         self.state, self.missing, self.moving = "waiting", tuple(range(sensors)), tuple[int, ...]()
         self._rate, self._hold = rate_hz, round(hold_s * rate_hz)
-        self._every, self._window = max(1, round(CHECK_S * rate_hz)), max(4, round(WINDOW_S * rate_hz))
+        self._every, self._window = max(1, round(CHECK_PERIOD_S * rate_hz)), max(4, round(CHECK_WINDOW_S * rate_hz))
         self._gyro = np.zeros((self._hold, sensors, 3))
         self._held = 0
         self._tick = 0
@@ -51,7 +51,7 @@ class StartGuide:
         return self._tick - 1
 
     def push(self, gyro_S: np.ndarray) -> str:
-        """One tick, (k, 3) [rad/s], NaN where a sensor is lost; gives the state."""
+        """Add one tick, (k, 3) [rad/s], NaN where a sensor is lost; return the state."""
         if self.state == "ready":
             return self.state
         self._tick += 1
@@ -65,28 +65,30 @@ class StartGuide:
             held = self._gyro[: self._held]
             last = held[-self._window :]
             rate = np.sqrt(np.mean(np.sum((last - last.mean(axis=0)) ** 2, axis=2), axis=0))
-            turn = np.linalg.norm(np.cumsum(held - held.mean(axis=0), axis=0) / self._rate, axis=2).max(axis=0)
+            rotation = np.linalg.norm(np.cumsum(held - held.mean(axis=0), axis=0) / self._rate, axis=2).max(axis=0)
             mean = np.linalg.norm(held.mean(axis=0), axis=1)
-            moves = (np.degrees(rate) > SWAYS_DEG_S) | (np.degrees(turn) > SWAYS_DEG) | (np.degrees(mean) > SWAYS_DEG_S)
+            moves = (
+                (np.degrees(rate) > SWAYS_DEG_S) | (np.degrees(rotation) > SWAYS_DEG) | (np.degrees(mean) > SWAYS_DEG_S)
+            )
             if moves.any():
                 self.moving = tuple(np.flatnonzero(moves).tolist())
                 self._held, self._moved_at = 0, self._tick
         if self._held == self._hold:
             self.state = "ready"
         else:
-            self.state = "moved" if self._tick - self._moved_at < self._rate else "hold"
+            self.state = "moved" if self._tick - self._moved_at < self._rate else "start_pose"
         return self.state
 
 
 def cut_start_pose(recording: Recording, interval: tuple[float, float]) -> Recording:
-    """From the start pose's begin, or that of a phase `static` before its end, to its end.
+    """Return the part of a recording with the start pose, and with a phase `static` that ends before it does.
 
-    Gaps are bridged from samples before its end alone, while a reader bridges them with later samples as well.
+    Gaps are bridged from samples before the end of the start pose alone; a reader uses later samples as well.
 
     Raises
     ------
     BadPhase
-        A sensor that sent nothing in it.
+        A sensor without samples in the start pose.
     """
     before: dict[str, Intervals] = {"start": (interval,)}
     static = recording.phases.get("static", ())
@@ -102,7 +104,7 @@ def cut_start_pose(recording: Recording, interval: tuple[float, float]) -> Recor
 
 
 def _bridge_gaps(part: Recording, name: str, clock: Clock) -> Sensor:
-    """A sensor with its gaps filled from this part alone."""
+    """Return a sensor of `part` with its gaps bridged from this part alone."""
     sensor = part.sensors[name]
     if isinstance(sensor, OrientationSensor) or sensor.gap is None or not sensor.gap.any():
         return sensor

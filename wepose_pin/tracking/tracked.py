@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..alignment import Segments
+from ..alignment import SegmentOrientations
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json
 from ..errors import BadData
-from ..kinematics import Pose, orientation_residuals
+from ..kinematics import Pose, compute_orientation_residuals
 from ..model import POINTS, BodyModel, load_model
 from ..recording import SEGMENTS, Recording
 from ..subject import Subject, population_subject
@@ -38,7 +38,7 @@ class TrackedRecording:
     recording: Recording
     subject: Subject
     model: BodyModel
-    segments: Segments
+    segments: SegmentOrientations
     options: TrackOptions
     correction: HeadingCorrection | None
 
@@ -79,7 +79,7 @@ class TrackedRecording:
 
     def orientation_residual(self) -> dict[str, np.ndarray]:
         """Segment → angle (n,) [rad] between its measured orientation and the model's, where joints are too few."""
-        return orientation_residuals(self.model, self.q, self.quat_WL)
+        return compute_orientation_residuals(self.model, self.q, self.quat_WL)
 
 
 class SummaryAccumulator:
@@ -129,7 +129,7 @@ class SummaryAccumulator:
         last = self.last
         sensors: dict[str, Any] = {}
         for segment in last.recording.sensors:
-            about: dict[str, Any] = {"heading_deg": round(float(np.degrees(last.segments.heading[segment])), 3)}
+            about: dict[str, Any] = {"heading_deg": round(float(np.degrees(last.segments.heading_offset[segment])), 3)}
             orientation = last.segments.orientation.get(segment)
             if orientation is None:
                 about["orientations"] = "from the recording"
@@ -188,11 +188,13 @@ def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | N
     if correction is None:
         return None
     about: dict[str, Any] = {
-        "hinge_rms_deg": {joint: [round(v, 3) for v in values] for joint, values in correction.hinge_deg.items()},
-        "largest_correction_deg": {name: round(value, 3) for name, value in correction.largest_deg.items()},
+        "hinge_rms_deg": {
+            joint: [round(v, 3) for v in values] for joint, values in correction.hinge_residual_rms_deg.items()
+        },
+        "largest_correction_deg": {name: round(value, 3) for name, value in correction.max_correction_deg.items()},
     }
-    if correction.clasp_mm is not None:
-        about["clasp_gap_rms_mm"] = [round(value, 2) for value in correction.clasp_mm]
+    if correction.palm_gap_rms_mm is not None:
+        about["clasp_gap_rms_mm"] = [round(value, 2) for value in correction.palm_gap_rms_mm]
     return about
 
 

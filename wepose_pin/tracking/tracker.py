@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 from ..errors import BadOption
-from ..kinematics import KinematicsSolver, point_covariance
+from ..kinematics import KinematicsSolver, compute_point_covariances
 from ..model import BodyModel
 from ..recording import CONFIGURATION, Recording
 from ..subject import Subject
-from .causal import CausalEstimator, SegmentFollower
+from .causal import CausalEstimator, CausalSegmentEstimator
 from .headings import HeadingCorrector
 from .options import TrackOptions
 from .segments import Oriented, SegmentEstimator
@@ -22,9 +22,9 @@ Chunks = Callable[[], Iterable[Recording]]
 class Tracker:
     """The pose of the upper body of a recording that comes in chunks; the whole recording may be one.
 
-    `push` gives the chunks that are complete, `finish` the rest: the smoother looks one chunk ahead, and the heading
-    correction needs the whole recording. To save memory, `observe_headings` goes over the chunks beforehand; its result
-    is `headings` here. A causal tracker takes single samples as well, as `follower.step`.
+    `push` returns the chunks that are complete, `finish` the rest: the smoother looks one chunk ahead, and the heading
+    correction needs the whole recording. To save memory, pass over the chunks with `observe_headings` first and give
+    its result as `headings`. A causal tracker takes single samples as well, by `segment_estimator.step`.
 
     All chunks of a recording carry its phases; `start` and `static` are in the first. The result of a causal filter
     does not depend on the chunks.
@@ -32,7 +32,7 @@ class Tracker:
     Parameters
     ----------
     subject : lengths and mounts; None for the population prior and the session's stated mounts
-    model : a body; None for ours. It gets the subject's lengths; without a subject its own stand
+    model : a body; None for the package's. It gets the subject's lengths; without a subject its own stand
     headings : solved beforehand; None: solved in `finish`, with `options.correct_headings`, where the subject allows it
     """
 
@@ -49,12 +49,12 @@ class Tracker:
         self._headings, self._solved = headings, headings is not None
         self._estimator = _estimator(subject, self.options)
         self._person, self._body = make_body(subject, model)
-        self._poser: KinematicsSolver | None = None
+        self._kinematics: KinematicsSolver | None = None
         self._waiting: list[Oriented] = []  # until the headings are solved
 
     @property
-    def follower(self) -> SegmentFollower:
-        """Segment orientations sample by sample, of a causal tracker whose start pose has ended.
+    def segment_estimator(self) -> CausalSegmentEstimator:
+        """The estimator of segment orientations for single samples, of a causal tracker after the start pose.
 
         Raises
         ------
@@ -63,10 +63,10 @@ class Tracker:
         """
         if not isinstance(self._estimator, CausalEstimator):
             raise BadOption("a tracker takes single samples where its options are causal")
-        return self._estimator.follower
+        return self._estimator.segment_estimator
 
     def push(self, chunk: Recording) -> list[TrackedRecording]:
-        """Take the next chunk; gives those that are complete.
+        """Add the next chunk; return those that are complete.
 
         Raises
         ------
@@ -74,51 +74,51 @@ class Tracker:
             What the recording, the subject or the model lacks; sensors on links that are no segments.
         """
         _check_person(chunk)
-        return [tracked for oriented in self._estimator.push(chunk) for tracked in self._take(oriented)]
+        return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented)]
 
     def finish(self) -> list[TrackedRecording]:
-        """The remaining chunks, after the last one has been pushed."""
-        done = [tracked for oriented in self._estimator.finish() for tracked in self._take(oriented)]
+        """Return the remaining chunks, after the last one has been pushed."""
+        done = [tracked for oriented in self._estimator.finish() for tracked in self._process(oriented)]
         if self._headings is not None and not self._solved:
             self._solved = True
             if not self._headings.solve():
                 self._headings = None
             waiting, self._waiting = self._waiting, []
-            done += [self._tracked(oriented) for oriented in waiting]
+            done += [self._solve_pose(oriented) for oriented in waiting]
         return done
 
-    def _take(self, oriented: Oriented) -> list[TrackedRecording]:
+    def _process(self, oriented: Oriented) -> list[TrackedRecording]:
         if self._headings is None and not self._solved:
             self._headings = make_heading_corrector(oriented, self._subject, self.options)
             self._solved = self._headings is None
         if self._headings is not None and not self._solved:
-            self._headings.observe(*oriented)
+            self._headings.add_observations(*oriented)
             self._waiting.append(oriented)
             return []
-        return [self._tracked(oriented)]
+        return [self._solve_pose(oriented)]
 
-    def _tracked(self, oriented: Oriented) -> TrackedRecording:
+    def _solve_pose(self, oriented: Oriented) -> TrackedRecording:
         recording, segments = oriented
         if self._headings is not None:
             segments = self._headings.correct(recording, segments)
-        if self._poser is None:
-            self._poser = KinematicsSolver(self._body, segments.quat_WL, limits=self.options.limits)
-        pose = self._poser.pose(recording.time, segments.quat_WL)
+        if self._kinematics is None:
+            self._kinematics = KinematicsSolver(self._body, segments.quat_WL, limits=self.options.limits)
+        pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
         lengths_cov = self._person.lengths_covariance()
         pose = replace(
             pose,
             segment_cov=segments.covariance_W,
-            point_cov=point_covariance(pose.points, pose.quat_WL, segments.covariance_W, lengths_cov),
+            point_cov=compute_point_covariances(pose.points, pose.quat_WL, segments.covariance_W, lengths_cov),
             gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         )
-        correction = None if self._headings is None else self._headings.correction()
+        correction = None if self._headings is None else self._headings.summarize()
         return TrackedRecording(pose, recording, self._person, self._body, segments, self.options, correction)
 
 
 def observe_headings(
     chunks: Iterable[Recording], subject: Subject | None = None, options: TrackOptions | None = None
 ) -> HeadingCorrector | None:
-    """The heading corrector of a recording after a pass over its chunks; None where nothing observes headings.
+    """Return the heading corrector of a recording after a pass over its chunks; None: nothing observes headings.
 
     Raises
     ------
@@ -138,21 +138,21 @@ def observe_headings(
         headings = headings or make_heading_corrector(oriented, subject, options)
         if headings is None:
             return None
-        headings.observe(*oriented)
+        headings.add_observations(*oriented)
     return headings if headings is not None and headings.solve() else None
 
 
 def make_heading_corrector(
     oriented: Oriented, subject: Subject | None, options: TrackOptions
 ) -> HeadingCorrector | None:
-    """The heading corrector of a recording with this first chunk; None where nothing can correct headings."""
+    """Return a heading corrector for a recording with this first chunk; None: its headings cannot be corrected."""
     recording, segments = oriented
     if subject is None or not subject.mounts or options.causal or not options.correct_headings:
         return None
     if recording.remounted or any(sensor.aligned for sensor in recording.sensors.values()):
-        return None  # not the frames of a calibration
+        return None  # the frames are not those of the calibration
     headings = HeadingCorrector(recording, segments.quat_WL, segments.start[1], subject)
-    return headings if headings.has_chain and headings.has_observations else None
+    return headings if headings.is_chain_complete and headings.has_observations else None
 
 
 def track_chunks(
@@ -163,9 +163,9 @@ def track_chunks(
     options: TrackOptions | None = None,
     progress: Callable[[str, Recording], None] | None = None,
 ) -> Iterator[TrackedRecording]:
-    """A recording too long for memory: `chunks()` gives its chunks, twice where headings are to be corrected.
+    """Track a recording too long for memory. `chunks()` iterates over its chunks; the heading correction does so twice.
 
-    `progress` gets what is done and the chunk that it was done with.
+    `progress` is called with the task and each chunk that it has finished.
 
     Raises
     ------

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from ..angles import NEAR_LOCK, euler
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..kinematics import compute_pose, configuration, forward_kinematics
+from ..kinematics import compute_link_poses, compute_pose, solve_configuration
 from ..rotations import conjugate, multiply
 from .motion import Motion, check_complete, diagnose_gaps, resample_evenly
 
@@ -56,7 +56,7 @@ def skeleton(motion: Motion) -> Bone:
     middle = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
     children = [bone for side in ("left", "right") if (bone := _arm(side, "upper_arm", measured, points)) is not None]
     if "head" in measured:
-        _, p_W = forward_kinematics(model, configuration(model, upright), ["head"], rotations=False)
+        _, p_W = compute_link_poses(model, solve_configuration(model, upright), ["head"], rotations=False)
         children.append(Bone("Head", "head", p_W[0, 0], [], p_W[0, 0] + [0.0, 0.0, 0.2]))
     spine = Bone("Spine", "torso", np.zeros(3), children, middle)
     return Bone("Hips", "pelvis" if "pelvis" in measured else "torso", np.zeros(3), [spine], middle)

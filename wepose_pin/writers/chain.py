@@ -8,7 +8,7 @@ from pathlib import Path
 import polars as pl
 
 from ..angles.torques import Torques, torque_table
-from ..kinematics import axis_std
+from ..kinematics import compute_axis_std
 from ..tracking import TrackedChain
 from .result import versions, write_table
 
@@ -26,7 +26,7 @@ def write_chain(folder: Path, chain: TrackedChain, torques: Torques | None = Non
         pose |= {f"{link}_{c}": quat[:, k] for k, c in enumerate(("qx", "qy", "qz", "qw"))}
         pose |= {f"{link}_measured_{c}": chain.quat_WL[link][:, k] for k, c in enumerate(("qx", "qy", "qz", "qw"))}
         if link in chain.segment_cov:
-            pose[f"{link}_std"] = axis_std(chain.segment_cov[link])
+            pose[f"{link}_std"] = compute_axis_std(chain.segment_cov[link])
     write_table(folder / "pose.parquet", pl.DataFrame(pose))
     summary = chain.summary() | {"versions": versions()}
     if torques is not None:

@@ -10,7 +10,7 @@ from typing import Any
 import polars as pl
 
 from ..errors import ExistingOutput
-from ..kinematics import pose_table
+from ..kinematics import build_pose_table
 from ..tracking import SummaryAccumulator, TrackedRecording
 from .result import write_about, write_table
 
@@ -40,7 +40,7 @@ class ChunkWriter:
         ExistingOutput
             It cannot be written: a full disk, say.
         """
-        write_table(self._parts / f"{self._seen:012d}.parquet", pose_table(chunk.pose, self._covariance))
+        write_table(self._parts / f"{self._seen:012d}.parquet", build_pose_table(chunk.pose, self._covariance))
         self._seen += len(chunk.time)
         self.accumulator.add(chunk)
 

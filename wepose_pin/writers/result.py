@@ -16,7 +16,7 @@ import polars as pl
 
 from .. import __version__
 from ..errors import BadData, ExistingOutput, MissingFile
-from ..kinematics import Pose, pose_from_table, pose_table
+from ..kinematics import Pose, build_pose_table, parse_pose_table
 from ..model import BodyModel, load_model
 from ..readers.tables import read_table
 from ..subject import Subject, subject_toml
@@ -39,7 +39,7 @@ def write_result(
     `phases` of the recording go to the summary, so that a page made from the folder shows them too. `torques` become
     ``torques.parquet``, `provenance` part of the summary.
     """
-    write_table(folder / "pose.parquet", pose_table(tracked.pose, covariance))
+    write_table(folder / "pose.parquet", build_pose_table(tracked.pose, covariance))
     summary = tracked.summary()
     if torques is not None:
         from ..angles.torques import torque_table
@@ -107,7 +107,7 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
         raise MissingFile(f"{folder}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
     if (folder / "joints.parquet").is_file():
         raise BadData(f"{folder}: of a chain, its motion is in joints.parquet; a person's result is wanted here")
-    pose = pose_from_table(read_table(folder / "pose.parquet"), str(folder / "pose.parquet"))
+    pose = parse_pose_table(read_table(folder / "pose.parquet"), str(folder / "pose.parquet"))
     summary_file = folder / "summary.json"
     try:
         summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.is_file() else {}

@@ -7,7 +7,7 @@ from pathlib import Path
 import polars as pl
 
 from ..documents import toml_key, toml_string, toml_strings
-from ..kinematics import Pose, pose_table
+from ..kinematics import Pose, build_pose_table
 from ..recording import ImuSensor, Recording, find_mount_axes
 from .result import write_table
 
@@ -51,5 +51,5 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
             lines.append(f'mount = {{ up = "{up}", forward = "{forward}" }}')
     write_table(folder / "recording.parquet", pl.DataFrame(table))
     if truth is not None:
-        write_table(folder / "truth.parquet", pose_table(truth))
+        write_table(folder / "truth.parquet", build_pose_table(truth))
     (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")

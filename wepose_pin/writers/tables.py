@@ -9,14 +9,14 @@ import polars as pl
 from ..angles import angle_table, joint_angles
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..kinematics import pose_table
+from ..kinematics import build_pose_table
 from .motion import Motion
 from .result import write_table
 
 
 def table(motion: Motion) -> pl.DataFrame:
-    """`pose_table`, and beside it `angle_table` where a joint has both of its segments."""
-    pose = pose_table(motion.pose)
+    """`build_pose_table`, and beside it `angle_table` where a joint has both of its segments."""
+    pose = build_pose_table(motion.pose)
     try:
         angles = angle_table(joint_angles(motion.pose))
     except BadData:

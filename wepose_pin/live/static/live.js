@@ -67,7 +67,7 @@ new ResizeObserver(() => { viewer.set_3d_pane_size(); if (!moved) fit(); }).obse
 
 // ---- words
 const SHAPES = { there: "M5 1a4 4 0 1 0 .01 0z", moving: "M1 0l9 5-9 5z", static: "M1 1h8v8H1z", lost: "M0 2l2-2 3 3 3-3 2 2-3 3 3 3-2 2-3-3-3 3-2-2 3-3z" };
-const SAYS = { waiting: "Waiting", hold: "Stand still", moved: "Moved – again", ready: "Live", ended: "Ended" };
+const SAYS = { waiting: "Waiting", start_pose: "Stand still", moved: "Moved – again", ready: "Live", ended: "Ended" };
 const known = (value, digits) => (value === null ? "–" : value.toFixed(digits).replace("-", "−"));
 const words = (name) => name.replaceAll("_", " ");
 function duration(s) {
