@@ -42,17 +42,17 @@ class RobotSummary(NamedTuple):
     commands: int
     skipped: int  # commands that were due while one took too long
     dropped: int  # that the system did not send
-    infeasible: int  # steps without a solution
+    infeasible: int  # steps in which limits and clearance could not both be kept: the clearance was relaxed
     share: Mapping[str, float]  # state → share of the commands that had a pose
     step: Latencies  # [s] of computing a command
     error: Mapping[str, Latencies]  # side → [m] of the hand while it followed
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """Commands that did not reach the robot, and steps in which it could not move."""
+        """Commands that did not reach the robot, and steps in which its clearance was relaxed."""
         diagnostics = [
             Diagnostic("robot-commands-skipped", WARNING, self.robot, self.skipped),
-            Diagnostic("robot-blocked", WARNING, self.robot, self.infeasible),
+            Diagnostic("robot-clearance-relaxed", WARNING, self.robot, self.infeasible),
             Diagnostic("robot-commands-dropped", WARNING, self.robot, self.dropped),
         ]
         return [diagnostic for diagnostic in diagnostics if diagnostic.value]
