@@ -20,7 +20,7 @@ from wepose_pin.readers.describe import describe_file
 from wepose_pin.readers.trials import find_ur5, read_ur5
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.tracking import track, track_chain
-from wepose_pin.validation.real import UNSCORED_S, UR5_OFF
+from wepose_pin.validation.real import UNSCORED_S, UR5_EXCLUDED
 from wepose_pin.writers import write_session
 
 RATE = 100.0
@@ -141,7 +141,7 @@ def ur5_session(data: Path, run: str, folder: Path) -> dict[str, Rotation]:
     The encoders' frames equal each other at the start, where the arm stands upright; their x is W's y there. That their
     joint angles, taken so, have the tool drawn in a plane to 0.1 mm is what says that the start is `HOME`.
     """
-    files = [each for each in find_ur5(data) if each.recording == run and (run, each.sensor) not in UR5_OFF]
+    files = [each for each in find_ur5(data) if each.recording == run and (run, each.sensor) not in UR5_EXCLUDED]
     trials = {each.sensor: read_ur5(each) for each in files}
     table, text, truth = {}, "", {}
     for sensor, trial in trials.items():

@@ -437,7 +437,7 @@ def test_a_protocol_is_simulated_and_calibrated(tmp_path: Path, capsys: pytest.C
     assert command("simulate", "-o", str(made), "--protocol", "poses") == 0
     assert set(load_session(made).phases) >= {"start", "t_pose", "bow"}
     assert command("calibrate", str(made), "--protocol", "poses", "--gaps", "-o", str(tmp_path / "out")) == 3
-    assert "shows headings and no length" in capsys.readouterr().err
+    assert "determines headings and no length" in capsys.readouterr().err
 
 
 def test_the_command_takes_protocols(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
