@@ -122,7 +122,10 @@ def _measure(recording: Recording, file: Path, outputs: Sequence[Output]) -> dic
     assert meter.before is not None
     assert meter.after is not None
     wall, busy, grown = (after - before for before, after in zip(meter.before, meter.after, strict=True))
-    lost = sum(of["missing"] + of["late"] + of["bad"] + len(recording) - of["taken"] for of in summary.counts.values())
+    lost = sum(
+        count["missing"] + count["late"] + count["bad"] + len(recording) - count["taken"]
+        for count in summary.counts.values()
+    )
     return {
         "ticks": float(summary.poses),
         "lost": float(lost),

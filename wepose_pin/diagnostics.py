@@ -29,7 +29,7 @@ class Severity(StrEnum):
 
 INFO, WARNING, ERROR = Severity.INFO, Severity.WARNING, Severity.ERROR
 _GRAVEST_FIRST = (ERROR, WARNING, INFO)
-MOST_ALIKE = 3  # of diagnostics with the same reason and remedy that are told in full
+MOST_ALIKE = 3  # of diagnostics with the same reason and remedy that are shown in full
 
 
 @dataclass(frozen=True)
@@ -100,10 +100,10 @@ def render_all(diagnostics: Iterable[Diagnostic]) -> list[tuple[Severity, Text]]
         alike.setdefault((diagnostic.code, diagnostic.severity, key), {}).setdefault(text.what, diagnostic.place)
     texts = []
     for (_, severity, text), places in alike.items():
-        told, others = list(places)[:MOST_ALIKE], list(places.values())[MOST_ALIKE:]
+        shown, others = list(places)[:MOST_ALIKE], list(places.values())[MOST_ALIKE:]
         if others:
-            told.append(f"So it is in {len(others)} more: {', '.join(dict.fromkeys(others)).replace('_', ' ')}.")
-        texts.append((severity, text._replace(what=" ".join(told))))
+            shown.append(f"So it is in {len(others)} more: {', '.join(dict.fromkeys(others)).replace('_', ' ')}.")
+        texts.append((severity, text._replace(what=" ".join(shown))))
     return texts
 
 

@@ -54,9 +54,9 @@ class Torques:
             "note": "estimates: the model's inertias, fixed base, nothing in the hands, smoothed motion",
             "cutoff_hz": self.cutoff_hz,
             "mass_kg": round(self.mass, 3),
-            "rms": {name: round(float(np.sqrt(np.mean(of**2))), 3) for name, of in size.items()},
+            "rms": {name: round(float(np.sqrt(np.mean(values**2))), 3) for name, values in size.items()},
             # Not the largest: that is where a fit jumped between two minima, or at an impact on a sensor.
-            "95_percent_below": {name: round(float(np.quantile(of, 0.95)), 3) for name, of in size.items()},
+            "95_percent_below": {name: round(float(np.quantile(values, 0.95)), 3) for name, values in size.items()},
         }
 
 

@@ -112,11 +112,11 @@ class Motion(NamedTuple):
     twist: Range | None  # heading of the torso
 
 
-class Direction(NamedTuple):
+class InformationDirection(NamedTuple):
     """A combination of lengths and mounts, and how much information the motion gives on it."""
 
     information: float  # in units of the prior's: 0 none, 1 as much again
-    of: dict[str, float]  # its largest parts, each in units of its standard deviation before
+    parts: dict[str, float]  # its largest parts, each in units of its standard deviation before
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class CalibrationQuality:
     reasons: tuple[Diagnostic, ...]
     further: tuple[Diagnostic, ...]
     motion: Motion
-    directions: tuple[Direction, ...]
+    directions: tuple[InformationDirection, ...]
     rank: int
     determined: int
     unknowns: int
@@ -165,7 +165,7 @@ def assess(calibration: Calibration) -> CalibrationQuality:
         quality=max((check.quality for check in checks), key=QUALITIES.index),
         checks=tuple(checks),
         reasons=reasons,
-        further=tuple(each for each in calibration.diagnostics if each.code not in {of.code for of in reasons}),
+        further=tuple(each for each in calibration.diagnostics if each.code not in {reason.code for reason in reasons}),
         motion=motion,
         directions=directions,
         rank=sum(d.information > MIN_INFORMATION for d in directions),
@@ -356,7 +356,7 @@ def _range(values: np.ndarray) -> Range:
     return Range(*(float(v) for v in np.percentile(values, (2, 98))))
 
 
-def _find_directions(calibration: Calibration) -> tuple[Direction, ...]:
+def _find_directions(calibration: Calibration) -> tuple[InformationDirection, ...]:
     """The information of the motion in units of the prior's: eigenvectors of one covariance in the other."""
     names = calibration.subject.order
     if calibration.prior_covariance.shape != calibration.subject.covariance.shape:
@@ -370,8 +370,8 @@ def _find_directions(calibration: Calibration) -> tuple[Direction, ...]:
         way = before @ vector  # along which x moves, where vector weighs it
         way = way / np.linalg.norm(way) * np.sign(way[np.argmax(np.abs(way))])
         largest = [k for k in np.argsort(-np.abs(way))[:4] if abs(way[k]) > 0.2]
-        of = {names[k]: round(float(way[k]), 2) for k in largest}
-        directions.append(Direction(max(1.0 / float(share) - 1.0, 0.0), of))
+        parts = {names[k]: round(float(way[k]), 2) for k in largest}
+        directions.append(InformationDirection(max(1.0 / float(share) - 1.0, 0.0), parts))
     return tuple(directions)
 
 

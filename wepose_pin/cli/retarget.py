@@ -28,29 +28,29 @@ def run(job: RetargetJob) -> int:
 def _print_arms(summary: Mapping[str, Any]) -> None:
     """Errors of the hands, and their causes."""
     rows, reasons = [], []
-    for side, of in summary["arms"].items():
+    for side, arm in summary["arms"].items():
         inside, rotation, swivel, reachability = (
-            of[key] for key in ("hand_error_mm", "hand_error_deg", "swivel_error_deg", "reachability")
+            arm[key] for key in ("hand_error_mm", "hand_error_deg", "swivel_error_deg", "reachability")
         )
         near = reachability["hand_error_where_reachable_mm"]
         rows.append(
             (
                 side,
-                f"{of['scale']:.2f}",
+                f"{arm['scale']:.2f}",
                 *((f"{error[key]:.1f}" if error else "") for error in (inside, near) for key in ("median", "p90")),
                 f"{rotation['median']:.1f}",
                 f"{swivel['median']:.0f}" if swivel else "",
                 f"{100 * reachability['reachable_share']:.0f}",
             )
         )
-        reasons.append((side, *(f"{100 * share:.1f}" for share in of["error_attribution"].values())))
+        reasons.append((side, *(f"{100 * share:.1f}" for share in arm["error_attribution"].values())))
     hand = ("hand [mm] median", "90 %", "where reachable: median", "90 %")
     print_table(
         f"{summary['robot']}: {summary['duration_s']:.1f} s for {summary['recorded_s']:.1f} s recorded",
         ("arm", "scale", *hand, "orientation [deg]", "elbow swivel [deg]", "reachable [%]"),
         rows,
     )
-    print_table("Hand more than 20 mm off [% of the time], for", ("arm", *of["error_attribution"]), reasons)
+    print_table("Hand more than 20 mm off [% of the time], for", ("arm", *arm["error_attribution"]), reasons)
 
 
 def _print_checks(summary: Mapping[str, Any]) -> None:

@@ -34,10 +34,10 @@ def print_experiments(document: Document) -> None:
 
     rows = summarize(document.results)
     for experiment in dict.fromkeys(row.experiment for row in rows):
-        of = [row for row in rows if row.experiment == experiment]
+        own_rows = [row for row in rows if row.experiment == experiment]
         trials = len({result.trial for result in document.results if result.experiment == experiment})
-        unit = find_shared_unit(of)
-        header, lines = make_experiment_table(of, whole=False)
+        unit = find_shared_unit(own_rows)
+        header, lines = make_experiment_table(own_rows, whole=False)
         header = [name if len(name) < LONGEST_HEADER else "\n".join(name.rsplit(" ", 1)) for name in header]
         title = f"{experiment}, {trials} trial{'s' * (trials != 1)}" + (f" [{unit}]" if unit else "")
         print_table(title + ", a quick run" * document.quick, header, [[str(cell) for cell in line] for line in lines])

@@ -84,7 +84,11 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
                 progress("drawing the figures", 0.0)
                 failures = [page_incomplete("validation.html", each) for each in write_pages(folder, document)]
         return ValidateOutcome(document, failures)
-    trials = [trial for of in list_experiments(job.quick, job.data).values() for trial in of]
+    trials = [
+        trial
+        for trials_of_experiment in list_experiments(job.quick, job.data).values()
+        for trial in trials_of_experiment
+    ]
     steps = len(trials) + (job.out is not None)
     with contextlib.ExitStack() as place:
         folder_or_none = place.enter_context(whole_folder(job.out, job.force)) if job.out is not None else None

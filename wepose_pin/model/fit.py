@@ -129,11 +129,11 @@ class Fit:
             push, value = g[self._bounded], q[at]
             free[self._bounded] = ~((value <= lower) & (push < 0.0) | (value >= upper) & (push > 0.0))
             H = (J.T @ J) * self._both
-            of = np.flatnonzero(free)
-            H = H[np.ix_(of, of)]
+            rows = np.flatnonzero(free)
+            H = H[np.ix_(rows, rows)]
             while True:
                 step[:] = 0.0
-                step[self.columns[of]] = np.linalg.solve(H + damping * np.eye(len(of)), g[of])
+                step[self.columns[rows]] = np.linalg.solve(H + damping * np.eye(len(rows)), g[rows])
                 tried = self._within(pin.integrate(self.model, q, step))
                 less, new = self._left(tried, R_target)
                 if less <= left or damping >= _MOST_DAMPING:

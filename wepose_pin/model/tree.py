@@ -259,13 +259,13 @@ def _mimicking(model: pin.Model, joint: Any, where: str) -> pin.Model:
     leader = joint.mimic.joint
     if not model.existJointName(joint.name) or not model.existJointName(leader) or leader == joint.name:
         raise BadModel(f"{where}: joint '{joint.name}' mimics '{leader}', which is no joint that it could follow")
-    of, to = model.getJointId(leader), model.getJointId(joint.name)
-    if to < of or model.nvs[to] != 1 or model.nvs[of] != 1:
+    leader_id, to = model.getJointId(leader), model.getJointId(joint.name)
+    if to < leader_id or model.nvs[to] != 1 or model.nvs[leader_id] != 1:
         raise BadModel(f"{where}: joint '{joint.name}' mimics '{leader}', which must be a joint before it, of one axis")
     ratio = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
     offset = 0.0 if joint.mimic.offset is None else float(joint.mimic.offset)
     try:
-        return pin.transformJointIntoMimic(model, of, to, ratio, offset)
+        return pin.transformJointIntoMimic(model, leader_id, to, ratio, offset)
     except Exception as error:  # what C++ throws
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadModel(f"{where}: joint '{joint.name}' cannot mimic '{leader}': {reason}") from error

@@ -135,9 +135,9 @@ def _reference_pose(path: Path, frames: Frames) -> str | None:
                 f"T-pose) and {off['N']:.0f} deg off -z (N-pose); its orientations are of neither and are not read"
             )
     if len(set(poses.values())) > 1:
-        told = ", ".join(f"{label} {pose}-pose" for label, pose in poses.items())
+        names = ", ".join(f"{label} {pose}-pose" for label, pose in poses.items())
         raise BadData(
-            f"{path}: the arms' frames are the world's in two poses: {told}; export it again, with one of them"
+            f"{path}: the arms' frames are the world's in two poses: {names}; export it again, with one of them"
         )
     return next(iter(poses.values()), None)
 

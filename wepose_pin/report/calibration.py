@@ -323,8 +323,8 @@ def _build_posture_section(calibration: Calibration) -> dict[str, Any] | None:
     for name, (x, y) in tilt.items():
         std = np.degrees([calibration.subject.std(row) for row in mount_rows(name)[:2]])
         observed[name] = (~(std > UNOBSERVED * np.degrees(START_POSE_STD))).tolist()
-        of = ((1, x, std[0], observed[name][0]), (0, y, std[1], observed[name][1]))
-        lines.append([plain(name), *(_format_tilt(name, *about) for about in of)])
+        tilts = ((1, x, std[0], observed[name][0]), (0, y, std[1], observed[name][1]))
+        lines.append([plain(name), *(_format_tilt(name, *about) for about in tilts)])
     elbows = {}
     for side in SIDES:
         upper, fore = (tilt.get(f"{side}_{part}") for part in ("upper_arm", "forearm"))
@@ -361,13 +361,13 @@ def _build_view_section(
     if tracked is None or not len(calibration.time):
         return None
     begin, end = float(calibration.time.min()), float(calibration.time.max())
-    of = slice(*np.searchsorted(tracked.time, [begin - 1e-6, end + 1e-6]))
-    if of.stop - of.start < 2:
+    samples = slice(*np.searchsorted(tracked.time, [begin - 1e-6, end + 1e-6]))
+    if samples.stop - samples.start < 2:
         return None
     cut = Pose(
-        tracked.time[of],
-        {name: quat[of] for name, quat in tracked.quat_WL.items()},
-        {name: points[of] for name, points in tracked.points.items()},
+        tracked.time[samples],
+        {name: quat[samples] for name, quat in tracked.quat_WL.items()},
+        {name: points[samples] for name, points in tracked.points.items()},
     )
     visible = {
         name: [(max(a, begin), min(b, end)) for a, b in spans if b > begin and a < end]

@@ -103,7 +103,7 @@ class Decimator:
         """Bins that begin at the kept samples; what comes before the first belongs to the last bin so far."""
         parts = self._signals.setdefault(name, [])
         edges = at if len(at) and at[0] == 0 else np.concatenate([[0], at]).astype(int)
-        of = signal._replace(
+        merged = signal._replace(
             rate=np.maximum.reduceat(signal.rate, edges),
             cut=np.logical_or.reduceat(signal.cut, edges),
             gap=np.logical_or.reduceat(signal.gap, edges),
@@ -111,18 +111,21 @@ class Decimator:
         )
         if len(edges) > len(at):
             before = parts[-1]
-            before.rate[-1] = max(before.rate[-1], of.rate[0])
-            before.cut[-1] |= of.cut[0]
-            before.gap[-1] |= of.gap[0]
-            if before.static is not None and of.static is not None:
-                before.static[-1] &= of.static[0]
-            of = of._replace(
-                rate=of.rate[1:], cut=of.cut[1:], gap=of.gap[1:], static=None if of.static is None else of.static[1:]
+            before.rate[-1] = max(before.rate[-1], merged.rate[0])
+            before.cut[-1] |= merged.cut[0]
+            before.gap[-1] |= merged.gap[0]
+            if before.static is not None and merged.static is not None:
+                before.static[-1] &= merged.static[0]
+            merged = merged._replace(
+                rate=merged.rate[1:],
+                cut=merged.cut[1:],
+                gap=merged.gap[1:],
+                static=None if merged.static is None else merged.static[1:],
             )
         if len(at):
-            parts.append(of)
+            parts.append(merged)
         else:  # a chunk shorter than a bin: its bias is the last one, its peak may be the largest
-            parts[-1] = parts[-1]._replace(bias=of.bias, peak_accel=max(parts[-1].peak_accel, of.peak_accel))
+            parts[-1] = parts[-1]._replace(bias=merged.bias, peak_accel=max(parts[-1].peak_accel, merged.peak_accel))
 
 
 def _join_signals(parts: list[Signal]) -> Signal:
@@ -142,12 +145,12 @@ def _decimate(tracked: TrackedRecording, at: np.ndarray, rate_hz: float) -> Trac
     pose, recording, segments = tracked.pose, tracked.recording, tracked.segments
     sensors = {name: sensor.part(at) for name, sensor in recording.sensors.items()}
     orientation = {
-        name: of._replace(**{field: _rows(getattr(of, field), at) for field in _OF_EACH_SAMPLE})
-        for name, of in segments.orientation.items()
+        name: orientation._replace(**{field: _rows(getattr(orientation, field), at) for field in _OF_EACH_SAMPLE})
+        for name, orientation in segments.orientation.items()
     }
     return replace(
         tracked,
-        pose=Pose(*(_rows(getattr(pose, of.name), at) for of in fields(Pose))),
+        pose=Pose(*(_rows(getattr(pose, entry.name), at) for entry in fields(Pose))),
         recording=replace(recording, time=recording.time[at], rate_hz=rate_hz, sensors=sensors),
         segments=replace(
             segments,
@@ -171,23 +174,23 @@ def _join_recordings(parts: list[TrackedRecording], phases: Mapping[str, Interva
     last = parts[-1]
     segments = [part.segments for part in parts]
     orientation = {
-        name: of._replace(
+        name: orientation._replace(
             **{
                 field: _concatenate([getattr(s.orientation[name], field) for s in segments])
                 for field in _OF_EACH_SAMPLE
             }
         )
-        for name, of in segments[-1].orientation.items()
+        for name, orientation in segments[-1].orientation.items()
     }
     return replace(
         last,
-        pose=Pose(*(_concatenate([getattr(part.pose, of.name) for part in parts]) for of in fields(Pose))),
+        pose=Pose(*(_concatenate([getattr(part.pose, entry.name) for part in parts]) for entry in fields(Pose))),
         recording=replace(reduce(join_recordings, [part.recording for part in parts]), phases=phases),
         segments=replace(
             segments[-1],
-            time=np.concatenate([of.time for of in segments]),
-            quat_WL=_concatenate([of.quat_WL for of in segments]),
-            covariance_W=_concatenate([of.covariance_W for of in segments]),
+            time=np.concatenate([part.time for part in segments]),
+            quat_WL=_concatenate([part.quat_WL for part in segments]),
+            covariance_W=_concatenate([part.covariance_W for part in segments]),
             orientation=orientation,
         ),
     )

@@ -192,7 +192,7 @@ def _diagnose_elbows(rate_hz: float, elbows: Mapping[str, Elbow]) -> Iterator[Di
 def _median_of_halves(elbow: Elbow) -> tuple[float, float]:
     """Median [rad] by which the bent forearm is out of plane, in the first and the second half."""
     half = len(elbow.bend) // 2
-    parts = [elbow.aside[of][elbow.bend[of] > BENT] for of in (slice(half), slice(half, None))]
+    parts = [elbow.aside[rows][elbow.bend[rows] > BENT] for rows in (slice(half), slice(half, None))]
     if not all(len(part) for part in parts):
         return 0.0, 0.0
     return float(np.median(parts[0])), float(np.median(parts[1]))

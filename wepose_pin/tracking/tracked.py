@@ -114,8 +114,8 @@ class SummaryAccumulator:
             known = (*self._later, *tracked.segments.diagnostics)
             self._later += [each for each in tracked.recording.diagnostics if each not in known]
         self._samples += len(tracked.time)
-        for segment, of in tracked.segments.orientation.items():
-            self._static[segment] = self._static.get(segment, 0) + int(np.count_nonzero(of.static))
+        for segment, orientation in tracked.segments.orientation.items():
+            self._static[segment] = self._static.get(segment, 0) + int(np.count_nonzero(orientation.static))
         for segment, gap in tracked.pose.gap.items():
             gaps, samples, before = self._lost.get(segment, (0, 0, False))
             begun = int(np.count_nonzero(np.diff(gap, prepend=before) & gap))

@@ -45,8 +45,11 @@ def format_document(
         },
         "noise": asdict(MTI_3),
         "gains": {
-            setting: {name: asdict(params) for name, params in of.items()}
-            for setting, of in {"default gains": DEFAULT_GAINS, **{s: g._asdict() for s, g in STATED.items()}}.items()
+            setting: {name: asdict(params) for name, params in gains.items()}
+            for setting, gains in {
+                "default gains": DEFAULT_GAINS,
+                **{s: g._asdict() for s, g in STATED.items()},
+            }.items()
         },
     }
     text = json.dumps(_plain(head), indent=1, ensure_ascii=False, allow_nan=False).removesuffix("\n}")
@@ -84,8 +87,8 @@ def parse_document(content: Any, where: str) -> Document:
         A key is missing or its value is of the wrong kind.
     """
 
-    def read_value(of: Any, key: str, kind: type, place: str, default: Any = None) -> Any:
-        value = of.get(key, default) if isinstance(of, dict) else None
+    def read_value(table: Any, key: str, kind: type, place: str, default: Any = None) -> Any:
+        value = table.get(key, default) if isinstance(table, dict) else None
         if not isinstance(value, kind):
             shown = "nothing" if value is None else type(value).__name__
             raise BadData(f"{where}: {place}{key}: {shown}, a {kind.__name__} is wanted; is it `wepose validate`'s?")

@@ -49,11 +49,11 @@ def draw_pictures(document: Document, failures: list[str] | None = None) -> Iter
     """
     rows = summarize(document.results)
     for experiment in dict.fromkeys(row.experiment for row in rows):
-        of = [row for row in rows if row.experiment == experiment]
+        own_rows = [row for row in rows if row.experiment == experiment]
         results = [result for result in document.results if result.experiment == experiment]
         for draw in (_budget, _bars, _trials, _over_time, _path):
             try:
-                picture = draw(experiment, of, results)
+                picture = draw(experiment, own_rows, results)
             except Exception as error:
                 if failures is not None:
                     kind = draw.__name__.strip("_").replace("_", " ")
@@ -89,7 +89,10 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Pi
                 panel.line(np.array([mean, mean + std]), np.full(2, place), "ink thin")
                 bars.append((place, mean, mean + std))
         limit = limits.get(name, (0.0, 0.0))[1]
-        panel.x = 0.0, _end_of_bars(bars, max([limit, *(sum(of[name]) for of in paper.values() if name in of)]))
+        panel.x = (
+            0.0,
+            _end_of_bars(bars, max([limit, *(sum(figures[name]) for figures in paper.values() if name in figures)])),
+        )
         for place, mean, _ in bars:
             if mean > panel.x[1]:  # beyond the scale: text
                 panel.text(panel.x[1], place, f"{mean:.1f} →", "halo", "end", dx=-3.0)
@@ -139,13 +142,16 @@ def _over_time(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> 
     """Draw the error of the first trial over time, one line a filter."""
     trial = next((r.trial for r in results if r.series), "")
     series = {r.method: r.series for r in results if r.series and r.trial == trial}
-    name = next((n for n in ("total_deg", "error_mm", "heading_deg") if all(n in of for of in series.values())), None)
+    name = next(
+        (n for n in ("total_deg", "error_mm", "heading_deg") if all(n in own_series for own_series in series.values())),
+        None,
+    )
     if not series or name is None:
         return None
     curves = {}
     window = 0.0
-    for method, of in series.items():
-        time, error = (np.array(of[key], dtype=float) for key in ("time", name))
+    for method, own_series in series.items():
+        time, error = (np.array(own_series[key], dtype=float) for key in ("time", name))
         over = max(len(time) // WINDOWS, 1)
         window = float(time[min(over, len(time) - 1)] - time[0])
         curves[method] = time, _running_rms(error, over)
@@ -181,9 +187,9 @@ def _path(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pictu
     for up, title in (("z", "from behind: z, upwards [mm]"), ("x", "from above: x, forwards [mm]")):
         panel = Panel(title, "y, to the left [mm]", equal=True, flip_x=True)
         for method in [*others, first]:
-            of = {key: np.array(series[method][key], float) for key in needed}
-            panel.line(of["y_mm"], of[f"{up}_mm"], "", colour=_colour(method))
-        panel.line(of["true_y_mm"], of[f"true_{up}_mm"], "ink dotted")
+            path = {key: np.array(series[method][key], float) for key in needed}
+            panel.line(path["y_mm"], path[f"{up}_mm"], "", colour=_colour(method))
+        panel.line(path["true_y_mm"], path[f"true_{up}_mm"], "ink dotted")
         panels.append(panel)
     keys = [*(Key(m, "", colour=_colour(m)) for m in [first, *others]), Key("truth", "ink dotted")]
     caption = f"{capital(experiment)}, trial {trial}: the path of the right hand, in W, root of the trunk at zero"
@@ -204,8 +210,8 @@ def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pic
     for name in budget.full:
         ends = min(0.0, 1.05 * min(values)), 1.15 * max(values)
         panel = Panel(f"{FROM[name]} [mm]", x=ends, shown_y=not panels)
-        for at, (__, of, css) in zip(category_rows(panel, names), lines, strict=True):
-            value = of.get(name)
+        for at, (__, figures, css) in zip(category_rows(panel, names), lines, strict=True):
+            value = figures.get(name)
             if value is not None:
                 ends = min(value, 0.0), max(value, 0.0)
                 panel.boxes(ends, (at - 0.31, at + 0.31), css if value >= 0.0 else "hatched outlined soft")

@@ -55,11 +55,11 @@ def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str
     rows = summarize(document.results)
     experiments = {}
     for name in dict.fromkeys(row.experiment for row in rows):
-        of = [row for row in rows if row.experiment == name]
+        own_rows = [row for row in rows if row.experiment == name]
         experiments[name] = {
             "trials": len({result.trial for result in document.results if result.experiment == name}),
-            "table": make_experiment_table(of, True),
-            "note": describe_table(of),
+            "table": make_experiment_table(own_rows, True),
+            "note": describe_table(own_rows),
             "pictures": [picture for experiment, picture in drawn if experiment == name],
         }
     text = load_template(TEMPLATE).render(

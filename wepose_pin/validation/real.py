@@ -181,8 +181,8 @@ def _compare_links(experiment: str, name: str, files: RingFiles, mount: str) -> 
     tip_W = Rotation.from_quat(registered[mount, "seg2"].quat_WV).apply(links.tip_V)
     results = []
     for contender in list_contenders("real"):
-        of = [each[contender.label] for each in orientations]
-        fitted = fit_links(tip_W[of[0].scored], *(each.estimated[each.scored] for each in of))
+        own_runs = [each[contender.label] for each in orientations]
+        fitted = fit_links(tip_W[own_runs[0].scored], *(each.estimated[each.scored] for each in own_runs))
         figures: dict[str, float] = {}
         for link, length, true in zip(("seg2_and_seg3", "seg4"), fitted, optical, strict=True):
             figures |= {f"{link}_mm": 1e3 * float(length), f"{link}_optical_mm": 1e3 * true}
@@ -290,7 +290,7 @@ def _score_reference(
     experiment: str, name: str, sensor: Referenced, registration: Registration, noise: SensorNoise, keep: bool
 ) -> list[Result]:
     results = []
-    for label, of in _run_orientations(sensor, registration, noise):
-        figures, series = _make_errors(of.estimated[of.scored], of.true[of.scored], sensor.time[of.scored], keep)
+    for label, run in _run_orientations(sensor, registration, noise):
+        figures, series = _make_errors(run.estimated[run.scored], run.true[run.scored], sensor.time[run.scored], keep)
         results.append(Result(experiment, name, label, figures | registration.figures(), series))
     return results

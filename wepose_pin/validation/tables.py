@@ -108,8 +108,8 @@ def summarize(results: Sequence[Result]) -> list[Row]:
     rows = []
     for experiment in dict.fromkeys(result.experiment for result in results):
         for method in dict.fromkeys(result.method for result in results if result.experiment == experiment):
-            of = [collect_figures(r) for r in results if r.experiment == experiment and r.method == method]
-            rows.append(Row(experiment, method, _mean(of), format_paper(experiment, method)))
+            figures = [collect_figures(r) for r in results if r.experiment == experiment and r.method == method]
+            rows.append(Row(experiment, method, _mean(figures), format_paper(experiment, method)))
     return rows
 
 
@@ -217,24 +217,25 @@ def make_overview_table(rows: Sequence[Row]) -> Table:
     """Make the overview: smekf, the paper's smekf and the best of all filters; bold where ours exceeds the paper's."""
     cells = []
     for experiment in dict.fromkeys(row.experiment for row in rows if row.experiment != ERROR_BUDGET):
-        of = {row.method: row.figures for row in rows if row.experiment == experiment}
+        figures = {row.method: row.figures for row in rows if row.experiment == experiment}
         paper = find_paper_figures(experiment, OURS)
-        for name in (name for name in of.get(OURS, {}) if name in ERRORS and name != "mean angle"):
-            ours, (text, unit) = of[OURS][name], split_unit(name)
-            best = min((m for m in of if name in of[m]), key=lambda m, name=name: (round(of[m][name], 2), m != OURS))  # type: ignore[misc]
+        for name in (name for name in figures.get(OURS, {}) if name in ERRORS and name != "mean angle"):
+            ours, (text, unit) = figures[OURS][name], split_unit(name)
+            ranks = {m: (round(values[name], 2), m != OURS) for m, values in figures.items() if name in values}
+            best = min(ranks, key=ranks.__getitem__)
             shown = f"{ours:.2f}"
             if name in paper and round(ours, 2) > paper[name][0]:
                 shown = f"**{shown}**"
             theirs = f"{paper[name][0]:.2f}" if name in paper else ""
-            cells.append([experiment, f"{text} [{unit}]", shown, theirs, f"{of[best][name]:.2f}", best])
+            cells.append([experiment, f"{text} [{unit}]", shown, theirs, f"{figures[best][name]:.2f}", best])
     return Table(["experiment", "mean error", "smekf", "the paper's smekf", "best", "by"], cells)
 
 
 def make_imperfections_table(worlds: Mapping[str, Mapping[str, Any]]) -> Table:
     """Make the table of the imperfections of each preset."""
-    sizes = {world: of.get("imperfections", {}) for world, of in worlds.items()}
+    sizes = {world: sizes_of_world.get("imperfections", {}) for world, sizes_of_world in worlds.items()}
     cells = [
-        [words, *(_size(of.get(name), factor, unit) for of in sizes.values())]
+        [words, *(_size(sizes_of_world.get(name), factor, unit) for sizes_of_world in sizes.values())]
         for name, (words, factor, unit) in _IMPERFECTIONS.items()
     ]
     return Table(["imperfection", *sizes], cells)
@@ -251,8 +252,8 @@ def make_noise_table(noise: Mapping[str, float]) -> Table:
 def make_gains_table(gains: Mapping[str, Mapping[str, Any]]) -> Table:
     """Make the table of the gains of ncf and gdc in each setting."""
     cells = [
-        [setting, *(", ".join(f"{k} {v:.3g}" for k, v in of.get(name, {}).items()) for name in ("ncf", "gdc"))]
-        for setting, of in gains.items()
+        [setting, *(", ".join(f"{k} {v:.3g}" for k, v in own_gains.get(name, {}).items()) for name in ("ncf", "gdc"))]
+        for setting, own_gains in gains.items()
     ]
     return Table(["setting", "ncf", "gdc"], cells)
 
@@ -300,11 +301,11 @@ def compute_error_budget(results: Sequence[Result]) -> ErrorBudget | None:
     """Compute the part of each imperfection in the hand's error; None without a run with all of them."""
     rms: dict[str, dict[str, float]] = {}
     for method in dict.fromkeys(result.method for result in results if result.experiment == ERROR_BUDGET):
-        of = [r.figures for r in results if r.experiment == ERROR_BUDGET and r.method == method]
+        figures = [r.figures for r in results if r.experiment == ERROR_BUDGET and r.method == method]
         rms[method] = {
-            name: float(np.sqrt(np.mean([figure[key]["rmse"] ** 2 for figure in of])))
+            name: float(np.sqrt(np.mean([figure[key]["rmse"] ** 2 for figure in figures])))
             for key, name in HAND.items()
-            if all(isinstance(figure.get(key), dict) and figure[key].get("rmse") is not None for figure in of)
+            if all(isinstance(figure.get(key), dict) and figure[key].get("rmse") is not None for figure in figures)
         }
     full = rms.pop("all on", None)
     if not full:

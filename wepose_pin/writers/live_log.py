@@ -110,7 +110,7 @@ class LiveLog:
         if not self._samples:
             return
         samples, self._samples, self._waiting = self._samples, [], 0
-        which, *numbers = (np.concatenate(of) for of in zip(*samples, strict=True))
+        which, *numbers = (np.concatenate(column) for column in zip(*samples, strict=True))
         parts = [which.astype("u1").tobytes(), *(part.astype("<f8").tobytes() for part in numbers)]
         payload = struct.pack("<I", len(which)) + b"".join(parts)
         self._block(SAMPLES, payload)

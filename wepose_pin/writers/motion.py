@@ -143,7 +143,7 @@ def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:
     for point, p_W in pose.points.items():
         side, part = point.split("_", 1)
         hand = ("hand",) if f"{side}_hand" in pose.quat_WL else ()
-        way = ("torso", *(f"{side}_{of}" for of in _WAY.get(part, (*_WAY["wrist"], *hand))))
+        way = ("torso", *(f"{side}_{link}" for link in _WAY.get(part, (*_WAY["wrist"], *hand))))
         lost = [pose.gap[segment] for segment in way if segment in pose.gap]
         points[point] = np.where(np.any(lost, axis=0)[:, None], np.nan, p_W) if lost else p_W
     return points

@@ -49,9 +49,9 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagno
     if names == "isb":
         angles = joint_angles(motion.pose)
         columns = {
-            f"{joint}_{angle}": of.values[:, k]
-            for joint, of in angles.joints.items()
-            for k, angle in enumerate(of.names)
+            f"{joint}_{angle}": joint_table.values[:, k]
+            for joint, joint_table in angles.joints.items()
+            for k, angle in enumerate(joint_table.names)
         }
     else:
         columns, residuals = coordinates(orientations(motion.pose.quat_WL))
@@ -64,7 +64,7 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagno
         raise BadData(
             f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles to write"
         )
-    rows = pl.DataFrame({"time": motion.pose.time, **{name: np.degrees(of) for name, of in columns.items()}})
+    rows = pl.DataFrame({"time": motion.pose.time, **{name: np.degrees(angle) for name, angle in columns.items()}})
     header = {"version": 1, "nRows": rows.height, "nColumns": rows.width, "inDegrees": "yes"}
     name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
     _write(path, [name, *(f"{key}={value}" for key, value in header.items()), "endheader"], rows)

@@ -122,7 +122,7 @@ def list_files(path: Path, truth: bool = False) -> list[Path]:
         return [path / name for name in _RESULT if (path / name).is_file()] or sorted(_list_all(path))
     # A map may name a URDF of example-robot-data, which lies elsewhere and has a version of its own.
     named = [path.parent / name for name in list_named_files(path, truth)]
-    return [path, *(of for of in named if of.exists() or of.suffix != ".urdf"), *_companion_files(path)]
+    return [path, *(file for file in named if file.exists() or file.suffix != ".urdf"), *_companion_files(path)]
 
 
 def _companion_files(path: Path) -> list[Path]:

@@ -87,7 +87,7 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
             residuals |= {name: float(np.sqrt(np.mean(angle**2))) for name, angle in zip(arm, left, strict=True)}
         if "torso" in quat_GB:
             shoulder = multiply(conjugate(quat_GB["torso"] * mirror), quat[0])
-            columns |= _solve_three_axes(shoulder, [f"arm_{of}_{side}" for of in ("flex", "add", "rot")])
+            columns |= _solve_three_axes(shoulder, [f"arm_{angle}_{side}" for angle in ("flex", "add", "rot")])
         columns |= below
     return columns, residuals
 

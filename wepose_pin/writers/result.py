@@ -58,7 +58,7 @@ def write_about(
 ) -> None:
     """Write the files of a result beside its tables: the subject as used, and ``summary.json``."""
     write_subject(folder, tracked.subject, tracked.model)
-    spans = {name: [[float(a), float(b)] for a, b in of] for name, of in (phases or {}).items()}
+    spans = {name: [[float(a), float(b)] for a, b in intervals] for name, intervals in (phases or {}).items()}
     about = {**summary, "recorded_phases": spans, "versions": versions()}
     if provenance is not None:
         about["provenance"] = dict(provenance)
