@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bodies import SEGMENTS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.alignment import MOUNT_MOVED_STDS, check_mounts, compute_heading_offset, suggest_mounts
@@ -13,14 +14,7 @@ from wepose_pin.calibration import load_protocol
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
 from wepose_pin.filters.phases import COMMON_RATE
-from wepose_pin.recording import (
-    SEGMENTS,
-    ImuSensor,
-    OrientationSensor,
-    Recording,
-    compute_mount,
-    find_mount_axes,
-)
+from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, compute_mount, find_mount_axes
 from wepose_pin.simulation import Simulation, simulate_paper_dynamic
 from wepose_pin.subject import StartPoseOffset, Subject, mount_rows, population_subject
 from wepose_pin.tracking.segments import estimate_segments

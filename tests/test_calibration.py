@@ -7,6 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from bodies import LENGTHS
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +18,7 @@ from wepose_pin.errors import BadOption, BadPhase, BadSession
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.simulation.motion import Motion, Wander
-from wepose_pin.subject import LENGTHS, mount_rows, population_subject
+from wepose_pin.subject import mount_rows, population_subject
 
 
 def codes(found: Calibration) -> set[str]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
+from bodies import LENGTHS
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +15,7 @@ from wepose_pin.errors import BadOption, BadPhase
 from wepose_pin.kinematics import build_pose_table
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import LENGTHS, Subject, mount_rows, population_subject
+from wepose_pin.subject import Subject, mount_rows, population_subject
 from wepose_pin.tracking import Tracker, TrackOptions, track
 from wepose_pin.tracking.causal import CausalSegmentEstimator
 from wepose_pin.tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector

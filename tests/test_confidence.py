@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
 from wepose_pin.kinematics import build_pose_table, compute_axis_std, compute_point_covariances, compute_pose
 from wepose_pin.model import load_model
 from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
-from wepose_pin.subject import LENGTHS, population_subject
+from wepose_pin.subject import population_subject
 from wepose_pin.tracking import track
 
 ARMS = [f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from bodies import SEGMENTS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import cli
@@ -16,7 +17,6 @@ from wepose_pin.angles import joint_angles
 from wepose_pin.errors import BadData, BadOption, ExistingOutput, MissingFile
 from wepose_pin.kinematics import Pose, build_pose_table, compute_pose, parse_pose_table
 from wepose_pin.model import load_model
-from wepose_pin.recording import SEGMENTS
 from wepose_pin.writers import export as writers
 from wepose_pin.writers.export import export
 from wepose_pin.writers.motion import Motion, resampled

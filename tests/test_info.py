@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from bodies import SEGMENTS
 from test_formats import ACCEL, GYRO, RATE, TIME, WXYZ, dot, mat, mt_manager, sto, ximu3
 from test_mvnx import mvnx, turning
 
@@ -16,7 +17,7 @@ import wepose_pin as wp
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, WARNING, Diagnostic, render
 from wepose_pin.readers.describe import describe_file
-from wepose_pin.recording import SEGMENTS, Recording
+from wepose_pin.recording import Recording
 
 
 def info(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 from test_causal import first
 
@@ -23,7 +24,7 @@ from wepose_pin.readers.live_log import SAMPLES, read_blocks, read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import LENGTHS, mount_rows, parse_subject, population_subject
+from wepose_pin.subject import mount_rows, parse_subject, population_subject
 from wepose_pin.tracking import track
 from wepose_pin.writers.live_log import LiveLog
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from bodies import SEGMENTS
 from test_causal import first
 
 from wepose_pin import cli
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
-from wepose_pin.recording import SEGMENTS
 from wepose_pin.simulation import Simulation
 from wepose_pin.writers import write_session
 

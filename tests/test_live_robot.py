@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from arms import person, write_arm
+from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 from test_causal import first
 from test_retargeting import far_away
@@ -44,7 +45,7 @@ from wepose_pin.retargeting.stream import (
     _LowPass,
 )
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import LENGTHS, population_subject
+from wepose_pin.subject import population_subject
 from wepose_pin.writers import write_session
 
 pytest.importorskip("daqp")

@@ -10,13 +10,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yourdfpy
+from bodies import POINTS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.assets import asset
 from wepose_pin.diagnostics import from_json, render
 from wepose_pin.errors import BadModel, BadOption, MissingFile
 from wepose_pin.kinematics import compute_link_poses, compute_pose
-from wepose_pin.model import POINTS, BodyModel, SegmentLink, chains, load_model
+from wepose_pin.model import BodyModel, load_model
 from wepose_pin.tracking import track
 
 OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"
@@ -125,7 +126,7 @@ def test_our_model_has_nine_spherical_joints() -> None:
     assert set(body.joints) == set(SEGMENTS) == set(body.limits)
     assert (body.pin.nq, body.pin.nv) == (36, 27)
     assert all(body.pin.joints[k].shortname() == "JointModelSpherical" for k in body.joints.values())
-    assert all(chain.exact for chain in chains(body.pin).values())
+    assert all(chain.exact for chain in body.chains.values())
 
 
 def test_our_lengths_are_those_that_the_urdf_states() -> None:
@@ -530,7 +531,7 @@ def test_light_links_between_the_axes_do_not_keep_a_triple_apart(tmp_path: Path)
 def test_a_torso_on_light_links_follows_exactly(data: Path) -> None:
     """As hinges its joints miss one that is turned about the vertical by 170 degrees by 70."""
     body = load_model(data / "human_urdf" / GAZEBO["spine"])
-    assert chains(body.pin)["torso"].exact
+    assert body.chains["torso"].exact
     assert body.diagnostics == ()
     quat = {"torso": Rotation.from_euler("ZYX", [[170.0, 0.0, 0.0], [60.0, 20.0, -30.0]], degrees=True).as_quat()}
     pose = compute_pose(body, np.arange(2) / 100.0, quat)
@@ -696,7 +697,7 @@ def other_names(text: str) -> str:
 
 def table_toml(up: str = "+z", forward: str = "+x", more: str = "") -> str:
     rows = "\n".join(f'{segment} = "{link}"' for segment, link in OTHER.items())
-    return f'urdf = "small.urdf"\nup = "{up}"\nforward = "{forward}"\n[segments]\n{rows}\n{more}'
+    return f'urdf = "small.urdf"\nlike = "upper_body"\nup = "{up}"\nforward = "{forward}"\n[segments]\n{rows}\n{more}'
 
 
 PALMS = '[points]\nleft_palm = "left_palm"\nright_palm = {link = "L_right_hand", at = [0, 0, -0.07]}'
@@ -705,7 +706,7 @@ PALMS = '[points]\nleft_palm = "left_palm"\nright_palm = {link = "L_right_hand",
 def test_the_table_as_keywords_and_as_files(tmp_path: Path) -> None:
     file = written(tmp_path, other_names(small()))
     points = {"left_palm": "left_palm", "right_palm": {"link": "L_right_hand", "at": [0.0, 0.0, -0.07]}}
-    by_keywords = load_model(file, segments=OTHER | {"torso": SegmentLink("L_torso")}, points=points)
+    by_keywords = load_model(file, segments=OTHER | {"torso": "L_torso"}, points=points)
     by_table = load_model(written(tmp_path, table_toml(more=PALMS), "any.toml"))
     written(tmp_path, table_toml(more=PALMS), "model.toml")
     found = load_model(file)
@@ -762,13 +763,13 @@ BAD_TABLES = {
     "unknown key": (table_toml().replace("forward", "foreward"), "did you mean 'forward'"),
     "unknown segment": (table_toml().replace("left_forearm =", "left_forarm ="), "did you mean 'left_forearm'"),
     "unknown link": (table_toml().replace("L_left_forearm", "L_left_foreram"), "did you mean 'L_left_forearm'"),
-    "unknown point": (table_toml(more='[points]\nleft_thumb = "torso"'), "points.left_thumb is not a point"),
+    "unknown body": (table_toml().replace("upper_body", "uper_body"), "did you mean 'upper_body'"),
+    "unknown point": (table_toml(more='[draw]\npaths = ["left_elbo"]'), "did you mean 'left_elbow'"),
     "unknown axis": (table_toml(up="z"), "up = 'z'"),
     "parallel axes": (table_toml(up="+x"), "is parallel to up"),
     "no number": (table_toml(more='[points]\nleft_palm = {link = "torso", at = [1, 2]}'), "three numbers [m]"),
     "no name": (table_toml(more="[points]\nleft_palm = 3"), "a link's name is wanted"),
-    "missing": (table_toml().replace('left_forearm = "L_left_forearm"', ""), "no link for segment 'left_forearm'"),
-    "no wrist": (table_toml().replace('left_hand = "L_left_hand"', ""), "no wrist"),
+    "no wrist": (table_toml().replace('left_hand = "L_left_hand"', ""), "left_forearm has no left_wrist"),
     "half": (table_toml().replace('"L_torso"', '{link = "L_torso", up = "+z"}'), "up and forward go together"),
     "root": ('root = "hips"\n' + table_toml(), "root: no link 'hips'"),
     "one place": (table_toml(more='[points]\nleft_elbow = "L_left_upper_arm"'), "lie in one place"),
@@ -788,7 +789,7 @@ def test_a_wrong_table_says_so_in_one_line(case: str, tmp_path: Path) -> None:
 def test_arms_that_point_up_need_their_axes(tmp_path: Path) -> None:
     text = other_names(small()).replace("0 0 -0.3", "0 0 0.3").replace("0 0 -0.25", "0 0 0.25")
     file = written(tmp_path, text)
-    with pytest.raises(BadModel, match="points straight up; state its up and forward"):
+    with pytest.raises(BadModel, match="points opposite to its direction in the N-pose; state its up and forward"):
         load_model(file, segments=OTHER)
     down = {
         name: {"link": link, "up": "-z", "forward": "+x"} if "arm" in name or "hand" in name else link

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate_lengths, load_protocol
@@ -29,7 +30,6 @@ from wepose_pin.simulation import (
     simulate_person,
 )
 from wepose_pin.simulation.tasks import TASKS, Touch
-from wepose_pin.subject import LENGTHS
 from wepose_pin.writers.session import write_session
 
 CALIBRATION = Path(__file__).resolve().parent.parent / "calibration"

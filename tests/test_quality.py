@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, calibrate_lengths
@@ -23,7 +24,6 @@ from wepose_pin.recording import Recording
 from wepose_pin.simulation import MILD_PRESET, Imperfections, Person, Simulation, simulate, simulate_person
 from wepose_pin.simulation import motion as motions
 from wepose_pin.simulation.tasks import TASKS
-from wepose_pin.subject import LENGTHS
 from wepose_pin.writers import write_session
 
 ANY = replace(MILD_PRESET, mount="any")

@@ -9,14 +9,13 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 from test_model import GAZEBO, example_robot_data_human
 
-from wepose_pin.calibration.chain import default_reaches, measure_reaches, point_position
+from wepose_pin.calibration.chain import point_position
 from wepose_pin.errors import BadModel
-from wepose_pin.model import POINTS, BodyModel, load_model
-from wepose_pin.recording import SEGMENTS
-from wepose_pin.subject import LENGTHS
+from wepose_pin.model import BodyModel, load_model, measure_reaches
 
 
 def cosmik(data: Path) -> BodyModel:
@@ -42,14 +41,15 @@ def body(request: pytest.FixtureRequest, data: Path) -> BodyModel:
     return BODIES[request.param](data)
 
 
-def random_rotations(m: pin.Model, rng: np.random.Generator) -> tuple[pin.Data, dict[str, np.ndarray]]:
+def random_rotations(body: BodyModel, rng: np.random.Generator) -> tuple[pin.Data, dict[str, np.ndarray]]:
     """Forward kinematics of a configuration drawn at random, and link → its `quat_WK`."""
+    m = body.pin
     low, high = (np.clip(limit, -np.pi, np.pi) for limit in (m.lowerPositionLimit, m.upperPositionLimit))
     q = pin.normalize(m, rng.uniform(low, high))
     kinematics = m.createData()
     pin.framesForwardKinematics(m, kinematics, q)
     R_WK = {m.names[joint]: kinematics.oMi[joint].rotation for joint in range(m.njoints)}
-    R_WK |= {s: kinematics.oMf[m.getFrameId(s)].rotation for s in SEGMENTS if m.existFrame(s)}
+    R_WK |= {s: kinematics.oMf[m.getFrameId(s)].rotation for s in body.table.segments}
     return kinematics, {link: Rotation.from_matrix(R).as_quat() for link, R in R_WK.items()}
 
 
@@ -57,32 +57,32 @@ def test_every_point_is_pinocchios_for_all_lengths_and_orientations(body: BodyMo
     """All known bodies are affine in their lengths; those of others have constant parts and links between segments."""
     rng, own = np.random.default_rng(0), body.lengths
     reaches = measure_reaches(body)
-    assert set(reaches) == {point for point, link in POINTS.items() if body.pin.existFrame(link)}
-    lengths = ca.SX.sym("lengths", len(LENGTHS))
+    assert set(reaches) == set(body.point_frames)
+    lengths = ca.SX.sym("lengths", len(own))
     functions = {}
     for point, way in reaches.items():
         quats = {link: ca.SX.sym(link, 4) for link in way}
         functions[point] = ca.Function("p", [lengths, *quats.values()], [point_position(lengths, quats, way)])
     for _ in range(5):
         changed = body.with_lengths({name: value * rng.uniform(0.7, 1.3) for name, value in own.items()})
-        kinematics, quat_WK = random_rotations(changed.pin, rng)
-        values = [changed.lengths.get(name, 0.0) for name in LENGTHS]
+        kinematics, quat_WK = random_rotations(changed, rng)
+        values = list(changed.lengths.values())
         for point, function in functions.items():
             place = np.asarray(function(values, *(quat_WK[link] for link in reaches[point]))).ravel()
-            expected = kinematics.oMf[changed.pin.getFrameId(POINTS[point])].translation
+            expected = kinematics.oMf[changed.pin.getFrameId(changed.point_frames[point])].translation
             np.testing.assert_allclose(place, expected, atol=1e-12)
 
 
 def test_the_default_model_is_its_lengths() -> None:
     """Every number is a whole one or a half: no rounding remains of the measurement."""
-    reaches = default_reaches()
+    reaches = load_model().reaches
     assert list(reaches["right_palm"]) == ["torso", "right_upper_arm", "right_forearm", "right_hand"]
     for way in reaches.values():
-        for segment, by_length in way.items():
+        for segment, (by_length, constant) in way.items():
+            assert not constant.any()
             ends = {"torso": {"trunk", "shoulder_width"}}.get(segment, {segment})
             assert {LENGTHS[k] for k in np.flatnonzero(by_length.any(axis=0))} == ends
             assert set(np.abs(by_length).ravel()) <= {0.0, 0.5, 1.0}
-    assert default_reaches() is reaches
 
 
 def test_bodies_of_others_have_links_between_the_segments(data: Path) -> None:

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bodies import SEGMENTS
 
 from wepose_pin.errors import BadSource
 from wepose_pin.live.sources import open_source, packets
 from wepose_pin.live.sources.udp import MAX_KINDS, UdpSource
-from wepose_pin.recording import SEGMENTS
 from wepose_pin.recording.arrivals import Samples
 
 GOOD = {"sensor": "torso", "t": 12.345, "gyro": [0.1, -0.2, 0.3], "accel": [0.0, 0.5, 9.81]}

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.alignment import SEGMENT_ATTITUDE_STD, START_POSE_STD
@@ -27,7 +28,7 @@ from wepose_pin.calibration.weights import LEAST_CORRELATION_S
 from wepose_pin.filters.sensors import FilteredRecording
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import NOISE_FREE, Person, simulate, simulate_person
-from wepose_pin.subject import LENGTHS, mount_rows
+from wepose_pin.subject import mount_rows
 
 UP = np.array([0.0, 0.0, 1.0])
 SENSORS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")

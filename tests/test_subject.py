@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bodies import LENGTHS, SEGMENTS, TABLE
 
 from wepose_pin.errors import BadOption, BadSubject, MissingFile
-from wepose_pin.recording import SEGMENTS
 from wepose_pin.subject import (
-    LENGTHS,
     HeadingDrift,
     Hinge,
     StartPoseOffset,
@@ -97,7 +96,7 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
         ("format = 2\n[lengths]\nleft_uper_arm = 0.3", "did you mean 'left_upper_arm'"),
         ("format = 2\n[lengths]\ntrunk = 'long'", "lengths.trunk = 'long'; a number in metres"),
         ("format = 2\n[lengths]\ntrunk = -0.5", "lengths.trunk = -0.5"),
-        ("format = 2\n[lengths]\ntrunk = 0.5", "lengths.shoulder_width = None"),
+        ("format = 2\n[lengths]\ntrunk = 0.5", "lengths: shoulder_width, left_upper_arm"),
         ("format 1", "not valid TOML"),
         (
             "ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0",
@@ -105,7 +104,10 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
         ),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [[1.0, 2.0]]", "covariance.matrix is (1, 2)"),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [['a']]", "holds NaN or text"),
-        ("ALL\n[start_pose_offset.tors]\nx_deg = 1", "start_pose_offset.tors is not a segment; did you mean 'torso'"),
+        (
+            "ALL\n[start_pose_offset.tors]\nx_deg = 1\ny_deg = 1\nstd_deg = 1",
+            "start_pose_offset: 'tors' is not known; did you mean 'torso'",
+        ),
         ("ALL\n[start_pose_offset.torso]\nx_deg = 1", "it needs x_deg, y_deg, std_deg"),
         ("ALL\n[heading_drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1", "it needs rate_deg_min, std_deg_min"),
         ("ALL\n[heading_drift]\ntorso = 1", "heading_drift.torso = 1 is not a table"),
@@ -119,7 +121,7 @@ def test_what_is_wrong_is_named(tmp_path: Path, text: str, says: str) -> None:
     every = "format = 2\n[lengths]\n" + "\n".join(f"{name} = 0.3" for name in LENGTHS)
     (tmp_path / "subject.toml").write_text(text.replace("ALL", every), encoding="utf-8")
     with pytest.raises(BadSubject) as caught:
-        load_subject(tmp_path)
+        load_subject(tmp_path).check_body(TABLE)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 

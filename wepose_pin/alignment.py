@@ -20,7 +20,7 @@ from .errors import BadSession
 from .filters import Orientation
 from .filters.sensors import FilteredRecording, collect_rotations
 from .filters.start import ACCEL_BIAS_STD
-from .recording import SEGMENTS, Recording, format_span
+from .recording import Recording, format_span
 from .subject import Subject
 
 # Angles [deg] between a stated mount and gravity or motion. Above them the mount is an error or gets a warning.
@@ -160,7 +160,7 @@ def align_sensors(recording: Recording, subject: Subject | None, filtered: Filte
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
         # The torso faces x; without a torso the most central segment does.
-        reference_segment = min(aligned, key=SEGMENTS.index)
+        reference_segment = aligned[0]
         aligned_heading_offset = compute_heading_offset(filtered.R_VS_start[reference_segment], Rotation.identity())
     for segment, R_VS_start in filtered.R_VS_start.items():
         if recording.sensors[segment].aligned:

@@ -14,12 +14,13 @@ from . import rotations
 from .arguments import check_array, check_covariance, check_fields, check_finite, check_names, check_unit
 from .compilation import kernel
 from .errors import BadData, BadModel, one_of
-from .model import POINTS, BodyModel, chains
-from .model.orientation_ik import OrientationIk, groups
-from .recording import EACH_TIME, SEGMENTS, check_time
+from .model import BodyModel
+from .model.orientation_ik import OrientationIk, find_groups
+from .model.reaches import UNIVERSE
+from .recording import EACH_TIME, check_time
 from .rotations import product
-from .subject import LENGTHS
 
+_ON_JOINT = 1e-12  # [m] from a joint's origin, below which the joint does not move a point
 _MAX_TABLE_VALUE = 1e12  # beyond this a number in a table is no time [s] and no position [m]
 MAX_POSE_NORM_DEVIATION = 1e-3  # of a quaternion in a `Pose` from 1
 MAX_TABLE_NORM_DEVIATION = 1e-2  # of a quaternion in a table from 1: a file may have few decimals
@@ -27,13 +28,13 @@ MAX_TABLE_NORM_DEVIATION = 1e-2  # of a quaternion in a table from 1: a file may
 
 @dataclass(frozen=True)
 class Pose:
-    """The pose of the upper body over time, in W.
+    """The pose of a body over time, in W.
 
     Parameters
     ----------
     time : (n,) [s]
     quat_WL : segment → (n, 4) xyzw; only segments that are known
-    points : point → (n, 3) [m] in W, from the root midway between the hips; only points that are known
+    points : point → (n, 3) [m] in W, from the root, of a person midway between the hips; only points that are known
     q : (n, nq) configuration of the Pinocchio model; an unmeasured segment is rigid with its parent segment; None for
         a pose from a table
     segment_cov : segment → (n, 3, 3) [rad²], covariance of the orientation's error in W (on the left of `quat_WL`)
@@ -56,7 +57,7 @@ class Pose:
         Raises
         ------
         BadOption, BadData
-            A field of a wrong type; an unknown segment or point; a wrong shape; time that does not increase; a
+            A field of a wrong type; a wrong shape; time that does not increase; a
             quaternion without unit norm; a covariance that is not symmetric and positive.
         """
         where = "pose: "
@@ -67,10 +68,10 @@ class Pose:
             raise BadData(f"{where}time has no samples")
         check_time("pose", self.time)
         for name, known, shape in (
-            ("quat_WL", SEGMENTS, (n, 4)),
-            ("points", POINTS, (n, 3)),
-            ("segment_cov", SEGMENTS, (n, 3, 3)),
-            ("point_cov", POINTS, (n, 3, 3)),
+            ("quat_WL", self.quat_WL, (n, 4)),
+            ("points", self.points, (n, 3)),
+            ("segment_cov", self.quat_WL, (n, 3, 3)),
+            ("point_cov", self.points, (n, 3, 3)),
         ):
             check_names(f"{where}{name}", getattr(self, name), tuple(known))
             for key, values in getattr(self, name).items():
@@ -81,7 +82,7 @@ class Pose:
                     check_unit(place, values, MAX_POSE_NORM_DEVIATION)
                 elif shape == (n, 3, 3):
                     check_covariance(place, values)
-        check_names(f"{where}gap", self.gap, SEGMENTS)
+        check_names(f"{where}gap", self.gap, tuple(self.quat_WL))
         for segment, gap in self.gap.items():
             check_array(f"{where}gap.{segment}", gap, (n,), "b", EACH_TIME)
         return self
@@ -105,53 +106,60 @@ class KinematicsSolver:
         if not segments:
             raise BadData("no segment has an orientation: a pose needs one")
         self._model, self._ik = model, _make_ik(model, segments, limits)
-        self._points = [point for point in find_known_points(segments) if model.pin.existFrame(POINTS[point])]
+        self._points = find_known_points(model, segments)
         self._last_quats: dict[str, np.ndarray] = {}
 
     def solve_chunk(self, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
         """Compute the pose of the next chunk: `time` (n,) [s], segment → (n, 4) xyzw."""
         q = self._ik.run(quat_WL, warm_start=True)
-        _, p_W = compute_link_poses(self._model, q, [POINTS[point] for point in self._points], rotations=False)
+        _, p_W = compute_link_poses(
+            self._model, q, [self._model.point_frames[point] for point in self._points], rotations=False
+        )
         points = {point: p_W[:, k] for k, point in enumerate(self._points)}
         quats = {name: rotations.unwrap_signs(quat, self._last_quats.get(name)) for name, quat in quat_WL.items()}
         self._last_quats = {name: quat[-1].copy() for name, quat in quats.items()}
         return Pose(time, quats, points, q)
 
 
-def find_known_points(segments: Iterable[str]) -> list[str]:
-    """Find the points that follow from the measured segments; a hand without a sensor is rigid with its forearm."""
-    measured = set(segments)
-    known = []
-    for point in POINTS:
-        side, part = point.split("_", 1)
-        required = {
-            "shoulder": ["torso"],
-            "elbow": ["torso", f"{side}_upper_arm"],
-            "wrist": ["torso", f"{side}_upper_arm", f"{side}_forearm"],
-            "palm": ["torso", f"{side}_upper_arm", f"{side}_forearm"],
-        }[part]
-        if measured.issuperset(required):
-            known.append(point)
-    return known
+def find_known_points(model: BodyModel, segments: Iterable[str]) -> list[str]:
+    """Find the points that follow from the measured segments: those on known joints, and on joints that move below."""
+    known_joint, points = _find_known_joints(model, segments), []
+    for point, link in model.point_frames.items():
+        frame = model.pin.frames[model.pin.getFrameId(link)]
+        joint, offset = frame.parentJoint, frame.placement.translation
+        while joint and np.abs(offset).max() < _ON_JOINT:  # the joint does not move it
+            joint, offset = model.pin.parents[joint], model.pin.jointPlacements[joint].translation
+        if known_joint[joint]:
+            points.append(point)
+    return points
 
 
 def find_known_links(model: BodyModel, segments: Iterable[str]) -> list[str]:
-    """Find the links whose pose follows from the measured segments: those, and links that are rigid with them.
+    """Find the links whose pose follows from the measured segments: those, and links that are rigid with them."""
+    known_joint = _find_known_joints(model, segments)
+    return [frame.name for frame in model.pin.frames[1:] if known_joint[frame.parentJoint]]
 
-    A hand without a sensor is rigid with the forearm, head and pelvis with the torso. An upper arm or forearm without
-    a sensor is unknown, with all links below it.
+
+def _find_known_joints(model: BodyModel, segments: Iterable[str]) -> list[bool]:
+    """Whether the placement of each Pinocchio joint follows from the measured segments.
+
+    Without a sensor a segment is rigid with the one above where the table says so, else it is unknown with all below
+    it. Of a mechanism all joints above a measured link are known.
     """
-    measured = set(segments)
+    measured, m = set(segments), model.pin
+    if model.table.is_mechanism:
+        carrying = {m.frames[m.getFrameId(segment)].parentJoint for segment in measured}
+        return [any(joint in m.supports[carrier] for carrier in carrying) or not joint for joint in range(m.njoints)]
     unmeasured_joints = {
         joint
-        for segment, chain in chains(model.pin).items()
-        if segment not in measured and not segment.endswith(("hand", "head", "pelvis"))
+        for segment, chain in model.chains.items()
+        if segment not in measured and not model.table.segments[segment].rigid_without_sensor
         for joint in chain.joints
     }
-    known_joint = {0: True}
-    for joint in range(1, model.pin.njoints):
-        known_joint[joint] = known_joint[model.pin.parents[joint]] and joint not in unmeasured_joints
-    return [frame.name for frame in model.pin.frames[1:] if known_joint[frame.parentJoint]]
+    known = [True]
+    for joint in range(1, m.njoints):
+        known.append(known[m.parents[joint]] and joint not in unmeasured_joints)
+    return known
 
 
 def solve_configuration(
@@ -163,14 +171,14 @@ def solve_configuration(
 ) -> np.ndarray:
     """Solve for the configuration `q` (n, nq) with the measured orientations, or the nearest one.
 
-    Segments on spherical joints have their orientations exactly. For arms with fewer axes the weighted sum of the
+    Segments on spherical joints have their orientations exactly. For limbs with fewer axes the weighted sum of the
     segments' squared angles to their measured orientations is minimised; `compute_orientation_residuals` returns these
     angles. An unmeasured segment is rigid with its parent segment. `wepose_pin.model.chains` finds the moving joints.
 
     Parameters
     ----------
     limits : keep the limits of joints with one axis; those of spherical joints are not kept
-    weights : segment → weight of its squared angle within its arm; 1 where not named
+    weights : segment → weight of its squared angle within its limb; 1 where not named
 
     Raises
     ------
@@ -186,11 +194,8 @@ def _make_ik(
     model: BodyModel, segments: Collection[str], limits: bool = True, weights: Mapping[str, float] | None = None
 ) -> OrientationIk:
     """Return the inverse kinematics of these segments; raise `BadModel` where the model has no link for one."""
-    links = chains(model.pin)
-    for segment in segments:
-        if segment not in links:
-            raise BadModel(f"{model.pin.name}: the model has no link for segment '{segment}'; {one_of(links, segment)}")
-    return OrientationIk(model, links, segments, limits=limits, weights=weights)
+    model.table.check_segments(segments, f"{model.pin.name}: ", BadModel)
+    return OrientationIk(model, segments, limits=limits, weights=weights)
 
 
 def compute_orientation_residuals(
@@ -200,9 +205,8 @@ def compute_orientation_residuals(
 
     Only for segments whose orientation the joints cannot reproduce exactly.
     """
-    links = chains(model.pin)
-    fitted = {segment for group in groups(links, quat_WL) for segment in group.segments}
-    limited = [name for name, chain in links.items() if name in quat_WL and (name in fitted or not chain.exact)]
+    fitted = {segment for group in find_groups(model, quat_WL) for segment in group.segments}
+    limited = [name for name, chain in model.chains.items() if name in quat_WL and (name in fitted or not chain.exact)]
     R_WL, _ = compute_link_poses(model, q, limited)
     R_model = {segment: Rotation.from_matrix(R_WL[:, k]) for k, segment in enumerate(limited)}
     return {segment: (R_model[segment].inv() * Rotation.from_quat(quat_WL[segment])).magnitude() for segment in limited}
@@ -249,9 +253,10 @@ class LiveKinematics:
 
     def __init__(self, model: BodyModel, segments: Sequence[str]) -> None:
         self.segments = tuple(segments)
-        self.points = tuple(p for p in find_known_points(self.segments) if model.pin.existFrame(POINTS[p]))
+        self.points = tuple(find_known_points(model, self.segments))
         self._model, self.data, self._q = model, model.pin.createData(), pin.neutral(model.pin)
-        self._views = [self.data.oMf[model.pin.getFrameId(POINTS[point])].translation for point in self.points]
+        frames = [model.pin.getFrameId(model.point_frames[point]) for point in self.points]
+        self._views = [self.data.oMf[frame].translation for frame in frames]
         self._spherical_joints = self._match_spherical_joints()
         self._ik = None if self._spherical_joints is not None else _make_ik(model, self.segments)
         self._previous_q: np.ndarray | None = None
@@ -261,7 +266,7 @@ class LiveKinematics:
 
         None if a measured segment is not on a spherical joint of its own.
         """
-        links, joints = chains(self._model.pin), []
+        links, joints = self._model.chains, []
         rows: dict[int, int] = {}  # Pinocchio joint → row of the segment whose orientation its frame has
         identity = np.array([0.0, 0.0, 0.0, 1.0])
         for joint in range(1, self._model.pin.njoints):
@@ -317,12 +322,12 @@ def compute_link_placements(
 
 
 def compute_point_covariances(
-    points: Mapping[str, np.ndarray],
+    model: BodyModel,
     quat_WL: Mapping[str, np.ndarray],
     segment_cov: Mapping[str, np.ndarray],
     lengths_cov: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Compute the covariance (n, 3, 3) [m²] in W of the points.
+    """Compute the covariance (n, 3, 3) [m²] in W of the known points.
 
     Only of points for which every segment between root and point has a covariance. A point is the sum of vectors v that
     rotate with segments: an error δ of a segment's orientation moves the point by δ × v, errors of different sensors
@@ -330,43 +335,57 @@ def compute_point_covariances(
 
     Parameters
     ----------
-    points : point → (n, 3) [m], with all points between root and point
+    model : with its lengths
     segment_cov : segment → (n, 3, 3) [rad²] in W
-    lengths_cov : (8, 8) [m²] in the order of `LENGTHS`; zeros: known exactly
+    lengths_cov : (k, k) [m²] in the order of the model's lengths; zeros: known exactly
     """
     covariances: dict[str, np.ndarray] = {}
-    if "torso" not in segment_cov:
-        return covariances
-    R_torso = Rotation.from_quat(quat_WL["torso"]).as_matrix()
-    for side, sign in (("left", 0.5), ("right", -0.5)):
-        hand = f"{side}_hand" if f"{side}_hand" in quat_WL else f"{side}_forearm"
-        chain = (  # point, the segment with which the last vector rotates, its length
-            ("shoulder", "torso", ""),
-            ("elbow", f"{side}_upper_arm", f"{side}_upper_arm"),
-            ("wrist", f"{side}_forearm", f"{side}_forearm"),
-            ("palm", hand, f"{side}_hand"),
-        )
+    lengths = np.array(list(model.lengths.values()))
+    R_WK: dict[str, np.ndarray] = {}
+    carriers = {link: _find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
+    for link, carrier in carriers.items():
+        if carrier is not None and carrier in segment_cov:
+            R_CK = _neutral_rotation(model, carrier).T @ _neutral_rotation(model, link)
+            R_WK[link] = Rotation.from_quat(quat_WL[carrier]).as_matrix()
+            if not np.allclose(R_CK, np.eye(3), atol=1e-12):
+                R_WK[link] = R_WK[link] @ R_CK
+    for point in find_known_points(model, quat_WL):
+        way = model.reaches[point]
+        if not way or not all(link in R_WK or link == UNIVERSE for link in way):
+            continue
         vectors: dict[str, np.ndarray] = {}
-        length_jacobian = np.zeros((len(R_torso), 3, len(LENGTHS)))
-        previous_point = np.zeros((len(R_torso), 3))
-        for point, segment, length in chain:
-            p = points.get(f"{side}_{point}")
-            if p is None or segment not in segment_cov:
-                break
-            v = p - previous_point
-            vectors[segment] = vectors.get(segment, 0.0) + v
-            if length:
-                length_jacobian[:, :, LENGTHS.index(length)] = v / np.linalg.norm(v, axis=1, keepdims=True)
-            else:
-                length_jacobian[:, :, LENGTHS.index("trunk")] = R_torso[:, :, 2]
-                length_jacobian[:, :, LENGTHS.index("shoulder_width")] = sign * R_torso[:, :, 1]
-            cov = length_jacobian @ lengths_cov @ length_jacobian.swapaxes(1, 2)
-            for moving_segment, vector in vectors.items():
-                skew = _build_skew_matrices(vector)
-                cov = cov + skew @ segment_cov[moving_segment] @ skew.swapaxes(1, 2)
-            covariances[f"{side}_{point}"] = cov
-            previous_point = p
+        n = len(next(iter(quat_WL.values())))
+        length_jacobian = np.zeros((n, 3, len(lengths)))
+        for link, part in way.items():
+            if link == UNIVERSE:
+                length_jacobian += part.by_length
+                continue
+            carrier = carriers[link]
+            assert carrier is not None  # it has a rotation
+            vectors[carrier] = vectors.get(carrier, 0.0) + R_WK[link] @ (part.by_length @ lengths + part.constant)
+            length_jacobian += R_WK[link] @ part.by_length
+        cov = length_jacobian @ lengths_cov @ length_jacobian.swapaxes(1, 2)
+        for moving_segment, vector in vectors.items():
+            skew = _build_skew_matrices(vector)
+            cov = cov + skew @ segment_cov[moving_segment] @ skew.swapaxes(1, 2)
+        covariances[point] = cov
     return covariances
+
+
+def _find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str | None:
+    """Find the measured segment with which a link rotates: itself, or above it where it is rigid; None: no such."""
+    segment: str | None = link
+    while segment is not None and segment not in measured:
+        own = model.table.segments.get(segment)
+        segment = model.parents[segment] if own is not None and own.rigid_without_sensor else None
+    return segment
+
+
+def _neutral_rotation(model: BodyModel, link: str) -> np.ndarray:
+    """Rotation (3, 3) of a link in W, all joints at zero."""
+    data = model.pin.createData()
+    pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
+    return np.array(data.oMf[model.pin.getFrameId(link)].rotation)
 
 
 def _build_skew_matrices(v: np.ndarray) -> np.ndarray:
@@ -426,25 +445,23 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
         numbers = {name: table[name].cast(pl.Float64).to_numpy() for name in table.columns}
     except pl.exceptions.PolarsError as error:
         raise BadData(f"{file}: a column holds text: {str(error).splitlines()[0]}") from error
-    _check_numbers(numbers, file)
+    segments = [name for name in _stems(numbers, "_qx") if {f"{name}_{c}" for c in ("qy", "qz", "qw")} <= set(numbers)]
+    places = [name for name in _stems(numbers, "_x") if {f"{name}_{c}" for c in "yz"} <= set(numbers)]
+    _check_numbers(numbers, file, (*segments, *places))
     quat_WL, points = {}, {}
-    for segment in SEGMENTS:
-        names = [f"{segment}_{c}" for c in ("qx", "qy", "qz", "qw")]
-        if all(name in numbers for name in names):
-            quat = np.column_stack([numbers[name] for name in names])
-            norm = np.linalg.norm(quat, axis=1)
-            if np.any(np.abs(norm - 1.0) > MAX_TABLE_NORM_DEVIATION):
-                raise BadData(f"{file}: {segment}_qx … _qw is no unit quaternion in row {np.argmax(abs(norm - 1)) + 1}")
-            quat_WL[segment] = quat / norm[:, None]
-    for point in POINTS:
-        names = [f"{point}_{c}" for c in "xyz"]
-        if all(name in numbers for name in names):
-            points[point] = np.column_stack([numbers[name] for name in names])
+    for segment in segments:
+        quat = np.column_stack([numbers[f"{segment}_{c}"] for c in ("qx", "qy", "qz", "qw")])
+        norm = np.linalg.norm(quat, axis=1)
+        if np.any(np.abs(norm - 1.0) > MAX_TABLE_NORM_DEVIATION):
+            raise BadData(f"{file}: {segment}_qx … _qw is no unit quaternion in row {np.argmax(abs(norm - 1)) + 1}")
+        quat_WL[segment] = quat / norm[:, None]
+    for point in places:
+        points[point] = np.column_stack([numbers[f"{point}_{c}"] for c in "xyz"])
     if not quat_WL and not points:
         raise BadData(f"{file}: neither orientations nor points; columns as torso_qx … or left_palm_x … are needed")
     segment_cov = {name: _parse_covariances(numbers, name) for name in quat_WL}
     point_cov = {name: _parse_covariances(numbers, name) for name in points}
-    gap = {name: numbers[f"{name}_gap"] > 0.0 for name in SEGMENTS if f"{name}_gap" in numbers}
+    gap = {name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers}
     return Pose(
         numbers["time"],
         quat_WL,
@@ -455,7 +472,12 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
     )
 
 
-def _check_numbers(numbers: Mapping[str, np.ndarray], file: str) -> None:
+def _stems(numbers: Mapping[str, np.ndarray], ending: str) -> list[str]:
+    """Return the beginnings of the columns that end so."""
+    return [name.removesuffix(ending) for name in numbers if name.endswith(ending)]
+
+
+def _check_numbers(numbers: Mapping[str, np.ndarray], file: str, names: tuple[str, ...]) -> None:
     """Raise `BadData` where time does not increase or a number is beyond `_MAX_TABLE_VALUE`; NaN means not known."""
     time = numbers["time"]
     if not len(time):
@@ -463,7 +485,7 @@ def _check_numbers(numbers: Mapping[str, np.ndarray], file: str) -> None:
     if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
         raise BadData(f"{file}: time does not increase from row to row; seconds that do are needed")
     for name, values in numbers.items():
-        if name != "time" and not name.startswith((*SEGMENTS, *POINTS)):
+        if name != "time" and not name.startswith(names):
             continue
         too_large = np.abs(values) > _MAX_TABLE_VALUE
         if too_large.any():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,24 +20,12 @@ from .arguments import (
     check_names,
     check_unit,
 )
-from .assets import asset
 from .documents import TomlTable, is_number, parse_toml, read_toml, toml_string, toml_strings
-from .errors import BadData, BadOption, BadSubject, one_of
-from .recording import SEGMENTS
+from .errors import BadData, BadModel, BadOption, BadSubject, one_of
+from .model import BodyModel, BodyTable, compute_population_lengths, load_table
 
-LENGTHS = (
-    "trunk",
-    "shoulder_width",
-    "left_upper_arm",
-    "left_forearm",
-    "left_hand",
-    "right_upper_arm",
-    "right_forearm",
-    "right_hand",
-)
+_MOUNT_ROW = re.compile(r"mounts\..+\.[xyz]")  # of a covariance
 LONGEST = 3.0  # [m] of a plausible length
-HINGES = ("left_elbow", "right_elbow")  # joints whose axis a calibration estimates
-SEXES = ("f", "m")
 _TABLES = ("lengths", "lengths_std", "mounts", "hinges", "start_pose_offset", "heading_drift", "covariance")
 FORMAT = 2
 MOST_OFFSET_DEG = 180.0  # of a file; the calibration checks whether it is plausible
@@ -44,10 +33,10 @@ MOST_DRIFT_DEG_MIN = 6000.0  # of a heading: 100 deg/s, beyond any gyroscope's b
 
 
 class Hinge(NamedTuple):
-    """An elbow's axis."""
+    """The axis of a joint of nearly one axis, such as an elbow."""
 
-    axis: np.ndarray  # (3,) unit, in the upper arm's frame, y towards the left
-    std: NonNegative  # [rad] by which the forearm leaves the plane across it, with soft tissue
+    axis: np.ndarray  # (3,) unit, in the frame of the segment above
+    std: NonNegative  # [rad] by which the segment below leaves the plane across it, with soft tissue
 
 
 class StartPoseOffset(NamedTuple):
@@ -70,13 +59,13 @@ class Subject:
 
     Parameters
     ----------
-    lengths : name → [m], every one of `LENGTHS`
+    lengths : name → [m], as the table of the body names them
     order : the rows of `covariance`: names of lengths [m], then ``mounts.<segment>.x``, ``.y``, ``.z``
         [rad], the error of a mount as a small turn about the segment's axes
     covariance : (k, k)
     mounts : segment → `quat_LS` (4,) xyzw, the calibrated mounts; empty where none are calibrated
     note : where the numbers come from, in a few words
-    hinges : joint of `HINGES` → its axis, where a calibration estimated it
+    hinges : joint → its axis, where a calibration estimated it
     start_pose_offset : segment → its offset from the start pose in the calibration, which a person nearly repeats
     heading_drift : segment → that of its sensor in the calibration; on another day it has a similar size
     """
@@ -103,18 +92,15 @@ class Subject:
         where = f"subject {self.name!r}: "
         check_fields(self, where)
         try:
-            check_lengths(f"{where}lengths", self.lengths, LENGTHS)
-            if set(self.lengths) != set(LENGTHS):
-                raise BadData(f"{where}lengths: {', '.join(n for n in LENGTHS if n not in self.lengths)} is missing")
-            check_names(f"{where}order", self.order, _ROWS)
+            if not self.lengths:
+                raise BadData(f"{where}lengths is empty; it needs the lengths of the body [m]")
+            check_lengths(f"{where}lengths", self.lengths)
+            check_names(f"{where}order", [row for row in self.order if not _MOUNT_ROW.fullmatch(row)], self.lengths)
             if len(set(self.order)) < len(self.order):
                 raise BadData(f"{where}order = {self.order}: each name once")
             check_array(f"{where}covariance", self.covariance, (len(self.order), len(self.order)))
             check_finite(f"{where}covariance", self.covariance)
             check_covariance(f"{where}covariance", self.covariance)
-            for name in ("mounts", "start_pose_offset", "heading_drift"):
-                check_names(f"{where}{name}", getattr(self, name), SEGMENTS)
-            check_names(f"{where}hinges", self.hinges, HINGES)
             arrays = [(f"mounts.{s}", quat, (4,)) for s, quat in self.mounts.items()]
             arrays += [(f"hinges.{joint}.axis", hinge.axis, (3,)) for joint, hinge in self.hinges.items()]
             arrays += [(f"start_pose_offset.{s}.tilt", start.tilt, (2,)) for s, start in self.start_pose_offset.items()]
@@ -127,6 +113,20 @@ class Subject:
             raise BadSubject(str(error)) from None
         return self
 
+    def check_body(self, table: BodyTable) -> None:
+        """Raise `BadSubject` where a name is none of the body's, or a length of the body is missing."""
+        where = f"subject '{self.name}': "
+        try:
+            check_names(f"{where}lengths", self.lengths, (*table.lengths, *table.absent))
+            missing = [name for name in table.lengths if name not in self.lengths]
+            if missing:
+                raise BadOption(f"{where}lengths: {', '.join(missing)} of the body {table.name} is missing")
+            for name in ("mounts", "start_pose_offset", "heading_drift"):
+                check_names(f"{where}{name}", getattr(self, name), table.segments)
+            check_names(f"{where}hinges", self.hinges, table.hinges)
+        except BadOption as error:
+            raise BadSubject(str(error)) from None
+
     def std(self, name: str) -> float:
         """One standard deviation of a length [m], or of a mount's axis [rad]; NaN where nothing is known."""
         if name not in self.order:
@@ -134,9 +134,9 @@ class Subject:
         k = self.order.index(name)
         return float(np.sqrt(self.covariance[k, k]))
 
-    def lengths_covariance(self, names: Iterable[str] = LENGTHS) -> np.ndarray:
-        """Covariance (n, n) [m²] of the named lengths; zero where nothing is known of a length's error."""
-        names = list(names)
+    def lengths_covariance(self, names: Iterable[str] | None = None) -> np.ndarray:
+        """Covariance (n, n) [m²] of the named lengths, or of all; zero where nothing is known of a length's error."""
+        names = list(self.lengths if names is None else names)
         known = [k for k, name in enumerate(names) if name in self.order]
         rows = [self.order.index(names[k]) for k in known]
         covariance = np.zeros((len(names), len(names)))
@@ -153,14 +153,14 @@ class Subject:
 
     def sample(self, rng: np.random.Generator) -> Subject:
         """A random person from this one's distribution of lengths, for simulation."""
-        mean = np.array([self.lengths[name] for name in LENGTHS])
+        mean = np.array(list(self.lengths.values()))
         drawn = rng.multivariate_normal(mean, self.lengths_covariance())
         # Guards the far tails of the distribution.
         drawn = np.clip(drawn, 0.7 * mean, 1.3 * mean)
         return replace(
             self,
             name="sampled",
-            lengths=dict(zip(LENGTHS, drawn.tolist(), strict=True)),
+            lengths=dict(zip(self.lengths, drawn.tolist(), strict=True)),
             covariance=np.zeros_like(self.covariance),
             note="a random person of the population",
         )
@@ -171,64 +171,50 @@ def mount_rows(segment: str) -> list[str]:
     return [f"mounts.{segment}.{axis}" for axis in "xyz"]
 
 
-_ROWS = (*LENGTHS, *(row for segment in SEGMENTS for row in mount_rows(segment)))  # rows that a covariance may have
-
-
-def check_lengths(place: str, lengths: Mapping[str, float], names: Collection[str]) -> None:
-    """Check that each length [m] has one of the names and a possible value.
-
-    Raises
-    ------
-    BadOption
-        An unknown name, or an impossible value.
-    """
-    check_names(place, lengths, names)
+def check_lengths(place: str, lengths: Mapping[str, float]) -> None:
+    """Raise `BadOption` where a length [m] has an impossible value."""
     for name, value in lengths.items():
         if not 0.0 < value < LONGEST:
             raise BadOption(f"{place}.{name} = {value:g}: a length in metres is needed, above 0 and below {LONGEST:g}")
 
 
-def population_subject(stature: float | None = None, sex: str | None = None) -> Subject:
-    """The anthropometric prior: mean lengths and their covariance over people.
+def population_subject(
+    stature: float | None = None, sex: str | None = None, body: BodyModel | BodyTable | None = None
+) -> Subject:
+    """The prior of a body's lengths: those that people have, with their covariance.
 
-    Lengths share the stature's spread where it is not given, left and right share the person's shape; numbers and
-    sources stand in ``calibration/anthropometry.toml``.
+    Lengths share the stature's spread where it is not given, left and right share the person's shape. A length that is
+    no share of stature, of a robot say, is that of the model, to within the percentage that the table states.
 
     Parameters
     ----------
     stature : body height [m]; None: 1.75 with the spread of adults
     sex : "f", "m", or None for the mean of both
+    body : None: the upper body
 
     Raises
     ------
     BadOption
         A stature outside 1.0 to 2.5 m, or another sex.
+    BadModel
+        The table names a share that is not known, or a length that is none without a model.
     """
     check_arguments(population_subject, locals())
-    if stature is not None and not 1.0 <= stature <= 2.5:
-        raise BadOption(f"stature {stature:g} is not a body height in metres; between 1.0 and 2.5")
-    if sex is not None and sex not in SEXES:
-        raise BadOption(f"sex '{sex}' is not known; {one_of(SEXES)}")
-    table = read_toml(asset("calibration", "anthropometry.toml"), "the anthropometric prior")
-    height = stature if stature is not None else table["stature"]["mean"]
-    height_std = 0.0 if stature is not None else table["stature"]["std"] / table["stature"]["mean"]
-    shares = [table[{"f": "female", "m": "male"}[s]] for s in ([sex] if sex else SEXES)]
-
-    part = [name.removeprefix("left_").removeprefix("right_") for name in LENGTHS]
-    mean = np.array([height * np.mean([share[p] for share in shares]) for p in part])
-    # Relative errors: one of stature common to all, one of shape common to left and right, one of each side.
-    shape = np.array([table["shape_std"][p] for p in part])
-    same = np.array([[a == b for a in part] for b in part], dtype=float)
-    sided = np.array([p != name for p, name in zip(part, LENGTHS, strict=True)], dtype=float)
-    relative = height_std**2 + same * np.outer(shape, shape) + np.diag(sided * table["asymmetry_std"]["all"] ** 2)
-    known = ", ".join([f"stature {height:g} m" + ("" if stature else " assumed"), f"sex {sex or 'not given'}"])
-    return Subject(
-        name="population",
-        lengths=dict(zip(LENGTHS, mean.tolist(), strict=True)),
-        order=LENGTHS,
-        covariance=np.outer(mean, mean) * relative,
-        note=f"population prior ({known})",
-    )
+    table = load_table() if body is None else body if isinstance(body, BodyTable) else body.table
+    people = compute_population_lengths(table, stature, sex)
+    lengths, variances = dict(zip(people.names, people.mean.tolist(), strict=True)), {}
+    for name, length in table.lengths.items():
+        if name not in lengths:
+            if not isinstance(body, BodyModel):
+                raise BadModel(f"{table.where}: lengths.{name} is no share of stature; its model is needed")
+            lengths[name] = body.lengths[name]
+            variances[name] = (length.relative_std * lengths[name]) ** 2
+    order = tuple(table.lengths)
+    covariance = np.diag([variances.get(name, 0.0) for name in order])
+    rows = [order.index(name) for name in people.names]
+    covariance[np.ix_(rows, rows)] += people.covariance
+    note = people.note if people.names else f"lengths of the model {table.name}"
+    return Subject("population", {name: lengths[name] for name in order}, order, covariance, note=note)
 
 
 def subject_toml(subject: Subject) -> str:
@@ -304,7 +290,8 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
     top.allow("format", "name", "note", *_TABLES)
     tables = {name: top.table(name, {}) for name in _TABLES}
     of_segments = {
-        name: tables[name].tables(SEGMENTS, "segment") for name in ("mounts", "start_pose_offset", "heading_drift")
+        name: {segment: tables[name].table(segment) for segment in tables[name].values}
+        for name in ("mounts", "start_pose_offset", "heading_drift")
     }
     offset = {
         segment: np.radians(entry.numbers("x_deg", "y_deg", "std_deg", most=MOST_OFFSET_DEG))
@@ -314,9 +301,9 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         segment: np.radians(entry.numbers("rate_deg_min", "std_deg_min", most=MOST_DRIFT_DEG_MIN)) / 60.0
         for segment, entry in of_segments["heading_drift"].items()
     }
-    hinges = tables["hinges"].tables(HINGES, "joint")
+    hinges = {joint: tables["hinges"].table(joint) for joint in tables["hinges"].values}
     lengths = _read_lengths(tables["lengths"])
-    order, matrix = _read_covariance(tables["covariance"], tables["lengths_std"])
+    order, matrix = _read_covariance(tables["covariance"], tables["lengths_std"], tuple(lengths))
     return Subject(
         name=str(values.get("name", path.parent.name)),
         lengths=lengths,
@@ -333,31 +320,31 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
 
 
 def _read_lengths(table: TomlTable) -> dict[str, float]:
-    """Every one of `LENGTHS` [m]."""
-    table.allow(*LENGTHS)
-    for name in LENGTHS:
-        value = table.values.get(name)
+    """The lengths [m]."""
+    if not table.values:
+        raise BadSubject(f"{table.where} is empty or missing; it needs the lengths of the body [m]")
+    for name, value in table.values.items():
         if not is_number(value, LONGEST) or value <= 0.0:
             raise BadSubject(f"{table.at(name)} = {value!r}; a number in metres is needed, above 0")
-    return {name: float(table.values[name]) for name in LENGTHS}
+    return {name: float(value) for name, value in table.values.items()}
 
 
-def _read_covariance(table: TomlTable, std: TomlTable) -> tuple[tuple[str, ...], np.ndarray]:
+def _read_covariance(table: TomlTable, std: TomlTable, lengths: Collection[str]) -> tuple[tuple[str, ...], np.ndarray]:
     """What the rows are, and the matrix; without a table of its own that of the lengths' standard deviations [m]."""
-    std.allow(*LENGTHS)
+    std.allow(*lengths)
     for name, value in std.values.items():
         if not is_number(value, LONGEST) or value < 0.0:
             raise BadSubject(f"{std.at(name)} = {value!r}; a standard deviation in metres is needed")
     if not table.values:
-        order = tuple(name for name in LENGTHS if name in std)
+        order = tuple(name for name in lengths if name in std)
         return order, np.diag([float(std.values[name]) ** 2 for name in order])
     table.allow("order", "matrix")
     order = table.values.get("order", ())
     if not isinstance(order, list | tuple) or len(set(map(str, order))) != len(order):
         raise BadSubject(f"{table.at('order')} = {order!r}; a list of names is needed, each once")
     for name in order:
-        if name not in _ROWS:
-            raise BadSubject(f"{table.at('order')}: {name!r} is not known; {one_of(_ROWS, str(name))}")
+        if name not in lengths and not _MOUNT_ROW.fullmatch(str(name)):
+            raise BadSubject(f"{table.at('order')}: {name!r} is not known; {one_of(lengths, str(name))}")
     place = table.at("matrix")
     try:
         matrix = np.array(table.values.get("matrix"), dtype=float)

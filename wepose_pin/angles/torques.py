@@ -18,7 +18,6 @@ import polars as pl
 from scipy.signal import butter, sosfiltfilt
 
 from ..errors import BadData, BadModel, BadOption
-from ..model import chains
 from ..rotations import unwrap_signs
 from ..tracking import TrackedRecording
 
@@ -117,7 +116,7 @@ def pose_torques(tracked: TrackedRecording, cutoff_hz: float = CUTOFF_HZ) -> Tor
     Masses are the model's, stretched with the subject's lengths (`BodyModel.with_lengths`), not the person's.
     """
     model = tracked.model.pin
-    moved = {joint for name, chain in chains(model).items() if name in tracked.quat_WL for joint in chain.joints}
+    moved = {joint for name, chain in tracked.model.chains.items() if name in tracked.quat_WL for joint in chain.joints}
     return joint_torques(model, tracked.time, tracked.q, cutoff_hz, moved)
 
 

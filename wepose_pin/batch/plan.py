@@ -19,8 +19,9 @@ from ..jobs.export import ExportJob
 from ..jobs.fields import REQUIRED, build_job, convert_value, field_defaults, field_types
 from ..jobs.retarget import RetargetJob
 from ..jobs.track import TrackJob
+from ..model import load_table
 from ..readers.tables import read_table
-from ..subject import LENGTHS, population_subject
+from ..subject import population_subject
 from .storage import find_urls, is_remote
 
 SESSION = "session.toml"
@@ -109,7 +110,7 @@ def _read_plan(path: Path, items_folder: str) -> Plan:
     top = TomlTable(read_toml(path, "a plan"), str(path))
     top.allow("name", "sessions", "subjects", "steps")
     steps = _read_steps(top, path.parent)
-    lengths = (*LENGTHS, *_list_protocol_lengths(steps))
+    lengths = (*load_table().lengths, *_list_protocol_lengths(steps))
     tables = top.table("subjects", {})
     subjects = {name: _read_subject(tables.table(name), path, lengths) for name in tables.values}
     named = [

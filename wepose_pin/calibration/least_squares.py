@@ -29,8 +29,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import SEGMENT_ATTITUDE_STD
-from ..subject import LENGTHS
-from .chain import SIDES, about_z, inverse, links, product, rotate, small_turn
+from .chain import LENGTHS, SIDES, about_z, inverse, links, product, rotate, small_turn
 from .protocols import Closure, Condition, Direction, coefficients
 
 HINGE_STD = np.deg2rad(2.0)  # [rad] of the forearm against the elbow's plane

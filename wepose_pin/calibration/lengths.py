@@ -35,11 +35,12 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
+from ..model import load_table
 from ..recording import Recording
-from ..subject import LENGTHS, HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
+from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
 from .anatomy import BETTER, LabelCheck, check_labels
-from .chain import SIDES
+from .chain import LENGTHS, SIDES
 from .contact import find_contact_start
 from .joints import add_couplings, estimate_couplings
 from .least_squares import HINGE_STD, Gaussian, K, Layout, Observations, place_points, residuals
@@ -97,6 +98,7 @@ def calibrate_lengths(
         protocol = load_protocol(protocol)
     with_std = {name: (metres, measured_std) for name, metres in (measured or {}).items()}
     _check_measured(with_std, protocol)
+    load_table().check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
     for segment in protocol.needs:
         if segment not in recording.sensors:
             raise BadSession(
@@ -104,6 +106,7 @@ def calibrate_lengths(
                 f"{', '.join(protocol.needs)}"
             )
     prior = prior or population_subject()
+    prior.check_body(load_table())
     for condition in protocol.conditions:
         recording.phase(condition.phase)
     filtered = filter_recording(recording, method=method)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..recording import format_span
-from ..subject import LENGTHS
+from .chain import LENGTHS
 from .least_squares import K, Observations
 from .problem import CalibrationProblem
 from .protocols import PROTOCOLS, Closure, Protocol, load_protocol

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from ..alignment import START_POSE_STD, find_mount_covariance
 from ..errors import BadSubject
-from ..subject import LENGTHS, Subject
+from ..subject import Subject
+from .chain import LENGTHS
 from .initial_headings import estimate_headings
 from .least_squares import Gaussian, K, Observations, place_points
 from .losses import FREE_STD, HEADING_STD

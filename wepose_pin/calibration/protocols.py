@@ -22,9 +22,8 @@ from ..alignment import PALM_SLIP_STD
 from ..assets import asset
 from ..documents import is_number, read_toml
 from ..errors import BadOption, one_of
-from ..recording import SEGMENTS
-from ..subject import LENGTHS
-from .chain import CHAIN, default_reaches
+from ..model import load_table
+from .chain import CHAIN, LENGTHS, default_reaches
 
 PROTOCOLS = ("clasp", "clasp_measured", "handle", "poses", "touch_left", "touch_right")
 KINDS = {"coincide": 2, "distance": 2, "fixed_point": 1}  # how many points each takes
@@ -196,7 +195,9 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
         conditions.append(Axis(str(_get(entry, "phase", place)), segment, std))
     if not conditions:
         raise BadOption(f"{path}: no [[closure]], [[pose]] or [[axis]]; a protocol needs one at least")
-    needs = tuple(_among(segment, SEGMENTS, f"{path}: needs") for segment in _list(table, "needs", str(path)))
+    needs = tuple(
+        _among(segment, load_table().segments, f"{path}: needs") for segment in _list(table, "needs", str(path))
+    )
     steps = []
     for i, entry in enumerate(table.get("step", [])):
         place = f"{path}: step {i + 1}"

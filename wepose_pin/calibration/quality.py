@@ -16,8 +16,8 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
-from ..subject import LENGTHS
 from .anatomy import E_Z, SIDES
+from .chain import LENGTHS
 from .observability import MOST_OPEN, find_intervals, format_longest
 from .result import Calibration
 from .weights import CONTRADICTED, MIN_CONTACT

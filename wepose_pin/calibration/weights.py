@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..subject import LENGTHS, mount_rows
-from .chain import SIDES
+from ..subject import mount_rows
+from .chain import LENGTHS, SIDES
 from .least_squares import Gaussian, K, Layout, Observations
 from .protocols import Closure
 from .solver import STEPS, Fit, LeastSquares, solve

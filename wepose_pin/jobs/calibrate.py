@@ -69,9 +69,9 @@ class CalibrateJob:
     def check(self) -> None:
         """Raise `WeposeError` where the protocol is none, or a length is measured that it does not know."""
         from ..calibration import load_protocol
-        from ..subject import LENGTHS
+        from ..model import load_table
 
-        known = (*LENGTHS, *load_protocol(self.protocol).distances)
+        known = (*load_table().lengths, *load_protocol(self.protocol).distances)
         for name, metres in self.measured.items():
             stated = f"{name}={metres:g}"
             if name == "handle" and name not in known:

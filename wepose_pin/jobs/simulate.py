@@ -109,7 +109,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
 
     from ..documents import whole_folder
     from ..simulation import simulate, simulate_person
-    from ..subject import LENGTHS, mount_rows, subject_toml
+    from ..subject import mount_rows, subject_toml
     from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
 
@@ -126,7 +126,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
             circles=0 if job.protocol == "poses" else CIRCLES,
         )
         write_session(folder, simulation.recording(f"simulated-{job.seed}"), simulation.truth())
-        order = (*LENGTHS, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
+        order = (*simulation.lengths, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
         true = replace(
             person.prior,
             name="truth",

@@ -10,7 +10,6 @@ import pinocchio as pin
 
 from ..kinematics import LiveKinematics, find_known_links
 from ..model import BodyModel
-from ..model.chains import chains
 from ..report.viewer import visible
 from .state import LivePose, StreamInfo
 
@@ -64,7 +63,7 @@ class MeasuredLinks:
         known = set(find_known_links(model, info.segments))
         self.known = np.array([link in known for link in links], dtype=bool)
         self._hands = [info.points.index(hand) if hand in info.points else -1 for hand in HANDS]
-        moved = {chain.joints[-1]: segment for segment, chain in chains(model.pin).items() if chain.joints}
+        moved = {chain.joints[-1]: segment for segment, chain in model.chains.items() if chain.joints}
         self._rows = []  # of each link the sensor that places it; -1: none
         for frame in frames:
             joint = model.pin.frames[frame].parentJoint

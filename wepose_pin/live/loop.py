@@ -13,9 +13,9 @@ import numpy as np
 from ..diagnostics import Diagnostic
 from ..filters import BEST
 from ..kinematics import LiveKinematics
-from ..model import BodyModel, load_model
+from ..model import BodyModel, load_model, load_table
 from ..readers.live_log import build_recording
-from ..recording import SEGMENTS, ImuSensor, Recording
+from ..recording import ImuSensor, Recording
 from ..recording.arrivals import (
     COUNTS,
     CUT_OFF,
@@ -439,7 +439,7 @@ def _measure_rate(times: Sequence[np.ndarray]) -> float:
 
 def warm_up(method: str) -> None:
     """Run a tracker once: compilation and reading of files must not delay the start pose."""
-    n, rng, sensors = 200, np.random.default_rng(0), SEGMENTS[:2]
+    n, rng, sensors = 200, np.random.default_rng(0), tuple(load_table().segments)[:2]
     recording = Recording(
         "warm",
         np.arange(n) / 100.0,

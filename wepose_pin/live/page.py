@@ -14,8 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from ..kinematics import find_known_points
-from ..model import POINTS, BodyModel
-from ..model.chains import chains
+from ..model import BodyModel
 from ..report.viewer import DARK, LIGHT, backdrop, filled, scene, trail_colour, view
 from .addresses import LOOPBACK
 from .encoder import HANDS, PoseEncoder
@@ -114,8 +113,8 @@ def _find_reach(model: BodyModel) -> np.ndarray:
     """Points (n, 3) [m] that the hands reach in front, at the sides and above the head."""
     data = pin.Data(model.pin)
     pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
-    known = [point for point in find_known_points(chains(model.pin)) if model.pin.existFrame(POINTS[point])]
-    p_W = {point: data.oMf[model.pin.getFrameId(POINTS[point])].translation for point in known}
+    known = find_known_points(model, model.chains)
+    p_W = {point: data.oMf[model.pin.getFrameId(model.point_frames[point])].translation for point in known}
     ends = [np.zeros(3)]
     for hand, left in zip(HANDS, (1.0, -1.0), strict=True):
         if hand in p_W:

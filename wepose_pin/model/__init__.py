@@ -5,29 +5,39 @@ joints with intersecting orthogonal axes and massless links between them. They a
 `pin.JointModelSpherical`, whose frame at zero is that of the link it moves; a `floating` joint likewise, since W does
 not travel. Other joints stay as they are.
 
-Every body has links named after our segments, in our frames, and `POINTS` are origins of links. A body of others gets
-them from a table (`LinkTable`): massless links, fixed to its own.
+What there is on a body stands in a table beside its URDF (`BodyTable`): segments, points, lengths, hinges, poses,
+pairs. In a `BodyModel` links bear the names of segments and points, in our frames; a body of others gets massless links
+for them, fixed to its own.
 
-`tree` reads the joints, `table` names the links, `lengths` measures and stretches, `chains` turns a segment's
-orientation into joint values, `visuals` reads the shapes of the links.
+`tree` reads the joints, `table` the table, `naming` gives links its names, `lengths` measures and stretches,
+`anthropometry` has the lengths of people, `chains` turns a segment's orientation into joint values, `reaches` has the
+way from the root to each point, `visuals` reads the shapes of the links.
 """
 
-from .body import DEFAULT_URDF, BodyModel, load_model
-from .chains import Chain, chains
-from .table import POINTS, LinkTable, SegmentLink, read_table
+from .anthropometry import SEXES, LengthPrior, compute_population_lengths
+from .body import BodyModel, load_model
+from .chains import Chain
+from .reaches import LinkVector, measure_reaches
+from .table import DEFAULT_BODY, BodyTable, HingeJoint, Segment, find_table, load_table, read_table
 from .tree import AxisLimits
 from .visuals import Visual
 
 __all__ = [
-    "DEFAULT_URDF",
-    "POINTS",
+    "DEFAULT_BODY",
+    "SEXES",
     "AxisLimits",
     "BodyModel",
+    "BodyTable",
     "Chain",
-    "LinkTable",
-    "SegmentLink",
+    "HingeJoint",
+    "LengthPrior",
+    "LinkVector",
+    "Segment",
     "Visual",
-    "chains",
+    "compute_population_lengths",
+    "find_table",
     "load_model",
+    "load_table",
+    "measure_reaches",
     "read_table",
 ]

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+import numpy as np
 import pinocchio as pin
 
 from ..arguments import check_arguments
 from ..assets import asset
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, MissingFile, one_of
-from ..subject import population_subject
 from . import lengths as _lengths
 from . import visuals as _visuals
-from .chains import chains
-from .table import MOST_LINKS, NEEDED, LinkTable, find_table, format_closest_links, read_table, rename_links, table_from
-from .tree import AxisLimits, build, find_impossible_inertia, parse_tree
+from .anthropometry import compute_population_lengths
+from .chains import Chain, find_chains, find_parents
+from .naming import MOST_LINKS, format_closest_links, rename_links
+from .reaches import LinkVector, measure_reaches
+from .table import DEFAULT_BODY, BodyTable, find_table, load_table, parse_table, read_table
+from .tree import AxisLimits, build, find_bounds, find_impossible_inertia, parse_tree
 from .visuals import Visual
 
-DEFAULT_URDF = "upper_body.urdf"
 # Standard deviations off the mean of adults (calibration/anthropometry.toml), above which a length is implausible.
 FAR_OFF = 5.0
 # So is a mass [kg] beyond ten standard deviations above the mean of men, 85.5 ± 14.2 kg (ANSUR II), or below an upper
@@ -37,46 +40,67 @@ class BodyModel:
     Parameters
     ----------
     pin : the Pinocchio model; one frame a link, of the link's name. Its universe is W
-    robot : the parsed URDF it was built from, already with its lengths and our names (yourdfpy)
+    robot : the parsed URDF it was built from, already with its lengths and the table's names (yourdfpy)
+    table : what there is on it; its links bear the names of segments and points
     joints : child link of a spherical joint → its Pinocchio joint
     limits : the same → what its three axes may do; without an entry for a `floating` joint
     """
 
     pin: pin.Model
     robot: Any
+    table: BodyTable
     joints: Mapping[str, int]
     limits: Mapping[str, AxisLimits]
 
-    @property
+    @cached_property
     def lengths(self) -> dict[str, float]:
         """The lengths [m] that this model has, measured on it in the neutral configuration."""
-        return _lengths.lengths(self.robot)
+        return _lengths.measure_lengths(self.robot, self.table)
+
+    @cached_property
+    def chains(self) -> dict[str, Chain]:
+        """Segment → the joints that set its orientation, in the order of Pinocchio's joints."""
+        return find_chains(self.pin, self.table)
+
+    @cached_property
+    def parents(self) -> dict[str, str | None]:
+        """Segment → the segment above it; None for the first."""
+        return find_parents(self.pin, self.table)
+
+    @cached_property
+    def reaches(self) -> dict[str, dict[str, LinkVector]]:
+        """Point → link → its part of the way from the root."""
+        return measure_reaches(self)
+
+    @cached_property
+    def point_frames(self) -> dict[str, str]:
+        """Point → the frame whose origin it is."""
+        return {name: point.link for name, point in self.table.points.items()}
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """Implausible lengths, mass or moments of inertia, and a trunk that cannot move."""
-        name, prior = self.robot.name, population_subject()
+        name, people = self.robot.name, compute_population_lengths(self.table)
         diagnostics = []
-        for length, value in self.lengths.items():
-            mean, std = prior.lengths[length], prior.std(length)
+        for length, mean, std in zip(people.names, people.mean, np.sqrt(np.diag(people.covariance)), strict=True):
+            value = self.lengths[length]
             if abs(value - mean) > FAR_OFF * std:
                 plausible = {"shortest": max(0.0, mean - FAR_OFF * std), "longest": mean + FAR_OFF * std}
                 facts: dict[str, float | str] = {"model": name, "deviations": FAR_OFF, **plausible}
                 diagnostics.append(Diagnostic("model-length-implausible", WARNING, length, value, facts=facts))
         mass = sum(inertia.mass for inertia in self.pin.inertias)
-        if mass and not LIGHTEST <= mass <= HEAVIEST:
+        if mass and people.names and not LIGHTEST <= mass <= HEAVIEST:
             facts = {"lightest": LIGHTEST, "heaviest": HEAVIEST}
             diagnostics.append(Diagnostic("model-mass-implausible", WARNING, name, mass, facts=facts))
         impossible = find_impossible_inertia(self.robot)
         if impossible:
             facts = {"links": ", ".join(impossible)}
             diagnostics.append(Diagnostic("model-inertia-impossible", WARNING, name, facts=facts))
-        torso = chains(self.pin).get("torso")
-        if torso is not None and not torso.joints:
-            rigid = ", ".join(joint.name for joint in parse_tree(self.robot, name).path("torso"))
-            diagnostics.append(
-                Diagnostic("model-torso-fixed", WARNING, name, facts={"joints": rigid or "the root is the torso"})
-            )
+        first = self.table.reference
+        if not self.table.is_mechanism and not self.chains[first].joints:
+            rigid = ", ".join(joint.name for joint in parse_tree(self.robot, name).path(first))
+            facts = {"joints": rigid or "the root", "segment": first}
+            diagnostics.append(Diagnostic("model-torso-fixed", WARNING, name, facts=facts))
         return tuple(diagnostics)
 
     @property
@@ -102,7 +126,7 @@ class BodyModel:
                 raise BadModel(
                     f"{self.robot.name}: length {name} = {value!r} is no length of a body: above 0 and below 10 m"
                 )
-        return _body(_lengths.with_lengths(self.robot, lengths), self.robot.name)
+        return _body(_lengths.with_lengths(self.robot, self.table, lengths), self.table, self.robot.name)
 
     def urdf(self) -> str:
         """This body as the text of a URDF that any tool reads."""
@@ -117,6 +141,7 @@ def load_model(
     path: str | Path | None = None,
     lengths: Mapping[str, float] | None = None,
     *,
+    like: str = DEFAULT_BODY,
     segments: Mapping[str, Any] | None = None,
     points: Mapping[str, Any] | None = None,
     up: str = "+z",
@@ -128,10 +153,13 @@ def load_model(
     Parameters
     ----------
     path
-        A URDF, or a table (TOML) that names one and its links; None for ours, a person of 1.75 m.
+        A URDF, or a table (TOML) that names one, or the name of a body that comes with the package ("whole_body"); None
+        for the upper body, a person of 1.75 m.
+    like
+        The body whose names and lengths `segments` and `points` are.
     segments
         Segment → its link; or → ``{"link": …, "up": "+z", "forward": "+x"}`` with the link's axes in the N-pose, where
-        they do not follow from the arm's direction at zero. None: a ``model.toml`` beside the URDF, the segments' own
+        they do not follow from the segment's direction at zero. None: a table beside the URDF, the segments' own
         names, or a table of ours that fits (human-gazebo, the human of example-robot-data).
     points
         Point → its link, or ``{"link": …, "at": [x, y, z]}`` [m], where it is not the origin of the segment's link.
@@ -144,35 +172,63 @@ def load_model(
     ------
     MissingFile, BadModel
         Not there; not a URDF; no tree with one root; a table that names what is not there; no links for the segments;
-        an arm without a joint that could move it.
+        a segment without a joint that could move it.
     """
     check_arguments(load_model, locals())
-    path = Path(path) if path is not None else asset("urdf", DEFAULT_URDF)
-    table: LinkTable | None = None
+    path = _find_body(path)
+    table: BodyTable | None = None
     if path.suffix.lower() == ".toml":
-        table, urdf = read_table(path)
-        if urdf is None:
-            raise BadModel(f'{path}: names no URDF; urdf = "body.urdf" is wanted, a file beside this one')
-        path = urdf
+        table, urdf = read_table(path, needs_urdf=True)
+        path = urdf or path
     if segments is not None:
-        entries = {"segments": segments, "points": points or {}, "up": up, "forward": forward, "root": root}
-        table = table_from(entries, str(path))
+        entries = {"like": like, "segments": segments, "points": points or {}, "up": up, "forward": forward}
+        table = parse_table({**entries, "root": root or ()}, str(path), path.stem)
     elif points is not None or root is not None or (up, forward) != ("+z", "+x"):
         raise BadModel(f"{path}: points, up, forward and root are part of a table; give segments with them")
     robot = read_urdf(path)
-    tree = parse_tree(robot, str(path))
+    tree, own = parse_tree(robot, str(path)), table is not None
     table = table or find_table(path, tree.below)
-    if table is not None:
-        robot = rename_links(robot, table)
-    lacking = [link for link in NEEDED if link not in parse_tree(robot, str(path)).below]
-    if lacking:
+    if table is None:
+        default = load_table()
+        lacking = [name for name in default.needed if default.segments[name].link not in tree.below]
         raise BadModel(
-            f"{path}: no link {format_closest_links(lacking, tree.below)}; name the segments' links in a table, as "
-            f"docs/models.md shows; {one_of(tree.below, most=MOST_LINKS)}"
+            f"{path}: no link {format_closest_links(lacking, tree.below, default)}; name the segments' links in a "
+            f"table, as docs/models.md shows; {one_of(tree.below, most=MOST_LINKS)}"
         )
-    body = _body(robot, str(path))
-    _check_arms(body, str(path))
+    if own:
+        _check_poses(robot, table)
+    else:  # the names fit; joints may have others
+        joints = {joint.name for joint in robot.joints}
+        table = replace(table, poses={name: pose for name, pose in table.poses.items() if joints.issuperset(pose)})
+    robot, table = rename_links(robot, table)
+    body = _body(robot, table, str(path))
+    _check_segments_move(body, str(path))
+    if own:
+        _lengths.check_lengths_scale(robot, table)
     return body.with_lengths(lengths) if lengths else body
+
+
+def _find_body(path: str | Path | None) -> Path:
+    """The file of a body: ours by its name, else the path itself."""
+    if path is None:
+        return asset("urdf", f"{DEFAULT_BODY}.urdf")
+    path = Path(path)
+    if path.suffix or path.exists() or len(path.parts) > 1:
+        return path
+    return asset("urdf", f"{load_table(path.name).name}.toml")
+
+
+def _check_poses(robot: Any, table: BodyTable) -> None:
+    """Raise `BadModel` where a pose names a joint that is none, or has a value outside its limits."""
+    joints = {joint.name: joint for joint in robot.joints if joint.type != "fixed"}
+    for pose, values in table.poses.items():
+        for name, value in values.items():
+            place = f"{table.where}: poses.{pose}.{name}"
+            if name not in joints:
+                raise BadModel(f"{place} is no joint that moves; {one_of(joints, name)}")
+            low, high = find_bounds(joints[name], np.inf)
+            if not low - 1e-6 <= value <= high + 1e-6:
+                raise BadModel(f"{place} = {value:g} is outside its limits, {low:g} to {high:g}")
 
 
 def read_urdf(path: Path) -> Any:
@@ -205,21 +261,26 @@ def read_urdf(path: Path) -> Any:
     return robot
 
 
-def _check_arms(body: BodyModel, where: str) -> None:
-    """Raise an error on arm segments that no joint moves against the segment above, or that no joint could follow."""
-    links, tree = chains(body.pin), parse_tree(body.robot, where)
+def _check_segments_move(body: BodyModel, where: str) -> None:
+    """Raise `BadModel` on segments that no joint moves against the one above, and on hinges between no neighbours."""
+    table, tree = body.table, parse_tree(body.robot, where)
     rigid = []
-    for segment in NEEDED[1:]:
-        if not links[segment].joints:
-            above = segment.replace("forearm", "upper_arm") if segment.endswith("forearm") else "torso"
+    for segment in table.needed:
+        above = body.parents[segment]
+        if above is not None and not body.chains[segment].joints:
             shared = {joint.name for joint in tree.path(above)}
             between = [f"'{joint.name}' ({joint.type})" for joint in tree.path(segment) if joint.name not in shared]
             rigid.append(f"{segment} against {above} (between them: {', '.join(between) or 'nothing'})")
     if rigid:
         raise BadModel(
-            f"{where}: no joint moves {'; '.join(rigid)}: the arm could not follow a person's; it needs revolute "
-            f"joints there"
+            f"{where}: no joint moves {'; '.join(rigid)}: the body could not follow; it needs revolute joints there"
         )
+    for name, hinge in table.hinges.items():
+        if body.parents[hinge.moves] != hinge.on:
+            raise BadModel(
+                f"{table.where}: hinges.{name} is none: {hinge.moves} hangs on "
+                f"{body.parents[hinge.moves] or 'the root'}, not on {hinge.on}"
+            )
 
 
 def _check_xml(path: Path) -> None:
@@ -232,6 +293,6 @@ def _check_xml(path: Path) -> None:
         parser.ParseFile(file)
 
 
-def _body(robot: Any, where: str) -> BodyModel:
-    built = build(robot, where)
-    return BodyModel(built.pin, robot, built.joints, built.limits)
+def _body(robot: Any, table: BodyTable, where: str) -> BodyModel:
+    built = build(robot, where, spherical=not table.is_mechanism)
+    return BodyModel(built.pin, robot, table, built.joints, built.limits)

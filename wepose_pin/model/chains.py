@@ -3,10 +3,10 @@
 Between a segment and the one above it lie joints. The rotation that they have to make together is known from the
 orientations; how they share it is decided here:
 
-- an arm's segment is set by the joints nearest to it, as many as make three axes; others above (a clavicle) rest;
-- torso, pelvis and head are set by all joints in between: each place in the spine takes an equal share of the tilt;
+- a segment of a limb is set by the joints nearest to it, as many as make three axes; others above (a clavicle) rest;
+- a segment of the spine is set by all joints in between: each place in the spine takes an equal share of the tilt;
 - where one of them is spherical, it takes what the others leave, with it the turn about the segment's long axis (a
-  a whole turn of the person does not twist the spine): the segment follows exactly;
+  whole turn of the person does not twist the spine): the segment follows exactly;
 - one or two axes come as near as they can, in closed form; three and more by Levenberg-Marquardt.
 
 Near means the smallest angle. Limits of joints are not looked at here; `follow` keeps those of hinges.
@@ -15,6 +15,7 @@ Near means the smallest angle. Limits of joints are not looked at here; `follow`
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -22,10 +23,9 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadModel
-from ..recording import SEGMENTS
 from ..rotations import conjugate, exp, log, multiply, rotation_about
+from .table import BodyTable
 
-AXIAL = ("torso", "pelvis", "head")
 _MEET_TOLERANCE = 1e-6  # [m]
 _ROUNDS = 60  # Levenberg-Marquardt; about 6 are the rule
 _CLOSE = 1e-24  # [rad²]
@@ -51,7 +51,7 @@ class Chain(NamedTuple):
         return any(axis is None for axis in self.axes)
 
 
-def chains(model: pin.Model) -> dict[str, Chain]:
+def find_chains(model: pin.Model, table: BodyTable) -> dict[str, Chain]:
     """Segment → its chain, for segments that the model has, in the order of Pinocchio's joints.
 
     Raises
@@ -59,11 +59,8 @@ def chains(model: pin.Model) -> dict[str, Chain]:
     BadModel
         A mimic joint lies between two segments.
     """
-    frames = {frame.name: frame for frame in model.frames[1:] if frame.name in SEGMENTS}
-    at: dict[int, str] = {}  # joint → the first of the segments that it carries; the others are rigid with that
-    for segment in SEGMENTS:
-        if segment in frames:
-            at.setdefault(frames[segment].parentJoint, segment)
+    frames = {name: model.frames[model.getFrameId(name)] for name in table.segments if model.existFrame(name)}
+    at = _first_segments(frames)
     between = {segment: _joints_below(model, joint, set(at)) for joint, segment in at.items()}
     for segment, joints in between.items():
         for joint in joints:
@@ -77,10 +74,33 @@ def chains(model: pin.Model) -> dict[str, Chain]:
     by_segment = {}
     for segment, frame in sorted(frames.items(), key=lambda item: item[1].parentJoint):
         free = [j for j in between.get(segment, []) if times[j] == 1 and "Prismatic" not in model.joints[j].shortname()]
-        if segment not in AXIAL:
+        if not table.segments[segment].spine:
             free = _take_nearest_three(model, free)
         by_segment[segment] = _chain(model, frame, free)
     return by_segment
+
+
+def find_parents(model: pin.Model, table: BodyTable) -> dict[str, str | None]:
+    """Segment → the segment above it, None for the first; of segments on one joint the later ones are on the first."""
+    frames = {name: model.frames[model.getFrameId(name)] for name in table.segments if model.existFrame(name)}
+    at = _first_segments(frames)
+    parents: dict[str, str | None] = {}
+    for segment, frame in frames.items():
+        joint = frame.parentJoint
+        if at[joint] != segment:
+            parents[segment] = at[joint]
+            continue
+        above = [j for j in reversed(model.supports[joint].tolist()) if j != joint and j in at]
+        parents[segment] = at[above[0]] if above else None
+    return parents
+
+
+def _first_segments(frames: Mapping[str, pin.Frame]) -> dict[int, str]:
+    """Joint → the first of the segments that it carries; the others are rigid with that."""
+    at: dict[int, str] = {}
+    for segment, frame in frames.items():
+        at.setdefault(frame.parentJoint, segment)
+    return at
 
 
 def solve(chain: Chain, quat: np.ndarray) -> list[np.ndarray]:

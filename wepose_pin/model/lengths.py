@@ -8,76 +8,87 @@ from typing import Any
 
 import numpy as np
 
-from ..recording import SEGMENTS
-from ..subject import LENGTHS
-from .table import POINTS
+from ..errors import BadModel
+from .table import ROOT, BodyTable, Stretch
 from .tree import Tree, parse_tree
 
 _TOLERANCE = 1e-13  # [m]
 _MOST_ROUNDS = 50  # one is enough where every point lies on its joint
-
-# Lengths of an arm's segments: from the first point to the second, which is where the next segment begins.
-ENDS = {
-    f"{side}_{part}": (f"{side}_{first}", f"{side}_{last}")
-    for side in ("left", "right")
-    for part, first, last in (
-        ("upper_arm", "shoulder", "elbow"),
-        ("forearm", "elbow", "wrist"),
-        ("hand", "wrist", "palm"),
-    )
-}
+_LEAST = 1e-6  # [m] of a length
 
 
-def lengths(robot: Any) -> dict[str, float]:
-    """The lengths [m] between the points of `robot` (yourdfpy), all joints at zero; those that it has."""
-    at = _points(parse_tree(robot, robot.name))
-    measured = {name: float(np.linalg.norm(at[b] - at[a])) for name, (a, b) in ENDS.items() if a in at and b in at}
-    if "left_shoulder" in at and "right_shoulder" in at:
-        measured["shoulder_width"] = float(np.linalg.norm(at["left_shoulder"] - at["right_shoulder"]))
-        measured["trunk"] = float(np.linalg.norm(at["left_shoulder"] + at["right_shoulder"]) / 2.0)
-    return {name: measured[name] for name in LENGTHS if name in measured}
+def measure_lengths(robot: Any, table: BodyTable) -> dict[str, float]:
+    """The lengths [m] between the points of `robot` (yourdfpy), all joints at zero; the mean where parts share one."""
+    at = _points(parse_tree(robot, robot.name), table)
+    return {
+        name: float(np.mean([np.linalg.norm(_line(at, part)) for part in length.stretches]))
+        for name, length in table.lengths.items()
+    }
 
 
-def with_lengths(robot: Any, targets: Mapping[str, float]) -> Any:
+def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> Any:
     """A copy of the robot with these lengths [m], each of which it has.
 
-    An arm's segment stretches along the line between its ends, the trunk along the lines from W's origin to the middle
-    of the shoulders and from shoulder to shoulder, all joints at zero.
+    A segment stretches along the line of its length, all joints at zero; one of several lengths along each of them.
     """
     robot = copy.deepcopy(robot)
     for _ in range(_MOST_ROUNDS):
-        own = lengths(robot)
+        own = measure_lengths(robot, table)
         ratio = {name: value / own[name] for name, value in targets.items() if abs(own[name] - value) > _TOLERANCE}
         if not ratio:
             break
-        _stretch(robot, ratio)
+        _stretch(robot, table, ratio)
     return robot
 
 
-def _points(tree: Tree) -> dict[str, np.ndarray]:
-    return {point: tree.neutral(link)[:3, 3] for point, link in POINTS.items() if link in tree.below}
+def check_lengths_scale(robot: Any, table: BodyTable) -> None:
+    """Raise `BadModel` where a length's points lie in one place, or stretching its segment does not move them apart."""
+    own = measure_lengths(robot, table)
+    for name, value in own.items():
+        if value < _LEAST:
+            raise BadModel(f"{table.where}: lengths.{name}: its points lie in one place; it scales nothing")
+    for name, value in own.items():
+        changed = copy.deepcopy(robot)
+        _stretch(changed, table, {name: 1.1})
+        if abs(measure_lengths(changed, table)[name] - 1.1 * value) > 0.05 * value:
+            segments = " and ".join(part.segment for part in table.lengths[name].stretches)
+            raise BadModel(
+                f"{table.where}: lengths.{name}: scales nothing: stretching {segments} does not move its points apart; "
+                f"name the segment between them"
+            )
 
 
-def _stretch(robot: Any, ratio: Mapping[str, float]) -> None:
+def _points(tree: Tree, table: BodyTable) -> dict[str, np.ndarray]:
+    return {ROOT: np.zeros(3)} | {name: tree.neutral(point.link)[:3, 3] for name, point in table.points.items()}
+
+
+def _line(at: Mapping[str, np.ndarray], part: Stretch) -> np.ndarray:
+    """The line (3,) [m] that a length measures."""
+    first, last = (np.sum([at[point] for point in points], axis=0) / len(points) for points in (part.start, part.end))
+    return last - first
+
+
+def _stretch(robot: Any, table: BodyTable, ratio: Mapping[str, float]) -> None:
     """Make the lengths longer by `ratio`.
 
-    To a segment belong all links from its own down to the next segments, to the torso also the spine below it, down to
-    the pelvis or the root, which keep their shape.
+    To a segment belong all links from its own down to the next segments, to one of the spine also the spine below it,
+    down to the next segment or the root, which keep their shape.
     """
     tree = parse_tree(robot, robot.name)
-    at = _points(tree)
-    starts = {segment: tree.body(segment) for segment in SEGMENTS if segment in tree.below}
+    at = _points(tree, table)
+    starts = {name: tree.body(segment.link) for name, segment in table.segments.items()}
     of_link: dict[str, np.ndarray] = {}  # (3, 3) in W
     of_joint: dict[str, np.ndarray] = {}
     for segment, start in starts.items():
-        S_W = _torso_stretch(at, ratio) if segment == "torso" else _arm_stretch(segment, at, ratio)
+        S_W = _segment_stretch(segment, table, at, ratio)
         if S_W is None:
             continue
         links = _links_between(tree, start, set(starts.values()))
-        if segment == "torso":
+        if table.segments[segment].spine:
             below = [joint.parent for joint in tree.path(start)]
-            if starts.get("pelvis") in below:
-                below = below[below.index(starts["pelvis"]) :]
+            bases = [link for name, link in starts.items() if name != segment and link in below]
+            if bases:
+                below = below[max(below.index(link) for link in bases) :]
             of_joint |= {joint.name: S_W for joint in tree.path(start) if joint.parent in below}
             links += below[1:]
         of_link |= dict.fromkeys(links, S_W)
@@ -90,21 +101,30 @@ def _stretch(robot: Any, ratio: Mapping[str, float]) -> None:
             _stretch_link(link, _rotate_to_link(tree, link.name, of_link[link.name]))
 
 
-def _arm_stretch(segment: str, at: Mapping[str, np.ndarray], ratio: Mapping[str, float]) -> np.ndarray | None:
-    if segment not in ratio:
+def _segment_stretch(
+    segment: str, table: BodyTable, at: Mapping[str, np.ndarray], ratio: Mapping[str, float]
+) -> np.ndarray | None:
+    """The stretch (3, 3) in W of a segment by its lengths; None where none of them changes."""
+    lines = [
+        (_line(at, part), ratio.get(name, 1.0))
+        for name, length in table.lengths.items()
+        for part in length.stretches
+        if part.segment == segment
+    ]
+    if all(factor == 1.0 for _, factor in lines):
         return None
-    first, last = ENDS[segment]
-    along = (at[last] - at[first]) / np.linalg.norm(at[last] - at[first])
-    return np.eye(3) + (ratio[segment] - 1.0) * np.outer(along, along)
-
-
-def _torso_stretch(at: Mapping[str, np.ndarray], ratio: Mapping[str, float]) -> np.ndarray | None:
-    if "trunk" not in ratio and "shoulder_width" not in ratio:
-        return None
-    up, across = at["left_shoulder"] + at["right_shoulder"], at["left_shoulder"] - at["right_shoulder"]
-    basis = np.column_stack([np.cross(across, up), across, up])
-    scale = np.diag([1.0, ratio.get("shoulder_width", 1.0), ratio.get("trunk", 1.0)])
-    return basis @ scale @ np.linalg.inv(basis)
+    if len(lines) == 1:
+        line, factor = lines[0]
+        along = line / np.linalg.norm(line)
+        return np.eye(3) + (factor - 1.0) * np.outer(along, along)
+    directions = np.array([line for line, _ in lines])  # (k, 3)
+    if len(lines) == 2:
+        directions = np.vstack([directions, np.cross(directions[1], directions[0])])
+    if len(lines) > 3 or abs(np.linalg.det(directions)) < 1e-9 * np.prod(np.linalg.norm(directions, axis=1)):
+        raise BadModel(f"{table.where}: the lengths of segment '{segment}' do not lie in different directions")
+    basis = directions.T
+    factors = [factor for _, factor in lines] + [1.0] * (3 - len(lines))
+    return basis @ np.diag(factors) @ np.linalg.inv(basis)
 
 
 def _links_between(tree: Tree, start: str, others: set[str]) -> list[str]:

@@ -1,8 +1,8 @@
 """Segment orientations → the configuration of a body: exactly where its joints can, else as near as they come.
 
 First every segment by itself, from the root outwards (`chains`). A spherical joint has done its work with that. Where a
-segment of an arm hangs on fewer axes, or on hinges that have ends, what they cannot do is shared: `Fit` over all
-measured segments of that arm, in the frames in which an orientation is not reached or a limit passed.
+segment of a limb hangs on fewer axes, or on hinges that have ends, what they cannot do is shared: `Fit` over all
+measured segments of that limb, in the frames in which an orientation is not reached or a limit passed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import pinocchio as pin
 from .. import rotations
 from ..rotations import conjugate, multiply, rotation_about
 from .body import BodyModel
-from .chains import AXIAL, Chain, axis_in_joint, solve
+from .chains import axis_in_joint, find_parents, solve
 from .fit import Fit, Limits, joint_limits
 
 _MAX_RESIDUAL = 1e-9  # [rad] that is nothing
@@ -29,17 +29,25 @@ class Group(NamedTuple):
     joints: tuple[int, ...]
 
 
-def groups(chains: Mapping[str, Chain], measured: Collection[str]) -> list[Group]:
-    """What has to be fitted: an arm, or a segment of the trunk, with a chain that cannot follow everything."""
+def find_groups(model: BodyModel, measured: Collection[str]) -> list[Group]:
+    """What has to be fitted, the spine first: a limb, or a segment of the spine, that cannot follow everything."""
+    parents, segments = find_parents(model.pin, model.table), model.table.segments
+
+    def limb(segment: str) -> str:
+        """The first segment of the limb."""
+        above = parents[segment]
+        return segment if above is None or segments[segment].spine or segments[above].spine else limb(above)
+
     together: dict[str, list[str]] = {}
-    for segment in chains:
+    for segment in model.chains:
         if segment in measured:
-            together.setdefault(segment if segment in AXIAL else segment.split("_")[0], []).append(segment)
-    return [
-        Group(tuple(segments), tuple(sorted({joint for segment in segments for joint in chains[segment].joints})))
-        for segments in together.values()
-        if any(chains[segment].joints and not chains[segment].exact for segment in segments)
+            together.setdefault(limb(segment), []).append(segment)
+    groups = [
+        Group(tuple(names), tuple(sorted({joint for name in names for joint in model.chains[name].joints})))
+        for names in together.values()
+        if any(model.chains[name].joints and not model.chains[name].exact for name in names)
     ]
+    return sorted(groups, key=lambda group: not segments[group.segments[0]].spine)
 
 
 class OrientationIk:
@@ -47,7 +55,6 @@ class OrientationIk:
 
     Parameters
     ----------
-    chains : of the model
     segments : the measured ones
     limits, weights : as in `kinematics.solve_configuration`
     """
@@ -55,18 +62,19 @@ class OrientationIk:
     def __init__(
         self,
         model: BodyModel,
-        chains: Mapping[str, Chain],
         segments: Collection[str],
         *,
         limits: bool = True,
         weights: Mapping[str, float] | None = None,
     ) -> None:
-        self.model, self.chains = model.pin, chains
+        self.model, self.chains, self._table = model.pin, model.chains, model.table
         self._limits, self._weights = limits, weights
-        to_fit = sorted(groups(chains, segments), key=lambda group: group.segments[0] not in AXIAL)
+        to_fit = find_groups(model, segments)
         self._fits = [(group, Fit(self.model, group.segments, group.joints, weights or {}, limits)) for group in to_fit]
         self._ends = [joint_limits(self.model, group.joints) for group in to_fit]
-        self._begins = {chain.joints[0]: name for name, chain in chains.items() if chain.joints and name in segments}
+        self._begins = {
+            chain.joints[0]: name for name, chain in self.chains.items() if chain.joints and name in segments
+        }
         self._neutral = pin.neutral(self.model)
         placed = [placement.rotation for placement in self.model.jointPlacements]
         self._placements = [pin.Quaternion(R).coeffs() for R in placed]
@@ -96,7 +104,7 @@ class OrientationIk:
                 if self.model.nqs[joint] == 4:
                     first = self.model.idx_qs[joint]
                     q[:, first : first + 4] = rotations.unwrap_signs(q[:, first : first + 4])
-            if group.segments[0] in AXIAL:  # what hangs on it stands elsewhere now
+            if self._table.segments[group.segments[0]].spine:  # what hangs on it stands elsewhere now
                 kept |= {joint: _value(self.model, q, joint) for joint in group.joints}
                 q, quat_WJ = self.stepwise(quat_WL, kept)
         return q

@@ -1,136 +1,555 @@
-"""Which link of a body is which segment: the table, its file, and a URDF that bears our names because of it.
+"""The table beside a URDF: what there is on a body, and what calibration, tracking and pages may rely on.
 
-Links named after our segments, in our frames, are added to a body of others as massless links fixed to its own. So all
-that follows, and every reader of the URDF that comes out, finds the segments without the table.
+`BodyTable` names segments, points, lengths, hinges, poses, pairs, usual places of sensors and what to draw. Nothing
+else of the package names a segment, a point or a length. docs/models.md explains the file.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Collection, Iterable, Mapping
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..assets import asset
-from ..documents import TomlTable, is_number, read_toml
+from ..documents import TomlTable, is_number, read_toml, toml_key, toml_string, toml_strings
 from ..errors import BadModel, one_of
-from ..recording import SEGMENTS, compute_mount
-from ..recording.segments import guess_segment
-from ..recording.sensors import read_axes
-from .tree import Tree, parse_tree
+from ..recording.sensors import AXES, read_axes
 
-# A point is the origin of a link; the link is moved by the joint at that point.
-POINTS = {
-    f"{side}_{point}": f"{side}_{link}"
-    for side in ("left", "right")
-    for point, link in (("shoulder", "upper_arm"), ("elbow", "forearm"), ("wrist", "hand"), ("palm", "palm"))
-}
-NEEDED = SEGMENTS[:5]
+DEFAULT_BODY = "upper_body"
+ROOT = "root"  # the origin of W, as the end of a length
 MODEL_TABLE = "model.toml"
-MOST_LINKS = 100  # that an error lists; a person's body has fewer
+PERSON, MECHANISM = "person", "mechanism"
+NEUTRAL_POSE = "n_pose"
+_KEYS = ("segments", "points", "lengths", "hinges", "poses", "pairs", "sensors", "draw")
+_SETTINGS = ("kind", "up", "forward", "root")
 
 
-class SegmentLink(NamedTuple):
-    """The link that is a segment; which of its axes point up and forward in the N-pose, None: found."""
+class Segment(NamedTuple):
+    """A segment of a body.
+
+    Parameters
+    ----------
+    link : the link that it is
+    up, forward : the link's axes that point up and forward in the N-pose; None: found from the URDF at zero
+    along : (3,) its long axis in its own frame, from its first point on
+    spine : whether it shares its rotation with all joints between it and the root
+    rigid_without_sensor : whether it follows the segment above where it has no sensor; else it is unknown then
+    labels : a regular expression of words that mean it in a sensor's name
+    soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian
+    point_twist_std : [rad] by which the points above which other segments hang turn about its long axis
+    """
 
     link: str
     up: str | None = None
     forward: str | None = None
+    along: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    spine: bool = False
+    rigid_without_sensor: bool = False
+    labels: str = ""
+    soft_tissue_std: float = float(np.deg2rad(0.6))
+    point_twist_std: float = 0.0
 
 
-class PointLink(NamedTuple):
-    """The link on which a point lies, and where."""
+class Point(NamedTuple):
+    """The link on which a point lies, and where [m] in the link."""
 
     link: str
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m] in the link
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class LinkTable:
-    """Which link of a body is which segment.
+class Stretch(NamedTuple):
+    """What a length scales: a segment, along the line from the middle of some points to that of others at zero."""
+
+    segment: str
+    start: tuple[str, ...]
+    end: tuple[str, ...]
+
+
+class Length(NamedTuple):
+    """A length of a body.
 
     Parameters
     ----------
-    segments : segment → its link
-    points : point → its link, where it is not the origin of the segment that begins there; the palm (`left_palm`,
-        `right_palm`) has none of its own
+    stretches : what it scales; more than one where parts of the body share it
+    share : its name among the shares of stature in ``calibration/anthropometry.toml``; empty: the model's own value
+    relative_std : of the model's own value, one standard deviation, where there is no share
+    """
+
+    stretches: tuple[Stretch, ...]
+    share: str = ""
+    relative_std: float = 0.1
+
+
+class HingeJoint(NamedTuple):
+    """A joint of nearly one axis; standard deviations [rad].
+
+    Parameters
+    ----------
+    on, moves : segments; the long axis of `moves` stays in a plane of `on` across the axis
+    axis : (3,) unit, in the frame of `on`
+    range : from and to which `moves` rotates about the axis
+    softness : by which the long axis leaves the plane
+    common_std, mirror_std : of the axis about the long axis of `on`, with its counterpart alike and against it
+    tilt_std : of the axis about the third axis
+    """
+
+    on: str
+    moves: str
+    axis: tuple[float, float, float]
+    range: tuple[float, float] = (-np.pi, np.pi)
+    softness: float = float(np.deg2rad(2.0))
+    common_std: float = float(np.deg2rad(5.0))
+    mirror_std: float = float(np.deg2rad(20.0))
+    tilt_std: float = float(np.deg2rad(5.0))
+
+
+class SensorPlace(NamedTuple):
+    """Where a sensor usually sits, and its axes that point up and forward in the N-pose; None: not usual."""
+
+    place: str = ""
+    up: str | None = None
+    forward: str | None = None
+
+
+@dataclass(frozen=True)
+class BodyTable:
+    """What there is on a body.
+
+    Parameters
+    ----------
+    name : of the table, for messages and files
+    segments : name → segment; the first one faces x of W in the start pose
+    points : name → its link
+    lengths : name → what it scales
+    hinges : name → joint of nearly one axis
+    poses : name → joint of the URDF → value [rad or m]
+    pairs : what lies left → its counterpart on the right: segments, points, lengths, hinges
+    sensors : segment → where its sensor usually sits
+    limbs : lines through points
+    paths : points whose path is drawn
+    kind : "person": triples of revolute joints are spherical, segment frames are W's in the N-pose; "mechanism": the
+        URDF stands as it is, with its links' frames
     up, forward : the root link's axes that point up and forward while all joints are at zero
     root : the link at whose origin W begins, or links whose middle it is; none: the root link
+    absent : lengths of the body that it is like, which this one lacks
     where : for error texts
     """
 
-    segments: Mapping[str, SegmentLink]
-    points: Mapping[str, PointLink] = field(default_factory=dict)
+    name: str
+    segments: Mapping[str, Segment]
+    points: Mapping[str, Point] = field(default_factory=dict)
+    lengths: Mapping[str, Length] = field(default_factory=dict)
+    hinges: Mapping[str, HingeJoint] = field(default_factory=dict)
+    poses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    pairs: Mapping[str, str] = field(default_factory=dict)
+    sensors: Mapping[str, SensorPlace] = field(default_factory=dict)
+    limbs: tuple[tuple[str, ...], ...] = ()
+    paths: tuple[str, ...] = ()
+    kind: Literal["person", "mechanism"] = "person"
     up: str = "+z"
     forward: str = "+x"
     root: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
     where: str = "segments"
 
     @property
+    def is_mechanism(self) -> bool:
+        return self.kind == MECHANISM
+
+    @property
+    def reference(self) -> str:
+        """The segment that faces x of W in the start pose."""
+        return next(iter(self.segments))
+
+    @property
     def links(self) -> set[str]:
-        """All links it names."""
+        """All links that it names."""
         segments = {segment.link for segment in self.segments.values()}
         return segments | {point.link for point in self.points.values()} | set(self.root)
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """Segments that are unknown without a sensor."""
+        return tuple(name for name, segment in self.segments.items() if not segment.rigid_without_sensor)
+
+    @cached_property
+    def _counterparts(self) -> dict[str, str]:
+        return {**self.pairs, **{right: left for left, right in self.pairs.items()}}
+
+    def counterpart(self, name: str) -> str | None:
+        """The same on the other side; None where there is none."""
+        return self._counterparts.get(name)
+
+    def side(self, name: str) -> str:
+        """ "left", "right", or empty where it has no counterpart."""
+        return "left" if name in self.pairs else "right" if name in self._counterparts else ""
+
+    def ends(self, segment: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
+        """The points between which a segment's own length lies; None where it has none."""
+        stretches = [part for length in self.lengths.values() for part in length.stretches if part.segment == segment]
+        return (stretches[0].start, stretches[0].end) if len(stretches) == 1 else None
+
+    def check_segments(self, names: Iterable[str], where: str, error: type[Exception]) -> None:
+        """Raise an `error` where a name is no segment."""
+        for name in names:
+            if name not in self.segments:
+                raise error(f"{where}{name} is no segment of {self.name}; {one_of(self.segments, name)}")
+
+    def guess_segment(self, label: str) -> str | None:
+        """Guess the segment from a label or a file name, as ``humerus_r_imu`` or ``LeftForeArm``; None if unclear."""
+        words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+|(?<=[a-z])(?=\d)", " ", label).lower()
+        sides = {
+            side
+            for side in ("left", "right")
+            if re.search(rf"\b({side}|{side[0]})(?=\b|hand|fore|upper|foot|low)", words)
+        }
+        matches = set()
+        for name, segment in self.segments.items():
+            side = self.side(name)
+            pattern = rf"({segment.labels})" if side else rf"\b({segment.labels})\b"
+            if segment.labels and (not side or side in sides) and re.search(pattern, words):
+                matches.add(name)
+        return matches.pop() if len(matches) == 1 else None
+
+    def drop(self, segments: Collection[str]) -> BodyTable:
+        """The table without these segments and all that needs them."""
+        kept = {name: segment for name, segment in self.segments.items() if name not in segments}
+        links = {self.segments[name].link for name in segments} - {segment.link for segment in kept.values()}
+        points = {name: point for name, point in self.points.items() if point.link not in links}
+        return _prune(replace(self, segments=kept, points=points))
+
+
+def _prune(table: BodyTable) -> BodyTable:
+    """The table without lengths, hinges, pairs, places and lines whose segments or points are not there."""
+    points = {*table.points, ROOT}
+    lengths = {
+        name: length
+        for name, length in table.lengths.items()
+        if all(part.segment in table.segments and points.issuperset(part.start + part.end) for part in length.stretches)
+    }
+    hinges = {name: hinge for name, hinge in table.hinges.items() if {hinge.on, hinge.moves} <= set(table.segments)}
+    names = {*table.segments, *table.points, *lengths, *hinges}
+    limbs = tuple(limb for limb in table.limbs if set(limb) <= set(table.points))
+    return replace(
+        table,
+        lengths=lengths,
+        absent=tuple(name for name in (*table.absent, *table.lengths) if name not in lengths),
+        hinges=hinges,
+        pairs={left: right for left, right in table.pairs.items() if {left, right} <= names},
+        sensors={name: place for name, place in table.sensors.items() if name in table.segments},
+        limbs=limbs,
+        paths=tuple(point for point in table.paths if point in table.points),
+    )
 
 
 # Reading ----------------------------------------------------------------------------------------------------------
 
 
-def table_from(values: Mapping[str, Any], where: str) -> LinkTable:
-    """The table that a TOML file or keywords spell: ``segments``, ``points``, ``up``, ``forward``, ``root``.
+@lru_cache(maxsize=8)
+def load_table(name: str = DEFAULT_BODY) -> BodyTable:
+    """The table of a body that comes with the package.
 
     Raises
     ------
     BadModel
-        A key, a segment, a point or an axis that is not known, or a value of the wrong kind.
+        There is none of that name.
     """
-    top = TomlTable(values, where, error=BadModel)
-    top.allow("segments", "points", "up", "forward", "root")
-    segments, points = {}, {}
-    for name, entry in _entries(top, "segments", SEGMENTS).items():
-        entry.allow("link", "up", "forward")
-        if ("up" in entry) != ("forward" in entry):
-            raise BadModel(f'{entry.where}: up and forward go together, as in up = "+z", forward = "+x"')
-        up, forward = read_axes(entry) if "up" in entry else (None, None)
-        segments[name] = SegmentLink(entry.values["link"], up, forward)
-    for name, entry in _entries(top, "points", POINTS).items():
-        entry.allow("link", "at")
-        at = entry.values.get("at", (0.0, 0.0, 0.0))
-        if not (isinstance(at, list | tuple) and len(at) == 3 and all(is_number(v, 1e3) for v in at)):
-            raise BadModel(f"{entry.at('at')} = {at!r}; three numbers [m] in the link are wanted")
-        points[name] = PointLink(entry.values["link"], (float(at[0]), float(at[1]), float(at[2])))
-    up, forward = read_axes(top, "+z", "+x")
-    root = values.get("root") or ()
-    root = (root,) if isinstance(root, str) else root
-    if not isinstance(root, list | tuple) or not all(isinstance(link, str) for link in root):
-        raise BadModel(f"{where}: root = {root!r}; the name of a link is wanted, or a list of names")
-    return LinkTable(segments, points, up, forward, tuple(root), where)
+    folder = asset("urdf", f"{DEFAULT_BODY}.toml").parent
+    known = sorted(path.stem for path in folder.glob("*.toml"))
+    if name not in known:
+        raise BadModel(f"no body '{name}' comes with the package; {one_of(known, name)}")
+    return read_table(folder / f"{name}.toml")[0]
 
 
-def read_table(path: Path) -> tuple[LinkTable, Path | None]:
-    """The table in a TOML file and the URDF it names with ``urdf``, None without.
+def read_table(path: Path, *, needs_urdf: bool = False) -> tuple[BodyTable, Path | None]:
+    """The table in a TOML file, and the URDF that it names or that lies beside it under its name; None without.
+
+    With `needs_urdf` a table without one is an error.
 
     Raises
     ------
     MissingFile, BadModel
         Not there; no TOML; not a table.
     """
-    values = read_toml(path, "a table of links", BadModel)
+    values = read_toml(path, "the table of a body", BadModel)
     urdf = values.pop("urdf", None)
     if urdf is not None and not isinstance(urdf, str):
         raise BadModel(f"{path}: urdf = {urdf!r}; the name of a file is wanted")
-    return table_from(values, str(path)), (path.parent / urdf if urdf is not None else None)
+    beside = path.with_suffix(".urdf")
+    file = path.parent / urdf if urdf is not None else beside if beside.is_file() else None
+    if needs_urdf and file is None:
+        raise BadModel(f'{path}: names no URDF; urdf = "body.urdf" is wanted, a file beside this one')
+    return parse_table(values, str(path), path.stem), file
 
 
-def find_table(urdf: Path, links: Iterable[str]) -> LinkTable | None:
-    """The table for a URDF that came without: ``model.toml`` beside it that names it, else one of ours that fits.
+def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
+    """The table that a TOML file or keywords spell.
 
-    None where the links bear our names already, or nothing is found.
+    With ``like`` the names and all else are those of that body, and `values` say what differs: of its segments those
+    are there that `values` name, and all where they name none.
+
+    Raises
+    ------
+    BadModel
+        A key, a name or an axis that is not known, or a value of the wrong kind.
+    """
+    top = TomlTable(values, where, error=BadModel)
+    top.allow("like", *_SETTINGS, *_KEYS)
+    like = top.text("like", None)
+    base = load_table(like) if like is not None else BodyTable(name, {}, where=where)
+    new = like is None
+    segments = _read_segments(top, base)
+    if not segments:
+        raise BadModel(f'{where}: [segments] is missing; each segment\'s link is needed, as in torso = "chest_link"')
+    up, forward = read_axes(top, base.up if new else "+z", base.forward if new else "+x")
+    table = replace(
+        base,
+        name=name,
+        segments=segments,
+        points=_read_points(top, base, segments),
+        kind=top.choice("kind", (PERSON, MECHANISM), base.kind),  # type: ignore[arg-type]
+        up=up,
+        forward=forward,
+        root=_read_names(top, "root"),
+        where=where,
+    )
+    if like is not None:
+        table = _prune(replace(table, poses={}))
+        _check_ends(table, base)
+    lengths = {**table.lengths, **_read_lengths(top, table)}
+    table = replace(table, lengths=lengths)
+    hinges = {**table.hinges, **_read_hinges(top, table)}
+    table = replace(table, hinges=hinges, poses=_read_poses(top))
+    names = {*table.segments, *table.points, *table.lengths, *table.hinges}
+    pairs = top.table("pairs", {})
+    for left, right in pairs.values.items():
+        for each in (left, right):
+            if each not in names:
+                raise BadModel(
+                    f"{pairs.at(left)}: '{each}' is no segment, point, length or hinge; {one_of(names, each)}"
+                )
+    draw = top.table("draw", {})
+    draw.allow("limbs", "paths")
+    limbs = draw.values.get("limbs", [])
+    if not isinstance(limbs, list) or not all(isinstance(limb, list) for limb in limbs):
+        raise BadModel(f'{draw.at("limbs")} = {limbs!r}; lists of points are wanted, as [["hip", "knee", "ankle"]]')
+    for point in (*(point for limb in limbs for point in limb), *_read_names(draw, "paths")):
+        if point not in table.points:
+            raise BadModel(f"{draw.where}: '{point}' is no point; {one_of(table.points, str(point))}")
+    return replace(
+        table,
+        pairs={**table.pairs, **pairs.values},
+        sensors={**table.sensors, **_read_sensors(top, table)},
+        limbs=(*table.limbs, *(tuple(limb) for limb in limbs)),
+        paths=(*table.paths, *_read_names(draw, "paths")),
+    )
+
+
+def _read_segments(top: TomlTable, base: BodyTable) -> dict[str, Segment]:
+    segments = {}
+    for name, entry in _read_links(top, "segments"):
+        entry.allow(
+            *("link", "up", "forward", "along", "spine", "without_sensor", "labels"),
+            *("soft_tissue_deg", "point_twist_deg"),
+        )
+        own = base.segments.get(name)
+        if ("up" in entry) != ("forward" in entry):
+            raise BadModel(f'{entry.where}: up and forward go together, as in up = "+z", forward = "+x"')
+        up, forward = read_axes(entry) if "up" in entry else (None, None)
+        segment = (own or Segment(name))._replace(link=entry.text("link", name) or name, up=up, forward=forward)
+        if "along" in entry:
+            x, y, z = (float(v) for v in AXES[entry.choice("along", AXES)])
+            segment = segment._replace(along=(x, y, z))
+        if "spine" in entry:
+            segment = segment._replace(spine=entry.flag("spine"))
+        if "without_sensor" in entry:
+            rigid = entry.choice("without_sensor", ("rigid", "unknown")) == "rigid"
+            segment = segment._replace(rigid_without_sensor=rigid)
+        labels = entry.text("labels", segment.labels or None) or ""
+        try:
+            re.compile(labels)
+        except re.error as error:
+            raise BadModel(f"{entry.at('labels')} = {labels!r} is no regular expression: {error}") from None
+        soft, twist = (
+            _read_angle(entry, key, value)
+            for key, value in (
+                ("soft_tissue_deg", segment.soft_tissue_std),
+                ("point_twist_deg", segment.point_twist_std),
+            )
+        )
+        segments[name] = segment._replace(labels=labels, soft_tissue_std=soft, point_twist_std=twist)
+    if base.segments and (not segments or not set(segments) & set(base.segments)):
+        return {**base.segments, **segments}  # the same body with more on it
+    lacking = [name for name in base.segments if name not in segments]
+    for name in segments:
+        close = [] if name in base.segments else get_close_matches(name, lacking, n=1, cutoff=0.85)
+        if close:
+            raise BadModel(f"{top.at('segments')}.{name}: did you mean '{close[0]}'? {base.name} has that")
+    order = [*base.segments, *segments]
+    return dict(sorted(segments.items(), key=lambda item: order.index(item[0])))
+
+
+def _check_ends(table: BodyTable, base: BodyTable) -> None:
+    """Raise `BadModel` where a segment of another body has lost its length, and its direction cannot be found."""
+    for name, segment in table.segments.items():
+        ends = base.ends(name)
+        if ends is None or segment.spine or segment.rigid_without_sensor or segment.up is not None or table.ends(name):
+            continue
+        lacking = [point for point in ends[0] + ends[1] if point not in table.points]
+        raise BadModel(
+            f"{table.where}: segments.{name} has no {' and no '.join(lacking)}; name a link in points.{lacking[0]}, or "
+            f"the segment that begins there"
+        )
+
+
+def _read_points(top: TomlTable, base: BodyTable, segments: Mapping[str, Segment]) -> dict[str, Point]:
+    points: dict[str, Point] = {}
+    by_link = {segment.link: name for name, segment in base.segments.items()}
+    for name, point in base.points.items():
+        # A point where a segment begins is there with the segment.
+        begins = by_link.get(point.link)
+        if begins in segments and not any(point.at):
+            points[name] = Point(segments[begins].link)
+        elif all(segments.get(each) == own for each, own in base.segments.items()):
+            points[name] = point
+    for name, entry in _read_links(top, "points"):
+        entry.allow("link", "at")
+        at = entry.values.get("at", (0.0, 0.0, 0.0))
+        if not (isinstance(at, list | tuple) and len(at) == 3 and all(is_number(v, 1e3) for v in at)):
+            raise BadModel(f"{entry.at('at')} = {at!r}; three numbers [m] in the link are wanted")
+        points[name] = Point(entry.text("link", name) or name, (float(at[0]), float(at[1]), float(at[2])))
+    order = [*base.points, *points]
+    return dict(sorted(points.items(), key=lambda item: order.index(item[0])))
+
+
+def _read_lengths(top: TomlTable, table: BodyTable) -> dict[str, Length]:
+    entries, lengths = top.table("lengths", {}), {}
+    for name, value in entries.values.items():
+        parts = value if isinstance(value, list) else [value]
+        if not parts or not all(isinstance(part, Mapping) for part in parts):
+            raise BadModel(
+                f'{entries.at(name)} = {value!r}; what it scales is wanted, as {{ segment = "forearm", '
+                f'from = "elbow", to = "wrist" }}, or a list of that'
+            )
+        stretches, settings = [], TomlTable({}, top.file, error=BadModel)
+        for part in parts:
+            entry = replace(entries, values=part, place=f"{entries.place}{name}.")
+            entry.allow("segment", "from", "to", "share", "std_percent")
+            start, end = (_read_names(entry, key) for key in ("from", "to"))
+            for point in start + end:
+                if point not in table.points and point != ROOT:
+                    raise BadModel(f"{entry.where}: '{point}' is no point; {one_of((*table.points, ROOT), point)}")
+            if not start or not end or start == end:
+                raise BadModel(f"{entry.where}: scales nothing: it needs from and to, two different points")
+            stretches.append(Stretch(entry.choice("segment", table.segments), start, end))
+            if "share" in entry or "std_percent" in entry:
+                settings = entry
+        percent = settings.number("std_percent", 10.0, positive=True) or 10.0
+        lengths[name] = Length(tuple(stretches), settings.text("share", None) or "", percent / 100.0)
+    return lengths
+
+
+def _read_hinges(top: TomlTable, table: BodyTable) -> dict[str, HingeJoint]:
+    hinges = {}
+    for name, entry in _read_tables(top, "hinges"):
+        keys = ("softness_deg", "common_std_deg", "mirror_std_deg", "tilt_std_deg")
+        entry.allow("on", "moves", "axis", "range_deg", *keys)
+        on, moves = (entry.choice(key, table.segments) for key in ("on", "moves"))
+        axis = _read_numbers(entry, "axis", 3, None)
+        size = float(np.linalg.norm(axis))
+        if size < 1e-6 or on == moves:
+            raise BadModel(f"{entry.where}: is no hinge: it needs two different segments and an axis of some length")
+        x, y, z = (float(v) / size for v in axis)
+        low, high = np.deg2rad(_read_numbers(entry, "range_deg", 2, [-180.0, 180.0])).tolist()
+        if low >= high:
+            raise BadModel(f"{entry.at('range_deg')}: the first number must be below the second")
+        defaults = HingeJoint(on, moves, (x, y, z), (low, high))
+        softness, common, mirror, tilt = (
+            _read_angle(entry, key, value)
+            for key, value in zip(
+                keys, (defaults.softness, defaults.common_std, defaults.mirror_std, defaults.tilt_std), strict=True
+            )
+        )
+        if abs(np.dot((x, y, z), table.segments[on].along)) > 0.7:
+            raise BadModel(f"{entry.at('axis')}: lies along the segment '{on}'; no hinge bends about that")
+        hinges[name] = defaults._replace(softness=softness, common_std=common, mirror_std=mirror, tilt_std=tilt)
+    return hinges
+
+
+def _read_poses(top: TomlTable) -> dict[str, dict[str, float]]:
+    poses: dict[str, dict[str, float]] = {NEUTRAL_POSE: {}}
+    for name, entry in _read_tables(top, "poses"):
+        for joint, value in entry.values.items():
+            if not is_number(value, 1e3):
+                raise BadModel(f"{entry.at(joint)} = {value!r}; a number is wanted [rad, or m of a joint that slides]")
+        poses[name] = {joint: float(value) for joint, value in entry.values.items()}
+    return poses
+
+
+def _read_sensors(top: TomlTable, table: BodyTable) -> dict[str, SensorPlace]:
+    sensors = {}
+    for name, entry in top.table("sensors", {}).tables(table.segments, "segment").items():
+        entry.allow("place", "up", "forward")
+        up, forward = read_axes(entry) if "up" in entry or "forward" in entry else (None, None)
+        sensors[name] = SensorPlace(entry.text("place", None) or "", up, forward)
+    return sensors
+
+
+def _read_tables(top: TomlTable, key: str) -> Iterator[tuple[str, TomlTable]]:
+    entries = top.table(key, {})
+    for name in entries.values:
+        yield name, entries.table(name)
+
+
+def _read_links(top: TomlTable, key: str) -> Iterator[tuple[str, TomlTable]]:
+    """Segment or point, and the table that names its link; a link's name stands for a table of that alone."""
+    entries = top.table(key, {})
+    for name, value in entries.values.items():
+        if isinstance(value, Segment | Point):
+            value = {part: own for part, own in value._asdict().items() if part in ("link", "up", "forward", "at")}
+            value = {part: own for part, own in value.items() if own is not None}
+        if isinstance(value, str):
+            value = {"link": value}
+        if not isinstance(value, Mapping) or not isinstance(value.get("link", name), str):
+            raise BadModel(f'{entries.at(name)} = {value!r}; a link\'s name is wanted, or {{ link = "name", … }}')
+        yield name, replace(entries, values=value, place=f"{entries.place}{name}.")
+
+
+def _read_names(table: TomlTable, key: str) -> tuple[str, ...]:
+    value = table.values.get(key) or ()
+    value = (value,) if isinstance(value, str) else value
+    if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
+        raise BadModel(f"{table.at(key)} = {value!r}; a name is wanted, or a list of names")
+    return tuple(value)
+
+
+def _read_numbers(table: TomlTable, key: str, count: int, default: Sequence[float] | None) -> list[float]:
+    value = table.values.get(key, default)
+    if not isinstance(value, list) or len(value) != count or not all(is_number(v, 1e6) for v in value):
+        raise BadModel(f"{table.at(key)} = {value!r}; {count} numbers are wanted")
+    return [float(v) for v in value]
+
+
+def _read_angle(table: TomlTable, key: str, default: float) -> float:
+    """An angle [rad] of a key in degrees."""
+    value = table.number(key, None)
+    if value is None:
+        return default
+    if not 0.0 <= value <= 180.0:
+        raise BadModel(f"{table.at(key)} = {value:g}; between 0 and 180 degrees are wanted")
+    return float(np.deg2rad(value))
+
+
+def find_table(urdf: Path, links: Iterable[str]) -> BodyTable | None:
+    """The table for a URDF that came without: beside it, else one of the package's that fits; None: nothing is found.
+
+    Beside it is ``<name>.toml`` that is a table, or ``model.toml`` that names the URDF.
     """
     links = set(links)
     own_table = urdf.parent / MODEL_TABLE
@@ -138,184 +557,76 @@ def find_table(urdf: Path, links: Iterable[str]) -> LinkTable | None:
         table, named = read_table(own_table)
         if named is not None and named.name == urdf.name:
             return table
-    if links.issuperset(NEEDED):
-        return None
-    for path in sorted(asset("urdf", "human_gazebo.toml").parent.glob("*.toml")):
-        table, _ = read_table(path)
-        if table.links <= links:
+    beside = urdf.with_suffix(".toml")
+    if beside.is_file() and "segments" in read_toml(beside, "the table of a body", BadModel):
+        return read_table(beside)[0]
+    default = load_table()
+    if links.issuperset(default.segments[name].link for name in default.needed):
+        lacking = [name for name, segment in default.segments.items() if segment.link not in links]
+        there = {name: point for name, point in default.points.items() if point.link in links}
+        return _prune(replace(default.drop(lacking), points=there, where=str(urdf)))
+    for path in sorted(asset("urdf", f"{DEFAULT_BODY}.toml").parent.glob("*.toml")):
+        table = load_table(path.stem)
+        if path.stem != DEFAULT_BODY and table.links <= links:
             return replace(table, where=f"{urdf}: by {path.name}")
     return None
 
 
-def _entries(top: TomlTable, key: str, names: Collection[str]) -> dict[str, TomlTable]:
-    """Segment or point → the table that names its link; a link's name stands for a table of that alone."""
-    entries = top.table(key, {})
-    tables = {}
-    for name, value in entries.values.items():
-        if isinstance(value, SegmentLink | PointLink):
-            value = {part: own for part, own in value._asdict().items() if own is not None}
-        tables[name] = {"link": value} if isinstance(value, str) else value
-        if not isinstance(tables[name], Mapping) or not isinstance(tables[name].get("link"), str):
-            raise BadModel(f'{entries.at(name)} = {value!r}; a link\'s name is wanted, or {{ link = "name", … }}')
-    return replace(entries, values=tables).tables(names, key.removesuffix("s"))
+# Writing ----------------------------------------------------------------------------------------------------------
 
 
-# Naming -----------------------------------------------------------------------------------------------------------
-
-
-def rename_links(robot: Any, table: LinkTable) -> Any:
-    """A copy of the robot (yourdfpy) with links named after our segments and points, in our frames.
-
-    Every segment frame equals W in the N-pose. At zero of its joints a body may stand otherwise, in a T-pose say. There
-
-    - torso, pelvis and head are upright: their frames are W's;
-    - an upper arm and a forearm point from joint to joint, a hand to its palm (without one: as its forearm). The
-      shortest rotation that carries the arm of the N-pose, −z, there is the segment's orientation;
-    - `up` and `forward` of a `SegmentLink` are taken in place of that.
-
-    Raises
-    ------
-    BadModel
-        A link that is not there; no wrist; an arm that points straight up, so that no rotation is the shortest.
-    """
-    where = table.where
-    tree = parse_tree(robot, where)
-    _check_links(table, tree)
-    R_WM = Rotation.from_quat(compute_mount(table.up, table.forward)).as_matrix()  # M: the root link
-    M_WM = np.eye(4)
-    M_WM[:3, :3] = R_WM
-    M_WM[:3, 3] = -R_WM @ np.mean([tree.neutral(link)[:3, 3] for link in table.root or (tree.root,)], axis=0)
-    M_WK = {link: M_WM @ tree.neutral(link) for link in table.links}  # K: a link of theirs
-
-    R_WL: dict[str, np.ndarray] = {}  # orientation of our segments while their joints are at zero
-    p_W = {}
-    for point, link in _points(table).items():
-        p_W[point] = M_WK[link.link][:3, :3] @ link.at + M_WK[link.link][:3, 3]
-    for segment, own in table.segments.items():
-        if own.up is not None and own.forward is not None:
-            R_LK = Rotation.from_quat(compute_mount(own.up, own.forward)).as_matrix()
-            R_WL[segment] = M_WK[own.link][:3, :3] @ R_LK.T
-    for segment in (*table.segments, "left_hand", "right_hand"):
-        if segment not in R_WL:
-            R_WL[segment] = _neutral_orientation(segment, p_W, R_WL, where)
-
-    # Our frames on their links; wrists and palms lie on the hand, else on the forearm.
-    frames: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # name → their link, R_WL, p_W
-    for segment, own in table.segments.items():
-        frames[segment] = own.link, R_WL[segment], M_WK[own.link][:3, 3]
-    for point, name in POINTS.items():
-        side, part = point.split("_", 1)
-        segment = name if part != "palm" else f"{side}_hand"
-        if point in p_W:
-            on = table.segments.get(segment, table.segments[f"{side}_forearm"]).link
-            frames[name] = on, R_WL[segment], p_W[point]
-
-    return _with_links(robot, tree.root, M_WM, M_WK, frames)
-
-
-def _check_links(table: LinkTable, tree: Tree) -> None:
-    where = table.where
-    for key, entries in (("segments", table.segments), ("points", table.points)):
-        for name, entry in entries.items():
-            if entry.link not in tree.below:
-                raise BadModel(
-                    f"{where}: {key}.{name}: no link '{entry.link}'; {one_of(tree.below, entry.link, MOST_LINKS)}"
-                )
-    for link in table.root:
-        if link not in tree.below:
-            raise BadModel(f"{where}: root: no link '{link}'; {one_of(tree.below, link, MOST_LINKS)}")
-    lacking = [segment for segment in NEEDED if segment not in table.segments]
-    if lacking:
-        raise BadModel(
-            f"{where}: no link for segment {format_closest_links(lacking, tree.below)}; name it in segments; "
-            f"{one_of(tree.below, most=MOST_LINKS)}"
-        )
-    handless = [side for side in ("left", "right") if f"{side}_wrist" not in _points(table)]
-    if handless:
-        names = " and ".join(f"segments.{side}_hand or points.{side}_wrist" for side in handless)
-        raise BadModel(f"{where}: no wrist; name a link in {names}")
-
-
-def format_closest_links(segments: Iterable[str], links: Iterable[str]) -> str:
-    """Segments that have no link, each with the links whose names speak of it or come closest."""
-    links = list(links)
-    names = []
-    for segment in segments:
-        close = [link for link in links if guess_segment(link) == segment]
-        others = [link for link in links if guess_segment(link) is None]
-        close = close or get_close_matches(segment, others, n=3, cutoff=0.5)
-        names.append(f"'{segment}'" + (f" (maybe {' or '.join(close[:4])})" if close else ""))
-    return ", ".join(names)
-
-
-def _points(table: LinkTable) -> dict[str, PointLink]:
-    """Points with their links: the table's own, else where their segment begins."""
-    begin = {point: table.segments[name] for point, name in POINTS.items() if name in table.segments}
-    return {point: PointLink(segment.link) for point, segment in begin.items()} | dict(table.points)
-
-
-def _neutral_orientation(
-    segment: str, p_W: Mapping[str, np.ndarray], R_WL: Mapping[str, np.ndarray], where: str
-) -> np.ndarray:
-    """Orientation R_WL (3, 3) of a segment while all joints are at zero."""
-    side, _, part = segment.partition("_")
-    ends = {"upper_arm": ("shoulder", "elbow"), "forearm": ("elbow", "wrist"), "hand": ("wrist", "palm")}.get(part)
-    if ends is None:
-        return np.eye(3)
-    first, last = (f"{side}_{end}" for end in ends)
-    if last not in p_W:
-        return R_WL[f"{side}_forearm"]
-    along = p_W[last] - p_W[first]
-    length = np.linalg.norm(along)
-    if length < 1e-6:
-        raise BadModel(f"{where}: {first} and {last} lie in one place; name the links at both ends of {segment}")
-    x, y, z = along / length
-    if z > 1.0 - 1e-6:
-        raise BadModel(f"{where}: segments.{segment}: points straight up; state its up and forward axes of the N-pose")
-    # From (0, 0, −1) to (x, y, z): the axis is their cross product (y, −x, 0).
-    return Rotation.from_quat([y, -x, 0.0, 1.0 - z]).as_matrix()
-
-
-def _with_links(
-    robot: Any,
-    root: str,
-    M_WM: np.ndarray,
-    M_WK: Mapping[str, np.ndarray],
-    frames: Mapping[str, tuple[str, np.ndarray, np.ndarray]],
-) -> Any:
-    """A copy of the robot with the links `frames` (name → the link it is fixed to, R_WL, p_WL), on a root that is W.
-
-    A link of theirs that bears such a name and stands elsewhere becomes ``<name>_link``.
-    """
-    import yourdfpy
-
-    robot = copy.deepcopy(robot)
-    added = {}
-    for name, (link, R, p) in frames.items():
-        M_WL = np.eye(4)
-        M_WL[:3, :3], M_WL[:3, 3] = R, p
-        M_KL = np.linalg.inv(M_WK[link]) @ M_WL
-        if name != link or not np.allclose(M_KL, np.eye(4), atol=1e-12):
-            added[name] = link, M_KL
-    if not np.allclose(M_WM, np.eye(4), atol=1e-12):
-        added["root"] = root, M_WM
-    own = {link.name for link in robot.links}
-    renamed = {name: _make_unique(f"{name}_link", own) for name in added if name in own}
-    for link in robot.links:
-        link.name = renamed.get(link.name, link.name)
-    for joint in robot.joints:
-        joint.parent = renamed.get(joint.parent, joint.parent)
-        joint.child = renamed.get(joint.child, joint.child)
-    joints = {joint.name for joint in robot.joints}
-    for name, (link, M) in added.items():
-        ends = (name, renamed.get(link, link)) if name == "root" else (renamed.get(link, link), name)
-        robot.links.append(yourdfpy.Link(name=name))
-        robot.joints.append(yourdfpy.Joint(_make_unique(f"{name}_fixed", joints), "fixed", *ends, origin=M))
-    return robot
-
-
-def _make_unique(name: str, used: Iterable[str]) -> str:
-    """`name`, made longer until it is not `taken`."""
-    while name in used:
-        name += "_"
-    return name
+def format_table(table: BodyTable, urdf: str) -> str:
+    """The text of a table's file, beside the URDF of that name."""
+    lines = [f"urdf = {toml_string(urdf)}", f"kind = {toml_string(table.kind)}"]
+    lines += [f"up = {toml_string(table.up)}", f"forward = {toml_string(table.forward)}"]
+    if table.root:
+        lines.append(f"root = {toml_strings(table.root)}")
+    axes = {tuple(float(v) for v in axis): name for name, axis in AXES.items()}
+    for name, segment in table.segments.items():
+        lines += ["", f"[segments.{toml_key(name)}]", f"link = {toml_string(segment.link)}"]
+        if segment.up is not None and segment.forward is not None:
+            lines += [f"up = {toml_string(segment.up)}", f"forward = {toml_string(segment.forward)}"]
+        lines.append(f"along = {toml_string(axes[segment.along])}")
+        lines += ["spine = true"] if segment.spine else []
+        lines += ['without_sensor = "rigid"'] if segment.rigid_without_sensor else []
+        lines += [f"labels = {toml_string(segment.labels)}"] if segment.labels else []
+        lines.append(f"soft_tissue_deg = {np.degrees(segment.soft_tissue_std):.6g}")
+        lines.append(f"point_twist_deg = {np.degrees(segment.point_twist_std):.6g}")
+    lines += ["", "[points]"]
+    for name, point in table.points.items():
+        at = f", at = {list(point.at)}" if any(point.at) else ""
+        lines.append(f"{toml_key(name)} = {{ link = {toml_string(point.link)}{at} }}")
+    lines += ["", "[lengths]"]
+    for name, length in table.lengths.items():
+        prior = f", share = {toml_string(length.share)}" if length.share else ""
+        prior += f", std_percent = {100.0 * length.relative_std:.6g}"
+        parts = [
+            f"{{ segment = {toml_string(part.segment)}, from = {toml_strings(part.start)}, "
+            f"to = {toml_strings(part.end)}{prior} }}"
+            for part in length.stretches
+        ]
+        lines.append(f"{toml_key(name)} = [{', '.join(parts)}]")
+    for name, hinge in table.hinges.items():
+        lines += ["", f"[hinges.{toml_key(name)}]", f"on = {toml_string(hinge.on)}"]
+        lines += [f"moves = {toml_string(hinge.moves)}", f"axis = {list(hinge.axis)}"]
+        lines.append(f"range_deg = {np.degrees(hinge.range).round(6).tolist()}")
+        for key, value in (
+            ("softness_deg", hinge.softness),
+            ("common_std_deg", hinge.common_std),
+            ("mirror_std_deg", hinge.mirror_std),
+            ("tilt_std_deg", hinge.tilt_std),
+        ):
+            lines.append(f"{key} = {np.degrees(value):.6g}")
+    for name, joints in table.poses.items():
+        lines += ["", f"[poses.{toml_key(name)}]"]
+        lines += [f"{toml_key(joint)} = {value!r}" for joint, value in joints.items()]
+    lines += ["", "[pairs]"]
+    lines += [f"{toml_key(left)} = {toml_string(right)}" for left, right in table.pairs.items()]
+    for name, sensor in table.sensors.items():
+        lines += ["", f"[sensors.{toml_key(name)}]"]
+        lines += [f"place = {toml_string(sensor.place)}"] if sensor.place else []
+        if sensor.up is not None and sensor.forward is not None:
+            lines += [f"up = {toml_string(sensor.up)}", f"forward = {toml_string(sensor.forward)}"]
+    lines += ["", "[draw]", f"limbs = [{', '.join(toml_strings(limb) for limb in table.limbs)}]"]
+    lines.append(f"paths = {toml_strings(table.paths)}")
+    return "\n".join(lines) + "\n"

@@ -116,10 +116,11 @@ def parse_tree(robot: Any, where: str) -> Tree:
     return Tree(roots[0], above, below)
 
 
-def build(robot: Any, where: str) -> Built:
+def build(robot: Any, where: str, *, spherical: bool = True) -> Built:
     """The Pinocchio model, depth first as Pinocchio's algorithms need it; one frame a link.
 
-    A mimic joint follows the joint it mimics. The limits of joints that stay as they are are the URDF's.
+    A mimic joint follows the joint it mimics. The limits of joints that stay as they are are the URDF's. Without
+    `spherical` triples of revolute joints stay as they are too.
 
     Raises
     ------
@@ -148,7 +149,7 @@ def build(robot: Any, where: str) -> Built:
             if first.type == "fixed":
                 grow(first.child, parent, M_Jc)
                 continue
-            triple = _triple(first, tree, links, mimicked)
+            triple = _triple(first, tree, links, mimicked) if spherical else None
             if triple is None and first.type != "floating":
                 grow(first.child, *_add_single(model, parent, M_Jc, first, where))
                 continue
@@ -217,11 +218,11 @@ def _axes(chain: Any) -> np.ndarray:
 
 
 def _limits(triple: tuple[Any, Any, Any]) -> AxisLimits:
-    low, high = np.array([_bounds(joint, np.pi) for joint in triple]).T
+    low, high = np.array([find_bounds(joint, np.pi) for joint in triple]).T
     return AxisLimits(_axes(triple), low, high)
 
 
-def _bounds(joint: Any, unbounded: float) -> tuple[float, float]:
+def find_bounds(joint: Any, unbounded: float) -> tuple[float, float]:
     """Lower and upper limit of a joint [rad or m]."""
     if joint.type == "continuous" or joint.limit is None:
         return -unbounded, unbounded
@@ -249,7 +250,7 @@ def _add_single(model: pin.Model, parent: int, M: pin.SE3, joint: Any, where: st
         bounds = np.full(2, -1.01), np.full(2, 1.01)
         return model.addJoint(parent, pin.JointModelRUBZ(), M * turn, joint.name, *of_rate, *bounds), turn.inverse()
     kind = pin.JointModelRevoluteUnaligned if joint.type == "revolute" else pin.JointModelPrismaticUnaligned
-    low, high = _bounds(joint, np.inf)
+    low, high = find_bounds(joint, np.inf)
     added = model.addJoint(parent, kind(axis), M, joint.name, *of_rate, np.array([low]), np.array([high]))
     return added, pin.SE3.Identity()
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, one_of
-from ..recording.segments import guess_segment
+from ..model import load_table
 from .device import Device, Text, make_table, parse_rows, read_first_lines
 
 US = 1e-6
@@ -88,7 +88,7 @@ def read_apdm(path: Path, use: str | None = None, rate_hz: float | None = None) 
     facts = {"devices": ", ".join(left_out), "signals": " and ".join(wanted[kind])}
     missing = (Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts),) if left_out else ()
     time = np.arange(text.cells.height) / rate_hz if rate_hz else (US if newer else 1.0) * text.numbers(["0"])[:, 0]
-    labels = {label: guess_segment(label) for label in values}
+    labels = {label: load_table().guess_segment(label) for label in values}
     return Device("apdm", make_table(time, values), labels, kind, since_power_on=True, diagnostics=missing)
 
 

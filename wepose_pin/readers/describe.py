@@ -16,7 +16,8 @@ import numpy as np
 from ..diagnostics import ERROR, WARNING, Diagnostic
 from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
 from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
-from ..recording import AXES, CONFIGURATION, SEGMENTS, ImuSensor, OrientationSensor, Recording, format_span, format_time
+from ..model import load_table
+from ..recording import AXES, CONFIGURATION, ImuSensor, OrientationSensor, Recording, format_span, format_time
 from ..recording.clocks import TIME_UNITS, guess_time_unit
 from ..recording.gaps import find_runs
 from ..recording.limits import LONGEST_STEP_S
@@ -37,7 +38,7 @@ SHORTEST_STATIC_S = 1.0
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
 # Segments with sensor mounts that `wepose calibrate` estimates.
-ARMS = frozenset(SEGMENTS[:5])
+ARMS = frozenset(load_table().needed)
 
 
 class Description(NamedTuple):
@@ -214,7 +215,7 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal) -> Descripti
 
 def _advise(recording: Recording) -> str:
     """Advise on the use of a session with these sensors, once its lines marked CHECK are right."""
-    worn = {segment: sensor for segment, sensor in recording.sensors.items() if segment in SEGMENTS}
+    worn = {segment: sensor for segment, sensor in recording.sensors.items() if segment in load_table().segments}
     if not worn:
         return "name the segment of each sensor in place of SEGMENT"
     without = [segment for segment, sensor in worn.items() if not sensor.aligned and sensor.stated_quat_LS is None]
@@ -252,12 +253,13 @@ def _session_text(
         "[phases]   # seconds",
     ]
     lines += phases
-    if set(tables) >= ARMS or not any(name in SEGMENTS for name in tables):
+    if set(tables) >= ARMS or not any(name in load_table().segments for name in tables):
         lines.append(
             "# clasp = [[10.0, 70.0]]   # for wepose calibrate: the seconds in which the palms are held together"
         )
-    for segment in sorted(tables, key=lambda name: SEGMENTS.index(name) if name in SEGMENTS else 99):
-        commented = segment not in SEGMENTS
+    segments = list(load_table().segments)
+    for segment in sorted(tables, key=lambda name: segments.index(name) if name in segments else len(segments)):
+        commented = segment not in segments
         table = [f"[sensors.{'SEGMENT' if commented else segment}]", *tables[segment], *comments.get(segment, [])]
         lines += ["", *(f"# {line}" if commented else line for line in table)]
     return "\n".join(lines) + "\n"

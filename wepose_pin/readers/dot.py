@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
-from ..recording.segments import guess_segment
+from ..model import load_table
 from .device import Device, Text, compute_counted_time, make_table, read_text, unwrap_counter
 from .mt_manager import RAW, read_orientation
 
@@ -59,7 +59,7 @@ def read_dot(path: Path, use: str | None = None, rate_hz: float | None = None) -
     unsynced = Diagnostic("device-not-synchronized", WARNING, path.name)
     diagnostics = () if status.startswith("synced") else (unsynced,)
     label = text.about.get("DeviceTag") or path.stem
-    labels = {label: guess_segment(label) or guess_segment(path.stem)}
+    labels = {label: load_table().guess_segment(label) or load_table().guess_segment(path.stem)}
     table = make_table(time, {label: values})
     return Device("dot", table, labels, kind, since_power_on=True, wraps_s=wraps_s, diagnostics=diagnostics)
 

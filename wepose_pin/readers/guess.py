@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from ..recording.segments import guess_segment
+from ..model import load_table
 
 AXIS = re.compile(r"(?P<stem>.*?)[ _.\-\[(]*(?P<axis>[xyzw0-3])[\])]?\s*(?P<unit>[\[(].*[\])])?", re.IGNORECASE)
 # Signals in the order of the search; (?![a-z]) for names such as gx, ax.
@@ -101,7 +101,7 @@ def _compute_size(shape: tuple[int, ...]) -> int:
 
 def _find_owner(stem: str) -> str:
     """Return the segment, or the name without its signal, which one sensor's signals have in common."""
-    segment = guess_segment(stem)
+    segment = load_table().guess_segment(stem)
     if segment:
         return segment
     text = stem.lower()

@@ -25,7 +25,7 @@ import numpy as np
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable, is_number
 from ..errors import BadData, MissingFile
-from ..recording import SEGMENTS, ImuSensor, Recording, check_recording
+from ..recording import ImuSensor, Recording, check_recording
 from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
@@ -184,7 +184,7 @@ def read_blocks(path: Path) -> Iterator[tuple[bytes, bytes]]:
 def _header(path: Path, payload: bytes) -> dict[str, Any]:
     header = _json(path, payload)
     sensors = header.get("sensors")
-    named = isinstance(sensors, list) and sensors and all(name in SEGMENTS for name in sensors)
+    named = isinstance(sensors, list) and sensors and all(isinstance(name, str) for name in sensors)
     if header.get("format") != FORMAT or not named or len(set(sensors or ())) < len(sensors or ()):
         raise BadData(
             f"{path}: format {header.get('format')!r} with sensors {sensors!r}; this version reads format {FORMAT}"

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, MissingRate
-from ..recording.segments import guess_segment
+from ..model import load_table
 from .device import Device, Text, compute_counted_time, make_table, read_text, unwrap_counter
 
 COUNTER_WRAPS = 65536.0
@@ -55,7 +55,7 @@ def read_mt_manager(path: Path, use: str | None = None, rate_hz: float | None = 
         values = {"orientation": read_orientation(text)}
     # MT_012345_001-000_00B40001.txt: the last part is the sensor's number.
     label = path.stem.rpartition("_")[2] or path.stem
-    labels = {label: guess_segment(path.stem)}
+    labels = {label: load_table().guess_segment(path.stem)}
     table = make_table(time, {label: values})
     return Device("mt_manager", table, labels, kind, since_power_on=True, wraps_s=wraps_s)
 

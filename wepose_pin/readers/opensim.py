@@ -16,7 +16,7 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData
-from ..recording.segments import guess_segment
+from ..model import load_table
 from .device import Device, check_measured, make_table, read_first_lines
 from .tables import read_columns
 
@@ -81,7 +81,7 @@ def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = Non
     return Device(
         "opensim",
         make_table(time, {label: {"orientation": quat} for label, quat in quats.items()}),
-        {label: guess_segment(label) for label in labels},
+        {label: load_table().guess_segment(label) for label in labels},
         "orientation",
         aligned=own,
     )

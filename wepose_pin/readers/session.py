@@ -13,10 +13,8 @@ import polars as pl
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, printable
+from ..model.table import NEUTRAL_POSE
 from ..recording import (
-    CONFIGURATION,
-    SEGMENTS,
-    START_POSES,
     ImuSensor,
     Intervals,
     OrientationSensor,
@@ -159,13 +157,11 @@ class SessionReader:
         data, sensors = top.table("data"), top.table("sensors", {})
         data.allow(*_FOR_SENSORS, "truth")
         self._used: set[str] = set()  # keys of `_FOR_SENSORS` that a sensor uses
-        start_pose = top.choice("start_pose", (*START_POSES, CONFIGURATION), "n_pose")
-        # Sensors of a chain are named by links, and the chain's model is not known here.
-        tables = sensors.tables(sensors.values if start_pose == CONFIGURATION else SEGMENTS, "segment")
+        start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
+        # Whether the names are segments, and the start pose one of theirs, is checked where the body is known.
+        tables = {name: sensors.table(name) for name in sensors.values}
         if not tables:
-            raise BadSession(
-                f"{self.path}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}"
-            )
+            raise BadSession(f"{self.path}: no sensors; one [sensors.<segment>] table each")
         self._head = Recording(
             name=printable(top.text("name", None) or self.path.absolute().parent.name or self.path.stem),
             time=np.empty(0),

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import BadData, MissingFile
+from ..model import load_table
 from ..recording.limits import STANDARD_GRAVITY
-from ..recording.segments import guess_segment
 from .device import Device, Text, make_table, read_first_lines, read_text
 
 INERTIAL, QUATERNION = "Inertial.csv", "Quaternion.csv"
@@ -54,7 +54,7 @@ def read_ximu3(path: Path, use: str | None = None, rate_hz: float | None = None)
         values = {"orientation": _quat(text)}
     label = folder.name if file.name in (INERTIAL, QUATERNION) else file.stem
     kind = "raw" if "gyro" in values else "orientation"
-    segment = guess_segment(folder.absolute().name if file.name in (INERTIAL, QUATERNION) else file.stem)
+    segment = load_table().guess_segment(folder.absolute().name if file.name in (INERTIAL, QUATERNION) else file.stem)
     return Device("ximu3", make_table(time, {label: values}), {label: segment}, kind, since_power_on=True)
 
 

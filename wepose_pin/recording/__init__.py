@@ -1,4 +1,4 @@
-"""What the sensors measured: SI units, one even time base, sensors named by the segment they are strapped on.
+"""What the sensors measured: SI units, one even time base, sensors named by the segment that they are on.
 
 `recording` holds the type and its checks. What a file or a live source gives becomes one in these steps: `clocks` (the
 sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a file; `arrivals` of a live source;
@@ -6,16 +6,13 @@ sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a f
 """
 
 from .intervals import Intervals, check_phases, check_time, format_span, format_time
-from .recording import CONFIGURATION, EACH_TIME, START_POSES, Recording, check_recording, join_recordings
-from .segments import SEGMENTS
+from .recording import CONFIGURATION, EACH_TIME, Recording, check_recording, join_recordings
 from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, compute_mount, find_mount_axes
 
 __all__ = [
     "AXES",
     "CONFIGURATION",
     "EACH_TIME",
-    "SEGMENTS",
-    "START_POSES",
     "ImuSensor",
     "Intervals",
     "OrientationSensor",

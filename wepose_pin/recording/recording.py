@@ -8,15 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arguments import Positive, check_array, check_fields, check_finite, check_names, check_unit
+from ..arguments import Positive, check_array, check_fields, check_finite, check_unit
 from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, BadPhase, one_of
 from .intervals import Intervals, check_phases, check_time
 from .limits import MEDIAN_FORCE
-from .segments import SEGMENTS
 from .sensors import ImuSensor, OrientationSensor, Sensor, join_sensors
 
-START_POSES = ("n_pose",)
 # The start pose of a chain that is not a person: values of its joints. Its sensors are named by links.
 CONFIGURATION = "configuration"
 
@@ -161,14 +159,8 @@ def check_recording(recording: Recording) -> Recording:
     """
     where, time = recording.where(), recording.time
     check_fields(recording, f"{where}: ")
-    start_poses = (*START_POSES, CONFIGURATION)
-    if recording.start_pose not in start_poses:
-        raise BadOption(f"{where}: start_pose = '{recording.start_pose}' is not known; {one_of(start_poses)}")
-    if recording.start_pose != CONFIGURATION:  # else the sensors are named by links
-        links = f'; a chain\'s links need start_pose = "{CONFIGURATION}"'
-        check_names(f"{where}: sensors", recording.sensors, SEGMENTS, links)
     if not recording.sensors:
-        raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each, segments: {', '.join(SEGMENTS)}")
+        raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each")
     if len(time) < 2:
         raise BadData(f"{where}: time has {len(time)} samples; a recording has at least 2")
     check_array(f"{where}: time", time, (len(time),))

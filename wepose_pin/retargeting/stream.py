@@ -17,7 +17,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, BadOption
-from ..subject import LENGTHS
+from ..model import load_table
 from .collision import CollisionModel
 from .controller import ControllerParams, HandTarget, JointState, PostureReference, QpController, StepCounts
 from .robot import Arm, Robot
@@ -185,7 +185,7 @@ class ArmObserver:
     Parameters
     ----------
     segments, points : rows of a live pose
-    lengths_cov : (8, 8) [m²] of the person's lengths in the order of `LENGTHS`; None: exact
+    lengths_cov : (8, 8) [m²] of the person's lengths in the order of the table; None: exact
     scale : metres of the robot for one of the person; None: a straight arm becomes `compute_target_reach`
 
     Raises
@@ -204,7 +204,8 @@ class ArmObserver:
     ) -> None:
         check_segments(robot, segments)
         self._robot, self._scale = robot, scale
-        self._lengths_cov = np.zeros((len(LENGTHS), len(LENGTHS))) if lengths_cov is None else lengths_cov
+        lengths = list(load_table().lengths)
+        self._lengths_cov = np.zeros((len(lengths), len(lengths))) if lengths_cov is None else lengths_cov
         self._segments = tuple(segments)
         self._points, self._rows, self._lengths = [], [], []  # of each arm, into points, segments, lengths
         for arm in robot.arms:
@@ -213,7 +214,7 @@ class ArmObserver:
             chain = ("torso", f"{arm.side}_upper_arm", f"{arm.side}_forearm", hand)
             self._rows.append([self._segments.index(name) for name in chain])
             names = (f"{arm.side}_{part}" for part in ("upper_arm", "forearm", "hand"))
-            self._lengths.append([LENGTHS.index(name) for name in names])
+            self._lengths.append([lengths.index(name) for name in names])
         self.scales: list[float] = []
 
     def observe(

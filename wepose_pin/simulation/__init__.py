@@ -9,7 +9,6 @@ By default a perfect world: no soft tissue, an exact N-pose, palms that coincide
 the table, and sensors with noise and bias only. `Imperfections` add those of real people and sensors.
 """
 
-from ..subject import LENGTHS
 from .imperfections import IDEAL_PRESET, MILD_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, NOISE_FREE, Device, ImuNoise
 from .motion import SEGMENTS, SIDES
@@ -19,7 +18,6 @@ from .subject import MOUNT, Person, Simulation, simulate, simulate_person
 __all__ = [
     "GRAVITY",
     "IDEAL_PRESET",
-    "LENGTHS",
     "MILD_PRESET",
     "MOUNT",
     "MTI_3",

@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arguments import Count, NonNegative, Positive, check_arguments
+from ..arguments import Count, NonNegative, Positive, check_arguments, check_names
 from ..errors import BadOption
 from ..kinematics import Pose
+from ..model import SEXES, load_table
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, mark_lost_samples
-from ..subject import LENGTHS, SEXES, Subject, check_lengths, population_subject
+from ..subject import Subject, check_lengths, population_subject
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
 from .motion import (
@@ -216,15 +217,17 @@ def simulate(
         A length is missing or not positive, the arms cannot do the motion, or a parameter is out of range.
     """
     check_arguments(simulate, locals())
-    check_lengths("lengths", lengths, LENGTHS)
-    missing = [name for name in LENGTHS if name not in lengths]
+    names = tuple(load_table().lengths)
+    check_names("lengths", lengths, names)
+    check_lengths("lengths", lengths)
+    missing = [name for name in names if name not in lengths]
     if missing:
         raise BadOption(f"lengths: {', '.join(missing)} is missing; each is needed, in metres")
     if not (clasp_s >= 5.0 and circles >= 0 and rate_hz > 0.0):
         raise BadOption(f"clasp_s {clasp_s} must be >= 5, circles {circles} >= 0, rate_hz {rate_hz} > 0")
     if protocol not in TASKS or (protocol == "poses" and circles):
         raise BadOption(f"protocol {protocol!r} must be one of {', '.join(TASKS)}; with 'poses' circles must be 0")
-    lengths = {name: float(lengths[name]) for name in LENGTHS}
+    lengths = {name: float(lengths[name]) for name in names}
     motion_rng, mount_rng, noise_rng, *others = np.random.default_rng(seed).spawn(3 + len(_STREAMS))
     rngs = dict(zip(_STREAMS, others, strict=True))
     motion = TASKS[protocol](lengths, motion_rng, clasp_s, circles, Flaws(imperfections, rngs))

@@ -27,10 +27,10 @@ from ..alignment import (
     SegmentOrientations,
     compute_start_heading_var,
 )
-from ..recording import SEGMENTS, Recording
+from ..recording import Recording
 from ..subject import Subject
 
-HAND_TO_HAND_CHAIN = SEGMENTS[:5]
+HAND_TO_HAND_CHAIN = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 HANDS = ("left_hand", "right_hand")  # part of the chain if measured, else rigid with their forearms
 KNOT_S = 2.0  # [s] between knots of the random walk
 SAMPLE_RATE_HZ = 8.0

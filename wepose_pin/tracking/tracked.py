@@ -12,8 +12,8 @@ from ..alignment import SegmentOrientations
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json
 from ..errors import BadData
 from ..kinematics import Pose, compute_orientation_residuals
-from ..model import POINTS, BodyModel, load_model
-from ..recording import SEGMENTS, Recording
+from ..model import BodyModel, load_model
+from ..recording import Recording
 from ..subject import Subject, population_subject
 from .headings import HeadingCorrection
 from .options import TrackOptions
@@ -200,8 +200,8 @@ def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | N
 
 def _diagnose_unknown_points(tracked: TrackedRecording) -> list[Diagnostic]:
     """The points that are unknown for lack of a sensor."""
-    missing = [point for point in POINTS if point not in tracked.points]
-    lacking = [name for name in SEGMENTS[:5] if name not in tracked.quat_WL]
+    missing = [point for point in tracked.model.table.points if point not in tracked.points]
+    lacking = [name for name in tracked.model.table.needed if name not in tracked.quat_WL]
     if not missing or not lacking:
         return []
     facts = {"segments": ", ".join(lacking), "points": ", ".join(missing)}
@@ -210,10 +210,9 @@ def _diagnose_unknown_points(tracked: TrackedRecording) -> list[Diagnostic]:
 
 def make_body(subject: Subject | None, model: BodyModel | None) -> tuple[Subject, BodyModel]:
     """The subject as used, without one the population prior, and a body of those lengths."""
-    person = subject or population_subject()
     body = model or load_model()
-    own = body.lengths
-    if subject is None and model is not None:
-        # A chosen model has its person's lengths; lengths that it lacks are the population prior's.
-        person = replace(person, name=body.robot.name, lengths={**person.lengths, **own}, note="lengths of the model")
-    return person, body.with_lengths({name: value for name, value in person.lengths.items() if name in own})
+    person = subject or population_subject(body=body)
+    person.check_body(body.table)
+    if subject is None and model is not None:  # a chosen model has its person's lengths
+        person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
+    return person, body.with_lengths({name: person.lengths[name] for name in body.table.lengths})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
-from ..errors import BadOption
+from ..errors import BadOption, BadSession, one_of
 from ..kinematics import KinematicsSolver, compute_point_covariances
 from ..model import BodyModel
 from ..recording import CONFIGURATION, Recording
@@ -74,6 +74,11 @@ class Tracker:
             What the recording, the subject or the model lacks; sensors on links that are no segments.
         """
         _check_person(chunk)
+        self._body.table.check_segments(chunk.sensors, f"{chunk.where()}: sensors.", BadSession)
+        if chunk.start_pose not in self._body.table.poses:
+            raise BadSession(
+                f"{chunk.where()}: start_pose = '{chunk.start_pose}' is not known; {one_of(self._body.table.poses)}"
+            )
         return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented)]
 
     def finish(self) -> list[TrackedRecording]:
@@ -104,11 +109,11 @@ class Tracker:
         if self._kinematics is None:
             self._kinematics = KinematicsSolver(self._body, segments.quat_WL, limits=self.options.limits)
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
-        lengths_cov = self._person.lengths_covariance()
+        lengths_cov = self._person.lengths_covariance(self._body.lengths)
         pose = replace(
             pose,
             segment_cov=segments.covariance_W,
-            point_cov=compute_point_covariances(pose.points, pose.quat_WL, segments.covariance_W, lengths_cov),
+            point_cov=compute_point_covariances(self._body, pose.quat_WL, segments.covariance_W, lengths_cov),
             gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         )
         correction = None if self._headings is None else self._headings.summarize()

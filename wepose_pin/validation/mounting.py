@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from ..calibration import calibrate_lengths
 from ..evaluation import evaluate
+from ..model import load_table
 from ..simulation import MILD_PRESET, Person, Simulation, simulate, simulate_person
-from ..subject import LENGTHS, Subject, mount_rows
+from ..subject import Subject, mount_rows
 from ..tracking import track
 from .jobs import Job, Result
 from .tables import ARBITRARY_MOUNTING
@@ -45,7 +46,7 @@ def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
 
 def _compute_calibration_errors(subject: Subject, person: Person, simulation: Simulation) -> dict[str, float]:
     """Compute errors of the calibration, also as multiples of its standard deviations."""
-    names = [name for name in LENGTHS if name != "trunk"]  # joined hands do not observe the trunk
+    names = [name for name in load_table().lengths if name != "trunk"]  # joined hands do not observe the trunk
     lengths = np.array([subject.lengths[name] - person.lengths[name] for name in names])
     order = list(simulation.quat_LS)
     mounts = np.array(

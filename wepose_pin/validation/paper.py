@@ -32,7 +32,7 @@ from ..simulation import (
     simulate_paper_dynamic,
     simulate_person,
 )
-from ..subject import LENGTHS, Subject, mount_rows
+from ..subject import Subject, mount_rows
 from ..tracking import track
 from .contenders import Contender, list_contenders
 from .jobs import Job, Result
@@ -201,7 +201,7 @@ def _collect_hand_errors(errors: Evaluation) -> dict[str, dict[str, float]]:
 def _compute_lengths_rms(subject: Subject, person: Person) -> float:
     """Compute the rms error [mm] of the lengths that the closed chain observes: all but the trunk."""
     return 1e3 * float(
-        np.sqrt(np.mean([(subject.lengths[n] - person.lengths[n]) ** 2 for n in LENGTHS if n != "trunk"]))
+        np.sqrt(np.mean([(subject.lengths[n] - person.lengths[n]) ** 2 for n in person.lengths if n != "trunk"]))
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...errors import BadOption, one_of
-from ...recording import SEGMENTS
+from ...model import load_table
 from ..addresses import parse_address
 from .base import Source
 
@@ -46,9 +46,9 @@ def open_source(
     kind, colon, rest = spec.partition(":")
     if kind not in FORMS or not colon or not rest:
         raise BadOption(f"source '{spec}' is none; {one_of(FORMS.values(), kind)}")
-    unknown = [name for name in sensors or () if name not in SEGMENTS]
+    unknown = [name for name in sensors or () if name not in tuple(load_table().segments)]
     if unknown:
-        raise BadOption(f"source '{spec}': '{unknown[0]}' is not a segment; {one_of(SEGMENTS, unknown[0])}")
+        raise BadOption(f"source '{spec}': '{unknown[0]}' is not a segment; {one_of(unknown[0])}")
     if kind == "replay":
         return _open_replay(spec, rest, sensors, speed)
     if kind == "lsl":
@@ -111,8 +111,8 @@ def _open_mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int) ->
         device, equals, segment = pair.rpartition("=")
         if not equals or not device:
             raise BadOption(f"source '{spec}': '{pair}' is no DEVICE=SEGMENT, as /dev/ttyUSB0=torso")
-        if segment not in SEGMENTS:
-            raise BadOption(f"source '{spec}': '{segment}' is not a segment; {one_of(SEGMENTS, segment)}")
+        if segment not in tuple(load_table().segments):
+            raise BadOption(f"source '{spec}': '{segment}' is not a segment; {one_of(segment)}")
         if segment in devices or device in devices.values():
             raise BadOption(f"source '{spec}': '{pair}': each device and each segment is named once")
         devices[segment] = device

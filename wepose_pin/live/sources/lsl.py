@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import BadOption, BadSource, one_of
-from ...recording import SEGMENTS
+from ...model import load_table
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
 from .checks import IMPLAUSIBLE, keep_plausible
@@ -69,8 +69,8 @@ def find_channels(
     where = f"lsl:{name}: stream '{stream}'"
     if stream != name:
         segment = stream[len(name) + 1 :]
-        if segment not in SEGMENTS:
-            raise BadSource(f"{where}: '{segment}' is not a segment; {one_of(SEGMENTS, segment)}")
+        if segment not in tuple(load_table().segments):
+            raise BadSource(f"{where}: '{segment}' is not a segment; {one_of(segment)}")
         wanted = {segment: list(SIGNALS)}
         if not any(labels):
             if count != len(SIGNALS):
@@ -80,7 +80,11 @@ def find_channels(
                 )
             labels = SIGNALS
     else:
-        there = [segment for segment in SEGMENTS if any(label.startswith(f"{segment}_") for label in labels)]
+        there = [
+            segment
+            for segment in tuple(load_table().segments)
+            if any(label.startswith(f"{segment}_") for label in labels)
+        ]
         wanted = {segment: [f"{segment}_{signal}" for signal in SIGNALS] for segment in there}
         if not wanted:
             raise BadSource(
@@ -167,7 +171,7 @@ class LslSource:
                 f"lsl:{self._name}: {problem}, within {self._wait_s:g} s; name streams {self._name}-<segment>, or look "
                 f"further with lsl:{self._name}@site"
             )
-        self.sensors = self.sensors or tuple(segment for segment in SEGMENTS if segment in present)
+        self.sensors = self.sensors or tuple(segment for segment in tuple(load_table().segments) if segment in present)
         rates = {stream.rate_hz for stream in self._streams.values()}
         self.rate_hz = rates.pop() if len(rates) == 1 and min(rates) > 0.0 else None
         self._reconnector = threading.Thread(target=self._reconnect, name=f"lsl {self._name}", daemon=True)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from ...recording import SEGMENTS
+from ...model import load_table
 
 MAGIC = b"WPIN"
 VERSION = 1
@@ -86,7 +86,7 @@ def _decode_line(line: bytes) -> tuple[str, list[float], list[list[float]]]:
     if not isinstance(message, dict) or not message.keys() >= {"sensor", "t", "gyro", "accel"}:
         raise _Malformed("JSON lines without sensor, t, gyro and accel")
     sensor = message["sensor"]
-    if sensor not in SEGMENTS:
+    if sensor not in tuple(load_table().segments):
         raise _Malformed(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
     time, gyro, accel = message["t"], message["gyro"], message["accel"]
     if not isinstance(time, list):

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...errors import BadSource
-from ...recording import SEGMENTS
+from ...model import load_table
 from ...recording.arrivals import Samples
 from .checks import IMPLAUSIBLE, MAX_TIME, keep_plausible
 from .clocks import HostClock
@@ -74,7 +74,7 @@ class UdpSource:
 
     def _find_sensors(self) -> None:
         host, port = self.address
-        self.sensors = SEGMENTS
+        self.sensors = tuple(load_table().segments)
         deadline = time.monotonic() + self._wait_s
         while not self._waiting and time.monotonic() < deadline:
             self._waiting = self._receive(0.1)
@@ -89,7 +89,7 @@ class UdpSource:
         while time.monotonic() < deadline:
             self._waiting += self._receive(0.1)
         present = {samples.sensor for samples in self._waiting}
-        self.sensors = tuple(segment for segment in SEGMENTS if segment in present)
+        self.sensors = tuple(segment for segment in tuple(load_table().segments) if segment in present)
 
     def read(self, timeout_s: float) -> list[Samples]:
         """Samples since the last call, one `Samples` a sensor."""

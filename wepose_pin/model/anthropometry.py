@@ -1,0 +1,68 @@
+"""The lengths of people: mean and covariance, from shares of stature."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..assets import asset
+from ..documents import read_toml
+from ..errors import BadModel, BadOption, one_of
+from .table import BodyTable
+
+SEXES = ("f", "m")
+
+
+class LengthPrior(NamedTuple):
+    """Lengths before anything is measured: names, mean (k,) [m], covariance (k, k) [m²], and whose they are."""
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    covariance: np.ndarray
+    note: str
+
+
+def compute_population_lengths(table: BodyTable, stature: float | None = None, sex: str | None = None) -> LengthPrior:
+    """The lengths of a table that people have; of those that name a share of stature.
+
+    Lengths share the stature's spread where it is not given, left and right share the person's shape; numbers and
+    sources stand in ``calibration/anthropometry.toml``.
+
+    Parameters
+    ----------
+    stature : body height [m]; None: 1.75 with the spread of adults
+    sex : "f", "m", or None for the mean of both
+
+    Raises
+    ------
+    BadOption
+        A stature outside 1.0 to 2.5 m, or another sex.
+    BadModel
+        The table names a share that is not known.
+    """
+    if stature is not None and not 1.0 <= stature <= 2.5:
+        raise BadOption(f"stature {stature:g} is not a body height in metres; between 1.0 and 2.5")
+    if sex is not None and sex not in SEXES:
+        raise BadOption(f"sex '{sex}' is not known; {one_of(SEXES)}")
+    numbers = read_toml(asset("calibration", "anthropometry.toml"), "the anthropometric prior")
+    height = stature if stature is not None else numbers["stature"]["mean"]
+    height_std = 0.0 if stature is not None else numbers["stature"]["std"] / numbers["stature"]["mean"]
+    shares = [numbers[{"f": "female", "m": "male"}[s]] for s in ([sex] if sex else SEXES)]
+
+    names = [name for name, length in table.lengths.items() if length.share]
+    part = [table.lengths[name].share for name in names]
+    for name, share in zip(names, part, strict=True):
+        if share not in numbers["shape_std"]:
+            raise BadModel(
+                f"{table.where}: lengths.{name}.share = '{share}' is not known; {one_of(numbers['shape_std'], share)}"
+            )
+    mean = np.array([height * np.mean([share[p] for share in shares]) for p in part])
+    # Relative errors: one of stature common to all, one of shape common to left and right, one of each side.
+    shape = np.array([numbers["shape_std"][p] for p in part])
+    same = np.array([[a == b for a in part] for b in part], dtype=float)
+    sided = np.array([bool(table.side(name)) for name in names], dtype=float)
+    relative = height_std**2 + same * np.outer(shape, shape) + np.diag(sided * numbers["asymmetry_std"]["all"] ** 2)
+    known = ", ".join([f"stature {height:g} m" + ("" if stature else " assumed"), f"sex {sex or 'not given'}"])
+    covariance = np.outer(mean, mean) * relative
+    return LengthPrior(tuple(names), mean, covariance, f"population prior ({known})")

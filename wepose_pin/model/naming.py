@@ -1,0 +1,190 @@
+"""A URDF that bears the names of its table: links named after segments and points, in our frames.
+
+They are massless links fixed to those of the URDF. So all that follows, and every reader of the URDF that comes out,
+finds the segments by their names.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import BadModel, one_of
+from ..recording import compute_mount
+from .table import BodyTable, Point
+from .tree import Tree, parse_tree
+
+MOST_LINKS = 100  # that an error lists; a person's body has fewer
+
+
+def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
+    """A copy of the robot (yourdfpy) with links named after segments and points, and the table of these names.
+
+    A mechanism's segments have their links' frames, and so have those of a URDF whose links bear the segments' names.
+    Else every segment frame equals W in the N-pose. At zero of its joints a body may stand otherwise, in a T-pose say.
+    There
+
+    - segments of the spine are upright: their frames are W's;
+    - others lie along the line between the points of their length. The shortest rotation that carries their long axis
+      there is their orientation; a segment without a length has that of the segment above;
+    - `up` and `forward` of a segment are taken in place of that.
+
+    Raises
+    ------
+    BadModel
+        A link that is not there; points in one place; a segment so far off that no rotation is the shortest.
+    """
+    tree = parse_tree(robot, table.where)
+    _check_links(table, tree)
+    R_WM = Rotation.from_quat(compute_mount(table.up, table.forward)).as_matrix()  # M: the root link
+    M_WM = np.eye(4)
+    M_WM[:3, :3] = R_WM
+    M_WM[:3, 3] = -R_WM @ np.mean([tree.neutral(link)[:3, 3] for link in table.root or (tree.root,)], axis=0)
+    M_WK = {link: M_WM @ tree.neutral(link) for link in table.links}  # K: a link of theirs
+    p_W = {name: M_WK[point.link][:3, :3] @ point.at + M_WK[point.link][:3, 3] for name, point in table.points.items()}
+
+    segment_of = {segment.link: name for name, segment in reversed(table.segments.items())}
+    R_WL: dict[str, np.ndarray] = {}  # orientation of our segments while their joints are at zero
+    for name in sorted(table.segments, key=lambda name: len(tree.path(table.segments[name].link))):
+        above = _segment_above(tree, table.segments[name].link, segment_of)
+        R_WL[name] = _neutral_orientation(table, name, M_WK, p_W, np.eye(3) if above is None else R_WL[above])
+
+    frames: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # name → their link, R_WL, p_W
+    points: dict[str, Point] = {}
+    for name, segment in table.segments.items():
+        frames[name] = segment.link, R_WL[name], M_WK[segment.link][:3, 3]
+    for name, point in table.points.items():
+        begins = segment_of.get(point.link)
+        if begins is not None and not any(point.at):
+            points[name] = Point(begins)
+            continue
+        carrier = begins or _segment_above(tree, point.link, segment_of)
+        link = point.link if carrier is None or table.is_mechanism else table.segments[carrier].link
+        frames[name] = link, M_WK[link][:3, :3] if carrier is None else R_WL[carrier], p_W[name]
+        M_WK.setdefault(link, M_WM @ tree.neutral(link))
+        points[name] = Point(name)
+    segments = {name: segment._replace(link=name, up=None, forward=None) for name, segment in table.segments.items()}
+    named = replace(table, segments=segments, points=points, up="+z", forward="+x", root=())
+    return _with_links(robot, tree.root, M_WM, M_WK, frames), named
+
+
+def _segment_above(tree: Tree, link: str, segment_of: Mapping[str, str]) -> str | None:
+    """The nearest segment between a link and the root."""
+    while link != tree.root:
+        link = tree.above[link].parent
+        if link in segment_of:
+            return segment_of[link]
+    return None
+
+
+def _check_links(table: BodyTable, tree: Tree) -> None:
+    where = table.where
+    lacking = [name for name, segment in table.segments.items() if segment.link not in tree.below]
+    if len(lacking) > 1:
+        raise BadModel(
+            f"{where}: segments: no link for {format_closest_links(lacking, tree.below, table)}; "
+            f"{one_of(tree.below, most=MOST_LINKS)}"
+        )
+    for key, entries in (("segments", table.segments), ("points", table.points)):
+        for name, entry in entries.items():
+            if entry.link not in tree.below:
+                raise BadModel(
+                    f"{where}: {key}.{name}: no link '{entry.link}'; {one_of(tree.below, entry.link, MOST_LINKS)}"
+                )
+    for link in table.root:
+        if link not in tree.below:
+            raise BadModel(f"{where}: root: no link '{link}'; {one_of(tree.below, link, MOST_LINKS)}")
+
+
+def format_closest_links(segments: Iterable[str], links: Iterable[str], table: BodyTable) -> str:
+    """Segments that have no link, each with the links whose names speak of it or come closest."""
+    links = list(links)
+    names = []
+    for segment in segments:
+        close = [link for link in links if table.guess_segment(link) == segment]
+        others = [link for link in links if table.guess_segment(link) is None]
+        close = close or get_close_matches(segment, others, n=3, cutoff=0.5)
+        names.append(f"'{segment}'" + (f" (maybe {' or '.join(close[:4])})" if close else ""))
+    return ", ".join(names)
+
+
+def _neutral_orientation(
+    table: BodyTable, name: str, M_WK: Mapping[str, np.ndarray], p_W: Mapping[str, np.ndarray], R_above: np.ndarray
+) -> np.ndarray:
+    """Orientation R_WL (3, 3) of a segment while all joints are at zero; `R_above`: of the segment above."""
+    segment, where = table.segments[name], table.where
+    R_WK = M_WK[segment.link][:3, :3]
+    if segment.up is not None and segment.forward is not None:
+        return R_WK @ Rotation.from_quat(compute_mount(segment.up, segment.forward)).as_matrix().T
+    if table.is_mechanism or all(each.link == key for key, each in table.segments.items()):
+        return R_WK
+    if segment.spine:
+        return np.eye(3)
+    ends = table.ends(name)
+    if ends is None or not set(ends[0] + ends[1]) <= set(p_W):
+        return R_above
+    first, last = (np.mean([p_W[point] for point in points], axis=0) for points in ends)
+    along = last - first
+    length = np.linalg.norm(along)
+    if length < 1e-6:
+        raise BadModel(
+            f"{where}: {' and '.join(ends[0] + ends[1])} lie in one place; name the links at both ends of {name}"
+        )
+    cosine = float(np.dot(segment.along, along) / length)
+    if cosine < 1e-6 - 1.0:
+        raise BadModel(
+            f"{where}: segments.{name}: points opposite to its direction in the N-pose; state its up and forward axes "
+            f"of the N-pose"
+        )
+    return Rotation.from_quat([*np.cross(segment.along, along / length), 1.0 + cosine]).as_matrix()
+
+
+def _with_links(
+    robot: Any,
+    root: str,
+    M_WM: np.ndarray,
+    M_WK: Mapping[str, np.ndarray],
+    frames: Mapping[str, tuple[str, np.ndarray, np.ndarray]],
+) -> Any:
+    """A copy of the robot with the links `frames` (name → the link it is fixed to, R_WL, p_WL), on a root that is W.
+
+    A link of theirs that bears such a name and stands elsewhere becomes ``<name>_link``.
+    """
+    import yourdfpy
+
+    robot = copy.deepcopy(robot)
+    added = {}
+    for name, (link, R, p) in frames.items():
+        M_WL = np.eye(4)
+        M_WL[:3, :3], M_WL[:3, 3] = R, p
+        M_KL = np.linalg.inv(M_WK[link]) @ M_WL
+        if name != link or not np.allclose(M_KL, np.eye(4), atol=1e-12):
+            added[name] = link, M_KL
+    if not np.allclose(M_WM, np.eye(4), atol=1e-12):
+        added["root"] = root, M_WM
+    own = {link.name for link in robot.links}
+    renamed = {name: _make_unique(f"{name}_link", own) for name in added if name in own}
+    for link in robot.links:
+        link.name = renamed.get(link.name, link.name)
+    for joint in robot.joints:
+        joint.parent = renamed.get(joint.parent, joint.parent)
+        joint.child = renamed.get(joint.child, joint.child)
+    joints = {joint.name for joint in robot.joints}
+    for name, (link, M) in added.items():
+        ends = (name, renamed.get(link, link)) if name == "root" else (renamed.get(link, link), name)
+        robot.links.append(yourdfpy.Link(name=name))
+        robot.joints.append(yourdfpy.Joint(_make_unique(f"{name}_fixed", joints), "fixed", *ends, origin=M))
+    return robot
+
+
+def _make_unique(name: str, used: Iterable[str]) -> str:
+    """`name`, made longer until it is not among those `used`."""
+    while name in used:
+        name += "_"
+    return name
