@@ -220,7 +220,7 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
         take = np.array([float(name in parts) for name in names])
         return float(np.sqrt(max(take @ shape @ take, 0.0)))
 
-    sides = [side for side in SIDES if f"{side}_upper_arm" in subject.mounts]
+    sides = [side for side in SIDES if f"{side}_upper_arm" in calibration.quat_WL]
     checks = []
     if closure:  # without a closure lengths are the prior's
         upper_arms = {s: std(f"{s}_upper_arm") for s in sides}
