@@ -215,9 +215,7 @@ def _minimise(A: np.ndarray, constraints: _Constraints) -> np.ndarray:
     return np.asarray(solution["x"]).ravel()
 
 
-def _estimate_covariance(
-    A: np.ndarray, gaps: np.ndarray, constraints: _Constraints, correlated: float
-) -> np.ndarray:
+def _estimate_covariance(A: np.ndarray, gaps: np.ndarray, constraints: _Constraints, correlated: float) -> np.ndarray:
     """Covariance (8, 8) [m²] of the lengths from the gaps' scatter and the constraints' errors; no bound is active.
 
     Parameters
