@@ -20,13 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 from scipy.linalg import block_diag, null_space
 
-from ..alignment import align_sensors
+from ..alignment import PALM_SLIP_STD, align_sensors
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, NoSolution, one_of
 from ..subject import LENGTHS, Subject
@@ -39,9 +40,10 @@ from .problem import CalibrationProblem
 from .protocols import Closure, Protocol, coefficients
 from .result import Calibration
 from .solver import MIN_LENGTH
-from .weights import MeasuredLength, count_correlated_samples, min_correlation
+from .weights import LEAST_VARIANCE, MeasuredLength, count_correlated_samples, min_correlation
 
 Formulation = Literal["full", "paper"]
+LEAST_EFFECT = 1e-6  # of a change of the lengths on the gaps, beside that of the change with the largest effect
 DECIMALS = 9  # of a length's effect on the chain, by which lengths that rotate together are found
 
 
@@ -86,13 +88,13 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     }
     A = compute_gap_matrices(observations, quat_WL)
     constraints = _state_constraints(problem, _group_lengths(protocol, filtered.R_VS))
-    lengths = _minimise(A, constraints)
-    if np.min(lengths) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
+    try:
+        lengths = _minimise(A, constraints)
+    except NoSolution as error:
         raise NoSolution(
-            f"{recording.where()}: the gap does not determine the lengths ({LENGTHS[int(np.argmin(lengths))]} = "
-            f"{1e3 * np.min(lengths):.0f} mm); check that the hands do in the phase what the protocol says, and that "
+            f"{recording.where()}: {error}; check that the hands do in the phase what the protocol says, and that "
             f"every mount is as the session states"
-        )
+        ) from error
     gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in LENGTHS]
     correlated = count_correlated_samples(gaps, min_correlation(observations))
     covariance = _estimate_covariance(A, gaps, constraints, correlated)
@@ -163,6 +165,10 @@ class _Constraints(NamedTuple):
     d: np.ndarray  # (m,)
     covariance: np.ndarray  # (m, m) of d
 
+    def find_free(self) -> np.ndarray:
+        """Directions (8, k) in which the lengths are free, orthonormal: ℓ = E⁺ d + free @ z."""
+        return null_space(self.E)
+
 
 def _group_lengths(protocol: Protocol, sensors: Collection[str]) -> list[tuple[str, ...]]:
     """The lengths in the chain; those that always rotate together are one group, of which the gap shows the sum."""
@@ -187,7 +193,7 @@ def _state_constraints(problem: CalibrationProblem, groups: list[tuple[str, ...]
     for group in groups:
         names = [name for name in group if name not in measured]
         shares = [unit[name] / prior.lengths[name] for name in names]
-        assumed += [a - b for a, b in zip(shares, shares[1:], strict=False)]
+        assumed += [a - b for a, b in pairwise(shares)]
     outside = set(LENGTHS).difference(measured, *groups)
     assumed += [unit[name] for name in LENGTHS if name in outside]
     E_measured = np.array([unit[name] for name in measured if name in unit])
@@ -202,17 +208,30 @@ def _state_constraints(problem: CalibrationProblem, groups: list[tuple[str, ...]
 
 
 def _minimise(A: np.ndarray, constraints: _Constraints) -> np.ndarray:
-    """The lengths (8,) [m] that make the gaps least under the constraints, by CasADi's `qpsol`."""
-    lengths = ca.MX.sym("lengths", K)
-    gaps = ca.mtimes(ca.DM(A.reshape(-1, K)), lengths)
-    program = {"x": lengths, "f": 0.5 * ca.sumsqr(gaps), "g": ca.mtimes(ca.DM(constraints.E), lengths)}
+    """The lengths (8,) [m] that make the gaps least under the constraints, by CasADi's `qpsol`.
+
+    Raises
+    ------
+    NoSolution
+        The gaps do not determine the lengths, or determine one that is at its bound.
+    """
+    effects = np.linalg.svd(A.reshape(-1, K) @ constraints.find_free(), compute_uv=False)
+    if np.min(effects, initial=1.0) < LEAST_EFFECT * np.max(effects, initial=1.0):
+        raise NoSolution("the motion does not determine the lengths: the gap does not change with some of them")
+    x = ca.MX.sym("lengths", K)
+    gaps = ca.mtimes(ca.DM(A.reshape(-1, K)), x)
+    program = {"x": x, "f": 0.5 * ca.sumsqr(gaps), "g": ca.mtimes(ca.DM(constraints.E), x)}
     options: dict[str, Any] = {"print_iter": False, "print_header": False, "print_info": False, "print_time": False}
     solver = ca.qpsol("lengths", "qrqp", program, options)
     try:
         solution = solver(lbx=MIN_LENGTH, lbg=constraints.d, ubg=constraints.d)
     except RuntimeError as error:
-        raise NoSolution("the gap does not determine the lengths: the quadratic program has no solution") from error
-    return np.asarray(solution["x"]).ravel()
+        raise NoSolution("the quadratic program of the lengths has no solution") from error
+    lengths = np.asarray(solution["x"]).ravel()
+    if np.min(lengths) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
+        shortest = int(np.argmin(lengths))
+        raise NoSolution(f"the gap is least with {LENGTHS[shortest]} = {1e3 * lengths[shortest]:.0f} mm")
+    return lengths
 
 
 def _estimate_covariance(A: np.ndarray, gaps: np.ndarray, constraints: _Constraints, correlated: float) -> np.ndarray:
@@ -222,12 +241,11 @@ def _estimate_covariance(A: np.ndarray, gaps: np.ndarray, constraints: _Constrai
     ----------
     correlated : samples that make one independent one
     """
-    rows, E = A.reshape(-1, K), constraints.E
-    free = null_space(E)  # (8, k): ℓ = E⁺ d + free z
+    rows, free = A.reshape(-1, K), constraints.find_free()
     information = free.T @ rows.T @ rows @ free
-    variance = np.sum(gaps**2) / (gaps.size - free.shape[1])
+    variance = max(np.sum(gaps**2) / (gaps.size - free.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
     by_z = free @ np.linalg.solve(information, free.T)
-    by_d = (np.eye(K) - by_z @ rows.T @ rows) @ np.linalg.pinv(E)
+    by_d = (np.eye(K) - by_z @ rows.T @ rows) @ np.linalg.pinv(constraints.E)
     covariance = correlated * variance * by_z + by_d @ constraints.covariance @ by_d.T
     return 0.5 * (covariance + covariance.T)
 

@@ -40,9 +40,9 @@ class CalibrateJob:
         Use this measured length, such as shoulder_width=0.385; may be given several times. With --protocol handle also
         handle=0.42, the distance of the palms on the bar.
     formulation
-        Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with priors) or
-        paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the palms, with the
-        mounts as the session states them and a measured length that fixes the scale).
+        Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
+        priors) or paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the
+        palms, with the mounts as the session states them and a measured length that fixes the scale).
     stature : METRES
         Narrow the population prior to people of this body height.
     sex
