@@ -141,6 +141,27 @@ def test_exact_orientations_give_the_lengths_back() -> None:
     assert found.rms_gap < 1e-6
 
 
+def test_noise_in_the_orientations_makes_arms_short() -> None:
+    """It adds to the bare gap in proportion to the lengths; `full` weighs for that (test_calibration)."""
+    person = simulate_person(11)
+    simulation = simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=30.0, circles=0)
+    rng, moving = np.random.default_rng(2), (simulation.time > 6.0)[:, None]
+    sensors = {}
+    for name, quat in simulation.quat_WL.items():
+        turn = Rotation.from_rotvec(rng.normal(scale=0.06, size=(len(quat), 3)) * moving)
+        sensors[name] = OrientationSensor(quat_WS=(Rotation.from_quat(quat) * turn).as_quat())
+    recording = replace(simulation.recording("noisy"), sensors=sensors)
+    measured = {"shoulder_width": person.lengths["shoulder_width"]}
+    ratio = {}
+    for formulation in ("full", "paper"):
+        lengths = calibrate_lengths(recording, measured=measured, measured_std=1e-4, formulation=formulation).subject
+        ratio[formulation] = np.mean(
+            [lengths.lengths[n] / person.lengths[n] for n in ("left_upper_arm", "right_upper_arm")]
+        )
+    assert ratio["full"] == pytest.approx(1.0, abs=0.02)
+    assert ratio["paper"] < 0.97
+
+
 def test_mounts_of_the_prior_are_used_and_stay(made: tuple[Person, Simulation, Recording]) -> None:
     person, simulation, recording = made
     prior = replace(person.prior, mounts=simulation.quat_LS)

@@ -189,6 +189,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "protocol": (*NAME, None),
         "method": (*NAME, None),
         "measured_std": (*POSITIVE, None),
+        "formulation": (*NAME, None),
     },
     "evaluate": {
         "pose": (*THING, None),
