@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.calibration import Calibration, assess, calibrate_lengths, load_protocol
 from wepose_pin.calibration.paper import check_paper_formulation
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadOption, BadSession, NoSolution
 from wepose_pin.recording import SEGMENTS, OrientationSensor, Recording
 from wepose_pin.report.track_diagnostics import describe_heading_remedy
@@ -139,6 +140,23 @@ def test_exact_orientations_give_the_lengths_back() -> None:
     for name in ("shoulder_width", *(n for n in LENGTHS if "arm" in n or "hand" in n)):
         assert found.subject.lengths[name] == pytest.approx(person.lengths[name], abs=1e-6), name
     assert found.rms_gap < 1e-6
+
+
+def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulation, Recording]) -> None:
+    person, _, recording = made
+    found = calibrate_lengths(recording, measured={"shoulder_width": 0.6}, prior=person.prior, formulation="paper")
+    quality = assess(found)
+    (contradicted,) = [each for each in quality.reasons if each.code == "measured-length-contradicted"]
+    assert quality.quality == "fail"
+    width = 1e3 * person.prior.lengths["shoulder_width"]
+    assert f"was measured as 600 mm. The population prior gives {width:.0f} mm ±" in render(contradicted).what
+
+
+def test_lengths_that_are_all_measured_stay(made: tuple[Person, Simulation, Recording]) -> None:
+    person, _, recording = made
+    found = calibrate_lengths(recording, measured=person.lengths, prior=person.prior, formulation="paper").subject
+    assert found.lengths == pytest.approx(person.lengths, abs=1e-9)
+    np.testing.assert_allclose(found.covariance, 0.003**2 * np.eye(8), atol=1e-12)
 
 
 def test_noise_in_the_orientations_makes_arms_short() -> None:

@@ -131,11 +131,12 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         protocol=protocol.name,
         closure="coincide",
         measured_example=protocol.measured_example,
-        measured_lengths={
+        measured_lengths={  # beside the prior alone: the gap is least without any length
             name: MeasuredLength(metres, prior.lengths[name], prior.std(name), std)
             for name, (metres, std) in problem.measured.items()
         },
         scale_lengths=scale_lengths,
+        formulation="paper",
     )  # fmt: skip
     arms = calibration.arms()
     return replace(calibration, labels=LabelCheck(arms.doubt(), arms.contradiction() if arms.doubt() > 1.0 else None))

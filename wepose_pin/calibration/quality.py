@@ -311,6 +311,8 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
         checks.append(_check(Diagnostic("start-pose-off", INFO, name, tilts[name]), TILT))
     for name, length in calibration.measured_lengths.items():
         lengths: dict[str, float | str] = {"measured": length.metres, "expected": length.expected, "std": length.std}
+        if calibration.formulation == "paper":
+            lengths["variant"] = "paper"
         checks.append(
             _check(Diagnostic("measured-length-contradicted", INFO, name, length.deviation, facts=lengths), MEASURED)
         )
