@@ -126,7 +126,7 @@ def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording) ->
 
 def test_it_is_close_to_tracking_the_whole_recording(recording: Recording) -> None:
     """The filter begins half a second later and is else the same."""
-    causal, whole = track(recording, causal=True), track(recording, correct_headings=False)
+    causal, whole = track(recording, causal=True), track(recording, open_loop=True)
     for name, quat in causal.quat_WL.items():
         offline = Rotation.from_quat(whole.quat_WL[name][-len(quat) :])
         assert np.degrees((offline.inv() * Rotation.from_quat(quat)).magnitude().max()) < 0.2

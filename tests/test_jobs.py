@@ -11,6 +11,7 @@ from typing import Any, get_args
 import pytest
 
 from benchmarks.results import adapter
+from wepose_pin import calibration
 from wepose_pin.batch.plan import STEPS, step_options
 from wepose_pin.batch.reproduction import REPRODUCIBLE
 from wepose_pin.calibration import PROTOCOLS
@@ -18,7 +19,7 @@ from wepose_pin.cli import COMMANDS, find_command
 from wepose_pin.cli.parser import parse
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import METHODS, OFFLINE
-from wepose_pin.jobs import LiveMethod, Method
+from wepose_pin.jobs import Formulation, LiveMethod, Method
 from wepose_pin.jobs.calibrate import CalibrateJob
 from wepose_pin.jobs.demo import DemoJob
 from wepose_pin.jobs.evaluate import EvaluateJob
@@ -33,8 +34,10 @@ from wepose_pin.writers import write_session
 from wepose_pin.writers.provenance import collect_provenance
 
 JOBS = {
-    "track": TrackJob(Path("s.toml"), Path("out"), Path("anna"), method="smekf", limits=False, chunk_seconds=20.0),
-    "calibrate": CalibrateJob(Path("s.toml"), Path("out"), "handle", {"handle": 0.4, "trunk": 0.5}, 1.7, "f"),
+    "track": TrackJob(
+        Path("s.toml"), Path("out"), Path("anna"), method="smekf", open_loop=True, limits=False, chunk_seconds=20.0
+    ),
+    "calibrate": CalibrateJob(Path("s.toml"), Path("out"), "handle", {"handle": 0.4, "trunk": 0.5}, 1.7, "f", "paper"),
     "simulate": SimulateJob(Path("out"), 3, 50.0, preset="mild", imperfection={"bits": 12.0, "mount": "any"}),
     "retarget": RetargetJob(Path("result"), "panda", Path("out"), "both", scale=0.8, episode=True),
     "demo": DemoJob(Path("out"), 4),
@@ -45,6 +48,7 @@ JOBS = {
 def test_choices_of_options_are_those_of_the_rooms() -> None:
     """Options are annotated without loading a room; what is added there must be added here."""
     assert get_args(Method) == tuple(METHODS) == adapter.METHODS
+    assert get_args(Formulation) == get_args(calibration.Formulation)
     assert get_args(LiveMethod) == tuple(name for name in METHODS if name not in OFFLINE)
     assert set(get_args(field_types(SimulateJob)["protocol"])) == set(TASKS) <= set(PROTOCOLS)
 
@@ -104,9 +108,10 @@ def test_the_example_of_a_command_is_a_job(name: str) -> None:
 
 
 def test_words_and_defaults_become_the_fields() -> None:
-    words = "s.toml --measured handle=0.4 --protocol handle --measured trunk=0.5 --stature 1.7 --sex f -o out"
+    words = "s.toml --measured handle=0.4 --protocol handle --measured trunk=0.5 --stature 1.7 --sex f"
+    words += " --formulation paper -o out"
     assert parse("calibrate", find_command("calibrate"), words.split()) == JOBS["calibrate"]
-    words = "--out=out s.toml --subject anna --method smekf --no-limits --chunk-seconds 20"
+    words = "--out=out s.toml --subject anna --method smekf --open-loop --no-limits --chunk-seconds 20"
     assert parse("track", find_command("track"), words.split()) == JOBS["track"]
     words = "-o out --seed 3 --rate-hz 50 --preset mild --imperfection bits=12 --imperfection mount=any"
     assert parse("simulate", find_command("simulate"), words.split()) == JOBS["simulate"]

@@ -171,7 +171,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "method": (*NAME, None),
         "model": THING,
         "static_test": THING,
-        "correct_headings": (*FLAG, None),
+        "open_loop": (*FLAG, None),
         "causal": (*FLAG, None),
         "limits": (*FLAG, None),
     },
@@ -189,6 +189,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "protocol": (*NAME, None),
         "method": (*NAME, None),
         "measured_std": (*POSITIVE, None),
+        "formulation": (*NAME, None),
     },
     "evaluate": {
         "pose": (*THING, None),

@@ -4,8 +4,8 @@
 inputs and samples, `chain` is the model's chains in CasADi, `least_squares` unknowns and residuals, `solver` the
 problem and its solution by `nlpsol`, `priors` what is known before. `initial_headings` and `contact` give the start,
 `joints` adds what accelerations show of headings, `losses` what lost samples change, `weights` weighs the samples,
-`alternatives` searches other minima, `anatomy` checks sensors and mounts. `result` is the outcome, `observability` and
-`quality` assess it.
+`alternatives` searches other minima, `anatomy` checks sensors and mounts. `paper` is the published calibration of the
+lengths alone. `result` is the outcome, `observability` and `quality` assess it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ..filters import BEST
 from ..recording import Recording
 from ..subject import Subject
 from .lengths import MEASURED_STD, calibrate_lengths
+from .paper import Formulation
 from .protocols import PROTOCOLS, Protocol, load_protocol
 from .quality import CalibrationQuality, Check, assess, document
 from .result import Calibration
@@ -29,6 +30,7 @@ __all__ = [
     "Calibration",
     "CalibrationQuality",
     "Check",
+    "Formulation",
     "Protocol",
     "assess",
     "calibrate",
@@ -46,6 +48,7 @@ def calibrate(
     protocol: str | Protocol = "clasp",
     method: str = BEST,
     measured_std: float = MEASURED_STD,
+    formulation: Formulation = "full",
 ) -> Subject:
     """The subject of a hands-together recording, if the calibration does not fail. Parameters as `calibrate_lengths`.
 
@@ -64,7 +67,13 @@ def calibrate(
         Its quality is "poor": what is uncertain, and what to do.
     """
     calibration = calibrate_lengths(
-        recording, measured=measured, prior=prior, protocol=protocol, method=method, measured_std=measured_std
+        recording,
+        measured=measured,
+        prior=prior,
+        protocol=protocol,
+        method=method,
+        measured_std=measured_std,
+        formulation=formulation,
     )
     quality = assess(calibration)
     reasons = " ".join(line for _, line in lines(quality.reasons))

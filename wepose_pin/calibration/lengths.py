@@ -45,6 +45,7 @@ from .contact import find_contact_start
 from .joints import add_couplings, estimate_couplings
 from .least_squares import HINGE_STD, Gaussian, K, Layout, Observations, place_points, residuals
 from .observability import diagnose_closures, diagnose_distances, diagnose_lengths, diagnose_mounts
+from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .priors import build_prior, combine_lengths
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem
 from .protocols import Protocol, load_protocol
@@ -74,6 +75,7 @@ def calibrate_lengths(
     protocol: str | Protocol = "clasp",
     method: str = BEST,
     measured_std: Positive = MEASURED_STD,
+    formulation: Formulation = "full",
 ) -> Calibration:
     """Link lengths with their covariance, and all else that a calibration estimates.
 
@@ -84,11 +86,13 @@ def calibrate_lengths(
     protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave
     method : the orientation filter
     measured_std : standard deviation [m] of each measured length
+    formulation : "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone,
+        by plain least squares with one measured length at least (`paper`)
 
     Raises
     ------
     BadOption
-        An unknown protocol, or a measured length that is none or not plausible.
+        An unknown protocol or formulation, or a measured length that is none, not plausible, or missing.
     BadSession, BadPhase
         A sensor that the protocol needs is missing; there is no such phase.
     """
@@ -105,12 +109,15 @@ def calibrate_lengths(
                 f"{recording.where()}: no sensor on {segment}; protocol '{protocol.name}' needs one each on "
                 f"{', '.join(protocol.needs)}"
             )
+    if formulation == "paper":
+        check_paper_formulation(protocol, with_std, recording.sensors)
     prior = prior or population_subject()
     prior.check_body(load_table())
     for condition in protocol.conditions:
         recording.phase(condition.phase)
     filtered = filter_recording(recording, method=method)
-    return _calibrate_checked(CalibrationProblem(recording, filtered, protocol, prior, with_std))
+    problem = CalibrationProblem(recording, filtered, protocol, prior, with_std)
+    return solve_paper_calibration(problem) if formulation == "paper" else _calibrate_checked(problem)
 
 
 def _check_measured(measured: Mapping[str, tuple[float, float]], protocol: Protocol) -> None:

@@ -220,7 +220,7 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
         take = np.array([float(name in parts) for name in names])
         return float(np.sqrt(max(take @ shape @ take, 0.0)))
 
-    sides = [side for side in SIDES if f"{side}_upper_arm" in subject.mounts]
+    sides = [side for side in SIDES if f"{side}_upper_arm" in calibration.quat_WL]
     checks = []
     if closure:  # without a closure lengths are the prior's
         upper_arms = {s: std(f"{s}_upper_arm") for s in sides}
@@ -311,6 +311,8 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
         checks.append(_check(Diagnostic("start-pose-off", INFO, name, tilts[name]), TILT))
     for name, length in calibration.measured_lengths.items():
         lengths: dict[str, float | str] = {"measured": length.metres, "expected": length.expected, "std": length.std}
+        if calibration.formulation == "paper":
+            lengths["variant"] = "paper"
         checks.append(
             _check(Diagnostic("measured-length-contradicted", INFO, name, length.deviation, facts=lengths), MEASURED)
         )

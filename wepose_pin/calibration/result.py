@@ -45,6 +45,7 @@ class Calibration:
     labels : whether the sensors sit where the session says
     unused_mounts : stated mounts that gravity or the motion contradicts
     scale_lengths : measured lengths that fix the scale; empty: the prior does
+    formulation : "full" or "paper"
     """
 
     subject: Subject
@@ -73,6 +74,7 @@ class Calibration:
     labels: LabelCheck = field(default_factory=LabelCheck)
     unused_mounts: tuple[Diagnostic, ...] = ()
     scale_lengths: tuple[str, ...] = ()
+    formulation: str = "full"
 
     def arms(self) -> ArmMotion:
         """How the arms moved while the chain was closed."""

@@ -74,7 +74,7 @@ def solve_reweighted(
         thinned = solve_reweighted(observations.take(rows), prior, start, contact[rows])
         start, contact, rounds = thinned.fit.x, np.interp(np.arange(n), rows, thinned.contact), rounds[-1:]
     x: np.ndarray | Fit = start
-    contact, correlation = contact.copy(), _min_correlation(observations)
+    contact, correlation = contact.copy(), min_correlation(observations)
     weights = np.full((n, 5), 1.0 / correlation)
     weights[:, :3] *= contact[:, None]
     if quick:
@@ -96,7 +96,7 @@ def solve_reweighted(
                 r = fit.closure[span, : closure.rows]
                 contact[span] = _estimate_contact(r, MIN_LATE_CONTACT if k > 1 else MIN_CONTACT)
                 weights[span, :3] = _weigh(r, contact[span], correlation)
-                effective += float(contact[span].sum()) / _correlated_samples(r * contact[span, None], correlation)
+                effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], correlation)
         arms = [SIDES.index(side) for side in observations.layout.arms]
         if arms and not quick:
             weights[closed, 3:] = _weigh(fit.hinge[closed][:, arms], np.ones(int(closed.sum())), correlation)
@@ -116,15 +116,15 @@ def _estimate_contact(r: np.ndarray, least: float) -> np.ndarray:
 def _weigh(r: np.ndarray, contact: np.ndarray, least: float) -> np.ndarray:
     """Weights (n, 1) of residuals (n, k): one over their variance and the number of correlated samples."""
     variance = max(float(np.sum(contact * np.sum(r**2, axis=1))) / (r.shape[1] * float(contact.sum())), LEAST_VARIANCE)
-    return contact[:, None] / (_correlated_samples(r * contact[:, None], least) * variance)
+    return contact[:, None] / (count_correlated_samples(r * contact[:, None], least) * variance)
 
 
-def _min_correlation(observations: Observations) -> float:
+def min_correlation(observations: Observations) -> float:
     """The number of samples in `LEAST_CORRELATION_S`."""
     return LEAST_CORRELATION_S / max(float(np.median(np.diff(observations.data[-1]))), 1e-3)
 
 
-def _correlated_samples(r: np.ndarray, least: float) -> float:
+def count_correlated_samples(r: np.ndarray, least: float) -> float:
     """How many samples of `r` (n, k) make one independent one, at least `least`: 1 + 2 Σ ρ up to the first zero."""
     n = len(r)
     centred = r - r.mean(axis=0)
@@ -148,7 +148,7 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
     """
     fit, contact = result.fit, result.contact
     C = np.linalg.inv(fit.information)
-    J, r, least = fit.jacobian, np.hstack((fit.closure, fit.hinge)), _min_correlation(observations)
+    J, r, least = fit.jacobian, np.hstack((fit.closure, fit.hinge)), min_correlation(observations)
     weights = np.broadcast_to(result.weights, r.shape)
     arms = [3 + SIDES.index(side) for side in observations.layout.arms]
     gradient = prior_information.copy()
@@ -167,7 +167,7 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
             # The fit has reduced the residuals: their variance gets back what it took.
             size = np.sum(r[span][:, rows] ** 2, axis=1) + np.einsum("nki,ij,nkj->n", slope, C, slope, optimize=True)
             variance = max(float(share @ size) / (len(rows) * float(share.sum())), LEAST_VARIANCE)
-            duration = round(_correlated_samples(r[span][:, rows] * share[:, None], least))
+            duration = round(count_correlated_samples(r[span][:, rows] * share[:, None], least))
             summed = np.concatenate((np.zeros((1, *pull.shape[1:])), np.cumsum(pull, axis=0)))
             ends = np.arange(1, len(pull) + duration)
             windows = summed[np.minimum(ends, len(pull))] - summed[np.maximum(ends - duration, 0)]

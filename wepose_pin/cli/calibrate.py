@@ -51,6 +51,8 @@ def _print_mounts(calibration: Calibration) -> None:
         off_start, drift = np.degrees(np.linalg.norm(tilt)), 60.0 * np.degrees(calibration.heading_drift[segment])
         cells = f"± {z:.1f}", f"± {np.hypot(x, y) / 2**0.5:.1f}", f"{off_start:.1f}", f"{drift:+.1f}"
         rows.append((segment, f"{up} up, {forward} ahead", *cells))
+    if not rows:
+        return
     header = ("sensor", "nearest axes", "heading", "tilt", "off the start pose", "heading drift [1/min]")
     print_table("Mounts, in deg: ± is one standard deviation", header, rows)
 

@@ -14,6 +14,7 @@ from typing import Literal
 
 Method = Literal["amekf", "smoother", "smekf", "ncf", "gdc"]
 LiveMethod = Literal["amekf", "smekf", "ncf", "gdc"]
+Formulation = Literal["full", "paper"]
 Arms = Literal["left", "right", "both"]
 Progress = Callable[[str, float], None]  # the current step, and the fraction of the job that is done; may raise
 

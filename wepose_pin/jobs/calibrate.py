@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic
 from ..errors import WrongOption, one_of
-from . import Method, Progress, no_progress
+from . import Formulation, Method, Progress, no_progress
 from .fields import field_values
 
 if TYPE_CHECKING:
@@ -39,6 +39,10 @@ class CalibrateJob:
     measured : NAME=METRES
         Use this measured length, such as shoulder_width=0.385; may be given several times. With --protocol handle also
         handle=0.42, the distance of the palms on the bar.
+    formulation
+        Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
+        priors) or paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the
+        palms, with the mounts as the session states them and a measured length that fixes the scale).
     stature : METRES
         Narrow the population prior to people of this body height.
     sex
@@ -61,6 +65,7 @@ class CalibrateJob:
     measured: Mapping[str, float] = field(default_factory=dict)
     stature: float | None = None
     sex: Literal["f", "m"] | None = None
+    formulation: Formulation = "full"
     method: Method = "amekf"
     gaps: bool = False
     report: bool = True
@@ -122,7 +127,12 @@ def run_calibrate(
         recording = load_session(job.session, gaps=job.gaps)
         progress("calibrating", 1 / 3)
         calibration = calibrate_lengths(
-            recording, measured=dict(job.measured), prior=prior, protocol=protocol, method=job.method
+            recording,
+            measured=dict(job.measured),
+            prior=prior,
+            protocol=protocol,
+            method=job.method,
+            formulation=job.formulation,
         )
         quality = assess(calibration)
         write_subject(folder, calibration.subject, load_model(lengths=calibration.subject.lengths))

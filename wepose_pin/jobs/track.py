@@ -24,6 +24,9 @@ class TrackJob:
     A recording of `wepose live` is tracked causally, with the subject and the method of that session, and gives the
     displayed poses again, bit-identical. With --subject or --method it is tracked as any other recording.
 
+    The protocol of Lisini Baldi et al. 2019 is --method smekf --open-loop with a subject of `wepose calibrate
+    --formulation paper`, which holds lengths and no mounts.
+
     Parameters
     ----------
     session : SESSION
@@ -43,6 +46,9 @@ class TrackJob:
         the method of the live session.
     causal
         Use only past samples, as `wepose live` does. Poses begin at the end of the start pose.
+    open_loop
+        Correct no headings: neither by the elbows and joined hands of a calibrated subject, nor by the resets of a live
+        session. Orientations are those of the filter from the start pose on.
     gaps
         Accept gaps of more than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap). Without it such a gap
         is an error.
@@ -71,6 +77,7 @@ class TrackJob:
     model: Path | None = None
     method: Method | None = None
     causal: bool = False
+    open_loop: bool = False
     gaps: bool = False
     covariance: bool = False
     limits: bool = True
@@ -153,7 +160,9 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
             return _track_chain(job, recording, folder, progress, provenance)
         model = load_model(job.model) if job.model else None
         progress(f"tracking by {method}", 1 / 3)
-        tracked = track(recording, subject, method=method, model=model, causal=causal, limits=job.limits)
+        tracked = track(
+            recording, subject, method=method, model=model, causal=causal, open_loop=job.open_loop, limits=job.limits
+        )
         torques = None
         if job.torques:
             from ..angles.torques import pose_torques
@@ -186,7 +195,7 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
         model = load_model(job.model) if job.model else None
         reader = SessionReader(job.session, gaps=job.gaps, in_memory=False)
         writer, decimator = ChunkWriter(folder, job.covariance), Decimator(len(reader.time))
-        options = TrackOptions(job.method or BEST, causal=job.causal, limits=job.limits)
+        options = TrackOptions(job.method or BEST, causal=job.causal, open_loop=job.open_loop, limits=job.limits)
         for chunk in track_session(
             reader, subject, seconds=job.chunk_seconds, model=model, options=options, progress=progress
         ):
@@ -219,9 +228,9 @@ def _track_chain(
     from ..writers.chain import write_chain
     from ..writers.provenance import write_provenance
 
-    if job.subject is not None or job.causal:
-        wrong = "subject" if job.subject else "causal"
-        raise BadOption(f"--{wrong}: for a person; {job.session} is of another chain")
+    wrong = [name for name in ("subject", "causal", "open_loop") if getattr(job, name)]
+    if wrong:
+        raise BadOption(f"--{wrong[0].replace('_', '-')}: for a person; {job.session} is of another chain")
     assert job.model is not None
     model, method = load_robot(job.model), job.method or BEST
     progress(f"tracking by {method}", 1 / 3)

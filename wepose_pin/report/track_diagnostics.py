@@ -157,6 +157,8 @@ def _diagnose_time_before_start(
 
 def _remedy_variant(tracked: TrackedRecording) -> dict[str, str]:
     """The variant of the texts on drifting headings."""
+    if tracked.options.open_loop:
+        return {"variant": "open-loop"}
     if tracked.correction is None:
         return {"variant": "uncalibrated"}
     return {} if tracked.recording and tracked.recording.phases.get("clasp") else {"variant": "no-clasp"}

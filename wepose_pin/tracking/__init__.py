@@ -40,7 +40,7 @@ def track(
     method: str = BEST,
     model: BodyModel | None = None,
     static_test: StaticTest | None = None,
-    correct_headings: bool = True,
+    open_loop: bool = False,
     causal: bool = False,
     limits: bool = True,
 ) -> TrackedRecording:
@@ -50,7 +50,7 @@ def track(
     ----------
     subject : lengths and mounts; None for the population's mean and the session's stated mounts
     model : a body; None for ours. It gets the subject's lengths; without a subject its own stand
-    method, static_test, correct_headings, causal, limits : as `TrackOptions`
+    method, static_test, open_loop, causal, limits : as `TrackOptions`
 
     Raises
     ------
@@ -58,6 +58,6 @@ def track(
         What the recording, the subject or the model lacks; sensors on links that are no segments.
     """
     check_arguments(track, locals())
-    tracker = Tracker(subject, model=model, options=TrackOptions(method, static_test, correct_headings, causal, limits))
+    tracker = Tracker(subject, model=model, options=TrackOptions(method, static_test, open_loop, causal, limits))
     [tracked] = tracker.push(recording) + tracker.finish()
     return tracked

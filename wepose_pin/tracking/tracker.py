@@ -33,7 +33,8 @@ class Tracker:
     ----------
     subject : lengths and mounts; None for the population prior and the session's stated mounts
     model : a body; None for the package's. It gets the subject's lengths; without a subject its own stand
-    headings : solved beforehand; None: solved in `finish`, with `options.correct_headings`, where the subject allows it
+    headings, observed : what `observe_headings` returned, after a pass over all chunks; without it headings are solved
+        in `finish`, unless `options.open_loop`, where the subject allows it
     """
 
     def __init__(
@@ -43,10 +44,11 @@ class Tracker:
         model: BodyModel | None = None,
         options: TrackOptions | None = None,
         headings: HeadingCorrector | None = None,
+        observed: bool = False,
     ) -> None:
         self.options = options or TrackOptions()
         self._subject, self._model = subject, model
-        self._headings, self._solved = headings, headings is not None
+        self._headings, self._solved = headings, observed
         self._estimator = _estimator(subject, self.options)
         self._person, self._body = make_body(subject, model)
         self._kinematics: KinematicsSolver | None = None
@@ -79,6 +81,8 @@ class Tracker:
             raise BadSession(
                 f"{chunk.where()}: start_pose = '{chunk.start_pose}' is not known; {one_of(self._body.table.poses)}"
             )
+        if self.options.open_loop and chunk.resets:
+            chunk = replace(chunk, resets=())
         return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented)]
 
     def finish(self) -> list[TrackedRecording]:
@@ -152,7 +156,7 @@ def make_heading_corrector(
 ) -> HeadingCorrector | None:
     """Return a heading corrector for a recording with this first chunk; None: its headings cannot be corrected."""
     recording, segments = oriented
-    if subject is None or not subject.mounts or options.causal or not options.correct_headings:
+    if subject is None or not subject.mounts or options.causal or options.open_loop:
         return None
     if recording.remounted or any(sensor.aligned for sensor in recording.sensors.values()):
         return None  # the frames are not those of the calibration
@@ -185,11 +189,9 @@ def track_chunks(
             if progress is not None:
                 progress(task, chunk)
 
-    headings = None
-    if subject is not None and subject.mounts and options.correct_headings and not options.causal:
-        headings = observe_headings(counted("observing headings"), subject, options)
-        options = options if headings is not None else replace(options, correct_headings=False)
-    tracker = Tracker(subject, model=model, options=options, headings=headings)
+    observed = subject is not None and bool(subject.mounts) and not options.open_loop and not options.causal
+    headings = observe_headings(counted("observing headings"), subject, options) if observed else None
+    tracker = Tracker(subject, model=model, options=options, headings=headings, observed=observed)
     for chunk in counted(f"tracking by {options.method}"):
         yield from tracker.push(chunk)
     yield from tracker.finish()

@@ -17,7 +17,10 @@ from .tables import (
     ERROR_BUDGET,
     FROM,
     HAND,
+    LENGTHS_ALONE,
+    OPEN_LOOP,
     OURS,
+    PROTOCOL,
     SPLIT,
     TARGETS,
     Row,
@@ -30,6 +33,9 @@ from .tables import (
 
 COLOURS = {
     "smekf": "#24618f",
+    LENGTHS_ALONE: "#7a9fbe",
+    OPEN_LOOP: "#a9c1d5",
+    PROTOCOL: "#1b3a57",
     "amekf": "#3fa7c9",
     "smoother": "#2f4a66",
     "ncf": "#d9772b",

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..calibration import calibrate_lengths
+from ..calibration import Formulation, calibrate_lengths
 from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
 from ..filters.noise import estimate_noise
 from ..recording import OrientationSensor, Recording
@@ -37,7 +37,7 @@ from ..tracking import track
 from .contenders import Contender, list_contenders
 from .jobs import Job, Result
 from .series import align_rotation, decimate_curves
-from .tables import ERROR_BUDGET
+from .tables import ERROR_BUDGET, LENGTHS_ALONE, OPEN_LOOP, OURS, PROTOCOL
 
 RATES = {"100 Hz": 100.0, "1 kHz": 1000.0}
 WORLDS = {"MTi-3 noise alone": IDEAL_PRESET, "realistic": MILD_PRESET}
@@ -127,16 +127,18 @@ def _simulate_person(seed: int, imperfections: Imperfections) -> tuple[Person, S
 
 
 def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfections) -> list[Result]:
-    """Calibrate by each filter with measured shoulder width and trunk and known mounts, then track six circles."""
+    """Calibrate by each filter with measured shoulder width and trunk and known mounts, then track six circles.
+
+    smekf has a row for each part of the paper's protocol, and one for the whole of it.
+    """
     person, simulation = _simulate_person(seed, imperfections)
     recorded, truth = simulation.recording(), simulation.truth()
     circles = simulation.phases["circles"][0]
     prior = set_exact_mounts(person.prior, simulation)
     results = []
-    for contender in list_contenders(experiment):
-        recording, method = orient_recording(recorded, contender)
-        subject = _calibrate(recording, person, prior, method)
-        pose = track(recording, subject, method=method).pose
+
+    def score(label: str, recording: Recording, subject: Subject, method: str, *, open_loop: bool = False) -> None:
+        pose = track(recording, subject, method=method, open_loop=open_loop).pose
         series = {}
         if seed == 0:
             inside = recording.span(circles)
@@ -147,7 +149,17 @@ def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfect
         figures = _collect_hand_errors(evaluate(pose, truth, circles)) | {
             "lengths_rms_mm": _compute_lengths_rms(subject, person)
         }
-        results.append(Result(experiment, trial, contender.label, figures, series))
+        results.append(Result(experiment, trial, label, figures, series))
+
+    for contender in list_contenders(experiment):
+        recording, method = orient_recording(recorded, contender)
+        subject = _calibrate(recording, person, prior, method)
+        score(contender.label, recording, subject, method)
+        if contender.label == OURS:
+            score(LENGTHS_ALONE, recording, _calibrate(recording, person, prior, OURS, "paper"), OURS)
+            score(OPEN_LOOP, recording, subject, OURS, open_loop=True)
+            stated = _calibrate(recording, person, person.prior, OURS, "paper")
+            score(PROTOCOL, recording, stated, OURS, open_loop=True)
     return results
 
 
@@ -181,11 +193,17 @@ def _error_budget(experiment: str, trial: str, seed: int) -> list[Result]:
     return results
 
 
-def _calibrate(recording: Recording, person: Person, prior: Subject, method: str) -> Subject:
-    found = calibrate_lengths(
-        recording, measured=person.measured, prior=prior, method=method, measured_std=person.measured_std
-    )
-    return found.subject
+def _calibrate(
+    recording: Recording, person: Person, prior: Subject, method: str, formulation: Formulation = "full"
+) -> Subject:
+    return calibrate_lengths(
+        recording,
+        measured=person.measured,
+        prior=prior,
+        method=method,
+        measured_std=person.measured_std,
+        formulation=formulation,
+    ).subject
 
 
 def _collect_hand_errors(errors: Evaluation) -> dict[str, dict[str, float]]:

@@ -14,6 +14,10 @@ from .jobs import Result
 
 OURS = "smekf"  # the paper's filter
 DEFAULTS = ", default gains"  # suffix of the label of a filter's second row
+LENGTHS_ALONE = f"{OURS}, lengths alone"  # calibrated in the paper's formulation
+OPEN_LOOP = f"{OURS}, open loop"  # tracked without heading correction
+PROTOCOL = f"{OURS}, the paper's protocol"  # both, and mounts by the session and the start pose
+VARIANTS = LENGTHS_ALONE, OPEN_LOOP, PROTOCOL  # no filters of their own
 ERROR_BUDGET = "error budget"
 ARBITRARY_MOUNTING = "arbitrary sensor mounting"
 
@@ -126,8 +130,8 @@ def collect_figures(result: Result) -> dict[str, float]:
 
 
 def find_paper_figures(experiment: str, method: str) -> dict[str, tuple[float, float]]:
-    """Find the paper's figures: name → mean and deviation; a filter's row with default gains has the same."""
-    filter_ = method.removesuffix(DEFAULTS)
+    """Find the paper's figures: name → mean and deviation; all rows of a filter have the same."""
+    filter_ = method.partition(", ")[0]
     if experiment.startswith("dynamic"):
         rate = 1000 if "1 kHz" in experiment else 100
         return dict(zip(AXES, PAPER_DYNAMIC.get((filter_, rate), ()), strict=False))
@@ -221,7 +225,8 @@ def make_overview_table(rows: Sequence[Row]) -> Table:
         paper = find_paper_figures(experiment, OURS)
         for name in (name for name in figures.get(OURS, {}) if name in ERRORS and name != "mean angle"):
             ours, (text, unit) = figures[OURS][name], split_unit(name)
-            ranks = {m: (round(values[name], 2), m != OURS) for m, values in figures.items() if name in values}
+            filters = {m: values[name] for m, values in figures.items() if name in values and m not in VARIANTS}
+            ranks = {m: (round(value, 2), m != OURS) for m, value in filters.items()}
             best = min(ranks, key=ranks.__getitem__)
             shown = f"{ours:.2f}"
             if name in paper and round(ours, 2) > paper[name][0]:

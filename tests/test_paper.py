@@ -1,0 +1,371 @@
+"""The paper's formulation of the calibration, and tracking without heading correction."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from arms import write_arm
+from bodies import LENGTHS
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.calibration import Calibration, assess, calibrate_lengths, load_protocol
+from wepose_pin.calibration.paper import check_paper_formulation
+from wepose_pin.cli import main
+from wepose_pin.diagnostics import render
+from wepose_pin.errors import BadOption, BadSession, NoSolution
+from wepose_pin.recording import SEGMENTS, OrientationSensor, Recording
+from wepose_pin.report.track_diagnostics import describe_heading_remedy
+from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
+from wepose_pin.subject import load_subject
+from wepose_pin.tracking import TrackOptions, track, track_chunks
+from wepose_pin.validation import contenders, list_experiments, summarize
+from wepose_pin.validation.tables import LENGTHS_ALONE, OPEN_LOOP, PAPER_HAND, PROTOCOL, make_overview_table
+from wepose_pin.writers import write_session
+
+SENSORS = SEGMENTS[:5]
+
+
+@pytest.fixture(scope="module")
+def made() -> tuple[Person, Simulation, Recording]:
+    """Usual imperfections, so that nothing closes exactly."""
+    person = simulate_person(5)
+    simulation = simulate(person.lengths, seed=5, imperfections=MILD_PRESET, clasp_s=30.0, circles=1)
+    return person, simulation, simulation.recording()
+
+
+@pytest.fixture(scope="module")
+def estimated(made: tuple[Person, Simulation, Recording]) -> Calibration:
+    person, _, recording = made
+    measured = {"shoulder_width": person.lengths["shoulder_width"]}
+    return calibrate_lengths(recording, measured=measured, prior=person.prior, method="smekf", formulation="paper")
+
+
+def run(*words: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in words])
+    return int(stop.value.code or 0)
+
+
+def links_in_world(made: tuple[Person, Simulation, Recording], time: np.ndarray) -> dict[str, np.ndarray]:
+    """Segment → direction (n, 3) of its link in W, from the orientations of `track`."""
+    person, _, recording = made
+    tracked = track(recording, person.prior, method="smekf")
+    assert tracked.correction is None
+    samples = np.searchsorted(tracked.time, time - 1e-6)
+    np.testing.assert_allclose(tracked.time[samples], time, atol=1e-9)
+    along = {"torso": [0.0, 1.0, 0.0]}
+    R = {name: Rotation.from_quat(tracked.quat_WL[name][samples]) for name in SENSORS}
+    return {name: R[name].apply(along.get(name, [0.0, 0.0, -1.0])) for name in SENSORS}
+
+
+# Calibration ----------------------------------------------------------------------------------------------------------
+
+
+def test_lengths_are_those_of_numpys_least_squares(
+    made: tuple[Person, Simulation, Recording], estimated: Calibration
+) -> None:
+    """Shoulder width known: R_t e_y w + u_l a_l + f_l b_l − u_r a_r − f_r b_r = 0, in a, b of both sides."""
+    person, _, _ = made
+    link = links_in_world(made, estimated.time)
+    left, right = ([link[f"{side}_{part}"] for part in ("upper_arm", "forearm")] for side in ("left", "right"))
+    columns = np.stack([*left, *(-v for v in right)], axis=2).reshape(-1, 4)
+    width = person.lengths["shoulder_width"]
+    target = -width * link["torso"].reshape(-1)
+    expected, squares, *_ = np.linalg.lstsq(columns, target)
+    lengths = estimated.subject.lengths
+    arms = [
+        value
+        for side in ("left", "right")
+        for value in (lengths[f"{side}_upper_arm"], lengths[f"{side}_forearm"] + lengths[f"{side}_hand"])
+    ]
+    np.testing.assert_allclose(arms, expected, atol=1e-8)
+    assert lengths["shoulder_width"] == pytest.approx(width, abs=1e-12)
+    assert estimated.rms_gap == pytest.approx(np.sqrt(squares[0] / len(estimated.time)), rel=1e-9)
+    assert estimated.rms_gap > 5e-3  # there is something to minimise
+    # What the gap does not show is the population's.
+    assert lengths["trunk"] == pytest.approx(person.prior.lengths["trunk"], abs=1e-12)
+    for side in ("left", "right"):
+        share, population = (
+            of[f"{side}_hand"] / (of[f"{side}_forearm"] + of[f"{side}_hand"]) for of in (lengths, person.prior.lengths)
+        )
+        assert share == pytest.approx(population, abs=1e-9)
+
+
+def test_the_covariance_is_that_of_the_same_least_squares(
+    made: tuple[Person, Simulation, Recording], estimated: Calibration
+) -> None:
+    person, _, _ = made
+    link = links_in_world(made, estimated.time)
+    left, right = ([link[f"{side}_{part}"] for part in ("upper_arm", "forearm")] for side in ("left", "right"))
+    columns = np.stack([*left, *(-v for v in right)], axis=2).reshape(-1, 4)
+    variance = np.sum(estimated.gap**2) / (len(columns) - 4) * len(estimated.gap) / estimated.effective_sample_size
+    expected = variance * np.linalg.inv(columns.T @ columns)
+    # A measured length that is off by one standard deviation scales all that the gap shows.
+    names = ["left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand"]
+    sums = np.zeros((4, 6))
+    sums[[0, 1, 1, 2, 3, 3], range(6)] = 1.0
+    arms = sums @ [estimated.subject.lengths[name] for name in names]
+    width, std = person.lengths["shoulder_width"], 0.003
+    expected += np.outer(arms, arms) * (std / width) ** 2
+    np.testing.assert_allclose(sums @ estimated.subject.lengths_covariance(names) @ sums.T, expected, rtol=1e-6)
+    assert estimated.subject.std("shoulder_width") == pytest.approx(std, rel=1e-9)
+    assert estimated.subject.std("trunk") == pytest.approx(person.prior.std("trunk"), rel=1e-9)
+    assert np.linalg.eigvalsh(estimated.subject.covariance)[0] > 0.0
+
+
+def test_the_outcome_holds_lengths_and_says_what_its_deviations_lack(estimated: Calibration) -> None:
+    subject = estimated.subject
+    assert (subject.mounts, subject.hinges, subject.start_pose_offset, subject.heading_drift) == ({}, {}, {}, {})
+    assert subject.order == LENGTHS
+    assert subject.note == "hands together, lengths alone as in the paper; scale measured: shoulder_width"
+    assert "lengths-alone-estimated" in {d.code for d in estimated.diagnostics}
+    checks = {check.diagnostic.code for check in assess(estimated).checks}
+    assert {"upper-arm-length-uncertain", "forearm-length-uncertain", "closure-gap-large"} <= checks
+    assert "mount-heading-uncertain" not in checks
+    assert 1.0 < estimated.effective_sample_size < 12.0  # 30 s of errors that last 3 s and more
+
+
+def test_exact_orientations_give_the_lengths_back() -> None:
+    person = simulate_person(11)
+    simulation = simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=20.0, circles=0)
+    sensors = {name: OrientationSensor(quat_WS=quat) for name, quat in simulation.quat_WL.items()}
+    recording = replace(simulation.recording("exact"), sensors=sensors)
+    measured = {name: person.lengths[name] for name in ("left_upper_arm", "left_hand", "right_forearm")}
+    found = calibrate_lengths(recording, measured=measured, formulation="paper")
+    for name in ("shoulder_width", *(n for n in LENGTHS if "arm" in n or "hand" in n)):
+        assert found.subject.lengths[name] == pytest.approx(person.lengths[name], abs=1e-6), name
+    assert found.rms_gap < 1e-6
+
+
+def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulation, Recording]) -> None:
+    person, _, recording = made
+    found = calibrate_lengths(recording, measured={"shoulder_width": 0.6}, prior=person.prior, formulation="paper")
+    quality = assess(found)
+    (contradicted,) = [each for each in quality.reasons if each.code == "measured-length-contradicted"]
+    assert quality.quality == "fail"
+    width = 1e3 * person.prior.lengths["shoulder_width"]
+    assert f"was measured as 600 mm. The population prior gives {width:.0f} mm ±" in render(contradicted).what
+
+
+def test_lengths_that_are_all_measured_stay(made: tuple[Person, Simulation, Recording]) -> None:
+    person, _, recording = made
+    found = calibrate_lengths(recording, measured=person.lengths, prior=person.prior, formulation="paper").subject
+    assert found.lengths == pytest.approx(person.lengths, abs=1e-9)
+    np.testing.assert_allclose(found.covariance, 0.003**2 * np.eye(8), atol=1e-12)
+
+
+def test_noise_in_the_orientations_makes_arms_short() -> None:
+    """It adds to the bare gap in proportion to the lengths; `full` weighs for that (test_calibration)."""
+    person = simulate_person(11)
+    simulation = simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=30.0, circles=0)
+    rng, moving = np.random.default_rng(2), (simulation.time > 6.0)[:, None]
+    sensors = {}
+    for name, quat in simulation.quat_WL.items():
+        turn = Rotation.from_rotvec(rng.normal(scale=0.06, size=(len(quat), 3)) * moving)
+        sensors[name] = OrientationSensor(quat_WS=(Rotation.from_quat(quat) * turn).as_quat())
+    recording = replace(simulation.recording("noisy"), sensors=sensors)
+    measured = {"shoulder_width": person.lengths["shoulder_width"]}
+    ratio = {}
+    for formulation in ("full", "paper"):
+        lengths = calibrate_lengths(recording, measured=measured, measured_std=1e-4, formulation=formulation).subject
+        ratio[formulation] = np.mean(
+            [lengths.lengths[n] / person.lengths[n] for n in ("left_upper_arm", "right_upper_arm")]
+        )
+    assert ratio["full"] == pytest.approx(1.0, abs=0.02)
+    assert ratio["paper"] < 0.97
+
+
+def test_mounts_of_the_prior_are_used_and_stay(made: tuple[Person, Simulation, Recording]) -> None:
+    person, simulation, recording = made
+    prior = replace(person.prior, mounts=simulation.quat_LS)
+    measured = {"shoulder_width": person.lengths["shoulder_width"]}
+    found = calibrate_lengths(recording, measured=measured, prior=prior, method="smekf", formulation="paper")
+    assert found.subject.mounts == simulation.quat_LS
+    assert found.subject.lengths["left_upper_arm"] != found.prior.lengths["left_upper_arm"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, "needs one measured length that fixes the scale, as in --measured shoulder_width=0.385; there is: shoul"),
+        ({"measured": {"trunk": 0.5, "left_hand": 0.07}}, "needs one measured length that fixes the scale"),
+        ({"measured": {"handle": 0.4}, "protocol": "handle"}, "points of the body coincide .* not 'handle'"),
+        ({"measured": {"shoulder_width": 0.4}, "protocol": "poses"}, "points of the body coincide .* not 'poses'"),
+        ({"formulation": "linear"}, "formulation = 'linear' is not known; .*full, paper"),
+    ],
+)
+def test_what_it_needs_is_said(options: dict[str, Any], said: str, made: tuple[Person, Simulation, Recording]) -> None:
+    with pytest.raises(BadOption, match=said):
+        calibrate_lengths(made[2], **({"formulation": "paper"} | options))
+
+
+def test_a_hand_with_a_sensor_fixes_the_scale_and_one_without_does_not() -> None:
+    clasp = load_protocol("clasp")
+    check_paper_formulation(clasp, ["left_hand"], [*SENSORS, "left_hand"])
+    check_paper_formulation(clasp, ["left_forearm", "left_hand"], SENSORS)
+    for measured in (["left_hand"], ["left_forearm", "right_hand"], ["trunk"]):
+        with pytest.raises(BadOption, match="fixes the scale"):
+            check_paper_formulation(clasp, measured, SENSORS)
+
+
+def test_every_mount_must_be_stated(made: tuple[Person, Simulation, Recording]) -> None:
+    _, _, recording = made
+    torso = replace(recording.sensors["torso"], stated_quat_LS=None)
+    unknown = replace(recording, sensors={**recording.sensors, "torso": torso})
+    with pytest.raises(BadSession, match=r"sensors\.torso\.mount is not known"):
+        calibrate_lengths(unknown, measured={"shoulder_width": 0.38}, formulation="paper")
+
+
+@pytest.mark.parametrize(
+    ("swing", "said"),
+    [
+        (0.0, "the motion does not determine the lengths"),
+        (0.3, "the gap is least with .* = 10 mm"),
+    ],
+)
+def test_hands_that_are_not_joined_give_no_lengths(swing: float, said: str) -> None:
+    """Arms that hang, or swing on their own: the gap cannot close, and arms of no length are its least."""
+    person = simulate_person(11)
+    simulation = simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=6.0, circles=0)
+    since = np.clip(simulation.time - 5.0, 0.0, None)
+    sensors = {}
+    for k, name in enumerate(simulation.quat_WL):
+        angles = k * swing * np.sin((1.0 + 0.3 * k) * since)[:, None] * [0.3, 1.0, 0.0]
+        sensors[name] = OrientationSensor(quat_WS=Rotation.from_rotvec(angles).as_quat())
+    with pytest.raises(NoSolution, match=said):
+        calibrate_lengths(
+            replace(simulation.recording("apart"), sensors=sensors),
+            measured={"shoulder_width": 0.38},
+            formulation="paper",
+        )
+
+
+# Tracking -------------------------------------------------------------------------------------------------------------
+
+
+def test_open_loop_leaves_the_headings_as_the_filter_has_them(made: tuple[Person, Simulation, Recording]) -> None:
+    person, simulation, recording = made
+    subject = replace(person.prior, lengths=person.lengths, mounts=simulation.quat_LS)
+    corrected, free, causal = (
+        track(recording, subject, **options) for options in ({}, {"open_loop": True}, {"causal": True})
+    )
+    assert corrected.correction is not None
+    assert free.correction is None
+    assert "without `--open-loop`" in describe_heading_remedy(free)
+    assert "without `--open-loop`" not in describe_heading_remedy(corrected)
+    chunks = [replace(recording.cut(part), phases=recording.phases) for part in (slice(0, 3000), slice(3000, None))]
+    options = TrackOptions(open_loop=True)
+    for parts, whole in (
+        (list(track_chunks(lambda: chunks, subject, options=options)), free),
+        (list(track_chunks(lambda: chunks, subject)), corrected),
+    ):
+        for name, quat in whole.quat_WL.items():
+            np.testing.assert_array_equal(np.concatenate([part.quat_WL[name] for part in parts]), quat)
+    # Uncorrected as a live session is, but for its start half a second later.
+    for name, quat in causal.quat_WL.items():
+        offline = Rotation.from_quat(free.quat_WL[name][-len(quat) :])
+        assert np.degrees((offline.inv() * Rotation.from_quat(quat)).magnitude().max()) < 0.5
+
+
+def test_chunks_in_which_nothing_shows_headings_are_not_kept(made: tuple[Person, Simulation, Recording]) -> None:
+    person, simulation, recording = made
+    subject = replace(person.prior, mounts=simulation.quat_LS)
+    recording = replace(recording, phases={"start": recording.phases["start"]})
+    chunks = [replace(recording.cut(part), phases=recording.phases) for part in (slice(0, 3000), slice(3000, None))]
+    parts = list(track_chunks(lambda: chunks, subject))
+    assert [part.correction for part in parts] == [None, None]
+    assert not parts[0].options.open_loop  # it was not asked for
+
+
+def test_resets_of_a_live_session_are_left_out(made: tuple[Person, Simulation, Recording]) -> None:
+    """A reset in motion turns the headings of a causal run; an open-loop one has none."""
+    person, _, recording = made
+    reset = replace(recording, resets=(2500,))
+    with_, without, never = (
+        track(each, person.prior, causal=True, open_loop=open_loop).quat_WL["right_forearm"]
+        for each, open_loop in ((reset, False), (reset, True), (recording, False))
+    )
+    np.testing.assert_array_equal(without, never)
+    assert np.abs(with_ - never).max() > 0.01
+
+
+# Commands -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_commands(
+    made: tuple[Person, Simulation, Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    person, simulation, recording = made
+    (tmp_path / "session").mkdir()
+    write_session(tmp_path / "session", recording, simulation.truth())
+    words = ["calibrate", tmp_path / "session", "--formulation", "paper", "--method", "smekf", "-o", tmp_path / "anna"]
+    assert run(*words) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "--measured shoulder_width=0.385" in said
+    assert not (tmp_path / "anna").exists()
+    assert run(*words, "--measured", f"shoulder_width={person.lengths['shoulder_width']:.4f}") in (0, 3)
+    said = capsys.readouterr()
+    assert "`--formulation paper` estimates the lengths alone" in said.err
+    assert "Mounts" not in said.out
+    content = json.loads((tmp_path / "anna" / "calibration.json").read_text())
+    assert content["provenance"]["options"]["formulation"] == "paper"
+    assert "lengths-alone-estimated" in {each["code"] for each in content["diagnostics"]}
+    assert "page-incomplete" not in {each["code"] for each in content["diagnostics"]}
+    assert load_subject(tmp_path / "anna").mounts == {}
+    page = (tmp_path / "anna" / "report.html").read_text(encoding="utf-8")
+    assert "Lengths alone estimated" in page
+    assert run("reproduce", tmp_path / "anna") == 0
+
+    out = tmp_path / "result"
+    options = ["--method", "smekf", "--open-loop", "--no-view", "--no-report"]
+    assert run("track", tmp_path / "session", "--subject", tmp_path / "anna", *options, "-o", out) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["heading_correction"] is None
+    assert summary["provenance"]["options"]["open_loop"] is True
+    assert run("reproduce", out) == 0
+    tracked = track(recording, load_subject(tmp_path / "anna"), method="smekf", open_loop=True)
+    palm = pl.read_parquet(out / "pose.parquet", columns=["right_palm_x"]).to_series().to_numpy()
+    np.testing.assert_allclose(palm, tracked.points["right_palm"][:, 0], atol=1e-9)
+
+
+def test_open_loop_is_for_a_person(
+    made: tuple[Person, Simulation, Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    urdf = write_arm(tmp_path)
+    (tmp_path / "session").mkdir()
+    write_session(tmp_path / "session", made[2], None)
+    text = (tmp_path / "session" / "session.toml").read_text()
+    text = text.replace('start_pose = "n_pose"', 'start_pose = "configuration"')
+    text = text.replace("[sensors.left_upper_arm]", "[sensors.upper_arm]").replace(
+        "[sensors.left_forearm]", "[sensors.forearm]"
+    )
+    (tmp_path / "session" / "session.toml").write_text(text)
+    words = ["track", tmp_path / "session", "--model", urdf, "--open-loop", "-o", tmp_path / "out"]
+    assert run(*words) == 2
+    assert "--open-loop: for a person; " in capsys.readouterr().err
+
+
+# Validation -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_validation_has_rows_of_the_papers_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
+    smekf = [each for each in contenders.list_contenders("upper body, realistic") if each.label == "smekf"]
+    monkeypatch.setattr("wepose_pin.validation.paper.list_contenders", lambda _: smekf)
+    (job,) = list_experiments(True)["upper body, realistic"]
+    rows = {row.method: row for row in summarize(job())}
+    assert list(rows) == ["smekf", LENGTHS_ALONE, OPEN_LOOP, PROTOCOL]
+    mean, std = PAPER_HAND["smekf"]
+    assert {row.paper for row in rows.values()} == {f"{mean:.2f} ± {std:.2f}"}
+    figures = {method: row.figures for method, row in rows.items()}
+    assert figures[OPEN_LOOP]["lengths_rms_mm"] == figures["smekf"]["lengths_rms_mm"]
+    assert len({row["lengths_rms_mm"] for row in figures.values()}) == 3
+    assert len({row["hand"] for row in figures.values()}) == 4
+    assert figures["smekf"]["hand"] < figures[PROTOCOL]["hand"]
+    assert [row[-1] for row in make_overview_table(list(rows.values())).rows] == ["smekf", "smekf"]
