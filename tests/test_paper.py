@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 import pytest
 from arms import write_arm
-from bodies import LENGTHS
+from bodies import LENGTHS, SEGMENTS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import Calibration, assess, calibrate_lengths, load_protocol
@@ -19,7 +19,7 @@ from wepose_pin.calibration.paper import check_paper_formulation
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadOption, BadSession, NoSolution
-from wepose_pin.recording import SEGMENTS, OrientationSensor, Recording
+from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.report.track_diagnostics import describe_heading_remedy
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.subject import load_subject

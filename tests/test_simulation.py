@@ -6,10 +6,11 @@ from time import perf_counter
 
 import numpy as np
 import pytest
+from bodies import LENGTHS
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.simulation import LENGTHS, NOISE_FREE, SEGMENTS, ImuNoise, Simulation, simulate
+from wepose_pin.simulation import NOISE_FREE, SEGMENTS, ImuNoise, Simulation, simulate
 
 G = 9.81
 SIDES = ("left", "right")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..readers.session_file import read_joints, read_phases, read_sensor_keys, read_session_file
-from ..recording import START_POSES, Intervals, Recording
+from ..recording import Intervals, Recording
 from ..subject import Subject, parse_subject, subject_toml
 
 
@@ -79,9 +79,9 @@ def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "
     """
     top = read_session_file(path)
     read_phases(top.table("phases", {}))
-    sensors = top.table("sensors").tables("segment")
+    sensors = top.table("sensors").tables(load_table().segments, "segment")
     stated = {segment: read_sensor_keys(table).mount for segment, table in sensors.items()}
-    start_pose = top.choice("start_pose", START_POSES, "n_pose")
+    start_pose = top.choice("start_pose", "n_pose")
     read_joints(top, start_pose)
     return SensorSetup(
         top.text("name", None) or Path(top.file).absolute().parent.name,

@@ -49,7 +49,7 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
     M_WK = {link: M_WM @ tree.neutral(link) for link in table.links}  # K: a link of theirs
     p_W = {name: M_WK[point.link][:3, :3] @ point.at + M_WK[point.link][:3, 3] for name, point in table.points.items()}
 
-    segment_of = {segment.link: name for name, segment in reversed(table.segments.items())}
+    segment_of = {segment.link: name for name, segment in reversed(list(table.segments.items()))}
     R_WL: dict[str, np.ndarray] = {}  # orientation of our segments while their joints are at zero
     for name in sorted(table.segments, key=lambda name: len(tree.path(table.segments[name].link))):
         above = _segment_above(tree, table.segments[name].link, segment_of)

@@ -87,7 +87,7 @@ def _name_links(model: BodyModel) -> dict[int, tuple[str, np.ndarray]]:
     """Joint → the link that it moves, by the segment's name where it is one, and its rotation R_JK in the joint."""
     m = model.pin
     name_of = {joint: (m.names[joint], np.eye(3)) for joint in range(m.njoints)}
-    for segment in reversed(model.table.segments):  # of segments that are rigid with one another the first
+    for segment in reversed(list(model.table.segments)):  # of segments that are rigid with one another the first
         frame = m.frames[m.getFrameId(segment)]
         name_of[frame.parentJoint] = segment, frame.placement.rotation
     return name_of

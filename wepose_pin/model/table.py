@@ -414,7 +414,7 @@ def _read_points(top: TomlTable, base: BodyTable, segments: Mapping[str, Segment
     for name, point in base.points.items():
         # A point where a segment begins is there with the segment.
         begins = by_link.get(point.link)
-        if begins in segments and not any(point.at):
+        if begins is not None and begins in segments and not any(point.at):
             points[name] = Point(segments[begins].link)
         elif all(segments.get(each) == own for each, own in base.segments.items()):
             points[name] = point
