@@ -16,11 +16,11 @@ from test_mvnx import mvnx, turning
 import wepose_pin as wp
 from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadData, BadSession, MissingFile, UnknownColumn, WeposeError
+from wepose_pin.model import load_table
 from wepose_pin.readers.device import unwrap_counter
 from wepose_pin.readers.formats import detect_format, read_device
 from wepose_pin.readers.guess import guess_columns
 from wepose_pin.recording import OrientationSensor, Recording
-from wepose_pin.recording.segments import guess_segment
 
 N, RATE = 400, 100.0
 TIME = np.arange(N) / RATE
@@ -679,7 +679,7 @@ def test_a_counter_that_begins_anew_goes_on() -> None:
     ],
 )
 def test_segments_by_their_names(label: str, segment: str | None) -> None:
-    assert guess_segment(label) == segment
+    assert load_table().guess_segment(label) == segment
 
 
 def test_columns_by_their_names() -> None:

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..model import load_table
+from ..model.table import NEUTRAL_POSE
 from ..readers.session_file import read_joints, read_phases, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
 from ..subject import Subject, parse_subject, subject_toml
@@ -81,7 +83,7 @@ def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "
     read_phases(top.table("phases", {}))
     sensors = top.table("sensors").tables(load_table().segments, "segment")
     stated = {segment: read_sensor_keys(table).mount for segment, table in sensors.items()}
-    start_pose = top.choice("start_pose", "n_pose")
+    start_pose = top.choice("start_pose", load_table().poses, NEUTRAL_POSE)
     read_joints(top, start_pose)
     return SensorSetup(
         top.text("name", None) or Path(top.file).absolute().parent.name,
