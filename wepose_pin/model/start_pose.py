@@ -1,0 +1,81 @@
+"""The configuration of a body in its start pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import Rotation
+
+from ..errors import BadSession, one_of
+from .body import BodyModel
+from .tree import find_bounds, joint_axis, joint_placement, parse_tree
+
+CONFIGURATION = "configuration"  # a start pose whose joints the session states
+
+
+def compute_start_configuration(
+    model: BodyModel, start_pose: str, joints: Mapping[str, float], where: str
+) -> np.ndarray:
+    """`q` (nq,) in the start pose.
+
+    Parameters
+    ----------
+    start_pose : a pose of the body's table, or "configuration"
+    joints : joint of the URDF → value [rad or m] in a configuration; those not named are at zero
+    where : begins an error's text
+
+    Raises
+    ------
+    BadSession
+        A start pose that the table does not have; a joint that the body does not have, or outside its limits.
+    """
+    poses = model.table.poses
+    if start_pose != CONFIGURATION and start_pose not in poses:
+        raise BadSession(f"{where}: start_pose = '{start_pose}' is not known; {one_of((*poses, CONFIGURATION))}")
+    values = joints if start_pose == CONFIGURATION else poses[start_pose]
+    by_name = {joint.name: joint for joint in model.robot.joints if joint.type not in ("fixed", "floating")}
+    for name, value in values.items():
+        if name not in by_name:
+            raise BadSession(f"{where}: joints.{name} is no joint that moves; {one_of(by_name, name)}")
+        low, high = find_bounds(by_name[name], np.inf)
+        if not low - 1e-6 <= value <= high + 1e-6:
+            raise BadSession(f"{where}: joints.{name} = {value:g} is outside its limits, {low:g} to {high:g}")
+    q, m = pin.neutral(model.pin), model.pin
+    tree = parse_tree(model.robot, where)
+    spherical = {joint: link for link, joint in model.joints.items()}
+    for joint in range(1, m.njoints):
+        first = m.idx_qs[joint]
+        if joint in spherical:
+            R = _rotate_triple(tree.path(spherical[joint])[-3:], values) if spherical[joint] in model.limits else None
+            if R is not None:
+                q[first : first + 4] = Rotation.from_matrix(R).as_quat()
+            continue
+        value = values.get(m.names[joint], 0.0)
+        if m.nqs[joint] == 1:
+            q[first] = value
+        else:  # without limits: cosine and sine
+            q[first], q[first + 1] = np.cos(value), np.sin(value)
+    return q
+
+
+def orient_links(model: BodyModel, q: np.ndarray) -> dict[str, np.ndarray]:
+    """Link → R_WK (3, 3) in the configuration `q` (nq,): segments and points by their names, others by their joint's."""
+    data = model.pin.createData()
+    pin.framesForwardKinematics(model.pin, data, q)
+    R_WK = {model.pin.names[joint]: np.array(data.oMi[joint].rotation) for joint in range(model.pin.njoints)}
+    for link in (*model.table.points, *model.table.segments):
+        if model.pin.existFrame(link):
+            R_WK[link] = np.array(data.oMf[model.pin.getFrameId(link)].rotation)
+    return R_WK
+
+
+def _rotate_triple(joints: list, values: Mapping[str, float]) -> np.ndarray:  # type: ignore[type-arg]
+    """Rotation (3, 3) of three joints that are one spherical joint, out of zero."""
+    zero = turned = np.eye(3)
+    for k, joint in enumerate(joints):
+        placement = joint_placement(joint)[:3, :3] if k else np.eye(3)
+        axis = joint_axis(joint) * values.get(joint.name, 0.0)
+        zero, turned = zero @ placement, turned @ placement @ Rotation.from_rotvec(axis).as_matrix()
+    return zero.T @ turned
