@@ -342,7 +342,7 @@ def compute_point_covariances(
     covariances: dict[str, np.ndarray] = {}
     lengths = np.array(list(model.lengths.values()))
     R_WK: dict[str, np.ndarray] = {}
-    carriers = {link: _find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
+    carriers = {link: find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
     for link, carrier in carriers.items():
         if carrier is not None and carrier in segment_cov:
             R_CK = _neutral_rotation(model, carrier).T @ _neutral_rotation(model, link)
@@ -372,7 +372,7 @@ def compute_point_covariances(
     return covariances
 
 
-def _find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str | None:
+def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str | None:
     """Find the measured segment with which a link rotates: itself, or above it where it is rigid; None: no such."""
     segment: str | None = link
     while segment is not None and segment not in measured:

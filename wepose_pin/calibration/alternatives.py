@@ -14,7 +14,7 @@ import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
 from .initial_headings import find_distinct_headings
-from .least_squares import Gaussian, K, Layout, Observations, place_points
+from .least_squares import Gaussian, Layout, Observations, place_points
 from .solver import Fit, LeastSquares, solve
 from .weights import WeightedFit
 
@@ -65,7 +65,7 @@ def find_alternatives(
     std = np.sqrt(np.diag(np.linalg.inv(fit.information))[rows])
     found: list[Alternative] = []
     closed = observations.take(observations.closed).apply_steps(fit.x)
-    for psi in find_distinct_headings(closed, fit.x[:K], fit.x[layout.distances], stated):
+    for psi in find_distinct_headings(closed, fit.x, stated):
         other = solve_from(psi)
         offset = other.x - best.x
         offset[rows] = (offset[rows] + np.pi) % (2.0 * np.pi) - np.pi

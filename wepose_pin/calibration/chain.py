@@ -3,24 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
-from ..model import LinkVector, load_model, load_table
-
-LENGTHS = tuple(load_table().lengths)
-SIDES = ("left", "right")
-ARMS = tuple(f"{side}_{part}" for side in SIDES for part in ("upper_arm", "forearm", "hand"))
-CHAIN = ("torso", *ARMS)
-
-
-@lru_cache(maxsize=1)
-def default_reaches() -> dict[str, dict[str, np.ndarray]]:
-    """Point → segment → (3, 8), by which the lengths make the segment's part of the chain from the root."""
-    return {point: {link: part.by_length for link, part in way.items()} for point, way in load_model().reaches.items()}
+if TYPE_CHECKING:
+    from ..model import LinkVector
 
 
 def point_position(lengths: Any, quat_WK: Mapping[str, Any], way: Mapping[str, LinkVector]) -> Any:
@@ -35,7 +24,7 @@ def point_position(lengths: Any, quat_WK: Mapping[str, Any], way: Mapping[str, L
 
 
 def links(lengths: Any, quat_WL: Mapping[str, Any], way: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Segment → its part (3,) [m] of a chain, in W; `way` holds the (3, 8) of each segment, as `default_reaches`."""
+    """Link → its part (3,) [m] of a chain, in W; `way` holds the (3, k) of each link."""
     return {
         name: rotate(quat_WL[name], ca.vertcat(*(_combined(row, lengths) for row in rows)))
         for name, rows in way.items()
@@ -73,3 +62,8 @@ def small_turn(rotvec: Any) -> Any:
     """The unit quaternion (4,) xyzw of a turn by about `rotvec` (3,) [rad], in CasADi: to third order of its size."""
     half = rotvec / 2.0
     return ca.vertcat(half, 1.0) / ca.sqrt(1.0 + ca.sumsqr(half))
+
+
+def about_axis(axis: tuple[float, float, float], angle: Any) -> Any:
+    """The unit quaternion (4,) xyzw of a turn about a unit axis (3,) [rad], in CasADi."""
+    return ca.vertcat(ca.DM(axis) * ca.sin(angle / 2.0), ca.cos(angle / 2.0))

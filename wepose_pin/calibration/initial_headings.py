@@ -2,14 +2,14 @@
 
 Poses show them directly: the azimuth at which an arm is raised, the axis about which the torso bows.
 
-Where points coincide, the closure is linear in lengths times headings. A hanging segment's direction in its sensor's
-start world is v(t) = Q(t)(−e_z), and L Rz(ψ) v is linear in (L cos ψ, L sin ψ, L). So R_torso(t) s + Σ ± L_i Rz(ψ_i)
-v_i(t) = 0, with s the line between the shoulders at the start, has its least-squares solution in the smallest singular
-vector. Beyond a heading step of the sensor, or of the torso, to which all others are relative, ψ is another unknown and
-L is the same.
+Where two points coincide and all parts of the way between them but one hang vertically in the start pose, the closure is
+linear in lengths times headings. A hanging part's direction in its sensor's start world is v(t) = Q(t)(−e_z), and
+L Rz(ψ) v is linear in (L cos ψ, L sin ψ, L). So R_0(t) s + Σ ± L_i Rz(ψ_i) v_i(t) = 0, with s the other part at the
+start, such as the line between the shoulders, has its least-squares solution in the smallest singular vector. Beyond a
+heading step of the sensor, or of that of s, to which all others are relative, ψ is another unknown and L is the same.
 
-A fixed point is nearly the same, but a torso that hardly turns solves it by itself (s = c, no arms); a distance is not
-linear at all. There the headings are searched: Gauss-Newton from many starts at once, over headings and the size of
+A fixed point is nearly the same, but a torso that hardly turns solves it by itself (s = c, no arms); a distance or a
+plane is not linear at all. There the headings are searched: Gauss-Newton from many starts at once, over headings and the size of
 each sensor's part of the chain, with the prior's few per cent of uncertainty.
 """
 
@@ -21,8 +21,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from .least_squares import Observations, sensor_of
-from .protocols import Axis, Closure, Condition, Direction, coefficients
+from ..model.reaches import UNIVERSE
+from .conditions import Constraint, Level, Loop, Part, Pointing
+from .least_squares import Observations
 
 STARTS, NEARER = 256, 24  # starts, and how many of the best continue after some rounds
 MINIMA, MOST_DISTINCT = 64, 12  # as `NEARER` for a search of all minima, and how many of these at most
@@ -34,32 +35,37 @@ SIZE_STD = 0.08  # of a part of the chain, relative
 KNOWN_STD = np.deg2rad(10.0)  # [rad] of a heading from a mount or a pose
 
 
-def estimate_headings(
-    observations: Observations, lengths: np.ndarray, distances: np.ndarray, stated: Mapping[str, float]
-) -> np.ndarray:
+def estimate_headings(observations: Observations, x: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
     """ψ [rad] of each sensor of the chain, then each heading step [rad], which is zero where the closure is not linear.
 
-    ψ turns the sensor's world to W, whose y is the line of the shoulders at the start.
+    ψ turns the sensor's world to W, in which the body's start pose is known.
 
     Parameters
     ----------
-    lengths, distances : (8,) and as many as the layout's distances [m], as known before
+    x : (m,) with the lengths, points, heights and distances as known before
     stated : sensor → ψ [rad] of its stated mount
     """
     sensors = observations.layout.sensors
     if is_linear(observations.conditions):
-        return _solve_linear(observations.take(observations.closed), stated)
+        return _solve_linear(observations.take(observations.closed), x, stated)
     known, steps = {**_solve_poses(observations, stated), **stated}, np.zeros(len(observations.layout.steps))
     if observations.closed.any() and not set(sensors) <= set(known):
-        x = _find_minima(observations, lengths, distances, known, NEARER)
-        return np.append(x[0, : len(sensors)], steps)
+        minima = _find_minima(observations, x, known, NEARER)
+        return np.append(minima[0, : len(sensors)], steps)
     return np.append([known.get(name, 0.0) for name in sensors], steps)
 
 
-def is_linear(conditions: Sequence[Condition]) -> bool:
-    """Whether headings come from joined hands."""
-    closures = [c for c in conditions if isinstance(c, Closure)]
-    return len(closures) == 1 and closures[0].kind == "coincide" and closures[0].points == ("left_palm", "right_palm")
+def is_linear(conditions: Sequence[Constraint]) -> bool:
+    """Whether headings come from one closure of points that coincide, with all parts but the first vertical."""
+    loops = [c for c in conditions if isinstance(c, Loop)]
+    if len(loops) != 1 or loops[0].kind != "coincide":
+        return False
+    first, *others = loops[0].parts
+    return first.sensor != UNIVERSE and not _is_vertical(first) and all(map(_is_vertical, others))
+
+
+def _is_vertical(part: Part) -> bool:
+    return part.sensor != UNIVERSE and not np.any(np.array(part.by_length)[:2]) and not np.any(part.constant[:2])
 
 
 def _rotations(observations: Observations) -> dict[str, Rotation]:
@@ -69,36 +75,38 @@ def _rotations(observations: Observations) -> dict[str, Rotation]:
 
 
 def _solve_poses(observations: Observations, stated: Mapping[str, float]) -> dict[str, float]:
-    """Sensor → ψ [rad] from poses and axes; the torso's comes first, since directions are in its frame."""
+    """Sensor → ψ [rad] from poses and axes; the reference's comes first, since directions are in its frame."""
     Q = _rotations(observations)
     headings: dict[str, float] = {}
     for condition, span in observations.spans():
-        if isinstance(condition, Axis):
-            turn = Q[condition.segment][span].as_rotvec().sum(axis=0)  # forwards: about +y
-            headings[condition.segment] = np.pi / 2.0 - np.arctan2(turn[1], turn[0])
-    torso = {**headings, **stated}.get("torso")
+        if isinstance(condition, Level):
+            turn = Q[condition.segment][span].as_rotvec().sum(axis=0)  # forwards: about the axis
+            axis = np.arctan2(condition.axis[1], condition.axis[0])
+            headings[condition.segment] = axis - np.arctan2(turn[1], turn[0])
     for condition, span in observations.spans():
-        if isinstance(condition, Direction) and np.hypot(*condition.direction[:2]) > 0.3:
+        if isinstance(condition, Pointing) and np.hypot(*condition.direction[:2]) > 0.3:
+            reference = {**headings, **stated}.get(condition.reference)
             target = np.tile(condition.direction, (span.stop - span.start, 1))
-            if torso is not None:
-                to_W = Rotation.from_rotvec([0.0, 0.0, torso])
-                target = (to_W * Q["torso"][span] * to_W.inv()).apply(target)
-            v = Q[condition.segment][span].apply([0.0, 0.0, -1.0])
+            if reference is not None:
+                to_W = Rotation.from_rotvec([0.0, 0.0, reference])
+                target = (to_W * Q[condition.reference][span] * to_W.inv()).apply(target)
+            v = Q[condition.segment][span].apply(condition.along)
             turn = np.sum((target[:, 0] + 1j * target[:, 1]) * (v[:, 0] - 1j * v[:, 1]))
             headings[condition.segment] = float(np.angle(turn))
     return headings
 
 
-def _solve_linear(observations: Observations, stated: Mapping[str, float]) -> np.ndarray:
+def _solve_linear(observations: Observations, x: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
     """ψ of each sensor and each heading step [rad], from the smallest singular vector of the closure."""
-    columns, parts = [], []
-    for i, (name, R) in enumerate(_rotations(observations).items()):
-        if i == 0:
-            columns.append(R.as_matrix())
-            continue
-        v = R.apply([0.0, 0.0, -1.0 if name.startswith("left") else 1.0])
+    layout = observations.layout
+    [loop] = [c for c in observations.conditions if isinstance(c, Loop)]
+    lengths, (first, *others) = x[layout.length], loop.parts
+    rotations = _rotations(observations)
+    columns, parts = [rotations[first.sensor].as_matrix()], []
+    for other in others:
+        v = rotations[other.sensor].apply([0.0, 0.0, float(np.sign(other.vector(lengths)[2]))])
         zero = np.zeros(len(v))
-        part = _group_by_steps(observations, name)
+        part = _group_by_steps(observations, other.sensor, first.sensor)
         parts.append(part)
         across = np.stack((np.column_stack((v[:, 0], v[:, 1], zero)), np.column_stack((-v[:, 1], v[:, 0], zero))), 2)
         columns += [across * (part == k)[:, None, None] for k in range(part.max() + 1)]
@@ -109,25 +117,34 @@ def _solve_linear(observations: Observations, stated: Mapping[str, float]) -> np
     ends = 3 + np.cumsum([size + 1 for size in sizes])
     if z[ends - 1].sum() < 0.0:  # lengths are positive; their mirror image solves it as well
         z = -z
-    torso = -np.arctan2(-z[0], z[1])  # turns s to y
+    known = first.vector(lengths)
+    reference = np.arctan2(known[1], known[0]) - np.arctan2(z[1], z[0])  # turns s to its direction
     solved = [z[end - 1 - size : end - 1].reshape(-1, 2) for end, size in zip(ends, sizes, strict=True)]
-    arms = np.array(
-        [(np.arctan2(xy[:, 1], xy[:, 0]) + torso)[part] for xy, part in zip(solved, parts, strict=True)]
-    )  # (m − 1, n) ψ and steps of each sensor at each sample, less the torso's steps
-    return _separate_steps(observations, np.vstack([np.full(arms.shape[1], torso), arms]), stated)
+    # (m − 1, n) ψ and steps of each sensor at each sample, less the reference's steps
+    relative = {
+        other.sensor: (np.arctan2(xy[:, 1], xy[:, 0]) + reference)[part]
+        for other, xy, part in zip(others, solved, parts, strict=True)
+    }
+    n = observations.data.shape[1]
+    headings = np.array([relative.get(name, np.full(n, stated.get(name, 0.0))) for name in layout.sensors])
+    k = layout.sensors.index(first.sensor)
+    headings[k] = reference
+    return _separate_steps(observations, headings, k, stated)
 
 
-def _group_by_steps(observations: Observations, name: str) -> np.ndarray:
-    """(n,) which samples have the same heading of a sensor relative to the torso, numbered from 0 on."""
+def _group_by_steps(observations: Observations, name: str, reference: str) -> np.ndarray:
+    """(n,) which samples have the same heading of a sensor relative to the reference, numbered from 0 on."""
     steps = zip(observations.layout.steps, observations.beyond, strict=True)
-    between = [row for sensor, row in steps if sensor in (name, "torso")]
+    between = [row for sensor, row in steps if sensor in (name, reference)]
     if not between:
         return np.zeros(observations.data.shape[1], dtype=int)
     return np.unique(np.array(between), axis=1, return_inverse=True)[1].ravel()
 
 
-def _separate_steps(observations: Observations, headings: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
-    """ψ of each of the m sensors and each step [rad], of `headings` (m, n) relative to the torso at each sample.
+def _separate_steps(
+    observations: Observations, headings: np.ndarray, reference: int, stated: Mapping[str, float]
+) -> np.ndarray:
+    """ψ of each of the m sensors and each step [rad], of `headings` (m, n) relative to the reference at each sample.
 
     The steps are solved from the start pose outwards: ψ is that before any of them, or the `stated` one.
     """
@@ -135,37 +152,36 @@ def _separate_steps(observations: Observations, headings: np.ndarray, stated: Ma
     index = np.array([layout.sensors.index(name) for name in layout.steps], dtype=int)
     steps, known = np.zeros(len(index)), np.zeros(len(index), dtype=bool)
     psi = np.array([stated.get(name, np.nan) for name in layout.sensors])
-    psi[0] = headings[0, 0]
+    psi[reference] = headings[reference, 0]
     for k in np.argsort(beyond.sum(axis=0), kind="stable") if len(index) else [0]:
         passed_steps = beyond[:, k]
         psi = np.where(np.isnan(psi), headings[:, k], psi)
         if known[passed_steps].all():
             continue
         passed = np.bincount(index[passed_steps], steps[passed_steps], len(psi))
-        off = _within_half_turn(headings[:, k] - psi - passed + passed[0])
+        off = _within_half_turn(headings[:, k] - psi - passed + passed[reference])
         new = passed_steps & ~known
-        old = np.setdiff1d(np.arange(1, len(psi)), index[new])
-        turn = (
-            float(np.angle(np.exp(1j * off[old]).sum())) if 0 in index[new] and len(old) else 0.0
-        )  # the torso's, back
+        old = np.setdiff1d(np.arange(len(psi)), [reference, *index[new]])
+        turn = 0.0  # of the reference, back
+        if reference in index[new] and len(old):
+            turn = float(np.angle(np.exp(1j * off[old]).sum()))
         for step in np.flatnonzero(new):
-            steps[step] = -turn if index[step] == 0 else _within_half_turn(off[index[step]] - turn)
+            steps[step] = -turn if index[step] == reference else _within_half_turn(off[index[step]] - turn)
         known |= passed_steps
     return np.append(psi, steps)
 
 
-def find_distinct_headings(
-    observations: Observations, lengths: np.ndarray, distances: np.ndarray, known: Mapping[str, float]
-) -> np.ndarray:
+def find_distinct_headings(observations: Observations, x: np.ndarray, known: Mapping[str, float]) -> np.ndarray:
     """Headings (k, m) [rad] of the m sensors at which the closures have a minimum each, the best first.
 
     Parameters
     ----------
+    x : (n,) with the lengths, points, heights and distances
     known : sensor → ψ [rad] from a mount or a pose; the others may be anywhere
     """
-    x = _find_minima(observations, lengths, distances, known, MINIMA)
+    minima = _find_minima(observations, x, known, MINIMA)
     distinct: list[np.ndarray] = []
-    for psi in x[:, : len(observations.layout.sensors)]:
+    for psi in minima[:, : len(observations.layout.sensors)]:
         if all(np.abs(_within_half_turn(psi - other)).max() > DISTINCT for other in distinct):
             distinct.append(psi)
     return np.array(distinct[:MOST_DISTINCT])
@@ -176,24 +192,28 @@ def _within_half_turn(angle: np.ndarray) -> np.ndarray:
 
 
 def _find_minima(
-    observations: Observations, lengths: np.ndarray, distances: np.ndarray, known: Mapping[str, float], nearer: int
+    observations: Observations, known_x: np.ndarray, known: Mapping[str, float], nearer: int
 ) -> np.ndarray:
     """Headings and log sizes (`nearer`, 2 m) at the minima that the best of many starts reach, the lowest first."""
-    sensors = observations.layout.sensors
+    sensors, layout = observations.layout.sensors, observations.layout
     m = len(sensors)
-    parts = []  # of each closure: it, Q (m, n, 3, 3), and u (m, 3), each sensor's part of the chain in its own frame
-    for closure, span in observations.spans():
-        if not isinstance(closure, Closure):
+    parts = []  # of each way of a closure: it, Q (m, n, 3, 3), u (m, 3) each sensor's part, what does not move (3,)
+    for loop, span in observations.spans():
+        if not isinstance(loop, Loop):
             continue
         few = np.unique(np.linspace(span.start, span.stop - 1, SEARCH_SAMPLES).astype(int))
         Q = np.stack([R.as_matrix() for R in _rotations(observations.take(few)).values()])
-        u = np.zeros((m, 3))
-        for segment, coefficient in coefficients(closure).items():
-            u[sensors.index(sensor_of(segment, sensors))] += coefficient @ lengths
-        parts.append((closure, Q, u))
+        for way in loop.ways:
+            u, still = np.zeros((m, 3)), np.zeros(3)
+            for part in way:
+                if part.sensor == UNIVERSE:
+                    still = still + part.vector(known_x[layout.length])
+                else:
+                    u[sensors.index(part.sensor)] += part.vector(known_x[layout.length])
+            parts.append((loop, Q, u, still))
 
     def closure_residuals(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _closure_residuals(x, parts, observations, distances)
+        return _closure_residuals(x, parts, observations, known_x[layout.distances])
 
     is_known = np.array([name in known for name in sensors])
     center = np.array([known.get(name, 0.0) for name in sensors] + [0.0] * m)
@@ -238,7 +258,7 @@ def _closure_residuals(
     m = x.shape[1] // 2
     psi, size = x[:, :m], np.exp(x[:, m:])
     rs, Js = [], []
-    for closure, Q, u in parts:
+    for loop, Q, u, still in parts:
         c, s = np.cos(psi), np.sin(psi)
         # Rz(ψ) Q Rz(−ψ) u, and its derivative Rz(ψ) (e_z × Q b − Q (e_z × b)) with b = Rz(−ψ) u.
         b = np.stack([c * u[:, 0] + s * u[:, 1], c * u[:, 1] - s * u[:, 0], u[:, 2] + 0.0 * c], axis=2)  # (B, m, 3)
@@ -251,13 +271,17 @@ def _closure_residuals(
             return k * np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1], v[..., 2]], axis=3)
 
         parts_W, J = turned(Qb), np.concatenate([turned(slope), turned(Qb)], axis=1)  # (B, m, n, 3), (B, 2m, n, 3)
-        gap = parts_W.sum(axis=1)
-        if closure.kind == "fixed_point":
+        gap = parts_W.sum(axis=1) + still
+        if loop.kind == "fixed_point" and loop.closure.at is not None:
+            gap = gap - np.array(loop.closure.at)
+        elif loop.kind in ("fixed_point", "plane"):
             gap, J = gap - gap.mean(axis=1, keepdims=True), J - J.mean(axis=2, keepdims=True)
-        if closure.kind == "distance":
+        if loop.kind == "plane":
+            gap, J = gap[..., 2:], J[..., 2:]
+        if loop.kind == "distance":
             length = np.linalg.norm(gap, axis=2) + 1e-9
             J = np.einsum("bkni,bni->bkn", J, gap / length[:, :, None])[..., None]
-            gap = (length - distances[observations.layout.distance_names.index(closure.distance)])[..., None]
+            gap = (length - distances[observations.layout.distance_names.index(loop.closure.distance)])[..., None]
         rs.append(gap.reshape(len(x), -1) / GAP_STD)
         Js.append(J.reshape(len(x), 2 * m, -1).swapaxes(1, 2) / GAP_STD)
     return np.concatenate(rs, axis=1), np.concatenate(Js, axis=1)

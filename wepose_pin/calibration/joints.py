@@ -24,16 +24,6 @@ from .least_squares import Gaussian, Layout
 from .losses import find_losses, mask_connected
 from .weights import LEAST_CORRELATION_S
 
-# Nearer the trunk first; of a hand with a sensor the wrist is the joint.
-JOINTS = tuple(
-    pair
-    for side in ("left", "right")
-    for pair in (
-        ("torso", f"{side}_upper_arm"),
-        (f"{side}_upper_arm", f"{side}_forearm"),
-        (f"{side}_forearm", f"{side}_hand"),
-    )
-)
 # What people move in, without gravity's constant and without what tissue shakes; of the rate, before it is derived.
 BAND_HZ, RATE_HZ = (0.1, 1.5), 8.0
 SAMPLES_HZ = 10.0
@@ -59,11 +49,19 @@ class Coupling(NamedTuple):
 
 
 def estimate_couplings(
-    recording: Recording, filtered: FilteredRecording, names: Sequence[str], spans: Sequence[tuple[float, float]]
+    recording: Recording,
+    filtered: FilteredRecording,
+    pairs: Sequence[tuple[str, str]],
+    spans: Sequence[tuple[float, float]],
 ) -> list[Coupling]:
-    """Of each joint between two IMUs of `names`, from the motion in these spans [s]; none where there is too little."""
-    raw = [name for name in names if name in recording.imus]
-    pairs = [pair for pair in JOINTS if set(pair) <= set(raw)]
+    """Of each joint between two IMUs, from the motion in these spans [s]; none where there is too little.
+
+    Parameters
+    ----------
+    pairs : of neighbouring segments, the one nearer the root first
+    """
+    pairs = [pair for pair in pairs if set(pair) <= set(recording.imus)]
+    raw = list(dict.fromkeys(name for pair in pairs for name in pair))
     if recording.rate_hz < LEAST_RATE_HZ or not pairs:
         return []
     inside = np.zeros(len(recording), dtype=bool)

@@ -1,25 +1,26 @@
 """The unknowns of a calibration and the residuals of its samples, with their Jacobian; `solver` minimises them.
 
-For each sensor i the filter gives R_VS(t) in a world V of its own heading, and Q(t) = R_VS(t) R_VS(start)ᵀ. With a
-start pose that is ε off the N-pose, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
+For each sensor i the filter gives R_VS(t) in a world V of its own heading, and Q(t) = R_VS(t) R_VS(start)ᵀ. Here L is the
+frame of its segment that equals W in the start pose (S' in `conditions`). With a start pose that is ε off the stated
+one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
 
     R_WL(t) = Rz(ψ + d τ + s) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
 
 with ψ the heading, d its drift since the start, s its steps where samples were lost since (`losses`), and A the
-soft-tissue artefact: soft tissue rotates a sensor as the direction of gravity in the segment changes. The line between
-the shoulders is the torso's y except for a rotation by collarbones and shoulder blades while the arms are raised. That
-rotation, d, s, A and the hinges are nuisance parameters: the covariance of lengths and mounts includes their effect.
+soft-tissue artefact: soft tissue rotates a sensor as the direction of gravity in the segment changes. A segment's points
+may turn about its long axis, as the shoulders do by collarbones and shoulder blades while the arms are raised. That
+twist, d, s, A and the hinges are nuisance parameters: the covariance of lengths and mounts includes their effect.
 
 A sample is one of the protocol's condition that holds then. A closure gives the gap, whitened by the covariance that
 errors of the orientations and slipping palms give it, which makes it as homogeneous in the lengths as the gap itself
-(see `lengths`), and of each elbow by how much the forearm leaves the plane of its hinge. A pose gives the deviation of
-a segment from its stated direction, an axis its deviation from the level. Each sample has the same five residuals:
-three of its condition and two elbows; those that do not apply are zero.
+(see `lengths`), and of each hinge by how much the segment that it moves leaves its plane. A pose gives the deviation of
+a segment from its stated direction, an axis its deviation from the level. Each sample has the same residuals: three of
+its condition and one a hinge; those that do not apply are zero.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -29,11 +30,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import SEGMENT_ATTITUDE_STD
-from .chain import LENGTHS, SIDES, about_z, inverse, links, product, rotate, small_turn
-from .protocols import Closure, Condition, Direction, coefficients
+from ..model.reaches import UNIVERSE
+from .chain import about_axis, about_z, inverse, product, rotate, small_turn
+from .conditions import Constraint, HingeUnknown, Loop, Part, Pointing, Twist
 
-HINGE_STD = np.deg2rad(2.0)  # [rad] of the forearm against the elbow's plane
-K = len(LENGTHS)
+HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
+GAP_ROWS = 3  # residuals of a sample's condition
 
 
 class Layout(NamedTuple):
@@ -41,21 +43,33 @@ class Layout(NamedTuple):
 
     Parameters
     ----------
-    sensors : of the chain, in its order
+    lengths : names, in the order of the table
+    sensors : by their segments, in the order of the table
+    hinges, twists : of these sensors
     fixed : how many unknown points
+    planes : how many level planes of unknown height
     distance_names : of the unknown distances outside the body
     steps : the sensor of each heading step
     """
 
+    lengths: tuple[str, ...]
     sensors: tuple[str, ...]
+    hinges: tuple[HingeUnknown, ...] = ()
+    twists: tuple[Twist, ...] = ()
     fixed: int = 0
+    planes: int = 0
     distance_names: tuple[str, ...] = ()
     steps: tuple[str, ...] = ()
 
     @property
+    def length(self) -> slice:
+        """The lengths [m]."""
+        return slice(0, len(self.lengths))
+
+    @property
     def heading(self) -> slice:
         """ψ [rad] of each sensor."""
-        return slice(K, K + len(self.sensors))
+        return slice(self.length.stop, self.length.stop + len(self.sensors))
 
     @property
     def tilt(self) -> slice:
@@ -69,8 +83,8 @@ class Layout(NamedTuple):
 
     @property
     def hinge(self) -> slice:
-        """Of each elbow's axis (x, 1, z) in the upper arm's frame: x, z, left then right."""
-        return slice(self.drift.stop, self.drift.stop + 4)
+        """Of each hinge's axis, by how much it is turned across and tilted."""
+        return slice(self.drift.stop, self.drift.stop + 2 * len(self.hinges))
 
     @property
     def soft_tissue(self) -> slice:
@@ -78,19 +92,24 @@ class Layout(NamedTuple):
         return slice(self.hinge.stop, self.hinge.stop + 9 * len(self.sensors))
 
     @property
-    def shoulders(self) -> slice:
-        """Rotation of the line between the shoulders about the torso's z [rad]."""
-        return slice(self.soft_tissue.stop, self.soft_tissue.stop + 1)
+    def twist(self) -> slice:
+        """Rotation of points about the long axis of their segment [rad]."""
+        return slice(self.soft_tissue.stop, self.soft_tissue.stop + len(self.twists))
 
     @property
     def points(self) -> slice:
         """Unknown points of W (3,) each [m]."""
-        return slice(self.shoulders.stop, self.shoulders.stop + 3 * self.fixed)
+        return slice(self.twist.stop, self.twist.stop + 3 * self.fixed)
+
+    @property
+    def heights(self) -> slice:
+        """Heights of level planes in W [m]."""
+        return slice(self.points.stop, self.points.stop + self.planes)
 
     @property
     def distances(self) -> slice:
         """Distances outside the body [m]."""
-        return slice(self.points.stop, self.points.stop + len(self.distance_names))
+        return slice(self.heights.stop, self.heights.stop + len(self.distance_names))
 
     @property
     def step(self) -> slice:
@@ -107,9 +126,9 @@ class Layout(NamedTuple):
         return 4 * len(self.sensors) + len(self.steps) + 1
 
     @property
-    def arms(self) -> tuple[str, ...]:
-        """Sides whose elbow has a sensor above and below."""
-        return tuple(s for s in SIDES if {f"{s}_upper_arm", f"{s}_forearm"} <= set(self.sensors))
+    def residuals(self) -> int:
+        """How many residuals a sample has."""
+        return GAP_ROWS + len(self.hinges)
 
 
 class Gaussian(NamedTuple):
@@ -125,7 +144,7 @@ class Observations:
 
     layout: Layout
     data: np.ndarray  # (rows, n): Q of each sensor xyzw, whether it is beyond each step, [s] since the start pose
-    conditions: tuple[Condition, ...]
+    conditions: tuple[Constraint, ...]
     condition_index: np.ndarray  # (n,) of each sample's condition, never falling
     step_std: np.ndarray = field(default_factory=lambda: np.empty(0))  # [rad] of each step, before the motion
 
@@ -151,7 +170,7 @@ class Observations:
         data = np.delete(data, np.arange(4 * len(self.layout.sensors), len(data) - 1), axis=0)
         return replace(self, layout=self.layout._replace(steps=()), data=data, step_std=np.empty(0))
 
-    def spans(self) -> list[tuple[Condition, slice]]:
+    def spans(self) -> list[tuple[Constraint, slice]]:
         """Each condition with its samples; none may be empty."""
         edges = np.searchsorted(self.condition_index, np.arange(len(self.conditions) + 1))
         return [(c, slice(int(edges[i]), int(edges[i + 1]))) for i, c in enumerate(self.conditions)]
@@ -159,23 +178,33 @@ class Observations:
     @property
     def closed(self) -> np.ndarray:
         """(n,) bool: samples of a closure."""
-        return np.array([isinstance(c, Closure) for c in self.conditions], dtype=bool)[self.condition_index]
+        return np.array([isinstance(c, Loop) for c in self.conditions], dtype=bool)[self.condition_index]
 
 
 def residuals(x: np.ndarray, observations: Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (n, 5), their Jacobian (n, 5, len(x)), gaps (n, 3) [m], which are zero without a closure."""
-    parts, point = [], 0
-    for condition, span in observations.spans():
+    """Residuals (n, k), their Jacobian (n, k, len(x)), gaps (n, 3) [m], which are zero without a closure."""
+    parts, k = [], observations.layout.residuals
+    for (condition, span), place in zip(observations.spans(), _unknown_places(observations.conditions), strict=True):
         n = span.stop - span.start
-        r, J, gap = np.empty((n, 5)), np.empty((n, len(x), 5)), np.empty((n, 3))
+        r, J, gap = np.empty((n, k)), np.empty((n, len(x), k)), np.empty((n, 3))
         inputs = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(observations.data[:, span].T, dtype=float)
-        evaluate_into(_mapped_residuals(observations.layout, condition, point, n), inputs, (r, J, gap))
+        evaluate_into(_mapped_residuals(observations.layout, condition, place, n), inputs, (r, J, gap))
         parts.append((r, np.ascontiguousarray(J.swapaxes(1, 2)), gap))
-        point += isinstance(condition, Closure) and condition.kind == "fixed_point"
     if len(parts) == 1:
         return parts[0]
     r, J, gap = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return r, J, gap
+
+
+def _unknown_places(conditions: Sequence[Constraint]) -> list[int]:
+    """Of each condition which of the unknown points, or heights of planes, is its own."""
+    places, counts = [], {"fixed_point": 0, "plane": 0}
+    for condition in conditions:
+        kind = condition.kind if isinstance(condition, Loop) else ""
+        places.append(counts.get(kind, 0))
+        if kind in counts:
+            counts[kind] += 1
+    return places
 
 
 def evaluate_into(function: Any, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
@@ -192,26 +221,29 @@ def evaluate_into(function: Any, arguments: Sequence[np.ndarray], results: Seque
 
 
 def place_points(x: np.ndarray, observations: Observations) -> np.ndarray:
-    """The same x with each unknown point at the mean of the body's point."""
-    if not observations.layout.fixed:
+    """The same x with each unknown point and height at the mean of the body's points."""
+    layout = observations.layout
+    if not layout.fixed and not layout.planes:
         return x
     x, gaps = x.copy(), residuals(x, observations)[2]
-    fixed = [span for c, span in observations.spans() if isinstance(c, Closure) and c.kind == "fixed_point"]
-    for i, span in enumerate(fixed):
-        x[observations.layout.points][3 * i : 3 * i + 3] += gaps[span].mean(axis=0)
+    for (condition, span), place in zip(observations.spans(), _unknown_places(observations.conditions), strict=True):
+        if isinstance(condition, Loop) and condition.kind == "fixed_point" and condition.closure.at is None:
+            x[layout.points][3 * place : 3 * place + 3] += gaps[span].mean(axis=0)
+        elif isinstance(condition, Loop) and condition.kind == "plane":
+            x[layout.heights][place] += gaps[span, : condition.rows].mean()
     return x
 
 
 @lru_cache(maxsize=32)
-def _mapped_residuals(layout: Layout, condition: Condition, point: int, n: int) -> Any:
+def _mapped_residuals(layout: Layout, condition: Constraint, place: int, n: int) -> Any:
     x, data = ca.MX.sym("x", layout.size), ca.MX.sym("data", layout.rows, n)
-    r, J, gap = _residual_function(layout, condition, point).map(n)(ca.repmat(x, 1, n), data)
+    r, J, gap = _residual_function(layout, condition, place).map(n)(ca.repmat(x, 1, n), data)
     return ca.Function("samples", [x, data], [r, J, gap])
 
 
 @lru_cache(maxsize=32)
-def _residual_function(layout: Layout, condition: Condition, point: int) -> Any:
-    """CasADi function of a sample: (x, data) → residuals (5), Jacobian (5, len(x)), gap (3)."""
+def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any:
+    """CasADi function of a sample: (x, data) → residuals (k), Jacobian (k, len(x)), gap (3)."""
     sensors = layout.sensors
     x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", layout.rows)
     heading, tilt, drift, soft_tissue = x[layout.heading], x[layout.tilt], x[layout.drift], x[layout.soft_tissue]
@@ -226,64 +258,80 @@ def _residual_function(layout: Layout, condition: Condition, point: int) -> Any:
         quat = product(turned, small_turn(ca.vertcat(tilt[2 * i], tilt[2 * i + 1], 0.0)))
         A = ca.reshape(soft_tissue[9 * i : 9 * i + 9], 3, 3)
         quat_WL[name] = product(quat, small_turn(A @ (rotate(inverse(quat), _UP) - _UP)))
-    gap, elbows = ca.SX.zeros(3), ca.SX.zeros(2)
-    if isinstance(condition, Closure):
-        whitened, gap = _closure_residual(layout, condition, x, quat_WL, point)
-        elbows = _hinge_residuals(layout, x, quat_WL)
-    elif isinstance(condition, Direction):
-        along_T = rotate(inverse(quat_WL["torso"]), rotate(quat_WL[condition.segment], -_UP))
-        whitened = (along_T - ca.DM(condition.direction)) / condition.std
+    gap, hinges = ca.SX.zeros(3), ca.SX.zeros(len(layout.hinges))
+    if isinstance(condition, Loop):
+        whitened, gap = _closure_residual(layout, condition, x, quat_WL, place)
+        hinges = _hinge_residuals(layout, x, quat_WL)
+    elif isinstance(condition, Pointing):
+        along = rotate(
+            inverse(quat_WL[condition.reference]), rotate(quat_WL[condition.segment], ca.DM(condition.along))
+        )
+        whitened = (along - ca.DM(condition.direction)) / condition.std
     else:
-        level = rotate(quat_WL[condition.segment], ca.vertcat(0.0, 1.0, 0.0))[2]
+        level = rotate(quat_WL[condition.segment], ca.DM(condition.axis))[2]
         whitened = ca.vertcat(level / condition.std, 0.0, 0.0)
-    r = ca.cse(ca.vertcat(whitened, elbows))
+    r = ca.cse(ca.vertcat(whitened, hinges))
     return ca.Function("sample", [x, data], ca.cse([r, ca.densify(ca.jacobian(r, x)), ca.densify(gap)]))
 
 
 _UP = ca.vertcat(0.0, 0.0, 1.0)
 
 
-def sensor_of(segment: str, sensors: Collection[str]) -> str:
-    """The segment whose sensor measures this one: a hand without a sensor is rigid with its forearm."""
-    return segment if segment in sensors else segment.replace("hand", "forearm")
+def orient_parts(layout: Layout, x: Any, quat_WL: Mapping[str, Any], parts: Sequence[Part]) -> list[tuple[str, Any]]:
+    """Sensor and vector (3,) [m] in W of each part of a way, in CasADi."""
+    lengths, twists = x[layout.length], {twist.sensor: k for k, twist in enumerate(layout.twists)}
+    vectors = []
+    for part in parts:
+        rows = [
+            sum((row[i] * lengths[i] for i in map(int, np.flatnonzero(row))), start=ca.SX(c))
+            for row, c in zip(np.array(part.by_length), part.constant, strict=True)
+        ]
+        vector = ca.vertcat(*rows)
+        if part.sensor == UNIVERSE:
+            vectors.append((part.sensor, vector))
+            continue
+        quat = quat_WL[part.sensor]
+        if part.sensor in twists:
+            k = twists[part.sensor]
+            quat = product(quat, about_axis(layout.twists[k].axis, x[layout.twist][k]))
+        vectors.append((part.sensor, rotate(quat, vector)))
+    return vectors
 
 
-def _closure_residual(
-    layout: Layout, closure: Closure, x: Any, quat_WL: Mapping[str, Any], point: int
-) -> tuple[Any, Any]:
+def _closure_residual(layout: Layout, loop: Loop, x: Any, quat_WL: Mapping[str, Any], place: int) -> tuple[Any, Any]:
     """Whitened residual (3) and gap (3) [m] of a closure."""
-    way = coefficients(closure)
-    carried = {name: sensor_of(name, layout.sensors) for name in way}
-    moved = {sensor: ca.SX.zeros(3) for sensor in layout.sensors if sensor in carried.values()}
-    turned = {name: quat_WL[carried[name]] for name in way}
-    if "torso" in turned:
-        turned["torso"] = product(turned["torso"], about_z(x[layout.shoulders]))
-    for name, vector in links(x[:K], turned, way).items():
-        moved[carried[name]] += vector
-    gap, covariance = ca.SX.zeros(3), closure.slip**2 * ca.SX.eye(3)
-    for v in moved.values():
-        gap += v
-        # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ). Only
-        # the ratios of these weights matter here.
-        covariance += SEGMENT_ATTITUDE_STD**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
-    if closure.kind == "distance":
+    gaps, covariances = [], []
+    for way in loop.ways:
+        gap, covariance = ca.SX.zeros(3), loop.closure.slip**2 * ca.SX.eye(3)
+        for sensor, v in orient_parts(layout, x, quat_WL, way):
+            gap += v
+            # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ).
+            # Only the ratios of these weights matter here.
+            if sensor != UNIVERSE:
+                covariance += SEGMENT_ATTITUDE_STD**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
+        gaps.append(gap)
+        covariances.append(covariance)
+    if loop.kind == "plane":
+        off = [gap[2] - x[layout.heights][place] for gap in gaps]
+        rows = [d / ca.sqrt(covariance[2, 2]) for d, covariance in zip(off, covariances, strict=True)]
+        missing = GAP_ROWS - len(off)
+        return ca.vertcat(*rows, *[0.0] * missing), ca.vertcat(*off, *[0.0] * missing)
+    [gap], [covariance] = gaps, covariances
+    if loop.kind == "distance":
         size = ca.norm_2(gap)
-        off = size - x[layout.distances][layout.distance_names.index(closure.distance)]
+        off = size - x[layout.distances][layout.distance_names.index(loop.closure.distance)]
         return ca.vertcat(off / ca.sqrt(gap.T @ covariance @ gap) * size, 0.0, 0.0), off * gap / size
-    if closure.kind == "fixed_point":
-        first = layout.points.start + 3 * point
+    if loop.kind == "fixed_point":
+        first = layout.points.start + 3 * place
         gap -= x[first : first + 3]
     return ca.solve(ca.chol(covariance).T, gap), gap
 
 
 def _hinge_residuals(layout: Layout, x: Any, quat_WL: Mapping[str, Any]) -> Any:
-    """By how much each forearm leaves the plane of its hinge, (2) in units of `HINGE_STD`."""
-    hinge, residual = x[layout.hinge], []
-    for i, side in enumerate(SIDES):
-        if side not in layout.arms:
-            residual.append(ca.SX(0.0))
-            continue
-        forearm = rotate(inverse(quat_WL[f"{side}_upper_arm"]), rotate(quat_WL[f"{side}_forearm"], -_UP))
-        axis = ca.vertcat(hinge[2 * i], 1.0, hinge[2 * i + 1])
-        residual.append(ca.dot(axis, forearm) / ca.norm_2(axis) / HINGE_STD)
+    """By how much each segment leaves the plane of its hinge, in units of `HINGE_STD`."""
+    unknown, residual = x[layout.hinge], []
+    for i, hinge in enumerate(layout.hinges):
+        along = rotate(inverse(quat_WL[hinge.on]), rotate(quat_WL[hinge.moves], ca.DM(hinge.along)))
+        axis = ca.DM(hinge.axis) + unknown[2 * i] * ca.DM(hinge.across) + unknown[2 * i + 1] * ca.DM(hinge.tilted)
+        residual.append(ca.dot(axis, along) / ca.norm_2(axis) / HINGE_STD)
     return ca.vertcat(*residual)

@@ -4,7 +4,8 @@ While the palms are held together the chain shoulder–arm–palm–palm–arm�
 
     g(ℓ) = R_torso e_y w + Σ_left R_i(−e_z) ℓ_i − Σ_right R_i(−e_z) ℓ_i
 
-is zero. It is linear and homogeneous in the lengths ℓ, which decides the form of the problem:
+is zero. Other bodies and points have other terms (`conditions`). It is linear and homogeneous in the lengths ℓ, unless
+a length of the chain is known as it is on a robot, which decides the form of the problem:
 
 - Nothing in g fixes the scale: ℓ = 0 closes the chain perfectly. Errors of the orientations even favour it, since they
   add to ‖g‖² in proportion to ‖ℓ‖². So the residual is the gap whitened by the covariance that errors of the
@@ -35,15 +36,15 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
-from ..model import load_table
+from ..model import BodyModel, load_model
 from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
 from .anatomy import BETTER, LabelCheck, check_labels
-from .chain import LENGTHS, SIDES
+from .conditions import find_hinges, find_measured_lengths, group_lengths
 from .contact import find_contact_start
 from .joints import add_couplings, estimate_couplings
-from .least_squares import HINGE_STD, Gaussian, K, Layout, Observations, place_points, residuals
+from .least_squares import HINGE_STD, Gaussian, Observations, place_points, residuals
 from .observability import diagnose_closures, diagnose_distances, diagnose_lengths, diagnose_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .priors import build_prior, combine_lengths
@@ -72,6 +73,7 @@ def calibrate_lengths(
     *,
     measured: Mapping[str, float] | None = None,
     prior: Subject | None = None,
+    model: BodyModel | None = None,
     protocol: str | Protocol = "clasp",
     method: str = BEST,
     measured_std: Positive = MEASURED_STD,
@@ -83,6 +85,7 @@ def calibrate_lengths(
     ----------
     measured : measured lengths, and distances that the protocol names, name → [m]; without one the scale is the prior's
     prior : lengths before, with covariance, and mounts; None: `population_subject`
+    model : the body; None: that which the recording states, else the upper body
     protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave
     method : the orientation filter
     measured_std : standard deviation [m] of each measured length
@@ -101,37 +104,41 @@ def calibrate_lengths(
     if not isinstance(protocol, Protocol):
         protocol = load_protocol(protocol)
     with_std = {name: (metres, measured_std) for name, metres in (measured or {}).items()}
-    _check_measured(with_std, protocol)
-    load_table().check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
+    model = model or load_model()
+    table = model.table
+    table.check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
+    protocol.check_body(table)
     for segment in protocol.needs:
         if segment not in recording.sensors:
             raise BadSession(
                 f"{recording.where()}: no sensor on {segment}; protocol '{protocol.name}' needs one each on "
                 f"{', '.join(protocol.needs)}"
             )
+    prior = prior or population_subject(body=model)
+    prior.check_body(table)
+    _check_measured(with_std, protocol, model)
     if formulation == "paper":
-        check_paper_formulation(protocol, with_std, recording.sensors)
-    prior = prior or population_subject()
-    prior.check_body(load_table())
+        check_paper_formulation(protocol, model, with_std, recording.sensors)
     for condition in protocol.conditions:
         recording.phase(condition.phase)
     filtered = filter_recording(recording, method=method)
-    problem = CalibrationProblem(recording, filtered, protocol, prior, with_std)
+    problem = CalibrationProblem(recording, filtered, protocol, prior, with_std, model)
     return solve_paper_calibration(problem) if formulation == "paper" else _calibrate_checked(problem)
 
 
-def _check_measured(measured: Mapping[str, tuple[float, float]], protocol: Protocol) -> None:
+def _check_measured(measured: Mapping[str, tuple[float, float]], protocol: Protocol, model: BodyModel) -> None:
     """Raises `BadOption` where a measured length is none of the protocol's, not plausible, or missing."""
-    names, (low, high) = (*LENGTHS, *protocol.distances), MEASURED_RANGE
+    names, (low, high) = (*model.lengths, *protocol.distances), MEASURED_RANGE
     for name, (metres, _) in measured.items():
         if name not in names:
             raise BadOption(f"measured {name}: not a length; {one_of(names, name)}")
         if not low < metres < high:
             raise BadOption(f"measured {name}={metres:g}: a length in metres is needed, between {low} and {high}")
-    if len(set(measured) & set(protocol.chain)) < protocol.min_measured:
+    chain = find_measured_lengths(protocol, model)
+    if len(set(measured) & set(chain)) < protocol.min_measured:
         raise BadOption(
             f"protocol '{protocol.name}' needs {protocol.min_measured} measured length of its chain, as in --measured "
-            f"{protocol.measured_example}; {one_of(protocol.chain)}"
+            f"{protocol.measured_example}; {one_of(chain)}"
         )
 
 
@@ -142,19 +149,20 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
     problem = problem.remove_mounts(wrong)
     problem.check_start_pose()
     stated = solve_calibration(problem, quick=True)
-    doubt = stated.arms().doubt()
+    doubt = stated.limbs().doubt()
     if doubt > 1.0 or problem.mounts_against_motion(stated.subject.mounts):
         free = solve_calibration(problem.remove_mounts(problem.filtered.R_VS), quick=True)
-        if free.arms().doubt() < min(1.0, BETTER * max(doubt, 1.0 / BETTER)):
+        if free.limbs().doubt() < min(1.0, BETTER * max(doubt, 1.0 / BETTER)):
             wrong = problem.mounts_against_motion(free.subject.mounts)
             unused += [_diagnose_unused_mount(n, angle, MOUNT_WARNING_DEG, "motion") for n, angle in wrong.items()]
             problem = problem.remove_mounts(wrong)
             doubt = 0.0 if wrong else doubt
     if doubt > 1.0:
         labels = check_labels(
-            stated.arms(),
-            lambda moved: solve_calibration(problem.relabel(moved), quick=True).arms(),
-            tuple(problem.filtered.R_VS),
+            stated.limbs(),
+            lambda moved: solve_calibration(problem.relabel(moved), quick=True).limbs(),
+            [name for name in problem.sensors if name in problem.model.table.needed],
+            problem.model.table,
         )
         if labels.moved:
             return _keep_prior(replace(stated, diagnostics=(*unused, *stated.diagnostics)), labels, problem.measured)
@@ -162,8 +170,8 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
         best = solve_calibration(problem)
     except NoSolution as error:
         raise NoSolution(f"{problem.recording.where()}: {error}") from error
-    arms = best.arms()
-    labels = LabelCheck(arms.doubt(), arms.contradiction() if arms.doubt() > 1.0 else None)
+    limbs = best.limbs()
+    labels = LabelCheck(limbs.doubt(), limbs.contradiction() if limbs.doubt() > 1.0 else None)
     return replace(best, labels=labels, unused_mounts=tuple(unused))
 
 
@@ -177,10 +185,11 @@ def _keep_prior(
     calibration: Calibration, labels: LabelCheck, measured: Mapping[str, tuple[float, float]]
 ) -> Calibration:
     """The calibration with the lengths and covariance from before the motion, where sensors sit on other segments."""
-    lengths, information = combine_lengths(calibration.prior, measured)
+    names = tuple(calibration.subject.lengths)
+    lengths, information = combine_lengths(calibration.prior, measured, names)
     subject = replace(
         calibration.subject,
-        lengths=dict(zip(LENGTHS, lengths.tolist(), strict=True)),
+        lengths=dict(zip(names, lengths.tolist(), strict=True)),
         covariance=calibration.prior_covariance,
         hinges={},
         start_pose_offset={},
@@ -210,7 +219,9 @@ def _solve(problem: CalibrationProblem) -> _Solution:
     prior = build_prior(problem, observations)
     start, contact = find_contact_start(observations, lambda some: build_prior(problem, some).mean)
     spans = [span for closure in problem.protocol.closures for span in recording.phase(closure.phase)]
-    couplings = estimate_couplings(recording, problem.filtered, layout.sensors, spans)
+    neighbours = [(problem.model.parents[name], name) for name in layout.sensors]
+    pairs = [(above, name) for above, name in neighbours if above is not None and above in layout.sensors]
+    couplings = estimate_couplings(recording, problem.filtered, pairs, spans)
     coupled = add_couplings(prior, layout, couplings, start)
     result = solve_reweighted(observations, coupled, start, contact)
 
@@ -223,14 +234,15 @@ def _solve(problem: CalibrationProblem) -> _Solution:
         return add_couplings(Gaussian(mean, prior.information), layout, couplings, x)
 
     alternatives = find_alternatives(observations, prior_at, result, headings)
-    lengths = result.fit.x[:K]
-    if np.min(lengths) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
+    lengths = result.fit.x[layout.length]
+    if np.min(lengths, initial=np.inf) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
         raise NoSolution(
-            f"the lengths did not converge ({LENGTHS[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm); "
-            f"check that the hands do in the phase what the protocol says, and that every sensor sits where the "
+            f"the lengths did not converge ({layout.lengths[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} "
+            f"mm); check that the points do in the phase what the protocol says, and that every sensor sits where the "
             f"session says"
         )
-    shares = compute_information_shares(result.fit, layout, result.weights, np.linalg.inv(result.fit.information))
+    sums = list(group_lengths(observations.conditions, layout.lengths).values())
+    shares = compute_information_shares(result.fit, layout, result.weights, np.linalg.inv(result.fit.information), sums)
     covariance = estimate_covariance(observations, result, coupled.information)
     covariance = widen_covariance(covariance, alternatives, layout)
     return _Solution(observations, samples, prior, result, covariance, shares, alternatives)
@@ -250,34 +262,34 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
     recording, protocol, prior = problem.recording, problem.protocol, problem.prior
     observations, samples, fit = solution.observations, solution.samples, solution.result.fit
     layout, contact = observations.layout, solution.result.contact
-    lengths, covariance = fit.x[:K], solution.covariance[:K, :K]
-    scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1)
+    lengths, covariance = fit.x[layout.length], solution.covariance[layout.length, layout.length]
+    scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1) if len(lengths) else float("nan")
     # A length outside the chain, such as the trunk where the hands are joined, does not fix its scale.
-    scale_lengths = [name for name in problem.measured if name in (protocol.chain or LENGTHS)]
+    scale_lengths = [name for name in problem.measured if name in (problem.lengths_in_closures or layout.lengths)]
     scale_lengths += protocol.distances
     measured = dict(problem.measured)
     measured |= {
         c.distance: (c.metres, c.metres_std) for c in protocol.closures if c.distance and c.distance not in measured
     }
-    hinges = _hinges(fit.hinge[observations.closed], fit.x[layout.hinge], layout) if observations.closed.any() else {}
+    hinges = _hinges(fit.hinge[observations.closed], fit.x[layout.hinge], problem) if observations.closed.any() else {}
     offsets = Rotation.from_rotvec(np.pad(fit.x[layout.tilt].reshape(-1, 2), ((0, 0), (0, 1)))).as_rotvec()[:, :2]
     subject = _make_subject(problem, solution, {joint: hinge for joint, (hinge, _) in hinges.items()}, offsets)
     scale = f"measured: {', '.join(scale_lengths)}" if scale_lengths else "of the population prior"
 
     prior_x = fit.x.copy()
-    prior_x[:K] = [prior.lengths[name] for name in LENGTHS]
+    prior_x[layout.length] = [prior.lengths[name] for name in layout.lengths]
     prior_gaps = residuals(place_points(prior_x, observations), observations)[2]
     gap, prior_gap = (np.linalg.norm(gaps, axis=1) for gaps in (fit.gaps, prior_gaps))
     gap[~observations.closed] = prior_gap[~observations.closed] = np.nan
     touching = observations.closed & (contact > MIN_CONTACT)
 
     diagnostics = list(problem.filtered.diagnostics)
-    prior_lengths_cov = np.linalg.inv(solution.prior.information[:K, :K])
+    prior_lengths_cov = np.linalg.inv(solution.prior.information[layout.length, layout.length])
     free_scale_std = None if scale_lengths else scale_std
     diagnostics += diagnose_lengths(problem, lengths, covariance, prior_lengths_cov, free_scale_std)
     diagnostics += diagnose_distances(problem)
     diagnostics += diagnose_ambiguity(solution.alternatives, layout)
-    diagnostics += diagnose_mounts([name for name in problem.filtered.R_VS if name not in subject.mounts], protocol)
+    diagnostics += diagnose_mounts([name for name in problem.filtered.R_VS if name not in subject.mounts], problem)
     diagnostics += diagnose_closures(recording.time[samples], contact, observations)
     return Calibration(
         subject=replace(subject, note=f"{protocol.title}; scale {scale}"),
@@ -297,29 +309,36 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
         hinge_axes={joint: hinge.axis for joint, (hinge, _) in hinges.items()},
         hinge_rms={joint: rms for joint, (_, rms) in hinges.items()},
         information_shares=solution.information_shares,
-        prior_covariance=project_to_subject(layout, np.linalg.inv(solution.prior.information))[1],
+        prior_covariance=project_to_subject(layout, np.linalg.inv(solution.prior.information), problem.start_pose)[1],
         quat_WL=problem.orient_segments(subject.mounts, samples),
         protocol=protocol.name,
         closure=next((closure.kind for closure in protocol.closures), ""),
         measured_example=protocol.measured_example,
         measured_lengths=compare_measured(fit, layout, measured),
         scale_lengths=tuple(scale_lengths),
+        model=problem.model,
+        start_pose=problem.start_pose,
+        conditions=problem.conditions,
     )
 
 
-def _hinges(hinge_residuals: np.ndarray, xz: np.ndarray, layout: Layout) -> dict[str, tuple[Hinge, float]]:
-    """Joint → its hinge, and the root mean square [rad] by which the forearm leaves the plane across it.
+def _hinges(
+    hinge_residuals: np.ndarray, unknown: np.ndarray, problem: CalibrationProblem
+) -> dict[str, tuple[Hinge, float]]:
+    """Joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it.
 
     Parameters
     ----------
-    hinge_residuals : (n, 2) of left and right, in units of `HINGE_STD`
-    xz : (4,) of the axes (x, 1, z), left then right
+    hinge_residuals : (n, h) in units of `HINGE_STD`
+    unknown : (2 h,) by which each axis is turned across and tilted
     """
     hinges = {}
-    for i, (side, (x, z)) in enumerate(zip(SIDES, xz.reshape(2, 2), strict=True)):
-        if side in layout.arms:
-            axis, rms = np.array([x, 1.0, z]), HINGE_STD * _rms(hinge_residuals[:, i])
-            hinges[f"{side}_elbow"] = Hinge(axis / np.linalg.norm(axis), max(rms, HINGE_STD)), rms
+    layout_hinges = find_hinges(problem.model, problem.start_pose, problem.sensors)
+    for i, (hinge, (across, tilted)) in enumerate(zip(layout_hinges, unknown.reshape(-1, 2), strict=True)):
+        axis = np.array(hinge.axis) + across * np.array(hinge.across) + tilted * np.array(hinge.tilted)
+        axis_L = problem.turn(hinge.on).inv().apply(axis / np.linalg.norm(axis))
+        rms = HINGE_STD * _rms(hinge_residuals[:, i])
+        hinges[hinge.name] = Hinge(axis_L, max(rms, problem.model.table.hinges[hinge.name].softness)), rms
     return hinges
 
 
@@ -331,11 +350,12 @@ def _make_subject(
     mounts = {}
     for i, name in enumerate(layout.sensors):
         tilt = Rotation.from_rotvec(-np.append(x[layout.tilt][2 * i : 2 * i + 2], 0.0))
-        mounts[name] = (tilt * _about_z(x[layout.heading][i]) * filtered.R_VS_start[name]).as_quat()
+        R_LS = problem.turn(name).inv() * tilt * _about_z(x[layout.heading][i]) * filtered.R_VS_start[name]
+        mounts[name] = R_LS.as_quat()
     # The mounts of sensors outside the chain are those of the start pose.
     for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
-        mounts[name] = (_about_z(psi) * filtered.R_VS_start[name]).as_quat()
-    order, covariance = project_to_subject(layout, solution.covariance)
+        mounts[name] = (problem.turn(name).inv() * _about_z(psi) * filtered.R_VS_start[name]).as_quat()
+    order, covariance = project_to_subject(layout, solution.covariance, problem.start_pose)
     std = np.sqrt(np.diag(solution.covariance))
     offset_stds = np.minimum(std[layout.tilt], np.pi).reshape(-1, 2)  # no angle is more uncertain than half a turn
     return replace(
@@ -350,7 +370,7 @@ def _make_subject(
             name: HeadingDrift(float(rate), float(rate_std))
             for name, rate, rate_std in zip(layout.sensors, x[layout.drift], std[layout.drift], strict=True)
         },
-        lengths=dict(zip(LENGTHS, x[:K].tolist(), strict=True)),
+        lengths=dict(zip(layout.lengths, x[layout.length].tolist(), strict=True)),
         order=order,
         covariance=covariance,
         mounts=mounts,

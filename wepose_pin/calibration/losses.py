@@ -91,19 +91,25 @@ def group_steps(losses: Sequence[Loss], samples: np.ndarray) -> tuple[tuple[str,
 
 
 def check_start_pose(
-    recording: Recording, losses: Sequence[Loss], samples: np.ndarray, unknown: Collection[str], min_samples: int
+    recording: Recording,
+    losses: Sequence[Loss],
+    samples: np.ndarray,
+    unknown: Collection[str],
+    reference: str,
+    min_samples: int,
 ) -> None:
-    """Raises `BadPhase` where the motion does not show a mount, since the sensor or the torso's lost samples before.
+    """Raises `BadPhase` where the motion does not show a mount, since the sensor or the reference lost samples before.
 
     Parameters
     ----------
     samples : (n,) of the motion
     unknown : sensors of the chain whose mount is not known
-    min_samples : at which the sensor and the torso must be connected with the start pose
+    reference : the sensor that faces x of W in the start pose
+    min_samples : at which the sensor and the reference must be connected with the start pose
     """
     for name in unknown:
-        between = [loss for loss in losses if loss.sensor in (name, "torso") and loss.free]
-        if name == "torso" or np.count_nonzero(mask_connected(between, samples)) >= min_samples:
+        between = [loss for loss in losses if loss.sensor in (name, reference) and loss.free]
+        if name == reference or np.count_nonzero(mask_connected(between, samples)) >= min_samples:
             continue
         worst = max(between, key=lambda loss: np.count_nonzero(loss.beyond(samples)))
         span = format_span(recording.time[[worst.first, worst.last]])

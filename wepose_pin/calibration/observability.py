@@ -8,10 +8,10 @@ import numpy as np
 
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..recording import format_span
-from .chain import LENGTHS
-from .least_squares import K, Observations
+from .conditions import Loop, find_segments
+from .least_squares import Observations
 from .problem import CalibrationProblem
-from .protocols import PROTOCOLS, Closure, Protocol, load_protocol
+from .protocols import PROTOCOLS, load_protocol
 from .weights import MIN_CONTACT
 
 LOOSE_SCALE = 0.6  # of the prior's relative standard deviation, above which a measured length shows little
@@ -43,25 +43,45 @@ def diagnose_lengths(
     if free_scale_std is not None:
         facts = names | {"measured": protocol.measured_example}
         diagnostics.append(Diagnostic("scale-from-prior", INFO, value=free_scale_std, facts=facts))
-    arms = [LENGTHS.index(name) for name in protocol.chain if name.endswith(("upper_arm", "forearm"))]
-    share = np.zeros(K)
-    share[arms] = 1.0 / lengths[arms] / max(len(arms), 1)
-    scale_std, before = (float(np.sqrt(share @ C @ share)) for C in (covariance, prior.lengths_covariance()))
+    table, names_of_lengths = problem.model.table, list(problem.model.lengths)
+    chain = problem.lengths_in_closures
+    of_limbs = [
+        name
+        for name in chain
+        if not any(
+            table.segments[part.segment].spine or table.segments[part.segment].rigid_without_sensor
+            for part in table.lengths[name].stretches
+        )
+    ]
+    rows = [names_of_lengths.index(name) for name in of_limbs]
+    share = np.zeros(len(lengths))
+    share[rows] = 1.0 / lengths[rows] / max(len(rows), 1)
+    covariance_before = prior.lengths_covariance(names_of_lengths)
+    scale_std, before = (float(np.sqrt(share @ C @ share)) for C in (covariance, covariance_before))
     limit = max(LOOSE_SCALE * before, LEAST_LOOSE_SCALE)
     if free_scale_std is None and scale_std > limit:
         diagnostics.append(
             Diagnostic("scale-uncertain", WARNING, "", scale_std, limit, {"measured": protocol.measured_example})
         )
     # Closures show proportions: those must be known better than from the prior and the measured lengths.
-    arms = [LENGTHS.index(name) for name in protocol.chain if name.endswith("upper_arm")]
-    for a, b in ((arm, other) for arm in arms for other in map(LENGTHS.index, protocol.chain) if other not in arms):
-        share = np.zeros(K)
-        share[a], share[b] = 1.0 / lengths[a], -1.0 / lengths[b]
+    first = [name for name in of_limbs if _is_first(problem, name)]
+    for a, b in ((name, other) for name in first for other in chain if other not in first):
+        share = np.zeros(len(lengths))
+        for name, sign in ((a, 1.0), (b, -1.0)):
+            share[names_of_lengths.index(name)] = sign / lengths[names_of_lengths.index(name)]
         if share @ covariance @ share < 0.5 * share @ prior_covariance @ share:
             break
     else:
-        diagnostics.append(Diagnostic("lengths-mostly-prior", WARNING, facts={"protocol": protocol.title}))
+        if first:
+            diagnostics.append(Diagnostic("lengths-mostly-prior", WARNING, facts={"protocol": protocol.title}))
     return diagnostics
+
+
+def _is_first(problem: CalibrationProblem, length: str) -> bool:
+    """Whether a length is that of a limb's first segment."""
+    segments, parents = problem.model.table.segments, problem.model.parents
+    above = [parents[part.segment] for part in problem.model.table.lengths[length].stretches]
+    return all(segment is None or segments[segment].spine for segment in above)
 
 
 def diagnose_distances(problem: CalibrationProblem) -> list[Diagnostic]:
@@ -73,12 +93,12 @@ def diagnose_distances(problem: CalibrationProblem) -> list[Diagnostic]:
     ]
 
 
-def diagnose_mounts(segments: Sequence[str], protocol: Protocol) -> list[Diagnostic]:
+def diagnose_mounts(segments: Sequence[str], problem: CalibrationProblem) -> list[Diagnostic]:
     """Sensors whose mount neither the session states nor this protocol estimates."""
     diagnostics = []
     for segment in segments:
-        facts: dict[str, float | str] = {"protocol": protocol.name}
-        others = [name for name in PROTOCOLS if segment in load_protocol(name).segments]
+        facts: dict[str, float | str] = {"protocol": problem.protocol.name}
+        others = [name for name in PROTOCOLS if segment in find_segments(load_protocol(name), problem.model)]
         facts |= {"protocols": ", ".join(others)} if others else {"variant": "stated-only"}
         diagnostics.append(Diagnostic("mount-unknown", WARNING, segment, facts=facts))
     return diagnostics
@@ -89,10 +109,10 @@ def diagnose_closures(time: np.ndarray, contact: np.ndarray, observations: Obser
     diagnostics = []
     for closure, span in observations.spans():
         apart = contact[span] < MIN_CONTACT
-        if isinstance(closure, Closure) and apart.any():
+        if isinstance(closure, Loop) and apart.any():
             facts = {"intervals": format_longest(find_intervals(time[span], apart)), "variant": closure.kind}
             share = float(apart.mean())
-            diagnostics.append(Diagnostic("closure-open", INFO, closure.phase, share, MOST_OPEN, facts))
+            diagnostics.append(Diagnostic("closure-open", INFO, closure.closure.phase, share, MOST_OPEN, facts))
     return diagnostics
 
 

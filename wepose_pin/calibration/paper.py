@@ -25,19 +25,23 @@ from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 from scipy.linalg import block_diag, null_space
 
 from ..alignment import PALM_SLIP_STD, align_sensors
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, NoSolution, one_of
+from ..model import BodyModel
+from ..model.start_pose import orient_links
 from ..subject import Subject
 from .anatomy import LabelCheck
-from .chain import LENGTHS, links
-from .least_squares import K, Observations, sensor_of
+from .chain import rotate
+from .conditions import Constraint, Loop, StartPose, resolve_conditions
+from .least_squares import Observations
 from .observability import diagnose_lengths
 from .priors import combine_lengths
 from .problem import CalibrationProblem
-from .protocols import Closure, Protocol, coefficients
+from .protocols import Closure, Protocol
 from .result import Calibration
 from .solver import MIN_LENGTH
 from .weights import LEAST_VARIANCE, MeasuredLength, count_correlated_samples, min_correlation
@@ -47,7 +51,9 @@ LEAST_EFFECT = 1e-6  # of a change of the lengths on the gaps, beside that of th
 DECIMALS = 9  # of a length's effect on the chain, by which lengths that rotate together are found
 
 
-def check_paper_formulation(protocol: Protocol, measured: Collection[str], sensors: Collection[str]) -> None:
+def check_paper_formulation(
+    protocol: Protocol, model: BodyModel, measured: Collection[str], sensors: Collection[str]
+) -> None:
     """Check that the protocol has the paper's closure, and that a measured length fixes the scale.
 
     Raises
@@ -60,7 +66,8 @@ def check_paper_formulation(protocol: Protocol, measured: Collection[str], senso
             f"formulation 'paper' needs a protocol in which points of the body coincide and nothing else is asked, "
             f"such as clasp; not '{protocol.name}'"
         )
-    groups = _group_lengths(protocol, sensors)
+    neutral = StartPose(orient_links(model, pin.neutral(model.pin)))
+    groups = _find_groups(resolve_conditions(protocol, model, neutral, sensors), tuple(model.lengths))
     if not any(set(group) <= set(measured) for group in groups):
         names = [group[0] for group in groups if len(group) == 1]
         raise BadOption(
@@ -87,20 +94,20 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         for name, R_VS in filtered.R_VS.items()
     }
     A = compute_gap_matrices(observations, quat_WL)
-    constraints = _state_constraints(problem, _group_lengths(protocol, filtered.R_VS))
+    constraints = _state_constraints(problem, _find_groups(problem.conditions, tuple(problem.model.lengths)))
     try:
-        lengths = _minimise(A, constraints)
+        lengths = _minimise(A, constraints, tuple(problem.model.lengths))
     except NoSolution as error:
         raise NoSolution(
             f"{recording.where()}: {error}; check that the hands do in the phase what the protocol says, and that "
             f"every mount is as the session states"
         ) from error
-    gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in LENGTHS]
+    gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in problem.model.lengths]
     correlated = count_correlated_samples(gaps, min_correlation(observations))
     covariance = _estimate_covariance(A, gaps, constraints, correlated)
     gap, prior_gap = (np.linalg.norm(vectors, axis=1) for vectors in (gaps, prior_gaps))
-    measured_covariance = np.linalg.inv(combine_lengths(prior, problem.measured)[1])
-    scale_lengths = tuple(name for name in problem.measured if name in protocol.chain)
+    measured_covariance = np.linalg.inv(combine_lengths(prior, problem.measured, tuple(problem.model.lengths))[1])
+    scale_lengths = tuple(name for name in problem.measured if name in problem.lengths_in_closures)
     calibration = Calibration(
         subject=_replace_lengths(
             prior, lengths, covariance,
@@ -137,24 +144,29 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         },
         scale_lengths=scale_lengths,
         formulation="paper",
+        model=problem.model,
+        start_pose=problem.start_pose,
+        conditions=problem.conditions,
     )  # fmt: skip
-    arms = calibration.arms()
-    return replace(calibration, labels=LabelCheck(arms.doubt(), arms.contradiction() if arms.doubt() > 1.0 else None))
+    limbs = calibration.limbs()
+    return replace(
+        calibration, labels=LabelCheck(limbs.doubt(), limbs.contradiction() if limbs.doubt() > 1.0 else None)
+    )
 
 
 def compute_gap_matrices(observations: Observations, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:
     """A (n, 3, 8) of each sample, from segment orientations (n, 4) xyzw: the gap [m] in W is ``A @ lengths``."""
-    matrices = []
-    for closure, span in observations.spans():
-        assert isinstance(closure, Closure)
-        way, lengths = coefficients(closure), ca.SX.sym("lengths", K)
-        sensors = {segment: sensor_of(segment, quat_WL) for segment in way}
-        quats = {sensor: ca.SX.sym(sensor, 4) for sensor in dict.fromkeys(sensors.values())}
-        vectors = links(lengths, {segment: quats[sensor] for segment, sensor in sensors.items()}, way)
-        gap = ca.sum2(ca.horzcat(*vectors.values()))
+    matrices, layout = [], observations.layout
+    K = len(layout.lengths)
+    for loop, span in observations.spans():
+        assert isinstance(loop, Loop)
+        lengths, [way] = ca.SX.sym("lengths", K), loop.ways
+        quats = {part.sensor: ca.SX.sym(part.sensor, 4) for part in way}
+        vectors = [rotate(quats[part.sensor], ca.DM(np.array(part.by_length)) @ lengths) for part in way]
+        gap = ca.sum2(ca.horzcat(*vectors))
         function = ca.Function("gap", [*quats.values()], [ca.densify(ca.jacobian(gap, lengths))])
         n = span.stop - span.start
-        rows = np.asarray(function.map(n)(*(quat_WL[sensor][span].T for sensor in quats)))  # (3, 8 n)
+        rows = np.asarray(function.map(n)(*(quat_WL[sensor][span].T for sensor in quats)))  # (3, K n)
         matrices.append(rows.reshape(3, n, K).swapaxes(0, 1))
     return np.concatenate(matrices)
 
@@ -171,17 +183,11 @@ class _Constraints(NamedTuple):
         return null_space(self.E)
 
 
-def _group_lengths(protocol: Protocol, sensors: Collection[str]) -> list[tuple[str, ...]]:
+def _find_groups(conditions: Collection[Constraint], lengths: tuple[str, ...]) -> list[tuple[str, ...]]:
     """The lengths in the chain; those that always rotate together are one group, of which the gap shows the sum."""
-    columns = []
-    for closure in protocol.closures:
-        parts: dict[str, np.ndarray] = {}
-        for segment, part in coefficients(closure).items():
-            sensor = sensor_of(segment, sensors)
-            parts[sensor] = parts.get(sensor, 0.0) + part
-        columns += list(parts.values())
+    columns = [np.array(part.by_length) for loop in conditions if isinstance(loop, Loop) for part in loop.parts]
     groups: dict[tuple[float, ...], list[str]] = {}
-    for name, column in zip(LENGTHS, np.round(np.vstack(columns), DECIMALS).T, strict=True):
+    for name, column in zip(lengths, np.round(np.vstack(columns), DECIMALS).T, strict=True):
         if np.any(column):
             groups.setdefault(tuple(column.tolist()), []).append(name)
     return [tuple(group) for group in groups.values()]
@@ -189,26 +195,26 @@ def _group_lengths(protocol: Protocol, sensors: Collection[str]) -> list[tuple[s
 
 def _state_constraints(problem: CalibrationProblem, groups: list[tuple[str, ...]]) -> _Constraints:
     """Measured lengths, and the population's proportions and lengths where the gap shows none."""
-    prior, measured, unit = problem.prior, problem.measured, dict(zip(LENGTHS, np.eye(K), strict=True))
+    names, prior, measured = tuple(problem.model.lengths), problem.prior, problem.measured
+    K, unit = len(names), dict(zip(names, np.eye(len(names)), strict=True))
     assumed = []
     for group in groups:
-        names = [name for name in group if name not in measured]
-        shares = [unit[name] / prior.lengths[name] for name in names]
+        shares = [unit[name] / prior.lengths[name] for name in group if name not in measured]
         assumed += [a - b for a, b in pairwise(shares)]
-    outside = set(LENGTHS).difference(measured, *groups)
-    assumed += [unit[name] for name in LENGTHS if name in outside]
+    outside = set(names).difference(measured, *groups)
+    assumed += [unit[name] for name in names if name in outside]
     E_measured = np.array([unit[name] for name in measured if name in unit])
     E_assumed = np.array(assumed).reshape(-1, K)
     stated = [measured[name] for name in measured if name in unit]
-    prior_lengths = np.array([prior.lengths[name] for name in LENGTHS])
+    prior_lengths = np.array([prior.lengths[name] for name in names])
     return _Constraints(
         np.vstack([E_measured, E_assumed]),
         np.concatenate([[metres for metres, _ in stated], E_assumed @ prior_lengths]),
-        block_diag(np.diag([std**2 for _, std in stated]), E_assumed @ prior.lengths_covariance() @ E_assumed.T),
+        block_diag(np.diag([std**2 for _, std in stated]), E_assumed @ prior.lengths_covariance(names) @ E_assumed.T),
     )
 
 
-def _minimise(A: np.ndarray, constraints: _Constraints) -> np.ndarray:
+def _minimise(A: np.ndarray, constraints: _Constraints, names: tuple[str, ...]) -> np.ndarray:
     """The lengths (8,) [m] that make the gaps least under the constraints, by CasADi's `qpsol`.
 
     Raises
@@ -216,11 +222,11 @@ def _minimise(A: np.ndarray, constraints: _Constraints) -> np.ndarray:
     NoSolution
         The gaps do not determine the lengths, or determine one that is at its bound.
     """
-    effects = np.linalg.svd(A.reshape(-1, K) @ constraints.find_free(), compute_uv=False)
+    effects = np.linalg.svd(A.reshape(-1, A.shape[-1]) @ constraints.find_free(), compute_uv=False)
     if np.min(effects, initial=1.0) < LEAST_EFFECT * np.max(effects, initial=1.0):
         raise NoSolution("the motion does not determine the lengths: the gap does not change with some of them")
-    x = ca.MX.sym("lengths", K)
-    gaps = ca.mtimes(ca.DM(A.reshape(-1, K)), x)
+    x = ca.MX.sym("lengths", A.shape[-1])
+    gaps = ca.mtimes(ca.DM(A.reshape(-1, A.shape[-1])), x)
     program = {"x": x, "f": 0.5 * ca.sumsqr(gaps), "g": ca.mtimes(ca.DM(constraints.E), x)}
     options: dict[str, Any] = {"print_iter": False, "print_header": False, "print_info": False, "print_time": False}
     solver = ca.qpsol("lengths", "qrqp", program, options)
@@ -231,7 +237,7 @@ def _minimise(A: np.ndarray, constraints: _Constraints) -> np.ndarray:
     lengths = np.asarray(solution["x"]).ravel()
     if np.min(lengths) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
         shortest = int(np.argmin(lengths))
-        raise NoSolution(f"the gap is least with {LENGTHS[shortest]} = {1e3 * lengths[shortest]:.0f} mm")
+        raise NoSolution(f"the gap is least with {names[shortest]} = {1e3 * lengths[shortest]:.0f} mm")
     return lengths
 
 
@@ -242,22 +248,22 @@ def _estimate_covariance(A: np.ndarray, gaps: np.ndarray, constraints: _Constrai
     ----------
     correlated : samples that make one independent one
     """
-    rows, free = A.reshape(-1, K), constraints.find_free()
+    rows, free = A.reshape(-1, A.shape[-1]), constraints.find_free()
     information = free.T @ rows.T @ rows @ free
     variance = max(np.sum(gaps**2) / (gaps.size - free.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
     by_z = free @ np.linalg.solve(information, free.T)
-    by_d = (np.eye(K) - by_z @ rows.T @ rows) @ np.linalg.pinv(constraints.E)
+    by_d = (np.eye(len(by_z)) - by_z @ rows.T @ rows) @ np.linalg.pinv(constraints.E)
     covariance = correlated * variance * by_z + by_d @ constraints.covariance @ by_d.T
     return 0.5 * (covariance + covariance.T)
 
 
 def _replace_lengths(subject: Subject, lengths: np.ndarray, covariance: np.ndarray, **fields: Any) -> Subject:
     """The subject with other lengths (8,) [m], their covariance, and other `fields`; what it knows of mounts stays."""
-    others = [k for k, name in enumerate(subject.order) if name not in LENGTHS]
+    others = [k for k, name in enumerate(subject.order) if name not in subject.lengths]
     return replace(
         subject,
-        lengths=dict(zip(LENGTHS, lengths.tolist(), strict=True)),
-        order=(*LENGTHS, *(subject.order[k] for k in others)),
+        lengths=dict(zip(subject.lengths, lengths.tolist(), strict=True)),
+        order=(*subject.lengths, *(subject.order[k] for k in others)),
         covariance=block_diag(covariance, subject.covariance[np.ix_(others, others)]),
         **fields,
     )

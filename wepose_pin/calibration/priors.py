@@ -5,32 +5,27 @@ All of it is one Gaussian over the unknowns of `least_squares`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import START_POSE_STD, find_mount_covariance
 from ..errors import BadSubject
+from ..model import BodyTable
 from ..subject import Subject
-from .chain import LENGTHS
+from .conditions import Loop
 from .initial_headings import estimate_headings
-from .least_squares import Gaussian, K, Observations, place_points
+from .least_squares import Gaussian, Layout, Observations, place_points
 from .losses import FREE_STD, HEADING_STD
 from .problem import CalibrationProblem
-from .protocols import Closure
 
 # Priors, one standard deviation. A stated mount names sensor axes, estimated by eye.
 STATED_STD = np.deg2rad(10.0)  # [rad] of a stated mount's heading
 MEASURED_ORIENTATION_STD = np.deg2rad(2.0)  # [rad] about each axis, of segments that a device aligned itself
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
 POINT_STD = 3.0  # [m] of an unknown point of W
-# [rad] by which soft tissue rotates a sensor as its segment rotates by a radian, each axis against each. It moves as
-# much on a trunk, which leans by a fifth of the angle that arms rotate.
-SOFT_TISSUE_STD, TORSO_SOFT_TISSUE_STD = np.deg2rad(0.6), np.deg2rad(3.0)
-SHOULDERS_STD = np.deg2rad(2.0)  # [rad] of the shoulders' line about the torso's z: some 9 mm of one of them
-# Elbow axis (x, 1, z) in the upper arm: palms turn in or out alike on both sides, the torso's facing is common to both.
-HINGE_MIRROR_STD, HINGE_COMMON_STD, HINGE_TILT_STD = np.deg2rad([20.0, 5.0, 5.0])
+MECHANISM_START_STD = np.deg2rad(0.5)  # [rad] of a mechanism's links in its start configuration; assumption
 
 
 def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaussian:
@@ -43,15 +38,18 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     """
     layout, prior = observations.layout, problem.prior
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
-    mean[:K], information[:K, :K] = combine_lengths(prior, problem.measured)
+    rows_of_lengths = layout.length
+    mean[rows_of_lengths], information[rows_of_lengths, rows_of_lengths] = combine_lengths(
+        prior, problem.measured, layout.lengths
+    )
     for name, row in zip(layout.distance_names, range(layout.size)[layout.distances], strict=True):
-        stated = next(c for c in observations.conditions if isinstance(c, Closure) and c.distance == name)
+        stated = next(c for c in observations.conditions if isinstance(c, Loop) and c.closure.distance == name).closure
         mean[row], std = problem.measured.get(name, (stated.metres, stated.metres_std))
         information[row, row] = std**-2
-    information[layout.points, layout.points] = np.eye(3 * layout.fixed) / POINT_STD**2
+    _add_places(mean, information, observations)
 
     stated_headings = problem.stated_headings(layout.sensors)
-    headings = estimate_headings(observations, mean[:K], mean[layout.distances], stated_headings)
+    headings = estimate_headings(observations, mean, stated_headings)
     free = observations.step_std > FREE_STD
     mean[layout.step] = np.where(free, headings[len(layout.sensors) :], 0.0)
     information[layout.step, layout.step] = np.diag(np.where(free, HEADING_STD, observations.step_std) ** -2.0)
@@ -61,18 +59,39 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
         offset, information[np.ix_(rows, rows)] = _mount_prior(problem, name, stated_headings.get(name))
         mean[rows] += offset
     information[layout.drift, layout.drift] = np.eye(len(layout.sensors)) / DRIFT_STD**2
-    soft_tissue = [TORSO_SOFT_TISSUE_STD if name == "torso" else SOFT_TISSUE_STD for name in layout.sensors]
+    segments = problem.model.table.segments
+    soft_tissue = [segments[name].soft_tissue_std for name in layout.sensors]
     information[layout.soft_tissue, layout.soft_tissue] = np.diag(np.repeat(soft_tissue, 9) ** -2.0)
-    information[layout.shoulders, layout.shoulders] = SHOULDERS_STD**-2
-    x_left, z_left, x_right, z_right = range(layout.hinge.start, layout.hinge.stop)
-    for std, columns, share in (
-        (HINGE_COMMON_STD, (x_left, x_right), np.array([0.5, 0.5])),
-        (HINGE_MIRROR_STD, (x_left, x_right), np.array([0.5, -0.5])),
-        (HINGE_TILT_STD, (z_left,), np.ones(1)),
-        (HINGE_TILT_STD, (z_right,), np.ones(1)),
-    ):
-        information[np.ix_(columns, columns)] += np.outer(share, share) / std**2
+    twists = [segments[twist.sensor].point_twist_std for twist in layout.twists]
+    information[layout.twist, layout.twist] = np.diag(np.array(twists) ** -2.0)
+    _add_hinges(information, layout, problem.model.table)
     return Gaussian(place_points(mean, observations), information)
+
+
+def _add_places(mean: np.ndarray, information: np.ndarray, observations: Observations) -> None:
+    """Unknown points and heights of planes, and known points."""
+    layout = observations.layout
+    information[layout.heights, layout.heights] = np.eye(layout.planes) / POINT_STD**2
+    fixed = [c.closure for c in observations.conditions if isinstance(c, Loop) and c.kind == "fixed_point"]
+    for k, closure in enumerate(fixed):
+        rows = np.arange(layout.points.start + 3 * k, layout.points.start + 3 * k + 3)
+        std = POINT_STD if closure.at is None else closure.at_std
+        information[rows, rows] = std**-2
+        mean[rows] = 0.0 if closure.at is None else closure.at
+
+
+def _add_hinges(information: np.ndarray, layout: Layout, table: BodyTable) -> None:
+    """The axes of hinges; those of a left and a right one are partly alike."""
+    rows = {hinge.name: layout.hinge.start + 2 * i for i, hinge in enumerate(layout.hinges)}
+    for name, across in rows.items():
+        hinge, other = table.hinges[name], table.counterpart(name)
+        information[across + 1, across + 1] += hinge.tilt_std**-2
+        if other not in rows:
+            information[across, across] += (hinge.common_std**2 + hinge.mirror_std**2) ** -1.0
+        elif table.side(name) == "left":
+            columns = (across, rows[other])
+            for std, share in ((hinge.common_std, np.array([0.5, 0.5])), (hinge.mirror_std, np.array([0.5, -0.5]))):
+                information[np.ix_(columns, columns)] += np.outer(share, share) / std**2
 
 
 def _mount_prior(problem: CalibrationProblem, segment: str, heading: float | None) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +100,8 @@ def _mount_prior(problem: CalibrationProblem, segment: str, heading: float | Non
     The person stands nearly in the start pose. A mount R_LS = exp(m) R_0 has a small error m = μ − ε + ψ e_z, with μ
     the misfit of the start pose at the heading nearest to R_0.
     """
-    information = np.diag([START_POSE_STD**-2, START_POSE_STD**-2, HEADING_STD**-2])
+    start_std = MECHANISM_START_STD if problem.model.table.is_mechanism else START_POSE_STD
+    information = np.diag([start_std**-2, start_std**-2, HEADING_STD**-2])
     mount = problem.mount(segment)
     if mount is None or heading is None:
         return np.zeros(3), information
@@ -100,26 +120,31 @@ def _mount_information(problem: CalibrationProblem, segment: str) -> np.ndarray:
     recording, prior = problem.recording, problem.prior
     covariance = find_mount_covariance(recording, segment, prior)
     if covariance is not None:
-        return np.linalg.inv(covariance + 1e-12 * np.eye(3))
+        R_start = problem.start_pose.R_WK[segment]
+        return np.linalg.inv(R_start @ covariance @ R_start.T + 1e-12 * np.eye(3))
     calibrated = segment in prior.mounts and not recording.remounted
     if calibrated or segment not in recording.imus:
         return np.eye(3) / MEASURED_ORIENTATION_STD**2
     return np.diag([0.0, 0.0, STATED_STD**-2])
 
 
-def combine_lengths(prior: Subject, measured: Mapping[str, tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Lengths (8,) [m] of the prior and the measured lengths, and their information (8, 8).
+def combine_lengths(
+    prior: Subject, measured: Mapping[str, tuple[float, float]], names: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The named lengths (k,) [m] of the prior and the measured lengths, and their information (k, k).
 
     Raises
     ------
     BadSubject
         The prior has no positive definite covariance of its lengths.
     """
-    if not set(LENGTHS) <= set(prior.order) or np.linalg.eigvalsh(prior.lengths_covariance())[0] <= 0.0:
+    if not names:
+        return np.empty(0), np.empty((0, 0))
+    if not set(names) <= set(prior.order) or np.linalg.eigvalsh(prior.lengths_covariance(names))[0] <= 0.0:
         raise BadSubject(f"prior '{prior.name}': its lengths need a covariance that is positive definite, all of them")
-    information = np.linalg.inv(prior.lengths_covariance())
-    target = information @ [prior.lengths[name] for name in LENGTHS]
-    for i, name in enumerate(LENGTHS):
+    information = np.linalg.inv(prior.lengths_covariance(names))
+    target = information @ [prior.lengths[name] for name in names]
+    for i, name in enumerate(names):
         if name in measured:
             metres, std = measured[name]
             information[i, i] += 1.0 / std**2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -12,13 +13,24 @@ from scipy.spatial.transform import Rotation
 from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
 from ..errors import BadPhase
 from ..filters.sensors import FilteredRecording
+from ..model import BodyModel
+from ..model.start_pose import compute_start_configuration, orient_links
 from ..recording import Recording
 from ..subject import Subject
-from .chain import CHAIN
+from .conditions import (
+    Constraint,
+    Loop,
+    Pointing,
+    StartPose,
+    find_hinges,
+    find_measured_lengths,
+    find_twists,
+    resolve_conditions,
+)
 from .initial_headings import is_linear
-from .least_squares import Layout, Observations, sensor_of
+from .least_squares import Layout, Observations
 from .losses import check_start_pose, find_losses, find_unknown_tilt, group_steps, mask_connected
-from .protocols import Closure, Protocol
+from .protocols import Protocol
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
@@ -36,6 +48,7 @@ class CalibrationProblem:
     recording, filtered : the samples, and the orientations of the sensors
     protocol : what the person did in which phase
     prior : lengths with their covariance, and mounts
+    model : the body
     measured : name of a length, or of a distance of the protocol → value and standard deviation [m]
     """
 
@@ -44,10 +57,47 @@ class CalibrationProblem:
     protocol: Protocol
     prior: Subject
     measured: Mapping[str, tuple[float, float]]
+    model: BodyModel
+
+    @cached_property
+    def start_pose(self) -> StartPose:
+        """The orientation of the links in the start pose."""
+        recording, model = self.recording, self.model
+        q = compute_start_configuration(model, recording.start_pose, recording.joints, recording.where())
+        return StartPose(orient_links(model, q))
+
+    @cached_property
+    def conditions(self) -> tuple[Constraint, ...]:
+        """The protocol's conditions on the body with these sensors."""
+        return resolve_conditions(self.protocol, self.model, self.start_pose, self.filtered.R_VS)
+
+    @cached_property
+    def lengths_in_closures(self) -> tuple[str, ...]:
+        """The lengths in some closure."""
+        return find_measured_lengths(self.protocol, self.model)
+
+    @cached_property
+    def sensors(self) -> tuple[str, ...]:
+        """The segments with sensors that some condition uses, in the order of the table."""
+        used = set[str]()
+        for condition in self.conditions:
+            if isinstance(condition, Loop):
+                used |= {part.sensor for part in condition.parts}
+            else:
+                used |= {condition.segment}
+                used |= {condition.reference} if isinstance(condition, Pointing) else set()
+        return tuple(name for name in self.model.table.segments if name in used)
 
     def mount(self, segment: str) -> np.ndarray | None:
-        """The mount `quat_LS` (4,) xyzw of the prior or the session; None where neither has one."""
-        return find_nominal_mount(self.recording, segment, self.prior)
+        """The mount `quat_LS` (4,) xyzw of the prior or the session, L that equals W in the start pose; None: unknown."""
+        mount = find_nominal_mount(self.recording, segment, self.prior)
+        if mount is None or segment not in self.prior.mounts or self.recording.remounted:
+            return mount  # a stated one names the sensor's axes in the start pose
+        return (self.turn(segment) * Rotation.from_quat(mount)).as_quat()
+
+    def turn(self, segment: str) -> Rotation:
+        """R_WL of a segment in the start pose."""
+        return Rotation.from_matrix(self.start_pose.R_WK[segment])
 
     def stated_headings(self, segments: Collection[str]) -> dict[str, float]:
         """Segment → ψ [rad] at which its sensor is nearest to its mount, of those that have a mount."""
@@ -102,7 +152,7 @@ class CalibrationProblem:
         for segment, quat_LS in estimated.items():
             mount = self.mount(segment)
             if mount is not None and segment in self.recording.imus:
-                turn = Rotation.from_quat(quat_LS) * Rotation.from_quat(mount).inv()
+                turn = self.turn(segment) * Rotation.from_quat(quat_LS) * Rotation.from_quat(mount).inv()
                 angles[segment] = float(np.degrees(turn.magnitude()))
         return {segment: angle for segment, angle in angles.items() if angle > MOUNT_WARNING_DEG}
 
@@ -110,9 +160,10 @@ class CalibrationProblem:
         """Segment → `quat_WL` (n, 4) xyzw at some samples (n,), with mounts `quat_LS`, as tracking gives it."""
         filtered, quat_WL = self.filtered, {}
         for name in (name for name in filtered.R_VS if name in mounts):
-            R_LS = Rotation.from_quat(mounts[name])
+            R_start = self.turn(name)
+            R_LS = R_start * Rotation.from_quat(mounts[name])
             turn = Rotation.from_rotvec([0.0, 0.0, compute_heading_offset(filtered.R_VS_start[name], R_LS)])
-            quat_WL[name] = (turn * filtered.R_VS[name][samples] * R_LS.inv()).as_quat()
+            quat_WL[name] = (turn * filtered.R_VS[name][samples] * R_LS.inv() * R_start).as_quat()
         return quat_WL
 
     def observe(self, rate_hz: float = SAMPLE_RATE_HZ) -> tuple[Observations, np.ndarray]:
@@ -125,15 +176,22 @@ class CalibrationProblem:
         """
         recording, filtered, protocol = self.recording, self.filtered, self.protocol
         stride = max(1, round(recording.rate_hz / rate_hz))
-        needed = {sensor_of(segment, filtered.R_VS) for segment in protocol.segments}
-        fixed = sum(closure.kind == "fixed_point" for closure in protocol.closures)
-        layout = Layout(tuple(name for name in CHAIN if name in needed), fixed, protocol.distances)
+        start, sensors = self.start_pose, self.sensors
+        layout = Layout(
+            tuple(self.model.lengths),
+            sensors,
+            find_hinges(self.model, start, sensors),
+            find_twists(self.model, start, sensors),
+            sum(closure.kind == "fixed_point" for closure in protocol.closures),
+            sum(closure.kind == "plane" for closure in protocol.closures),
+            protocol.distances,
+        )
         losses = find_losses(recording, filtered.start, layout.sensors)
         # Only the linear start can estimate a heading step of any size.
-        separate = [] if is_linear(protocol.conditions) else [loss for loss in losses if loss.free]
+        separate = [] if is_linear(self.conditions) else [loss for loss in losses if loss.free]
         parts = []
         gaps = {name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None}
-        for condition in protocol.conditions:
+        for condition, constraint in zip(protocol.conditions, self.conditions, strict=True):
             spans = [recording.span(interval) for interval in recording.phase(condition.phase)]
             # Intervals may overlap: each sample counts once.
             phase = np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride]
@@ -148,7 +206,7 @@ class CalibrationProblem:
                 raise BadPhase(
                     f"{recording.where()}: phases.{condition.phase} holds {len(parts[-1])} samples at "
                     f"{SAMPLE_RATE_HZ:g} Hz; at least {MIN_SAMPLES} are needed"
-                    + (", better a minute" if isinstance(condition, Closure) else ", better five seconds")
+                    + (", better a minute" if isinstance(constraint, Loop) else ", better five seconds")
                     + (
                         f"; lost in the others: {', '.join(f'sensors.{n}' for n in dict.fromkeys(lost))}"
                         if lost
@@ -164,7 +222,7 @@ class CalibrationProblem:
         ]
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         data = np.vstack([*turns, beyond, recording.time[samples] - filtered.start[1]])
-        return Observations(layout, data, protocol.conditions, condition_index, step_std), samples
+        return Observations(layout, data, self.conditions, condition_index, step_std), samples
 
     def check_start_pose(self) -> None:
         """Raises `BadPhase` where lost samples keep the motion from showing a mount that is not known."""
@@ -172,4 +230,4 @@ class CalibrationProblem:
         sensors = observations.layout.sensors
         unknown = [name for name in sensors if self.mount(name) is None]
         losses = find_losses(self.recording, self.filtered.start, sensors)
-        check_start_pose(self.recording, losses, samples, unknown, MIN_SAMPLES)
+        check_start_pose(self.recording, losses, samples, unknown, self.model.table.reference, MIN_SAMPLES)

@@ -1,10 +1,12 @@
 """Protocols as data: what a person does in which phase, and the conditions that hold for the body meanwhile.
 
-A ``calibration/<name>.toml`` lists steps for the person and conditions for the solver. There are three kinds:
+A ``calibration/<name>.toml`` lists steps for the person and conditions for the solver. Points, segments and lengths are
+those of the body's table (`wepose_pin.model.BodyTable`). There are three kinds of conditions:
 
-- ``[[closure]]``: two points of the body coincide (``kind = "coincide"``) or keep a distance (``"distance"``), or one
-  stays at an unknown point of W (``"fixed_point"``). All of them show lengths and headings by motion.
-- ``[[pose]]``: segments point in given directions of the torso; `std_deg` is how well a person does that.
+- ``[[closure]]``: two points coincide (``kind = "coincide"``) or keep a distance (``"distance"``), one stays at a point
+  of W (``"fixed_point"``), unknown or stated by ``at``, or points move on a level plane of unknown height (``"plane"``).
+  All of them show lengths and headings by motion.
+- ``[[pose]]``: segments point in given directions of the body's first segment; `std_deg` is how well a person does that.
 - ``[[axis]]``: a segment turns forwards about its own y, as the torso in a bow.
 
 The residual of a pose does not show how exactly it was taken, so its weight is stated; that of a closure is measured.
@@ -22,16 +24,15 @@ from ..alignment import PALM_SLIP_STD
 from ..assets import asset
 from ..documents import is_number, read_toml
 from ..errors import BadOption, one_of
-from ..model import load_table
-from .chain import CHAIN, LENGTHS, default_reaches
+from ..model import BodyTable
 
 PROTOCOLS = ("clasp", "clasp_measured", "handle", "poses", "touch_left", "touch_right")
-KINDS = {"coincide": 2, "distance": 2, "fixed_point": 1}  # how many points each takes
+KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3)}  # how many points each takes
 
 
 @dataclass(frozen=True)
 class Closure:
-    """Points that stay together, at a distance, or on a point of W.
+    """Points that stay together, at a distance, on a point of W, or on a level plane.
 
     Parameters
     ----------
@@ -41,6 +42,8 @@ class Closure:
     slip : [m] one standard deviation, each axis, of what holds only nearly; sets the weights' shape, not their size
     distance : its name, as in ``--measured handle=0.4``; empty for other kinds
     metres, metres_std : the distance where the user gives none, and one standard deviation [m]
+    at, at_std : (3,) [m] the fixed point in W and its standard deviation, where it is known
+    in_front_of : segment behind which a person does not bring the points; empty: they may be anywhere
     """
 
     phase: str
@@ -50,22 +53,24 @@ class Closure:
     distance: str = ""
     metres: float = 0.0
     metres_std: float = 0.003
+    at: tuple[float, float, float] | None = None
+    at_std: float = 0.005
+    in_front_of: str = ""
 
     @property
     def rows(self) -> int:
         """How many residuals a sample has."""
-        return 1 if self.kind == "distance" else 3
+        return {"distance": 1, "plane": len(self.points)}.get(self.kind, 3)
 
 
 @dataclass(frozen=True)
 class Direction:
-    """A segment's −z points along `direction` (3,) of the torso, to within `std` [rad] about each axis."""
+    """A segment's long axis points along `direction` (3,) of the body's first segment, to within `std` [rad]."""
 
     phase: str
     segment: str
     direction: tuple[float, float, float]
     std: float
-    rows: int = 3
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,6 @@ class Axis:
     phase: str
     segment: str
     std: float
-    rows: int = 1
 
 
 Condition = Closure | Direction | Axis
@@ -102,7 +106,7 @@ class Protocol:
     steps : for the person
     conditions : for the solver
     min_measured : how many lengths of the chain the user must measure
-    measured_example : the length that fixes the scale best, as ``name=metres``
+    measured_example : the length that fixes the scale best, as ``name=metres``; empty: any
     """
 
     name: str
@@ -111,7 +115,7 @@ class Protocol:
     steps: tuple[Step, ...]
     conditions: tuple[Condition, ...]
     min_measured: int = 0
-    measured_example: str = "shoulder_width=0.385"
+    measured_example: str = ""
 
     @property
     def closures(self) -> tuple[Closure, ...]:
@@ -122,28 +126,19 @@ class Protocol:
         """Names of distances outside the body that the user can measure."""
         return tuple(dict.fromkeys(c.distance for c in self.closures if c.distance))
 
-    @property
-    def chain(self) -> tuple[str, ...]:
-        """Lengths in some closure."""
-        parts = [abs(c) for closure in self.closures for c in coefficients(closure).values()]
-        return tuple(np.array(LENGTHS)[np.sum(parts, axis=(0, 1)) > 0.0].tolist()) if parts else ()
-
-    @property
-    def segments(self) -> frozenset[str]:
-        """Segments whose orientation some condition uses, hands included."""
-        used = {segment for closure in self.closures for segment in coefficients(closure)}
-        used |= {c.segment for c in self.conditions if isinstance(c, Direction | Axis)}
-        return frozenset(used | ({"torso"} if any(isinstance(c, Direction) for c in self.conditions) else set()))
-
-
-def coefficients(closure: Closure) -> dict[str, np.ndarray]:
-    """Segment → (3, 8), by which the lengths make its part of the closed chain, in its own frame."""
-    reaches = default_reaches()
-    parts = dict(reaches[closure.points[0]])
-    for other in closure.points[1:]:
-        for segment, part in reaches[other].items():
-            parts[segment] = parts.get(segment, 0.0) - part
-    return {segment: part for segment, part in parts.items() if np.any(part)}
+    def check_body(self, table: BodyTable) -> None:
+        """Raise `BadOption` where the body lacks a point or a segment of the protocol."""
+        where = f"protocol '{self.name}': "
+        for closure in self.closures:
+            for point in closure.points:
+                if point not in table.points:
+                    raise BadOption(f"{where}'{point}' is no point of {table.name}; {one_of(table.points, point)}")
+        named = [c.segment for c in self.conditions if not isinstance(c, Closure)]
+        named += [closure.in_front_of for closure in self.closures if closure.in_front_of]
+        table.check_segments((*named, *self.needs), where, BadOption)
+        measured = self.measured_example.partition("=")[0]
+        if measured and measured not in (*table.lengths, *self.distances):
+            raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
 
 
 def load_protocol(name: str | Path) -> Protocol:
@@ -181,7 +176,6 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
         if not isinstance(directions, dict):
             raise BadOption(f"{place}: directions = {directions!r}; of each segment x, y, z, as in directions.torso")
         for segment, value in directions.items():
-            _among(segment, CHAIN, f"{place}: directions")
             numbers = isinstance(value, list) and len(value) == 3 and all(is_number(v, 1e6) for v in value)
             length = float(np.linalg.norm(value)) if numbers else 0.0
             if not length > 1e-6:
@@ -190,39 +184,37 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
             conditions.append(Direction(str(_get(entry, "phase", place)), segment, (x, y, z), std))
     for i, entry in enumerate(table.get("axis", [])):
         place = f"{path}: axis {i + 1}"
-        segment = _among(_get(entry, "segment", place), CHAIN, place)
+        segment = str(_get(entry, "segment", place))
         std = np.deg2rad(_number(entry, "std_deg", place, 0.1, 45.0))
         conditions.append(Axis(str(_get(entry, "phase", place)), segment, std))
     if not conditions:
         raise BadOption(f"{path}: no [[closure]], [[pose]] or [[axis]]; a protocol needs one at least")
-    needs = tuple(
-        _among(segment, load_table().segments, f"{path}: needs") for segment in _list(table, "needs", str(path))
-    )
+    needs = tuple(str(segment) for segment in _list({"needs": [], **table}, "needs", str(path)))
     steps = []
     for i, entry in enumerate(table.get("step", [])):
         place = f"{path}: step {i + 1}"
         seconds = _number(entry, "seconds", place, 0.0, 3600.0)
         steps.append(Step(str(_get(entry, "phase", place)), seconds, str(_get(entry, "do", place))))
     name = str(table.get("name", path.stem))
-    measured_example = str(table.get("measured_example", Protocol.measured_example))
-    _among(measured_example.partition("=")[0], LENGTHS, f"{path}: measured_example")
+    measured_example = str(table.get("measured_example", ""))
     title = str(table.get("title", name))
-    min_measured = round(_number({"min_measured": 0, **table}, "min_measured", str(path), 0, len(LENGTHS)))
-    protocol = Protocol(name, title, needs, tuple(steps), tuple(conditions), min_measured, measured_example)
-    # A hand may go without a sensor, rigid with its forearm.
-    used = {segment if segment in needs else segment.replace("hand", "forearm") for segment in protocol.segments}
-    if not used <= set(needs):
-        lacking = ", ".join(sorted(used - set(needs)))
-        raise BadOption(f"{path}: needs = {list(needs)} lacks {lacking}, whose orientation a condition uses")
-    return protocol
+    min_measured = round(_number({"min_measured": 0, **table}, "min_measured", str(path), 0, 20))
+    return Protocol(name, title, needs, tuple(steps), tuple(conditions), min_measured, measured_example)
 
 
 def _closure(entry: dict[str, Any], place: str) -> Closure:
     kind = _among(_get(entry, "kind", place), KINDS, f"{place}: kind")
-    points = tuple(_among(point, default_reaches(), f"{place}: points") for point in _list(entry, "points", place))
-    if len(points) != KINDS[kind]:
-        raise BadOption(f"{place}: points = {list(points)}; kind '{kind}' takes {KINDS[kind]}")
-    more: dict[str, Any] = {}
+    points = tuple(str(point) for point in _list(entry, "points", place))
+    if len(points) not in KINDS[kind] or len(set(points)) < len(points):
+        counts = " or ".join(map(str, KINDS[kind]))
+        raise BadOption(f"{place}: points = {list(points)}; kind '{kind}' takes {counts} different ones")
+    more: dict[str, Any] = {"in_front_of": str(entry.get("in_front_of", ""))}
+    if kind == "fixed_point" and "at" in entry:
+        at = entry["at"]
+        if not isinstance(at, list) or len(at) != 3 or not all(is_number(v, 100.0) for v in at):
+            raise BadOption(f"{place}: at = {at!r}; three numbers [m] in W are needed")
+        more["at"] = (float(at[0]), float(at[1]), float(at[2]))
+        more["at_std"] = _number({"at_std": Closure.at_std, **entry}, "at_std", place, 1e-5, 1.0)
     if "slip" in entry:
         more["slip"] = _number(entry, "slip", place, 1e-4, 0.1)
     if kind == "distance":
@@ -242,7 +234,7 @@ def _get(table: dict[str, Any], key: str, place: str) -> Any:
 def _list(table: dict[str, Any], key: str, place: str) -> list[Any]:
     value = _get(table, key, place)
     if not isinstance(value, list):
-        raise BadOption(f'{place}: {key} = {value!r}; a list of names is needed, as in {key} = ["left_palm"]')
+        raise BadOption(f'{place}: {key} = {value!r}; a list of names is needed, as in {key} = ["name"]')
     return value
 
 

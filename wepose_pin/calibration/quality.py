@@ -16,8 +16,9 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
-from .anatomy import E_Z, SIDES
-from .chain import LENGTHS
+from ..errors import BadSession
+from ..model.table import ROOT
+from .conditions import find_parts, group_lengths
 from .observability import MOST_OPEN, find_intervals, format_longest
 from .result import Calibration
 from .weights import CONTRADICTED, MIN_CONTACT
@@ -61,7 +62,7 @@ DOUBT = Limits(1.0, 1.0)  # of anatomy, see `anatomy`
 ENOUGH = {
     "motion-elevation-small": np.deg2rad(40.0),
     "motion-sideways-small": np.deg2rad(35.0),
-    "motion-elbow-small": np.deg2rad(40.0),
+    "motion-bend-small": np.deg2rad(40.0),
     "motion-lean-small": np.deg2rad(8.0),
     "motion-twist-small": np.deg2rad(12.0),
 }
@@ -103,13 +104,13 @@ class Range(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How far the body moved while the chain was closed; keys are sides."""
+    """How far the body moved while the chain was closed; keys are limbs, by side or by their last point."""
 
-    elevation: dict[str, Range]  # of the upper arm in the torso, 0 hanging, 90 level
-    sideways: dict[str, Range]  # azimuth of the hand from its shoulder in the torso, positive left
-    elbow: dict[str, Range]  # flexion, 0 straight
-    lean: float  # [deg] of the torso's axis from its mean, 98th percentile
-    twist: Range | None  # heading of the torso
+    elevation: dict[str, Range]  # of the limb's first segment in the one above, 0 hanging, 90 level
+    sideways: dict[str, Range]  # azimuth of the limb's end from its beginning in the segment above, positive left
+    bend: dict[str, Range]  # flexion of its hinge, 0 straight
+    lean: float  # [deg] of the first segment's axis from its mean, 98th percentile
+    twist: Range | None  # heading of the first segment
 
 
 class InformationDirection(NamedTuple):
@@ -209,43 +210,55 @@ def _check_sensors(calibration: Calibration) -> list[Check]:
 def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
     """Checks of the standard deviations."""
     subject, closure = calibration.subject, calibration.closure
-    names = [name for name in LENGTHS if name != "trunk"]
+    table, model = calibration.model.table, calibration.model
+    # Lengths that begin at the root cancel in a closed chain, and are one with a point of W that is not known.
+    names = [name for name, length in table.lengths.items() if not any(ROOT in part.start for part in length.stretches)]
     lengths = np.array([subject.lengths[name] for name in names])
     covariance = subject.lengths_covariance(names)
     # Errors of the scale change all lengths together; they have their own check.
-    common = 1.0 / float(lengths @ np.linalg.solve(covariance, lengths))
-    shape = covariance - common * np.outer(lengths, lengths)
+    shape = covariance
+    if len(names) > 1:
+        common = 1.0 / float(lengths @ np.linalg.solve(covariance, lengths))
+        shape = covariance - common * np.outer(lengths, lengths)
 
-    def std(*parts: str) -> float:
+    def std(parts: tuple[str, ...]) -> float:
         take = np.array([float(name in parts) for name in names])
         return float(np.sqrt(max(take @ shape @ take, 0.0)))
 
-    sides = [side for side in SIDES if f"{side}_upper_arm" in calibration.quat_WL]
     checks = []
-    if closure:  # without a closure lengths are the prior's
-        upper_arms = {s: std(f"{s}_upper_arm") for s in sides}
-        forearms = {s: std(f"{s}_forearm", f"{s}_hand") for s in sides}
-        if sides:
-            side = max(sides, key=lambda s: upper_arms[s])
-            uncertain = Diagnostic("upper-arm-length-uncertain", INFO, f"{side}_upper_arm", upper_arms[side])
-            cause = _find_cause(calibration, motion, ("sideways", "elevation", "elbow"), [side])
-            checks.append(_check(uncertain, LENGTH, cause))
-            side = max(sides, key=lambda s: forearms[s])
-            uncertain = Diagnostic("forearm-length-uncertain", INFO, f"{side}_forearm", forearms[side])
-            cause = _find_cause(calibration, motion, ("sideways", "elbow", "elevation"), [side])
-            checks.append(_check(uncertain, LENGTH, cause))
-        uncertain = Diagnostic(
-            "shoulder-width-uncertain", INFO, "shoulder_width", std("shoulder_width"), facts={"variant": closure}
+    groups = group_lengths(calibration.conditions, model.lengths)
+    groups = {sensor: tuple(name for name in group if name in names) for sensor, group in groups.items()}
+    for sensor, group in sorted(groups.items(), key=lambda item: table.segments[item[0]].spine):
+        other = table.counterpart(sensor)
+        if not group or (other in groups and std(groups[other]) > std(group)):
+            continue
+        if other in groups and std(groups[other]) == std(group) and table.side(sensor) == "right":
+            continue
+        facts: dict[str, float | str] = {"variant": closure}
+        uncertain = Diagnostic("length-uncertain", INFO, " + ".join(group), std(group), facts=facts)
+        spine, first = table.segments[sensor].spine, _starts_limb(calibration, sensor)
+        causes = (
+            ("sideways", "elevation")
+            if spine
+            else ("sideways", "elevation", "bend")
+            if first
+            else ("sideways", "bend", "elevation")
         )
-        one_arm = closure == "fixed_point"
-        cause = None if one_arm else _find_cause(calibration, motion, ("sideways", "elevation"), sides)
+        cause = (
+            None if spine and closure == "fixed_point" else _find_cause(calibration, motion, causes, table.side(sensor))
+        )
         checks.append(_check(uncertain, LENGTH, cause))
     for segment in (s for s in subject.mounts if f"mounts.{s}.z" in subject.order):
-        torso = segment == "torso"
-        causes = ("lean", "twist", "sideways") if torso else ("sideways", "elevation", "elbow")
-        own = [s for s in SIDES if segment.startswith(s)]
-        cause = _find_cause(calibration, motion, causes, own or sides)
-        limits = TORSO_HEADING if torso else HAND_HEADING if segment.endswith("hand") else ARM_HEADING
+        reference = segment == table.reference
+        causes = ("lean", "twist", "sideways") if reference else ("sideways", "elevation", "bend")
+        cause = _find_cause(calibration, motion, causes, table.side(segment))
+        limits = (
+            TORSO_HEADING
+            if reference
+            else HAND_HEADING
+            if table.segments[segment].rigid_without_sensor
+            else ARM_HEADING
+        )
         if len(calibration.hinge_rms) < 2:
             limits = LONE_HEADING
         uncertain = Diagnostic(
@@ -257,7 +270,7 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
         )
         checks.append(_check(uncertain, limits, cause))
     prior = calibration.prior
-    facts: dict[str, float | str] = {"measured": calibration.measured_example}
+    facts = {"measured": calibration.measured_example}
     if calibration.scale_lengths:
         scale = Diagnostic("scale-uncertain", INFO, value=calibration.scale_std, facts=facts)
     else:
@@ -266,20 +279,24 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
     return [*checks, _check(scale, SCALE)]
 
 
-def _find_cause(
-    calibration: Calibration, motion: Motion, causes: tuple[str, ...], sides: list[str]
-) -> Diagnostic | None:
+def _starts_limb(calibration: Calibration, segment: str) -> bool:
+    """Whether a segment is the first of a limb."""
+    above = calibration.model.parents[segment]
+    return above is None or calibration.model.table.segments[above].spine
+
+
+def _find_cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...], side: str) -> Diagnostic | None:
     """The cause of an uncertainty: the smallest of the motions that it needs, or too short a motion."""
     if not calibration.closure:
         return None
 
     def size(values: Mapping[str, Range]) -> float:
-        return min((values[side].size for side in sides if side in values), default=np.nan)
+        return min((value.size for limb, value in values.items() if not side or limb == side), default=np.nan)
 
     sizes = {
         "elevation": size(motion.elevation),
         "sideways": size(motion.sideways),
-        "elbow": size(motion.elbow),
+        "bend": size(motion.bend),
         "lean": motion.lean,
         "twist": motion.twist.size if motion.twist else np.nan,
     }
@@ -319,7 +336,10 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
     if any(length.deviation > MEASURED.passes for length in calibration.measured_lengths.values()):
         return checks  # all lengths have followed a wrong measured one
     prior, subject = calibration.prior, calibration.subject
-    z = {n: abs(subject.lengths[n] - prior.lengths[n]) / prior.std(n) for n in LENGTHS if n not in calibration.measured}
+    names = [name for name in calibration.model.lengths if name not in calibration.measured]
+    z = {name: abs(subject.lengths[name] - prior.lengths[name]) / prior.std(name) for name in names}
+    if not z:
+        return checks
     name = max(z, key=lambda n: z[n])
     metres = {"metres": float(subject.lengths[name])}
     return [*checks, _check(Diagnostic("length-unusual", INFO, name, z[name], facts=metres), UNUSUAL)]
@@ -329,22 +349,35 @@ def _measure_motion(calibration: Calibration) -> Motion:
     closed = np.isfinite(calibration.gap) & (calibration.contact > MIN_CONTACT)
     rows = closed if closed.any() else np.ones(len(calibration.time), dtype=bool)
     R = {name: Rotation.from_quat(quat[rows]) for name, quat in calibration.quat_WL.items()}
-    length = calibration.subject.lengths
-    elevation, sideways, lean, twist = {}, {}, float("nan"), None
-    torso = R.get("torso", Rotation.identity(int(rows.sum())))
-    for side in SIDES:
-        if {f"{side}_upper_arm", f"{side}_forearm"} <= R.keys():
-            upper = (torso.inv() * R[f"{side}_upper_arm"]).apply(-E_Z)
-            fore = (torso.inv() * R[f"{side}_forearm"]).apply(-E_Z)
-            elevation[side] = _range(np.degrees(np.arccos(np.clip(-upper[:, 2], -1.0, 1.0))))
-            reach = length[f"{side}_upper_arm"] * upper + (length[f"{side}_forearm"] + length[f"{side}_hand"]) * fore
-            sideways[side] = _range(_azimuth(reach))
-    if "torso" in R:
-        up = torso.apply(E_Z)
+    model, table, start = calibration.model, calibration.model.table, calibration.start_pose
+    lengths = np.array([calibration.subject.lengths[name] for name in model.lengths])
+    turned = {name: rotation * Rotation.from_matrix(start.R_WK[name]).inv() for name, rotation in R.items()}
+    hinges = {hinge.on: joint for joint, hinge in table.hinges.items()}
+    elevation, sideways, bend = {}, {}, {}
+    flexion = calibration.limbs().flexion
+    for limb in table.limbs:
+        key, first = table.side(limb[0]) or limb[-1], table.points[limb[0]].link
+        above = model.parents.get(first)
+        joint = hinges.get(first, "")
+        if above not in R or first not in R or (joint and joint not in flexion):
+            continue
+        try:
+            parts = find_parts(model, start, R, [(limb[-1], 1.0), (limb[0], -1.0)])
+        except BadSession:  # the limb's end is not known
+            continue
+        base = R[above].inv()
+        along = (base * R[first]).apply(table.segments[first].along)
+        elevation[key] = _range(np.degrees(np.arccos(np.clip(-along[:, 2], -1.0, 1.0))))
+        sideways[key] = _range(_azimuth(base.apply(sum(turned[p.sensor].apply(p.vector(lengths)) for p in parts))))
+        if joint:
+            bend[key] = _range(flexion[joint])
+    lean, twist = float("nan"), None
+    if table.reference in R and not table.is_mechanism:
+        up = R[table.reference].apply([0.0, 0.0, 1.0])
         mean = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
         lean = float(np.degrees(np.percentile(np.arccos(np.clip(up @ mean, -1.0, 1.0)), 98)))
-        twist = _range(_azimuth(torso.apply([1.0, 0.0, 0.0])))
-    return Motion(elevation, sideways, {s: _range(f) for s, f in calibration.arms().flexion.items()}, lean, twist)
+        twist = _range(_azimuth(R[table.reference].apply([1.0, 0.0, 0.0])))
+    return Motion(elevation, sideways, bend, lean, twist)
 
 
 def _azimuth(v: np.ndarray) -> np.ndarray:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..diagnostics import Diagnostic
+from ..model import BodyModel
 from ..subject import Subject
-from .anatomy import ArmMotion, LabelCheck, measure_arms
-from .protocols import Protocol
+from .anatomy import LabelCheck, LimbMotion, measure_limbs
+from .conditions import Constraint, StartPose
 from .weights import MIN_CONTACT, MeasuredLength
 
 
@@ -32,8 +33,8 @@ class Calibration:
     contact : (n,) the weight of each sample's gap, near 0 where the palms are apart
     start_pose_offset : segment → (2,) [rad] about x and y of W, how far it was off the start pose
     heading_drift : segment → [rad/s] of its sensor's heading
-    hinge_axes : joint of `HINGES` → (3,) its axis in the upper arm's frame, unit length, y towards the left
-    hinge_rms : joint → [rad] of the forearm against the plane of that hinge
+    hinge_axes : joint → (3,) its axis in the frame of the segment above, unit length
+    hinge_rms : joint → [rad] of the segment below against the plane of that hinge
     information_shares : name as in the subject's covariance, or ``left_forearm + left_hand`` → (n,) share of the
         information on it that each sample brings; their sum and the prior's share make 1
     prior_covariance : (k, k) before the motion, in the order of the subject's
@@ -45,11 +46,15 @@ class Calibration:
     labels : whether the sensors sit where the session says
     unused_mounts : stated mounts that gravity or the motion contradicts
     scale_lengths : measured lengths that fix the scale; empty: the prior does
+    model, start_pose, conditions : the body, its links in the start pose, and the protocol's conditions on it
     formulation : "full" or "paper"
     """
 
     subject: Subject
     prior: Subject
+    model: BodyModel
+    start_pose: StartPose
+    conditions: tuple[Constraint, ...]
     rms_gap: float
     prior_rms_gap: float
     effective_sample_size: float
@@ -69,17 +74,22 @@ class Calibration:
     quat_WL: Mapping[str, np.ndarray] = field(default_factory=dict)
     protocol: str = "clasp"
     closure: str = "coincide"
-    measured_example: str = Protocol.measured_example
+    measured_example: str = ""
     measured_lengths: Mapping[str, MeasuredLength] = field(default_factory=dict)
     labels: LabelCheck = field(default_factory=LabelCheck)
     unused_mounts: tuple[Diagnostic, ...] = ()
     scale_lengths: tuple[str, ...] = ()
     formulation: str = "full"
 
-    def arms(self) -> ArmMotion:
-        """How the arms moved while the chain was closed."""
+    @property
+    def body(self) -> BodyModel:
+        """The body with the estimated lengths."""
+        return self.model.with_lengths({name: self.subject.lengths[name] for name in self.model.lengths})
+
+    def limbs(self) -> LimbMotion:
+        """How the limbs moved while the chain was closed."""
         closed = np.isfinite(self.gap)
         rows = closed & (self.contact > MIN_CONTACT) if closed.any() else np.ones(len(self.gap), dtype=bool)
         gap = np.sqrt(np.average(self.gap[closed] ** 2, weights=self.contact[closed])) if closed.any() else 0.0
         quat_WL = {name: quat[rows] for name, quat in self.quat_WL.items()}
-        return measure_arms(quat_WL, self.subject.lengths, float(gap))
+        return measure_limbs(self, quat_WL, float(gap))

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from ..errors import NoSolution
-from .least_squares import Gaussian, K, Observations, residuals
+from .least_squares import GAP_ROWS, Gaussian, Observations, residuals
 
 MIN_LENGTH = 0.01  # [m] below which a length has not converged
 TOLERANCE = 1e-4  # standard deviations of the result that may be left to go
@@ -35,9 +35,9 @@ class Fit(NamedTuple):
 
     x: np.ndarray
     closure: np.ndarray  # (n, 3) whitened residuals of the gap
-    hinge: np.ndarray  # (n, 2) of the elbows, in units of `HINGE_STD`
+    hinge: np.ndarray  # (n, k − 3) of the hinges, in units of `HINGE_STD`
     gaps: np.ndarray  # (n, 3) [m]
-    jacobian: np.ndarray  # (n, 5, m) of gap and hinge
+    jacobian: np.ndarray  # (n, k, m) of gap and hinges
     information: np.ndarray  # of x, prior included
     cost: float
 
@@ -50,7 +50,7 @@ class LeastSquares:
     ----------
     observations : the samples, whose residuals are r
     prior : c and Λ
-    weights : w (n, 5)
+    weights : w (n, k)
     """
 
     observations: Observations
@@ -61,7 +61,7 @@ class LeastSquares:
     def lower_bounds(self) -> np.ndarray:
         """(m,) of x: no length is below `MIN_LENGTH`, all else is free."""
         bounds = np.full(self.observations.layout.size, -np.inf)
-        bounds[:K] = MIN_LENGTH
+        bounds[self.observations.layout.length] = MIN_LENGTH
         return bounds
 
     def evaluate(self, x: np.ndarray) -> Evaluation:
@@ -69,7 +69,7 @@ class LeastSquares:
         return self.weigh(x, *residuals(x, self.observations))
 
     def weigh(self, x: np.ndarray, r: np.ndarray, J: np.ndarray, gaps: np.ndarray) -> Evaluation:
-        """The cost with residuals (n, 5), Jacobian (n, 5, m) and gaps (n, 3) that are known at x."""
+        """The cost with residuals (n, k), Jacobian (n, k, m) and gaps (n, 3) that are known at x."""
         off = x - self.prior.mean
         return Evaluation(self, x, r, J, gaps, float(np.sum(self.weights * r**2) + off @ self.prior.information @ off))
 
@@ -86,8 +86,8 @@ class Evaluation:
 
     problem: LeastSquares
     x: np.ndarray  # (m,)
-    r: np.ndarray  # (n, 5)
-    J: np.ndarray  # (n, 5, m)
+    r: np.ndarray  # (n, k)
+    J: np.ndarray  # (n, k, m)
     gaps: np.ndarray  # (n, 3) [m]
     cost: float
 
@@ -112,7 +112,7 @@ class Evaluation:
 
     def fit(self) -> Fit:
         """The solution, where this is one."""
-        return Fit(self.x, self.r[:, :3], self.r[:, 3:], self.gaps, self.J, self.information, self.cost)
+        return Fit(self.x, self.r[:, :GAP_ROWS], self.r[:, GAP_ROWS:], self.gaps, self.J, self.information, self.cost)
 
 
 def solve(
@@ -142,10 +142,11 @@ def solve(
     now = problem.evaluate_start(start)
     if np.any(now.x < problem.lower_bounds):
         now = problem.evaluate(np.maximum(now.x, problem.lower_bounds))
-    multipliers, damping, left = np.zeros(K), DAMPING, steps
+    bounded = problem.observations.layout.length
+    multipliers, damping, left = np.zeros(bounded.stop), DAMPING, steps
     while True:
         gradient = now.gradient.copy()
-        gradient[:K] += multipliers
+        gradient[bounded] += multipliers
         remaining = now.remaining(gradient)
         if not remaining >= tolerance or left <= 0:  # NaN is no way to go either
             break
@@ -158,8 +159,8 @@ def solve(
 
 
 def _minimise(oracle: _Oracle, steps: int, tolerance: float) -> tuple[Evaluation, np.ndarray]:
-    """The evaluation at the end, and the multipliers (8,) of the lengths' bounds there."""
-    m = len(oracle.start.x)
+    """The evaluation at the end, and the multipliers (k,) of the lengths' bounds there."""
+    m, K = len(oracle.start.x), oracle.bounded.stop
     unknowns, multipliers = {"x": (m, 1), "p": (0, 1)}, {"lam:f": (1, 1), "lam:g": (K, 1)}
     values, slopes = {"f": (1, 1), "g": (K, 1)}, {"f": (1, 1), "grad:f:x": (m, 1), "g": (K, 1), "jac:g:x": (K, m)}
     functions = (
@@ -206,12 +207,14 @@ class _Oracle:
 
     Attributes
     ----------
+    bounded : the lengths among the unknowns, which have bounds
     accepted, steps : the evaluation where the last step began, and how many steps there were with it
     error : raised by an evaluation
     """
 
     def __init__(self, start: Evaluation, damping: float) -> None:
         self.start = self._now = self.accepted = start
+        self.bounded = start.problem.observations.layout.length
         self._z = np.zeros(len(start.x))
         self._x_by_z = np.linalg.inv(np.linalg.cholesky(start.information)).T
         self.damping, self.steps, self._tries = damping, 0, 0
@@ -225,14 +228,14 @@ class _Oracle:
         return self._now
 
     def values(self, z: np.ndarray) -> tuple[Any, ...]:
-        """Half the cost, and the lengths (8,) [m]."""
+        """Half the cost, and the lengths (k,) [m]."""
         now = self.evaluate(z)
-        return 0.5 * now.cost, now.x[:K]
+        return 0.5 * now.cost, now.x[self.bounded]
 
     def slopes(self, z: np.ndarray) -> tuple[Any, ...]:
-        """Half the cost with its gradient (m,), and the lengths (8,) [m] with their Jacobian (8, m)."""
+        """Half the cost with its gradient (m,), and the lengths (k,) [m] with their Jacobian (k, m)."""
         cost, lengths = self.values(z)
-        return cost, self._x_by_z.T @ self._now.gradient, lengths, self._x_by_z[:K]
+        return cost, self._x_by_z.T @ self._now.gradient, lengths, self._x_by_z[self.bounded]
 
     def curvature(self, z: np.ndarray) -> tuple[Any, ...]:
         """The Gauss-Newton Hessian (m, m) of half the cost, damped; that of the lengths is zero.

@@ -7,15 +7,14 @@ lose their weight.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ..subject import mount_rows
-from .chain import LENGTHS, SIDES
-from .least_squares import Gaussian, K, Layout, Observations
-from .protocols import Closure
+from .conditions import Loop, StartPose
+from .least_squares import GAP_ROWS, Gaussian, Layout, Observations
 from .solver import STEPS, Fit, LeastSquares, solve
 
 # Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
@@ -23,7 +22,7 @@ LEAST_VARIANCE = 1e-4
 # Errors of orientations are slow: two samples closer than this [s] are never independent, however white the residual
 # of one phase is. Chosen on simulated people, whose joint errors it brings within the covariance.
 LEAST_CORRELATION_S = 3.0
-THIRD_CHI2 = {1: 0.1485, 3: 1.4237}  # 30 % quantile of chi², by degrees of freedom
+THIRD_CHI2 = {1: 0.1485, 2: 0.7133, 3: 1.4237}  # 30 % quantile of chi², by degrees of freedom
 ROUNDS = 5
 FINAL_STEPS = 300  # of the last solve, which must converge: hands that hardly move take a hundred
 QUICK_ROUNDS, QUICK_STEPS = 1, 15
@@ -52,7 +51,7 @@ class WeightedFit(NamedTuple):
     """A solution with the weights that its own residuals give."""
 
     fit: Fit
-    weights: np.ndarray  # (n, 5) of the residuals
+    weights: np.ndarray  # (n, k) of the residuals
     contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
     effective_sample_size: float  # effective sample size of the gap
 
@@ -75,12 +74,12 @@ def solve_reweighted(
         start, contact, rounds = thinned.fit.x, np.interp(np.arange(n), rows, thinned.contact), rounds[-1:]
     x: np.ndarray | Fit = start
     contact, correlation = contact.copy(), min_correlation(observations)
-    weights = np.full((n, 5), 1.0 / correlation)
+    weights = np.full((n, observations.layout.residuals), 1.0 / correlation)
     weights[:, :3] *= contact[:, None]
     if quick:
-        weights[:, 3:] = 0.0
+        weights[:, GAP_ROWS:] = 0.0
     for condition, span in observations.spans():
-        if not isinstance(condition, Closure):
+        if not isinstance(condition, Loop):
             weights[span] = 1.0 / (span.stop - span.start)  # the error of a pose is constant: one effective sample
     effective = float(closed.sum())
     if not closed.any():
@@ -92,14 +91,13 @@ def solve_reweighted(
         )  # the last solve is the strict one
         effective = 0.0
         for closure, span in observations.spans():
-            if isinstance(closure, Closure):
+            if isinstance(closure, Loop):
                 r = fit.closure[span, : closure.rows]
                 contact[span] = _estimate_contact(r, MIN_LATE_CONTACT if k > 1 else MIN_CONTACT)
                 weights[span, :3] = _weigh(r, contact[span], correlation)
                 effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], correlation)
-        arms = [SIDES.index(side) for side in observations.layout.arms]
-        if arms and not quick:
-            weights[closed, 3:] = _weigh(fit.hinge[closed][:, arms], np.ones(int(closed.sum())), correlation)
+        if observations.layout.hinges and not quick:
+            weights[closed, GAP_ROWS:] = _weigh(fit.hinge[closed], np.ones(int(closed.sum())), correlation)
     fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, not quick)
     return WeightedFit(fit, weights, contact, effective)
 
@@ -150,16 +148,16 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
     C = np.linalg.inv(fit.information)
     J, r, least = fit.jacobian, np.hstack((fit.closure, fit.hinge)), min_correlation(observations)
     weights = np.broadcast_to(result.weights, r.shape)
-    arms = [3 + SIDES.index(side) for side in observations.layout.arms]
+    hinges = list(range(GAP_ROWS, observations.layout.residuals))
     gradient = prior_information.copy()
     for condition, span in observations.spans():
         parts = [(list(range(condition.rows)), contact[span])]
-        if isinstance(condition, Closure):
-            parts += [(arms, np.ones(span.stop - span.start))] if arms else []
+        if isinstance(condition, Loop):
+            parts += [(hinges, np.ones(span.stop - span.start))] if hinges else []
         for rows, share in parts:
             slope, w = J[span][:, rows], weights[span][:, rows]
             pull = w[:, :, None] * slope
-            if not isinstance(condition, Closure):
+            if not isinstance(condition, Loop):
                 gradient += np.einsum("nki,nkj->ij", pull, slope)
                 continue
             if not share.sum() > 0.0:
@@ -181,7 +179,7 @@ def compare_measured(
 ) -> dict[str, MeasuredLength]:
     """Each measured length or distance, name → ([m], its standard deviation [m]), beside the solution without it."""
     C, compared = np.linalg.inv(fit.information), {}
-    rows = dict(zip(LENGTHS, range(K), strict=True)) | dict(
+    rows = dict(zip(layout.lengths, range(layout.size), strict=False)) | dict(
         zip(layout.distance_names, range(layout.size)[layout.distances], strict=True)
     )
     for name, (metres, std) in measured.items():
@@ -192,29 +190,39 @@ def compare_measured(
     return compared
 
 
-def project_to_subject(layout: Layout, covariance: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names and covariance of the lengths and mount errors, from x's covariance: R_LS = exp(−ε) Rz(ψ) R_VS(start)."""
-    rows = [row for name in layout.sensors for row in mount_rows(name)]
+def project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names and covariance of the lengths and mount errors, from x's covariance: R_LS = exp(−ε) Rz(ψ) R_VS(start).
+
+    Errors of mounts are turned from the frames that equal W in the start pose to those of the segments.
+    """
+    K, rows = len(layout.lengths), [row for name in layout.sensors for row in mount_rows(name)]
     T = np.zeros((K + len(rows), layout.size))
     T[:K, :K] = np.eye(K)
-    for i in range(len(layout.sensors)):
-        T[K + 3 * i, layout.tilt.start + 2 * i] = -1.0
-        T[K + 3 * i + 1, layout.tilt.start + 2 * i + 1] = -1.0
-        T[K + 3 * i + 2, layout.heading.start + i] = 1.0
-    return (*LENGTHS, *rows), T @ covariance @ T.T
+    for i, name in enumerate(layout.sensors):
+        own = np.zeros((3, layout.size))
+        own[0, layout.tilt.start + 2 * i] = -1.0
+        own[1, layout.tilt.start + 2 * i + 1] = -1.0
+        own[2, layout.heading.start + i] = 1.0
+        T[K + 3 * i : K + 3 * i + 3] = start.R_WK[name].T @ own
+    return (*layout.lengths, *rows), T @ covariance @ T.T
 
 
 def compute_information_shares(
-    fit: Fit, layout: Layout, weights: np.ndarray, covariance: np.ndarray
+    fit: Fit, layout: Layout, weights: np.ndarray, covariance: np.ndarray, sums: Sequence[tuple[str, ...]]
 ) -> dict[str, np.ndarray]:
-    """Name → share (n,) of the information that each sample brings: C = C (Σ Jᵀ W J + Λ) C, over C, is a sum to 1."""
+    """Name → share (n,) of the information that each sample brings: C = C (Σ Jᵀ W J + Λ) C, over C, is a sum to 1.
+
+    Parameters
+    ----------
+    sums : lengths that the closures show together, which are one direction as well, named with " + "
+    """
     unit = np.eye(layout.size)
-    directions = dict(zip(LENGTHS, unit[:K], strict=True))
-    directions |= {f"{s}_forearm + {s}_hand": directions[f"{s}_forearm"] + directions[f"{s}_hand"] for s in SIDES}
+    directions = dict(zip(layout.lengths, unit, strict=False))
+    directions |= {" + ".join(names): sum(directions[name] for name in names) for names in sums if len(names) > 1}
     for i, name in enumerate(layout.sensors):
         rows = (layout.tilt.start + 2 * i, layout.tilt.start + 2 * i + 1, layout.heading.start + i)
         directions |= dict(zip(mount_rows(name), unit[list(rows)], strict=True))
     T = np.array(list(directions.values()))
-    moved = fit.jacobian @ covariance @ T.T  # (n, 5, k)
+    moved = fit.jacobian @ covariance @ T.T  # (n, residuals, k)
     share = np.einsum("ni,nik->kn", weights, moved**2) / np.einsum("ki,ij,kj->k", T, covariance, T)[:, None]
     return dict(zip(directions, share, strict=True))

@@ -61,7 +61,7 @@ def compute_start_configuration(
 
 
 def orient_links(model: BodyModel, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Link → R_WK (3, 3) in the configuration `q` (nq,): segments and points by their names, others by their joint's."""
+    """Link → R_WK (3, 3) in the configuration `q` (nq,): segments and points by name, others by that of their joint."""
     data = model.pin.createData()
     pin.framesForwardKinematics(model.pin, data, q)
     R_WK = {model.pin.names[joint]: np.array(data.oMi[joint].rotation) for joint in range(model.pin.njoints)}

@@ -1,0 +1,279 @@
+"""A protocol's conditions on a body: the sensors' parts of each closure, in frames that equal W in the start pose.
+
+A point is the sum of the vectors of the links between it and the root (`wepose_pin.model.reaches`). Each link rotates
+with a segment that has a sensor, its own or the one above it with which it is rigid. Here S' is the frame of such a
+segment that equals W in the start pose: of a person in the N-pose the segment's own frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import BadOption, BadSession
+from ..kinematics import find_carrier
+from ..model import BodyModel
+from ..model.reaches import UNIVERSE
+from .protocols import Axis, Closure, Direction, Protocol
+
+Vector = tuple[float, float, float]
+
+
+class Part(NamedTuple):
+    """A sensor's part of the way between points: ``by_length @ lengths + constant`` [m] in S'."""
+
+    sensor: str  # its segment; `UNIVERSE` of what does not move
+    by_length: tuple[Vector | tuple[float, ...], ...]  # (3, k), lengths in the order of the table
+    constant: Vector
+
+    def vector(self, lengths: np.ndarray) -> np.ndarray:
+        """(3,) [m] for lengths (k,) [m]."""
+        return np.array(self.by_length) @ lengths + np.array(self.constant)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A closure on a body.
+
+    Parameters
+    ----------
+    ways : parts from the root to a point, or from one point to another where the closure is between two
+    """
+
+    closure: Closure
+    ways: tuple[tuple[Part, ...], ...]
+
+    @property
+    def kind(self) -> str:
+        return self.closure.kind
+
+    @property
+    def rows(self) -> int:
+        """How many residuals a sample has."""
+        return self.closure.rows
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """Of all ways."""
+        return tuple(part for way in self.ways for part in way)
+
+
+@dataclass(frozen=True)
+class Pointing:
+    """The long axis `along` (3,) of a segment points along `direction` (3,) of another; to within `std` [rad]."""
+
+    segment: str
+    reference: str
+    along: Vector
+    direction: Vector
+    std: float
+    rows: int = 3
+
+
+@dataclass(frozen=True)
+class Level:
+    """The segment turns forwards about `axis` (3,), which stays level to within `std` [rad]."""
+
+    segment: str
+    axis: Vector
+    std: float
+    rows: int = 1
+
+
+Constraint = Loop | Pointing | Level
+
+
+class HingeUnknown(NamedTuple):
+    """A hinge with an axis ``axis + x across + z tilted`` (3,) that is estimated; vectors in S' of `on`.
+
+    Parameters
+    ----------
+    on, moves : sensors
+    along : (3,) the long axis of `moves`, in its S'
+    """
+
+    name: str
+    on: str
+    moves: str
+    axis: Vector
+    across: Vector
+    tilted: Vector
+    along: Vector
+
+
+class Twist(NamedTuple):
+    """Points above which other segments hang, turned about the long axis of a sensor's segment."""
+
+    sensor: str
+    axis: Vector  # (3,) in S'
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """The orientation of the links of a body in the start pose, link → R_WK (3, 3)."""
+
+    R_WK: Mapping[str, np.ndarray]
+
+    def turn(self, link: str, vector: Collection[float]) -> Vector:
+        """A vector (3,) of a link's frame in S'."""
+        R = self.R_WK.get(link)
+        x, y, z = vector if R is None else R @ np.array(vector)
+        return float(x), float(y), float(z)
+
+
+def resolve_conditions(
+    protocol: Protocol, model: BodyModel, start: StartPose, sensors: Collection[str]
+) -> tuple[Constraint, ...]:
+    """The protocol's conditions on this body with these sensors.
+
+    Raises
+    ------
+    BadOption
+        A point or segment that the body does not have.
+    BadSession
+        A closure between points that no sensor determines.
+    """
+    table, constraints = model.table, list[Constraint]()
+    for condition in protocol.conditions:
+        if isinstance(condition, Closure):
+            constraints.append(_resolve_closure(condition, protocol, model, start, sensors))
+        elif isinstance(condition, Direction):
+            table.check_segments((condition.segment,), f"protocol '{protocol.name}': ", BadOption)
+            constraints.append(
+                Pointing(
+                    condition.segment,
+                    table.reference,
+                    start.turn(condition.segment, table.segments[condition.segment].along),
+                    start.turn(table.reference, condition.direction),
+                    condition.std,
+                )
+            )
+        elif isinstance(condition, Axis):
+            table.check_segments((condition.segment,), f"protocol '{protocol.name}': ", BadOption)
+            axis = start.turn(condition.segment, (0.0, 1.0, 0.0))
+            constraints.append(Level(condition.segment, axis, condition.std))
+    return tuple(constraints)
+
+
+def _resolve_closure(
+    closure: Closure, protocol: Protocol, model: BodyModel, start: StartPose, sensors: Collection[str]
+) -> Loop:
+    if closure.kind in ("coincide", "distance"):
+        first, last = closure.points
+        signed = [[(first, 1.0), (last, -1.0)]]
+    else:
+        signed = [[(point, 1.0)] for point in closure.points]
+    ways = tuple(find_parts(model, start, sensors, points) for points in signed)
+    if not any(part.sensor != UNIVERSE for way in ways for part in way):
+        raise BadSession(f"protocol '{protocol.name}': no sensor moves {' and '.join(closure.points)}")
+    return Loop(closure, ways)
+
+
+def find_parts(
+    model: BodyModel, start: StartPose, sensors: Collection[str], points: Collection[tuple[str, float]]
+) -> tuple[Part, ...]:
+    """The parts of a signed sum of points, by sensors in the order of the table.
+
+    Raises
+    ------
+    BadSession
+        A link on the way has no sensor, and is not rigid with one that has.
+    """
+    lengths = len(model.lengths)
+    sums: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    links: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for point, sign in points:
+        for link, (by_length, constant) in model.reaches[point].items():
+            B, c = links.get(link, (np.zeros((3, lengths)), np.zeros(3)))
+            links[link] = B + sign * by_length, c + sign * constant
+    for link, (by_length, constant) in links.items():
+        if not (np.any(np.abs(by_length) > 1e-12) or np.any(np.abs(constant) > 1e-12)):
+            continue
+        carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
+        if carrier is None:
+            names = " and ".join(point for point, _ in points)
+            raise BadSession(f"no sensor on {link}: where {names} is cannot be told without it")
+        R = start.R_WK.get(link, np.eye(3))
+        B, c = sums.get(carrier, (np.zeros((3, lengths)), np.zeros(3)))
+        sums[carrier] = B + R @ by_length, c + R @ constant
+    order = [UNIVERSE, *model.table.segments]
+    parts = []
+    for carrier in sorted(sums, key=order.index):
+        B, c = sums[carrier]
+        if np.any(np.abs(B) > 1e-12) or np.any(np.abs(c) > 1e-12):
+            x, y, z = (float(v) for v in c)
+            parts.append(Part(carrier, tuple(tuple(row) for row in B.tolist()), (x, y, z)))
+    return tuple(parts)
+
+
+def find_hinges(model: BodyModel, start: StartPose, sensors: Collection[str]) -> tuple[HingeUnknown, ...]:
+    """The hinges of the body whose two segments both have sensors."""
+    hinges = []
+    for name, hinge in model.table.hinges.items():
+        if {hinge.on, hinge.moves} <= set(sensors):
+            along_on = np.array(model.table.segments[hinge.on].along)
+            hinges.append(
+                HingeUnknown(
+                    name,
+                    hinge.on,
+                    hinge.moves,
+                    start.turn(hinge.on, hinge.axis),
+                    start.turn(hinge.on, np.cross(along_on, hinge.axis)),
+                    start.turn(hinge.on, -along_on),
+                    start.turn(hinge.moves, model.table.segments[hinge.moves].along),
+                )
+            )
+    return tuple(hinges)
+
+
+def find_twists(model: BodyModel, start: StartPose, sensors: Collection[str]) -> tuple[Twist, ...]:
+    """The segments with sensors whose points turn about their long axis."""
+    segments = model.table.segments
+    return tuple(
+        Twist(name, start.turn(name, segments[name].along)) for name in sensors if segments[name].point_twist_std > 0.0
+    )
+
+
+def find_measured_lengths(protocol: Protocol, model: BodyModel) -> tuple[str, ...]:
+    """The lengths in some closure of a protocol."""
+    names: dict[str, None] = {}
+    for closure in protocol.closures:
+        signs = (1.0, -1.0) if closure.kind in ("coincide", "distance") else (1.0,) * len(closure.points)
+        total: dict[str, np.ndarray] = {}
+        for point, sign in zip(closure.points, signs, strict=True):
+            for link, part in model.reaches.get(point, {}).items():
+                total[link] = total.get(link, 0.0) + sign * part.by_length
+                if closure.kind == "plane":
+                    names |= dict.fromkeys(_moved(model, part.by_length))
+        for by_length in total.values():
+            names |= dict.fromkeys(_moved(model, by_length))
+    return tuple(name for name in model.lengths if name in names)
+
+
+def _moved(model: BodyModel, by_length: np.ndarray) -> list[str]:
+    return [name for name, column in zip(model.lengths, by_length.T, strict=True) if np.abs(column).max() > 1e-12]
+
+
+def find_segments(protocol: Protocol, model: BodyModel) -> frozenset[str]:
+    """The segments whose orientation some condition of a protocol uses where all of them have sensors."""
+    used = {condition.segment for condition in protocol.conditions if not isinstance(condition, Closure)}
+    if any(isinstance(condition, Direction) for condition in protocol.conditions):
+        used.add(model.table.reference)
+    for closure in protocol.closures:
+        for link in {link for point in closure.points for link in model.reaches.get(point, {})}:
+            used |= {link} & set(model.table.segments)
+    return frozenset(used & set(model.table.segments))
+
+
+def group_lengths(constraints: Collection[Constraint], lengths: Collection[str]) -> dict[str, tuple[str, ...]]:
+    """Sensor → the lengths that rotate with it in some closure; a closure shows the sum of those in one direction."""
+    groups: dict[str, dict[str, None]] = {}
+    for loop in constraints:
+        for part in loop.parts if isinstance(loop, Loop) else ():
+            moved = np.abs(np.array(part.by_length)).max(axis=0) > 1e-12
+            names = [name for name, moves in zip(lengths, moved, strict=True) if moves]
+            groups.setdefault(part.sensor, {}).update(dict.fromkeys(names))
+    return {sensor: tuple(names) for sensor, names in groups.items() if names}
