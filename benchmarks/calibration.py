@@ -25,6 +25,7 @@ from wepose_pin.calibration.protocols import load_protocol
 from wepose_pin.calibration.solver import Fit, LeastSquares, solve, solve_without_bounds
 from wepose_pin.calibration.weights import FINAL_STEPS, solve_reweighted
 from wepose_pin.filters.sensors import filter_recording
+from wepose_pin.model import load_model
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import MILD_PRESET, Person, simulate, simulate_person
 
@@ -136,7 +137,7 @@ def pose_cases(seconds: float) -> dict[str, Posed]:
     posed = {}
     for name, (protocol, recording) in recordings.items():
         filtered = filter_recording(recording)
-        problem = CalibrationProblem(recording, filtered, load_protocol(protocol), person.prior, {})
+        problem = CalibrationProblem(recording, filtered, load_protocol(protocol), person.prior, {}, load_model())
         posed[name] = pose(problem, SAMPLE_RATE_HZ)
     return posed
 
@@ -193,7 +194,9 @@ def pose_problems(
 ) -> list[tuple[Posed, Callable[[], Posed]]]:
     """The last problem of a hands-together calibration at each rate of samples, and the calibration without filters."""
     measured = {name: (metres, person.measured_std) for name, metres in person.measured.items()}
-    problem = CalibrationProblem(recording, filter_recording(recording), load_protocol("clasp"), person.prior, measured)
+    problem = CalibrationProblem(
+        recording, filter_recording(recording), load_protocol("clasp"), person.prior, measured, load_model()
+    )
     return [(pose(problem, rate_hz), partial(pose, problem, rate_hz)) for rate_hz in rates_hz]
 
 

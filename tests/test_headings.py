@@ -50,8 +50,8 @@ def test_a_forearm_that_drifts_is_brought_back(made: tuple[Simulation, Subject])
         )
     assert errors[False] < 0.7 * errors[True]
     assert pose.correction is not None
-    assert pose.correction.palm_gap_rms_mm is not None
-    assert pose.correction.palm_gap_rms_mm[1] < 0.6 * pose.correction.palm_gap_rms_mm[0]
+    assert pose.correction.gap_rms_mm is not None
+    assert pose.correction.gap_rms_mm[1] < 0.6 * pose.correction.gap_rms_mm[0]
     assert (
         pose.correction.hinge_residual_rms_deg["right_elbow"][1]
         < pose.correction.hinge_residual_rms_deg["right_elbow"][0]
@@ -92,8 +92,8 @@ def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simula
     assert only.correction is not None
     assert only.correction.max_correction_deg["right_forearm"] > 0.5
     assert longer.correction is not None
-    assert longer.correction.palm_gap_rms_mm is not None
-    assert longer.correction.palm_gap_rms_mm[0] > 300.0
+    assert longer.correction.gap_rms_mm is not None
+    assert longer.correction.gap_rms_mm[0] > 300.0
     for name, quat in only.quat_WL.items():
         np.testing.assert_allclose(longer.quat_WL[name], quat, atol=1e-12)
     assert alone.correction is None
@@ -152,8 +152,8 @@ def test_hands_with_sensors_of_their_own_bend_at_the_wrist(made: tuple[Simulatio
         mounts[f"{side}_hand"] = np.array([0.0, 0.0, 0.0, 1.0])
     pose = track(replace(recording, sensors=sensors), replace(subject, lengths=lengths, mounts=mounts, hinges={}))
     assert pose.correction is not None
-    assert pose.correction.palm_gap_rms_mm is not None
-    assert max(pose.correction.palm_gap_rms_mm) < 2.0
+    assert pose.correction.gap_rms_mm is not None
+    assert max(pose.correction.gap_rms_mm) < 2.0
     assert max(pose.correction.max_correction_deg.values()) < 0.05
     assert set(pose.correction.max_correction_deg) == set(sensors)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bodies import LENGTHS
 from scipy.spatial.transform import Rotation, Slerp
 
 from wepose_pin import rotations
@@ -30,6 +31,12 @@ from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate,
 from wepose_pin.validation.real import RING_SEGMENTS, _register_ring, assume_noise
 
 NAMES = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+PAIRS = [
+    ("torso", "left_upper_arm"),
+    ("left_upper_arm", "left_forearm"),
+    ("torso", "right_upper_arm"),
+    ("right_upper_arm", "right_forearm"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +56,7 @@ def true_turn(simulation: Simulation, found: FilteredRecording, near: str, far: 
 
 def test_exact_motion_gives_the_turn_between_the_worlds(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
     simulation, recording, found = exact
-    couplings = estimate_couplings(recording, found, NAMES, recording.phases["clasp"])
+    couplings = estimate_couplings(recording, found, PAIRS, recording.phases["clasp"])
     assert [(c.near, c.far) for c in couplings] == [
         ("torso", "left_upper_arm"),
         ("left_upper_arm", "left_forearm"),
@@ -66,15 +73,15 @@ def test_exact_motion_gives_the_turn_between_the_worlds(exact: tuple[Simulation,
 def test_too_little_motion_rate_or_time_tells_nothing(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
     _, recording, found = exact
     clasp = recording.phases["clasp"]
-    assert estimate_couplings(recording, found, NAMES, ((clasp[0][0], clasp[0][0] + 10.0),)) == []
-    assert estimate_couplings(replace(recording, rate_hz=10.0), found, NAMES, clasp) == []
-    assert estimate_couplings(recording, found, ("torso", "left_forearm"), clasp) == []
+    assert estimate_couplings(recording, found, PAIRS, ((clasp[0][0], clasp[0][0] + 10.0),)) == []
+    assert estimate_couplings(replace(recording, rate_hz=10.0), found, PAIRS, clasp) == []
+    assert estimate_couplings(recording, found, PAIRS, ()) == []
     still = {
         name: replace(s, gyro_S=0.0 * s.gyro_S, accel_S=s.accel_S[:1] + 0.0 * s.accel_S)
         for name, s in recording.imus.items()
     }
     R_VS = {name: Rotation.concatenate([R[0]] * len(recording)) for name, R in found.R_VS.items()}
-    assert estimate_couplings(replace(recording, sensors=still), found._replace(R_VS=R_VS), NAMES, clasp) == []
+    assert estimate_couplings(replace(recording, sensors=still), found._replace(R_VS=R_VS), PAIRS, clasp) == []
 
 
 @pytest.mark.parametrize(("moving", "trusted"), [(1.0, True), (0.01, False)])
@@ -100,15 +107,15 @@ def test_samples_that_are_missing_are_bridged(exact: tuple[Simulation, Recording
     gyro_S = np.array(sensors["torso"].gyro_S)
     gyro_S[2000:2004] = np.nan
     sensors["torso"] = replace(sensors["torso"], gyro_S=gyro_S)
-    whole = estimate_couplings(recording, found, NAMES, clasp)
+    whole = estimate_couplings(recording, found, PAIRS, clasp)
     for ours, theirs in zip(
-        estimate_couplings(replace(recording, sensors=sensors), found, NAMES, clasp), whole, strict=True
+        estimate_couplings(replace(recording, sensors=sensors), found, PAIRS, clasp), whole, strict=True
     ):
         assert ours.heading == pytest.approx(theirs.heading, abs=np.deg2rad(0.2))
 
 
 def test_a_coupling_keeps_whole_turns_and_shares_with_the_drift() -> None:
-    layout = Layout(("torso", "left_upper_arm"))
+    layout = Layout(LENGTHS, ("torso", "left_upper_arm"))
     center, start = np.zeros(layout.size), np.zeros(layout.size)
     start[layout.heading] = [7.0, 0.3]  # the torso more than a turn on
     information = np.eye(layout.size) * 1e-6

@@ -6,17 +6,27 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate_lengths, load_protocol
-from wepose_pin.calibration.chain import CHAIN
+from wepose_pin.calibration.conditions import (
+    Loop,
+    StartPose,
+    find_hinges,
+    find_measured_lengths,
+    find_segments,
+    find_twists,
+    resolve_conditions,
+)
 from wepose_pin.calibration.least_squares import Layout, Observations, residuals
-from wepose_pin.calibration.protocols import Closure
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, render, render_all
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
+from wepose_pin.model import load_model
+from wepose_pin.model.start_pose import orient_links
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (
@@ -96,19 +106,24 @@ def test_every_protocol_file_is_known_and_says_what_to_do() -> None:
         assert protocol.name == name
         assert protocol.steps[0].phase == "start"
         assert {condition.phase for condition in protocol.conditions} == {s.phase for s in protocol.steps} - {"start"}
-        assert {segment.replace("hand", "forearm") for segment in protocol.segments} == set(protocol.needs)
+        assert {segment.replace("hand", "forearm") for segment in find_segments(protocol, load_model())} == set(
+            protocol.needs
+        )
 
 
 def test_what_is_in_the_chain_follows_from_the_points() -> None:
-    assert set(load_protocol("clasp").chain) == set(LENGTHS) - {"trunk"}  # the trunk cancels
-    assert load_protocol("touch_left").chain == (
+    def chain(name: str) -> tuple[str, ...]:
+        return find_measured_lengths(load_protocol(name), load_model())
+
+    assert set(chain("clasp")) == set(LENGTHS) - {"trunk"}  # the trunk cancels
+    assert chain("touch_left") == (
         "trunk",
         "shoulder_width",
         "left_upper_arm",
         "left_forearm",
         "left_hand",
     )
-    assert load_protocol("poses").chain == ()
+    assert chain("poses") == ()
     assert load_protocol("handle").distances == ("handle",)
 
 
@@ -116,26 +131,33 @@ def test_what_is_in_the_chain_follows_from_the_points() -> None:
 def test_jacobians_are_those_of_differences(name: str) -> None:
     protocol = load_protocol(name)
     rng = np.random.default_rng(1)
-    sensors = tuple(s for s in CHAIN if s in protocol.needs)
-    closures = protocol.closures
-    layout = Layout(sensors, sum(c.kind == "fixed_point" for c in closures), protocol.distances)
+    model, sensors, closures = load_model(), protocol.needs, protocol.closures
+    start = StartPose(orient_links(model, pin.neutral(model.pin)))
+    conditions = resolve_conditions(protocol, model, start, sensors)
+    layout = Layout(
+        LENGTHS,
+        sensors,
+        find_hinges(model, start, sensors),
+        find_twists(model, start, sensors),
+        fixed=sum(c.kind == "fixed_point" for c in closures),
+        planes=sum(c.kind == "plane" for c in closures),
+        distance_names=protocol.distances,
+    )
     n = 2 * len(protocol.conditions)
     turns = [Rotation.random(n, random_state=rng).as_quat().T for _ in sensors]
-    observations = Observations(
-        layout, np.vstack([*turns, rng.uniform(0, 60, n)]), protocol.conditions, np.arange(n) // 2
-    )
+    observations = Observations(layout, np.vstack([*turns, rng.uniform(0, 60, n)]), conditions, np.arange(n) // 2)
     x = rng.normal(scale=0.1, size=layout.size)
     x[:8] = rng.uniform(0.1, 0.5, 8)
     x[layout.heading] = rng.uniform(-3, 3, len(sensors))
     x[layout.drift] = rng.normal(scale=1e-3, size=len(sensors))
     _, J, gap = residuals(x, observations)
-    assert J.shape == (n, 5, layout.size)
+    assert J.shape == (n, 3 + len(layout.hinges), layout.size)
     for k in range(layout.size):
         step = np.zeros(layout.size)
         step[k] = 1e-6
         slope = (residuals(x + step, observations)[0] - residuals(x - step, observations)[0]) / 2e-6
         np.testing.assert_allclose(J[:, :, k], slope, atol=1e-5 * max(1.0, np.abs(slope).max()))
-    assert np.all((np.abs(gap).max(axis=1) > 0) == [isinstance(c, Closure) for c in protocol.conditions for _ in "ab"])
+    assert np.all((np.abs(gap).max(axis=1) > 0) == [isinstance(c, Loop) for c in conditions for _ in "ab"])
 
 
 # -------------------------------------------------------------------------------------------------------------- exact
@@ -158,7 +180,7 @@ def test_exact_motion_gives_headings_and_lengths_back(protocol: str, seed: int) 
         return
     assert found.rms_gap < min(1e-3, 0.2 * found.prior_rms_gap)
     for side in ("left", "right"):
-        if f"{side}_upper_arm" in load_protocol(protocol).chain:
+        if f"{side}_upper_arm" in find_measured_lengths(load_protocol(protocol), load_model()):
             parts = [f"{side}_upper_arm", f"{side}_forearm", f"{side}_hand"]
             upper, *fore = (found.subject.lengths[name] - person.lengths[name] for name in parts)
             assert abs(upper) < 4e-3
@@ -283,7 +305,7 @@ def test_a_palm_off_its_point_is_found_and_left_out() -> None:
     assert render(off).what.startswith("The palm was off its point for ")
     assert found.contact[:8].max() < 0.1
     whole = calibrate_lengths(recording, prior=person.prior, protocol="touch_right")
-    error, std = length_errors(found, person, load_protocol("touch_right").chain)
+    error, std = length_errors(found, person, find_measured_lengths(load_protocol("touch_right"), load_model()))
     assert np.abs(error / std).max() < 3.5
     assert found.rms_gap < 1.3 * whole.rms_gap
 
@@ -396,7 +418,7 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
     own.write_text(OWN)
     protocol = load_protocol(own)
     assert protocol.name == "rope"
-    assert "left_hand" not in protocol.chain
+    assert "left_hand" not in find_measured_lengths(protocol, load_model())
     person, simulation = made("handle", 1, real=False)
     found = calibrate_lengths(simulation.recording(), prior=person.prior, protocol=protocol)
     assert "rope" in found.subject.note

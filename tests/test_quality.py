@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import LENGTHS
+from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, calibrate_lengths
-from wepose_pin.calibration.anatomy import ArmMotion, check_labels
+from wepose_pin.calibration.anatomy import LimbMotion, check_labels
 from wepose_pin.calibration.quality import OPEN_SHARE, QUALITIES
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, INFO, WARNING, from_json, render
@@ -98,7 +98,7 @@ def arm_errors(found: Calibration, person: Person) -> np.ndarray:
 
 SIDES_EXCHANGED = tuple((f"left_{part}", f"right_{part}") for part in ("upper_arm", "forearm"))
 # Case → what is done to a good recording, the quality, the codes that come first, their places and variants.
-TABLE: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, str, str]]]] = {
+CASES: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, str, str]]]] = {
     "as it should be": (lambda r: r, "pass", []),
     "left and right swapped": (
         lambda r: exchanged(r, *SIDES_EXCHANGED),
@@ -109,7 +109,7 @@ TABLE: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, st
                 "left_forearm and right_forearm, left_upper_arm and right_upper_arm",
                 "sides",
             ),
-            ("calibration-elbow-backward", "left_elbow", ""),
+            ("calibration-hinge-backward", "left_elbow", ""),
         ],
     ),
     "upper arm and forearm exchanged": (
@@ -117,7 +117,7 @@ TABLE: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, st
         "fail",
         [
             ("sensors-exchanged", "left_upper_arm and left_forearm", ""),
-            ("calibration-elbow-backward", "left_elbow", ""),
+            ("calibration-hinge-backward", "left_elbow", ""),
         ],
     ),
     "the forearms exchanged": (
@@ -142,9 +142,9 @@ def codes(quality: CalibrationQuality) -> list[str]:
     return [diagnostic.code for diagnostic in quality.reasons]
 
 
-@pytest.mark.parametrize("case", TABLE)
+@pytest.mark.parametrize("case", CASES)
 def test_what_goes_wrong_is_diagnosed(case: str, anywhere: Simulation, person: Person) -> None:
-    change, wanted, first = TABLE[case]
+    change, wanted, first = CASES[case]
     quality = assess(solved(change(anywhere.recording()), person))
     found = [(d.code, d.place, str(d.facts.get("variant", ""))) for d in quality.reasons]
     print(case, "→", quality.quality, found)
@@ -211,7 +211,7 @@ def test_python_hands_out_no_subject_of_a_failed_calibration_in_silence(anywhere
 @pytest.mark.parametrize(
     ("share", "wanted", "causes"),
     [
-        ({"all": 0.05}, "poor", {"motion-sideways-small", "motion-elevation-small", "motion-elbow-small"}),
+        ({"all": 0.05}, "poor", {"motion-sideways-small", "motion-elevation-small", "motion-bend-small"}),
         ({"roll": 0.02, "pitch": 0.02, "yaw": 0.02}, "fail", {"motion-lean-small", "motion-twist-small"}),
     ],
 )
@@ -276,24 +276,24 @@ def test_a_mount_that_faces_elsewhere_is_said_and_solved(person: Person, stated:
 
 
 def test_labels_are_searched_only_where_a_person_cannot_move_so() -> None:
-    def arms(doubt: float) -> ArmMotion:
-        return ArmMotion({}, {"left": 0.15 * doubt}, {"left": 0.0}, 0.0, 0.01)
+    def arms(doubt: float) -> LimbMotion:
+        return LimbMotion({}, {"left_elbow": 0.15 * doubt}, {"left_elbow": 0.0}, 0.0, 0.01)
 
     tried: list[Mapping[str, str]] = []
 
-    def solve(moved: Mapping[str, str]) -> ArmMotion:
+    def solve(moved: Mapping[str, str]) -> LimbMotion:
         tried.append(moved)
         return arms(0.2 if moved == {"torso": "left_forearm", "left_forearm": "torso"} else 3.0)
 
     places = ("torso", "left_upper_arm", "left_forearm")
-    assert check_labels(arms(0.9), solve, places).contradiction is None
+    assert check_labels(arms(0.9), solve, places, TABLE).contradiction is None
     assert tried == []
-    exchanged = check_labels(arms(3.0), solve, places).diagnostic()
+    exchanged = check_labels(arms(3.0), solve, places, TABLE).diagnostic()
     assert (exchanged.code, exchanged.place) == ("sensors-exchanged", "torso and left_forearm")
-    none = check_labels(arms(3.0), lambda _: arms(3.0), places)
-    assert none.diagnostic().code == "arm-motion-implausible"
+    none = check_labels(arms(3.0), lambda _: arms(3.0), places, TABLE)
+    assert none.diagnostic().code == "limb-motion-implausible"
     assert none.contradiction is not None
-    assert (none.contradiction.code, none.contradiction.place) == ("calibration-elbow-backward", "left_elbow")
+    assert (none.contradiction.code, none.contradiction.place) == ("calibration-hinge-backward", "left_elbow")
 
 
 def test_exit_code_and_file_carry_the_quality(

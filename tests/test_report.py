@@ -22,7 +22,7 @@ from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
 from wepose_pin.tracking import TrackedRecording, track
 
 Made = tuple[Calibration, Recording, TrackedRecording]
-UNCERTAIN = Diagnostic("upper-arm-length-uncertain", WARNING, "left_upper_arm", 0.013, 0.010)
+UNCERTAIN = Diagnostic("length-uncertain", WARNING, "left_upper_arm", 0.013, 0.010)
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bodies import LENGTHS
 
 from benchmarks.calibration import Posed, count_evaluations, pose_cases
 from wepose_pin.calibration import solver
-from wepose_pin.calibration.least_squares import Gaussian, K
+from wepose_pin.calibration.least_squares import Gaussian
 from wepose_pin.calibration.solver import MIN_LENGTH, LeastSquares, solve, solve_without_bounds
 from wepose_pin.errors import NoSolution
 
@@ -43,14 +44,14 @@ def test_a_length_stays_above_its_bound(cases: dict[str, Posed]) -> None:
     """The prior wants a hand of −5 cm, the samples cannot tell: the loop goes there, `nlpsol` to the bound."""
     problem, start = cases["clasp"].problem, cases["clasp"].start
     mean, information = problem.prior.mean.copy(), problem.prior.information.copy()
-    k = K - 1
+    k = len(LENGTHS) - 1
     mean[k] = -0.05
     information[k, :], information[:, k], information[k, k] = 0.0, 0.0, 1e8
     problem = replace(problem, prior=Gaussian(mean, information))
     assert solve_without_bounds(problem, start).x[k] < 0.0
     fit = solve(problem, start)
     assert fit.x[k] == pytest.approx(MIN_LENGTH, abs=1e-6)
-    assert np.all(fit.x[:K] >= MIN_LENGTH - 1e-6)
+    assert np.all(fit.x[: len(LENGTHS)] >= MIN_LENGTH - 1e-6)
     # All else is the best that this length allows.
     others = np.arange(len(start)) != k
     gradient = problem.evaluate(fit.x).gradient

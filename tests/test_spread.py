@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from bodies import LENGTHS
+from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.alignment import SEGMENT_ATTITUDE_STD, START_POSE_STD
@@ -16,16 +16,11 @@ from wepose_pin.calibration import load_protocol, weights
 from wepose_pin.calibration.lengths import Calibration, solve_calibration
 from wepose_pin.calibration.priors import (
     DRIFT_STD,
-    HINGE_COMMON_STD,
-    HINGE_MIRROR_STD,
-    HINGE_TILT_STD,
-    SHOULDERS_STD,
-    SOFT_TISSUE_STD,
-    TORSO_SOFT_TISSUE_STD,
 )
 from wepose_pin.calibration.problem import CalibrationProblem
 from wepose_pin.calibration.weights import LEAST_CORRELATION_S
 from wepose_pin.filters.sensors import FilteredRecording
+from wepose_pin.model import load_model
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import NOISE_FREE, Person, simulate, simulate_person
 from wepose_pin.subject import mount_rows
@@ -33,6 +28,7 @@ from wepose_pin.subject import mount_rows
 UP = np.array([0.0, 0.0, 1.0])
 SENSORS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 START = (0.5, 4.5)
+MODEL, ELBOW = load_model(), TABLE.hinges["left_elbow"]
 RATE_HZ = 4.0  # of the recording and its observations: half of the usual, in half of the time
 DRAWS = 100
 # What of the covariance is compared: name → the rows whose sum it is. Forearm and hand are seen as one.
@@ -105,16 +101,16 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
         width = person.lengths["shoulder_width"] + rng.normal(scale=person.measured_std)
         measured = {"shoulder_width": (width, person.measured_std)}
         R_WL = _slipped(motion, slow(slip))
-        common = rng.normal(scale=HINGE_COMMON_STD)
-        mirrored = rng.normal(scale=HINGE_MIRROR_STD)
+        common = rng.normal(scale=ELBOW.common_std)
+        mirrored = rng.normal(scale=ELBOW.mirror_std)
         for side, x in (("left", common + mirrored), ("right", common - mirrored)):
-            R_WL = _hinged(R_WL, side, np.array([x, 1.0, rng.normal(scale=HINGE_TILT_STD)]))
-        R_WL["torso"] = R_WL["torso"] * _about_z(rng.normal(scale=SHOULDERS_STD))
+            R_WL = _hinged(R_WL, side, np.array([x, 1.0, rng.normal(scale=ELBOW.tilt_std)]))
+        R_WL["torso"] = R_WL["torso"] * _about_z(rng.normal(scale=TABLE.segments["torso"].point_twist_std))
         R_VS, R_VS_start, mounts = {}, {}, {}
         for name in SENSORS:
             psi, drift = rng.uniform(-np.pi, np.pi), rng.normal(scale=DRIFT_STD)
             tilt = Rotation.from_rotvec([*rng.normal(scale=START_POSE_STD, size=2), 0.0])
-            tissue = rng.normal(scale=TORSO_SOFT_TISSUE_STD if name == "torso" else SOFT_TISSUE_STD, size=(3, 3))
+            tissue = rng.normal(scale=TABLE.segments[name].soft_tissue_std, size=(3, 3))
             turned = R_WL[name]
             for _ in range(8):
                 turned = R_WL[name] * Rotation.from_rotvec((turned.inv().apply(UP) - UP) @ tissue.T).inv()
@@ -124,7 +120,7 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
             R_VS_start[name] = _about_z(-psi) * tilt * mounts[name]
             R_VS[name] = Rotation.concatenate([*[R_VS_start[name]] * len(start_time), Q * R_VS_start[name]])
         filtered = FilteredRecording(R_VS, R_VS_start, {}, START, START, [])
-        found = solve_calibration(CalibrationProblem(recording, filtered, protocol, prior, measured))
+        found = solve_calibration(CalibrationProblem(recording, filtered, protocol, prior, measured, MODEL))
         error = dict(zip(LENGTHS, np.array([found.subject.lengths[s] for s in LENGTHS]) - mean, strict=True))
         for name in SENSORS:
             off = (Rotation.from_quat(found.subject.mounts[name]) * mounts[name].inv()).as_rotvec()

@@ -74,12 +74,14 @@ class LabelCheck:
     contradiction : the movement that a person cannot make; None where all is well
     moved : segment → label of the sensor on it, of the labelling with a person's limbs; empty where that is the stated
         one, or none is
-    pairs : of segments that have sensors, left → right
+    places : segments with sensors of the chain, in the order of the table
+    pairs : of them, left → right
     """
 
     doubt: float = 0.0
     contradiction: Diagnostic | None = None
     moved: Mapping[str, str] = field(default_factory=dict)
+    places: tuple[str, ...] = ()
     pairs: Mapping[str, str] = field(default_factory=dict)
 
     def diagnostic(self, severity: Severity = ERROR) -> Diagnostic:
@@ -90,9 +92,9 @@ class LabelCheck:
         variant = {} if exchanged else {"variant": "mixed"}
         place = ", ".join(f"{label} sits on the {place}" for place, label in sorted(self.moved.items()))
         if exchanged:
-            pairs = {tuple(sorted(pair)) for pair in self.moved.items()}
+            pairs = {tuple(sorted(pair, key=self.places.index)) for pair in self.moved.items()}
             place = ", ".join(f"{a} and {b}" for a, b in sorted(pairs))
-            if pairs == {tuple(sorted(pair)) for pair in self.pairs.items()}:
+            if pairs == set(self.pairs.items()):
                 variant = {"variant": "sides"}
         return Diagnostic("sensors-exchanged", severity, place, self.doubt, 1.0, variant)
 
@@ -171,4 +173,6 @@ def check_labels(
         if limbs.doubt() < best:
             best, moved = limbs.doubt(), labelling
     pairs = {left: right for left, right in table.pairs.items() if left in places and right in places}
-    return LabelCheck(doubt, stated.contradiction(), moved if best < min(1.0, BETTER * doubt) else {}, pairs)
+    return LabelCheck(
+        doubt, stated.contradiction(), moved if best < min(1.0, BETTER * doubt) else {}, tuple(places), pairs
+    )

@@ -2,15 +2,15 @@
 
 Poses show them directly: the azimuth at which an arm is raised, the axis about which the torso bows.
 
-Where two points coincide and all parts of the way between them but one hang vertically in the start pose, the closure is
-linear in lengths times headings. A hanging part's direction in its sensor's start world is v(t) = Q(t)(−e_z), and
+Where two points coincide and all parts of the way between them but one hang vertically in the start pose, the closure
+is linear in lengths times headings. A hanging part's direction in its sensor's start world is v(t) = Q(t)(−e_z), and
 L Rz(ψ) v is linear in (L cos ψ, L sin ψ, L). So R_0(t) s + Σ ± L_i Rz(ψ_i) v_i(t) = 0, with s the other part at the
 start, such as the line between the shoulders, has its least-squares solution in the smallest singular vector. Beyond a
 heading step of the sensor, or of that of s, to which all others are relative, ψ is another unknown and L is the same.
 
 A fixed point is nearly the same, but a torso that hardly turns solves it by itself (s = c, no arms); a distance or a
-plane is not linear at all. There the headings are searched: Gauss-Newton from many starts at once, over headings and the size of
-each sensor's part of the chain, with the prior's few per cent of uncertainty.
+plane is not linear at all. There the headings are searched: Gauss-Newton from many starts at once, over headings and
+the size of each sensor's part of the chain, with the prior's few per cent of uncertainty.
 """
 
 from __future__ import annotations

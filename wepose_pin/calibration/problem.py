@@ -89,7 +89,7 @@ class CalibrationProblem:
         return tuple(name for name in self.model.table.segments if name in used)
 
     def mount(self, segment: str) -> np.ndarray | None:
-        """The mount `quat_LS` (4,) xyzw of the prior or the session, L that equals W in the start pose; None: unknown."""
+        """The mount `quat_LS` (4,) xyzw of prior or session, of L that equals W in the start pose; None: unknown."""
         mount = find_nominal_mount(self.recording, segment, self.prior)
         if mount is None or segment not in self.prior.mounts or self.recording.remounted:
             return mount  # a stated one names the sensor's axes in the start pose

@@ -4,9 +4,9 @@ A ``calibration/<name>.toml`` lists steps for the person and conditions for the 
 those of the body's table (`wepose_pin.model.BodyTable`). There are three kinds of conditions:
 
 - ``[[closure]]``: two points coincide (``kind = "coincide"``) or keep a distance (``"distance"``), one stays at a point
-  of W (``"fixed_point"``), unknown or stated by ``at``, or points move on a level plane of unknown height (``"plane"``).
-  All of them show lengths and headings by motion.
-- ``[[pose]]``: segments point in given directions of the body's first segment; `std_deg` is how well a person does that.
+  of W (``"fixed_point"``), unknown or stated by ``at``, or points move on a level plane of unknown height
+  (``"plane"``). All of them show lengths and headings by motion.
+- ``[[pose]]``: segments point in given directions of the body's first segment; `std_deg` is how well a person does it.
 - ``[[axis]]``: a segment turns forwards about its own y, as the torso in a bow.
 
 The residual of a pose does not show how exactly it was taken, so its weight is stated; that of a closure is measured.

@@ -218,7 +218,9 @@ def compute_information_shares(
     """
     unit = np.eye(layout.size)
     directions = dict(zip(layout.lengths, unit, strict=False))
-    directions |= {" + ".join(names): sum(directions[name] for name in names) for names in sums if len(names) > 1}
+    directions |= {
+        " + ".join(names): np.sum([directions[name] for name in names], axis=0) for names in sums if len(names) > 1
+    }
     for i, name in enumerate(layout.sensors):
         rows = (layout.tilt.start + 2 * i, layout.tilt.start + 2 * i + 1, layout.heading.start + i)
         directions |= dict(zip(mount_rows(name), unit[list(rows)], strict=True))

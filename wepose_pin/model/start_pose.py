@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -71,7 +72,7 @@ def orient_links(model: BodyModel, q: np.ndarray) -> dict[str, np.ndarray]:
     return R_WK
 
 
-def _rotate_triple(joints: list, values: Mapping[str, float]) -> np.ndarray:  # type: ignore[type-arg]
+def _rotate_triple(joints: list[Any], values: Mapping[str, float]) -> np.ndarray:
     """Rotation (3, 3) of three joints that are one spherical joint, out of zero."""
     zero = turned = np.eye(3)
     for k, joint in enumerate(joints):

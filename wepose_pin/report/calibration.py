@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ..alignment import START_POSE_STD
 from ..calibration import Calibration, CalibrationQuality
+from ..calibration.conditions import find_measured_lengths
 from ..calibration.observability import find_intervals
 from ..calibration.priors import DRIFT_STD
 from ..calibration.protocols import Protocol, load_protocol
@@ -87,7 +88,7 @@ def render_calibration_report(
     method, protocol : as the calibration was run
     failures : takes a line for each section that cannot be made; the page has the line in its place
     """
-    contact = _describe_contact(protocol if isinstance(protocol, Protocol) else load_protocol(protocol))
+    contact = _describe_contact(protocol if isinstance(protocol, Protocol) else load_protocol(protocol), calibration)
     untracked: list[Diagnostic] = []
     if tracked is None:
         try:
@@ -125,14 +126,15 @@ class _Contact(NamedTuple):
     chain: tuple[str, ...]  # lengths in it
 
 
-def _describe_contact(protocol: Protocol) -> _Contact:
+def _describe_contact(protocol: Protocol, calibration: Calibration) -> _Contact:
+    chain = find_measured_lengths(protocol, calibration.model)
     hands = tuple(dict.fromkeys(p for c in protocol.closures for p in c.points if p.endswith("_palm")))
     if len(hands) < 2:
         noun = f"the {plain(hands[0])}" if hands else "the hands"
-        return _Contact(protocol.name, hands, noun, "palm to its point", protocol.chain)
+        return _Contact(protocol.name, hands, noun, "palm to its point", chain)
     bar = any(c.kind == "distance" for c in protocol.closures)
     noun, gap = ("the hands on the handle", "palms against the handle") if bar else ("the joined hands", "palm to palm")
-    return _Contact(protocol.name, hands, noun, gap, protocol.chain)
+    return _Contact(protocol.name, hands, noun, gap, chain)
 
 
 # The sections: the values that the macros of the template take --------------------------------------------------------
@@ -467,12 +469,10 @@ def _describe_check(check: Check, contact: _Contact) -> tuple[str, str]:
     """The quantity of a check, and the unit in which its value is shown."""
     place = plain(check.diagnostic.place)
     return {
-        "arm-motion-implausible": ("doubt of the sensors' places, by anatomy", "number"),
+        "limb-motion-implausible": ("doubt of the sensors' places, by anatomy", "number"),
         "sensors-exchanged": ("doubt of the sensors' places, by anatomy", "number"),
         "mount-not-used": (f"stated mount that was not used, {place}", "deg"),
-        "upper-arm-length-uncertain": ("± upper arm, without the common scale", "mm"),
-        "forearm-length-uncertain": ("± forearm + hand, without the common scale", "mm"),
-        "shoulder-width-uncertain": ("± shoulder width, without the common scale", "mm"),
+        "length-uncertain": (f"± {place}, without the common scale", "mm"),
         "mount-heading-uncertain": (f"± heading, {place}", "deg"),
         "scale-uncertain": ("± scale, all lengths together", "percent"),
         "scale-from-prior": ("± scale, all lengths together", "percent"),

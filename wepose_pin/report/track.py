@@ -171,7 +171,7 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
     worst_sample = int(np.argmax(stds[worst]))
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     fastest = max(growth, key=growth.__getitem__) if growth else None
-    has_clasp = tracked.correction is not None and tracked.correction.palm_gap_rms_mm is not None
+    has_clasp = tracked.correction is not None and tracked.correction.gap_rms_mm is not None
     segments = [
         [
             plain(name),

@@ -1,11 +1,13 @@
-"""Heading correction from joined palms (clasp phases) and elbow hinge axes.
+"""Heading correction from points that coincide (as the palms in a clasp phase) and axes of hinges (as the elbows).
 
 The filters' tilt is good and their headings drift. δ_i(t) is the heading error of segment i, on the left in W:
 R_WL,true = Rz(δ) R_WL. It is a random walk whose step variance is the growth of the filter's heading variance. Two
 measurements observe it, both linear in δ:
 
-- the palm gap in a later `clasp` phase: g + Σ δ_i e_z × v_i = 0, with v_i the link of segment i;
-- the elbow of a calibrated subject: the forearm stays in the plane of its hinge, n · R_Uᵀ R_F (−e_z) = 0.
+- the gap in a later phase of a protocol's closure: g + Σ δ_i e_z × v_i = 0, with v_i the part of segment i in the way
+  between the two points;
+- the hinges of a calibrated subject: the segment below stays in the plane of its hinge, n · R_Oᵀ R_M e = 0, with e its
+  long axis.
 
 A forward pass and a Rauch-Tung-Striebel pass over knots of a few seconds give δ and its covariance. A heading error
 common to all segments is unobservable.
@@ -18,6 +20,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..alignment import (
@@ -27,20 +30,21 @@ from ..alignment import (
     SegmentOrientations,
     compute_start_heading_var,
 )
+from ..calibration import PROTOCOLS, load_protocol
+from ..calibration.conditions import Part, StartPose, find_parts
+from ..errors import BadSession
+from ..model import BodyModel, BodyTable
+from ..model.start_pose import orient_links
 from ..recording import Recording
 from ..subject import Subject
 
-HAND_TO_HAND_CHAIN = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
-HANDS = ("left_hand", "right_hand")  # part of the chain if measured, else rigid with their forearms
 KNOT_S = 2.0  # [s] between knots of the random walk
 SAMPLE_RATE_HZ = 8.0
 # [s] Correlation time of residual errors other than those of headings: soft tissue and remaining errors of the mounts
 # recur in every pose, so that a minute of joined hands gives three effective samples. Chosen on simulated people: with
 # a shorter time, the headings of a good filter become worse.
 CORRELATION_S = 20.0
-TORSO_START_STD = np.deg2rad(
-    0.5
-)  # [rad] of the torso's heading at the end of the start pose, which defines x; assumption
+REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_STEP_VARIANCE = 1e-10  # [rad²] of the random walk between two knots
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
@@ -50,8 +54,8 @@ HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted 
 class HeadingCorrection(NamedTuple):
     """The correction of headings: residuals before and after, and the largest correction."""
 
-    palm_gap_rms_mm: tuple[float, float] | None  # in the clasp phases
-    hinge_residual_rms_deg: Mapping[str, tuple[float, float]]  # joint → forearm against the plane of the elbow's hinge
+    gap_rms_mm: tuple[float, float] | None  # in the phases of closures
+    hinge_residual_rms_deg: Mapping[str, tuple[float, float]]  # joint → the segment below against its hinge's plane
     max_correction_deg: Mapping[str, float]  # segment → largest rotation about the vertical
 
 
@@ -66,20 +70,31 @@ class HeadingCorrector:
     chunk : the first chunk
     segments : names of the measured segments
     start_end : [s] end of the start pose, after which headings drift
+    model : the body with the subject's lengths
 
     Attributes
     ----------
-    is_chain_complete : whether all segments from hand to hand are measured; otherwise there is no correction
-    has_observations : whether there is a hinge, or a clasp phase that ends after the start pose
+    is_chain_complete : whether all segments between the points of the body's closures are measured, or both segments of
+        a hinge where it has no closures; otherwise there is no correction
+    has_observations : whether there is a hinge, or a phase of a closure that ends after the start pose
     """
 
-    def __init__(self, chunk: Recording, segments: Collection[str], start_end: float, subject: Subject) -> None:
-        self.is_chain_complete = set(HAND_TO_HAND_CHAIN) <= set(segments)
-        self._chain = (*HAND_TO_HAND_CHAIN, *(hand for hand in HANDS if hand in segments))
-        self._subject, self._start_end, self._clasp = subject, start_end, chunk.phases.get("clasp", ())
+    def __init__(
+        self, chunk: Recording, segments: Collection[str], start_end: float, subject: Subject, model: BodyModel
+    ) -> None:
+        self._subject, self._start_end, self._model = subject, start_end, model
+        self._closures, of_body = _find_closures(chunk, segments, model)
         # A hinge axis is relative to the calibrated mounts and holds as long as they do.
-        self._hinges = subject.hinges if not chunk.remounted else {}
-        self.has_observations = bool(self._hinges) or any(end >= start_end for _, end in self._clasp)
+        hinges = subject.hinges if not chunk.remounted else {}
+        table = model.table
+        self._hinges = {name: hinge for name, hinge in hinges.items() if {*_hinged(table, name)} <= set(segments)}
+        self.is_chain_complete = bool(self._closures) or (not of_body and bool(self._hinges))
+        used = {part.sensor for closure in self._closures for part in closure.parts}
+        used |= {segment for name in self._hinges for segment in _hinged(table, name)}
+        self._chain = tuple(name for name in table.segments if name in used)
+        self.has_observations = bool(self._hinges) or any(
+            end >= start_end for closure in self._closures for _, end in closure.intervals
+        )
         self._stride = max(1, round(chunk.rate_hz / SAMPLE_RATE_HZ))
         self._information_weight = 1.0 / max(1.0, CORRELATION_S * chunk.rate_hz / self._stride)
         self._first_time: float | None = None  # [s] of the first decimated sample
@@ -127,7 +142,12 @@ class HeadingCorrector:
                 missing = len(knot_times) + 1 - len(variance_at_knots)
                 variance_at_knots = np.concatenate([variance_at_knots, np.full(missing, self._last_variance[name][1])])
                 step_variances[:, i] = np.maximum(np.diff(variance_at_knots), MIN_STEP_VARIANCE)
-        self._heading_errors, self._cov = _smooth_random_walk(information, information_vector, step_variances)
+        start_stds = [
+            REFERENCE_START_STD if name == self._model.table.reference else START_POSE_STD for name in self._chain
+        ]
+        self._heading_errors, self._cov = _smooth_random_walk(
+            information, information_vector, step_variances, np.array(start_stds)
+        )
         self._knot_times = knot_times  # the errors are constant before the first and after the last
         return True
 
@@ -156,7 +176,7 @@ class HeadingCorrector:
         """Return the residuals and the largest correction of the chunks so far."""
         gaps, hinge_rms = self._gaps, self._hinge_rms
         return HeadingCorrection(
-            palm_gap_rms_mm=(1e3 * gaps["before"].value, 1e3 * gaps["after"].value) if gaps["before"].count else None,
+            gap_rms_mm=(1e3 * gaps["before"].value, 1e3 * gaps["after"].value) if gaps["before"].count else None,
             hinge_residual_rms_deg={
                 joint: (
                     float(np.degrees(hinge_rms["before"][joint].value)),
@@ -183,14 +203,14 @@ class HeadingCorrector:
     def _sum_knots(self, time: np.ndarray, quats: Mapping[str, np.ndarray]) -> None:
         """Add the information matrices and vectors of complete knots from their samples."""
         R = {name: Rotation.from_quat(quat) for name, quat in quats.items()}
-        joined = self._add_residuals("before", time, R)
+        self._add_residuals("before", time, R)
         complete_knots = sum(len(matrices) for matrices, _ in self._sums)
         knot = self._find_knots(time) - complete_knots
         count, size = int(knot[-1]) + 1, len(self._chain)
         information, information_vector = np.zeros((count, size, size)), np.zeros((count, size))
         for row in (
-            _build_gap_rows(R, self._subject, joined),
-            *(_build_hinge_rows(R, self._subject, joint) for joint in self._hinges),
+            *(_build_gap_rows(R, self._model, self._subject, c, c.holds(time)) for c in self._closures),
+            *(_build_hinge_rows(R, self._model, self._subject, joint) for joint in self._hinges),
         ):
             weight = self._information_weight * row.weight[:, None]
             np.add.at(information, knot[row.sample], np.einsum("na,nb->nab", weight * row.H, row.H))
@@ -198,17 +218,16 @@ class HeadingCorrector:
             self._has_rows |= len(row.sample) > 0
         self._sums.append((information, information_vector))
 
-    def _add_residuals(self, stage: str, time: np.ndarray, R: Mapping[str, Rotation]) -> np.ndarray:
-        """Add the residuals of palms and elbows before or after the correction; return where palms are joined (m,)."""
-        joined = np.zeros(len(time), dtype=bool)
-        for begin, end in self._clasp:
-            joined |= (time >= begin) & (time <= end)
-        if joined.any():
-            self._gaps[stage].add(np.sum(_compute_palm_gap(R, self._subject)[joined] ** 2, axis=1))
+    def _add_residuals(self, stage: str, time: np.ndarray, R: Mapping[str, Rotation]) -> None:
+        """Add the residuals of closures and hinges before or after the correction."""
+        for closure in self._closures:
+            closed = closure.holds(time)
+            if closed.any():
+                gap = closure.vectors(R, self._model).sum(axis=0)
+                self._gaps[stage].add(np.sum(gap[closed] ** 2, axis=1))
         if len(time):
             for joint in self._hinges:
-                self._hinge_rms[stage][joint].add(_compute_hinge_residual(R, self._subject, joint) ** 2)
-        return joined
+                self._hinge_rms[stage][joint].add(_compute_hinge_residual(R, self._model, self._subject, joint) ** 2)
 
     def _record_variances(self, chunk: Recording, orientations: SegmentOrientations) -> None:
         """Record the filters' heading variances at the end of the start pose and in the middles of the knots."""
@@ -257,33 +276,72 @@ class _Rows(NamedTuple):
     weight: np.ndarray  # (m,) 1 / variance of e
 
 
-def _compute_chain_links(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
-    """Compute the links (k, n, 3) [m] in W of the chain from the right palm to the left one, one of each segment."""
-    lengths = subject.lengths
-    links = [R["torso"].apply([0.0, lengths["shoulder_width"], 0.0])]
-    for name in [name for name in R if name != "torso"]:
-        side = name.split("_", 1)[0]
-        length = sum(lengths[part] for part in _find_rotating_lengths(name, R))
-        links.append(R[name].apply([0.0, 0.0, -length if side == "left" else length]))
-    return np.array(links)
+class _Closure(NamedTuple):
+    """Two points that coincide in some intervals [s]."""
+
+    intervals: tuple[tuple[float, float], ...]
+    parts: tuple[Part, ...]  # of the way from the second point to the first one, in frames that equal W at zero
+    neutral: StartPose
+
+    def holds(self, time: np.ndarray) -> np.ndarray:
+        """(n,) bool: which times [s] lie in an interval."""
+        closed = np.zeros(len(time), dtype=bool)
+        for begin, end in self.intervals:
+            closed |= (time >= begin) & (time <= end)
+        return closed
+
+    def rotations(self, R: Mapping[str, Rotation]) -> list[Rotation]:
+        """The orientation of each part."""
+        neutral = [self.neutral.R_WK[part.sensor] for part in self.parts]
+        return [
+            R[part.sensor] if np.array_equal(R_0, np.eye(3)) else R[part.sensor] * Rotation.from_matrix(R_0).inv()
+            for part, R_0 in zip(self.parts, neutral, strict=True)
+        ]
+
+    def vectors(self, R: Mapping[str, Rotation], model: BodyModel) -> np.ndarray:
+        """The vectors (k, n, 3) [m] in W of the parts; their sum is the gap."""
+        lengths = np.array(list(model.lengths.values()))
+        turned = zip(self.rotations(R), self.parts, strict=True)
+        return np.array([rotation.apply(part.vector(lengths)) for rotation, part in turned])
 
 
-def _find_rotating_lengths(name: str, R: Mapping[str, Rotation]) -> tuple[str, ...]:
-    """Return the names of the lengths that rotate with a segment of the chain."""
-    hand = name.replace("forearm", "hand")
-    if name == "torso":
-        return ("shoulder_width",)
-    return (name,) if hand in R else (name, hand)
+def _find_closures(
+    recording: Recording, segments: Collection[str], model: BodyModel
+) -> tuple[tuple[_Closure, ...], bool]:
+    """The closures of points that coincide whose segments are all measured, and whether the body has any.
+
+    They are those of the protocols; each holds in the phase of its name, which the recording may lack.
+    """
+    neutral = StartPose(orient_links(model, pin.neutral(model.pin)))
+    closures, of_body, seen = [], False, set[tuple[str, tuple[str, ...]]]()
+    for name in PROTOCOLS:
+        for closure in load_protocol(name).closures:
+            if closure.kind != "coincide" or not set(closure.points) <= set(model.table.points):
+                continue
+            if (closure.phase, closure.points) in seen:
+                continue
+            seen.add((closure.phase, closure.points))
+            of_body = True
+            first, last = closure.points
+            try:
+                parts = find_parts(model, neutral, segments, [(first, 1.0), (last, -1.0)])
+            except BadSession:
+                continue
+            closures.append(_Closure(tuple(recording.phases.get(closure.phase, ())), parts, neutral))
+    return tuple(closures), of_body
 
 
-def _compute_palm_gap(R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
-    """Compute the gap (n, 3) [m] in W, left palm minus right palm."""
-    return _compute_chain_links(R, subject).sum(axis=0)
+def _hinged(table: BodyTable, joint: str) -> tuple[str, str]:
+    """The two segments of a hinge."""
+    hinge = table.hinges[joint]
+    return hinge.on, hinge.moves
 
 
-def _build_gap_rows(R: Mapping[str, Rotation], subject: Subject, joined: np.ndarray) -> _Rows:
-    """Build three whitened rows for each sample with joined palms, without outliers."""
-    v = _compute_chain_links(R, subject)[:, joined]
+def _build_gap_rows(
+    R: Mapping[str, Rotation], model: BodyModel, subject: Subject, closure: _Closure, closed: np.ndarray
+) -> _Rows:
+    """Build three whitened rows for each sample at which the points coincide, without outliers."""
+    v = closure.vectors(R, model)[:, closed]
     n = v.shape[1]
     eye = np.eye(3)
     covariance = np.tile(PALM_SLIP_STD**2 * eye, (n, 1, 1))
@@ -291,44 +349,36 @@ def _build_gap_rows(R: Mapping[str, Rotation], subject: Subject, joined: np.ndar
         covariance += SEGMENT_ATTITUDE_STD**2 * (
             np.sum(link**2, axis=1)[:, None, None] * eye - np.einsum("na,nb->nab", link, link)
         )
-    covariance += _compute_length_covariance(v, R, subject)
-    H = np.stack([np.cross([0.0, 0.0, 1.0], link) for link in v], axis=2)  # (n, 3, k)
+    by_length = zip(closure.rotations(R), closure.parts, strict=True)
+    J = sum(rotation.as_matrix()[closed] @ np.array(part.by_length) for rotation, part in by_length)  # (n, 3, lengths)
+    covariance += J @ subject.lengths_covariance(model.lengths) @ np.swapaxes(J, 1, 2)
+    names = list(R)
+    H = np.zeros((n, 3, len(names)))
+    for part, link in zip(closure.parts, v, strict=True):
+        H[:, :, names.index(part.sensor)] += np.cross([0.0, 0.0, 1.0], link)
     r = v.sum(axis=0)
     whiten = np.linalg.inv(np.linalg.cholesky(covariance)) if n else covariance
     r, H = np.einsum("nab,nb->na", whiten, r), whiten @ H
     is_inlier = np.sum(r**2, axis=1) < OUTLIER_STDS**2 * 3.0  # three axes
-    sample = np.repeat(np.flatnonzero(joined)[is_inlier], 3)
-    return _Rows(sample, r[is_inlier].ravel(), H[is_inlier].reshape(-1, len(v)), np.ones(len(sample)))
+    sample = np.repeat(np.flatnonzero(closed)[is_inlier], 3)
+    return _Rows(sample, r[is_inlier].ravel(), H[is_inlier].reshape(-1, len(names)), np.ones(len(sample)))
 
 
-def _compute_length_covariance(v: np.ndarray, R: Mapping[str, Rotation], subject: Subject) -> np.ndarray:
-    """Compute the covariance (n, 3, 3) [m²] of the gap from that of the lengths."""
-    names, J = [], []
-    for link, name in zip(v, R, strict=True):
-        direction = link / np.linalg.norm(link, axis=1)[:, None]
-        for length in _find_rotating_lengths(name, R):
-            names.append(length)
-            J.append(direction)
-    jacobian = np.stack(J, axis=2)  # (n, 3, k)
-    return jacobian @ subject.lengths_covariance(names) @ jacobian.swapaxes(1, 2)
+def _compute_hinge_residual(R: Mapping[str, Rotation], model: BodyModel, subject: Subject, joint: str) -> np.ndarray:
+    """Compute the angle (n,) [rad] of the segment below out of the plane of its hinge."""
+    on, moves = _hinged(model.table, joint)
+    along_O = R[on].inv().apply(R[moves].apply(model.table.segments[moves].along))
+    return along_O @ subject.hinges[joint].axis
 
 
-def _compute_hinge_residual(R: Mapping[str, Rotation], subject: Subject, joint: str) -> np.ndarray:
-    """Compute the angle (n,) [rad] of the forearm out of the plane of the elbow's hinge."""
-    side = joint.removesuffix("_elbow")
-    forearm_U = R[f"{side}_upper_arm"].inv().apply(R[f"{side}_forearm"].apply([0.0, 0.0, -1.0]))
-    return forearm_U @ subject.hinges[joint].axis
-
-
-def _build_hinge_rows(R: Mapping[str, Rotation], subject: Subject, joint: str) -> _Rows:
-    """Build a row for each sample from the elbow's hinge, without outliers."""
-    side = joint.removesuffix("_elbow")
-    upper, fore = R[f"{side}_upper_arm"], R[f"{side}_forearm"]
-    r = _compute_hinge_residual(R, subject, joint)
-    heading_derivative_W = np.cross([0.0, 0.0, 1.0], fore.apply([0.0, 0.0, -1.0]))
-    derivative = upper.inv().apply(heading_derivative_W) @ subject.hinges[joint].axis
+def _build_hinge_rows(R: Mapping[str, Rotation], model: BodyModel, subject: Subject, joint: str) -> _Rows:
+    """Build a row for each sample from a hinge, without outliers."""
+    on, moves = _hinged(model.table, joint)
+    r = _compute_hinge_residual(R, model, subject, joint)
+    heading_derivative_W = np.cross([0.0, 0.0, 1.0], R[moves].apply(model.table.segments[moves].along))
+    derivative = R[on].inv().apply(heading_derivative_W) @ subject.hinges[joint].axis
     H, names = np.zeros((len(r), len(R))), list(R)
-    H[:, names.index(f"{side}_forearm")], H[:, names.index(f"{side}_upper_arm")] = derivative, -derivative
+    H[:, names.index(moves)], H[:, names.index(on)] = derivative, -derivative
     std = subject.hinges[joint].std
     is_inlier = np.abs(r) < OUTLIER_STDS * std + HINGE_HEADING_MARGIN
     sample = np.flatnonzero(is_inlier)
@@ -350,7 +400,7 @@ def _compute_heading_covariance(orientations: SegmentOrientations, name: str) ->
 
 
 def _smooth_random_walk(
-    information: np.ndarray, information_vector: np.ndarray, step_variances: np.ndarray
+    information: np.ndarray, information_vector: np.ndarray, step_variances: np.ndarray, start_stds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Smooth k random walks: return means (knots, k) and covariances (knots, k, k).
 
@@ -359,9 +409,10 @@ def _smooth_random_walk(
     information : (knots, k, k)
     information_vector : (knots, k) information matrix times measured value
     step_variances : (knots, k) [rad²] of the step that ends at a knot
+    start_stds : (k,) [rad] at the end of the start pose
     """
     n, size = information_vector.shape
-    x, P = np.zeros(size), np.diag([TORSO_START_STD**2] + [START_POSE_STD**2] * (size - 1))
+    x, P = np.zeros(size), np.diag(start_stds**2)
     before, filtered = [], []
     for k in range(n):
         P = P + np.diag(step_variances[k])

@@ -193,8 +193,8 @@ def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | N
         },
         "largest_correction_deg": {name: round(value, 3) for name, value in correction.max_correction_deg.items()},
     }
-    if correction.palm_gap_rms_mm is not None:
-        about["clasp_gap_rms_mm"] = [round(value, 2) for value in correction.palm_gap_rms_mm]
+    if correction.gap_rms_mm is not None:
+        about["clasp_gap_rms_mm"] = [round(value, 2) for value in correction.gap_rms_mm]
     return about
 
 

@@ -98,7 +98,7 @@ class Tracker:
 
     def _process(self, oriented: Oriented) -> list[TrackedRecording]:
         if self._headings is None and not self._solved:
-            self._headings = make_heading_corrector(oriented, self._subject, self.options)
+            self._headings = make_heading_corrector(oriented, self._subject, self._body, self.options)
             self._solved = self._headings is None
         if self._headings is not None and not self._solved:
             self._headings.add_observations(*oriented)
@@ -125,7 +125,10 @@ class Tracker:
 
 
 def observe_headings(
-    chunks: Iterable[Recording], subject: Subject | None = None, options: TrackOptions | None = None
+    chunks: Iterable[Recording],
+    subject: Subject | None = None,
+    options: TrackOptions | None = None,
+    model: BodyModel | None = None,
 ) -> HeadingCorrector | None:
     """Return the heading corrector of a recording after a pass over its chunks; None: nothing observes headings.
 
@@ -136,6 +139,7 @@ def observe_headings(
     """
     options = options or TrackOptions()
     estimator = _estimator(subject, options)
+    _, body = make_body(subject, model)
     headings: HeadingCorrector | None = None
 
     def estimates() -> Iterator[Oriented]:
@@ -144,7 +148,7 @@ def observe_headings(
         yield from estimator.finish()
 
     for oriented in estimates():
-        headings = headings or make_heading_corrector(oriented, subject, options)
+        headings = headings or make_heading_corrector(oriented, subject, body, options)
         if headings is None:
             return None
         headings.add_observations(*oriented)
@@ -152,7 +156,7 @@ def observe_headings(
 
 
 def make_heading_corrector(
-    oriented: Oriented, subject: Subject | None, options: TrackOptions
+    oriented: Oriented, subject: Subject | None, body: BodyModel, options: TrackOptions
 ) -> HeadingCorrector | None:
     """Return a heading corrector for a recording with this first chunk; None: its headings cannot be corrected."""
     recording, segments = oriented
@@ -160,7 +164,7 @@ def make_heading_corrector(
         return None
     if recording.remounted or any(sensor.aligned for sensor in recording.sensors.values()):
         return None  # the frames are not those of the calibration
-    headings = HeadingCorrector(recording, segments.quat_WL, segments.start[1], subject)
+    headings = HeadingCorrector(recording, segments.quat_WL, segments.start[1], subject, body)
     return headings if headings.is_chain_complete and headings.has_observations else None
 
 
@@ -190,7 +194,7 @@ def track_chunks(
                 progress(task, chunk)
 
     observed = subject is not None and bool(subject.mounts) and not options.open_loop and not options.causal
-    headings = observe_headings(counted("observing headings"), subject, options) if observed else None
+    headings = observe_headings(counted("observing headings"), subject, options, model) if observed else None
     tracker = Tracker(subject, model=model, options=options, headings=headings, observed=observed)
     for chunk in counted(f"tracking by {options.method}"):
         yield from tracker.push(chunk)
