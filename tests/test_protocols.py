@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from bodies import LENGTHS
+from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate_lengths, load_protocol
@@ -423,28 +423,26 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
     found = calibrate_lengths(simulation.recording(), prior=person.prior, protocol=protocol)
     assert "rope" in found.subject.note
     for old, new, match in (
-        ('"left_wrist"', '"left_wirst"', r"closure 1: points: 'left_wirst' is not known; did you mean 'left_wrist'"),
+        ('"left_wrist"', '"left_wirst"', "'left_wirst' is no point of upper_body; did you mean 'left_wrist'"),
         (', "right_wrist"', "", r"points = \['left_wrist'\]; kind 'distance' takes 2"),
         ('"distance"', '"near"', r"closure 1: kind: 'near' is not known"),
         ("metres = 0.5", 'metres = "half"', r"metres = 'half'; a number between"),
         ("distance =", "distanze =", r"closure 1: no 'distance'"),
         ("[[closure]]", "[[closures]]", r"'closures' is no key of a protocol; did you mean 'closure'"),
-        ("needs =", "# needs =", r"no 'needs'"),
-        ("needs =", "needs = ['torso'] #", r"lacks left_forearm, left_upper_arm, right_"),
         ("[[closure]]", "pose = 3\n[[closure]]", r"pose = 3 is no list of tables; write \[\[pose\]\]"),
         ("[[closure]]", "[[step]]\nseconds = 3\n[[closure]]", r"step 1: no 'phase'"),
         ("[[closure]]", POSE.format("3"), r"pose 1: directions = 3; of each segment"),
         ("[[closure]]", POSE.format("{ torso = ['a', 0, 0] }"), r"directions\.torso = .*three numbers are needed"),
-        ("[[closure]]", POSE.format("{ head = [0, 0, 1] }"), r"directions: 'head' is not known"),
+        ("[[closure]]", POSE.format("{ haed = [0, 0, 1] }"), "haed is no segment of upper_body; did you mean 'head'"),
         ("needs =", "needs ==", r"not valid TOML"),
         ("needs =", "needs = 3 #", r"needs = 3; a list of names is needed"),
-        ("needs =", "needs = [3] #", r"needs: 3 is not known"),
+        ("needs =", "needs = [3] #", "3 is no segment of upper_body"),
         ("points =", "points = 'left_wrist' #", r"closure 1: points = 'left_wrist'; a list of names"),
-        ("points =", "points = [['left_wrist'], 'right_wrist'] #", r"points: \['left_wrist'\] is not known"),
+        ("points =", "points = [['left_wrist'], 'right_wrist'] #", r"'\['left_wrist'\]' is no point of upper_body"),
     ):
         own.write_text(OWN.replace(old, new))
         with pytest.raises(BadOption, match=match) as caught:
-            load_protocol(own)
+            load_protocol(own).check_body(TABLE)
         assert "\n" not in str(caught.value)
 
 

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from ..diagnostics import lines
 from ..errors import CalibrationFailed, WeposeWarning
 from ..filters import BEST
+from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject
 from .lengths import MEASURED_STD, calibrate_lengths
@@ -45,6 +46,7 @@ def calibrate(
     *,
     measured: Mapping[str, float] | None = None,
     prior: Subject | None = None,
+    model: BodyModel | None = None,
     protocol: str | Protocol = "clasp",
     method: str = BEST,
     measured_std: float = MEASURED_STD,
@@ -70,6 +72,7 @@ def calibrate(
         recording,
         measured=measured,
         prior=prior,
+        model=model,
         protocol=protocol,
         method=method,
         measured_std=measured_std,

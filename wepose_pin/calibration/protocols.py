@@ -26,7 +26,7 @@ from ..documents import is_number, read_toml
 from ..errors import BadOption, one_of
 from ..model import BodyTable
 
-PROTOCOLS = ("clasp", "clasp_measured", "handle", "poses", "touch_left", "touch_right")
+PROTOCOLS = ("clasp", "clasp_measured", "handle", "poses", "table", "tip", "touch_left", "touch_right")
 KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3)}  # how many points each takes
 
 

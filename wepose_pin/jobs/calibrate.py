@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CalibrateJob:
-    """Calibrate arm lengths and sensor mounts from a recording with joined hands.
+    """Calibrate lengths and sensor mounts from a recording of a protocol, such as joined hands.
 
     Joined hands determine the proportions of the arms and not their scale. Measure one length, such as the shoulder
     width, and give it by --measured. Without one the scale is that of the population prior, and the output says how
@@ -34,8 +34,12 @@ class CalibrateJob:
         Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     protocol : NAME|FILE.toml
         Calibrate by this protocol: clasp (hands together), clasp_measured (the same with a measured length), handle
-        (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), poses (T-pose and bow:
+        (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), table (both palms on a
+        table), tip (of a robot's arm or another chain: its point "tip" on a fixed point), poses (T-pose and bow:
         determines headings and no lengths), or a file of your own, made like those in calibration/.
+    model : NAME|FILE
+        Calibrate this body: a name (upper_body, whole_body), a table of a body (.toml), or a URDF beside its table
+        (docs/models.md). Without it that which the session states, else upper_body.
     measured : NAME=METRES
         Use this measured length, such as shoulder_width=0.385; may be given several times. With --protocol handle also
         handle=0.42, the distance of the palms on the bar.
@@ -62,6 +66,7 @@ class CalibrateJob:
     session: Path
     out: Path
     protocol: str = "clasp"
+    model: str | None = None
     measured: Mapping[str, float] = field(default_factory=dict)
     stature: float | None = None
     sex: Literal["f", "m"] | None = None
@@ -74,9 +79,10 @@ class CalibrateJob:
     def check(self) -> None:
         """Raise `WeposeError` where the protocol is none, or a length is measured that it does not know."""
         from ..calibration import load_protocol
-        from ..model import load_table
+        from ..model import load_model, load_table
 
-        known = (*load_table().lengths, *load_protocol(self.protocol).distances)
+        lengths = load_table().lengths if self.model is None else load_model(self.model).table.lengths
+        known = (*lengths, *load_protocol(self.protocol).distances)
         for name, metres in self.measured.items():
             stated = f"{name}={metres:g}"
             if name == "handle" and name not in known:
@@ -123,19 +129,21 @@ def run_calibrate(
     protocol = load_protocol(job.protocol)
     with whole_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
-        prior = population_subject(job.stature, job.sex)
         recording = load_session(job.session, gaps=job.gaps)
+        model = load_model(job.model)
+        prior = population_subject(job.stature, job.sex, model)
         progress("calibrating", 1 / 3)
         calibration = calibrate_lengths(
             recording,
             measured=dict(job.measured),
             prior=prior,
+            model=model,
             protocol=protocol,
             method=job.method,
             formulation=job.formulation,
         )
         quality = assess(calibration)
-        write_subject(folder, calibration.subject, load_model(lengths=calibration.subject.lengths))
+        write_subject(folder, calibration.subject, calibration.body)
         if provenance is None:
             provenance = collect_provenance("calibrate", field_values(job))
         write_calibration(folder, calibration, quality, provenance)
