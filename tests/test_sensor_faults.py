@@ -248,6 +248,19 @@ def test_a_sensor_is_lost_from_where_an_axis_stops(method: str, made: Simulation
     assert off_by(read, made, method).max() < 6.0
 
 
+@pytest.mark.parametrize("signal", ["gyro", "accel"])
+def test_a_signal_that_stops_in_quiet_work_is_found_by_its_own_noise(signal: str, made: Simulation) -> None:
+    """While the person stands: neither motion nor gravity contradicts the constant value."""
+    quiet = stopped(made.recording(), signal, 2.0, 4.0).imus[BROKEN]
+    time = made.recording().time
+    [fault] = find_faults({BROKEN: scan_sensor(time, quiet.gyro_S, quiet.accel_S)})[BROKEN]
+    assert (fault.signals, round(fault.first, 2), round(fault.last, 2)) == (signal, 2.0, 4.0)
+    digit = {"gyro": np.deg2rad(0.5), "accel": 0.1}[signal]  # coarse: what stands still repeats its values
+    coarse = {f"{signal}_S": digit * np.round(getattr(quiet, f"{signal}_S") / digit)}
+    coarse = replace(made.recording().imus[BROKEN], **coarse)
+    assert BROKEN not in find_faults({BROKEN: scan_sensor(time, coarse.gyro_S, coarse.accel_S)})
+
+
 @pytest.mark.parametrize("bias_deg", [0.0, 4.9, 5.1])
 @pytest.mark.parametrize("moving", [False, True])
 def test_axes_of_a_coarse_sensor_stay_the_same(bias_deg: float, moving: bool) -> None:

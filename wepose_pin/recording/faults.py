@@ -5,7 +5,9 @@ a fault where it contradicts physics, or where the sensor is noisy whenever it d
 
 - constant specific force in the sensor while it rotates about a horizontal axis;
 - a constant rate while the specific force changes as in motion;
-- constant rate and force of a sensor with noise larger than its digits: two consecutive samples are never equal.
+- constant rate and force of a sensor with noise larger than its digits: two consecutive samples are never equal;
+- a constant rate, or a constant force, where the noise that this signal has elsewhere makes so many repetitions
+  improbable.
 
 A single axis may be constant during motion about another axis. It is a fault where
 
@@ -220,7 +222,20 @@ class SensorScan:
         The share of such steps gives a lower bound on the noise, and so an upper bound on repetitions.
         """
         first = 3 * (axis // 3)
-        others = [k for k in range(first, first + 3) if k != axis and self._noise_steps[k] > 0]
+        return self._bound_repeats([k for k in range(first, first + 3) if k != axis])
+
+    def repeats_of(self, name: str) -> float:
+        """Return a bound on the probability that all axes of gyro or accel repeat a row, from their own noise.
+
+        The rows are those of the faster signal: the other one repeats between its samples.
+        """
+        axes = range(6)[_SIGNALS[name]]
+        fresh = min(1.0, self._noise_steps[axes[0]] / max(float(self._noise_steps.max()), 1.0))
+        return float(np.prod([self._bound_repeats([k]) ** fresh for k in axes]))
+
+    def _bound_repeats(self, axes: list[int]) -> float:
+        """Return the bound on the probability that an axis with at least the noise of these repeats a sample."""
+        others = [k for k in axes if self._noise_steps[k] > 0]
         if not others:
             return 1.0
         wide = min((self._wide_steps[k] - 3.0 * np.sqrt(self._wide_steps[k])) / self._noise_steps[k] for k in others)
@@ -335,13 +350,16 @@ def find_faults(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
             if fine or run.tips > TIPS:
                 faults.append(_make_fault("gyro and accel", run))
         whole = [(fault.first, fault.last) for fault in faults]
+        improbable = {signal: -np.log(max(scan.repeats_of(signal), 1e-300)) for signal in ("gyro", "accel")}
         for run in scan.long_runs("gyro"):
             dead = scan.constant("gyro") and not scan.constant("accel") and noisy[name]
             dead &= any(not scans[other].constant("gyro") for other in others)
-            if (dead or np.max(run.high - run.low) > MOVES) and not _is_within(run, whole):
+            stuck = dead or np.max(run.high - run.low) > MOVES or run.rows * improbable["gyro"] > IMPROBABLE
+            if stuck and not _is_within(run, whole):
                 faults.append(_make_fault("gyro", run))
         for run in scan.long_runs("accel"):
-            if run.tipped > TIPPED and run.tips > TIPS and not _is_within(run, whole):
+            stuck = (run.tipped > TIPPED and run.tips > TIPS) or run.rows * improbable["accel"] > IMPROBABLE
+            if stuck and not _is_within(run, whole):
                 faults.append(_make_fault("accel", run))
         whole = [(fault.first, fault.last) for fault in faults]
         for axis, signals in enumerate(_AXES):
