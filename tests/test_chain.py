@@ -24,7 +24,7 @@ from wepose_pin.readers.describe import describe_file
 from wepose_pin.readers.trials import find_ur5, read_ur5
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.subject import Subject
-from wepose_pin.tracking import Tracker, TrackOptions, track
+from wepose_pin.tracking import Tracker, track
 from wepose_pin.validation.real import UNSCORED_S, UR5_EXCLUDED
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import read_result
@@ -360,7 +360,7 @@ wrist_1_joint = -1.5707963267948966
 """
 
 
-@pytest.fixture()
+@pytest.fixture
 def table(urdf: Path, tmp_path: Path) -> Path:
     """A table of the arm's own, and the URDF beside it."""
     (tmp_path / "arm.urdf").write_bytes(urdf.read_bytes())
@@ -454,7 +454,7 @@ def test_a_person_may_begin_in_another_pose(simulation_t_pose: Recording) -> Non
     assert np.degrees(begin["torso"].magnitude()) < 1.0
 
 
-@pytest.fixture()
+@pytest.fixture
 def simulation_t_pose() -> Recording:
     """A person of five sensors, put on squarely, in the T-pose."""
     n = 600

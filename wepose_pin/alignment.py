@@ -252,7 +252,10 @@ def align_sensors(
             calibrated_offset = subject.start_pose_offset.get(segment) if subject is not None else None
             if calibrated_offset is not None:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
-                misfit, misfit_cov = misfit - calibrated_offset.tilt, min(START_POSE_REPEATABILITY_STD, start_pose.std) ** 2 * np.eye(2)
+                misfit, misfit_cov = (
+                    misfit - calibrated_offset.tilt,
+                    min(START_POSE_REPEATABILITY_STD, start_pose.std) ** 2 * np.eye(2),
+                )
             if misfit @ np.linalg.solve(misfit_cov, misfit) > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
                 diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOUNT_MOVED_STDS, facts))

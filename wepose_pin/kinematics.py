@@ -236,15 +236,15 @@ class _MechanismIk:
         weights: Mapping[str, float] | None,
         start: np.ndarray,
     ) -> None:
-        self._segments, self._last = list(segments), start
+        self._segments, self._start, self._last = list(segments), start, start
         joints = [joint for joint in range(1, model.pin.njoints) if model.pin.nvs[joint]]  # a mimic joint has none
         self._fit = Fit(model.pin, self._segments, joints, weights or {}, limits)
 
     def run(
-        self, quat_WL: Mapping[str, np.ndarray], before: np.ndarray | None = None, *, warm_start: bool = True
+        self, quat_WL: Mapping[str, np.ndarray], before: np.ndarray | None = None, *, warm_start: bool = False
     ) -> np.ndarray:
         """`q` (n, nq); parameters as of `OrientationIk.run`."""
-        first = self._last if before is None else before
+        first = before if before is not None else self._last if warm_start else self._start
         q = self._fit.run({segment: quat_WL[segment] for segment in self._segments}, first[None])
         self._last = q[-1].copy()
         return q

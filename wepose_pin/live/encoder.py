@@ -13,6 +13,7 @@ from ..model import BodyModel
 from ..report.viewer import visible
 from .state import LivePose, StreamInfo
 
+
 class PoseEncoder:
     """Encodes poses for the page.
 
@@ -36,7 +37,7 @@ class PoseEncoder:
 
     def encode(self, pose: LivePose | None) -> bytes:
         """Little endian: time (float64, NaN before the start), of each link R_WL row by row and p_WL (12 float32),
-        the points whose paths are drawn (3 float32 each), of each link whether its sensor is lost (1 byte). NaN: not known.
+        points whose paths are drawn (3 float32 each), of each link whether its sensor is lost (1 byte). NaN: not known.
         """
         measured = self.measured
         if pose is None or measured is None or len(pose.quat_WL) != len(measured.segments):

@@ -22,7 +22,7 @@ from .anthropometry import compute_population_lengths
 from .chains import Chain, find_chains, find_parents
 from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
-from .table import DEFAULT_BODY, MECHANISM, BodyTable, Segment, find_table, load_table, parse_table, read_table
+from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, parse_table, read_table
 from .tree import AxisLimits, build, find_bounds, find_impossible_inertia, parse_tree
 from .visuals import Visual
 
@@ -232,7 +232,7 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: 
             )
     links = sorted(sensors, key=lambda name: len(tree.path(name)))
     segments = {name: Segment(name, rigid_without_sensor=True) for name in links}
-    body = _body(robot, BodyTable(robot.name, segments, kind=MECHANISM, where=str(file)), str(file))
+    body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(file)), str(file))
     if not body.pin.nv:
         raise BadModel(f"{file}: no joint moves; a chain of revolute or prismatic joints is needed")
     return body

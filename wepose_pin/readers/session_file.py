@@ -144,8 +144,8 @@ def find_model(path: Path, top: TomlTable) -> str:
     file = path.parent / name
     if not file.is_file() and (Path(name).suffix or len(Path(name).parts) > 1):
         raise MissingFile(
-            f"{top.at('model')}: no such file '{name}' beside {path.name}; a URDF, a TOML that names one, or the name of "
-            f"a body of the package is needed"
+            f"{top.at('model')}: no such file '{name}' beside {path.name}; a URDF, a TOML that names one, or the name "
+            f"of a body of the package is needed"
         )
     return str(file) if file.is_file() else name
 

@@ -148,7 +148,8 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
     data, sensors = content.get("data"), content.get("sensors")
     tables = [data, *(sensors.values() if isinstance(sensors, dict) else ())]
     names = [table.get("file") for table in tables if isinstance(table, dict)]
-    names += [_named_model(path, content.get("model")), content.get("urdf"), data.get("truth") if truth and isinstance(data, dict) else None]
+    names += [_named_model(path, content.get("model")), content.get("urdf")]
+    names += [data.get("truth") if truth and isinstance(data, dict) else None]
     return sorted({name for name in names if isinstance(name, str) and name})
 
 

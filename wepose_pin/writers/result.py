@@ -97,7 +97,7 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
 
 
 def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
-    """``subject.toml``, and ``subject.urdf``: the body with the subject's lengths; ``model.toml``: another body's table."""
+    """``subject.toml``, and ``subject.urdf``: the body with the subject's lengths; of another body ``model.toml``."""
     (folder / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
     head, _, body = model.urdf().partition("\n")
     text = "; ".join(

@@ -82,9 +82,7 @@ def _open_replay(spec: str, path: str, sensors: Sequence[str] | None, speed: flo
     return ReplaySource(recording, factor)
 
 
-def _open_lsl(
-    spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]
-) -> Source:
+def _open_lsl(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]) -> Source:
     from .lsl import SCOPES, LslSource
 
     name, separator, scope = rest.rpartition("@")
@@ -95,9 +93,7 @@ def _open_lsl(
     return LslSource(name, sensors, scope, wait_s, segments)
 
 
-def _open_udp(
-    spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]
-) -> Source:
+def _open_udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]) -> Source:
     from .udp import UdpSource
 
     host, port = parse_address(rest, f"source '{spec}':", 9000)
