@@ -3,7 +3,7 @@
 A filter observes the vertical and not the heading: its world V differs from W by a rotation about the vertical,
 R_WV = Rz(ψ). Alignment works in frames L' that equal W in the start pose: there the mount is R_L'S = R_WS =
 Rz(ψ) R_VS(start). Gravity gives its tilt; ψ is the angle that makes it nearest to the stated or calibrated mount. A
-calibrated mount is fused with the start pose, whose standard deviation is `StartPose.std`. A person's segment frames
+calibrated mount is fused with the start pose, whose standard deviation is `StartFrames.std`. A person's segment frames
 equal W in the N-pose; in another start pose R_LS = R_WL(start)ᵀ R_L'S.
 """
 
@@ -42,12 +42,12 @@ MOUNT_MOVED_STDS = 3.5
 
 
 @dataclass(frozen=True)
-class StartPose:
-    """The pose in which a recording begins.
+class StartFrames:
+    """The segment frames in the start pose.
 
     Parameters
     ----------
-    R_WL : segment → its orientation then; a segment that is not named has the frame of W
+    R_WL : segment → its orientation; a segment that is not named has the frame of W
     table : of the body
     """
 
@@ -73,11 +73,11 @@ class StartPose:
         return self.R_WL[segment].inv() * R_WS if segment in self.R_WL else R_WS
 
 
-N_POSE = StartPose()
+N_POSE = StartFrames()
 
 
-def find_start_pose(body: BodyModel, recording: Recording) -> StartPose:
-    """Find the pose in which a recording of a body begins.
+def find_start_frames(body: BodyModel, recording: Recording) -> StartFrames:
+    """Find the segment frames of a body in the start pose of its recording.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def find_start_pose(body: BodyModel, recording: Recording) -> StartPose:
     if table.is_mechanism or recording.start_pose != NEUTRAL_POSE:
         R_WK = orient_links(body, q)
         R_WL = {segment: Rotation.from_matrix(R_WK[segment]) for segment in recording.sensors}
-    return StartPose(R_WL, table)
+    return StartFrames(R_WL, table)
 
 
 @dataclass(frozen=True)
@@ -143,13 +143,13 @@ class SensorAlignment:
     diagnostics: tuple[Diagnostic, ...]
 
 
-def check_mounts(recording: Recording, subject: Subject | None, start_pose: StartPose = N_POSE) -> None:
+def check_mounts(recording: Recording, subject: Subject | None, start_frames: StartFrames = N_POSE) -> None:
     """Raise `BadSession` where neither the subject nor the session has the mount of a sensor."""
-    collect_nominal_mounts(recording, subject, start_pose)
+    collect_nominal_mounts(recording, subject, start_frames)
 
 
 def collect_nominal_mounts(
-    recording: Recording, subject: Subject | None, start_pose: StartPose = N_POSE
+    recording: Recording, subject: Subject | None, start_frames: StartFrames = N_POSE
 ) -> dict[str, np.ndarray]:
     """Collect segment → nominal mount `quat_LS` (4,) xyzw of every sensor.
 
@@ -158,7 +158,7 @@ def collect_nominal_mounts(
     BadSession
         Neither the subject nor the session has the mount of a sensor.
     """
-    nominal = {segment: find_nominal_mount(recording, segment, subject, start_pose) for segment in recording.sensors}
+    nominal = {segment: find_nominal_mount(recording, segment, subject, start_frames) for segment in recording.sensors}
     mounts = {segment: mount for segment, mount in nominal.items() if mount is not None}
     missing = [segment for segment in nominal if segment not in mounts]
     if missing:
@@ -169,7 +169,7 @@ def collect_nominal_mounts(
             problem += " (remounted = true: the subject's are of another mounting)"
         elif subject is not None and subject.mounts:
             problem += f"; the subject '{subject.name}' has none for it"
-        raise BadSession(f"{recording.where()}: {problem}: {suggest_mounts(missing, start_pose.table)}")
+        raise BadSession(f"{recording.where()}: {problem}: {suggest_mounts(missing, start_frames.table)}")
     return mounts
 
 
@@ -188,14 +188,14 @@ def suggest_mounts(segments: Sequence[str], table: BodyTable) -> str:
 
 
 def align_sensors(
-    recording: Recording, subject: Subject | None, filtered: FilteredRecording, start_pose: StartPose = N_POSE
+    recording: Recording, subject: Subject | None, filtered: FilteredRecording, start_frames: StartFrames = N_POSE
 ) -> SensorAlignment:
     """Compute mounts and heading offsets.
 
     Parameters
     ----------
     recording : that of `filtered`, or its chunk that contains the start pose
-    start_pose : `find_start_pose` of the body; left out: the N-pose
+    start_frames : `find_start_frames` of the body; left out: the N-pose
 
     Raises
     ------
@@ -205,19 +205,19 @@ def align_sensors(
     start, diagnostics = filtered.start, list(filtered.diagnostics)
     start_guessed = recording.start_is_guessed or not recording.phases.get("start")
     facts = {"variant": "guessed"} if start_guessed else {}
-    nominal_mounts = collect_nominal_mounts(recording, subject, start_pose)
+    nominal_mounts = collect_nominal_mounts(recording, subject, start_frames)
     mounts, heading_offsets = {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
         # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
         first = aligned[0]
-        R_WS_start = start_pose.to_world(first, Rotation.identity())
+        R_WS_start = start_frames.to_world(first, Rotation.identity())
         aligned_heading_offset = compute_heading_offset(filtered.R_VS_start[first], R_WS_start)
     for segment, R_VS_start in filtered.R_VS_start.items():
         if recording.sensors[segment].aligned:
             mounts[segment], heading_offsets[segment] = Rotation.identity(), aligned_heading_offset
             continue
-        R_nominal = start_pose.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
+        R_nominal = start_frames.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
         psi = compute_heading_offset(R_VS_start, R_nominal)
         R_LS = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS_start
         tilt_error_deg = np.degrees((R_LS * R_nominal.inv()).magnitude())
@@ -241,25 +241,23 @@ def align_sensors(
         if tilt_error_deg > MOUNT_WARNING_DEG:
             value, limit = float(np.deg2rad(tilt_error_deg)), float(np.deg2rad(MOUNT_WARNING_DEG))
             diagnostics.append(Diagnostic("mount-contradicts-gravity", WARNING, segment, value, limit, facts))
-        mount_cov = _find_start_mount_covariance(recording, segment, subject, start_pose)
+        mount_cov = _find_start_mount_covariance(recording, segment, subject, start_frames)
         if mount_cov is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
             misfit = (R_LS * R_nominal.inv()).as_rotvec()[:2]
-            misfit_cov = mount_cov[:2, :2] + start_pose.std**2 * np.eye(2)
+            misfit_cov = mount_cov[:2, :2] + start_frames.std**2 * np.eye(2)
             R_LS = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_nominal
             psi = compute_heading_offset(R_VS_start, R_LS)
             calibrated_offset = subject.start_pose_offset.get(segment) if subject is not None else None
             if calibrated_offset is not None:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
-                misfit, misfit_cov = (
-                    misfit - calibrated_offset.tilt,
-                    min(START_POSE_REPEATABILITY_STD, start_pose.std) ** 2 * np.eye(2),
-                )
+                misfit = misfit - calibrated_offset.tilt
+                misfit_cov = min(START_POSE_REPEATABILITY_STD, start_frames.std) ** 2 * np.eye(2)
             if misfit @ np.linalg.solve(misfit_cov, misfit) > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
                 diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOUNT_MOVED_STDS, facts))
-        mounts[segment], heading_offsets[segment] = start_pose.to_segment(segment, R_LS), psi
+        mounts[segment], heading_offsets[segment] = start_frames.to_segment(segment, R_LS), psi
     R_WV = {segment: Rotation.from_rotvec([0.0, 0.0, psi]) for segment, psi in heading_offsets.items()}
     return SensorAlignment(mounts, R_WV, heading_offsets, start, filtered.static_phase, tuple(diagnostics))
 
@@ -269,7 +267,7 @@ def orient_segments(
     alignment: SensorAlignment,
     orientation: Mapping[str, Orientation],
     subject: Subject | None,
-    start_pose: StartPose = N_POSE,
+    start_frames: StartFrames = N_POSE,
 ) -> SegmentOrientations:
     """Return the segment orientations of a recording or a chunk of it, from the results of its sensors' filters."""
     quat_WL, covariance_W = {}, {}
@@ -282,7 +280,7 @@ def orient_segments(
         filtered = orientation.get(segment)
         if filtered is not None and filtered.attitude_cov is not None:
             covariance_W[segment] = compute_segment_covariance(
-                chunk, segment, subject, R_WS, R_LS, filtered.attitude_cov, start_pose
+                chunk, segment, subject, R_WS, R_LS, filtered.attitude_cov, start_frames
             )
     return SegmentOrientations(
         chunk.time,
@@ -303,7 +301,7 @@ def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:
 
 
 def find_nominal_mount(
-    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose = N_POSE
+    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames = N_POSE
 ) -> np.ndarray | None:
     """Find the mount `quat_LS` (4,) xyzw: calibrated, else stated, else that of a measured segment; None: unknown.
 
@@ -314,9 +312,9 @@ def find_nominal_mount(
     stated = recording.sensors[segment].stated_quat_LS
     if stated is None and segment not in recording.imus:
         return np.array([0.0, 0.0, 0.0, 1.0])  # a device's own orientations of segments
-    if stated is None or segment not in start_pose.R_WL:
+    if stated is None or segment not in start_frames.R_WL:
         return stated
-    return start_pose.to_segment(segment, Rotation.from_quat(stated)).as_quat()
+    return start_frames.to_segment(segment, Rotation.from_quat(stated)).as_quat()
 
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
@@ -332,7 +330,7 @@ def compute_segment_covariance(
     R_WS: Rotation,
     R_LS: Rotation,
     attitude_cov: np.ndarray,
-    start_pose: StartPose = N_POSE,
+    start_frames: StartFrames = N_POSE,
 ) -> np.ndarray:
     """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
 
@@ -342,29 +340,29 @@ def compute_segment_covariance(
     cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
     # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
-    mount_cov = _find_start_mount_covariance(recording, segment, subject, start_pose)
+    mount_cov = _find_start_mount_covariance(recording, segment, subject, start_frames)
     if mount_cov is not None:
         # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount,
         # takes off the vertical component ε_z, so that in the start pose the heading has no error.
-        R_WL = (R_WS * start_pose.to_world(segment, R_LS).inv()).as_matrix()
+        R_WL = (R_WS * start_frames.to_world(segment, R_LS).inv()).as_matrix()
         error_jacobian = R_WL - np.array([0.0, 0.0, 1.0])[:, None] * np.array([0.0, 0.0, 1.0])
         tilt = mount_cov[:2]
         # What is left after the start pose has corrected the tilt, as in `align_sensors`.
-        remaining_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + start_pose.std**2 * np.eye(2), tilt)
+        remaining_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + start_frames.std**2 * np.eye(2), tilt)
         cov_W += error_jacobian @ remaining_cov @ error_jacobian.swapaxes(1, 2)
-        cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_pose)
+        cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_frames)
     return cov_W
 
 
 def compute_start_heading_var(
-    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose = N_POSE
+    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames = N_POSE
 ) -> float:
     """Compute the variance [rad²] of a segment's heading offset by the inexact start pose.
 
     Zero for the segment whose heading defines x, and for a stated mount, which is stated relative to the start pose.
     """
     calibrated = find_mount_covariance(recording, segment, subject) is not None
-    return start_pose.std**2 if calibrated and segment != start_pose.table.reference else 0.0
+    return start_frames.std**2 if calibrated and segment != start_frames.table.reference else 0.0
 
 
 def find_mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
@@ -373,11 +371,11 @@ def find_mount_covariance(recording: Recording, segment: str, subject: Subject |
 
 
 def _find_start_mount_covariance(
-    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose
+    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames
 ) -> np.ndarray | None:
     """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L'; None: as `find_mount_covariance`."""
     cov = find_mount_covariance(recording, segment, subject)
-    if cov is None or segment not in start_pose.R_WL:
+    if cov is None or segment not in start_frames.R_WL:
         return cov
-    R = start_pose.R_WL[segment].as_matrix()
+    R = start_frames.R_WL[segment].as_matrix()
     return R @ cov @ R.T

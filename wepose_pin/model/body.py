@@ -219,7 +219,7 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: 
         A sensor whose name is no link of a URDF without a table; `where` begins the text.
     """
     file = _find_body(path)
-    if file.suffix.lower() == ".toml":
+    if path is None or file.suffix.lower() == ".toml":
         return load_model(path)
     robot = read_urdf(file)
     tree, people = parse_tree(robot, str(file)), load_table().segments

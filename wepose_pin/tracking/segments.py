@@ -6,7 +6,7 @@ from ..alignment import (
     N_POSE,
     SegmentOrientations,
     SensorAlignment,
-    StartPose,
+    StartFrames,
     align_sensors,
     check_mounts,
     orient_segments,
@@ -29,18 +29,18 @@ class SegmentEstimator:
     Parameters
     ----------
     subject : its calibrated mounts go before those that the session states; None for the stated ones
-    start_pose : of the body; left out: the N-pose
+    start_frames : of the body; left out: the N-pose
     """
 
     def __init__(
         self,
         subject: Subject | None = None,
         *,
-        start_pose: StartPose = N_POSE,
+        start_frames: StartFrames = N_POSE,
         method: str = BEST,
         static_test: StaticTest | None = None,
     ) -> None:
-        self._subject, self._start_pose, self._method, self._static_test = subject, start_pose, method, static_test
+        self._subject, self._start_frames, self._method, self._static_test = subject, start_frames, method, static_test
         self._filters: SensorFilters | None = None
         self._alignment: SensorAlignment | None = None
 
@@ -53,9 +53,9 @@ class SegmentEstimator:
             No mount is known for a sensor, or gravity contradicts it; a start phase with too few samples.
         """
         if self._filters is None:
-            check_mounts(chunk, self._subject, self._start_pose)
+            check_mounts(chunk, self._subject, self._start_frames)
             self._filters = SensorFilters(
-                chunk, method=self._method, static_test=self._static_test, sways=self._start_pose.sways
+                chunk, method=self._method, static_test=self._static_test, sways=self._start_frames.sways
             )
         filtered = self._filters.push(chunk)
         return [] if filtered is None else [self._orient(self._filters, *filtered)]
@@ -69,8 +69,8 @@ class SegmentEstimator:
     def _orient(self, filters: SensorFilters, chunk: Recording, orientation: dict[str, Orientation]) -> Oriented:
         if self._alignment is None:
             filtered = combine_chunk(filters, chunk, orientation)
-            self._alignment = align_sensors(chunk, self._subject, filtered, self._start_pose)
-        return chunk, orient_segments(chunk, self._alignment, orientation, self._subject, self._start_pose)
+            self._alignment = align_sensors(chunk, self._subject, filtered, self._start_frames)
+        return chunk, orient_segments(chunk, self._alignment, orientation, self._subject, self._start_frames)
 
 
 def estimate_segments(

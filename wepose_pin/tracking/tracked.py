@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..alignment import SegmentOrientations, StartPose, find_start_pose
+from ..alignment import SegmentOrientations, StartFrames, find_start_frames
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json
 from ..errors import BadData, BadSession
 from ..kinematics import Pose, compute_orientation_residuals
@@ -258,13 +258,13 @@ class TrackedBody:
     ----------
     subject : lengths and mounts as used
     model : the body with those lengths
-    start_pose : in which it begins
+    start_frames : its segment frames in the start pose
     start : (nq,) its configuration then
     """
 
     subject: Subject
     model: BodyModel
-    start_pose: StartPose
+    start_frames: StartFrames
     start: np.ndarray
 
 
@@ -282,11 +282,11 @@ def make_body(subject: Subject | None, model: BodyModel | str | Path | None, rec
     chosen = model or recording.model or None
     body = chosen if isinstance(chosen, BodyModel) else load_sensed_model(chosen, recording.sensors, where)
     body.table.check_segments(recording.sensors, f"{where}: sensors.", BadSession)
-    start_pose = find_start_pose(body, recording)
+    start_frames = find_start_frames(body, recording)
     person = subject or population_subject(body=body)
     person.check_body(body.table)
     if subject is None and chosen is not None:  # a chosen model has its person's lengths
         person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
     body = body.with_lengths({name: person.lengths[name] for name in body.table.lengths})
     start = compute_start_configuration(body, recording.start_pose, recording.joints, where)
-    return TrackedBody(person, body, start_pose, start)
+    return TrackedBody(person, body, start_frames, start)

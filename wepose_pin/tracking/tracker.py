@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from ..alignment import StartPose
+from ..alignment import StartFrames
 from ..errors import BadOption, BadPhase
 from ..kinematics import KinematicsSolver, compute_point_covariances
 from ..model import BodyModel
@@ -82,7 +82,7 @@ class Tracker:
         """
         if self._estimator is None:
             self._body = make_body(self._subject, self._model, chunk)
-            self._estimator = _estimator(self._subject, self._body.start_pose, self.options)
+            self._estimator = _estimator(self._subject, self._body.start_frames, self.options)
         if self.options.open_loop and chunk.resets:
             chunk = replace(chunk, resets=())
         return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented)]
@@ -166,7 +166,7 @@ def _estimate(
     for chunk in chunks:
         if body is None or estimator is None:
             body = make_body(subject, model, chunk)
-            estimator = _estimator(subject, body.start_pose, options)
+            estimator = _estimator(subject, body.start_frames, options)
         for oriented in estimator.push(chunk):
             yield oriented, body.model
     if body is not None and estimator is not None:
@@ -221,7 +221,7 @@ def track_chunks(
 
 
 def _estimator(
-    subject: Subject | None, start_pose: StartPose, options: TrackOptions
+    subject: Subject | None, start_frames: StartFrames, options: TrackOptions
 ) -> SegmentEstimator | CausalEstimator:
     kind = CausalEstimator if options.causal else SegmentEstimator
-    return kind(subject, start_pose=start_pose, method=options.method, static_test=options.static_test)
+    return kind(subject, start_frames=start_frames, method=options.method, static_test=options.static_test)
