@@ -1,4 +1,4 @@
-"""Any chain: a made-up arm whose truth is known, and a UR5 beside its encoders."""
+"""Mechanisms: a made-up arm whose truth is known, and a UR5 beside its encoders."""
 
 from __future__ import annotations
 
@@ -13,15 +13,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
-from wepose_pin.errors import BadModel, BadOption, BadSession, WeposeError
-from wepose_pin.model.robot import joint_values, load_robot, start_configuration
+from wepose_pin.errors import BadModel, BadSession, WeposeError
+from wepose_pin.kinematics import LiveKinematics
+from wepose_pin.model import BodyModel, load_model
+from wepose_pin.model.body import load_sensed_model
+from wepose_pin.model.configurations import joint_values
+from wepose_pin.model.start_pose import compute_start_configuration
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.readers.trials import find_ur5, read_ur5
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
-from wepose_pin.tracking import track, track_chain
+from wepose_pin.subject import Subject
+from wepose_pin.tracking import Tracker, track
 from wepose_pin.validation.real import UNSCORED_S, UR5_EXCLUDED
 from wepose_pin.writers import write_session
+from wepose_pin.writers.result import read_result
 
 RATE = 100.0
 # The axes of a UR5's joints while all are at zero, the arm stretched out along x.
@@ -65,13 +71,20 @@ def turned(model: pin.Model, q: np.ndarray, link: str) -> Rotation:
     return Rotation.from_matrix(rows)
 
 
-def made(model: pin.Model, links: list[str], seconds: float = 30.0) -> tuple[Recording, np.ndarray]:
+def load(urdf: Path) -> BodyModel:
+    """The arm with all of its links as segments."""
+    return load_sensed_model(urdf, [link for link, *_ in UR5.values()], "test")
+
+
+def made(urdf: Path, links: list[str], seconds: float = 30.0) -> tuple[Recording, np.ndarray]:
     """A recording of noiseless sensors, put on squarely, and the configurations (n, nq) behind it.
 
     They measure no acceleration but gravity.
     """
+    body = load(urdf)
+    model = body.pin
     t = np.arange(0.0, seconds, 1.0 / RATE)
-    start = start_configuration(model, HOME, "made")
+    start = compute_start_configuration(body, CONFIGURATION, HOME, "made")
     rise = np.clip((t - 4.0) / 2.0, 0.0, 1.0)[:, None] ** 2
     rng = np.random.default_rng(0)
     q = start + rise * 0.5 * (np.sin(np.outer(t, rng.uniform(0.3, 1.0, model.nq)) + rng.uniform(0.0, 6.0, model.nq)))
@@ -92,46 +105,45 @@ def rms_deg(angle: np.ndarray) -> float:
 
 
 def test_sensors_on_all_links_give_all_joints(urdf: Path) -> None:
-    model = load_robot(urdf)
-    recording, q = made(model, ["upper_arm_link", "forearm_link", "wrist_1_link", "wrist_3_link"])
-    chain = track_chain(recording, model)
-    assert chain.open == ()
-    assert list(chain.joints) == list(UR5)
-    for k, value in enumerate(chain.joints.values()):
+    recording, q = made(urdf, ["upper_arm_link", "forearm_link", "wrist_1_link", "wrist_3_link"])
+    tracked = track(recording, model=urdf)
+    assert tracked.find_undetermined_joints() == []
+    assert list(tracked.joints) == list(UR5)
+    for k, value in enumerate(tracked.joints.values()):
         assert np.abs(value - q[:, k]).max() < np.deg2rad(1.0)
-    assert max(rms_deg(angle) for angle in chain.residual.values()) < 0.5
+    residual = tracked.orientation_residual()
+    assert set(residual) == set(recording.sensors)
+    assert max(rms_deg(angle) for angle in residual.values()) < 0.5
 
 
 def test_a_link_may_have_the_name_of_its_fixed_joint(urdf: Path, tmp_path: Path) -> None:
     joint = '<joint name="tool" type="fixed"><parent link="wrist_1_link"/><child link="tool"/></joint>'
     text = urdf.read_text(encoding="utf-8").replace("</robot>", f'<link name="tool"/>{joint}</robot>')
     (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
-    model = load_robot(tmp_path / "arm.urdf")
-    recording, _ = made(model, ["forearm_link", "tool"], 8.0)
-    chain = track_chain(recording, model)
-    assert max(rms_deg(angle) for angle in chain.residual.values()) < 0.5
-    assert set(chain.orientations()) == {"forearm_link", "tool"}
+    recording, _ = made(tmp_path / "arm.urdf", ["forearm_link", "tool"], 8.0)
+    tracked = track(recording, model=tmp_path / "arm.urdf")
+    assert max(rms_deg(angle) for angle in tracked.orientation_residual().values()) < 0.5
+    assert set(tracked.quat_WL) == {"forearm_link", "tool"}
 
 
 def test_what_the_links_leave_open_is_named_and_the_rest_is_right(urdf: Path) -> None:
-    model = load_robot(urdf)
-    recording, q = made(model, ["forearm_link"])
-    chain = track_chain(recording, model)
-    assert set(chain.open) == {"shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"}
-    joints = chain.joints
+    recording, q = made(urdf, ["forearm_link"])
+    tracked = track(recording, model=urdf)
+    undetermined = {"shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"}
+    assert set(tracked.find_undetermined_joints()) == undetermined
+    joints = tracked.joints
     np.testing.assert_allclose(joints["shoulder_pan_joint"], q[:, 0], atol=np.deg2rad(1.0))
     both = joints["shoulder_lift_joint"] + joints["elbow_joint"]
     np.testing.assert_allclose(both, q[:, 1] + q[:, 2], atol=np.deg2rad(1.0))
-    (undetermined,) = [d for d in chain.summary()["diagnostics"] if d["code"] == "joints-undetermined"]
-    assert undetermined["facts"]["joints"].startswith("shoulder_lift_joint, elbow_joint")
+    (told,) = [d for d in tracked.summary()["diagnostics"] if d["code"] == "joints-undetermined"]
+    assert told["facts"]["joints"].startswith("shoulder_lift_joint, elbow_joint")
 
 
 def test_the_pose_is_that_of_the_start_configuration_at_the_start(urdf: Path) -> None:
-    model = load_robot(urdf)
-    recording, q = made(model, ["forearm_link", "wrist_1_link"], 8.0)
-    chain = track_chain(recording, model)
-    for link, quat in chain.orientations().items():
-        off = (turned(model, q[:1], link)[0].inv() * Rotation.from_quat(quat[:350])).magnitude()
+    recording, q = made(urdf, ["forearm_link", "wrist_1_link"], 8.0)
+    tracked = track(recording, model=urdf)
+    for link, quat in tracked.quat_WL.items():
+        off = (turned(load(urdf).pin, q[:1], link)[0].inv() * Rotation.from_quat(quat[:350])).magnitude()
         assert np.degrees(off.max()) < 0.1
 
 
@@ -169,16 +181,14 @@ def ur5_session(data: Path, run: str, folder: Path) -> dict[str, Rotation]:
 @pytest.mark.parametrize("method", ["smekf", "amekf"])
 def test_a_ur5_beside_its_encoders(data: Path, urdf: Path, tmp_path: Path, method: str) -> None:
     """Nothing is fitted to the encoders: neither clock nor frames nor heading. Printed with -s."""
-    model = load_robot(urdf)
     errors: dict[str, list[float]] = {"sensor alone": [], "chain": []}
     for run in RUNS:
         truth = ur5_session(data, run, tmp_path)
         recording = load_session(tmp_path)
-        chain = track_chain(recording, model, method=method)
+        tracked = track(recording, method=method, model=urdf)
         scored = recording.time - recording.time[0] > UNSCORED_S
-        fitted = chain.orientations()
         for link, true in truth.items():
-            for name, quat in (("sensor alone", chain.quat_WL[link]), ("chain", fitted[link])):
+            for name, quat in (("sensor alone", tracked.segments.quat_WL[link]), ("chain", tracked.quat_WL[link])):
                 errors[name].append(rms_deg((Rotation.from_quat(quat) * true.inv()).magnitude()[scored]))
             print(f"\n{method} {run} {link}: " + ", ".join(f"{k} {v[-1]:.2f} deg" for k, v in errors.items()), end="")
     alone, fitted_ = (float(np.mean(each)) for each in errors.values())
@@ -197,36 +207,48 @@ def test_the_command_writes_joints_orientations_and_torques(
     assert end.value.code == 0
     assert {file.name for file in out.iterdir()} == {
         "joints.parquet",
+        "model.toml",
         "pose.parquet",
-        "torques.parquet",
+        "report.html",
+        "subject.toml",
+        "subject.urdf",
         "summary.json",
-        "provenance.json",
+        "torques.parquet",
+        "view.html",
     }
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert summary["torques"]["mass_kg"] == 6.0
-    assert "elbow_joint" in summary["joints_left_open"]
+    assert "elbow_joint" in summary["undetermined_joints"]
     joints, pose = pl.read_parquet(out / "joints.parquet"), pl.read_parquet(out / "pose.parquet")
     assert joints.columns == ["time", *UR5]
-    assert {"forearm_link_qw", "wrist_1_link_measured_qx", "wrist_1_link_std"} <= set(pose.columns)
+    assert {"forearm_link_qw", "wrist_1_link_qx", "wrist_1_link_std"} <= set(pose.columns)
     assert len(joints) == len(pose) == len(pl.read_parquet(out / "torques.parquet"))
 
-    for words in (["export", str(out), "-o", str(tmp_path / "x.trc")], ["view", str(out), "--no-open"]):
-        with pytest.raises(SystemExit) as end:
-            main(words)
-        assert end.value.code == 2
-        assert "of a chain, its motion is in joints.parquet; a person's result" in capsys.readouterr().err
-    said = describe_file(out)
-    assert "of a chain, sensors on: wrist_1_link, forearm_link" in said.facts
-    assert not any("wepose view" in fact for fact in said.facts)
+    capsys.readouterr()
+    read, model, _ = read_result(out)
+    assert model.table.is_mechanism
+    assert list(model.table.segments) == ["forearm_link", "wrist_1_link"]
+    np.testing.assert_array_equal(read.joints["elbow_joint"], joints["elbow_joint"].to_numpy())
+    assert model.pin.nq == 6
+    facts = describe_file(out).facts
+    assert "sensors: wrist_1_link, forearm_link" in facts
+    assert any(fact.startswith("joints: shoulder_pan_joint") for fact in facts)
+
+    shorter = tmp_path / "shorter"
+    with pytest.raises(SystemExit) as end:
+        main(["track", str(tmp_path), "--model", str(urdf), "--chunk-seconds", "20", "--no-report", "-o", str(shorter)])
+    assert end.value.code == 0
+    assert pl.read_parquet(shorter / "joints.parquet").equals(joints)
 
 
 def test_a_session_that_is_written_gives_the_recording_back(urdf: Path, tmp_path: Path) -> None:
-    recording, _ = made(load_robot(urdf), ["forearm_link", "wrist_1_link"], 6.0)
+    recording, _ = made(urdf, ["forearm_link", "wrist_1_link"], 6.0)
     odd = {"forearm.link": recording.sensors["forearm_link"], "wrist 1": recording.sensors["wrist_1_link"]}
-    recording = replace(recording, sensors=odd, joints={**HOME, "elbow/1": 0.1}, remounted=True)
+    recording = replace(recording, sensors=odd, joints={**HOME, "elbow/1": 0.1}, remounted=True, model=str(urdf))
     write_session(tmp_path, recording)
     again = load_session(tmp_path)
     assert (again.start_pose, again.joints, again.remounted) == (CONFIGURATION, recording.joints, True)
+    assert Path(again.model) == urdf
     assert list(again.sensors) == list(odd)
     for link, sensor in odd.items():
         np.testing.assert_array_equal(again.sensors[link].gyro_S, sensor.gyro_S)
@@ -268,11 +290,10 @@ def test_what_a_session_of_a_chain_may_not_say(
     pl.DataFrame(table, schema=["gx", "gy", "gz", "ax", "ay", "az"], orient="row").write_csv(tmp_path / "arm.csv")
     file = tmp_path / "session.toml"
     file.write_text(SESSION, encoding="utf-8")
-    model = load_robot(urdf)
-    assert track_chain(load_session(file), model).summary()["start"] == {"elbow_joint": 0.5}
+    assert track(load_session(file), model=urdf).summary()["start_joints"] == {"elbow_joint": 0.5}
     file.write_text(SESSION.replace(old, new), encoding="utf-8")
     with pytest.raises(error, match=text):
-        track_chain(load_session(file), model)
+        track(load_session(file), model=urdf)
 
 
 def test_joints_stand_only_beside_a_configuration(tmp_path: Path) -> None:
@@ -282,22 +303,23 @@ def test_joints_stand_only_beside_a_configuration(tmp_path: Path) -> None:
         load_session(file)
 
 
-def test_a_chain_and_a_person_are_not_mixed_up(urdf: Path) -> None:
-    model = load_robot(urdf)
-    recording, _ = made(model, ["forearm_link"], 6.0)
-    with pytest.raises(BadOption, match="give its URDF"):
+def test_a_mechanism_and_a_person_are_not_mixed_up(urdf: Path) -> None:
+    recording, _ = made(urdf, ["forearm_link"], 6.0)
+    with pytest.raises(BadSession, match=r"sensors\.forearm_link is no segment of upper_body"):
         track(recording)
-    with pytest.raises(BadOption, match='"configuration" is needed'):
-        track_chain(Recording("p", recording.time, RATE, recording.sensors), model)
-    with pytest.raises(BadOption, match="is a person's"):
-        track_chain(Recording("p", recording.time, RATE, {"torso": recording.sensors["forearm_link"]}), model)
+    with pytest.raises(BadSession, match="start_pose = 'n_pose' is not known; there is: configuration"):
+        track(replace(recording, start_pose="n_pose", joints={}), model=urdf)
+    with pytest.raises(BadModel, match="no link 'torso'"):
+        track(replace(recording, sensors={"torso": recording.sensors["forearm_link"]}), model=urdf)
+    with pytest.raises(BadModel, match="no body 'ur6' comes with the package"):
+        track(recording, model="ur6")
 
 
 def test_a_urdf_in_which_nothing_moves(tmp_path: Path) -> None:
     file = tmp_path / "stone.urdf"
     file.write_text('<robot name="stone"><link name="base"/></robot>', encoding="utf-8")
     with pytest.raises(BadModel, match="no joint moves"):
-        load_robot(file)
+        load_sensed_model(file, ["base"], "test")
 
 
 def test_values_of_a_joint_without_end_go_on(tmp_path: Path) -> None:
@@ -307,7 +329,143 @@ def test_values_of_a_joint_without_end_go_on(tmp_path: Path) -> None:
         '<parent link="base"/><child link="rim"/><axis xyz="0 0 1"/></joint></robot>',
         encoding="utf-8",
     )
-    model = load_robot(file)
+    body = load_sensed_model(file, ["rim"], "test")
     angle = np.linspace(0.0, 9.0, 200)
-    np.testing.assert_allclose(joint_values(model, np.column_stack([np.cos(angle), np.sin(angle)]))["axle"], angle)
-    np.testing.assert_allclose(start_configuration(model, {"axle": 0.3}, "x"), [np.cos(0.3), np.sin(0.3)])
+    q = np.column_stack([np.cos(angle), np.sin(angle)])
+    np.testing.assert_allclose(joint_values(body.pin, q)["axle"], angle)
+    first = joint_values(body.pin, q[:150])
+    again = joint_values(body.pin, q[150:], {"axle": float(first["axle"][-1])})
+    np.testing.assert_allclose(again["axle"], angle[150:])
+    start = compute_start_configuration(body, CONFIGURATION, {"axle": 0.3}, "x")
+    np.testing.assert_allclose(start, [np.cos(0.3), np.sin(0.3)])
+
+
+LINKS_WITH_SENSORS = ["upper_arm_link", "forearm_link", "wrist_1_link", "wrist_3_link"]
+TABLE = """urdf = "arm.urdf"
+kind = "mechanism"
+[segments]
+upper = "upper_arm_link"
+fore = "forearm_link"
+wrist = "wrist_1_link"
+tool = "wrist_3_link"
+[points]
+elbow = "forearm_link"
+wrist = "wrist_1_link"
+tip = { link = "wrist_3_link", at = [0.0, 0.0, -0.1] }
+[lengths]
+upper = { segment = "upper", from = "elbow", to = "wrist" }
+[poses.home]
+shoulder_lift_joint = -1.5707963267948966
+wrist_1_joint = -1.5707963267948966
+"""
+
+
+@pytest.fixture
+def table(urdf: Path, tmp_path: Path) -> Path:
+    """A table of the arm's own, and the URDF beside it."""
+    (tmp_path / "arm.urdf").write_bytes(urdf.read_bytes())
+    text = TABLE.replace('{ segment = "upper", from = "elbow"', '{ segment = "fore", from = "elbow"')
+    (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
+    return tmp_path / "arm.toml"
+
+
+def as_segments(recording: Recording) -> Recording:
+    """The recording with the table's names, from its named pose."""
+    names = dict(zip(LINKS_WITH_SENSORS, ("upper", "fore", "wrist", "tool"), strict=True))
+    sensors = {names[link]: sensor for link, sensor in recording.sensors.items()}
+    return replace(recording, sensors=sensors, start_pose="home", joints={})
+
+
+def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Path) -> None:
+    recording, q = made(urdf, LINKS_WITH_SENSORS, 12.0)
+    tracked = track(replace(as_segments(recording), model=str(table)))
+    bare = track(recording, model=urdf)
+    for name, values in bare.joints.items():
+        np.testing.assert_allclose(tracked.joints[name], values, atol=1e-9)
+    model, body = load_model(table), load(urdf).pin
+    assert set(tracked.points) == {"elbow", "wrist", "tip"}
+    data = body.createData()
+    for k in (0, 600, 1100):
+        pin.framesForwardKinematics(body, data, q[k])
+        M = data.oMf[body.getFrameId("wrist_3_link")]
+        np.testing.assert_allclose(tracked.points["tip"][k], M.act(np.array([0.0, 0.0, -0.1])), atol=0.01)
+    assert tracked.subject.lengths == pytest.approx(dict(model.lengths))
+    longer = Subject("long", {"upper": 0.5}, ("upper",), np.array([[1e-4]]))
+    again = track(replace(as_segments(recording), model=str(table)), longer)
+    assert again.model.lengths["upper"] == pytest.approx(0.5)
+    reach = np.linalg.norm(again.points["wrist"] - again.points["elbow"], axis=1)
+    np.testing.assert_allclose(reach, 0.5, atol=1e-9)
+
+
+def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> None:
+    """A mount R_LS that was found holds from any start configuration; a stated one is of the start pose."""
+    recording, _ = made(urdf, LINKS_WITH_SENSORS, 12.0)
+    recording = replace(as_segments(recording), model=str(table))
+    stated = track(recording)
+    names = list(recording.sensors)
+    order = tuple(f"mounts.{name}.{axis}" for name in names for axis in "xyz")
+    person = Subject(
+        "arm", dict(load_model(table).lengths), order, 1e-6 * np.eye(len(order)), mounts=dict(stated.segments.quat_LS)
+    )
+    bare = {name: replace(sensor, stated_quat_LS=None) for name, sensor in recording.sensors.items()}
+    tracked = track(replace(recording, sensors=bare), person)
+    for name, values in stated.joints.items():
+        np.testing.assert_allclose(tracked.joints[name], values, atol=np.deg2rad(0.1))
+
+
+def test_chunks_and_causal_tracking_give_the_joints_of_the_whole(urdf: Path) -> None:
+    recording, _ = made(urdf, LINKS_WITH_SENSORS, 20.0)
+    whole = track(recording, model=urdf)
+    tracker = Tracker(model=urdf)
+    parts = [part for chunk in recording.chunks(6.0) for part in tracker.push(chunk)] + tracker.finish()
+    assert len(parts) > 1
+    for name, values in whole.joints.items():
+        np.testing.assert_array_equal(np.concatenate([part.joints[name] for part in parts]), values)
+    causal = track(recording, model=urdf, causal=True)
+    last = len(causal.time)
+    for name, values in causal.joints.items():
+        np.testing.assert_allclose(values, whole.joints[name][-last:], atol=np.deg2rad(0.5))
+
+
+def test_live_kinematics_follow_a_mechanism(urdf: Path) -> None:
+    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    tracked = track(recording, model=urdf, causal=True)
+    body = tracked.model
+    start = compute_start_configuration(body, CONFIGURATION, HOME, "x")
+    live = LiveKinematics(body, list(recording.sensors), start)
+    for k in range(60):
+        measured = np.array([tracked.segments.quat_WL[name][k] for name in recording.sensors])
+        live.compute_points(measured)
+        fitted = live.orient_segments(measured)
+    for i, name in enumerate(recording.sensors):
+        off = (Rotation.from_quat(fitted[i]).inv() * Rotation.from_quat(tracked.quat_WL[name][59])).magnitude()
+        assert off < 1e-5
+
+
+def test_a_person_may_begin_in_another_pose(simulation_t_pose: Recording) -> None:
+    """Segment frames are W's in the N-pose; in the T-pose the arms' are turned by a right angle."""
+    tracked = track(simulation_t_pose)
+    begin = {name: Rotation.from_quat(quat[0]) for name, quat in tracked.quat_WL.items()}
+    for side, angle_deg in (("left", 90.0), ("right", -90.0)):
+        turn = Rotation.from_euler("x", angle_deg, degrees=True)
+        assert np.degrees((begin[f"{side}_upper_arm"] * turn.inv()).magnitude()) < 1.0
+        palm, shoulder = tracked.points[f"{side}_palm"][0], tracked.points[f"{side}_shoulder"][0]
+        assert abs((palm - shoulder)[2]) < 0.01
+    assert np.degrees(begin["torso"].magnitude()) < 1.0
+
+
+@pytest.fixture
+def simulation_t_pose() -> Recording:
+    """A person of five sensors, put on squarely, in the T-pose."""
+    n = 600
+    mount = compute_mount("+z", "+x")
+    rng = np.random.default_rng(0)
+    sensors = {
+        name: ImuSensor(
+            gyro_S=1e-3 * rng.standard_normal((n, 3)),
+            accel_S=[0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3)),
+            stated_quat_LS=mount,
+        )
+        for name in ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+    }
+    return Recording("t", np.arange(n) / RATE, RATE, sensors, {"start": ((0.5, 4.0),)}, start_pose="t_pose")

@@ -20,7 +20,8 @@ from wepose_pin.kinematics import (
     solve_configuration,
 )
 from wepose_pin.model import BodyModel, load_model
-from wepose_pin.model.fit import find_undetermined_joints, fit, joint_limits
+from wepose_pin.model.configurations import find_undetermined_joints
+from wepose_pin.model.fit import fit, joint_limits
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track

@@ -105,21 +105,12 @@ def right() -> dict[str, dict[str, Any]]:
     subject = replace(person, mounts=mounts)
     torso = recording.sensors["torso"]
     urdf = write_arm(folder)
-    arm = wp.load_robot(urdf)
-    names = [frame.name for frame in arm.frames if frame.name in ("upper_arm", "forearm")]
-    chain = replace(
-        recording,
-        start_pose="configuration",
-        sensors=dict(zip(names, [torso, torso], strict=True)),
-        joints={"elbow": -1.0},
-    )
     from wepose_pin.retargeting import find_map, load_robot
 
     return {
         "load_session": {"path": folder, "gaps": False},
         "load_subject": {"path": folder},
         "load_model": {"path": None, "lengths": None},
-        "load_robot": {"path": urdf},
         "population_subject": {"stature": 1.7, "sex": "f"},
         "estimate_orientation": {
             "gyro_S": torso.gyro_S[:600],
@@ -131,7 +122,6 @@ def right() -> dict[str, dict[str, Any]]:
             "static_test": None,
         },
         "track": {"recording": recording, "subject": subject},
-        "track_chain": {"recording": chain, "model": arm},
         "calibrate": {"recording": recording, "measured": {"shoulder_width": person.lengths["shoulder_width"]}},
         "evaluate": {"pose": pose, "truth": pose},
         "joint_angles": {"pose": pose},
@@ -154,7 +144,6 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "forward": ("x", 3, None, "+w"),
         "root": (3, 1.5, True),
     },
-    "load_robot": {"path": (*PATH, None)},
     "population_subject": {"stature": (*POSITIVE, 175.0, 0.3), "sex": NAME},
     "estimate_orientation": {
         "gyro_S": SAMPLES,
@@ -173,13 +162,6 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "static_test": THING,
         "open_loop": (*FLAG, None),
         "causal": (*FLAG, None),
-        "limits": (*FLAG, None),
-    },
-    "track_chain": {
-        "recording": (*THING, None),
-        "model": (*THING, None),
-        "method": (*NAME, None),
-        "static_test": THING,
         "limits": (*FLAG, None),
     },
     "calibrate": {

@@ -44,13 +44,11 @@ _WHERE = {
     "export": "writers.export",
     "joint_angles": "angles",
     "load_model": "model",
-    "load_robot": "model.robot",
     "load_session": "readers",
     "load_subject": "subject",
     "retarget": "retargeting",
     "simulate": "simulation",
     "track": "tracking",
-    "track_chain": "tracking",
 }
 __all__ = ["__version__", *sorted(_WHERE)]
 __version__ = "0.1.0"

@@ -1,15 +1,16 @@
 """Sensor-to-segment alignment: mounts R_LS and heading offsets ψ from the start pose, then segment orientations.
 
 A filter observes the vertical and not the heading: its world V differs from W by a rotation about the vertical,
-R_WV = Rz(ψ). In the N-pose every segment frame equals W, so that the mount is R_LS = R_WS = Rz(ψ) R_VS(start). Gravity
-gives its tilt; ψ is the angle that makes it nearest to the stated or calibrated mount. A calibrated mount is fused with
-the start pose, whose standard deviation is `START_POSE_STD`.
+R_WV = Rz(ψ). Alignment works in frames L' that equal W in the start pose: there the mount is R_L'S = R_WS =
+Rz(ψ) R_VS(start). Gravity gives its tilt; ψ is the angle that makes it nearest to the stated or calibrated mount. A
+calibrated mount is fused with the start pose, whose standard deviation is `StartFrames.std`. A person's segment frames
+equal W in the N-pose; in another start pose R_LS = R_WL(start)ᵀ R_L'S.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +21,9 @@ from .errors import BadSession
 from .filters import Orientation
 from .filters.sensors import FilteredRecording, collect_rotations
 from .filters.start import ACCEL_BIAS_STD
+from .model import BodyModel, BodyTable, load_table
+from .model.start_pose import compute_start_configuration, orient_links
+from .model.table import NEUTRAL_POSE
 from .recording import Recording, format_span
 from .subject import Subject
 
@@ -29,11 +33,64 @@ MOUNT_WARNING_DEG = 35.0
 
 # Standard deviations per axis; assumptions.
 START_POSE_STD = np.deg2rad(4.0)  # [rad] between a segment and the start pose: the elbows are never quite straight
+MECHANISM_START_POSE_STD = np.deg2rad(0.5)  # [rad] between a mechanism's link and its start configuration
 START_POSE_REPEATABILITY_STD = np.deg2rad(2.0)  # [rad] between two start poses of one person
 SEGMENT_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation in motion, mostly by soft tissue
 PALM_SLIP_STD = 0.005  # [m] by which joined palms slip
 # A calibrated mount has moved where gravity contradicts it by more standard deviations than this.
 MOUNT_MOVED_STDS = 3.5
+
+
+@dataclass(frozen=True)
+class StartFrames:
+    """The segment frames in the start pose.
+
+    Parameters
+    ----------
+    R_WL : segment → its orientation; a segment that is not named has the frame of W
+    table : of the body
+    """
+
+    R_WL: Mapping[str, Rotation] = field(default_factory=dict)
+    table: BodyTable = field(default_factory=load_table)
+
+    @property
+    def sways(self) -> bool:
+        """Whether a person stands in it, whom nothing holds still."""
+        return not self.table.is_mechanism
+
+    @property
+    def std(self) -> float:
+        """[rad] between a segment and the start pose, one standard deviation about each axis."""
+        return START_POSE_STD if self.sways else MECHANISM_START_POSE_STD
+
+    def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
+        """R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
+        return self.R_WL[segment] * R_LS if segment in self.R_WL else R_LS
+
+    def to_segment(self, segment: str, R_WS: Rotation) -> Rotation:
+        """R_LS of the sensor's orientation in W in the start pose."""
+        return self.R_WL[segment].inv() * R_WS if segment in self.R_WL else R_WS
+
+
+N_POSE = StartFrames()
+
+
+def find_start_frames(body: BodyModel, recording: Recording) -> StartFrames:
+    """Find the segment frames of a body in the start pose of its recording.
+
+    Raises
+    ------
+    BadSession
+        A start pose or a joint that the body does not have.
+    """
+    table = body.table
+    q = compute_start_configuration(body, recording.start_pose, recording.joints, recording.where())
+    R_WL: dict[str, Rotation] = {}
+    if table.is_mechanism or recording.start_pose != NEUTRAL_POSE:
+        R_WK = orient_links(body, q)
+        R_WL = {segment: Rotation.from_matrix(R_WK[segment]) for segment in recording.sensors}
+    return StartFrames(R_WL, table)
 
 
 @dataclass(frozen=True)
@@ -86,21 +143,14 @@ class SensorAlignment:
     diagnostics: tuple[Diagnostic, ...]
 
 
-# Segment → protocols of calibration/ that find its sensor's mount. No protocol finds that of another segment.
-_CALIBRATING_PROTOCOLS = {
-    "torso": "clasp, handle, poses or touch",
-    **{f"{side}_upper_arm": f"clasp, handle, poses or touch_{side}" for side in ("left", "right")},
-    **{f"{side}_forearm": f"clasp, handle, poses or touch_{side}" for side in ("left", "right")},
-    **{f"{side}_hand": f"clasp, handle or touch_{side}" for side in ("left", "right")},
-}
-
-
-def check_mounts(recording: Recording, subject: Subject | None) -> None:
+def check_mounts(recording: Recording, subject: Subject | None, start_frames: StartFrames = N_POSE) -> None:
     """Raise `BadSession` where neither the subject nor the session has the mount of a sensor."""
-    collect_nominal_mounts(recording, subject)
+    collect_nominal_mounts(recording, subject, start_frames)
 
 
-def collect_nominal_mounts(recording: Recording, subject: Subject | None) -> dict[str, np.ndarray]:
+def collect_nominal_mounts(
+    recording: Recording, subject: Subject | None, start_frames: StartFrames = N_POSE
+) -> dict[str, np.ndarray]:
     """Collect segment → nominal mount `quat_LS` (4,) xyzw of every sensor.
 
     Raises
@@ -108,7 +158,7 @@ def collect_nominal_mounts(recording: Recording, subject: Subject | None) -> dic
     BadSession
         Neither the subject nor the session has the mount of a sensor.
     """
-    nominal = {segment: find_nominal_mount(recording, segment, subject) for segment in recording.sensors}
+    nominal = {segment: find_nominal_mount(recording, segment, subject, start_frames) for segment in recording.sensors}
     mounts = {segment: mount for segment, mount in nominal.items() if mount is not None}
     missing = [segment for segment in nominal if segment not in mounts]
     if missing:
@@ -119,33 +169,33 @@ def collect_nominal_mounts(recording: Recording, subject: Subject | None) -> dic
             problem += " (remounted = true: the subject's are of another mounting)"
         elif subject is not None and subject.mounts:
             problem += f"; the subject '{subject.name}' has none for it"
-        raise BadSession(f"{recording.where()}: {problem}: {suggest_mounts(missing)}")
+        raise BadSession(f"{recording.where()}: {problem}: {suggest_mounts(missing, start_frames.table)}")
     return mounts
 
 
-def suggest_mounts(segments: Sequence[str]) -> str:
+def suggest_mounts(segments: Sequence[str], table: BodyTable) -> str:
     """Return what to do where the mounts of these segments' sensors are not known: state them or calibrate."""
     remedy = 'state it, as in mount = { up = "+x", forward = "-z" }'
-    by_protocols: dict[str, list[str]] = {}
-    for segment in segments:
-        by_protocols.setdefault(_CALIBRATING_PROTOCOLS.get(segment, ""), []).append(segment)
-    for protocols, calibrated in by_protocols.items():
-        if protocols:
-            remedy += (
-                f"; or find that of {', '.join(calibrated)} by `wepose calibrate --protocol` {protocols}, and "
-                "track with its --subject"
-            )
-    if "" in by_protocols:
-        remedy += f"; no calibration finds that of {', '.join(by_protocols[''])}"
+    # Calibrations close chains of lengths: a segment on which no length lies is in none of them.
+    measured = {part.segment for length in table.lengths.values() for part in length.stretches}
+    calibrated = [segment for segment in segments if segment in measured]
+    others = [segment for segment in segments if segment not in measured]
+    if calibrated:
+        remedy += f"; or find that of {', '.join(calibrated)} by `wepose calibrate`, and track with its --subject"
+    if others:
+        remedy += f"; no calibration finds that of {', '.join(others)}"
     return remedy
 
 
-def align_sensors(recording: Recording, subject: Subject | None, filtered: FilteredRecording) -> SensorAlignment:
+def align_sensors(
+    recording: Recording, subject: Subject | None, filtered: FilteredRecording, start_frames: StartFrames = N_POSE
+) -> SensorAlignment:
     """Compute mounts and heading offsets.
 
     Parameters
     ----------
     recording : that of `filtered`, or its chunk that contains the start pose
+    start_frames : `find_start_frames` of the body; left out: the N-pose
 
     Raises
     ------
@@ -155,18 +205,19 @@ def align_sensors(recording: Recording, subject: Subject | None, filtered: Filte
     start, diagnostics = filtered.start, list(filtered.diagnostics)
     start_guessed = recording.start_is_guessed or not recording.phases.get("start")
     facts = {"variant": "guessed"} if start_guessed else {}
-    nominal_mounts = collect_nominal_mounts(recording, subject)
+    nominal_mounts = collect_nominal_mounts(recording, subject, start_frames)
     mounts, heading_offsets = {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
-        # The torso faces x; without a torso the most central segment does.
-        reference_segment = aligned[0]
-        aligned_heading_offset = compute_heading_offset(filtered.R_VS_start[reference_segment], Rotation.identity())
+        # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
+        first = aligned[0]
+        R_WS_start = start_frames.to_world(first, Rotation.identity())
+        aligned_heading_offset = compute_heading_offset(filtered.R_VS_start[first], R_WS_start)
     for segment, R_VS_start in filtered.R_VS_start.items():
         if recording.sensors[segment].aligned:
             mounts[segment], heading_offsets[segment] = Rotation.identity(), aligned_heading_offset
             continue
-        R_nominal = Rotation.from_quat(nominal_mounts[segment])
+        R_nominal = start_frames.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
         psi = compute_heading_offset(R_VS_start, R_nominal)
         R_LS = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS_start
         tilt_error_deg = np.degrees((R_LS * R_nominal.inv()).magnitude())
@@ -190,28 +241,33 @@ def align_sensors(recording: Recording, subject: Subject | None, filtered: Filte
         if tilt_error_deg > MOUNT_WARNING_DEG:
             value, limit = float(np.deg2rad(tilt_error_deg)), float(np.deg2rad(MOUNT_WARNING_DEG))
             diagnostics.append(Diagnostic("mount-contradicts-gravity", WARNING, segment, value, limit, facts))
-        mount_cov = find_mount_covariance(recording, segment, subject)
+        mount_cov = _find_start_mount_covariance(recording, segment, subject, start_frames)
         if mount_cov is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
             misfit = (R_LS * R_nominal.inv()).as_rotvec()[:2]
-            misfit_cov = mount_cov[:2, :2] + START_POSE_STD**2 * np.eye(2)
+            misfit_cov = mount_cov[:2, :2] + start_frames.std**2 * np.eye(2)
             R_LS = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_nominal
             psi = compute_heading_offset(R_VS_start, R_LS)
             calibrated_offset = subject.start_pose_offset.get(segment) if subject is not None else None
             if calibrated_offset is not None:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
-                misfit, misfit_cov = misfit - calibrated_offset.tilt, START_POSE_REPEATABILITY_STD**2 * np.eye(2)
+                misfit = misfit - calibrated_offset.tilt
+                misfit_cov = min(START_POSE_REPEATABILITY_STD, start_frames.std) ** 2 * np.eye(2)
             if misfit @ np.linalg.solve(misfit_cov, misfit) > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
                 diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOUNT_MOVED_STDS, facts))
-        mounts[segment], heading_offsets[segment] = R_LS, psi
+        mounts[segment], heading_offsets[segment] = start_frames.to_segment(segment, R_LS), psi
     R_WV = {segment: Rotation.from_rotvec([0.0, 0.0, psi]) for segment, psi in heading_offsets.items()}
     return SensorAlignment(mounts, R_WV, heading_offsets, start, filtered.static_phase, tuple(diagnostics))
 
 
 def orient_segments(
-    chunk: Recording, alignment: SensorAlignment, orientation: Mapping[str, Orientation], subject: Subject | None
+    chunk: Recording,
+    alignment: SensorAlignment,
+    orientation: Mapping[str, Orientation],
+    subject: Subject | None,
+    start_frames: StartFrames = N_POSE,
 ) -> SegmentOrientations:
     """Return the segment orientations of a recording or a chunk of it, from the results of its sensors' filters."""
     quat_WL, covariance_W = {}, {}
@@ -224,7 +280,7 @@ def orient_segments(
         filtered = orientation.get(segment)
         if filtered is not None and filtered.attitude_cov is not None:
             covariance_W[segment] = compute_segment_covariance(
-                chunk, segment, subject, R_WS, R_LS, filtered.attitude_cov
+                chunk, segment, subject, R_WS, R_LS, filtered.attitude_cov, start_frames
             )
     return SegmentOrientations(
         chunk.time,
@@ -244,14 +300,21 @@ def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:
     return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
 
 
-def find_nominal_mount(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
-    """Find the mount `quat_LS` (4,) xyzw: calibrated, else stated, else that of a measured segment; None: unknown."""
+def find_nominal_mount(
+    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames = N_POSE
+) -> np.ndarray | None:
+    """Find the mount `quat_LS` (4,) xyzw: calibrated, else stated, else that of a measured segment; None: unknown.
+
+    A stated mount names the sensor's axes that point up and forward in the start pose.
+    """
     if subject is not None and segment in subject.mounts and not recording.remounted:
         return subject.mounts[segment]
     stated = recording.sensors[segment].stated_quat_LS
     if stated is None and segment not in recording.imus:
         return np.array([0.0, 0.0, 0.0, 1.0])  # a device's own orientations of segments
-    return stated
+    if stated is None or segment not in start_frames.R_WL:
+        return stated
+    return start_frames.to_segment(segment, Rotation.from_quat(stated)).as_quat()
 
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
@@ -267,6 +330,7 @@ def compute_segment_covariance(
     R_WS: Rotation,
     R_LS: Rotation,
     attitude_cov: np.ndarray,
+    start_frames: StartFrames = N_POSE,
 ) -> np.ndarray:
     """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
 
@@ -276,29 +340,42 @@ def compute_segment_covariance(
     cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
     # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
-    mount_cov = find_mount_covariance(recording, segment, subject)
+    mount_cov = _find_start_mount_covariance(recording, segment, subject, start_frames)
     if mount_cov is not None:
-        # A mount's error ε in L becomes the error R_WL ε in W. The heading offset ψ, computed with the same mount,
+        # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount,
         # takes off the vertical component ε_z, so that in the start pose the heading has no error.
-        R_WL = (R_WS * R_LS.inv()).as_matrix()
+        R_WL = (R_WS * start_frames.to_world(segment, R_LS).inv()).as_matrix()
         error_jacobian = R_WL - np.array([0.0, 0.0, 1.0])[:, None] * np.array([0.0, 0.0, 1.0])
         tilt = mount_cov[:2]
         # What is left after the start pose has corrected the tilt, as in `align_sensors`.
-        remaining_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + START_POSE_STD**2 * np.eye(2), tilt)
+        remaining_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + start_frames.std**2 * np.eye(2), tilt)
         cov_W += error_jacobian @ remaining_cov @ error_jacobian.swapaxes(1, 2)
-        cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject)
+        cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_frames)
     return cov_W
 
 
-def compute_start_heading_var(recording: Recording, segment: str, subject: Subject | None) -> float:
+def compute_start_heading_var(
+    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames = N_POSE
+) -> float:
     """Compute the variance [rad²] of a segment's heading offset by the inexact start pose.
 
-    Zero for the torso, whose heading defines x, and for a stated mount, which is stated relative to the start pose.
+    Zero for the segment whose heading defines x, and for a stated mount, which is stated relative to the start pose.
     """
     calibrated = find_mount_covariance(recording, segment, subject) is not None
-    return START_POSE_STD**2 if calibrated and segment != "torso" else 0.0
+    return start_frames.std**2 if calibrated and segment != start_frames.table.reference else 0.0
 
 
 def find_mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
     """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L; None: not known for this mounting."""
     return None if subject is None or recording.remounted else subject.mount_covariance(segment)
+
+
+def _find_start_mount_covariance(
+    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames
+) -> np.ndarray | None:
+    """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L'; None: as `find_mount_covariance`."""
+    cov = find_mount_covariance(recording, segment, subject)
+    if cov is None or segment not in start_frames.R_WL:
+        return cov
+    R = start_frames.R_WL[segment].as_matrix()
+    return R @ cov @ R.T

@@ -15,6 +15,8 @@ from .arguments import check_array, check_covariance, check_fields, check_finite
 from .compilation import kernel
 from .errors import BadData, BadModel, one_of
 from .model import BodyModel
+from .model.configurations import find_determined_frames, joint_values
+from .model.fit import Fit
 from .model.orientation_ik import OrientationIk, find_groups
 from .model.reaches import UNIVERSE
 from .recording import EACH_TIME, check_time
@@ -33,7 +35,8 @@ class Pose:
     Parameters
     ----------
     time : (n,) [s]
-    quat_WL : segment → (n, 4) xyzw; only segments that are known
+    quat_WL : segment → (n, 4) xyzw; only segments that are known. Of a person as measured, of a mechanism as its joints
+        can be
     points : point → (n, 3) [m] in W, from the root, of a person midway between the hips; only points that are known
     q : (n, nq) configuration of the Pinocchio model; an unmeasured segment is rigid with its parent segment; None for
         a pose from a table
@@ -41,6 +44,7 @@ class Pose:
     point_cov : point → (n, 3, 3) [m²], in W
     gap : segment → (n,) bool, true where its sensor has no samples and a long gap was bridged; empty where long gaps
         are not allowed
+    joints : joint of one axis → (n,) [rad or m], of a mechanism
     """
 
     time: np.ndarray
@@ -50,6 +54,7 @@ class Pose:
     segment_cov: Mapping[str, np.ndarray] = field(default_factory=dict)
     point_cov: Mapping[str, np.ndarray] = field(default_factory=dict)
     gap: Mapping[str, np.ndarray] = field(default_factory=dict)
+    joints: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def check(self) -> Pose:
         """Check all fields and return the pose. NaN stands for missing values.
@@ -85,6 +90,9 @@ class Pose:
         check_names(f"{where}gap", self.gap, tuple(self.quat_WL))
         for segment, gap in self.gap.items():
             check_array(f"{where}gap.{segment}", gap, (n,), "b", EACH_TIME)
+        for joint, values in self.joints.items():
+            check_array(f"{where}joints.{joint}", values, (n,), rows=EACH_TIME)
+            check_finite(f"{where}joints.{joint}", values, missing=True)
         return self
 
 
@@ -96,33 +104,54 @@ def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.nd
 class KinematicsSolver:
     """`compute_pose` chunk by chunk: its state carries over from one chunk to the next.
 
+    Parameters
+    ----------
+    start : (nq,) the configuration of a mechanism before the first frame; None: all joints at zero
+
     Raises
     ------
     BadData, BadModel
         As `solve_configuration`.
     """
 
-    def __init__(self, model: BodyModel, segments: Collection[str], *, limits: bool = True) -> None:
+    def __init__(
+        self, model: BodyModel, segments: Collection[str], *, limits: bool = True, start: np.ndarray | None = None
+    ) -> None:
         if not segments:
             raise BadData("no segment has an orientation: a pose needs one")
-        self._model, self._ik = model, _make_ik(model, segments, limits)
+        self._model, self._ik = model, _make_ik(model, segments, limits, start=start)
         self._points = find_known_points(model, segments)
         self._last_quats: dict[str, np.ndarray] = {}
+        self._last_joints: dict[str, float] = {}
 
     def solve_chunk(self, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
         """Compute the pose of the next chunk: `time` (n,) [s], segment → (n, 4) xyzw."""
         q = self._ik.run(quat_WL, warm_start=True)
-        _, p_W = compute_link_poses(
-            self._model, q, [self._model.point_frames[point] for point in self._points], rotations=False
-        )
+        frames, joints = [self._model.point_frames[point] for point in self._points], {}
+        if self._model.table.is_mechanism:
+            R_WL, p_W = compute_link_poses(self._model, q, [*frames, *quat_WL])
+            quat_WL = {
+                name: Rotation.from_matrix(R_WL[:, k]).as_quat() for k, name in enumerate(quat_WL, start=len(frames))
+            }
+            joints = joint_values(self._model.pin, q, self._last_joints)
+            self._last_joints = {name: float(values[-1]) for name, values in joints.items()}
+        else:
+            _, p_W = compute_link_poses(self._model, q, frames, rotations=False)
         points = {point: p_W[:, k] for k, point in enumerate(self._points)}
         quats = {name: rotations.unwrap_signs(quat, self._last_quats.get(name)) for name, quat in quat_WL.items()}
         self._last_quats = {name: quat[-1].copy() for name, quat in quats.items()}
-        return Pose(time, quats, points, q)
+        return Pose(time, quats, points, q, joints=joints)
 
 
 def find_known_points(model: BodyModel, segments: Iterable[str]) -> list[str]:
-    """Find the points that follow from the measured segments: those on known joints, and on joints that move below."""
+    """Find the points that follow from the measured segments: those on known joints, and on joints that move below.
+
+    Of a mechanism those that no joint moves which the orientations leave open.
+    """
+    if model.table.is_mechanism:
+        frames = model.point_frames
+        determined = set(find_determined_frames(model.pin, list(segments), list(frames.values())))
+        return [point for point, link in frames.items() if link in determined]
     known_joint, points = _find_known_joints(model, segments), []
     for point, link in model.point_frames.items():
         frame = model.pin.frames[model.pin.getFrameId(link)]
@@ -171,7 +200,8 @@ def solve_configuration(
 ) -> np.ndarray:
     """Solve for the configuration `q` (n, nq) with the measured orientations, or the nearest one.
 
-    Segments on spherical joints have their orientations exactly. For limbs with fewer axes the weighted sum of the
+    Of a mechanism all joints are fitted at once, each frame from the one before. Of a person: Segments on spherical
+    joints have their orientations exactly. For limbs with fewer axes the weighted sum of the
     segments' squared angles to their measured orientations is minimised; `compute_orientation_residuals` returns these
     angles. An unmeasured segment is rigid with its parent segment. `wepose_pin.model.chains` finds the moving joints.
 
@@ -190,11 +220,47 @@ def solve_configuration(
     return _make_ik(model, quat_WL, limits, weights).run(quat_WL)
 
 
+class _MechanismIk:
+    """Configurations of a mechanism that follow orientations: all joints at once, each frame from the one before.
+
+    Parameters
+    ----------
+    start : (nq,) the configuration before the first frame
+    """
+
+    def __init__(
+        self,
+        model: BodyModel,
+        segments: Collection[str],
+        limits: bool,
+        weights: Mapping[str, float] | None,
+        start: np.ndarray,
+    ) -> None:
+        self._segments, self._start, self._last = list(segments), start, start
+        joints = [joint for joint in range(1, model.pin.njoints) if model.pin.nvs[joint]]  # a mimic joint has none
+        self._fit = Fit(model.pin, self._segments, joints, weights or {}, limits)
+
+    def run(
+        self, quat_WL: Mapping[str, np.ndarray], before: np.ndarray | None = None, *, warm_start: bool = False
+    ) -> np.ndarray:
+        """`q` (n, nq); parameters as of `OrientationIk.run`."""
+        first = before if before is not None else self._last if warm_start else self._start
+        q = self._fit.run({segment: quat_WL[segment] for segment in self._segments}, first[None])
+        self._last = q[-1].copy()
+        return q
+
+
 def _make_ik(
-    model: BodyModel, segments: Collection[str], limits: bool = True, weights: Mapping[str, float] | None = None
-) -> OrientationIk:
+    model: BodyModel,
+    segments: Collection[str],
+    limits: bool = True,
+    weights: Mapping[str, float] | None = None,
+    start: np.ndarray | None = None,
+) -> OrientationIk | _MechanismIk:
     """Return the inverse kinematics of these segments; raise `BadModel` where the model has no link for one."""
     model.table.check_segments(segments, f"{model.pin.name}: ", BadModel)
+    if model.table.is_mechanism:
+        return _MechanismIk(model, segments, limits, weights, pin.neutral(model.pin) if start is None else start)
     return OrientationIk(model, segments, limits=limits, weights=weights)
 
 
@@ -203,10 +269,15 @@ def compute_orientation_residuals(
 ) -> dict[str, np.ndarray]:
     """Compute segment → angle (n,) [rad] between its measured orientation and that of the model in `q`.
 
-    Only for segments whose orientation the joints cannot reproduce exactly.
+    Only for segments whose orientation the joints cannot reproduce exactly; for all of a mechanism.
     """
-    fitted = {segment for group in find_groups(model, quat_WL) for segment in group.segments}
-    limited = [name for name, chain in model.chains.items() if name in quat_WL and (name in fitted or not chain.exact)]
+    if model.table.is_mechanism:
+        limited = list(quat_WL)
+    else:
+        fitted = {segment for group in find_groups(model, quat_WL) for segment in group.segments}
+        limited = [
+            name for name, chain in model.chains.items() if name in quat_WL and (name in fitted or not chain.exact)
+        ]
     R_WL, _ = compute_link_poses(model, q, limited)
     R_model = {segment: Rotation.from_matrix(R_WL[:, k]) for k, segment in enumerate(limited)}
     return {segment: (R_model[segment].inv() * Rotation.from_quat(quat_WL[segment])).magnitude() for segment in limited}
@@ -239,6 +310,7 @@ class LiveKinematics:
     ----------
     model : the body
     segments : the measured segments, in the order of the rows that `compute_points` takes
+    start : (nq,) the configuration of a mechanism before the first pose; None: all joints at zero
 
     Attributes
     ----------
@@ -251,14 +323,14 @@ class LiveKinematics:
         The model has no link for a measured segment.
     """
 
-    def __init__(self, model: BodyModel, segments: Sequence[str]) -> None:
+    def __init__(self, model: BodyModel, segments: Sequence[str], start: np.ndarray | None = None) -> None:
         self.segments = tuple(segments)
         self.points = tuple(find_known_points(model, self.segments))
         self._model, self.data, self._q = model, model.pin.createData(), pin.neutral(model.pin)
         frames = [model.pin.getFrameId(model.point_frames[point]) for point in self.points]
         self._views = [self.data.oMf[frame].translation for frame in frames]
-        self._spherical_joints = self._match_spherical_joints()
-        self._ik = None if self._spherical_joints is not None else _make_ik(model, self.segments)
+        self._spherical_joints = None if model.table.is_mechanism else self._match_spherical_joints()
+        self._ik = None if self._spherical_joints is not None else _make_ik(model, self.segments, start=start)
         self._previous_q: np.ndarray | None = None
 
     def _match_spherical_joints(self) -> list[tuple[int, int, int]] | None:
@@ -294,6 +366,14 @@ class LiveKinematics:
             set_relative_rotation(quat_WL, row, parent_row, self._q, q_index)
         pin.framesForwardKinematics(self._model.pin, self.data, self._q)
         return np.array(self._views)
+
+    def orient_segments(self, quat_WL: np.ndarray) -> np.ndarray:
+        """Return the orientations (k, 4) xyzw of the last pose, from the measured `quat_WL`: as `Pose` has them."""
+        if not self._model.table.is_mechanism:
+            return quat_WL
+        frames = [self.data.oMf[self._model.pin.getFrameId(segment)] for segment in self.segments]
+        fitted = Rotation.from_matrix([frame.rotation for frame in frames]).as_quat()
+        return np.where(np.einsum("ki,ki->k", fitted, quat_WL)[:, None] < 0.0, -fitted, fitted)
 
 
 @kernel
@@ -340,6 +420,9 @@ def compute_point_covariances(
     lengths_cov : (k, k) [m²] in the order of the model's lengths; zeros: known exactly
     """
     covariances: dict[str, np.ndarray] = {}
+    points = find_known_points(model, quat_WL)
+    if not points or _slides(model):
+        return covariances
     lengths = np.array(list(model.lengths.values()))
     R_WK: dict[str, np.ndarray] = {}
     carriers = {link: find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
@@ -349,7 +432,7 @@ def compute_point_covariances(
             R_WK[link] = Rotation.from_quat(quat_WL[carrier]).as_matrix()
             if not np.allclose(R_CK, np.eye(3), atol=1e-12):
                 R_WK[link] = R_WK[link] @ R_CK
-    for point in find_known_points(model, quat_WL):
+    for point in points:
         way = model.reaches[point]
         if not way or not all(link in R_WK or link == UNIVERSE for link in way):
             continue
@@ -370,6 +453,13 @@ def compute_point_covariances(
             cov = cov + skew @ segment_cov[moving_segment] @ skew.swapaxes(1, 2)
         covariances[point] = cov
     return covariances
+
+
+def _slides(model: BodyModel) -> bool:
+    """Whether a joint that slides moves some point: orientations alone do not tell where that is."""
+    frames = [model.pin.frames[model.pin.getFrameId(link)] for link in model.point_frames.values()]
+    above = {joint for frame in frames for joint in model.pin.supports[frame.parentJoint]}
+    return any(model.pin.joints[joint].shortname().startswith("JointModelP") for joint in above if joint)
 
 
 def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str | None:
@@ -458,7 +548,7 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
     for point in places:
         points[point] = np.column_stack([numbers[f"{point}_{c}"] for c in "xyz"])
     if not quat_WL and not points:
-        raise BadData(f"{file}: neither orientations nor points; columns as torso_qx … or left_palm_x … are needed")
+        raise BadData(f"{file}: neither orientations nor points; columns as <segment>_qx … or <point>_x … are needed")
     segment_cov = {name: _parse_covariances(numbers, name) for name in quat_WL}
     point_cov = {name: _parse_covariances(numbers, name) for name in points}
     gap = {name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers}

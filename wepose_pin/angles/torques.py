@@ -111,11 +111,13 @@ def joint_torques(
 
 
 def pose_torques(tracked: TrackedRecording, cutoff_hz: float = CUTOFF_HZ) -> Torques:
-    """`joint_torques` of a person, of the joints that follow measured segments.
+    """`joint_torques` of a person, of the joints that follow measured segments; of a mechanism, of all.
 
     Masses are the model's, stretched with the subject's lengths (`BodyModel.with_lengths`), not the person's.
     """
     model = tracked.model.pin
+    if tracked.model.table.is_mechanism:
+        return joint_torques(model, tracked.time, tracked.q, cutoff_hz)
     moved = {joint for name, chain in tracked.model.chains.items() if name in tracked.quat_WL for joint in chain.joints}
     return joint_torques(model, tracked.time, tracked.q, cutoff_hz, moved)
 

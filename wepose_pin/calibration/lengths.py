@@ -36,7 +36,8 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
-from ..model import BodyModel, load_model
+from ..model import BodyModel
+from ..model.body import load_sensed_model
 from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
@@ -104,7 +105,7 @@ def calibrate_lengths(
     if not isinstance(protocol, Protocol):
         protocol = load_protocol(protocol)
     with_std = {name: (metres, measured_std) for name, metres in (measured or {}).items()}
-    model = model or load_model()
+    model = model or load_sensed_model(recording.model or None, recording.sensors, recording.where())
     table = model.table
     table.check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
     protocol.check_body(table)
@@ -121,7 +122,7 @@ def calibrate_lengths(
         check_paper_formulation(protocol, model, with_std, recording.sensors)
     for condition in protocol.conditions:
         recording.phase(condition.phase)
-    filtered = filter_recording(recording, method=method)
+    filtered = filter_recording(recording, method=method, sways=not table.is_mechanism)
     problem = CalibrationProblem(recording, filtered, protocol, prior, with_std, model)
     return solve_paper_calibration(problem) if formulation == "paper" else _calibrate_checked(problem)
 

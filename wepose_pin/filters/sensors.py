@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..diagnostics import Diagnostic
 from ..errors import WeposeError
-from ..recording import CONFIGURATION, OrientationSensor, Recording
+from ..recording import OrientationSensor, Recording
 from . import BEST, OFFLINE, Orientation, SensorRun, check_method
 from .base import run_in_parallel
 from .noise import SensorNoise, estimate_noise
@@ -35,7 +35,7 @@ class SensorFilters:
     Parameters
     ----------
     first : the recording's first chunk, with the phases `start` and `static`
-    method, static_test : as in `filter_recording`
+    method, static_test, sways : as in `filter_recording`
 
     Attributes
     ----------
@@ -48,7 +48,9 @@ class SensorFilters:
         A start phase with too few samples; an unknown method.
     """
 
-    def __init__(self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None) -> None:
+    def __init__(
+        self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None, sways: bool = True
+    ) -> None:
         check_method(method)
         self.start, self.static_phase, self.diagnostics = find_reference_phases(first)
         self._queue: list[Recording] = []  # chunks that `push` has not returned; one, with the smoother
@@ -63,7 +65,7 @@ class SensorFilters:
                 continue
             static = first.find_measured(segment, self.static_phase)
             try:
-                worn = self.static_phase == self.start and first.start_pose != CONFIGURATION  # a robot does not sway
+                worn = self.static_phase == self.start and sways
                 noise = estimate_noise(sensor.gyro_S[static], sensor.accel_S[static], first.rate_hz, worn)
             except WeposeError as error:
                 raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
@@ -107,16 +109,20 @@ class SensorFilters:
 
 
 def filter_recording(
-    recording: Recording, *, method: str = BEST, static_test: StaticTest | None = None
+    recording: Recording, *, method: str = BEST, static_test: StaticTest | None = None, sways: bool = True
 ) -> FilteredRecording:
     """Filter every sensor, and check that the start pose is static.
+
+    Parameters
+    ----------
+    sways : whether a person stands in the start pose; a mechanism stands still
 
     Raises
     ------
     WeposeError
         A start phase with too few samples; an unknown method.
     """
-    filters = SensorFilters(recording, method=method, static_test=static_test)
+    filters = SensorFilters(recording, method=method, static_test=static_test, sways=sways)
     _, orientation = filters.push(recording) or filters.finish()
     return combine_chunk(filters, recording, orientation)
 

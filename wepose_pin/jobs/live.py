@@ -40,8 +40,9 @@ class LiveJob:
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smekf (Kalman filter of
         Lisini Baldi et al. 2019, corrected in static phases), ncf (complementary filter, Mahony et al. 2008), gdc
         (gradient descent, Madgwick et al. 2011).
-    model : URDF|TOML
-        Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md).
+    model : URDF|TOML|NAME
+        Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package
+        (docs/models.md). Without it the body that the session names, else the upper body.
     speed : FACTOR
         With --source replay: replay at this speed; 1 that of the recording, 4 four times that, max as fast as possible.
     page
@@ -136,14 +137,18 @@ def run_live(
     """
     from ..live import find_setup, open_source, run_session
     from ..live.loop import build_subject_model, warm_up
-    from ..model import load_model
 
     job.check()
     stated = None if job.session is None else find_setup(None, job.subject, job.session)
-    sensors = None if stated is None or job.replays else list(stated.mounts)
-    source = open_source(job.source, sensors=sensors or None, speed=job.speed)
-    setup = stated or find_setup(source, job.subject, None)
-    model = build_subject_model(setup.subject, load_model(job.model) if job.model else None)
+    if job.replays:
+        source = open_source(job.source, speed=job.speed)
+        setup = stated or find_setup(source, job.subject, None)
+        model = build_subject_model(setup, job.model, source.sensors)
+    else:
+        setup = stated or find_setup(None, job.subject, None)
+        model = build_subject_model(setup, job.model)
+        sensors, segments = list(setup.mounts), list(model.table.segments)
+        source = open_source(job.source, sensors=sensors or None, segments=segments)
     tell(model.diagnostics)
     outputs: list[Output] = []
     robot: RobotOutput | None = None

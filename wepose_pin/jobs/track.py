@@ -13,13 +13,12 @@ from . import Method, Progress, no_progress
 from .fields import field_values
 
 if TYPE_CHECKING:
-    from ..recording import Recording
-    from ..tracking import TrackedChain, TrackedRecording
+    from ..tracking import TrackedRecording
 
 
 @dataclass(frozen=True)
 class TrackJob:
-    """Estimate the pose of a recording: segment orientations and joint centres.
+    """Estimate the pose of a recording: segment orientations, joint centres, and joint angles of a mechanism.
 
     A recording of `wepose live` is tracked causally, with the subject and the method of that session, and gives the
     displayed poses again, bit-identical. With --subject or --method it is tracked as any other recording.
@@ -32,13 +31,15 @@ class TrackJob:
     session : SESSION
         The recording: session.toml, the folder that holds it, or a file that `wepose live --record` wrote.
     out : DIR
-        Write pose.parquet, subject.toml, subject.urdf, summary.json, view.html and report.html to this folder.
+        Write pose.parquet, subject.toml, subject.urdf, summary.json, view.html and report.html to this folder; of a
+        mechanism joints.parquet too.
     subject : SUBJECT
         Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
         Without it lengths are those of the population prior, and mounts those that the session states.
-    model : URDF|TOML
-        Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md). For sensors on a robot or
-        another chain (start_pose = "configuration"), its URDF.
+    model : URDF|TOML|NAME
+        Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package, such as
+        whole_body (docs/models.md). A URDF without a table, a robot's say, is a mechanism whose links bear the
+        sensors. Without it the body that the session names, else the upper body.
     method : METHOD
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
         and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases), ncf
@@ -55,7 +56,7 @@ class TrackJob:
     covariance
         Write the covariance of each orientation and point too, not only the standard deviations.
     limits
-        Keep elbows and wrists with one or two axes within the joint limits of the model.
+        Keep joints with one or two axes within the limits of the model.
     torques
         Write torques.parquet too: joint torques by inverse dynamics. Assumed are a fixed base, gravity as the only
         external force and no load in the hands; the motion is low-pass filtered at 6 Hz.
@@ -89,8 +90,12 @@ class TrackJob:
 
     def check(self) -> None:
         """Raise `BadOption` where options contradict each other or name what is not there."""
-        if self.model is not None and not self.model.is_file():
-            raise WrongOption("model", self.model, "no such file; a URDF, or a TOML that names one, is needed")
+        if self.model is not None and not self.model.is_file() and (self.model.suffix or len(self.model.parts) > 1):
+            raise WrongOption(
+                "model",
+                self.model,
+                "no such file; a URDF, a TOML that names one, or the name of a body of the package is needed",
+            )
 
 
 class TrackOutcome(NamedTuple):
@@ -99,8 +104,7 @@ class TrackOutcome(NamedTuple):
     summary: Mapping[str, Any]  # as in summary.json, page failures apart
     page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
     view_rate_hz: float | None = None  # of view.html, where it shows fewer samples than there are
-    tracked: TrackedRecording | None = None  # where a person was tracked as a whole
-    chain: TrackedChain | None = None  # where another chain was
+    tracked: TrackedRecording | None = None  # where it was tracked as a whole
 
 
 def run_track(
@@ -136,9 +140,7 @@ def run_track(
 def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
     from ..documents import whole_folder
     from ..filters import BEST
-    from ..model import load_model
     from ..readers import is_live_log, load_session, read_live_log
-    from ..recording import CONFIGURATION
     from ..report import write_track_pages
     from ..subject import load_subject, parse_subject
     from ..tracking import track
@@ -156,12 +158,15 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
                 subject = parse_subject(log.header["subject"], job.session)
         else:
             recording = load_session(job.session, gaps=job.gaps)
-        if job.model is not None and recording.start_pose == CONFIGURATION:
-            return _track_chain(job, recording, folder, progress, provenance)
-        model = load_model(job.model) if job.model else None
         progress(f"tracking by {method}", 1 / 3)
         tracked = track(
-            recording, subject, method=method, model=model, causal=causal, open_loop=job.open_loop, limits=job.limits
+            recording,
+            subject,
+            method=method,
+            model=job.model,
+            causal=causal,
+            open_loop=job.open_loop,
+            limits=job.limits,
         )
         torques = None
         if job.torques:
@@ -169,6 +174,8 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
 
             torques = pose_torques(tracked)
         write_result(folder, tracked, job.covariance, recording.phases, torques, _provenance_of(job, provenance))
+        written = {file.name for file in folder.iterdir()}
+    _remove_outdated(job.out, written)
     failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 2 / 3)
@@ -180,7 +187,6 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
     """In a memory that does not grow with the recording."""
     from ..documents import whole_folder
     from ..filters import BEST
-    from ..model import load_model
     from ..readers.session import SessionReader
     from ..report import write_decimated_pages
     from ..report.decimation import Decimator
@@ -192,18 +198,19 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
     with whole_folder(job.out, job.force) as folder:
         progress("reading the times", 0.0)
         subject = load_subject(job.subject) if job.subject else None
-        model = load_model(job.model) if job.model else None
         reader = SessionReader(job.session, gaps=job.gaps, in_memory=False)
         writer, decimator = ChunkWriter(folder, job.covariance), Decimator(len(reader.time))
         options = TrackOptions(job.method or BEST, causal=job.causal, open_loop=job.open_loop, limits=job.limits)
         for chunk in track_session(
-            reader, subject, seconds=job.chunk_seconds, model=model, options=options, progress=progress
+            reader, subject, seconds=job.chunk_seconds, model=job.model, options=options, progress=progress
         ):
             writer.add(chunk)
             decimator.add(chunk)
         progress("writing the result", 1.0)
         writer.finish(reader.phases, _provenance_of(job, provenance))
         summary = writer.accumulator.summary()
+        written = {file.name for file in folder.iterdir()}
+    _remove_outdated(job.out, written)
     view_rate_hz = min(30.0, MOST_FRAMES / max(summary["duration_s"], 1e-3))
     failures: list[Diagnostic] = []
     if job.view or job.report:
@@ -217,27 +224,14 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
     return TrackOutcome(summary, failures, view_rate_hz)
 
 
-def _track_chain(
-    job: TrackJob, recording: Recording, folder: Path, progress: Progress, provenance: Mapping[str, Any] | None
-) -> TrackOutcome:
-    """Where the sensors are on the links of a chain that is no person's arms."""
-    from ..angles.torques import joint_torques
-    from ..filters import BEST
-    from ..model.robot import load_robot
-    from ..tracking import track_chain
-    from ..writers.chain import write_chain
-    from ..writers.provenance import write_provenance
+def _remove_outdated(out: Path, written: set[str]) -> None:
+    """Remove what an earlier run on another body left: it would be read with this result."""
+    from ..model.table import MODEL_TABLE
+    from ..writers.result import JOINTS
 
-    wrong = [name for name in ("subject", "causal", "open_loop") if getattr(job, name)]
-    if wrong:
-        raise BadOption(f"--{wrong[0].replace('_', '-')}: for a person; {job.session} is of another chain")
-    assert job.model is not None
-    model, method = load_robot(job.model), job.method or BEST
-    progress(f"tracking by {method}", 1 / 3)
-    chain = track_chain(recording, model, method=method, limits=job.limits)
-    write_chain(folder, chain, joint_torques(model, chain.time, chain.q) if job.torques else None)
-    write_provenance(folder, _provenance_of(job, provenance))
-    return TrackOutcome(chain.summary(), [], chain=chain)
+    for name in (MODEL_TABLE, JOINTS):
+        if name not in written:
+            (out / name).unlink(missing_ok=True)
 
 
 def _provenance_of(job: TrackJob, stated: Mapping[str, Any] | None) -> Mapping[str, Any]:

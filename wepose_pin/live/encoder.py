@@ -13,8 +13,6 @@ from ..model import BodyModel
 from ..report.viewer import visible
 from .state import LivePose, StreamInfo
 
-HANDS = ("left_palm", "right_palm")
-
 
 class PoseEncoder:
     """Encodes poses for the page.
@@ -39,7 +37,7 @@ class PoseEncoder:
 
     def encode(self, pose: LivePose | None) -> bytes:
         """Little endian: time (float64, NaN before the start), of each link R_WL row by row and p_WL (12 float32),
-        both hands (6 float32), of each link whether its sensor is lost (1 byte). NaN: not known.
+        points whose paths are drawn (3 float32 each), of each link whether its sensor is lost (1 byte). NaN: not known.
         """
         measured = self.measured
         if pose is None or measured is None or len(pose.quat_WL) != len(measured.segments):
@@ -48,8 +46,10 @@ class PoseEncoder:
             placements = _stack([data.oMf[self._model.pin.getFrameId(link)] for link in self.links])
             if measured is not None:
                 placements[~measured.known] = np.nan
-            return _pack(math.nan, placements, np.full((2, 3), np.nan), np.zeros(len(self.links), dtype=bool))
-        return _pack(pose.time, measured.place(pose.quat_WL), measured.hands(pose.points), measured.lost(pose.lost))
+            paths = np.full((len(self._model.table.paths), 3), np.nan)
+            return _pack(math.nan, placements, paths, np.zeros(len(self.links), dtype=bool))
+        placements, points = measured.place(pose.quat_WL), measured.find_path_points(pose.points)
+        return _pack(pose.time, placements, points, measured.lost(pose.lost))
 
 
 class MeasuredLinks:
@@ -62,7 +62,7 @@ class MeasuredLinks:
         self._views = [self._kinematics.data.oMf[frame] for frame in frames]
         known = set(find_known_links(model, info.segments))
         self.known = np.array([link in known for link in links], dtype=bool)
-        self._hands = [info.points.index(hand) if hand in info.points else -1 for hand in HANDS]
+        self._paths = [info.points.index(point) if point in info.points else -1 for point in model.table.paths]
         moved = {chain.joints[-1]: segment for segment, chain in model.chains.items() if chain.joints}
         self._rows = []  # of each link the sensor that places it; -1: none
         for frame in frames:
@@ -78,9 +78,9 @@ class MeasuredLinks:
         placements[~self.known] = np.nan
         return placements
 
-    def hands(self, points: np.ndarray) -> np.ndarray:
-        """(2, 3) [m]; NaN where not known."""
-        return np.array([points[k] if k >= 0 else [np.nan] * 3 for k in self._hands])
+    def find_path_points(self, points: np.ndarray) -> np.ndarray:
+        """Points (p, 3) [m] whose paths are drawn; NaN where not known."""
+        return np.array([points[k] if k >= 0 else [np.nan] * 3 for k in self._paths]).reshape(-1, 3)
 
     def lost(self, lost: np.ndarray) -> np.ndarray:
         """(m,) bool: the sensor that places a link is lost."""
@@ -96,5 +96,5 @@ def _stack(views: list[Any]) -> np.ndarray:
     return placements
 
 
-def _pack(time: float, placements: np.ndarray, hands: np.ndarray, lost: np.ndarray) -> bytes:
-    return np.array(time, "<f8").tobytes() + placements.tobytes() + hands.astype("<f4").tobytes() + lost.tobytes()
+def _pack(time: float, placements: np.ndarray, points: np.ndarray, lost: np.ndarray) -> bytes:
+    return np.array(time, "<f8").tobytes() + placements.tobytes() + points.astype("<f4").tobytes() + lost.tobytes()

@@ -6,14 +6,19 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..diagnostics import Diagnostic
+from ..errors import BadSession
 from ..filters import BEST
 from ..kinematics import LiveKinematics
-from ..model import BodyModel, load_model, load_table
+from ..model import BodyModel, load_table
+from ..model.body import load_sensed_model
+from ..model.start_pose import compute_start_configuration
+from ..model.table import NEUTRAL_POSE
 from ..readers.live_log import build_recording
 from ..recording import ImuSensor, Recording
 from ..recording.arrivals import (
@@ -31,7 +36,7 @@ from ..recording.arrivals import (
     Ticks,
     order_arrivals,
 )
-from ..subject import Subject, population_subject
+from ..subject import population_subject
 from ..tracking import Tracker, TrackOptions
 from ..tracking.causal import CausalSegmentEstimator
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
@@ -48,7 +53,7 @@ MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before
 MAX_LATENCIES = 1000  # newest latencies in the status
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
 DEFAULT_RATE_HZ = 100.0  # where none can be measured
-START_POSE = "Stand upright and still, arms hanging, palms to the thighs"
+START_POSES = {NEUTRAL_POSE: "Stand upright and still, arms hanging, palms to the thighs"}  # what to tell a person
 
 
 class Latencies:
@@ -122,7 +127,7 @@ class LiveLoop:
     Parameters
     ----------
     source : an open source; `run` closes it
-    model : a body; None: the package's, with the subject's lengths
+    model : a body; None: that of the setup, with the subject's lengths
     log : the recording; `run` closes it
     begin : time [s] of the first tick; None: when every sensor has sent a sample
 
@@ -138,7 +143,7 @@ class LiveLoop:
         setup: SensorSetup,
         *,
         method: str = BEST,
-        model: BodyModel | None = None,
+        model: BodyModel | str | Path | None = None,
         log: LiveLog | None = None,
         outputs: Sequence[Output] = (),
         begin: float | None = None,
@@ -146,8 +151,13 @@ class LiveLoop:
     ) -> None:
         self.source, self.method, self.log, self.outputs = source, method, log, tuple(outputs)
         self.setup = setup.as_recorded()
-        self.model = build_subject_model(setup.subject, model)
-        self.kinematics = LiveKinematics(self.model, source.sensors)
+        self.model = build_subject_model(setup, model, source.sensors)
+        self.model.table.check_segments(source.sensors, f"{setup.name}: sensors.", BadSession)
+        start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
+        self.kinematics = LiveKinematics(self.model, source.sensors, start)
+        self._instruction = START_POSES.get(setup.start_pose, f"Hold still in the start pose, {setup.start_pose}")
+        if self.model.table.is_mechanism:
+            self._instruction = f"{self.model.table.name} must stand still in its start configuration"
         self._begin, self._wait_s = begin, wait_s
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
         self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
@@ -267,7 +277,8 @@ class LiveLoop:
             self._latency.add(now - tick)
         latency = now - self._last_pose
         self._recent_latencies.append(latency)
-        return LivePose(self._last_pose, quat_WL.copy(), points, self._std, ticks.lost[-1].copy(), latency)
+        quat_WL = self.kinematics.orient_segments(quat_WL).copy()
+        return LivePose(self._last_pose, quat_WL, points, self._std, ticks.lost[-1].copy(), latency)
 
     def _start_tracking(self, search: StartPoseSearch, begin: int, end: int) -> CausalSegmentEstimator:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
@@ -372,18 +383,18 @@ class LiveLoop:
             return "waiting", "Measuring the sampling rate.", 0.0
         search, detector = self._start_search, self._start_search.detector
         if search.stated is not None:
-            return "start_pose", f"{START_POSE}, until {search.stated[1]:g} s.", search.progress
+            return "start_pose", f"{self._instruction}, until {search.stated[1]:g} s.", search.progress
         if detector.state == "waiting":
             missing = np.isin(np.arange(len(lost)), detector.missing)
             text = self._describe_lost(missing & frozen, frozen) or f"Waiting for {self._join_sensors(missing)}."
             return "waiting", text, 0.0
         if detector.state == "moved":
             moved = join_names([self.source.sensors[i] for i in detector.moving])
-            again = START_POSE[0].lower() + START_POSE[1:]
+            again = self._instruction[0].lower() + self._instruction[1:]
             return "moved", f"You moved ({moved}). Once more: {again}.", search.progress
         return (
             "start_pose",
-            f"{START_POSE}: {max(0.0, START_POSE_HOLD_S - detector.held_s):.0f} s more.",
+            f"{self._instruction}: {max(0.0, START_POSE_HOLD_S - detector.held_s):.0f} s more.",
             search.progress,
         )
 
@@ -416,12 +427,21 @@ class LiveLoop:
         )
 
 
-def build_subject_model(subject: Subject | None, model: BodyModel | None) -> BodyModel:
-    """Return `model` with the subject's lengths; None: the package's, without a subject of the population prior."""
-    body = model or load_model()
-    if subject is None and model is not None:
+def build_subject_model(
+    setup: SensorSetup, model: BodyModel | str | Path | None = None, sensors: Sequence[str] = ()
+) -> BodyModel:
+    """Return `model`, else the body that the setup names, else the upper body, with the subject's lengths.
+
+    Without a subject a chosen body has its own lengths, the upper body those of the population prior. `sensors` are
+    those of the source where it knows them; without them those of the setup.
+    """
+    chosen = model or setup.model or None
+    body = chosen
+    if not isinstance(body, BodyModel):
+        body = load_sensed_model(body, tuple(sensors) or tuple(setup.mounts), setup.name)
+    if setup.subject is None and chosen is not None:
         return body
-    lengths = (subject or population_subject()).lengths
+    lengths = (setup.subject or population_subject(body=body)).lengths
     return body.with_lengths({name: value for name, value in lengths.items() if name in body.lengths})
 
 

@@ -17,11 +17,11 @@ from ..kinematics import find_known_points
 from ..model import BodyModel
 from ..report.viewer import DARK, LIGHT, backdrop, filled, scene, trail_colour, view
 from .addresses import LOOPBACK
-from .encoder import HANDS, PoseEncoder
+from .encoder import PoseEncoder
 from .server import Server, ServerOptions
 from .state import LivePose, Output, Status, StreamInfo
 
-FINGERS = 0.1  # [m] from the middle of the palm
+FINGERS = 0.1  # [m] beyond the end of a limb
 MAX_KEYS = 16  # not yet taken; more are dropped
 
 
@@ -93,7 +93,7 @@ class LivePage(Output):
 
 
 def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str) -> str:
-    """The page; its scene is the body in the N-pose, its camera sees all that the hands can reach."""
+    """The page; its scene is the body in the N-pose, its camera sees all that the limbs can reach."""
     links = encoder.links
     neutral = np.frombuffer(encoder.encode(None), "<f4", 12 * len(links), offset=8).reshape(-1, 12)
     motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(links), 1, 1)).astype("<f4")
@@ -104,21 +104,24 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str
         "scene": scene(encoder.visuals, links),
         "backdrops": {"light": backdrop(LIGHT), "dark": backdrop(DARK)},
         "view": view(encoder.visuals, links, motion, [_find_reach(model)]),
-        "trails": [{"name": hand, "colour": trail_colour(hand, encoder.visuals)} for hand in HANDS],
+        "trails": [{"name": hand, "colour": trail_colour(hand, encoder.visuals)} for hand in model.table.paths],
     }
     return filled("live/templates/live.html.j2", data, title or "wepose live")
 
 
 def _find_reach(model: BodyModel) -> np.ndarray:
-    """Points (n, 3) [m] that the hands reach in front, at the sides and above the head."""
+    """Points (n, 3) [m] that the ends of limbs reach in front, at their side and up."""
     data = pin.Data(model.pin)
     pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
     known = find_known_points(model, model.chains)
     p_W = {point: data.oMf[model.pin.getFrameId(model.point_frames[point])].translation for point in known}
     ends = [np.zeros(3)]
-    for hand, left in zip(HANDS, (1.0, -1.0), strict=True):
-        if hand in p_W:
-            p_shoulder = p_W[f"{hand.split('_')[0]}_shoulder"]
+    begins = {limb[-1]: limb[0] for limb in model.table.limbs}
+    for end in model.table.paths:
+        if end not in p_W or begins.get(end) not in p_W:
+            continue
+        p_begin, side = p_W[begins[end]], model.table.side(end)
+        for left in (1.0,) if side == "left" else (-1.0,) if side == "right" else (1.0, -1.0):
             directions = np.array([[1.0, 0.0, 0.0], [0.7, 0.7 * left, 0.0], [0.0, left, 0.0], [0.0, 0.6 * left, 0.8]])
-            ends += list(p_shoulder + (np.linalg.norm(p_W[hand] - p_shoulder) + FINGERS) * directions)
+            ends += list(p_begin + (np.linalg.norm(p_W[end] - p_begin) + FINGERS) * directions)
     return np.array(ends)

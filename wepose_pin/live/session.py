@@ -43,7 +43,7 @@ def run_session(
     setup: SensorSetup,
     *,
     method: str = BEST,
-    model: BodyModel | None = None,
+    model: BodyModel | str | Path | None = None,
     record: str | Path | None = None,
     force: bool = False,
     outputs: Sequence[Output] = (),

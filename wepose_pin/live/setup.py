@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..model import load_table
 from ..model.table import NEUTRAL_POSE
-from ..readers.session_file import read_joints, read_phases, read_sensor_keys, read_session_file
+from ..readers.session_file import find_model, read_joints, read_phases, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
 from ..subject import Subject, parse_subject, subject_toml
 
@@ -26,6 +25,7 @@ class SensorSetup:
     subject_text : the ``subject.toml`` it was read from, if any
     mounts : segment → stated `quat_LS` (4,) xyzw
     phases : of a replay: `start` and `static` [s]; without `start` the loop searches the start pose
+    start_pose, joints, model : as in `Recording`
     """
 
     name: str = "live"
@@ -33,8 +33,10 @@ class SensorSetup:
     subject_text: str = ""
     mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, Intervals] = field(default_factory=dict)
-    start_pose: str = "n_pose"
+    start_pose: str = NEUTRAL_POSE
     remounted: bool = False
+    joints: Mapping[str, float] = field(default_factory=dict)
+    model: str = ""
 
     @classmethod
     def from_recording(
@@ -49,6 +51,8 @@ class SensorSetup:
             recording.phases,
             recording.start_pose,
             recording.remounted,
+            recording.joints,
+            recording.model,
         )
 
     def as_recorded(self) -> SensorSetup:
@@ -67,6 +71,8 @@ class SensorSetup:
             "phases": {name: [list(span) for span in spans] for name, spans in self.phases.items()},
             "start_pose": self.start_pose,
             "remounted": self.remounted,
+            "joints": dict(self.joints),
+            "model": self.model,
             "subject": self.subject_text or None,
         }
 
@@ -81,10 +87,9 @@ def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "
     """
     top = read_session_file(path)
     read_phases(top.table("phases", {}))
-    sensors = top.table("sensors").tables(load_table().segments, "segment")
-    stated = {segment: read_sensor_keys(table).mount for segment, table in sensors.items()}
-    start_pose = top.choice("start_pose", load_table().poses, NEUTRAL_POSE)
-    read_joints(top, start_pose)
+    sensors = top.table("sensors")
+    stated = {segment: read_sensor_keys(sensors.table(segment)).mount for segment in sensors.values}
+    start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
     return SensorSetup(
         top.text("name", None) or Path(top.file).absolute().parent.name,
         subject,
@@ -92,4 +97,6 @@ def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "
         {segment: mount for segment, mount in stated.items() if mount is not None},
         start_pose=start_pose,
         remounted=top.flag("remounted"),
+        joints=read_joints(top, start_pose),
+        model=find_model(Path(top.file), top),
     )

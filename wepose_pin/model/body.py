@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,14 +15,14 @@ import pinocchio as pin
 from ..arguments import check_arguments
 from ..assets import asset
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadModel, MissingFile, one_of
+from ..errors import BadModel, BadSession, MissingFile, one_of
 from . import lengths as _lengths
 from . import visuals as _visuals
 from .anthropometry import compute_population_lengths
 from .chains import Chain, find_chains, find_parents
 from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
-from .table import DEFAULT_BODY, BodyTable, find_table, load_table, parse_table, read_table
+from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, parse_table, read_table
 from .tree import AxisLimits, build, find_bounds, find_impossible_inertia, parse_tree
 from .visuals import Visual
 
@@ -206,6 +206,36 @@ def load_model(
     if own:
         _lengths.check_lengths_scale(robot, table)
     return body.with_lengths(lengths) if lengths else body
+
+
+def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: str) -> BodyModel:
+    """Read the body of a recording whose sensors have these names; of a URDF without a table a mechanism.
+
+    Its segments are the links that bear the sensors, as they are. Parameters and errors else as of `load_model`.
+
+    Raises
+    ------
+    BadSession
+        A sensor whose name is no link of a URDF without a table; `where` begins the text.
+    """
+    file = _find_body(path)
+    if path is None or file.suffix.lower() == ".toml":
+        return load_model(path)
+    robot = read_urdf(file)
+    tree, people = parse_tree(robot, str(file)), load_table().segments
+    if find_table(file, tree.below) is not None or any(name in people and name not in tree.below for name in sensors):
+        return load_model(path)
+    for name in sensors:
+        if name not in tree.below:
+            raise BadSession(
+                f"{where}: sensors.{name} is no link of {robot.name}; {one_of(tree.below, name, MOST_LINKS)}"
+            )
+    links = sorted(sensors, key=lambda name: len(tree.path(name)))
+    segments = {name: Segment(name, rigid_without_sensor=True) for name in links}
+    body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(file)), str(file))
+    if not body.pin.nv:
+        raise BadModel(f"{file}: no joint moves; a chain of revolute or prismatic joints is needed")
+    return body
 
 
 def _find_body(path: str | Path | None) -> Path:

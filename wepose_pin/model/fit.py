@@ -147,20 +147,3 @@ class Fit:
             if np.abs(step).max() < _STEP:
                 break
         return q, left
-
-
-def find_undetermined_joints(model: pin.Model, links: Sequence[str], q: np.ndarray) -> list[str]:
-    """Names of joints whose value in `q` (nq,) the orientations of `links` leave open, at least in part."""
-    data = model.createData()
-    pin.computeJointJacobians(model, data, q)
-    J = np.concatenate(
-        [pin.getFrameJacobian(model, data, model.getFrameId(link), pin.LOCAL_WORLD_ALIGNED)[3:] for link in links]
-    )
-    _, s, Vt = np.linalg.svd(J)
-    null = Vt[np.count_nonzero(s > 1e-6) :]
-    share = np.linalg.norm(null, axis=0) if len(null) else np.zeros(model.nv)
-    return [
-        model.names[j]
-        for j in range(1, model.njoints)
-        if np.any(share[model.idx_vs[j] : model.idx_vs[j] + model.nvs[j]] > 1e-3)
-    ]

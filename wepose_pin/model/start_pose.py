@@ -10,10 +10,9 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadSession, one_of
+from ..recording import CONFIGURATION
 from .body import BodyModel
 from .tree import find_bounds, joint_axis, joint_placement, parse_tree
-
-CONFIGURATION = "configuration"  # a start pose whose joints the session states
 
 
 def compute_start_configuration(

@@ -132,12 +132,8 @@ def _describe_result(path: Path) -> Description:
         f"{run['rate_hz']} Hz",
         *_read_diagnostics(summary.get("diagnostics")),
     ]
-    if (path / "joints.parquet").is_file():
-        facts[1:1] = [f"of a chain, sensors on: {', '.join(_texts(summary.get('orientation_residual_rms_deg')))}"]
-        return Description(f"{path}: a result of `wepose track`", (*facts, "its motion: joints.parquet"), (), None)
     facts[1:1] = [
-        f"sensors: {', '.join(_texts(summary.get('sensors')))}",
-        f"points: {', '.join(_texts(summary.get('points')))}",
+        f"{name}: {', '.join(_texts(summary.get(name)))}" for name in ("sensors", "points", "joints") if name in summary
     ]
     facts.append(f"look at it: wepose view {path}")
     return Description(f"{path}: a result of `wepose track`", tuple(facts), (), None)

@@ -197,7 +197,10 @@ def _header(path: Path, payload: bytes) -> dict[str, Any]:
     if not (isinstance(mounts, dict) and all(_is_quat(mount) for mount in mounts.values())):
         raise BadData(f"{path}: mounts = {mounts!r} in its header; a unit quaternion x, y, z, w each is needed")
     read_phases(TomlTable(phases if isinstance(phases, dict) else {"phases": phases}, str(path), "phases."))
-    return {"subject": None, **header}
+    joints, model = header.get("joints", {}), header.get("model", "")
+    if not isinstance(model, str) or not isinstance(joints, dict) or not all(map(is_number, joints.values())):
+        raise BadData(f"{path}: joints = {joints!r}, model = {model!r} in its header; the file is damaged")
+    return {"subject": None, "joints": {}, "model": "", **header}
 
 
 def _is_quat(value: Any) -> bool:
@@ -264,7 +267,7 @@ def build_recording(
 
     Parameters
     ----------
-    header : name, sensors, mounts, phases, start_pose, remounted, as in `HEAD`
+    header : name, sensors, mounts, phases, start_pose, remounted, joints, model, as in `HEAD`
     start : first and last tick of the start pose
     resets : ticks before which the headings were reset
 
@@ -307,4 +310,6 @@ def build_recording(
         header["remounted"],
         source=source,
         resets=tuple(tick - first for tick in resets),
+        joints=header["joints"],
+        model=header["model"],
     )

@@ -16,7 +16,7 @@ from .device import Device
 
 # Suffixes of data files.
 DATA = (".csv", ".parquet", ".txt", ".mat", ".h5", ".hdf5", ".mvnx", ".sto", ".wepose")
-SESSION_KEYS = ("name", "start_pose", "remounted", "data", "phases", "sensors", "joints")
+SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "sensors", "joints")
 # Keys of earlier versions, with their replacements.
 _RENAMED_PHASES = {
     "still": "is called static now: write static = [[from, to]], seconds in which the sensors lie on a table"
@@ -122,7 +122,7 @@ def read_phases(keys: TomlTable) -> dict[str, Intervals]:
 
 
 def read_joints(top: TomlTable, start_pose: str) -> dict[str, float]:
-    """Read the values of joints [rad or m] in the start pose of a chain."""
+    """Read the values of joints [rad or m] in the start pose."""
     if "joints" in top and start_pose != CONFIGURATION:
         raise BadSession(
             f'{top.at("joints")} stands beside start_pose = "{start_pose}"; joints have values where start_pose = '
@@ -131,6 +131,23 @@ def read_joints(top: TomlTable, start_pose: str) -> dict[str, float]:
     joints = top.table("joints", {})
     values = {name: joints.number(name, None) for name in joints.values}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def find_model(path: Path, top: TomlTable) -> str:
+    """Find the body that the session file `path` names: a file beside it, or the name of a body of the package.
+
+    Empty where it names none.
+    """
+    name = top.text("model", None)
+    if name is None:
+        return ""
+    file = path.parent / name
+    if not file.is_file() and (Path(name).suffix or len(Path(name).parts) > 1):
+        raise MissingFile(
+            f"{top.at('model')}: no such file '{name}' beside {path.name}; a URDF, a TOML that names one, or the name "
+            f"of a body of the package is needed"
+        )
+    return str(file) if file.is_file() else name
 
 
 def find_truth(path: Path, data: TomlTable) -> Path | None:

@@ -15,7 +15,7 @@ from .intervals import Intervals, check_phases, check_time
 from .limits import MEDIAN_FORCE
 from .sensors import ImuSensor, OrientationSensor, Sensor, join_sensors
 
-# The start pose of a chain that is not a person: values of its joints. Its sensors are named by links.
+# A start pose whose joints the session states.
 CONFIGURATION = "configuration"
 
 RATE_ERROR = 0.01  # allowed relative error of the stated rate; it is the relative error of all angles
@@ -38,7 +38,10 @@ class Recording:
     source : the file of the recording, for messages
     truth : file with the reference; None: there is none
     resets : samples before which a live session reset the headings, with the person in the start pose
+    start_pose : a pose of the body's table, or `CONFIGURATION`
     joints : joint → value [rad or m] in the start pose `CONFIGURATION`; joints that are not named are at zero
+    model : the body that bears the sensors: the file of a table or a URDF, or the name of a body of the package; empty:
+        the upper body
     diagnostics : assumptions, bridged gaps and faults from reading
     """
 
@@ -54,6 +57,7 @@ class Recording:
     truth: Path | None = None
     resets: tuple[int, ...] = ()
     joints: Mapping[str, float] = field(default_factory=dict)
+    model: str = ""
     diagnostics: tuple[Diagnostic, ...] = ()
 
     def __len__(self) -> int:

@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from ..arguments import check_arguments
 from ..filters import BEST
 from ..filters.static import StaticTest
 from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject
-from .chain import TrackedChain, track_chain
 from .options import TrackOptions
 from .session import CHUNK_S, LARGE, SMOOTHER_CHUNK_S, track_session
 from .tracked import SummaryAccumulator, TrackedRecording
@@ -23,11 +24,9 @@ __all__ = [
     "SMOOTHER_CHUNK_S",
     "SummaryAccumulator",
     "TrackOptions",
-    "TrackedChain",
     "TrackedRecording",
     "Tracker",
     "track",
-    "track_chain",
     "track_chunks",
     "track_session",
 ]
@@ -38,18 +37,20 @@ def track(
     subject: Subject | None = None,
     *,
     method: str = BEST,
-    model: BodyModel | None = None,
+    model: BodyModel | str | Path | None = None,
     static_test: StaticTest | None = None,
     open_loop: bool = False,
     causal: bool = False,
     limits: bool = True,
 ) -> TrackedRecording:
-    """The pose of the upper body.
+    """The pose of a body.
 
     Parameters
     ----------
     subject : lengths and mounts; None for the population's mean and the session's stated mounts
-    model : a body; None for ours. It gets the subject's lengths; without a subject its own stand
+    model : a body; its file, as for `load_model`, or the URDF of a mechanism whose links bear the sensors; or the name
+        of one of the package's. None for that which the recording names, else the upper body. It gets the subject's
+        lengths; without a subject its own stand
     method, static_test, open_loop, causal, limits : as `TrackOptions`
 
     Raises

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..alignment import (
-    START_POSE_STD,
+    N_POSE,
     SegmentOrientations,
+    StartFrames,
     align_sensors,
     check_mounts,
     compute_heading_offset,
@@ -49,12 +50,18 @@ class CausalEstimator:
     Parameters
     ----------
     subject : lengths and mounts; None for the session's stated mounts
+    start_frames : of the body; left out: the N-pose
     """
 
     def __init__(
-        self, subject: Subject | None = None, *, method: str = BEST, static_test: StaticTest | None = None
+        self,
+        subject: Subject | None = None,
+        *,
+        start_frames: StartFrames = N_POSE,
+        method: str = BEST,
+        static_test: StaticTest | None = None,
     ) -> None:
-        self._subject, self._method, self._static_test = subject, method, static_test
+        self._subject, self._start_frames, self._method, self._static_test = subject, start_frames, method, static_test
         self._received: Recording | None = None  # samples up to the end of the start pose
         self._start_detector: StartPoseDetector | None = None
         self._segment_estimator: CausalSegmentEstimator | None = None
@@ -134,9 +141,9 @@ class CausalEstimator:
                 return chunk
             interval = float(received.time[self._start_detector.begin]), float(received.time[self._start_detector.end])
             last = self._start_detector.end + 1
-        start_pose = replace(cut_start_pose(received, interval), start_is_guessed=not received.phases.get("start"))
+        start = replace(cut_start_pose(received, interval), start_is_guessed=not received.phases.get("start"))
         self._segment_estimator = CausalSegmentEstimator(
-            start_pose, self._subject, method=self._method, static_test=self._static_test
+            start, self._subject, start_frames=self._start_frames, method=self._method, static_test=self._static_test
         )
         return received.cut(slice(last, len(received)))
 
@@ -148,6 +155,7 @@ class CausalSegmentEstimator:
     ----------
     start_recording : a recording that ends with its start pose, `phases.start`
     subject : lengths and mounts; None for the session's stated mounts
+    start_frames : of the body; left out: the N-pose
 
     Attributes
     ----------
@@ -161,14 +169,16 @@ class CausalSegmentEstimator:
         start_recording: Recording,
         subject: Subject | None = None,
         *,
+        start_frames: StartFrames = N_POSE,
         method: str = BEST,
         static_test: StaticTest | None = None,
     ) -> None:
-        check_mounts(start_recording, subject)
-        self._filters = SensorFilters(start_recording, method=method, static_test=static_test)
+        check_mounts(start_recording, subject, start_frames)
+        self._filters = SensorFilters(start_recording, method=method, static_test=static_test, sways=start_frames.sways)
         _, orientation = self._filters.push(start_recording) or self._filters.finish()
-        alignment = align_sensors(start_recording, subject, combine_chunk(self._filters, start_recording, orientation))
-        self.start = orient_segments(start_recording, alignment, orientation, subject)
+        filtered = combine_chunk(self._filters, start_recording, orientation)
+        alignment = align_sensors(start_recording, subject, filtered, start_frames)
+        self.start = orient_segments(start_recording, alignment, orientation, subject, start_frames)
         self.names = tuple(start_recording.sensors)
         self.rate_hz = start_recording.rate_hz
         started = [orientation[name] for name in self.names]
@@ -176,7 +186,7 @@ class CausalSegmentEstimator:
             [filtered.filter for filtered in started if filtered.filter is not None],
             [filtered.detector for filtered in started if filtered.detector is not None],
         )
-        self._start_recording, self._subject = start_recording, subject
+        self._start_recording, self._subject, self._start_frames = start_recording, subject, start_frames
         self._quat_LS = np.array([self.start.quat_LS[name] for name in self.names])
         self.heading_offset = np.array([self.start.heading_offset[name] for name in self.names])
         self._quat_WV = _quat_about_z(self.heading_offset)
@@ -239,7 +249,7 @@ class CausalSegmentEstimator:
         )
 
     def reset_headings(self, heading_var: np.ndarray | None = None) -> None:
-        """Reset the headings: the person has stood in the start pose again for `RESET_S`.
+        """Reset the headings: the body has stood in the start pose again for `RESET_S`.
 
         Parameters
         ----------
@@ -250,9 +260,8 @@ class CausalSegmentEstimator:
         mean = same_sign.sum(axis=0)
         mean /= np.linalg.norm(mean, axis=1)[:, None]
         for i in range(len(self.names)):
-            self.heading_offset[i] = compute_heading_offset(
-                Rotation.from_quat(mean[i]), Rotation.from_quat(self._quat_LS[i])
-            )
+            R_WS_start = self._start_frames.to_world(self.names[i], Rotation.from_quat(self._quat_LS[i]))
+            self.heading_offset[i] = compute_heading_offset(Rotation.from_quat(mean[i]), R_WS_start)
         self._quat_WV = _quat_about_z(self.heading_offset)
         self._var_at_reset = heading_var if heading_var is not None else self.heading_var()
 
@@ -288,12 +297,15 @@ class CausalSegmentEstimator:
         """
         R_WS = Rotation.from_rotvec([0.0, 0.0, self.heading_offset[i]]) * Rotation.from_quat(quat_VS)
         R_LS = Rotation.from_quat(self._quat_LS[i])
-        cov = compute_segment_covariance(self._start_recording, self.names[i], self._subject, R_WS, R_LS, attitude_cov)
+        cov = compute_segment_covariance(
+            self._start_recording, self.names[i], self._subject, R_WS, R_LS, attitude_cov, self._start_frames
+        )
         if self._var_at_reset is not None:
             var = compute_heading_variance(quat_VS, attitude_cov)
             grown = np.maximum(0.0, var - self._var_at_reset[i])
             # The mount's part of the heading stays: the reset has set that of the start pose alone.
-            std_ratio = np.sqrt((np.maximum(cov[:, 2, 2] - var, 0.0) + grown + START_POSE_STD**2) / cov[:, 2, 2])
+            of_mount = np.maximum(cov[:, 2, 2] - var, 0.0)
+            std_ratio = np.sqrt((of_mount + grown + self._start_frames.std**2) / cov[:, 2, 2])
             cov[:, 2, :] *= std_ratio[:, None]
             cov[:, :, 2] *= std_ratio[:, None]
         return cov

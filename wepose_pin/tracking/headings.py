@@ -28,6 +28,7 @@ from ..alignment import (
     SEGMENT_ATTITUDE_STD,
     START_POSE_STD,
     SegmentOrientations,
+    StartFrames,
     compute_start_heading_var,
 )
 from ..calibration import PROTOCOLS, load_protocol
@@ -83,6 +84,7 @@ class HeadingCorrector:
         self, chunk: Recording, segments: Collection[str], start_end: float, subject: Subject, model: BodyModel
     ) -> None:
         self._subject, self._start_end, self._model = subject, start_end, model
+        self._start_frames = StartFrames(table=model.table)
         self._closures, of_body = _find_closures(chunk, segments, model)
         # A hinge axis is relative to the calibrated mounts and holds as long as they do.
         hinges = subject.hinges if not chunk.remounted else {}
@@ -163,7 +165,7 @@ class HeadingCorrector:
             if filter_cov is not None:
                 variance = np.interp(chunk.time, self._knot_times, self._cov[:, i, i])
                 with_heading, filter_var = filter_cov
-                start = compute_start_heading_var(chunk, name, self._subject)
+                start = compute_start_heading_var(chunk, name, self._subject, self._start_frames)
                 covariance[name] = _reduce_heading_covariance(
                     covariance[name], with_heading, filter_var + start, variance
                 )

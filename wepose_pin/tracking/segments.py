@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from ..alignment import SegmentOrientations, SensorAlignment, align_sensors, check_mounts, orient_segments
+from ..alignment import (
+    N_POSE,
+    SegmentOrientations,
+    SensorAlignment,
+    StartFrames,
+    align_sensors,
+    check_mounts,
+    orient_segments,
+)
 from ..filters import BEST, Orientation
 from ..filters.sensors import SensorFilters, combine_chunk
 from ..filters.static import StaticTest
@@ -21,12 +29,18 @@ class SegmentEstimator:
     Parameters
     ----------
     subject : its calibrated mounts go before those that the session states; None for the stated ones
+    start_frames : of the body; left out: the N-pose
     """
 
     def __init__(
-        self, subject: Subject | None = None, *, method: str = BEST, static_test: StaticTest | None = None
+        self,
+        subject: Subject | None = None,
+        *,
+        start_frames: StartFrames = N_POSE,
+        method: str = BEST,
+        static_test: StaticTest | None = None,
     ) -> None:
-        self._subject, self._method, self._static_test = subject, method, static_test
+        self._subject, self._start_frames, self._method, self._static_test = subject, start_frames, method, static_test
         self._filters: SensorFilters | None = None
         self._alignment: SensorAlignment | None = None
 
@@ -39,8 +53,10 @@ class SegmentEstimator:
             No mount is known for a sensor, or gravity contradicts it; a start phase with too few samples.
         """
         if self._filters is None:
-            check_mounts(chunk, self._subject)
-            self._filters = SensorFilters(chunk, method=self._method, static_test=self._static_test)
+            check_mounts(chunk, self._subject, self._start_frames)
+            self._filters = SensorFilters(
+                chunk, method=self._method, static_test=self._static_test, sways=self._start_frames.sways
+            )
         filtered = self._filters.push(chunk)
         return [] if filtered is None else [self._orient(self._filters, *filtered)]
 
@@ -52,8 +68,9 @@ class SegmentEstimator:
 
     def _orient(self, filters: SensorFilters, chunk: Recording, orientation: dict[str, Orientation]) -> Oriented:
         if self._alignment is None:
-            self._alignment = align_sensors(chunk, self._subject, combine_chunk(filters, chunk, orientation))
-        return chunk, orient_segments(chunk, self._alignment, orientation, self._subject)
+            filtered = combine_chunk(filters, chunk, orientation)
+            self._alignment = align_sensors(chunk, self._subject, filtered, self._start_frames)
+        return chunk, orient_segments(chunk, self._alignment, orientation, self._subject, self._start_frames)
 
 
 def estimate_segments(
@@ -63,7 +80,7 @@ def estimate_segments(
     method: str = BEST,
     static_test: StaticTest | None = None,
 ) -> SegmentOrientations:
-    """Segment orientations of a whole recording; parameters and errors as `SegmentEstimator`."""
+    """Segment orientations of a whole recording from the N-pose; parameters and errors as `SegmentEstimator`."""
     estimator = SegmentEstimator(subject, method=method, static_test=static_test)
     [(_, segments)] = estimator.push(recording) + estimator.finish()
     return segments

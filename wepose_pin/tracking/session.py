@@ -17,7 +17,7 @@ from ..filters import OFFLINE, chunk_multiple
 from ..filters.noise import BEGINNING_S
 from ..model import BodyModel
 from ..readers.session import SessionReader
-from ..recording import CONFIGURATION, Recording
+from ..recording import Recording
 from ..subject import Subject
 from .options import TrackOptions
 from .tracked import TrackedRecording
@@ -35,7 +35,7 @@ def track_session(
     *,
     seconds: float | None = None,
     gaps: bool = False,
-    model: BodyModel | None = None,
+    model: BodyModel | str | Path | None = None,
     options: TrackOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Iterator[TrackedRecording]:
@@ -56,8 +56,6 @@ def track_session(
     if not seconds >= SHORTEST_S:
         raise BadOption(f"chunks of {seconds:g} s: they have at least {SHORTEST_S:g} s")
     reader = session if isinstance(session, SessionReader) else SessionReader(session, gaps=gaps, in_memory=False)
-    if reader.start_pose == CONFIGURATION:
-        raise BadOption(f'{reader.path}: start_pose = "{CONFIGURATION}" is that of a chain, which has no chunks')
     multiple = chunk_multiple(options.method, reader.rate_hz)
 
     def share(task: str, chunk: Recording) -> None:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..alignment import SegmentOrientations
+from ..alignment import SegmentOrientations, StartFrames, find_start_frames
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json
-from ..errors import BadData
+from ..errors import BadData, BadSession
 from ..kinematics import Pose, compute_orientation_residuals
-from ..model import BodyModel, load_model
+from ..model import BodyModel
+from ..model.body import load_sensed_model
+from ..model.configurations import find_undetermined_joints
+from ..model.start_pose import compute_start_configuration
 from ..recording import Recording
 from ..subject import Subject, population_subject
 from .headings import HeadingCorrection
@@ -77,9 +81,20 @@ class TrackedRecording:
         accumulator.add(self)
         return accumulator
 
+    @property
+    def joints(self) -> Mapping[str, np.ndarray]:
+        """Joint of one axis → its values (n,) [rad or m]; of a mechanism."""
+        return self.pose.joints
+
     def orientation_residual(self) -> dict[str, np.ndarray]:
         """Segment → angle (n,) [rad] between its measured orientation and the model's, where joints are too few."""
-        return compute_orientation_residuals(self.model, self.q, self.quat_WL)
+        return compute_orientation_residuals(self.model, self.q, self.segments.quat_WL)
+
+    def find_undetermined_joints(self) -> list[str]:
+        """The joints of a mechanism that the measured segments leave open, at least in part: they move little."""
+        if not self.model.table.is_mechanism:
+            return []
+        return find_undetermined_joints(self.model.pin, list(self.quat_WL))
 
 
 class SummaryAccumulator:
@@ -91,6 +106,7 @@ class SummaryAccumulator:
         self._static: dict[str, int] = {}
         self._lost: dict[str, tuple[int, int, bool]] = {}  # segment → gaps, lost samples, whether the last one was
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
+        self._ranges: dict[str, tuple[float, float]] = {}  # joint of a mechanism → least and largest value [rad or m]
         self._later: list[Diagnostic] = []  # of reading later chunks than the first
 
     @property
@@ -122,6 +138,9 @@ class SummaryAccumulator:
             self._lost[segment] = gaps + begun, samples + int(np.count_nonzero(gap)), bool(gap[-1])
         for segment, angle in tracked.orientation_residual().items():
             self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
+        for joint, values in tracked.joints.items():
+            low, high = self._ranges.get(joint, (np.inf, -np.inf))
+            self._ranges[joint] = min(low, float(values.min())), max(high, float(values.max()))
         self._last = tracked
 
     def summary(self) -> dict[str, Any]:
@@ -157,6 +176,7 @@ class SummaryAccumulator:
             "sensors": sensors,
             "points": sorted(last.points),
             "orientation_residual_rms_deg": {name: round(float(np.degrees(v)), 3) for name, v in residual_rms.items()},
+            **self._summarize_joints(),
             "heading_correction": _correction_json(last.correction),
             "diagnostics": [as_json(diagnostic) for diagnostic in self.diagnostics()],
         }
@@ -170,6 +190,7 @@ class SummaryAccumulator:
             *self._later[:_MOST_LATER],
             *([Diagnostic("diagnostics-omitted", INFO, value=more)] if more > 0 else []),
             *_diagnose_unknown_points(last),
+            *_diagnose_undetermined_joints(last),
             *(
                 Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
                 for segment, rms in self._residual_rms().items()
@@ -177,6 +198,16 @@ class SummaryAccumulator:
             ),
             *last.model.diagnostics,
         )
+
+    def _summarize_joints(self) -> dict[str, Any]:
+        """Start configuration, ranges and undetermined joints of a mechanism; of a person nothing."""
+        if not self.last.model.table.is_mechanism:
+            return {}
+        return {
+            "start_joints": find_start_joints(self.last.model, self.last.recording),
+            "joints": {name: {"min": round(a, 5), "max": round(b, 5)} for name, (a, b) in self._ranges.items()},
+            "undetermined_joints": self.last.find_undetermined_joints(),
+        }
 
     def _residual_rms(self) -> dict[str, float]:
         """Segment → [rad]."""
@@ -208,11 +239,54 @@ def _diagnose_unknown_points(tracked: TrackedRecording) -> list[Diagnostic]:
     return [Diagnostic("points-unknown", INFO, facts=facts)]
 
 
-def make_body(subject: Subject | None, model: BodyModel | None) -> tuple[Subject, BodyModel]:
-    """The subject as used, without one the population prior, and a body of those lengths."""
-    body = model or load_model()
+def _diagnose_undetermined_joints(tracked: TrackedRecording) -> list[Diagnostic]:
+    """The joints that sensors are too few to tell apart."""
+    joints = tracked.find_undetermined_joints()
+    return [Diagnostic("joints-undetermined", WARNING, facts={"joints": ", ".join(joints)})] if joints else []
+
+
+def find_start_joints(model: BodyModel, recording: Recording) -> dict[str, float]:
+    """Joint → its value [rad or m] in the start pose; those that are not named are at zero."""
+    return dict(model.table.poses.get(recording.start_pose, recording.joints))
+
+
+@dataclass(frozen=True)
+class TrackedBody:
+    """The body of a recording.
+
+    Parameters
+    ----------
+    subject : lengths and mounts as used
+    model : the body with those lengths
+    start_frames : its segment frames in the start pose
+    start : (nq,) its configuration then
+    """
+
+    subject: Subject
+    model: BodyModel
+    start_frames: StartFrames
+    start: np.ndarray
+
+
+def make_body(subject: Subject | None, model: BodyModel | str | Path | None, recording: Recording) -> TrackedBody:
+    """The body of a recording: `model`, else the one that the recording names, else the upper body.
+
+    It has the subject's lengths, without a subject those of the population prior, or of a chosen model its own.
+
+    Raises
+    ------
+    WeposeError
+        A body that cannot be read; sensors, a start pose or lengths that are not its own.
+    """
+    where = recording.where()
+    chosen = model or recording.model or None
+    body = chosen if isinstance(chosen, BodyModel) else load_sensed_model(chosen, recording.sensors, where)
+    body.table.check_segments(recording.sensors, f"{where}: sensors.", BadSession)
+    start_frames = find_start_frames(body, recording)
     person = subject or population_subject(body=body)
     person.check_body(body.table)
-    if subject is None and model is not None:  # a chosen model has its person's lengths
+    if subject is None and chosen is not None:  # a chosen model has its person's lengths
         person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
-    return person, body.with_lengths({name: person.lengths[name] for name in body.table.lengths})
+    body = body.with_lengths({name: person.lengths[name] for name in body.table.lengths})
+    start = compute_start_configuration(body, recording.start_pose, recording.joints, where)
+    return TrackedBody(person, body, start_frames, start)

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
-from ..errors import BadOption, BadSession, one_of
+from ..alignment import StartFrames
+from ..errors import BadOption, BadPhase
 from ..kinematics import KinematicsSolver, compute_point_covariances
 from ..model import BodyModel
-from ..recording import CONFIGURATION, Recording
+from ..recording import Recording
 from ..subject import Subject
 from .causal import CausalEstimator, CausalSegmentEstimator
 from .headings import HeadingCorrector
 from .options import TrackOptions
 from .segments import Oriented, SegmentEstimator
-from .tracked import TrackedRecording, make_body
+from .tracked import TrackedBody, TrackedRecording, make_body
 
 Chunks = Callable[[], Iterable[Recording]]
 
 
 class Tracker:
-    """The pose of the upper body of a recording that comes in chunks; the whole recording may be one.
+    """The pose of the body of a recording that comes in chunks; the whole recording may be one.
 
     `push` returns the chunks that are complete, `finish` the rest: the smoother looks one chunk ahead, and the heading
     correction needs the whole recording. To save memory, pass over the chunks with `observe_headings` first and give
@@ -32,7 +34,8 @@ class Tracker:
     Parameters
     ----------
     subject : lengths and mounts; None for the population prior and the session's stated mounts
-    model : a body; None for the package's. It gets the subject's lengths; without a subject its own stand
+    model : a body, its file, or the name of one of the package's; None for that which the recording names, else the
+        upper body. It gets the subject's lengths; without a subject its own stand
     headings, observed : what `observe_headings` returned, after a pass over all chunks; without it headings are solved
         in `finish`, unless `options.open_loop`, where the subject allows it
     """
@@ -41,7 +44,7 @@ class Tracker:
         self,
         subject: Subject | None = None,
         *,
-        model: BodyModel | None = None,
+        model: BodyModel | str | Path | None = None,
         options: TrackOptions | None = None,
         headings: HeadingCorrector | None = None,
         observed: bool = False,
@@ -49,8 +52,8 @@ class Tracker:
         self.options = options or TrackOptions()
         self._subject, self._model = subject, model
         self._headings, self._solved = headings, observed
-        self._estimator = _estimator(subject, self.options)
-        self._person, self._body = make_body(subject, model)
+        self._estimator: SegmentEstimator | CausalEstimator | None = None  # made with the body, of the first chunk
+        self._body: TrackedBody | None = None
         self._kinematics: KinematicsSolver | None = None
         self._waiting: list[Oriented] = []  # until the headings are solved
 
@@ -63,8 +66,10 @@ class Tracker:
         BadOption, BadPhase
             The tracker is not causal; the start pose has not ended.
         """
-        if not isinstance(self._estimator, CausalEstimator):
+        if not self.options.causal:
             raise BadOption("a tracker takes single samples where its options are causal")
+        if not isinstance(self._estimator, CausalEstimator):
+            raise BadPhase("the start pose has not ended: push a recording that includes it")
         return self._estimator.segment_estimator
 
     def push(self, chunk: Recording) -> list[TrackedRecording]:
@@ -75,18 +80,17 @@ class Tracker:
         WeposeError
             What the recording, the subject or the model lacks; sensors on links that are no segments.
         """
-        _check_person(chunk)
-        self._body.table.check_segments(chunk.sensors, f"{chunk.where()}: sensors.", BadSession)
-        if chunk.start_pose not in self._body.table.poses:
-            raise BadSession(
-                f"{chunk.where()}: start_pose = '{chunk.start_pose}' is not known; {one_of(self._body.table.poses)}"
-            )
+        if self._estimator is None:
+            self._body = make_body(self._subject, self._model, chunk)
+            self._estimator = _estimator(self._subject, self._body.start_frames, self.options)
         if self.options.open_loop and chunk.resets:
             chunk = replace(chunk, resets=())
         return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented)]
 
     def finish(self) -> list[TrackedRecording]:
         """Return the remaining chunks, after the last one has been pushed."""
+        if self._estimator is None:
+            return []
         done = [tracked for oriented in self._estimator.finish() for tracked in self._process(oriented)]
         if self._headings is not None and not self._solved:
             self._solved = True
@@ -97,8 +101,9 @@ class Tracker:
         return done
 
     def _process(self, oriented: Oriented) -> list[TrackedRecording]:
+        assert self._body is not None  # made with the first chunk
         if self._headings is None and not self._solved:
-            self._headings = make_heading_corrector(oriented, self._subject, self._body, self.options)
+            self._headings = make_heading_corrector(oriented, self._subject, self._body.model, self.options)
             self._solved = self._headings is None
         if self._headings is not None and not self._solved:
             self._headings.add_observations(*oriented)
@@ -107,30 +112,35 @@ class Tracker:
         return [self._solve_pose(oriented)]
 
     def _solve_pose(self, oriented: Oriented) -> TrackedRecording:
-        recording, segments = oriented
+        assert self._body is not None  # made with the first chunk
+        (recording, segments), person, body = oriented, self._body.subject, self._body.model
         if self._headings is not None:
             segments = self._headings.correct(recording, segments)
         if self._kinematics is None:
-            self._kinematics = KinematicsSolver(self._body, segments.quat_WL, limits=self.options.limits)
+            self._kinematics = KinematicsSolver(
+                body, segments.quat_WL, limits=self.options.limits, start=self._body.start
+            )
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
-        lengths_cov = self._person.lengths_covariance(self._body.lengths)
+        lengths_cov = person.lengths_covariance(body.lengths)
         pose = replace(
             pose,
             segment_cov=segments.covariance_W,
-            point_cov=compute_point_covariances(self._body, pose.quat_WL, segments.covariance_W, lengths_cov),
+            point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, lengths_cov),
             gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         )
         correction = None if self._headings is None else self._headings.summarize()
-        return TrackedRecording(pose, recording, self._person, self._body, segments, self.options, correction)
+        return TrackedRecording(pose, recording, person, body, segments, self.options, correction)
 
 
 def observe_headings(
     chunks: Iterable[Recording],
     subject: Subject | None = None,
     options: TrackOptions | None = None,
-    model: BodyModel | None = None,
+    model: BodyModel | str | Path | None = None,
 ) -> HeadingCorrector | None:
     """Return the heading corrector of a recording after a pass over its chunks; None: nothing observes headings.
+
+    Parameters as of `Tracker`.
 
     Raises
     ------
@@ -138,21 +148,30 @@ def observe_headings(
         As `Tracker.push`.
     """
     options = options or TrackOptions()
-    estimator = _estimator(subject, options)
-    _, body = make_body(subject, model)
     headings: HeadingCorrector | None = None
-
-    def estimates() -> Iterator[Oriented]:
-        for chunk in chunks:
-            yield from estimator.push(chunk)
-        yield from estimator.finish()
-
-    for oriented in estimates():
+    for oriented, body in _estimate(chunks, subject, model, options):
         headings = headings or make_heading_corrector(oriented, subject, body, options)
         if headings is None:
             return None
         headings.add_observations(*oriented)
     return headings if headings is not None and headings.solve() else None
+
+
+def _estimate(
+    chunks: Iterable[Recording], subject: Subject | None, model: BodyModel | str | Path | None, options: TrackOptions
+) -> Iterator[tuple[Oriented, BodyModel]]:
+    """Iterate over the segment orientations of all chunks, each with the body."""
+    body: TrackedBody | None = None
+    estimator: SegmentEstimator | CausalEstimator | None = None
+    for chunk in chunks:
+        if body is None or estimator is None:
+            body = make_body(subject, model, chunk)
+            estimator = _estimator(subject, body.start_frames, options)
+        for oriented in estimator.push(chunk):
+            yield oriented, body.model
+    if body is not None and estimator is not None:
+        for oriented in estimator.finish():
+            yield oriented, body.model
 
 
 def make_heading_corrector(
@@ -172,7 +191,7 @@ def track_chunks(
     chunks: Chunks,
     subject: Subject | None = None,
     *,
-    model: BodyModel | None = None,
+    model: BodyModel | str | Path | None = None,
     options: TrackOptions | None = None,
     progress: Callable[[str, Recording], None] | None = None,
 ) -> Iterator[TrackedRecording]:
@@ -201,14 +220,8 @@ def track_chunks(
     yield from tracker.finish()
 
 
-def _estimator(subject: Subject | None, options: TrackOptions) -> SegmentEstimator | CausalEstimator:
+def _estimator(
+    subject: Subject | None, start_frames: StartFrames, options: TrackOptions
+) -> SegmentEstimator | CausalEstimator:
     kind = CausalEstimator if options.causal else SegmentEstimator
-    return kind(subject, method=options.method, static_test=options.static_test)
-
-
-def _check_person(recording: Recording) -> None:
-    if recording.start_pose == CONFIGURATION:
-        raise BadOption(
-            f'{recording.where()}: start_pose = "{CONFIGURATION}" is that of a chain: give its URDF (--model; in '
-            f"Python track_chain)"
-        )
+    return kind(subject, start_frames=start_frames, method=options.method, static_test=options.static_test)

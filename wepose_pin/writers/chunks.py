@@ -12,13 +12,13 @@ import polars as pl
 from ..errors import ExistingOutput
 from ..kinematics import build_pose_table
 from ..tracking import SummaryAccumulator, TrackedRecording
-from .result import write_about, write_table
+from .result import JOINTS, build_joint_table, write_about, write_table
 
 ROW_GROUP = 50_000  # rows that are put together at a time
 
 
 class ChunkWriter:
-    """`write_result`, a chunk at a time: a part of ``pose.parquet`` each, made one table at the end.
+    """`write_result`, a chunk at a time: a part of each table, made one at the end.
 
     Attributes
     ----------
@@ -28,8 +28,9 @@ class ChunkWriter:
     def __init__(self, folder: Path, covariance: bool = False) -> None:
         self.accumulator = SummaryAccumulator()
         self._folder, self._covariance = folder, covariance
-        self._parts = folder / "parts"
-        self._parts.mkdir()
+        self._parts = {name: folder / f"{name}.parts" for name in ("pose.parquet", JOINTS)}
+        for parts in self._parts.values():
+            parts.mkdir()
         self._seen = 0
 
     def add(self, chunk: TrackedRecording) -> None:
@@ -40,14 +41,19 @@ class ChunkWriter:
         ExistingOutput
             It cannot be written: a full disk, say.
         """
-        write_table(self._parts / f"{self._seen:012d}.parquet", build_pose_table(chunk.pose, self._covariance))
+        name = f"{self._seen:012d}.parquet"
+        write_table(self._parts["pose.parquet"] / name, build_pose_table(chunk.pose, self._covariance))
+        if chunk.joints:
+            write_table(self._parts[JOINTS] / name, build_joint_table(chunk.pose))
         self._seen += len(chunk.time)
         self.accumulator.add(chunk)
 
     def finish(self, phases: Mapping[str, Sequence[tuple[float, float]]], provenance: Mapping[str, Any]) -> None:
         """Write the other files."""
-        _concatenate(self._parts, self._folder / "pose.parquet")
-        shutil.rmtree(self._parts)
+        for name, parts in self._parts.items():
+            if any(parts.iterdir()):
+                _concatenate(parts, self._folder / name)
+            shutil.rmtree(parts)
         write_about(self._folder, self.accumulator.last, self.accumulator.summary(), phases, provenance)
 
 

@@ -22,7 +22,7 @@ FORMAT = 1
 ALONE = "provenance.json"  # beside results that have no JSON of their own
 INSIDE = ("summary.json", "calibration.json")
 # Of a result folder, what others are made from; pages and what was exported into it are not.
-_RESULT = ("pose.parquet", "joints.parquet", "subject.toml", "subject.urdf")
+_RESULT = ("pose.parquet", "joints.parquet", "subject.toml", "subject.urdf", "model.toml")
 _NOT_OPTIONS = ("out", "force")
 _PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -122,7 +122,13 @@ def list_files(path: Path, truth: bool = False) -> list[Path]:
         return [path / name for name in _RESULT if (path / name).is_file()] or sorted(_list_all(path))
     # A map may name a URDF of example-robot-data, which lies elsewhere and has a version of its own.
     named = [path.parent / name for name in list_named_files(path, truth)]
+    named += [file for body in named if body.suffix in (".toml", ".urdf") for file in _list_of_body(body)]
     return [path, *(file for file in named if file.exists() or file.suffix != ".urdf"), *_companion_files(path)]
+
+
+def _list_of_body(body: Path) -> list[Path]:
+    """What is read with a body that a session names."""
+    return [*(body.parent / name for name in list_named_files(body)), *_companion_files(body)]
 
 
 def _companion_files(path: Path) -> list[Path]:
@@ -142,8 +148,14 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
     data, sensors = content.get("data"), content.get("sensors")
     tables = [data, *(sensors.values() if isinstance(sensors, dict) else ())]
     names = [table.get("file") for table in tables if isinstance(table, dict)]
-    names += [content.get("urdf"), data.get("truth") if truth and isinstance(data, dict) else None]
+    names += [_named_model(path, content.get("model")), content.get("urdf")]
+    names += [data.get("truth") if truth and isinstance(data, dict) else None]
     return sorted({name for name in names if isinstance(name, str) and name})
+
+
+def _named_model(path: Path, name: object) -> str | None:
+    """The body that a session names, where it is a file; one of the package is part of the code."""
+    return name if isinstance(name, str) and (path.parent / name).is_file() else None
 
 
 def file_hash(path: Path) -> str:

@@ -1,4 +1,7 @@
-"""The result folder: ``pose.parquet``, ``subject.toml``, ``subject.urdf``, ``summary.json``."""
+"""The result folder: ``pose.parquet``, ``subject.toml``, ``subject.urdf``, ``summary.json``.
+
+With a body other than the upper body also ``model.toml``, its table; of a mechanism also ``joints.parquet``.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import json
 import platform
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -17,13 +21,17 @@ import polars as pl
 from .. import __version__
 from ..errors import BadData, ExistingOutput, MissingFile
 from ..kinematics import Pose, build_pose_table, parse_pose_table
-from ..model import BodyModel, load_model
+from ..model import BodyModel, BodyTable, load_model, load_table
+from ..model.table import MODEL_TABLE, format_table
 from ..readers.tables import read_table
 from ..subject import Subject, subject_toml
 from ..tracking import TrackedRecording
 
 if TYPE_CHECKING:  # it loads scipy.signal, which few results need
     from ..angles.torques import Torques
+
+
+JOINTS = "joints.parquet"
 
 
 def write_result(
@@ -40,6 +48,8 @@ def write_result(
     ``torques.parquet``, `provenance` part of the summary.
     """
     write_table(folder / "pose.parquet", build_pose_table(tracked.pose, covariance))
+    if tracked.joints:
+        write_table(folder / JOINTS, build_joint_table(tracked.pose))
     summary = tracked.summary()
     if torques is not None:
         from ..angles.torques import torque_table
@@ -65,6 +75,11 @@ def write_about(
     (folder / "summary.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
 
 
+def build_joint_table(pose: Pose) -> pl.DataFrame:
+    """Build the table of ``joints.parquet``: ``time``, and a column a joint of one axis [rad or m]."""
+    return pl.DataFrame({"time": pose.time, **pose.joints})
+
+
 def write_table(path: Path, table: pl.DataFrame) -> None:
     """A Parquet file.
 
@@ -82,7 +97,7 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
 
 
 def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
-    """``subject.toml``, and ``subject.urdf``: the body with the subject's lengths."""
+    """``subject.toml``, and ``subject.urdf``: the body with the subject's lengths; of another body ``model.toml``."""
     (folder / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
     head, _, body = model.urdf().partition("\n")
     text = "; ".join(
@@ -93,6 +108,13 @@ def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
         "-(?=-)", "- ", f"{subject.name}: lengths in metres ± one standard deviation. {text}"
     )  # no -- in XML
     (folder / "subject.urdf").write_text(f"{head}\n<!-- {comment} -->\n{body}", encoding="utf-8")
+    if _strip_origin(model.table) != _strip_origin(load_table()):
+        (folder / MODEL_TABLE).write_text(format_table(model.table, "subject.urdf"), encoding="utf-8")
+
+
+def _strip_origin(table: BodyTable) -> BodyTable:
+    """A table without what says where it is from."""
+    return replace(table, name="", where="")
 
 
 def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
@@ -105,9 +127,9 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
     """
     if not (folder / "pose.parquet").is_file():
         raise MissingFile(f"{folder}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
-    if (folder / "joints.parquet").is_file():
-        raise BadData(f"{folder}: of a chain, its motion is in joints.parquet; a person's result is wanted here")
     pose = parse_pose_table(read_table(folder / "pose.parquet"), str(folder / "pose.parquet"))
+    if (folder / JOINTS).is_file():
+        pose = replace(pose, joints=_read_joints(folder / JOINTS, len(pose.time)))
     summary_file = folder / "summary.json"
     try:
         summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.is_file() else {}
@@ -116,6 +138,18 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
     if not isinstance(summary, dict):
         raise BadData(f"{summary_file}: is damaged: {str(summary)[:40]!r} in place of an object")
     return pose, load_model(folder / "subject.urdf"), summary
+
+
+def _read_joints(file: Path, samples: int) -> dict[str, np.ndarray]:
+    """Joint → its values (n,) [rad or m]."""
+    table = read_table(file)
+    try:
+        joints = {name: table[name].cast(pl.Float64).to_numpy() for name in table.columns if name != "time"}
+    except pl.exceptions.PolarsError as error:
+        raise BadData(f"{file}: a column holds text: {str(error).splitlines()[0]}") from error
+    if len(table) != samples:
+        raise BadData(f"{file}: {len(table)} rows, and pose.parquet beside it has {samples}; they must be as many")
+    return joints
 
 
 @cache

@@ -17,7 +17,8 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     table = {"time": recording.time}
     lines = [
         f"name = {toml_string(recording.name)}",
-        f'start_pose = "{recording.start_pose}"',
+        *([f"model = {toml_string(_name_model(recording.model))}"] if recording.model else []),
+        f"start_pose = {toml_string(recording.start_pose)}",
         *(["remounted = true"] if recording.remounted else []),
         "",
         "[data]",
@@ -53,3 +54,8 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     if truth is not None:
         write_table(folder / "truth.parquet", build_pose_table(truth))
     (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _name_model(model: str) -> str:
+    """The body as a session elsewhere names it."""
+    return str(Path(model).absolute()) if Path(model).is_file() else model

@@ -26,6 +26,7 @@ def open_source(
     speed: float | str = 1.0,
     baud: int = 115200,
     wait_s: float = 10.0,
+    segments: Sequence[str] | None = None,
 ) -> Source:
     """The source that `spec` describes, not yet opened.
 
@@ -37,6 +38,7 @@ def open_source(
     speed : of a replay: 1.0 its own, 4.0 four times that, "max" as fast as possible
     baud : of serial ports
     wait_s : how long `open` waits for streams or senders [s]
+    segments : names that sensors of a stream may have, those of the body; None: the upper body's. A replay has its own
 
     Raises
     ------
@@ -46,16 +48,17 @@ def open_source(
     kind, colon, rest = spec.partition(":")
     if kind not in FORMS or not colon or not rest:
         raise BadOption(f"source '{spec}' is none; {one_of(FORMS.values(), kind)}")
-    unknown = [name for name in sensors or () if name not in tuple(load_table().segments)]
-    if unknown:
-        raise BadOption(f"source '{spec}': '{unknown[0]}' is not a segment; {one_of(unknown[0])}")
     if kind == "replay":
         return _open_replay(spec, rest, sensors, speed)
+    segments = tuple(load_table().segments) if segments is None else segments
+    unknown = [name for name in sensors or () if name not in segments]
+    if unknown:
+        raise BadOption(f"source '{spec}': '{unknown[0]}' is not a segment; {one_of(segments, unknown[0])}")
     if kind == "lsl":
-        return _open_lsl(spec, rest, sensors, wait_s)
+        return _open_lsl(spec, rest, sensors, wait_s, segments)
     if kind == "udp":
-        return _open_udp(spec, rest, sensors, wait_s)
-    return _open_mti(spec, rest, sensors, baud)
+        return _open_udp(spec, rest, sensors, wait_s, segments)
+    return _open_mti(spec, rest, sensors, baud, segments)
 
 
 def _open_replay(spec: str, path: str, sensors: Sequence[str] | None, speed: float | str) -> Source:
@@ -79,25 +82,25 @@ def _open_replay(spec: str, path: str, sensors: Sequence[str] | None, speed: flo
     return ReplaySource(recording, factor)
 
 
-def _open_lsl(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float) -> Source:
+def _open_lsl(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]) -> Source:
     from .lsl import SCOPES, LslSource
 
     name, separator, scope = rest.rpartition("@")
     if not separator:
-        return LslSource(rest, sensors, None, wait_s)
+        return LslSource(rest, sensors, None, wait_s, segments)
     if scope not in SCOPES:
         raise BadOption(f"source '{spec}': '{scope}' is no reach of a search; {one_of(SCOPES, scope)}")
-    return LslSource(name, sensors, scope, wait_s)
+    return LslSource(name, sensors, scope, wait_s, segments)
 
 
-def _open_udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float) -> Source:
+def _open_udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]) -> Source:
     from .udp import UdpSource
 
     host, port = parse_address(rest, f"source '{spec}':", 9000)
-    return UdpSource(host, port, sensors, wait_s)
+    return UdpSource(host, port, sensors, wait_s, segments)
 
 
-def _open_mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int) -> Source:
+def _open_mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int, segments: Sequence[str]) -> Source:
     from .mti import MTiSource
 
     pairs, separator, rate = rest.rpartition("@")
@@ -110,9 +113,9 @@ def _open_mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int) ->
     for pair in (pairs if separator else rest).split(","):
         device, equals, segment = pair.rpartition("=")
         if not equals or not device:
-            raise BadOption(f"source '{spec}': '{pair}' is no DEVICE=SEGMENT, as /dev/ttyUSB0=torso")
-        if segment not in tuple(load_table().segments):
-            raise BadOption(f"source '{spec}': '{segment}' is not a segment; {one_of(segment)}")
+            raise BadOption(f"source '{spec}': '{pair}' is no DEVICE=SEGMENT, as /dev/ttyUSB0={segments[0]}")
+        if segment not in segments:
+            raise BadOption(f"source '{spec}': '{segment}' is not a segment; {one_of(segments, segment)}")
         if segment in devices or device in devices.values():
             raise BadOption(f"source '{spec}': '{pair}': each device and each segment is named once")
         devices[segment] = device

@@ -54,12 +54,18 @@ class SensorChannels(NamedTuple):
 
 
 def find_channels(
-    stream: str, name: str, labels: Sequence[str], units: Sequence[str], count: int
+    stream: str,
+    name: str,
+    labels: Sequence[str],
+    units: Sequence[str],
+    count: int,
+    segments: Sequence[str] | None = None,
 ) -> list[SensorChannels]:
     """The sensors of a stream and their channels.
 
     `<name>-<segment>` or `<name>_<segment>` is one sensor: six channels gyro xyz, accel xyz, or any number with labels
-    `gyr_x` … `acc_z`. `<name>` itself is one for all, with labels `<segment>_gyr_x` … `<segment>_acc_z`.
+    `gyr_x` … `acc_z`. `<name>` itself is one for all, with labels `<segment>_gyr_x` … `<segment>_acc_z`. `segments`:
+    names that sensors may have; None: those of the upper body.
 
     Raises
     ------
@@ -67,10 +73,11 @@ def find_channels(
         An unknown segment, label or unit, or missing channels.
     """
     where = f"lsl:{name}: stream '{stream}'"
+    segments = tuple(load_table().segments) if segments is None else segments
     if stream != name:
         segment = stream[len(name) + 1 :]
-        if segment not in tuple(load_table().segments):
-            raise BadSource(f"{where}: '{segment}' is not a segment; {one_of(segment)}")
+        if segment not in segments:
+            raise BadSource(f"{where}: '{segment}' is not a segment; {one_of(segments, segment)}")
         wanted = {segment: list(SIGNALS)}
         if not any(labels):
             if count != len(SIGNALS):
@@ -80,16 +87,12 @@ def find_channels(
                 )
             labels = SIGNALS
     else:
-        there = [
-            segment
-            for segment in tuple(load_table().segments)
-            if any(label.startswith(f"{segment}_") for label in labels)
-        ]
+        there = [segment for segment in segments if any(label.startswith(f"{segment}_") for label in labels)]
         wanted = {segment: [f"{segment}_{signal}" for signal in SIGNALS] for segment in there}
         if not wanted:
             raise BadSource(
-                f"{where}: no channel label names a segment, as torso_gyr_x; {one_of(filter(None, labels))} "
-                f"(or send one stream a sensor, named {name}-torso)"
+                f"{where}: no channel label names a segment, as {segments[0]}_gyr_x; {one_of(filter(None, labels))} "
+                f"(or send one stream a sensor, named {name}-{segments[0]})"
             )
     parts = []
     for segment, names in wanted.items():
@@ -115,6 +118,7 @@ class LslSource:
     sensors : to wait for; None: all that are found
     scope : "machine", "link" or "site"; None: this machine, or as the user's own ``LSLAPICFG`` says where it is set
     wait_s : [s] for which `open` searches the streams
+    segments : names that sensors may have; None: those of the upper body
 
     Notes
     -----
@@ -123,11 +127,17 @@ class LslSource:
     """
 
     def __init__(
-        self, name: str, sensors: Sequence[str] | None = None, scope: str | None = None, wait_s: float = 10.0
+        self,
+        name: str,
+        sensors: Sequence[str] | None = None,
+        scope: str | None = None,
+        wait_s: float = 10.0,
+        segments: Sequence[str] | None = None,
     ) -> None:
         if not name or "'" in name:
             raise BadOption(f"lsl:{name}: a stream's name has at least one letter and no quote, as lsl:wepose")
         self.sensors = tuple(sensors or ())
+        self._segments = tuple(load_table().segments if segments is None else segments)
         self.rate_hz: float | None = None
         self.problems: dict[str, int] = Counter()
         self._name, self._scope, self._wait_s = name, scope, wait_s
@@ -171,7 +181,7 @@ class LslSource:
                 f"lsl:{self._name}: {problem}, within {self._wait_s:g} s; name streams {self._name}-<segment>, or look "
                 f"further with lsl:{self._name}@site"
             )
-        self.sensors = self.sensors or tuple(segment for segment in tuple(load_table().segments) if segment in present)
+        self.sensors = self.sensors or tuple(segment for segment in self._segments if segment in present)
         rates = {stream.rate_hz for stream in self._streams.values()}
         self.rate_hz = rates.pop() if len(rates) == 1 and min(rates) > 0.0 else None
         self._reconnector = threading.Thread(target=self._reconnect, name=f"lsl {self._name}", daemon=True)
@@ -243,7 +253,7 @@ class LslSource:
         if full.channel_format() == lsl.cf_string:
             raise BadSource(f"lsl:{self._name}: stream '{stream}' holds text; six channels of numbers a sensor")
         labels, units = _read_channels(full)
-        parts = find_channels(stream, self._name, labels, units, full.channel_count())
+        parts = find_channels(stream, self._name, labels, units, full.channel_count(), self._segments)
         return _Stream(stream, inlet, parts, float(full.nominal_srate()))
 
     def _reconnect(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
+from collections.abc import Collection
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -35,8 +36,12 @@ class _Malformed(Exception):
     """A malformed line or datagram; its text is the problem."""
 
 
-def decode(datagram: bytes) -> tuple[list[Batch], list[str]]:
-    """The batches in a datagram, and a problem for each line that is dropped; raises nothing."""
+def decode(datagram: bytes, segments: Collection[str] | None = None) -> tuple[list[Batch], list[str]]:
+    """The batches in a datagram, and a problem for each line that is dropped; raises nothing.
+
+    `segments` : names of sensors in lines of JSON; None: those of the upper body
+    """
+    segments = load_table().segments if segments is None else segments
     if datagram[:4] == MAGIC:
         try:
             return [_decode_binary(datagram)], []
@@ -47,7 +52,7 @@ def decode(datagram: bytes) -> tuple[list[Batch], list[str]]:
     for line in datagram.splitlines():
         if line.strip():
             try:
-                sensor, time, rows = _decode_line(line)
+                sensor, time, rows = _decode_line(line, segments)
             except _Malformed as error:
                 problems.append(str(error))
                 continue
@@ -77,7 +82,7 @@ def _refuse_constant(text: str) -> NoReturn:
     raise _Malformed(f"JSON lines with {text}, which is no number")
 
 
-def _decode_line(line: bytes) -> tuple[str, list[float], list[list[float]]]:
+def _decode_line(line: bytes, segments: Collection[str]) -> tuple[str, list[float], list[list[float]]]:
     """Sensor, times (m), and rows of gyro and accel (m, 6); lists, which are faster for a single sample."""
     try:
         message = json.loads(line, parse_constant=_refuse_constant)
@@ -86,7 +91,7 @@ def _decode_line(line: bytes) -> tuple[str, list[float], list[list[float]]]:
     if not isinstance(message, dict) or not message.keys() >= {"sensor", "t", "gyro", "accel"}:
         raise _Malformed("JSON lines without sensor, t, gyro and accel")
     sensor = message["sensor"]
-    if sensor not in tuple(load_table().segments):
+    if sensor not in tuple(segments):
         raise _Malformed(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
     time, gyro, accel = message["t"], message["gyro"], message["accel"]
     if not isinstance(time, list):

@@ -34,11 +34,20 @@ class UdpSource:
     ----------
     port : 0 for any free one; then see `address`
     sensors : to take; None: those that send while `open` waits
+    segments : names that sensors may have; None: those of the upper body
     wait_s : [s] for which `open` waits for the first datagram where `sensors` are not given
     """
 
-    def __init__(self, host: str, port: int, sensors: Sequence[str] | None = None, wait_s: float = 10.0) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        sensors: Sequence[str] | None = None,
+        wait_s: float = 10.0,
+        segments: Sequence[str] | None = None,
+    ) -> None:
         self.sensors = tuple(sensors or ())
+        self._segments = tuple(load_table().segments if segments is None else segments)
         self.rate_hz: float | None = None
         self.problems: dict[str, int] = Counter()
         self.address = (host, port)
@@ -74,7 +83,7 @@ class UdpSource:
 
     def _find_sensors(self) -> None:
         host, port = self.address
-        self.sensors = tuple(load_table().segments)
+        self.sensors = self._segments
         deadline = time.monotonic() + self._wait_s
         while not self._waiting and time.monotonic() < deadline:
             self._waiting = self._receive(0.1)
@@ -89,7 +98,7 @@ class UdpSource:
         while time.monotonic() < deadline:
             self._waiting += self._receive(0.1)
         present = {samples.sensor for samples in self._waiting}
-        self.sensors = tuple(segment for segment in tuple(load_table().segments) if segment in present)
+        self.sensors = tuple(segment for segment in self._segments if segment in present)
 
     def read(self, timeout_s: float) -> list[Samples]:
         """Samples since the last call, one `Samples` a sensor."""
@@ -134,7 +143,7 @@ class UdpSource:
             except OSError:  # an ICMP reply to another datagram
                 self._count("errors of the socket")
                 break
-            batches, problems = decode(datagram)
+            batches, problems = decode(datagram, self._segments)
             for problem in problems:
                 self._count(problem)
             batches = [batch for batch in batches if self._accepts(batch)]

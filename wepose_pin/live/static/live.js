@@ -19,7 +19,8 @@ const screenBackdrop = () => backdrop(darkScreen.matches ? "dark" : "light");
 darkScreen.addEventListener("change", screenBackdrop);
 screenBackdrop();
 
-// ---- one frame: time [s], of each link R_WL row by row and p_WL, both hands, of each link whether its sensor is lost
+// ---- one frame: time [s], of each link R_WL row by row and p_WL, the points of trails, of each link whether its sensor
+// is lost
 const matrix = new THREE.Matrix4();
 const paths = data.trails.map(() => []);
 const ribbons = data.trails.map(({ colour }) => new Ribbon(viewer, colour, TRAIL_POINTS, TRAIL_S, TRAIL_WIDTH));
@@ -29,7 +30,7 @@ const shownLost = new Uint8Array(n);
 function pose(buffer) {
   const before = now;
   now = new DataView(buffer).getFloat64(0, true);
-  const v = new Float32Array(buffer, 8, 12 * n + 6), lost = new Uint8Array(buffer, 8 + 4 * v.length, n);
+  const v = new Float32Array(buffer, 8, 12 * n + 3 * paths.length), lost = new Uint8Array(buffer, 8 + 4 * v.length, n);
   body.forEach((link, k) => {
     const a = 12 * k;
     link.visible = isFinite(v[a] + v[a + 9]);                            // NaN: not known
