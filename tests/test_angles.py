@@ -259,7 +259,7 @@ def test_angles_are_scipys_on_frames_from_landmarks(side: str, name: str) -> Non
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_hip_and_ankle_are_scipys_on_frames_from_landmarks_and_the_knee_is_grood_and_suntays(side: str) -> None:
     rng = np.random.default_rng(8)
-    quat_WL = {s: Rotation.from_rotvec(rng.normal(scale=0.35, size=(300, 3))).as_quat() for s in SEGMENTS}
+    quat_WL = {s: Rotation.from_rotvec(rng.normal(scale=0.2, size=(300, 3))).as_quat() for s in SEGMENTS}
     frames = landmark_frames({s: Rotation.from_quat(quat).as_matrix() for s, quat in quat_WL.items()}, side)
     angles = joint_angles(pose_with(quat_WL))
     for proximal, distal in (("pelvis", "hip"), ("knee", "ankle")):
@@ -556,6 +556,7 @@ def test_the_page_shows_every_axis_and_angle() -> None:
     for joint in JOINTS.values():
         assert all(f"`{name}`" in page for name in joint.names)
     assert all(f"`{name}`" in page for names in SHOULDER_SEQUENCES.values() for name in names)
+    _, _, section = page.partition("## The ISB's axes")
     for segment, axes in ISB_AXES.items():
-        row = next(line for line in page.splitlines() if line.startswith(f"| `{segment}`"))
+        row = next(line for line in section.splitlines() if line.startswith(f"| `{segment}`"))
         assert [cell.strip().strip("`") for cell in row.split("|")[2:5]] == list(axes)
