@@ -8,6 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.angles import joint_angles
+from wepose_pin.errors import BadOption
+from wepose_pin.kinematics import Pose
+from wepose_pin.model import load_model
+from wepose_pin.simulation import NOISE_FREE, Simulation, simulate_activity
+from wepose_pin.simulation.activities import ACTIVITIES
 
 URDF = Path(__file__).resolve().parent.parent / "urdf"
 SIDES = ("left", "right")
@@ -19,6 +28,16 @@ def parts(name: str) -> dict[tuple[str, str | None], ET.Element]:
     for element in root.iter():
         element.text = element.tail = None
     return {(element.tag, element.get("name")): element for element in root}
+
+
+@pytest.fixture(scope="module", params=ACTIVITIES)
+def activity(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def made(activity: str) -> Simulation:
+    return simulate_activity(activity, seed=2, noise=NOISE_FREE, seconds=10.0)
 
 
 # The model --------------------------------------------------------------------------------------------------------
@@ -82,3 +101,69 @@ def test_left_and_right_leg_mirror_each_other() -> None:
             continue
         limits = [tuple(float(each.find("limit").get(end)) for end in ("lower", "upper")) for each in (left, right)]
         assert limits[1] == (limits[0] if name.endswith("_y") else (-limits[0][1], -limits[0][0]))
+
+
+# Activities -------------------------------------------------------------------------------------------------------
+
+
+def test_the_true_pose_has_the_angles_of_the_activity(activity: str) -> None:
+    motion = ACTIVITIES[activity](load_model(URDF / "whole_body.urdf"), np.random.default_rng(1), 10.0)
+    t = np.arange(0.0, 17.0, 0.013)
+    R_WL = motion(t, ()).R_WL
+    angles = joint_angles(Pose(t, {segment: R.as_quat() for segment, R in R_WL.items()}, {}))
+    for side in SIDES:
+        for joint, values in motion.leg(side, t)._asdict().items():
+            np.testing.assert_allclose(angles[f"{side}_{joint}"].values, values, atol=1e-12)
+        elbow = angles[f"{side}_elbow"]
+        np.testing.assert_allclose(elbow.values[:, 0], motion.arm(side, t)[:, 1], atol=1e-12)
+    most = {name: np.degrees(angle.values.max(axis=0)) for name, angle in angles.joints.items()}
+    if activity == "walk":
+        assert 50.0 < most["left_knee"][0] < 72.0
+        hip, shoulder = motion.leg("left", t).hip[:, 0], motion.arm("left", t)[:, 0]
+        assert np.corrcoef(hip, shoulder)[0, 1] < -0.8  # arms swing against the legs
+        half = round(0.5 * motion.stride_s / 0.013)
+        between = slice(700, 900)
+        left, right = (motion.leg(side, t).knee[:, 0] for side in SIDES)
+        assert np.corrcoef(left[between], right[700 + half : 900 + half])[0, 1] > 0.99
+    else:
+        assert 90.0 < most["left_knee"][0] < 95.0
+        assert 90.0 < most["left_hip"][0] < 105.0
+
+
+def test_points_and_sensors_are_where_the_segments_put_them(made: Simulation) -> None:
+    lengths, R_WL = made.lengths, {segment: Rotation.from_quat(quat) for segment, quat in made.quat_WL.items()}
+    for side, y in (("left", 1.0), ("right", -1.0)):
+        p_W = R_WL["pelvis"].apply([0.0, y * lengths["hip_width"] / 2.0, 0.0])
+        origins = {}
+        for segment, point, end in (("thigh", "hip", "knee"), ("shank", "knee", "ankle"), ("foot", "ankle", None)):
+            np.testing.assert_allclose(made.points[f"{side}_{point}"], p_W, atol=1e-12)
+            origins[segment] = p_W
+            if end is not None:
+                p_W = p_W + R_WL[f"{side}_{segment}"].apply([0.0, 0.0, -lengths[f"{side}_{segment}"]])
+        toe_L = R_WL[f"{side}_foot"].inv().apply(made.points[f"{side}_toe"] - p_W)
+        assert np.linalg.norm(toe_L, axis=1) == pytest.approx(lengths[f"{side}_foot"], abs=1e-12)
+        heel_L = R_WL[f"{side}_foot"].inv().apply(made.points[f"{side}_heel"] - p_W)
+        np.testing.assert_allclose(toe_L[:, 2], heel_L[:, 2], atol=1e-12)  # both on the sole
+        for segment, origin in origins.items():
+            sensor = f"{side}_{segment}"
+            p_WS = origin + R_WL[sensor].apply(made.p_LS[sensor])
+            R_WS = R_WL[sensor] * Rotation.from_quat(made.quat_LS[sensor])
+            accel_W = R_WS.apply(made.accel_S[sensor]) - [0.0, 0.0, 9.81]
+            spline = CubicSpline(made.time, p_WS).derivative(2)(made.time)
+            assert np.abs(accel_W - spline)[10:-10].max() < 0.02 * max(1.0, np.abs(accel_W).max())
+            turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * made.rate_hz
+            np.testing.assert_allclose(made.gyro_S[sensor][1:], turned, atol=1e-9)
+
+
+def test_standing_at_the_start_is_the_n_pose(made: Simulation) -> None:
+    standing = made.time < 4.9
+    for segment, quat in made.quat_WL.items():
+        np.testing.assert_array_equal(quat[standing], np.tile([0.0, 0.0, 0.0, 1.0], (standing.sum(), 1)), segment)
+    assert set(made.phases) > {"start", "rest"}
+
+
+def test_an_activity_that_is_none_or_too_short_is_named() -> None:
+    with pytest.raises(BadOption, match=r"activity 'run' is not known; .*walk, sit"):
+        simulate_activity("run", seed=1)
+    with pytest.raises(BadOption, match="seconds 5: sitting down and standing up once takes 8"):
+        simulate_activity("sit", seed=1, seconds=5.0)

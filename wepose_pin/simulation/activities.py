@@ -17,16 +17,15 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from ..arguments import Count, Positive, check_arguments
-from ..assets import asset
 from ..errors import BadOption, one_of
 from ..kinematics import compute_link_poses, solve_configuration
-from ..model import POINTS, BodyModel, load_model
+from ..model import BodyModel, load_model
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
-from .motion import MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, make_pulse, make_step, place_sensors
+from .motion import MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, make_pulse, place_sensors
 from .subject import Simulation, measure_motion, spawn_streams
 
-WHOLE_BODY = "whole_body.urdf"
+WHOLE_BODY = "whole_body"
 _RAMP_S = 2.0  # a walk grows and dies away over this time
 _END_S = 2.0  # the person stands still at the end
 
@@ -94,17 +93,17 @@ class Activity(BodyMotion):
         """Return the exact pose of all segments at the times `t` (n,) [s]."""
         R_WL = self._orientations(t)
         q = solve_configuration(self.model, {segment: R.as_quat() for segment, R in R_WL.items()})
-        links = {point: link for point, link in POINTS.items() if self.model.pin.existFrame(link)}
-        _, p_W = compute_link_poses(self.model, q, [*R_WL, *links.values()], rotations=False)
+        frames = self.model.point_frames
+        _, p_W = compute_link_poses(self.model, q, [*R_WL, *frames.values()], rotations=False)
         origins = {segment: p_W[:, k] for k, segment in enumerate(R_WL)}
-        return BodyPose(R_WL, {point: p_W[:, len(R_WL) + k] for k, point in enumerate(links)}, origins)
+        return BodyPose(R_WL, {point: p_W[:, len(R_WL) + k] for k, point in enumerate(frames)}, origins)
 
     def _orientations(self, t: np.ndarray) -> dict[str, Rotation]:
         R_WL = {name: Rotation.from_rotvec(turn) for name, turn in self.trunk(t)._asdict().items()}
         for side, y in SIDES.items():
             shoulder, elbow = self.arm(side, t).T
-            R_WU = R_WL["torso"] * Rotation.from_euler("y", -shoulder)
-            R_WF = R_WU * Rotation.from_euler("y", -elbow)
+            R_WU = R_WL["torso"] * Rotation.from_euler("y", -shoulder[:, None])
+            R_WF = R_WU * Rotation.from_euler("y", -elbow[:, None])
             leg = self.leg(side, t)
             # A right leg, y = −1: flexion about −y, adduction about x, internal rotation about z. Its knee: y, x, −z.
             R_WT = R_WL["pelvis"] * Rotation.from_euler("YXZ", leg.hip * (-1.0, -y, -y))
@@ -177,8 +176,9 @@ class Walk(Activity):
 class Sit(Activity):
     """Sitting down and standing up again, some times; the trunk leans forward while the body moves.
 
-    Seated, thighs and forearms are horizontal and the knees at 90°. The feet stay parallel to the floor. Durations near
-    those of Nuzik et al. 1986 (Phys Ther 66:1708-1713), sizes of lean and tilt are assumptions.
+    Seated, the hips and knees are bent to 90°, the elbows to 75°, and the pelvis is upright. The feet stay level to a
+    few degrees. Durations near those of Nuzik et al. 1986 (Phys Ther 66:1708-1713); sizes of lean and tilt are
+    assumptions.
     """
 
     phase = "sit"
@@ -195,6 +195,7 @@ class Sit(Activity):
             self.down.append(start)
             start += 2.0 * self._MOVE_S + sum(self._PAUSE_S)
         self.lean = np.radians(35.0 * rng.uniform(0.85, 1.15))
+        self.tilt = 0.6 * self.lean  # of the pelvis, forward
         self.spread = np.radians(rng.uniform(3.0, 10.0, 2))  # of each thigh outwards, seated
 
     def _seated(self, t: np.ndarray) -> np.ndarray:
@@ -214,17 +215,14 @@ class Sit(Activity):
         """Time [s] from the beginning of the way down to that of the way up."""
         return self._MOVE_S + self._PAUSE_S[1]
 
-    def _pelvis_forward(self, t: np.ndarray) -> np.ndarray:
-        """Anterior tilt (n,) [rad] of the pelvis: with the trunk on the way, backward on the seat."""
-        return 0.6 * self.lean * self._moving(t) - np.radians(10.0) * self._seated(t)
-
     def leg(self, side: str, t: np.ndarray) -> LegAngles:
         seated, moving = self._seated(t), self._moving(t)
         thigh, shank_forward = np.radians(90.0) * seated, np.radians(12.0) * moving
+        pelvis_forward = self.tilt * moving
         spread = self.spread[list(SIDES).index(side)] * seated
         none = np.zeros_like(t)
         return LegAngles(
-            np.column_stack((thigh + self._pelvis_forward(t), -spread, 0.3 * spread)),
+            np.column_stack((thigh + pelvis_forward, -spread, 0.3 * spread)),
             np.column_stack((thigh + shank_forward, none, np.radians(5.0) * seated)),
             np.column_stack((shank_forward, none, none)),
         )
@@ -232,10 +230,10 @@ class Sit(Activity):
     def trunk(self, t: np.ndarray) -> TrunkAngles:
         forward = self.lean * self._moving(t) + np.radians(3.0) * self._seated(t)
         none = np.zeros_like(t)
-        turn = np.radians(4.0) * make_step(t, STAND_S, self.seconds) * self._moving(t)
+        turn = np.radians(4.0) * self._moving(t)
         return TrunkAngles(
             np.column_stack((none, forward, turn)),
-            np.column_stack((none, self._pelvis_forward(t), none)),
+            np.column_stack((none, self.tilt * self._moving(t), none)),
             np.column_stack((none, 0.4 * forward, 2.0 * turn)),
         )
 
@@ -277,7 +275,7 @@ def simulate_activity(
     if activity not in ACTIVITIES:
         raise BadOption(f"activity {activity!r} is not known; {one_of(ACTIVITIES, activity)}")
     rngs = spawn_streams(seed)
-    motion = ACTIVITIES[activity](load_model(asset("urdf", WHOLE_BODY), lengths), rngs["motion"], seconds)
+    motion = ACTIVITIES[activity](load_model(WHOLE_BODY, lengths), rngs["motion"], seconds)
     return measure_motion(motion, rngs, rate_hz, noise, imperfections)
 
 

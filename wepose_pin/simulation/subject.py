@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..arguments import Count, NonNegative, Positive, check_arguments, check_names
 from ..errors import BadOption
 from ..kinematics import Pose
-from ..model import SEXES, load_table
+from ..model import DEFAULT_BODY, SEXES, load_table
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, mark_lost_samples
@@ -317,13 +317,14 @@ class Person(NamedTuple):
     prior: Subject  # the population prior of that stature and sex
 
 
-def simulate_person(seed: int, measured_std: float = 0.003) -> Person:
-    """Sample a person of the population, with measured shoulder width and trunk."""
+def simulate_person(seed: int, measured_std: float = 0.003, body: str = DEFAULT_BODY) -> Person:
+    """Sample a person of the population, with the lengths of a `body` and measured shoulder width and trunk."""
     rng = np.random.default_rng([seed, 7])
     sex = SEXES[int(rng.integers(2))]
     mean, std = {"f": (1.63, 0.064), "m": (1.756, 0.069)}[sex]  # [m], ANSUR II (Gordon et al. 2014)
     stature = float(np.clip(rng.normal(mean, std), 1.45, 2.0))
-    prior = population_subject(round(stature, 2), sex)
-    lengths = dict(population_subject(stature, sex).sample(rng).lengths)
+    table = load_table(body)
+    prior = population_subject(round(stature, 2), sex, table)
+    lengths = dict(population_subject(stature, sex, table).sample(rng).lengths)
     measured = {name: lengths[name] + float(rng.normal(0.0, measured_std)) for name in ("shoulder_width", "trunk")}
     return Person(lengths, stature, sex, measured, measured_std, prior)
