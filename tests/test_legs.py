@@ -7,13 +7,16 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.angles import joint_angles
+from wepose_pin.cli import main
 from wepose_pin.errors import BadOption
-from wepose_pin.kinematics import Pose
+from wepose_pin.jobs.evaluate import EvaluateJob, run_evaluate
+from wepose_pin.kinematics import Pose, parse_pose_table
 from wepose_pin.model import load_model
 from wepose_pin.simulation import NOISE_FREE, Simulation, simulate_activity
 from wepose_pin.simulation.activities import ACTIVITIES
@@ -107,7 +110,7 @@ def test_left_and_right_leg_mirror_each_other() -> None:
 
 
 def test_the_true_pose_has_the_angles_of_the_activity(activity: str) -> None:
-    motion = ACTIVITIES[activity](load_model(URDF / "whole_body.urdf"), np.random.default_rng(1), 10.0)
+    motion = ACTIVITIES[activity](load_model("whole_body"), np.random.default_rng(1), 10.0)
     t = np.arange(0.0, 17.0, 0.013)
     R_WL = motion(t, ()).R_WL
     angles = joint_angles(Pose(t, {segment: R.as_quat() for segment, R in R_WL.items()}, {}))
@@ -167,3 +170,54 @@ def test_an_activity_that_is_none_or_too_short_is_named() -> None:
         simulate_activity("run", seed=1)
     with pytest.raises(BadOption, match="seconds 5: sitting down and standing up once takes 8"):
         simulate_activity("sit", seed=1, seconds=5.0)
+
+
+# The commands -----------------------------------------------------------------------------------------------------
+
+LEG_JOINTS = [f"{side}_{joint}" for side in SIDES for joint in ("hip", "knee", "ankle")]
+
+
+def run(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.parametrize(
+    ("activity", "preset", "most_deg"), [("walk", "ideal", 0.6), ("sit", "ideal", 0.6), ("walk", "mild", 2.5)]
+)
+def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, most_deg: float, tmp_path: Path) -> None:
+    made, result = tmp_path / "made", tmp_path / "result"
+    assert run("simulate", "-o", made, "--seed", "5", "--activity", activity, "--preset", preset) == 0
+    assert run("track", made, "--model", "whole_body", "--no-view", "--no-report", "-o", result) == 0
+    assert run("evaluate", result, made) == 0
+    errors = run_evaluate(EvaluateJob(result, made))
+    for joint in LEG_JOINTS:
+        for name, error in errors.joints[joint].items():
+            assert error.rmse < most_deg, (joint, name)
+
+    assert run("export", result, "-o", tmp_path / "result.csv") == 0
+    table = pl.read_csv(tmp_path / "result.csv")
+    truth = joint_angles(parse_pose_table(pl.read_parquet(made / "truth.parquet"), "truth"))
+    for joint in LEG_JOINTS:
+        for k, name in enumerate(truth[joint].names):
+            difference = table[f"{joint}_{name}_deg"].to_numpy() - np.degrees(truth[joint].values[:, k])
+            rms = np.sqrt(np.mean(np.square(difference)))
+            assert rms == pytest.approx(errors.joints[joint][name].rmse, abs=1e-6)
+    assert {"pelvis_qx", "pelvis_in_world_qx", "left_toe_x", "right_heel_z"} <= set(table.columns)
+    again = load_model(result / "subject.urdf")
+    assert set(again.table.segments) == set(load_model("whole_body").table.segments)
+
+
+def test_legs_on_the_upper_body_are_refused_with_the_body_that_has_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = tmp_path / "made"
+    assert run("simulate", "-o", made, "--activity", "sit") == 0
+    assert run("track", made, "-o", tmp_path / "result") == 2
+    error = capsys.readouterr().err
+    assert "sensors.left_thigh is no segment of upper_body; the body whole_body has it" in error
+    assert run("simulate", "-o", made, "--activity", "sit", "--protocol", "handle", "--force") == 2
+    assert "--activity sit with --protocol handle" in capsys.readouterr().err
+    assert run("track", made, "--model", "half_body", "-o", tmp_path / "result") == 2
+    assert "no body 'half_body' comes with the package; did you mean 'whole_body'" in capsys.readouterr().err

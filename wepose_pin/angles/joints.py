@@ -92,8 +92,10 @@ JOINTS = {
     "thorax": Joint("world", "torso", "ZXY", ("extension", "lateral_flexion_right", "axial_rotation_left")),  # 2.4.1
     **_arm("left"),
     **_arm("right"),
-    # In the axes of Wu 2002, who give no sequence in W: the thorax's.
-    "pelvis": Joint("world", "pelvis", "ZXY", ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")),
+    # In the axes of Wu 2002, who give no sequence in W: the thorax's. A table has the segment's columns as "pelvis".
+    "pelvis_in_world": Joint(
+        "world", "pelvis", "ZXY", ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")
+    ),
     **_leg("left"),
     **_leg("right"),
 }

@@ -36,9 +36,10 @@ class TrackJob:
     subject : SUBJECT
         Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
         Without it lengths are those of the population prior, and mounts those that the session states.
-    model : URDF|TOML
-        Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md). For sensors on a robot or
-        another chain (start_pose = "configuration"), its URDF.
+    model : URDF|TOML|NAME
+        Use this body: a URDF, or a TOML that names a URDF and its links (docs/models.md), or the name of a body that
+        comes with the package (whole_body has legs). For sensors on a robot or another chain (start_pose =
+        "configuration"), its URDF.
     method : METHOD
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
         and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases), ncf
@@ -89,7 +90,8 @@ class TrackJob:
 
     def check(self) -> None:
         """Raise `BadOption` where options contradict each other or name what is not there."""
-        if self.model is not None and not self.model.is_file():
+        is_name = self.model is not None and not self.model.suffix and len(self.model.parts) == 1
+        if self.model is not None and not is_name and not self.model.is_file():
             raise WrongOption("model", self.model, "no such file; a URDF, or a TOML that names one, is needed")
 
 
