@@ -188,7 +188,9 @@ def run(*arguments: str | Path) -> int:
 )
 def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, most_deg: float, tmp_path: Path) -> None:
     made, result = tmp_path / "made", tmp_path / "result"
-    assert run("simulate", "-o", made, "--seed", "5", "--activity", activity, "--preset", preset) == 0
+    assert (
+        run("simulate", "-o", made, "--seed", "5", "--activity", activity, "--preset", preset, "--rate-hz", "60") == 0
+    )
     assert run("track", made, "--model", "whole_body", "--no-view", "--no-report", "-o", result) == 0
     assert run("evaluate", result, made) == 0
     errors = run_evaluate(EvaluateJob(result, made))
@@ -205,6 +207,9 @@ def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, mo
             rms = np.sqrt(np.mean(np.square(difference)))
             assert rms == pytest.approx(errors.joints[joint][name].rmse, abs=1e-6)
     assert {"pelvis_qx", "pelvis_in_world_qx", "left_toe_x", "right_heel_z"} <= set(table.columns)
+    assert run("export", result, "-o", tmp_path / "result.sto") == 0
+    labels = (tmp_path / "result.sto").read_text(encoding="utf-8").split("endheader\n")[1].splitlines()[0].split("\t")
+    assert {f"{body}_{side}_imu" for body in ("femur", "tibia", "calcn") for side in "lr"} <= set(labels)
     again = load_model(result / "subject.urdf")
     assert set(again.table.segments) == set(load_model("whole_body").table.segments)
 
