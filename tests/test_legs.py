@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+import wepose_pin as wp
 from wepose_pin.angles import joint_angles
 from wepose_pin.cli import main
 from wepose_pin.errors import BadOption
+from wepose_pin.evaluation import evaluate
 from wepose_pin.jobs.evaluate import EvaluateJob, run_evaluate
 from wepose_pin.kinematics import Pose, parse_pose_table
 from wepose_pin.model import load_model
@@ -212,6 +215,25 @@ def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, mo
     assert {f"{body}_{side}_imu" for body in ("femur", "tibia", "calcn") for side in "lr"} <= set(labels)
     again = load_model(result / "subject.urdf")
     assert set(again.table.segments) == set(load_model("whole_body").table.segments)
+
+
+@pytest.mark.parametrize("torso", [False, True])
+def test_seven_sensors_from_the_pelvis_down_are_enough(torso: bool) -> None:
+    simulation = simulate_activity("walk", seed=4, seconds=10.0)
+    recording = simulation.recording()
+    wanted = {"pelvis", *(f"{side}_{part}" for side in SIDES for part in ("thigh", "shank", "foot"))}
+    wanted |= {"torso"} if torso else set()
+    sensors = {segment: sensor for segment, sensor in recording.sensors.items() if segment in wanted}
+    model = load_model("whole_body", simulation.lengths)
+    pose = wp.track(replace(recording, sensors=sensors), model=model).pose
+    errors = evaluate(pose, simulation.truth())
+    below = {f"{side}_{point}" for side in SIDES for point in ("hip", "knee", "ankle", "heel", "toe")}
+    assert set(pose.points) == below | ({"left_shoulder", "right_shoulder"} if torso else set())
+    assert set(pose.point_cov) == set(pose.points)
+    for joint in LEG_JOINTS:
+        assert all(error.rmse < 0.5 for error in errors.joints[joint].values())
+    for point in below:
+        assert errors.position[point].rmse < 5.0  # mm
 
 
 def test_legs_on_the_upper_body_are_refused_with_the_body_that_has_them(
