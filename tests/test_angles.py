@@ -15,6 +15,7 @@ import wepose_pin as wp
 from wepose_pin.angles import (
     ISB_AXES,
     JOINTS,
+    KNEE_AXES,
     NEAR_LOCK,
     RATE_WINDOW_S,
     SHOULDER_SEQUENCES,
@@ -31,7 +32,8 @@ from wepose_pin.simulation import Person, Simulation
 from wepose_pin.subject import population_subject
 
 ARM = ("upper_arm", "forearm", "hand")
-SEGMENTS = ["torso", *(f"{side}_{part}" for side in ("left", "right") for part in ARM)]
+LEG = ("thigh", "shank", "foot")
+SEGMENTS = ["torso", "pelvis", *(f"{side}_{part}" for side in ("left", "right") for part in (*ARM, *LEG))]
 ALL_SEQUENCES = ["".join(p) for p in itertools.product("XYZ", repeat=3) if p[0] != p[1] and p[1] != p[2]]
 GLOBAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # columns: X, Y, Z of the ISB in x, y, z of W
 MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -202,7 +204,26 @@ def landmark_frames(R: dict[str, np.ndarray], side: str) -> dict[str, np.ndarray
     US, RS = (E + place(forearm, at) for at in ([0.0, 0.0, -0.25], [0.05, 0.0, -0.25]))  # thumbs forward in the N-pose
     base, head = (RS + place(hand, at) for at in ([0.0, 0.0, -0.02], [0.0, 0.0, -0.09]))  # third metacarpal
     MC2, MC5 = (RS + place(hand, at) for at in ([0.02, 0.0, -0.09], [-0.05, 0.0, -0.08]))
+    # Wu 2002. Pelvis: spines of the ilium in front and behind; the left of the mirrored body is where its right was.
+    thigh, shank, foot = (f"{side}_{part}" for part in LEG)
+    ASIS, far_ASIS, PSIS, far_PSIS = (
+        place("pelvis", at)
+        for at in ([0.09, 0.12, 0.07], [0.09, -0.12, 0.07], [-0.08, 0.05, 0.07], [-0.08, -0.05, 0.07])
+    )
+    right = ASIS - far_ASIS
+    HJC = place("pelvis", [0.0, 0.08, 0.0])
+    FE, far_FE = (HJC + place(thigh, at) for at in ([0.0, 0.045, -0.42], [0.0, -0.045, -0.42]))
+    knee = (FE + far_FE) / 2.0
+    LC, MC, LM, MM = (
+        knee + place(shank, at) for at in ([0, 0.04, -0.03], [0, -0.04, -0.03], [0, 0.035, -0.44], [0, -0.035, -0.44])
+    )
+    IC, IM = (LC + MC) / 2.0, (LM + MM) / 2.0
+    heel, ball, sole = (IM + place(foot, at) for at in ([-0.05, 0, -0.07], [0.15, 0, -0.07], [-0.05, 0, -0.08]))
     return {
+        "pelvis": frame(np.cross(right, (ASIS + far_ASIS) / 2.0 - (PSIS + far_PSIS) / 2.0), right),
+        "hip": frame(HJC - knee, FE - far_FE),
+        "knee": frame(IC - IM, LM - MM),
+        "ankle": frame(heel - sole, np.cross(ball - heel, heel - sole)),
         "thorax": thorax,
         "shoulder": frame(GH - E, EL - EM),
         "elbow": frame(E - US, RS - US),
@@ -235,6 +256,29 @@ def test_angles_are_scipys_on_frames_from_landmarks(side: str, name: str) -> Non
         )  # the ISB's world is the identity there
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_hip_and_ankle_are_scipys_on_frames_from_landmarks_and_the_knee_is_grood_and_suntays(side: str) -> None:
+    rng = np.random.default_rng(8)
+    quat_WL = {s: Rotation.from_rotvec(rng.normal(scale=0.2, size=(300, 3))).as_quat() for s in SEGMENTS}
+    frames = landmark_frames({s: Rotation.from_quat(quat).as_matrix() for s, quat in quat_WL.items()}, side)
+    angles = joint_angles(pose_with(quat_WL))
+    for proximal, distal in (("pelvis", "hip"), ("knee", "ankle")):
+        R = Rotation.from_matrix(frames[proximal].transpose(0, 2, 1) @ frames[distal])
+        np.testing.assert_allclose(angles[f"{side}_{distal}"].values, R.as_euler("ZXY"), atol=1e-9)
+    if side == "right":
+        R = Rotation.from_matrix(frames["pelvis"])
+        np.testing.assert_allclose(angles["pelvis_in_world"].values, R.as_euler("ZXY"), atol=1e-9)
+    # Grood and Suntay 1983, of a right knee: X (I_, i) to the right, Y (J, j) forward, Z (K, k) proximal; capitals are
+    # those of the femur. The left one is mirrored already.
+    (J, K, I_), (_, k, i) = (np.moveaxis(frames[part], -1, 0) for part in ("hip", "knee"))
+    e2 = unit(np.cross(k, I_))
+    flexion = np.arctan2(-np.sum(e2 * K, axis=1), np.sum(e2 * J, axis=1))
+    adduction = np.pi / 2.0 - np.arccos(np.sum(I_ * k, axis=1))
+    external_rotation = np.arcsin(-np.sum(e2 * i, axis=1))
+    expected = np.column_stack([flexion, adduction, external_rotation])
+    np.testing.assert_allclose(angles[f"{side}_knee"].values, expected, atol=1e-9)
+
+
 # Signs and names --------------------------------------------------------------------------------------------------
 
 # A segment of the right arm, turns about x, y, z of W, and what of the angles is to be seen [deg].
@@ -250,6 +294,16 @@ PLAIN = {
     "hand_to_its_palm": ({"hand": {"x": 30.0}}, {"wrist": {"flexion": 30.0, "ulnar_deviation": 0.0, "pronation": 0.0}}),
     "hand_to_the_thumb": ({"hand": {"y": -20.0}}, {"wrist": {"flexion": 0.0, "ulnar_deviation": -20.0}}),
     "hand_to_the_little_finger": ({"hand": {"y": 20.0}}, {"wrist": {"flexion": 0.0, "ulnar_deviation": 20.0}}),
+    "upright": ({}, {joint: dict.fromkeys(JOINTS[f"right_{joint}"].names, 0.0) for joint in ("hip", "knee", "ankle")}),
+    "thigh_forward": ({"thigh": {"y": -90.0}}, {"hip": {"flexion": 90.0, "adduction": 0.0, "internal_rotation": 0.0}}),
+    "thigh_outward": ({"thigh": {"x": -20.0}}, {"hip": {"flexion": 0.0, "adduction": -20.0}}),
+    "thigh_turned_inward": ({"thigh": {"z": 15.0}}, {"hip": {"adduction": 0.0, "internal_rotation": 15.0}}),
+    "heel_to_the_seat": ({"shank": {"y": 110.0}}, {"knee": {"flexion": 110.0, "adduction": 0.0}}),
+    "bow_legs": ({"shank": {"x": 8.0}}, {"knee": {"flexion": 0.0, "adduction": 8.0, "external_rotation": 0.0}}),
+    "shank_turned_outward": ({"shank": {"z": -12.0}}, {"knee": {"adduction": 0.0, "external_rotation": 12.0}}),
+    "toes_up": ({"foot": {"y": -20.0}}, {"ankle": {"dorsiflexion": 20.0, "inversion": 0.0}}),
+    "sole_inward": ({"foot": {"x": 10.0}}, {"ankle": {"dorsiflexion": 0.0, "inversion": 10.0}}),
+    "toes_inward": ({"foot": {"z": 10.0}}, {"ankle": {"inversion": 0.0, "internal_rotation": 10.0}}),
 }
 
 
@@ -257,11 +311,13 @@ PLAIN = {
 @pytest.mark.parametrize("pose", PLAIN)
 def test_plain_poses_have_the_angles_of_the_isb_on_both_sides(pose: str, side: str) -> None:
     turns, expected = PLAIN[pose]
-    quat_WL, last = {}, {}
-    for part in ARM:  # the hand goes with the forearm, that with the upper arm
-        last = turns.get(part, last)
-        sign = {"x": 1.0, "y": 1.0, "z": 1.0} if side == "right" else {"x": -1.0, "y": 1.0, "z": -1.0}
-        quat_WL[f"{side}_{part}"] = turned(**{axis: sign[axis] * angle for axis, angle in last.items()})
+    quat_WL = {}
+    sign = {"x": 1.0, "y": 1.0, "z": 1.0} if side == "right" else {"x": -1.0, "y": 1.0, "z": -1.0}
+    for limb in (ARM, LEG):  # the hand goes with the forearm, that with the upper arm
+        last: dict[str, float] = {}
+        for part in limb:
+            last = turns.get(part, last)
+            quat_WL[f"{side}_{part}"] = turned(**{axis: sign[axis] * angle for axis, angle in last.items()})
     angles = joint_angles(pose_with(quat_WL))
     for joint, named in expected.items():
         found = angles[f"{side}_{joint}"]
@@ -274,6 +330,13 @@ def test_the_thorax_extends_bends_right_and_turns_left_in_the_positive() -> None
         found = joint_angles(pose_with({"torso": turn}))["thorax"]
         np.testing.assert_allclose(np.degrees(found.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
     assert found.names == ("extension", "lateral_flexion_right", "axial_rotation_left")
+
+
+def test_the_pelvis_tilts_back_drops_on_the_right_and_turns_left_in_the_positive() -> None:
+    for k, turn in enumerate((turned(y=-20.0), turned(x=20.0), turned(z=20.0))):
+        found = joint_angles(pose_with({"pelvis": turn}))["pelvis_in_world"]
+        np.testing.assert_allclose(np.degrees(found.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
+    assert found.names == ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")
 
 
 @pytest.mark.parametrize("name", ["XZY", "ZXY"])
@@ -306,7 +369,7 @@ def test_a_mirrored_person_has_the_same_angles_on_the_other_side(name: str) -> N
     here = joint_angles(pose_with(quat_WL, segment_cov=cov), name)
     there = joint_angles(pose_with(mirrored, segment_cov=mirrored_cov), name)
     for joint in here.joints:
-        if joint != "thorax":
+        if joint not in ("thorax", "pelvis_in_world"):
             np.testing.assert_allclose(here[joint].values, there[other(joint)].values, atol=1e-12)
             np.testing.assert_allclose(here[joint].std, there[other(joint)].std, atol=1e-12)
 
@@ -390,7 +453,7 @@ def test_only_joints_with_both_segments_are_there() -> None:
         whole.time, {s: whole.quat_WL[s] for s in ("torso", "left_forearm", "right_upper_arm", "right_forearm")}, {}
     )
     assert list(joint_angles(some).joints) == ["thorax", "right_shoulder", "right_elbow"]
-    with pytest.raises(BadData, match=r"torso, or an upper arm and its forearm, are needed; there is: left_forearm$"):
+    with pytest.raises(BadData, match=r"torso, or two segments that one joint connects, are needed; .*: left_forearm$"):
         joint_angles(Pose(whole.time, {"left_forearm": whole.quat_WL["left_forearm"]}, {}))
 
 
@@ -472,7 +535,7 @@ def test_the_table_is_in_degrees_and_keeps_the_rotation() -> None:
 
 
 def test_the_axes_of_a_segment_are_right_handed() -> None:
-    for axes in ISB_AXES.values():
+    for axes in (*ISB_AXES.values(), KNEE_AXES):
         X, Y, Z = ((1 if a[0] == "+" else -1) * np.eye(3)["xyz".index(a[1])] for a in axes)
         np.testing.assert_array_equal(np.cross(X, Y), Z)
 
@@ -493,6 +556,7 @@ def test_the_page_shows_every_axis_and_angle() -> None:
     for joint in JOINTS.values():
         assert all(f"`{name}`" in page for name in joint.names)
     assert all(f"`{name}`" in page for names in SHOULDER_SEQUENCES.values() for name in names)
+    _, _, section = page.partition("## The ISB's axes")
     for segment, axes in ISB_AXES.items():
-        row = next(line for line in page.splitlines() if line.startswith(f"| `{segment}`"))
+        row = next(line for line in section.splitlines() if line.startswith(f"| `{segment}`"))
         assert [cell.strip().strip("`") for cell in row.split("|")[2:5]] == list(axes)

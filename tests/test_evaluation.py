@@ -50,6 +50,31 @@ def test_mean_and_std_are_of_the_absolute() -> None:
     assert error == pytest.approx((distance.mean(), distance.std(), np.sqrt((distance**2).mean()), distance.max()))
 
 
+def test_the_error_of_a_joint_is_that_of_its_angles() -> None:
+    flexion = np.radians(60.0 + 50.0 * np.sin(TIME))
+    upper = Rotation.from_euler("xy", [[20.0, -40.0]] * len(TIME), degrees=True)
+
+    def arm(off_deg: float, carrying_deg: float) -> Pose:
+        bend = np.column_stack([-flexion - np.radians(off_deg), np.full(len(TIME), -np.radians(carrying_deg))])
+        forearm = upper * Rotation.from_euler("YX", bend)
+        return Pose(TIME, {"right_upper_arm": upper.as_quat(), "right_forearm": forearm.as_quat()}, {})
+
+    truth = arm(0.0, 0.0)
+    truth.quat_WL["right_forearm"][:20] = np.nan
+    errors = evaluate(arm(3.0, 2.0), truth).joints
+    assert set(errors) == {"right_elbow"}
+    assert errors["right_elbow"]["flexion"] == pytest.approx((3.0, 3.0, 3.0), abs=1e-9)
+    assert errors["right_elbow"]["carrying_angle"] == pytest.approx((-2.0, 2.0, 2.0), abs=1e-9)
+    assert errors["right_elbow"]["pronation"] == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+
+
+def test_near_the_lock_there_is_no_error_of_an_angle() -> None:
+    """A shoulder's Y-X-Y is locked while the arm hangs."""
+    segments = {s: np.tile([0.0, 0.0, 0.0, 1.0], (len(TIME), 1)) for s in ("torso", "right_upper_arm")}
+    errors = evaluate(Pose(TIME, segments, {}), Pose(TIME, segments, {}))
+    assert set(errors.joints) == {"thorax"}
+
+
 def test_a_trunk_of_another_length_is_not_seen_from_the_shoulders() -> None:
     off = pose()
     for points in off.points.values():

@@ -1,4 +1,4 @@
-"""How wrong a pose is against a reference: attitude, positions, and how far its stated uncertainty is right."""
+"""How wrong a pose is against a reference: attitude, joint angles, positions, and how far its stated ± is right."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from . import rotations
+from .angles import euler, joint_angles
 from .arguments import check_arguments
 from .errors import BadData, BadOption
 from .kinematics import Pose
@@ -29,6 +30,14 @@ class AttitudeError(NamedTuple):
     heading_rmse: float  # twist of the error about the vertical
     total_rmse: float
     drift_deg_min: float  # slope of a line through the heading error [deg/min]
+
+
+class AngleError(NamedTuple):
+    """Error of one angle of a joint [deg], where neither pose nor reference is near gimbal lock or in a gap."""
+
+    mean: float  # with its sign: estimated less true
+    rmse: float
+    worst: float
 
 
 class PositionError(NamedTuple):
@@ -56,6 +65,7 @@ class Evaluation:
     """Errors over the time that pose and reference share."""
 
     attitude: dict[str, AttitudeError]
+    joints: dict[str, dict[str, AngleError]]  # joint → angle → its error
     position: dict[str, PositionError]  # relative to the root of the trunk
     position_from_shoulders: dict[str, PositionError]  # relative to the middle of the shoulders: without the trunk
     attitude_uncertainty: dict[str, Uncertainty]  # where the pose has covariances
@@ -90,6 +100,7 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         )
     time = np.clip(pose.time[inside], truth.time[0], truth.time[-1])
     attitude, position = {}, {}
+    true_WL: dict[str, np.ndarray] = {}  # on the pose's times, NaN where it is missing
     attitude_uncertainty, position_uncertainty = {}, {}
     for segment in [s for s in pose.quat_WL if s in truth.quat_WL]:
         finite = np.isfinite(truth.quat_WL[segment]).all(axis=1)
@@ -102,6 +113,8 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
             estimated = Rotation.from_quat(pose.quat_WL[segment][inside][known])
             true = reference(clipped)
             attitude[segment] = attitude_error(estimated, true, clipped)
+            true_WL[segment] = np.full((len(time), 4), np.nan)
+            true_WL[segment][known] = true.as_quat()
             if segment in pose.segment_cov:
                 turn = (true * estimated.inv()).as_rotvec()
                 attitude_uncertainty[segment] = uncertainty(turn, pose.segment_cov[segment][inside][known])
@@ -130,6 +143,7 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         )
     return Evaluation(
         attitude,
+        _joint_errors(pose, inside, true_WL),
         position,
         from_shoulders,
         attitude_uncertainty,
@@ -137,6 +151,32 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         (float(time[0]), float(time[-1])),
         int(inside.sum()),
     )
+
+
+def _joint_errors(pose: Pose, inside: np.ndarray, true_WL: dict[str, np.ndarray]) -> dict[str, dict[str, AngleError]]:
+    """Joint → angle → its error, over the samples `inside`, on which `true_WL` (segment → (m, 4) xyzw) are."""
+    if not true_WL:
+        return {}
+    time = pose.time[inside]
+    gap = {segment: gap[inside] for segment, gap in pose.gap.items() if segment in true_WL}
+    estimated = Pose(time, {segment: pose.quat_WL[segment][inside] for segment in true_WL}, {}, gap=gap)
+    try:
+        found, true = joint_angles(estimated), joint_angles(Pose(time, true_WL, {}))
+    except BadData:  # no joint has both of its segments
+        return {}
+    errors = {}
+    for name, joint in found.joints.items():
+        sound = ~(joint.gap | joint.near_lock | true[name].gap | true[name].near_lock)
+        if not sound.any():
+            continue
+        # Principal values: two sets of angles that differ by half turns are the same pose.
+        values = [euler.decompose(each.quat[sound], joint.sequence).values for each in (joint, true[name])]
+        error = np.degrees(euler.wrap(values[0] - values[1]))
+        errors[name] = {
+            angle: AngleError(float(error[:, k].mean()), _rms(error[:, k]), float(np.abs(error[:, k]).max()))
+            for k, angle in enumerate(joint.names)
+        }
+    return errors
 
 
 def _shoulders(pose: Pose) -> np.ndarray | None:

@@ -173,7 +173,8 @@ def _find_known_joints(model: BodyModel, segments: Iterable[str]) -> list[bool]:
     """Whether the placement of each Pinocchio joint follows from the measured segments.
 
     Without a sensor a segment is rigid with the one above where the table says so, else it is unknown with all below
-    it. Of a mechanism all joints above a measured link are known.
+    it, but for what is measured and hangs in the point about which it rotates: hips without a torso. Of a mechanism all
+    joints above a measured link are known.
     """
     measured, m = set(segments), model.pin
     if model.table.is_mechanism:
@@ -185,10 +186,17 @@ def _find_known_joints(model: BodyModel, segments: Iterable[str]) -> list[bool]:
         if segment not in measured and not model.table.segments[segment].rigid_without_sensor
         for joint in chain.joints
     }
-    known = [True]
+    own_joint = {
+        chain.joints[0]
+        for segment, chain in model.chains.items()
+        if segment in measured and chain.exact and len(chain.joints) == 1
+    }
+    placed, rotated = [True], [True]
     for joint in range(1, m.njoints):
-        known.append(known[m.parents[joint]] and joint not in unmeasured_joints)
-    return known
+        parent, offset = m.parents[joint], m.jointPlacements[joint].translation
+        placed.append(placed[parent] and (rotated[parent] or np.abs(offset).max() < _ON_JOINT))
+        rotated.append(joint in own_joint or (rotated[parent] and joint not in unmeasured_joints))
+    return [position and rotation for position, rotation in zip(placed, rotated, strict=True)]
 
 
 def solve_configuration(

@@ -1,4 +1,4 @@
-"""A pose → the angles of its joints, after Wu et al. 2005."""
+"""A pose → the angles of its joints, after Wu et al. 2005 and 2002 and, of the knee, Grood and Suntay 1983."""
 
 from __future__ import annotations
 
@@ -27,7 +27,14 @@ ISB_AXES = {
     "upper_arm": ("+x", "+z", "-y"),
     "forearm": ("+y", "+z", "+x"),
     "hand": ("+y", "+z", "+x"),
+    "pelvis": ("+x", "+z", "-y"),
+    "thigh": ("+x", "+z", "-y"),
+    "shank": ("+x", "+z", "-y"),
+    "foot": ("+x", "+z", "-y"),
 }
+# The axes of both segments of a right knee, by which Grood and Suntay's three angles have their signs: forward, distal,
+# medial.
+KNEE_AXES = ("+x", "-z", "+y")
 # Signs that mirror on the sagittal plane: quaternions xyzw, and rotation vectors.
 _MIRRORED_QUAT = np.array([-1.0, 1.0, -1.0, 1.0])
 _MIRRORED_TURN = np.array([-1.0, 1.0, -1.0])
@@ -47,15 +54,22 @@ SHOULDER_SEQUENCES = {
 
 
 class Joint(NamedTuple):
-    """A joint's two segments and the names of its angles; `sequence` is empty for the shoulder's choice."""
+    """A joint's two segments and the names of its angles.
+
+    Parameters
+    ----------
+    sequence : empty for the shoulder's choice
+    axes : where X, Y, Z of both segments point in our frame of them; None: as `ISB_AXES` has them
+    """
 
     proximal: str
     distal: str
     sequence: str
     names: tuple[str, ...]
+    axes: tuple[str, str, str] | None = None
 
 
-def _mirror(side: str) -> dict[str, Joint]:
+def _arm(side: str) -> dict[str, Joint]:
     upper_arm, forearm, hand = f"{side}_upper_arm", f"{side}_forearm", f"{side}_hand"
     return {
         f"{side}_shoulder": Joint("torso", upper_arm, "", ()),
@@ -64,10 +78,26 @@ def _mirror(side: str) -> dict[str, Joint]:
     }
 
 
+def _leg(side: str) -> dict[str, Joint]:
+    thigh, shank, foot = f"{side}_thigh", f"{side}_shank", f"{side}_foot"
+    knee = ("flexion", "adduction", "external_rotation")  # Grood and Suntay 1983
+    return {
+        f"{side}_hip": Joint("pelvis", thigh, "ZXY", ("flexion", "adduction", "internal_rotation")),  # Wu 2002
+        f"{side}_knee": Joint(thigh, shank, "ZXY", knee, KNEE_AXES),
+        f"{side}_ankle": Joint(shank, foot, "ZXY", ("dorsiflexion", "inversion", "internal_rotation")),  # Wu 2002
+    }
+
+
 JOINTS = {
     "thorax": Joint("world", "torso", "ZXY", ("extension", "lateral_flexion_right", "axial_rotation_left")),  # 2.4.1
-    **_mirror("left"),
-    **_mirror("right"),
+    **_arm("left"),
+    **_arm("right"),
+    # In the axes of Wu 2002, who give no sequence in W: the thorax's. A table has the segment's columns as "pelvis".
+    "pelvis_in_world": Joint(
+        "world", "pelvis", "ZXY", ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")
+    ),
+    **_leg("left"),
+    **_leg("right"),
 }
 
 
@@ -86,7 +116,7 @@ class JointAngles:
     std : (n, 3) [rad], one standard deviation, at most that of an angle even over the circle (104°); None where the
         pose has no covariances
     quat : (n, 4) xyzw, the rotation that the angles are of: the distal segment in the proximal one, both in the
-        ISB's axes, a left joint mirrored on the sagittal plane as its angles are
+        ISB's axes (a knee: in `KNEE_AXES`), a left joint mirrored on the sagittal plane as its angles are
     """
 
     sequence: str
@@ -111,7 +141,7 @@ class Angles:
 
 
 def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK) -> Angles:
-    """Thorax in W, shoulders (upper arm in thorax), elbows, and wrists where hands are measured.
+    """Thorax and pelvis in W, shoulders (upper arm in thorax), elbows, wrists, hips, knees, ankles, where measured.
 
     Left joints are mirrored on the sagittal plane first, so that an angle has the same sign and meaning on both sides.
     Angles are followed over time (`euler.follow`); standard deviations are to first order, with the errors of two
@@ -119,7 +149,7 @@ def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK
 
     Parameters
     ----------
-    sequence : of the shoulder, one of `SHOULDER_SEQUENCES`; other joints have the ISB's ZXY
+    sequence : of the shoulder, one of `SHOULDER_SEQUENCES`; other joints have ZXY
     near_lock : [rad], what is nearer to gimbal lock is flagged, and does not decide how angles go on after it
 
     Raises
@@ -142,7 +172,7 @@ def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK
             joints[name] = _angles(pose, joint, name.startswith("left_"), near_lock)
     if not joints:
         raise BadData(
-            f"no joint has its segments in the pose: torso, or an upper arm and its forearm, are needed; "
+            f"no joint has its segments in the pose: torso, or two segments that one joint connects, are needed; "
             f"{one_of(pose.quat_WL)}"
         )
     return Angles(pose.time, joints)
@@ -152,7 +182,7 @@ def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngl
     n = len(pose.time)
     members = [segment for segment in (joint.proximal, joint.distal) if segment != "world"]
     known = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in members], axis=0)
-    quat_WP, quat_WD = (_isb_frame(pose, segment, left, known) for segment in (joint.proximal, joint.distal))
+    quat_WP, quat_WD = (_joint_frame(pose, joint, segment, left, known) for segment in (joint.proximal, joint.distal))
     quat = multiply(conjugate(quat_WP), quat_WD)
     angles = euler.decompose(quat, joint.sequence)
     values = euler.follow(angles, joint.sequence, near_lock)
@@ -176,15 +206,13 @@ def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngl
     )
 
 
-def _quat_LI(segment: str) -> np.ndarray:
-    """The ISB's axes of a segment, or of "world", in our frame of it, (4,) xyzw."""
-    part = segment.removeprefix("left_").removeprefix("right_")
-    return Rotation.from_matrix(np.column_stack([AXES[axis] for axis in ISB_AXES[part]])).as_quat()
+def _joint_frame(pose: Pose, joint: Joint, segment: str, left: bool, known: np.ndarray) -> np.ndarray:
+    """The axes in which a joint's angles are taken, of one of its segments, in W; (n, 4) where it is `known`.
 
-
-def _isb_frame(pose: Pose, segment: str, left: bool, known: np.ndarray) -> np.ndarray:
-    """The ISB's frame of a segment in W, (n, 4) where it is `known`, of a left joint mirrored."""
-    quat_LI = _quat_LI(segment)
+    Of a left joint mirrored.
+    """
+    axes = joint.axes or ISB_AXES[segment.removeprefix("left_").removeprefix("right_")]
+    quat_LI = Rotation.from_matrix(np.column_stack([AXES[axis] for axis in axes])).as_quat()
     if segment == "world":
         return np.tile(quat_LI, (int(np.count_nonzero(known)), 1))
     quat_WL = pose.quat_WL[segment][known]

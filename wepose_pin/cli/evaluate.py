@@ -29,6 +29,16 @@ def run(job: EvaluateJob) -> int:
                 for name, error in errors.attitude.items()
             ],
         )
+    if errors.joints:
+        print_table(
+            "Joint angle error [deg]: mean; root mean square; largest (near gimbal lock left out)",
+            ("joint", "angle", "mean", "rms", "largest"),
+            [
+                (joint, angle, f"{error.mean:+.2f}", f"{error.rmse:.2f}", f"{error.worst:.2f}")
+                for joint, angles in errors.joints.items()
+                for angle, error in angles.items()
+            ],
+        )
     if errors.position:
         shoulders = errors.position_from_shoulders
         print_table(

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EvaluateJob:
-    """Compare a result with a reference: attitude, drift, positions, stated uncertainty.
+    """Compare a result with a reference: attitude, drift, joint angles, positions, stated uncertainty.
 
     Prints for each segment the attitude error (roll, pitch, yaw about the axes of W), inclination, heading and total
-    RMSE [deg] and the drift of the heading [deg/min]; for each point the position error [mm], relative to the root and
-    to the middle of the shoulders; and whether the stated standard deviations are consistent with the errors. Headings
-    are compared as they are, without alignment. Nothing is written.
+    RMSE [deg] and the drift of the heading [deg/min]; for each joint the error of its angles [deg]; for each point the
+    position error [mm], relative to the root and to the middle of the shoulders; and whether the stated standard
+    deviations are consistent with the errors. Headings are compared as they are, without alignment. Nothing is written.
 
     Parameters
     ----------

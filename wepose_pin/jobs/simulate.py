@@ -19,11 +19,11 @@ CIRCLES = 6  # drawn by the right hand after the protocol
 
 @dataclass(frozen=True)
 class SimulateJob:
-    """Simulate a person with five sensors and a known truth.
+    """Simulate a person with five sensors, or fifteen in an activity, and a known truth.
 
     The person stands in the start pose, does the motion of the protocol, then draws circles with the right hand (not
     after poses). The sensors have the noise and bias of an Xsens MTi-3. Continue with `wepose calibrate DIR --measured
-    ...` and `wepose track DIR`.
+    ...` and `wepose track DIR`; after an activity with `wepose track DIR --model whole_body`.
 
     Parameters
     ----------
@@ -36,6 +36,9 @@ class SimulateJob:
         Sample the sensors at this rate, 20 to 2000 Hz.
     protocol
         Simulate the motion of this calibration protocol (see `wepose calibrate --help`).
+    activity
+        Simulate the whole body in place of a protocol, with sensors on pelvis, head, hands and legs too: walking on the
+        spot (walk), or sitting down and standing up (sit). Of the body's imperfections it has soft-tissue artefacts.
     preset
         Simulate only the sensors' noise and bias (ideal), or also soft-tissue artefacts, slip, sway and sensor errors
         (mild); their sizes and sources are in wepose_pin/simulation/imperfections.py.
@@ -55,6 +58,7 @@ class SimulateJob:
     seed: int = 1
     rate_hz: float = 100.0
     protocol: Literal["clasp", "handle", "touch_left", "touch_right", "poses"] = "clasp"
+    activity: Literal["walk", "sit"] | None = None
     preset: Literal["ideal", "mild"] = "ideal"
     imperfection: Mapping[str, float | str] = field(default_factory=dict)
     force: bool = False
@@ -64,6 +68,8 @@ class SimulateJob:
         check_seed(self.seed)
         if not 20.0 <= self.rate_hz <= 2000.0:
             raise BadOption(f"--rate-hz {self.rate_hz:g}: between 20 and 2000 samples a second")
+        if self.activity is not None and self.protocol != "clasp":
+            raise BadOption(f"--activity {self.activity} with --protocol {self.protocol}: one of them; leave one out")
         self.imperfections()
 
     def imperfections(self) -> Imperfections:
@@ -108,7 +114,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
     import numpy as np
 
     from ..documents import whole_folder
-    from ..simulation import simulate, simulate_person
+    from ..simulation import simulate, simulate_activity, simulate_person
     from ..subject import mount_rows, subject_toml
     from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
@@ -116,15 +122,24 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
     job.check()
     with whole_folder(job.out, job.force) as folder:
         progress("simulating a person", 0.0)
-        person = simulate_person(job.seed)
-        simulation = simulate(
-            person.lengths,
-            seed=job.seed,
-            rate_hz=job.rate_hz,
-            imperfections=job.imperfections(),
-            protocol=job.protocol,
-            circles=0 if job.protocol == "poses" else CIRCLES,
-        )
+        person = simulate_person(job.seed, body="whole_body" if job.activity else "upper_body")
+        if job.activity:
+            simulation = simulate_activity(
+                job.activity,
+                seed=job.seed,
+                rate_hz=job.rate_hz,
+                imperfections=job.imperfections(),
+                lengths=person.lengths,
+            )
+        else:
+            simulation = simulate(
+                person.lengths,
+                seed=job.seed,
+                rate_hz=job.rate_hz,
+                imperfections=job.imperfections(),
+                protocol=job.protocol,
+                circles=0 if job.protocol == "poses" else CIRCLES,
+            )
         write_session(folder, simulation.recording(f"simulated-{job.seed}"), simulation.truth())
         order = (*simulation.lengths, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
         true = replace(

@@ -199,7 +199,9 @@ class BodyTable:
         """Raise an `error` where a name is no segment."""
         for name in names:
             if name not in self.segments:
-                raise error(f"{where}{name} is no segment of {self.name}; {one_of(self.segments, name)}")
+                others = [body for body in _list_bodies() if name in load_table(body).segments]
+                known = f"the body {others[0]} has it" if others else one_of(self.segments, name)
+                raise error(f"{where}{name} is no segment of {self.name}; {known}")
 
     def guess_segment(self, label: str) -> str | None:
         """Guess the segment from a label or a file name, as ``humerus_r_imu`` or ``LeftForeArm``; None if unclear."""
@@ -260,11 +262,14 @@ def load_table(name: str = DEFAULT_BODY) -> BodyTable:
     BadModel
         There is none of that name.
     """
-    folder = asset("urdf", f"{DEFAULT_BODY}.toml").parent
-    known = sorted(path.stem for path in folder.glob("*.toml"))
-    if name not in known:
-        raise BadModel(f"no body '{name}' comes with the package; {one_of(known, name)}")
-    return read_table(folder / f"{name}.toml")[0]
+    if name not in _list_bodies():
+        raise BadModel(f"no body '{name}' comes with the package; {one_of(_list_bodies(), name)}")
+    return read_table(asset("urdf", f"{name}.toml"))[0]
+
+
+def _list_bodies() -> list[str]:
+    """The names of the bodies that come with the package."""
+    return sorted(path.stem for path in asset("urdf", f"{DEFAULT_BODY}.toml").parent.glob("*.toml"))
 
 
 def read_table(path: Path, *, needs_urdf: bool = False) -> tuple[BodyTable, Path | None]:
@@ -561,15 +566,16 @@ def find_table(urdf: Path, links: Iterable[str]) -> BodyTable | None:
     if beside.is_file() and "segments" in read_toml(beside, "the table of a body", BadModel):
         return read_table(beside)[0]
     default = load_table()
+    others = [load_table(body) for body in _list_bodies() if body != DEFAULT_BODY]
+    fitting = [replace(table, where=f"{urdf}: by {table.name}.toml") for table in others if table.links <= links]
+    more = [table for table in fitting if len(table.segments) > len(default.segments)]
+    if more:
+        return more[0]
     if links.issuperset(default.segments[name].link for name in default.needed):
         lacking = [name for name, segment in default.segments.items() if segment.link not in links]
         there = {name: point for name, point in default.points.items() if point.link in links}
         return _prune(replace(default.drop(lacking), points=there, where=str(urdf)))
-    for path in sorted(asset("urdf", f"{DEFAULT_BODY}.toml").parent.glob("*.toml")):
-        table = load_table(path.stem)
-        if path.stem != DEFAULT_BODY and table.links <= links:
-            return replace(table, where=f"{urdf}: by {path.name}")
-    return None
+    return fitting[0] if fitting else None
 
 
 # Writing ----------------------------------------------------------------------------------------------------------

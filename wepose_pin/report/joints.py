@@ -34,7 +34,7 @@ def build_joint_angles_section(tracked: TrackedRecording) -> dict[str, Any] | No
             }
             for k, name in enumerate(angles[members[0]].names)
         }
-        caption = f"The {group if len(members) == 1 else group + 's'} over time."
+        caption = f"The {plain(group) if len(members) == 1 else plain(group) + 's'} over time."
         if any((angles[joint].near_lock | angles[joint].gap).any() for joint in members):
             caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
         pictures.append(draw_over_time(angles.time, panels, f"angles-{group}", caption))

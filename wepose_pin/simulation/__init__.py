@@ -1,7 +1,8 @@
 """A subject with known truth and the IMU data that its motion gives.
 
-The motion is a closed form of continuous time, so that it is known exactly between the samples as well, and
-it shares no code with the model room: what the tests compare against is written here and nowhere else. Frames
+The motion is a closed form of continuous time, so that it is known exactly between the samples as well. That of a
+protocol shares no code with the model room: what the tests compare against is written here and nowhere else. That of
+an activity of the whole body gives orientations; the model places the segments. Frames
 as everywhere: W is z up, x forward, y left, origin at the root of the trunk; each segment frame equals W in
 the N-pose; the arm runs along -z.
 
@@ -9,6 +10,7 @@ By default a perfect world: no soft tissue, an exact N-pose, palms that coincide
 the table, and sensors with noise and bias only. `Imperfections` add those of real people and sensors.
 """
 
+from .activities import ACTIVITIES, simulate_activity
 from .imperfections import IDEAL_PRESET, MILD_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, NOISE_FREE, Device, ImuNoise
 from .motion import SEGMENTS, SIDES
@@ -16,6 +18,7 @@ from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
 from .subject import MOUNT, Person, Simulation, simulate, simulate_person
 
 __all__ = [
+    "ACTIVITIES",
     "GRAVITY",
     "IDEAL_PRESET",
     "MILD_PRESET",
@@ -31,6 +34,7 @@ __all__ = [
     "Simulation",
     "SingleSensor",
     "simulate",
+    "simulate_activity",
     "simulate_paper_drift",
     "simulate_paper_dynamic",
     "simulate_person",

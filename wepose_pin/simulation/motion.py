@@ -1,4 +1,4 @@
-"""The subject's motion: a closed form of continuous time.
+"""The motion of a protocol: a closed form of continuous time.
 
 It is exact between the samples as well, and shares no code with the model room, since tests compare the two. The torso
 frame T has the origin of W: the torso rotates about it.
@@ -6,6 +6,7 @@ frame T has the origin of W: the torso rotates about it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -35,6 +36,37 @@ class BodyPose(NamedTuple):
 
     R_WL: dict[str, Rotation]  # segment -> n rotations
     points: dict[str, np.ndarray]  # point -> (n, 3) [m] in W
+    origins: dict[str, np.ndarray]  # segment -> (n, 3) [m] in W, or (3,) where it does not move
+
+
+class BodyMotion(ABC):
+    """A body's motion as a function of continuous time, and where its sensors sit.
+
+    Attributes
+    ----------
+    lengths : of the body [m]
+    p_LS : segment → (3,) [m] in L, of its sensor
+    """
+
+    lengths: Mapping[str, float]
+    p_LS: Mapping[str, np.ndarray]
+
+    @property
+    @abstractmethod
+    def span(self) -> tuple[float, float]:
+        """The times [s] at which the free motion begins and the recording ends."""
+
+    @abstractmethod
+    def __call__(self, t: np.ndarray, segments: Collection[str]) -> BodyPose:
+        """Return the exact pose at the times `t` (n,) [s], of these segments at least."""
+
+    @abstractmethod
+    def activity(self, t: np.ndarray) -> np.ndarray:
+        """Return the activity (n,): 1 in free motion, 0 where the segments are static."""
+
+    @abstractmethod
+    def phases(self) -> dict[str, list[tuple[float, float]]]:
+        """Return the phases of the recording: phase → intervals [s]."""
 
 
 def make_step(t: np.ndarray, start: float, duration: float) -> np.ndarray:
@@ -122,8 +154,8 @@ class _Circle:
         return make_pulse(t, self.start, self.stop, _LIFT_S)[:, None] * (circle_W - table_W)
 
 
-class Motion:
-    """The subject's motion as a function of continuous time; `tasks` holds those of other protocols than the clasp."""
+class Motion(BodyMotion):
+    """The motion of a protocol, with torso and arms; `tasks` holds those of other protocols than the clasp."""
 
     phase = "clasp"
     lean_deg: float | np.ndarray = 15.0  # yaw, pitch, roll of the torso in the clasp
@@ -131,15 +163,28 @@ class Motion:
     def prepare(self, rng: np.random.Generator, pose_deg: float) -> None:
         """Draw what a protocol needs beyond the clasp; `pose_deg` is the error of poses about each axis."""
 
-    def phases(self) -> dict[str, list[tuple[float, float]]]:
+    def protocol_phases(self) -> dict[str, list[tuple[float, float]]]:
         """Return the phases between start and circles: phase → intervals [s]."""
         return {self.phase: [(self.clasp[0] + MARGIN_S, self.clasp[1] - MARGIN_S)]}
+
+    def phases(self) -> dict[str, list[tuple[float, float]]]:
+        return {
+            "start": [(0.5, STAND_S - 0.5)],
+            **self.protocol_phases(),
+            "circles": [(self.circles[0].start, self.circles[-1].stop)] if self.circles else [],
+            "rest": [(a + MARGIN_S, b - MARGIN_S) for a, b in self.rest],
+        }
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return self.clasp[0], self.rest[-1][1]
 
     def __init__(
         self, lengths: Mapping[str, float], rng: np.random.Generator, clasp_s: float, circles: int, flaws: Flaws
     ) -> None:
         self.flaws = flaws
         self.lengths = lengths
+        self.p_LS = place_sensors(lengths)
         self.half_width = 0.5 * lengths["shoulder_width"]
         self.arm = {s: (lengths[f"{s}_upper_arm"], lengths[f"{s}_forearm"] + lengths[f"{s}_hand"]) for s in SIDES}
         self.reach = min(sum(arm) for arm in self.arm.values())
@@ -171,7 +216,6 @@ class Motion:
         self.slip_gain = flaws.sizes.palm_slip / np.sqrt(3.0) / rms
 
     def activity(self, t: np.ndarray) -> np.ndarray:
-        """Return the activity (n,): 1 in the free motion of clasp and circles, 0 where the segments are static."""
         moving = make_pulse(t, *self.clasp, _RAMP_S)
         return moving + sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
 
@@ -238,8 +282,8 @@ class Motion:
         x = sin_alpha[:, None] * n - cos_alpha[:, None] * m  # into which the forearm flexes
         return Rotation.from_matrix(np.stack((x, np.cross(n, m), -u), axis=2)), flexion
 
-    def __call__(self, t: np.ndarray, sides: Collection[str] = tuple(SIDES)) -> BodyPose:
-        """Return the exact pose of the torso and of the arms of these sides at the times `t` (n,) [s]."""
+    def __call__(self, t: np.ndarray, segments: Collection[str] = SEGMENTS) -> BodyPose:
+        """Return the exact pose of the torso and of the arms of the segments' sides at the times `t` (n,) [s]."""
         moving = self._motion_share(t)
         circling = sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
         led = make_step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
@@ -264,8 +308,8 @@ class Motion:
         led_by = self._lead_share(t, led, table)
         palm_down = {"left": 0.0 * t, "right": np.deg2rad(40.0) * table}
 
-        R_WL, points = {"torso": R_WT}, {}
-        for side in sides:
+        R_WL, points, origins = {"torso": R_WT}, {}, {"torso": np.zeros(3)}
+        for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
             y, blend = SIDES[side], led_by[side]
             shoulder_T = np.array((0.0, y * self.half_width, self.lengths["trunk"]))
             swivel = np.deg2rad(35.0 + 30.0 * (moving + 0.3 * circling) * self.wander[f"{side}_swivel"](t))
@@ -298,7 +342,8 @@ class Motion:
             ):
                 p_W = p_W + R_WL_part.apply((0.0, 0.0, -self.lengths[f"{side}_{part}"]))
                 points[f"{side}_{end}"] = p_W
-        return BodyPose(R_WL, points)
+            origins |= {f"{side}_upper_arm": points[f"{side}_shoulder"], f"{side}_forearm": points[f"{side}_elbow"]}
+        return BodyPose(R_WL, points, origins)
 
 
 def place_sensors(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
@@ -312,8 +357,4 @@ def place_sensors(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
 
 def locate_sensor(pose: BodyPose, segment: str, p_LS: np.ndarray) -> np.ndarray:
     """Compute the sensor's position (n, 3) [m] in W."""
-    p_W = pose.R_WL[segment].apply(p_LS)
-    if segment == "torso":
-        return p_W
-    side, part = segment.split("_", 1)
-    return p_W + pose.points[f"{side}_shoulder" if part == "upper_arm" else f"{side}_elbow"]
+    return pose.R_WL[segment].apply(p_LS) + pose.origins[segment]

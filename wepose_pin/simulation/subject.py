@@ -1,4 +1,4 @@
-"""`simulate`: the paper's upper-body experiment with known truth and its IMU data."""
+"""`simulate`: the paper's upper-body experiment with known truth; and the IMU data that any motion gives."""
 
 from __future__ import annotations
 
@@ -12,34 +12,25 @@ from scipy.spatial.transform import Rotation
 from ..arguments import Count, NonNegative, Positive, check_arguments, check_names
 from ..errors import BadOption
 from ..kinematics import Pose
-from ..model import SEXES, load_table
+from ..model import DEFAULT_BODY, SEXES, load_table
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, mark_lost_samples
 from ..subject import Subject, check_lengths, population_subject
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
-from .motion import (
-    E_Z,
-    MARGIN_S,
-    SEGMENTS,
-    SIDES,
-    STAND_S,
-    BodyPose,
-    Flaws,
-    Motion,
-    Wander,
-    locate_sensor,
-    place_sensors,
-)
+from .motion import E_Z, BodyMotion, BodyPose, Flaws, Wander, locate_sensor
 from .tasks import TASKS
 
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
 _STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
 _GAIN_RATE_HZ = 20.0  # at which soft-tissue motion is scaled to its rms
-# Streams of random numbers beyond those of motion, mounts and noise: new ones go to the end.
+# Streams of random numbers: new ones go to the end.
 _STREAMS = (
+    "motion",
+    "strap",
+    "noise",
     "palm_slip",
     "shoulder_wander",
     "start_elbow",
@@ -125,12 +116,12 @@ class _Moved(NamedTuple):
 class _Sampled:
     """The motion at n times, and at neighbouring times for numerical derivatives."""
 
-    def __init__(self, motion: Motion, t: np.ndarray, segment: str = "") -> None:
+    def __init__(self, motion: BodyMotion, t: np.ndarray, segment: str = "") -> None:
         """Sample all segments, or one segment and those that carry it."""
-        sides = [side for side in SIDES if not segment or segment.startswith(side)]
+        segments = [segment] if segment else list(motion.p_LS)
         self.time = t
-        self.pose: BodyPose = motion(t, sides)
-        self.neighbours = [motion(t + k * _STENCIL_S, sides) for k in (-2, -1, 1, 2)]
+        self.pose: BodyPose = motion(t, segments)
+        self.neighbours = [motion(t + k * _STENCIL_S, segments) for k in (-2, -1, 1, 2)]
 
     def segment(self, segment: str, p_LS: np.ndarray) -> _Moved:
         # Differences to the middle first: for a static segment they are exactly zero.
@@ -228,25 +219,39 @@ def simulate(
     if protocol not in TASKS or (protocol == "poses" and circles):
         raise BadOption(f"protocol {protocol!r} must be one of {', '.join(TASKS)}; with 'poses' circles must be 0")
     lengths = {name: float(lengths[name]) for name in names}
-    motion_rng, mount_rng, noise_rng, *others = np.random.default_rng(seed).spawn(3 + len(_STREAMS))
-    rngs = dict(zip(_STREAMS, others, strict=True))
-    motion = TASKS[protocol](lengths, motion_rng, clasp_s, circles, Flaws(imperfections, rngs))
+    rngs = spawn_streams(seed)
+    motion = TASKS[protocol](lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs))
     motion.prepare(rngs["task"], pose_deg)
-    n = int(np.floor(motion.rest[-1][1] * rate_hz)) + 1
+    return measure_motion(motion, rngs, rate_hz, noise, imperfections)
+
+
+def spawn_streams(seed: int) -> dict[str, np.random.Generator]:
+    """Spawn the streams of random numbers by their names."""
+    return dict(zip(_STREAMS, np.random.default_rng(seed).spawn(len(_STREAMS)), strict=True))
+
+
+def measure_motion(
+    motion: BodyMotion,
+    rngs: Mapping[str, np.random.Generator],
+    rate_hz: float,
+    noise: ImuNoise,
+    imperfections: Imperfections,
+) -> Simulation:
+    """Measure a motion with a sensor on each segment of its `p_LS`, by the streams of `spawn_streams`."""
+    n = int(np.floor(motion.span[1] * rate_hz)) + 1
     time = np.arange(n) / rate_hz
-    p_LS = place_sensors(lengths)
     N = Rotation.from_matrix([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # x_S to z_L, -z_S to x_L
 
     stated_time = _Sampled(motion, time)
     own_clocks = imperfections.clock_jitter > 0.0 or imperfections.clock_offset > 0.0
     never_still = own_clocks or imperfections.sway_deg_s > 0.0
-    coarse_t = np.arange(motion.clasp[0], motion.rest[-1][1], 1.0 / _GAIN_RATE_HZ)
+    coarse_t = np.arange(*motion.span, 1.0 / _GAIN_RATE_HZ)
     coarse = _Sampled(motion, coarse_t) if imperfections.soft_tissue_deg else None
 
     sensors: dict[str, dict] = {name: {} for name in ("quat_LS", "gyro_S", "accel_S", "gyro_bias", "accel_bias")}
     sensors |= {name: {} for name in ("quat_WS", "soft_tissue", "device", "sample_time")}
-    for segment in SEGMENTS:
-        heading, tilt = mount_rng.uniform(0.0, 2.0 * np.pi), np.deg2rad(mount_rng.uniform(2.0, 10.0))
+    for segment, p_LS in motion.p_LS.items():
+        heading, tilt = rngs["strap"].uniform(0.0, 2.0 * np.pi), np.deg2rad(rngs["strap"].uniform(2.0, 10.0))
         R_LS = Rotation.from_rotvec(tilt * np.array((np.cos(heading), np.sin(heading), 0.0))) * N
         any_quat = rngs["mount"].standard_normal(4)  # uniform on the sphere
         if imperfections.mount == "any":
@@ -256,10 +261,10 @@ def simulate(
 
         tissue = _SoftTissue(rngs["soft_tissue"], imperfections.soft_tissue_deg)
         if coarse is not None:
-            tissue.scale(coarse.segment(segment, p_LS[segment]), motion.activity(coarse_t))
+            tissue.scale(coarse.segment(segment, p_LS), motion.activity(coarse_t))
 
         sampled = _Sampled(motion, own_time, segment) if own_clocks else stated_time
-        moved = sampled.segment(segment, p_LS[segment])
+        moved = sampled.segment(segment, p_LS)
         soft_L = tissue(moved, motion.activity(own_time))
         # A product with the identity would not keep the last bit.
         R_WS = (moved.R_WL * Rotation.from_rotvec(soft_L) if tissue.rms else moved.R_WL) * R_LS
@@ -268,13 +273,13 @@ def simulate(
         if own_clocks:
             rate_S[1:] = rotvec / np.diff(own_time)[:, None]
         if never_still:  # a sample before the first one, for the rate that ends there
-            before = _Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment).segment(segment, p_LS[segment])
+            before = _Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment).segment(segment, p_LS)
             R_before = before.R_WL * Rotation.from_rotvec(tissue(before, motion.activity(before.time))) * R_LS
             rate_S[0] = (R_before[0].inv() * R_WS[0]).as_rotvec() * rate_hz
         force_S = R_WS.inv().apply(moved.p_ddot + GRAVITY * E_Z)
 
         device = Device.sample(rngs["device"], imperfections)
-        readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, noise_rng)
+        readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, rngs["noise"])
         dropped = draw_lost(rngs["dropped"], n, rate_hz, imperfections.dropped)
         readings.gyro_S[dropped] = readings.accel_S[dropped] = np.nan
         for name, value in (
@@ -287,21 +292,15 @@ def simulate(
         ):
             sensors[name][segment] = value
 
-    phases = {
-        "start": [(0.5, STAND_S - 0.5)],
-        **motion.phases(),
-        "circles": [(motion.circles[0].start, motion.circles[-1].stop)] if motion.circles else [],
-        "rest": [(a + MARGIN_S, b - MARGIN_S) for a, b in motion.rest],
-    }
     return Simulation(
         time=time,
         rate_hz=rate_hz,
-        quat_WL={segment: stated_time.pose.R_WL[segment].as_quat() for segment in SEGMENTS},
+        quat_WL={segment: stated_time.pose.R_WL[segment].as_quat() for segment in motion.p_LS},
         points=stated_time.pose.points,
-        p_LS=p_LS,
-        stated_mount=dict.fromkeys(SEGMENTS, MOUNT if imperfections.mount == "stated" else None),
-        lengths=lengths,
-        phases=phases,
+        p_LS=dict(motion.p_LS),
+        stated_mount=dict.fromkeys(motion.p_LS, MOUNT if imperfections.mount == "stated" else None),
+        lengths=dict(motion.lengths),
+        phases=motion.phases(),
         imperfections=imperfections,
         **sensors,
     )
@@ -318,13 +317,14 @@ class Person(NamedTuple):
     prior: Subject  # the population prior of that stature and sex
 
 
-def simulate_person(seed: int, measured_std: float = 0.003) -> Person:
-    """Sample a person of the population, with measured shoulder width and trunk."""
+def simulate_person(seed: int, measured_std: float = 0.003, body: str = DEFAULT_BODY) -> Person:
+    """Sample a person of the population, with the lengths of a `body` and measured shoulder width and trunk."""
     rng = np.random.default_rng([seed, 7])
     sex = SEXES[int(rng.integers(2))]
     mean, std = {"f": (1.63, 0.064), "m": (1.756, 0.069)}[sex]  # [m], ANSUR II (Gordon et al. 2014)
     stature = float(np.clip(rng.normal(mean, std), 1.45, 2.0))
-    prior = population_subject(round(stature, 2), sex)
-    lengths = dict(population_subject(stature, sex).sample(rng).lengths)
+    table = load_table(body)
+    prior = population_subject(round(stature, 2), sex, table)
+    lengths = dict(population_subject(stature, sex, table).sample(rng).lengths)
     measured = {name: lengths[name] + float(rng.normal(0.0, measured_std)) for name in ("shoulder_width", "trunk")}
     return Person(lengths, stature, sex, measured, measured_std, prior)

@@ -99,7 +99,7 @@ class Poses(Motion):
         self.elbow = {side: abs(size * rng.standard_normal()) for side in SIDES}  # [rad]
         self.bow_axis = 0.75 * size * rng.standard_normal()  # [rad] from y
 
-    def phases(self) -> dict[str, list[tuple[float, float]]]:
+    def protocol_phases(self) -> dict[str, list[tuple[float, float]]]:
         return {
             "t_pose": [(_T_POSE_S[0] + MARGIN_S, _T_POSE_S[1] - MARGIN_S)],
             "bow": [(_BOW_S[0] - MARGIN_S, _BOW_S[1] + MARGIN_S)],

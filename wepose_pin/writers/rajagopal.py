@@ -28,6 +28,12 @@ BODIES = {
     "left_upper_arm": "humerus_l",
     "left_forearm": "radius_l",
     "left_hand": "hand_l",
+    "right_thigh": "femur_r",
+    "right_shank": "tibia_r",
+    "right_foot": "calcn_r",
+    "left_thigh": "femur_l",
+    "left_shank": "tibia_l",
+    "left_foot": "calcn_l",
 }
 # Axes of a right arm's joints with two, in the body above; a left arm's are mirrored on the sagittal plane.
 ELBOW = (np.array([0.22604696, 0.022269, 0.97386183]), PRONATION)

@@ -1,0 +1,250 @@
+"""Legs: the whole body's URDF, activities with known truth, and their joint angles through the commands."""
+
+from __future__ import annotations
+
+import copy
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+import wepose_pin as wp
+from wepose_pin.angles import joint_angles
+from wepose_pin.cli import main
+from wepose_pin.errors import BadOption
+from wepose_pin.evaluation import evaluate
+from wepose_pin.jobs.evaluate import EvaluateJob, run_evaluate
+from wepose_pin.kinematics import Pose, parse_pose_table
+from wepose_pin.model import load_model
+from wepose_pin.simulation import NOISE_FREE, Simulation, simulate_activity
+from wepose_pin.simulation.activities import ACTIVITIES
+
+URDF = Path(__file__).resolve().parent.parent / "urdf"
+SIDES = ("left", "right")
+
+
+def parts(name: str) -> dict[tuple[str, str | None], ET.Element]:
+    """Kind and name → element of a URDF, without the space between elements."""
+    root = ET.parse(URDF / name).getroot()
+    for element in root.iter():
+        element.text = element.tail = None
+    return {(element.tag, element.get("name")): element for element in root}
+
+
+@pytest.fixture(scope="module", params=ACTIVITIES)
+def activity(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def made(activity: str) -> Simulation:
+    return simulate_activity(activity, seed=2, noise=NOISE_FREE, seconds=10.0)
+
+
+# The model --------------------------------------------------------------------------------------------------------
+
+
+def test_the_upper_body_is_that_of_its_own_urdf() -> None:
+    upper, whole = parts("upper_body.urdf"), parts("whole_body.urdf")
+    for key, element in upper.items():
+        if key == ("link", "pelvis"):  # the stumps where the legs begin
+            element = copy.deepcopy(element)
+            stumps = element.findall("visual")[-2:]
+            assert all(float(stump.find("origin").get("xyz").split()[2]) < -0.05 for stump in stumps)
+            for stump in stumps:
+                element.remove(stump)
+        assert ET.tostring(whole[key]) == ET.tostring(element), key
+    more = {name for kind, name in set(whole) - set(upper) if kind in ("link", "joint")}
+    assert all(name.startswith(("left_", "right_")) for name in more)
+    assert [key for key in whole if key in upper] == list(upper)
+
+
+@pytest.mark.parametrize(
+    ("segment", "length", "share", "centre", "radii"),
+    [  # de Leva 1996, Table 4, male: length of 1.741 m of stature [mm], then % of mass, length, radii about x, y, z
+        ("thigh", 422.2, 14.16, 40.95, (32.9, 32.9, 14.9)),
+        ("shank", 440.3, 4.33, 43.95, (25.1, 24.6, 10.2)),
+        ("foot", 258.1, 1.37, 44.15, (12.4, 24.5, 25.7)),
+    ],
+)
+def test_a_leg_is_de_levas(
+    segment: str, length: float, share: float, centre: float, radii: tuple[float, float, float]
+) -> None:
+    whole = parts("whole_body.urdf")
+    length *= 1e-3 * 1.75 / 1.741
+    mass = 75.0 * share / 100.0
+    for side in SIDES:
+        inertial = whole["link", f"{side}_{segment}"].find("inertial")
+        assert float(inertial.find("mass").get("value")) == pytest.approx(mass, rel=1e-4)
+        moments = [float(inertial.find("inertia").get(name)) for name in ("ixx", "iyy", "izz")]
+        assert moments == pytest.approx([mass * (r / 100.0 * length) ** 2 for r in radii], rel=4e-3)
+        at = np.array(inertial.find("origin").get("xyz").split(), dtype=float)
+        if segment == "foot":  # from the heel, along the foot
+            heel, toe = (
+                float(whole["joint", f"{side}_{point}_fixed"].find("origin").get("xyz").split()[0])
+                for point in ("heel", "toe")
+            )
+            assert toe - heel == pytest.approx(length, abs=1e-3)
+            assert at[0] - heel == pytest.approx(centre / 100.0 * length, abs=1e-3)
+        else:
+            assert at[2] == pytest.approx(-centre / 100.0 * length, abs=1e-3)
+
+
+def test_left_and_right_leg_mirror_each_other() -> None:
+    whole = parts("whole_body.urdf")
+    for (kind, name), left in whole.items():
+        if kind != "joint" or not name.startswith(("left_thigh", "left_shank", "left_foot", "left_heel", "left_toe")):
+            continue
+        right = whole["joint", name.replace("left", "right")]
+        here, there = (np.array(each.find("origin").get("xyz").split(), dtype=float) for each in (left, right))
+        np.testing.assert_array_equal(here * [1.0, -1.0, 1.0], there)
+        if left.get("type") == "fixed":
+            continue
+        limits = [tuple(float(each.find("limit").get(end)) for end in ("lower", "upper")) for each in (left, right)]
+        assert limits[1] == (limits[0] if name.endswith("_y") else (-limits[0][1], -limits[0][0]))
+
+
+# Activities -------------------------------------------------------------------------------------------------------
+
+
+def test_the_true_pose_has_the_angles_of_the_activity(activity: str) -> None:
+    motion = ACTIVITIES[activity](load_model("whole_body"), np.random.default_rng(1), 10.0)
+    t = np.arange(0.0, 17.0, 0.013)
+    R_WL = motion(t, ()).R_WL
+    angles = joint_angles(Pose(t, {segment: R.as_quat() for segment, R in R_WL.items()}, {}))
+    for side in SIDES:
+        for joint, values in motion.leg(side, t)._asdict().items():
+            np.testing.assert_allclose(angles[f"{side}_{joint}"].values, values, atol=1e-12)
+        elbow = angles[f"{side}_elbow"]
+        np.testing.assert_allclose(elbow.values[:, 0], motion.arm(side, t)[:, 1], atol=1e-12)
+    most = {name: np.degrees(angle.values.max(axis=0)) for name, angle in angles.joints.items()}
+    if activity == "walk":
+        assert 50.0 < most["left_knee"][0] < 72.0
+        hip, shoulder = motion.leg("left", t).hip[:, 0], motion.arm("left", t)[:, 0]
+        assert np.corrcoef(hip, shoulder)[0, 1] < -0.8  # arms swing against the legs
+        half = round(0.5 * motion.stride_s / 0.013)
+        between = slice(700, 900)
+        left, right = (motion.leg(side, t).knee[:, 0] for side in SIDES)
+        assert np.corrcoef(left[between], right[700 + half : 900 + half])[0, 1] > 0.99
+    else:
+        assert 90.0 < most["left_knee"][0] < 95.0
+        assert 90.0 < most["left_hip"][0] < 105.0
+
+
+def test_points_and_sensors_are_where_the_segments_put_them(made: Simulation) -> None:
+    lengths, R_WL = made.lengths, {segment: Rotation.from_quat(quat) for segment, quat in made.quat_WL.items()}
+    for side, y in (("left", 1.0), ("right", -1.0)):
+        p_W = R_WL["pelvis"].apply([0.0, y * lengths["hip_width"] / 2.0, 0.0])
+        origins = {}
+        for segment, point, end in (("thigh", "hip", "knee"), ("shank", "knee", "ankle"), ("foot", "ankle", None)):
+            np.testing.assert_allclose(made.points[f"{side}_{point}"], p_W, atol=1e-12)
+            origins[segment] = p_W
+            if end is not None:
+                p_W = p_W + R_WL[f"{side}_{segment}"].apply([0.0, 0.0, -lengths[f"{side}_{segment}"]])
+        toe_L = R_WL[f"{side}_foot"].inv().apply(made.points[f"{side}_toe"] - p_W)
+        assert np.linalg.norm(toe_L, axis=1) == pytest.approx(lengths[f"{side}_foot"], abs=1e-12)
+        heel_L = R_WL[f"{side}_foot"].inv().apply(made.points[f"{side}_heel"] - p_W)
+        np.testing.assert_allclose(toe_L[:, 2], heel_L[:, 2], atol=1e-12)  # both on the sole
+        for segment, origin in origins.items():
+            sensor = f"{side}_{segment}"
+            p_WS = origin + R_WL[sensor].apply(made.p_LS[sensor])
+            R_WS = R_WL[sensor] * Rotation.from_quat(made.quat_LS[sensor])
+            accel_W = R_WS.apply(made.accel_S[sensor]) - [0.0, 0.0, 9.81]
+            spline = CubicSpline(made.time, p_WS).derivative(2)(made.time)
+            assert np.abs(accel_W - spline)[10:-10].max() < 0.02 * max(1.0, np.abs(accel_W).max())
+            turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * made.rate_hz
+            np.testing.assert_allclose(made.gyro_S[sensor][1:], turned, atol=1e-9)
+
+
+def test_standing_at_the_start_is_the_n_pose(made: Simulation) -> None:
+    standing = made.time < 4.9
+    for segment, quat in made.quat_WL.items():
+        np.testing.assert_array_equal(quat[standing], np.tile([0.0, 0.0, 0.0, 1.0], (standing.sum(), 1)), segment)
+    assert set(made.phases) > {"start", "rest"}
+
+
+def test_an_activity_that_is_none_or_too_short_is_named() -> None:
+    with pytest.raises(BadOption, match=r"activity 'run' is not known; .*walk, sit"):
+        simulate_activity("run", seed=1)
+    with pytest.raises(BadOption, match="seconds 5: sitting down and standing up once takes 8"):
+        simulate_activity("sit", seed=1, seconds=5.0)
+
+
+# The commands -----------------------------------------------------------------------------------------------------
+
+LEG_JOINTS = [f"{side}_{joint}" for side in SIDES for joint in ("hip", "knee", "ankle")]
+
+
+def run(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.parametrize(
+    ("activity", "preset", "most_deg"), [("walk", "ideal", 0.6), ("sit", "ideal", 0.6), ("walk", "mild", 2.5)]
+)
+def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, most_deg: float, tmp_path: Path) -> None:
+    made, result = tmp_path / "made", tmp_path / "result"
+    assert (
+        run("simulate", "-o", made, "--seed", "5", "--activity", activity, "--preset", preset, "--rate-hz", "60") == 0
+    )
+    assert run("track", made, "--model", "whole_body", "--no-view", "--no-report", "-o", result) == 0
+    assert run("evaluate", result, made) == 0
+    errors = run_evaluate(EvaluateJob(result, made))
+    for joint in LEG_JOINTS:
+        for name, error in errors.joints[joint].items():
+            assert error.rmse < most_deg, (joint, name)
+
+    assert run("export", result, "-o", tmp_path / "result.csv") == 0
+    table = pl.read_csv(tmp_path / "result.csv")
+    truth = joint_angles(parse_pose_table(pl.read_parquet(made / "truth.parquet"), "truth"))
+    for joint in LEG_JOINTS:
+        for k, name in enumerate(truth[joint].names):
+            difference = table[f"{joint}_{name}_deg"].to_numpy() - np.degrees(truth[joint].values[:, k])
+            rms = np.sqrt(np.mean(np.square(difference)))
+            assert rms == pytest.approx(errors.joints[joint][name].rmse, abs=1e-6)
+    assert {"pelvis_qx", "pelvis_in_world_qx", "left_toe_x", "right_heel_z"} <= set(table.columns)
+    assert run("export", result, "-o", tmp_path / "result.sto") == 0
+    labels = (tmp_path / "result.sto").read_text(encoding="utf-8").split("endheader\n")[1].splitlines()[0].split("\t")
+    assert {f"{body}_{side}_imu" for body in ("femur", "tibia", "calcn") for side in "lr"} <= set(labels)
+    again = load_model(result / "subject.urdf")
+    assert set(again.table.segments) == set(load_model("whole_body").table.segments)
+
+
+@pytest.mark.parametrize("torso", [False, True])
+def test_seven_sensors_from_the_pelvis_down_are_enough(torso: bool) -> None:
+    simulation = simulate_activity("walk", seed=4, seconds=10.0)
+    recording = simulation.recording()
+    wanted = {"pelvis", *(f"{side}_{part}" for side in SIDES for part in ("thigh", "shank", "foot"))}
+    wanted |= {"torso"} if torso else set()
+    sensors = {segment: sensor for segment, sensor in recording.sensors.items() if segment in wanted}
+    model = load_model("whole_body", simulation.lengths)
+    pose = wp.track(replace(recording, sensors=sensors), model=model).pose
+    errors = evaluate(pose, simulation.truth())
+    below = {f"{side}_{point}" for side in SIDES for point in ("hip", "knee", "ankle", "heel", "toe")}
+    assert set(pose.points) == below | ({"left_shoulder", "right_shoulder"} if torso else set())
+    assert set(pose.point_cov) == set(pose.points)
+    for joint in LEG_JOINTS:
+        assert all(error.rmse < 0.5 for error in errors.joints[joint].values())
+    for point in below:
+        assert errors.position[point].rmse < 5.0  # mm
+
+
+def test_legs_on_the_upper_body_are_refused_with_the_body_that_has_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = tmp_path / "made"
+    assert run("simulate", "-o", made, "--activity", "sit") == 0
+    assert run("track", made, "-o", tmp_path / "result") == 2
+    error = capsys.readouterr().err
+    assert "sensors.left_thigh is no segment of upper_body; the body whole_body has it" in error
+    assert run("simulate", "-o", made, "--activity", "sit", "--protocol", "handle", "--force") == 2
+    assert "--activity sit with --protocol handle" in capsys.readouterr().err
+    assert run("track", made, "--model", "half_body", "-o", tmp_path / "result") == 2
+    assert "no body 'half_body' comes with the package; did you mean 'whole_body'" in capsys.readouterr().err

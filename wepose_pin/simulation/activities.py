@@ -1,0 +1,290 @@
+"""Activities of the whole body with known truth: walking on the spot, sitting down and standing up.
+
+An activity is a set of joint angles as closed forms of time, of the hips and ankles after Wu et al. 2002, of the knees
+after Grood and Suntay 1983; segment orientations are put together from them here, without the code of the angles room.
+Where the segments and their sensors are follows from the model by Pinocchio: the root, midway between the hips, stays
+where it is, so a person who sits down raises the feet.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from ..arguments import Count, Positive, check_arguments
+from ..errors import BadOption, one_of
+from ..kinematics import compute_link_poses, solve_configuration
+from ..model import BodyModel, load_model
+from .imperfections import IDEAL_PRESET, Imperfections
+from .imu import MTI_3, ImuNoise
+from .motion import MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, make_pulse, place_sensors
+from .subject import Simulation, measure_motion, spawn_streams
+
+WHOLE_BODY = "whole_body"
+_RAMP_S = 2.0  # a walk grows and dies away over this time
+_END_S = 2.0  # the person stands still at the end
+
+
+class LegAngles(NamedTuple):
+    """The three angles of each joint of a leg (n, 3) [rad], with the names and signs of `angles.JOINTS`."""
+
+    hip: np.ndarray  # flexion, adduction, internal rotation
+    knee: np.ndarray  # flexion, adduction, external rotation
+    ankle: np.ndarray  # dorsiflexion, inversion, internal rotation
+
+
+class TrunkAngles(NamedTuple):
+    """Rotation vectors (n, 3) [rad] about x (right side down), y (forward) and z (to the left) of W."""
+
+    torso: np.ndarray
+    pelvis: np.ndarray
+    head: np.ndarray
+
+
+class Activity(BodyMotion):
+    """An activity of a body with legs, with a sensor on each segment."""
+
+    phase = ""
+
+    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float) -> None:
+        self.model = model
+        self.lengths = model.lengths
+        self.p_LS = _place_sensors(self.lengths)
+        self.seconds = seconds
+        self.prepare(rng)
+
+    @abstractmethod
+    def prepare(self, rng: np.random.Generator) -> None:
+        """Draw what is this person's own."""
+
+    @abstractmethod
+    def leg(self, side: str, t: np.ndarray) -> LegAngles:
+        """Compute the angles of a leg at the times `t` (n,) [s]."""
+
+    @abstractmethod
+    def trunk(self, t: np.ndarray) -> TrunkAngles:
+        """Compute the rotations of torso, pelvis and head at the times `t` (n,) [s]."""
+
+    @abstractmethod
+    def arm(self, side: str, t: np.ndarray) -> np.ndarray:
+        """Compute flexion of shoulder and elbow (n, 2) [rad] at the times `t` (n,) [s]."""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return STAND_S, STAND_S + self.seconds + _END_S
+
+    def activity(self, t: np.ndarray) -> np.ndarray:
+        return make_pulse(t, STAND_S, STAND_S + self.seconds, _RAMP_S)
+
+    def phases(self) -> dict[str, list[tuple[float, float]]]:
+        stop = STAND_S + self.seconds
+        return {
+            "start": [(0.5, STAND_S - 0.5)],
+            self.phase: [(STAND_S + MARGIN_S, stop - MARGIN_S)],
+            "rest": [(stop + MARGIN_S, stop + _END_S - MARGIN_S)],
+        }
+
+    def __call__(self, t: np.ndarray, _segments: Collection[str] = ()) -> BodyPose:
+        """Return the exact pose of all segments at the times `t` (n,) [s]."""
+        R_WL = self._orientations(t)
+        q = solve_configuration(self.model, {segment: R.as_quat() for segment, R in R_WL.items()})
+        frames = self.model.point_frames
+        _, p_W = compute_link_poses(self.model, q, [*R_WL, *frames.values()], rotations=False)
+        origins = {segment: p_W[:, k] for k, segment in enumerate(R_WL)}
+        return BodyPose(R_WL, {point: p_W[:, len(R_WL) + k] for k, point in enumerate(frames)}, origins)
+
+    def _orientations(self, t: np.ndarray) -> dict[str, Rotation]:
+        R_WL = {name: Rotation.from_rotvec(turn) for name, turn in self.trunk(t)._asdict().items()}
+        for side, y in SIDES.items():
+            shoulder, elbow = self.arm(side, t).T
+            R_WU = R_WL["torso"] * Rotation.from_euler("y", -shoulder[:, None])
+            R_WF = R_WU * Rotation.from_euler("y", -elbow[:, None])
+            leg = self.leg(side, t)
+            # A right leg, y = −1: flexion about −y, adduction about x, internal rotation about z. Its knee: y, x, −z.
+            R_WT = R_WL["pelvis"] * Rotation.from_euler("YXZ", leg.hip * (-1.0, -y, -y))
+            R_WS = R_WT * Rotation.from_euler("YXZ", leg.knee * (1.0, -y, y))
+            R_WA = R_WS * Rotation.from_euler("YXZ", leg.ankle * (-1.0, -y, -y))
+            parts = {"upper_arm": R_WU, "forearm": R_WF, "hand": R_WF, "thigh": R_WT, "shank": R_WS, "foot": R_WA}
+            R_WL |= {f"{side}_{part}": R for part, R in parts.items()}
+        return R_WL
+
+
+class Walk(Activity):
+    """Walking: each leg the other half a stride later, the arms against the legs, torso against pelvis.
+
+    Hip, knee and ankle in the sagittal plane: Perry & Burnfield 2010, "Gait Analysis: Normal and Pathological
+    Function", 2nd ed., the angles at the ends of the phases of a stride, and the sizes of the pelvis's motion. The
+    shoulder from 24° of extension to 8° of flexion: Perry 1992, first edition of the same, chapter 8. The small angles
+    in the other planes, the torso's, and the elbow's are assumptions.
+    """
+
+    phase = "walk"
+    # Share of the stride, from the foot's first contact; hip flexion, knee flexion, ankle dorsiflexion [deg].
+    _STRIDE = np.array(
+        [
+            (0.00, 20.0, 5.0, 0.0),  # initial contact
+            (0.12, 20.0, 15.0, -5.0),  # loading response
+            (0.31, 0.0, 5.0, 5.0),  # mid stance
+            (0.50, -20.0, 10.0, 10.0),  # terminal stance
+            (0.62, -10.0, 40.0, -15.0),  # pre-swing
+            (0.75, 15.0, 60.0, -5.0),  # initial swing
+            (0.87, 25.0, 25.0, 0.0),  # mid swing
+            (1.00, 20.0, 5.0, 0.0),  # terminal swing
+        ]
+    )
+    _STRIDE_S = 1.06  # 113 steps a minute, Perry & Burnfield 2010
+
+    def prepare(self, rng: np.random.Generator) -> None:
+        self.stride_s = self._STRIDE_S * rng.uniform(0.92, 1.08)
+        self.size = rng.uniform(0.85, 1.15, 3)  # of hip, knee and ankle
+        self.curves = CubicSpline(self._STRIDE[:, 0], np.radians(self._STRIDE[:, 1:]), bc_type="periodic")
+
+    def _cycle(self, t: np.ndarray, side: str) -> np.ndarray:
+        """Share of the stride (n,), from the first contact of this side's foot."""
+        return (t - STAND_S) / self.stride_s + (0.5 if side == "left" else 0.0)
+
+    def leg(self, side: str, t: np.ndarray) -> LegAngles:
+        share = self._cycle(t, side)
+        wave, quadrature = np.sin(2.0 * np.pi * share), np.cos(2.0 * np.pi * share)
+        sagittal = self.activity(t)[:, None] * self.size * self.curves(share % 1.0)
+        small = np.radians(self.activity(t))
+        return LegAngles(
+            np.column_stack((sagittal[:, 0], small * 6.0 * wave, small * 4.0 * quadrature)),
+            np.column_stack((sagittal[:, 1], small * 2.0 * wave, small * 4.0 * quadrature)),
+            np.column_stack((sagittal[:, 2], small * -4.0 * wave, small * 3.0 * quadrature)),
+        )
+
+    def trunk(self, t: np.ndarray) -> TrunkAngles:
+        angle = 2.0 * np.pi * self._cycle(t, "right")
+        size = np.radians(self.activity(t))[:, None]
+        # At the right foot's first contact the right side of the pelvis is in front; then its left side drops.
+        pelvis = np.column_stack((-4.0 * np.sin(angle), 2.0 * np.sin(2.0 * angle), 5.0 * np.cos(angle)))
+        torso = np.column_stack((2.0 * np.sin(angle), 1.0 + np.sin(2.0 * angle), -5.0 * np.cos(angle)))
+        return TrunkAngles(size * torso, size * pelvis, size * 0.3 * torso)
+
+    def arm(self, side: str, t: np.ndarray) -> np.ndarray:
+        forward = 0.5 - 0.5 * np.cos(2.0 * np.pi * self._cycle(t, side))  # 0 at the first contact of its own foot
+        degrees = np.column_stack((-24.0 + 32.0 * forward, 20.0 + 24.0 * forward))
+        return self.activity(t)[:, None] * np.radians(degrees)
+
+
+class Sit(Activity):
+    """Sitting down and standing up again, some times; the trunk leans forward while the body moves.
+
+    Seated, the hips and knees are bent to 90°, the elbows to 75°, and the pelvis is upright. The feet stay level to a
+    few degrees. Durations near those of Nuzik et al. 1986 (Phys Ther 66:1708-1713); sizes of lean and tilt are
+    assumptions.
+    """
+
+    phase = "sit"
+    _MOVE_S = 2.0  # down, and up
+    _PAUSE_S = (1.0, 3.0)  # standing, seated
+
+    def prepare(self, rng: np.random.Generator) -> None:
+        times = int(self.seconds // (2.0 * self._MOVE_S + sum(self._PAUSE_S)))
+        if times < 1:
+            raise BadOption(f"seconds {self.seconds:g}: sitting down and standing up once takes 8")
+        start = STAND_S + self._PAUSE_S[0]
+        self.down: list[float] = []
+        for _ in range(times):
+            self.down.append(start)
+            start += 2.0 * self._MOVE_S + sum(self._PAUSE_S)
+        self.lean = np.radians(35.0 * rng.uniform(0.85, 1.15))
+        self.tilt = 0.6 * self.lean  # of the pelvis, forward
+        self.spread = np.radians(rng.uniform(3.0, 10.0, 2))  # of each thigh outwards, seated
+
+    def _seated(self, t: np.ndarray) -> np.ndarray:
+        """Share (n,): 0 standing, 1 seated."""
+        return sum(
+            (make_pulse(t, at, at + self._up + self._MOVE_S, self._MOVE_S) for at in self.down), np.zeros_like(t)
+        )
+
+    def _moving(self, t: np.ndarray) -> np.ndarray:
+        """Share (n,): 1 in the middle of each way down or up."""
+        half = 0.5 * self._MOVE_S
+        ways = [way for at in self.down for way in (at, at + self._up)]
+        return sum((make_pulse(t, way, way + self._MOVE_S, half) for way in ways), np.zeros_like(t))
+
+    @property
+    def _up(self) -> float:
+        """Time [s] from the beginning of the way down to that of the way up."""
+        return self._MOVE_S + self._PAUSE_S[1]
+
+    def leg(self, side: str, t: np.ndarray) -> LegAngles:
+        seated, moving = self._seated(t), self._moving(t)
+        thigh, shank_forward = np.radians(90.0) * seated, np.radians(12.0) * moving
+        pelvis_forward = self.tilt * moving
+        spread = self.spread[list(SIDES).index(side)] * seated
+        none = np.zeros_like(t)
+        return LegAngles(
+            np.column_stack((thigh + pelvis_forward, -spread, 0.3 * spread)),
+            np.column_stack((thigh + shank_forward, none, np.radians(5.0) * seated)),
+            np.column_stack((shank_forward, none, none)),
+        )
+
+    def trunk(self, t: np.ndarray) -> TrunkAngles:
+        forward = self.lean * self._moving(t) + np.radians(3.0) * self._seated(t)
+        none = np.zeros_like(t)
+        turn = np.radians(4.0) * self._moving(t)
+        return TrunkAngles(
+            np.column_stack((none, forward, turn)),
+            np.column_stack((none, self.tilt * self._moving(t), none)),
+            np.column_stack((none, 0.4 * forward, 2.0 * turn)),
+        )
+
+    def arm(self, _side: str, t: np.ndarray) -> np.ndarray:
+        reach, rest = np.radians((30.0, 20.0)), np.radians((15.0, 75.0))
+        return self._moving(t)[:, None] * reach + self._seated(t)[:, None] * rest
+
+
+ACTIVITIES: dict[str, type[Activity]] = {"walk": Walk, "sit": Sit}
+
+
+def simulate_activity(
+    activity: str,
+    *,
+    seed: Count,
+    rate_hz: Positive = 100.0,
+    noise: ImuNoise = MTI_3,
+    imperfections: Imperfections = IDEAL_PRESET,
+    seconds: Positive = 40.0,
+    lengths: Mapping[str, float] | None = None,
+) -> Simulation:
+    """Simulate an activity of the whole body with known truth: a sensor on each of 15 segments.
+
+    0 to 5 s static in the N-pose, `seconds` of the activity, 2 s static.
+
+    Parameters
+    ----------
+    activity : one of `ACTIVITIES`
+    imperfections : as in `simulate`, but of the body's only soft tissue
+    lengths : of the body [m]; those not named, or None: a person of 1.75 m
+    seed, rate_hz, noise : as in `simulate`
+
+    Raises
+    ------
+    BadOption, BadModel
+        No such activity; too short for it; a length that the body does not have.
+    """
+    check_arguments(simulate_activity, locals())
+    if activity not in ACTIVITIES:
+        raise BadOption(f"activity {activity!r} is not known; {one_of(ACTIVITIES, activity)}")
+    rngs = spawn_streams(seed)
+    motion = ACTIVITIES[activity](load_model(WHOLE_BODY, lengths), rngs["motion"], seconds)
+    return measure_motion(motion, rngs, rate_hz, noise, imperfections)
+
+
+def _place_sensors(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """Place each sensor in L [m]: the upper body's, and those of head, hands, pelvis and legs."""
+    places = place_sensors(lengths) | {"pelvis": np.array((-0.1, 0.0, 0.02)), "head": np.array((-0.1, 0.0, 0.15))}
+    for side, y in SIDES.items():
+        places[f"{side}_hand"] = np.array((0.0, 0.02 * y, -lengths[f"{side}_hand"]))
+        places[f"{side}_thigh"] = np.array((0.0, 0.07 * y, -0.7 * lengths[f"{side}_thigh"]))
+        places[f"{side}_shank"] = np.array((0.06, 0.0, -0.36 * lengths[f"{side}_shank"]))
+        places[f"{side}_foot"] = np.array((0.4 * lengths[f"{side}_foot"], 0.0, 0.0))
+    return places
