@@ -291,7 +291,7 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
     diagnostics += diagnose_distances(problem)
     diagnostics += diagnose_ambiguity(solution.alternatives, layout)
     diagnostics += diagnose_mounts([name for name in problem.filtered.R_VS if name not in subject.mounts], problem)
-    diagnostics += diagnose_closures(recording.time[samples], contact, observations)
+    diagnostics += diagnose_closures(recording.time[samples], contact, observations, problem.model)
     return Calibration(
         subject=replace(subject, note=f"{protocol.title}; scale {scale}"),
         prior=prior,
@@ -314,7 +314,7 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
         quat_WL=problem.orient_segments(subject.mounts, samples),
         protocol=protocol.name,
         closure=next((closure.kind for closure in protocol.closures), ""),
-        measured_example=protocol.measured_example,
+        measured_example=problem.measured_example,
         measured_lengths=compare_measured(fit, layout, measured),
         scale_lengths=tuple(scale_lengths),
         model=problem.model,

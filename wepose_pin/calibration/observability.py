@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..diagnostics import INFO, WARNING, Diagnostic
+from ..model import BodyModel
 from ..recording import format_span
 from .conditions import Loop, find_segments
 from .least_squares import Observations
@@ -41,7 +42,7 @@ def diagnose_lengths(
         return [Diagnostic("lengths-not-observed", INFO, facts=names)]
     diagnostics = []
     if free_scale_std is not None:
-        facts = names | {"measured": protocol.measured_example}
+        facts = names | {"measured": problem.measured_example}
         diagnostics.append(Diagnostic("scale-from-prior", INFO, value=free_scale_std, facts=facts))
     table, names_of_lengths = problem.model.table, list(problem.model.lengths)
     chain = problem.lengths_in_closures
@@ -61,7 +62,7 @@ def diagnose_lengths(
     limit = max(LOOSE_SCALE * before, LEAST_LOOSE_SCALE)
     if free_scale_std is None and scale_std > limit:
         diagnostics.append(
-            Diagnostic("scale-uncertain", WARNING, "", scale_std, limit, {"measured": protocol.measured_example})
+            Diagnostic("scale-uncertain", WARNING, "", scale_std, limit, {"measured": problem.measured_example})
         )
     # Closures show proportions: those must be known better than from the prior and the measured lengths.
     first = [name for name in of_limbs if _is_first(problem, name)]
@@ -104,13 +105,15 @@ def diagnose_mounts(segments: Sequence[str], problem: CalibrationProblem) -> lis
     return diagnostics
 
 
-def diagnose_closures(time: np.ndarray, contact: np.ndarray, observations: Observations) -> list[Diagnostic]:
+def diagnose_closures(
+    time: np.ndarray, contact: np.ndarray, observations: Observations, model: BodyModel
+) -> list[Diagnostic]:
     """The share and the intervals in which each closure was open."""
-    diagnostics = []
+    diagnostics, variant = [], "mechanism" if model.table.is_mechanism else ""
     for closure, span in observations.spans():
         apart = contact[span] < MIN_CONTACT
         if isinstance(closure, Loop) and apart.any():
-            facts = {"intervals": format_longest(find_intervals(time[span], apart)), "variant": closure.kind}
+            facts = {"intervals": format_longest(find_intervals(time[span], apart)), "variant": variant or closure.kind}
             share = float(apart.mean())
             diagnostics.append(Diagnostic("closure-open", INFO, closure.closure.phase, share, MOST_OPEN, facts))
     return diagnostics

@@ -137,7 +137,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         quat_WL=quat_WL,
         protocol=protocol.name,
         closure="coincide",
-        measured_example=protocol.measured_example,
+        measured_example=problem.measured_example,
         measured_lengths={  # beside the prior alone: the gap is least without any length
             name: MeasuredLength(metres, prior.lengths[name], prior.std(name), std)
             for name, (metres, std) in problem.measured.items()

@@ -76,6 +76,15 @@ class CalibrationProblem:
         """The lengths in some closure."""
         return find_measured_lengths(self.protocol, self.model)
 
+    @property
+    def measured_example(self) -> str:
+        """The length that fixes the scale best, as ``name=metres``: the protocol's, else the longest in a closure."""
+        names = self.lengths_in_closures
+        if self.protocol.measured_example or not names:
+            return self.protocol.measured_example
+        longest = max(names, key=lambda name: self.model.lengths[name])
+        return f"{longest}={self.model.lengths[longest]:.3f}"
+
     @cached_property
     def sensors(self) -> tuple[str, ...]:
         """The segments with sensors that some condition uses, in the order of the table."""

@@ -234,7 +234,7 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
             continue
         if other in groups and std(groups[other]) == std(group) and table.side(sensor) == "right":
             continue
-        facts: dict[str, float | str] = {"variant": closure}
+        facts: dict[str, float | str] = {"variant": calibration.variant}
         uncertain = Diagnostic("length-uncertain", INFO, " + ".join(group), std(group), facts=facts)
         spine, first = table.segments[sensor].spine, _starts_limb(calibration, sensor)
         causes = (
@@ -266,7 +266,7 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
             INFO,
             segment,
             subject.std(f"mounts.{segment}.z"),
-            facts={"variant": closure or "poses"},
+            facts={"variant": calibration.variant or "poses"},
         )
         checks.append(_check(uncertain, limits, cause))
     prior = calibration.prior
@@ -300,7 +300,7 @@ def _find_cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...
         "lean": motion.lean,
         "twist": motion.twist.size if motion.twist else np.nan,
     }
-    facts = {"variant": calibration.closure}
+    facts = {"variant": calibration.variant}
     codes = {f"motion-{name}-small": np.deg2rad(sizes[name]) for name in causes if np.isfinite(sizes[name])}
     least = min(codes, key=lambda code: codes[code] / ENOUGH[code], default="")
     if least and codes[least] < ENOUGH[least]:
@@ -312,7 +312,7 @@ def _find_cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...
 
 def _check_residuals(calibration: Calibration) -> list[Check]:
     """Checks of residuals, and of estimates against the prior."""
-    closed, facts = np.isfinite(calibration.gap), {"variant": calibration.closure}
+    closed, facts = np.isfinite(calibration.gap), {"variant": calibration.variant}
     checks = []
     if calibration.closure:
         share = float(np.mean(calibration.contact[closed] < MIN_CONTACT))
@@ -465,7 +465,7 @@ def document(calibration: Calibration, quality: CalibrationQuality) -> dict[str,
             "condition": _number(quality.condition),
             "directions": quality.directions,
         },
-        "motion_deg": quality.motion,
+        "motion_deg": {**quality.motion._asdict(), "lean": _number(quality.motion.lean)},
         "labels": {"doubt": _number(calibration.labels.doubt), "moved": dict(calibration.labels.moved)},
     }
 

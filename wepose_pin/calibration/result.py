@@ -82,6 +82,11 @@ class Calibration:
     formulation: str = "full"
 
     @property
+    def variant(self) -> str:
+        """Which words fit: of a mechanism, of the kind of closure, or none without a closure."""
+        return "mechanism" if self.model.table.is_mechanism else self.closure
+
+    @property
     def body(self) -> BodyModel:
         """The body with the estimated lengths."""
         return self.model.with_lengths({name: self.subject.lengths[name] for name in self.model.lengths})

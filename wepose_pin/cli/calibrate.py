@@ -15,7 +15,12 @@ if TYPE_CHECKING:
 
 EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
 COLOURS = {"pass": "green", "poor": "yellow", "fail": "red"}
-GAPS = {"coincide": "Palm-to-palm gap", "distance": "Error of the distance between the palms"}
+GAPS = {
+    "coincide": "Gap between {}",
+    "distance": "Error of the distance between {}",
+    "fixed_point": "Gap from {} to its place",
+    "plane": "Height of {} off the plane",
+}
 
 
 def run(job: CalibrateJob) -> int:
@@ -27,7 +32,8 @@ def run(job: CalibrateJob) -> int:
     print_lengths(f"Lengths, by {protocol.title}", calibration.subject, outcome.prior, job.measured)
     _print_mounts(calibration)
     if protocol.closures:
-        gap = GAPS.get(calibration.closure, "Gap from palm to its point")
+        points = " and ".join(point.replace("_", " ") for point in protocol.closures[0].points)
+        gap = GAPS[calibration.closure].format(points)
         prior_mm = f"{1e3 * calibration.prior_rms_gap:.1f} mm with the lengths of the population prior"
         say(f"{gap}: {1e3 * calibration.rms_gap:.1f} mm rms, {prior_mm}")
         say(f"Effective sample size of the motion: {calibration.effective_sample_size:.0f}")

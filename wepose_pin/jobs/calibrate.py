@@ -14,6 +14,7 @@ from .fields import field_values
 
 if TYPE_CHECKING:
     from ..calibration import Calibration, CalibrationQuality, Protocol
+    from ..model import BodyModel
     from ..subject import Subject
 
 
@@ -77,18 +78,24 @@ class CalibrateJob:
     force: bool = False
 
     def check(self) -> None:
-        """Raise `WeposeError` where the protocol is none, or a length is measured that it does not know."""
+        """Raise `WeposeError` where the protocol is none."""
         from ..calibration import load_protocol
-        from ..model import load_model, load_table
 
-        lengths = load_table().lengths if self.model is None else load_model(self.model).table.lengths
-        known = (*lengths, *load_protocol(self.protocol).distances)
-        for name, metres in self.measured.items():
-            stated = f"{name}={metres:g}"
-            if name == "handle" and name not in known:
-                raise WrongOption("measured", stated, "the bar of --protocol handle, which is not given")
-            if name not in known:
-                raise WrongOption("measured", stated, f"'{name}' is not a length; {one_of(known, name)}")
+        load_protocol(self.protocol)
+
+
+def _check_measured(job: CalibrateJob, model: BodyModel) -> None:
+    """Raise `WrongOption` where a length is measured that neither the body nor the protocol has."""
+    from ..calibration import PROTOCOLS, load_protocol
+
+    known = (*model.lengths, *load_protocol(job.protocol).distances)
+    for name, metres in job.measured.items():
+        stated = f"{name}={metres:g}"
+        others = [each for each in PROTOCOLS if name in load_protocol(each).distances]
+        if name not in known and others:
+            raise WrongOption("measured", stated, f"a distance of --protocol {others[0]}, which is not given")
+        if name not in known:
+            raise WrongOption("measured", stated, f"'{name}' is not a length; {one_of(known, name)}")
 
 
 class CalibrateOutcome(NamedTuple):
@@ -117,7 +124,7 @@ def run_calibrate(
     """
     from ..calibration import assess, calibrate_lengths, load_protocol
     from ..documents import whole_folder
-    from ..model import load_model
+    from ..model.body import load_sensed_model
     from ..readers import load_session
     from ..report import write_calibration_page
     from ..subject import population_subject
@@ -130,7 +137,8 @@ def run_calibrate(
     with whole_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
         recording = load_session(job.session, gaps=job.gaps)
-        model = load_model(job.model)
+        model = load_sensed_model(job.model or recording.model or None, recording.sensors, recording.where())
+        _check_measured(job, model)
         prior = population_subject(job.stature, job.sex, model)
         progress("calibrating", 1 / 3)
         calibration = calibrate_lengths(
