@@ -94,7 +94,7 @@ def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: py
         == 0
     )
     said = capsys.readouterr().out
-    assert "Palm-to-palm gap" in said
+    assert "Gap between left palm and right palm" in said
     assert "Quality: pass" in said
     assert run("track", session, "--subject", tmp_path / "subject", "-o", tmp_path / "result") == 0
     assert "static" in capsys.readouterr().out
