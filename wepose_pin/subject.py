@@ -121,7 +121,7 @@ class Subject:
             missing = [name for name in table.lengths if name not in self.lengths]
             if missing:
                 raise BadOption(f"{where}lengths: {', '.join(missing)} of the body {table.name} is missing")
-            for name in ("mounts", "start_pose_offset", "heading_drift"):
+            for name in ("start_pose_offset", "heading_drift"):  # mounts may be of a segment's second sensor
                 check_names(f"{where}{name}", getattr(self, name), table.segments)
             check_names(f"{where}hinges", self.hinges, table.hinges)
         except BadOption as error:

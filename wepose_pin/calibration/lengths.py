@@ -44,6 +44,7 @@ from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, wi
 from .anatomy import BETTER, LabelCheck, check_labels
 from .conditions import find_hinges, find_measured_lengths, group_lengths
 from .contact import find_contact_start
+from .doubled import add_second_mounts
 from .joints import add_couplings, estimate_couplings
 from .least_squares import HINGE_STD, Gaussian, Observations, place_points, residuals
 from .observability import diagnose_closures, diagnose_distances, diagnose_lengths, diagnose_mounts
@@ -124,7 +125,9 @@ def calibrate_lengths(
         recording.phase(condition.phase)
     filtered = filter_recording(recording, method=method, sways=not table.is_mechanism)
     problem = CalibrationProblem(recording, filtered, protocol, prior, with_std, model)
-    return solve_paper_calibration(problem) if formulation == "paper" else _calibrate_checked(problem)
+    if formulation == "paper":
+        return solve_paper_calibration(problem)
+    return add_second_mounts(_calibrate_checked(problem), recording, method)
 
 
 def _check_measured(measured: Mapping[str, tuple[float, float]], protocol: Protocol, model: BodyModel) -> None:

@@ -248,7 +248,7 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
             None if spine and closure == "fixed_point" else _find_cause(calibration, motion, causes, table.side(sensor))
         )
         checks.append(_check(uncertain, LENGTH, cause))
-    for segment in (s for s in subject.mounts if f"mounts.{s}.z" in subject.order):
+    for segment in (s for s in subject.mounts if s in table.segments and f"mounts.{s}.z" in subject.order):
         reference = segment == table.reference
         causes = ("lean", "twist", "sideways") if reference else ("sideways", "elevation", "bend")
         cause = _find_cause(calibration, motion, causes, table.side(segment))
@@ -393,12 +393,13 @@ def _range(values: np.ndarray) -> Range:
 
 def _find_directions(calibration: Calibration) -> tuple[InformationDirection, ...]:
     """The information of the motion in units of the prior's: eigenvectors of one covariance in the other."""
-    names = calibration.subject.order
-    if calibration.prior_covariance.shape != calibration.subject.covariance.shape:
+    k = len(calibration.prior_covariance)  # without second sensors, whose mounts follow from the first ones
+    names = calibration.subject.order[:k]
+    if not k:
         return ()
     scale = np.sqrt(np.diag(calibration.prior_covariance))
     before = calibration.prior_covariance / np.outer(scale, scale)
-    after = calibration.subject.covariance / np.outer(scale, scale)
+    after = calibration.subject.covariance[:k, :k] / np.outer(scale, scale)
     shares, vectors = eigh(after, before)
     directions = []
     for share, vector in zip(shares, vectors.T, strict=True):

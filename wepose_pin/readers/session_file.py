@@ -61,7 +61,7 @@ def read_sensor_keys(keys: TomlTable) -> SensorKeys:
     """Read the columns by signal, the mount, and whether the orientations are the segment's own."""
     keys.allow(
         *("gyro", "accel", "orientation", "mount", "file", "time", "time_unit", "rate_hz", "offset_s"),
-        *("format", "label", "aligned"),
+        *("format", "label", "aligned", "segment"),
     )
     mount = _read_mount(keys.table("mount")) if "mount" in keys else None
     aligned = keys.flag("aligned") if "aligned" in keys else None

@@ -6,13 +6,14 @@ sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a f
 """
 
 from .intervals import Intervals, check_phases, check_time, format_span, format_time
-from .recording import CONFIGURATION, EACH_TIME, Recording, check_recording, join_recordings
+from .recording import CONFIGURATION, EACH_TIME, DoubledSensor, Recording, check_recording, join_recordings
 from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, compute_mount, find_mount_axes
 
 __all__ = [
     "AXES",
     "CONFIGURATION",
     "EACH_TIME",
+    "DoubledSensor",
     "ImuSensor",
     "Intervals",
     "OrientationSensor",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,13 @@ LONGEST_STEP = 2.5  # allowed step between two times, in steps of the rate; read
 EACH_TIME = ", a row for each time"  # part of an error's text on an array's shape
 
 
+class DoubledSensor(NamedTuple):
+    """A second sensor on a segment, and its name."""
+
+    name: str
+    sensor: Sensor
+
+
 @dataclass(frozen=True)
 class Recording:
     """Sensors on one uniform time base.
@@ -32,6 +40,7 @@ class Recording:
     ----------
     time : (n,) [s], uniform at `rate_hz` to within the clock's jitter
     sensors : segment → sensor
+    doubled : segment → its second sensor, where it has two
     phases : name → intervals [s] on `time`; `start` is the start pose, `static` sensors on a table
     remounted : the sensors were remounted after the subject's calibration, so that its mounts do not hold here
     start_is_guessed : `phases.start` was found in the motion and not stated by the user
@@ -59,6 +68,7 @@ class Recording:
     joints: Mapping[str, float] = field(default_factory=dict)
     model: str = ""
     diagnostics: tuple[Diagnostic, ...] = ()
+    doubled: Mapping[str, DoubledSensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -104,9 +114,11 @@ class Recording:
     def cut(self, span: slice) -> Recording:
         """Return the recording of a span of samples; its phases stay whole."""
         first, last, _ = span.indices(len(self))
-        sensors = {name: sensor.part(slice(first, last)) for name, sensor in self.sensors.items()}
+        span = slice(first, last)
+        sensors = {name: sensor.part(span) for name, sensor in self.sensors.items()}
+        doubled = {name: second._replace(sensor=second.sensor.part(span)) for name, second in self.doubled.items()}
         resets = tuple(tick - first for tick in self.resets if first <= tick < last)
-        return replace(self, time=self.time[first:last], sensors=sensors, resets=resets)
+        return replace(self, time=self.time[first:last], sensors=sensors, doubled=doubled, resets=resets)
 
     def chunks(self, seconds: float) -> Iterator[Recording]:
         """Iterate over consecutive chunks of so many seconds; the last one may be half a chunk longer."""
@@ -143,10 +155,14 @@ class Recording:
 def join_recordings(first: Recording, second: Recording) -> Recording:
     """Join two recordings of the same sensors in time; diagnostics are those of both, all else is the first's."""
     sensors = {name: join_sensors([sensor, second.sensors[name]]) for name, sensor in first.sensors.items()}
+    doubled = {
+        name: own._replace(sensor=join_sensors([own.sensor, second.doubled[name].sensor]))
+        for name, own in first.doubled.items()
+    }
     resets = (*first.resets, *(len(first) + tick for tick in second.resets))
     diagnostics = (*first.diagnostics, *(each for each in second.diagnostics if each not in first.diagnostics))
     time = np.concatenate([first.time, second.time])
-    return replace(first, time=time, sensors=sensors, resets=resets, diagnostics=diagnostics)
+    return replace(first, time=time, sensors=sensors, doubled=doubled, resets=resets, diagnostics=diagnostics)
 
 
 def check_recording(recording: Recording) -> Recording:
@@ -174,6 +190,10 @@ def check_recording(recording: Recording) -> Recording:
         raise BadOption(f"{where}: resets = {recording.resets}: samples from 0 to {len(time) - 1} are needed")
     for segment, sensor in recording.sensors.items():
         _check_sensor(f"{where}: sensors.{segment}", time, sensor)
+    for segment, second in recording.doubled.items():
+        if segment not in recording.sensors:
+            raise BadData(f"{where}: doubled.{segment}: the segment has no first sensor")
+        _check_sensor(f"{where}: sensors.{second.name}", time, second.sensor)
     check_phases(where, time, recording.phases)
     return recording
 

@@ -13,6 +13,7 @@ from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject
 from .causal import CausalEstimator, CausalSegmentEstimator
+from .doubled import DoubledEstimator
 from .headings import HeadingCorrector
 from .options import TrackOptions
 from .segments import Oriented, SegmentEstimator
@@ -52,7 +53,7 @@ class Tracker:
         self.options = options or TrackOptions()
         self._subject, self._model = subject, model
         self._headings, self._solved = headings, observed
-        self._estimator: SegmentEstimator | CausalEstimator | None = None  # made with the body, of the first chunk
+        self._estimator: SegmentEstimator | CausalEstimator | DoubledEstimator | None = None  # made at the first chunk
         self._body: TrackedBody | None = None
         self._kinematics: KinematicsSolver | None = None
         self._waiting: list[Oriented] = []  # until the headings are solved
@@ -82,7 +83,7 @@ class Tracker:
         """
         if self._estimator is None:
             self._body = make_body(self._subject, self._model, chunk)
-            self._estimator = _estimator(self._subject, self._body.start_frames, self.options)
+            self._estimator = _estimator(self._subject, self._body.start_frames, self.options, chunk)
         if self.options.open_loop and chunk.resets:
             chunk = replace(chunk, resets=())
         return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented)]
@@ -162,11 +163,11 @@ def _estimate(
 ) -> Iterator[tuple[Oriented, BodyModel]]:
     """Iterate over the segment orientations of all chunks, each with the body."""
     body: TrackedBody | None = None
-    estimator: SegmentEstimator | CausalEstimator | None = None
+    estimator: SegmentEstimator | CausalEstimator | DoubledEstimator | None = None
     for chunk in chunks:
         if body is None or estimator is None:
             body = make_body(subject, model, chunk)
-            estimator = _estimator(subject, body.start_frames, options)
+            estimator = _estimator(subject, body.start_frames, options, chunk)
         for oriented in estimator.push(chunk):
             yield oriented, body.model
     if body is not None and estimator is not None:
@@ -221,7 +222,11 @@ def track_chunks(
 
 
 def _estimator(
-    subject: Subject | None, start_frames: StartFrames, options: TrackOptions
-) -> SegmentEstimator | CausalEstimator:
+    subject: Subject | None, start_frames: StartFrames, options: TrackOptions, chunk: Recording
+) -> SegmentEstimator | CausalEstimator | DoubledEstimator:
     kind = CausalEstimator if options.causal else SegmentEstimator
-    return kind(subject, start_frames=start_frames, method=options.method, static_test=options.static_test)
+
+    def make(person: Subject | None) -> SegmentEstimator | CausalEstimator:
+        return kind(person, start_frames=start_frames, method=options.method, static_test=options.static_test)
+
+    return DoubledEstimator(make, subject, chunk) if chunk.doubled else make(subject)

@@ -1,0 +1,127 @@
+"""Two sensors on one segment: each is filtered and aligned by itself, and both are used.
+
+The segment's orientation lies between the two, nearer to the one with the smaller covariance. Their errors by soft
+tissue are partly alike, so that two sensors are not taken as more certain than one: the covariance is the mean of both,
+with their difference added. How far they differ is a diagnostic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..alignment import SegmentOrientations
+from ..diagnostics import INFO, WARNING, Diagnostic
+from ..recording import Recording
+from ..subject import Subject, mount_rows
+from .segments import Oriented
+
+MOST_DIFFERENCE = float(np.deg2rad(8.0))  # [rad] rms by which soft tissue lets two sensors differ; assumption
+ALIKE_STD = float(np.deg2rad(1.0))  # [rad] of a sensor whose filter states no covariance
+
+
+class Estimator(Protocol):
+    """What `SegmentEstimator` and `CausalEstimator` are."""
+
+    def push(self, chunk: Recording) -> list[Oriented]: ...
+
+    def finish(self) -> list[Oriented]: ...
+
+
+class DoubledEstimator:
+    """Orientation of each segment of a recording some of whose segments bear two sensors; used as `SegmentEstimator`.
+
+    Parameters
+    ----------
+    make : subject → the estimator of a recording with one sensor a segment
+    """
+
+    def __init__(self, make: Callable[[Subject | None], Estimator], subject: Subject | None, chunk: Recording) -> None:
+        self._names = {segment: doubled.name for segment, doubled in chunk.doubled.items()}
+        self._first, self._second = make(subject), make(_rename_mounts(subject, self._names))
+        self._squares = dict.fromkeys(self._names, 0.0)  # [rad²] sums of the differences
+        self._samples = 0
+
+    def push(self, chunk: Recording) -> list[Oriented]:
+        """Take a chunk; as `SegmentEstimator.push`."""
+        second = replace(chunk, sensors={segment: doubled.sensor for segment, doubled in chunk.doubled.items()})
+        return self._fuse(self._first.push(chunk), self._second.push(second))
+
+    def finish(self) -> list[Oriented]:
+        """What is left when the last chunk has been pushed."""
+        return self._fuse(self._first.finish(), self._second.finish())
+
+    def _fuse(self, first: list[Oriented], second: list[Oriented]) -> list[Oriented]:
+        fused = []
+        for (chunk, a), (_, b) in zip(first, second, strict=True):
+            quat_WL, covariance = dict(a.quat_WL), dict(a.covariance_W)
+            diagnostics = []
+            self._samples += len(chunk)
+            for segment, name in self._names.items():
+                quat_WL[segment], cov, angle = fuse_orientations(
+                    (a.quat_WL[segment], a.covariance_W.get(segment)), (b.quat_WL[segment], b.covariance_W.get(segment))
+                )
+                if cov is not None:
+                    covariance[segment] = cov
+                self._squares[segment] += float(np.sum(angle**2))
+                rms = float(np.sqrt(self._squares[segment] / self._samples))
+                severity = WARNING if rms > MOST_DIFFERENCE else INFO
+                facts = {"sensor": name}
+                diagnostics.append(Diagnostic("sensors-differ", severity, segment, rms, MOST_DIFFERENCE, facts))
+            both: SegmentOrientations = replace(
+                a, quat_WL=quat_WL, covariance_W=covariance, diagnostics=(*a.diagnostics, *diagnostics)
+            )
+            fused.append((chunk, both))
+        return fused
+
+
+def fuse_orientations(
+    a: tuple[np.ndarray, np.ndarray | None], b: tuple[np.ndarray, np.ndarray | None]
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """The orientation (n, 4) xyzw between two, its covariance (n, 3, 3) in W, and the angle (n,) [rad] between them.
+
+    Parameters
+    ----------
+    a, b : (n, 4) xyzw, and covariance (n, 3, 3) [rad²] in W, None where it is not known
+    """
+    (quat_a, cov_a), (quat_b, cov_b) = a, b
+    R_a = Rotation.from_quat(quat_a)
+    difference = (Rotation.from_quat(quat_b) * R_a.inv()).as_rotvec()  # in W, from a to b
+    var_a, var_b = (
+        np.full(len(quat_a), ALIKE_STD**2) if cov is None else np.trace(cov, axis1=1, axis2=2) / 3.0
+        for cov in (cov_a, cov_b)
+    )
+    share = var_a / np.maximum(var_a + var_b, 1e-12)  # of b
+    quat = (Rotation.from_rotvec(share[:, None] * difference) * R_a).as_quat()
+    covariance = None
+    if cov_a is not None and cov_b is not None:
+        w = share[:, None, None]
+        outer = np.einsum("ni,nj->nij", difference, difference)
+        covariance = (1.0 - w) * cov_a + w * cov_b + w * (1.0 - w) * outer
+    return quat, covariance, np.linalg.norm(difference, axis=1)
+
+
+def _rename_mounts(subject: Subject | None, names: Mapping[str, str]) -> Subject | None:
+    """The subject with the mounts of the second sensors, by segment."""
+    if subject is None:
+        return None
+    new = {
+        row: own
+        for segment, name in names.items()
+        for row, own in zip(mount_rows(name), mount_rows(segment), strict=True)
+    }
+    mounts = {segment: subject.mounts[name] for segment, name in names.items() if name in subject.mounts}
+    kept = [k for k, row in enumerate(subject.order) if row in subject.lengths or row in new]
+    return replace(
+        subject,
+        mounts=mounts,
+        order=tuple(new.get(subject.order[k], subject.order[k]) for k in kept),
+        covariance=subject.covariance[np.ix_(kept, kept)],
+        start_pose_offset={},
+        heading_drift={},
+        hinges={},
+    )
