@@ -245,7 +245,7 @@ def test_what_is_bridged_is_uncertain(method: str) -> None:
     assert np.mean(nees) < 6.0
 
 
-def test_it_says_which_mounts_a_calibration_finds() -> None:
+def test_it_says_which_calibration_finds_a_mount() -> None:
     """Those of segments that are between the points of some protocol's closures."""
     body = load_model()
     start = StartPose(orient_links(body, pin.neutral(body.pin)))

@@ -126,7 +126,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "unknown segment": (
         lambda f: f.say("sensors.torso", "sensors.torsoo"),
-        "sensors.torsoo is not a segment; did you mean 'torso'?",
+        "sensors.torsoo is no segment of upper_body; did you mean 'torso'?",
     ),
     "no sensors": (lambda f: setattr(f, "session", f.session.split("[sensors")[0]), "session.toml: no sensors; one"),
     "a sensor that is no table": (

@@ -141,9 +141,9 @@ def _body(path: Path) -> object:
 
 
 def _robot(path: Path) -> object:
-    from wepose_pin.model.robot import load_robot
+    from wepose_pin.model.body import load_sensed_model
 
-    return load_robot(path)
+    return load_sensed_model(path, ("upper", "tool"), "session.toml")
 
 
 def _live(path: Path) -> object:
@@ -294,7 +294,7 @@ TARGETS = (
     Target("plan", lambda: [seeds.PLAN], records.plan, TOML, "batch.plan"),
     Target("plan_table", lambda: [seeds.PLAN_TABLE], records.plan_table, LINES, "batch.plan"),
     Target("body", lambda: seeds.shipped("urdf/upper_body.urdf"), file("body.urdf", _body), XML, "model.tree"),
-    Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML, "model.robot"),
+    Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML, "model.body"),
     Target("retarget", lambda: [seeds.ARM.encode()], file("arm.urdf", _retargeted), XML, "retargeting.robot"),
     Target("srdf", lambda: [seeds.SRDF], file("arm.srdf", _srdf), XML, "retargeting.collision"),
     Target("datagram", seeds.datagrams, streams.datagram, JSON, "live.sources.packets"),

@@ -33,7 +33,9 @@ def compute_start_configuration(
     """
     poses = model.table.poses
     if start_pose != CONFIGURATION and start_pose not in poses:
-        raise BadSession(f"{where}: start_pose = '{start_pose}' is not known; {one_of((*poses, CONFIGURATION))}")
+        raise BadSession(
+            f"{where}: start_pose = '{start_pose}' is not known; {one_of((*poses, CONFIGURATION), start_pose)}"
+        )
     values = joints if start_pose == CONFIGURATION else poses[start_pose]
     by_name = {joint.name: joint for joint in model.robot.joints if joint.type not in ("fixed", "floating")}
     for name, value in values.items():

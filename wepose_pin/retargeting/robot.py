@@ -11,7 +11,6 @@ import pinocchio as pin
 from scipy.optimize import minimize
 
 from ..errors import BadModel, BadOption, native_stderr_muted, one_of
-from ..model.robot import distinguish_frames
 from .limits import JointLimit, read_joint_limits
 from .maps import AXES, ArmMap, LinkPoint, RobotMap, package_folders
 
@@ -109,7 +108,7 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
     limits = read_joint_limits(robot.urdf)
     try:
         with native_stderr_muted():  # urdfdom repeats the exception's text
-            full = distinguish_frames(pin.buildModelFromUrdf(str(robot.urdf)))
+            full = _distinguish_frames(pin.buildModelFromUrdf(str(robot.urdf)))
     except Exception as error:  # what C++ throws
         raise BadModel(f"{robot.urdf}: Pinocchio cannot build it: {_first_line(error)}") from error
     joints = [name for arm in maps.values() for name in arm.joints]
@@ -145,6 +144,15 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
         arms=(),
     )
     return replace(built, arms=tuple(_build_arm(built, side, arm) for side, arm in maps.items()))
+
+
+def _distinguish_frames(model: pin.Model) -> pin.Model:
+    """The model with other names for fixed joints that have the name of a link: Pinocchio finds frames by name."""
+    links = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.FIXED_JOINT and frame.name in links:
+            frame.name = f"{frame.name} (fixed joint)"
+    return model
 
 
 def _build_arm(robot: Robot, side: str, arm: ArmMap) -> Arm:
