@@ -85,7 +85,7 @@ def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     for about in report["lengths"].values():
         assert abs(about["estimated"] - about["true"]) < 4 * about["std"]
     for method in ("smekf", "ncf", "gdc"):
-        assert report["errors"][method]["position_from_shoulders"]["right_palm"]["mean"] < 25.0
+        assert report["errors"][method]["position_on_limb"]["right_palm"]["mean"] < 25.0
 
 
 def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -133,13 +133,14 @@ def test_a_code_or_a_fact_that_is_not_there_fails() -> None:
 
 
 def test_json_holds_data_and_text_and_comes_back() -> None:
-    diagnostic = Diagnostic("elbow-overflexed", ERROR, "left_elbow", 2.967, float("nan"))
+    facts = {"joint": "elbow", "above": "upper arm", "below": "forearm"}
+    diagnostic = Diagnostic("hinge-overflexed", ERROR, "left_elbow", 2.967, float("nan"), facts)
     content = json.loads(json.dumps(as_json(diagnostic), allow_nan=False))
     assert content["text"]["what"].startswith("The left elbow bends by up to 170°")
     assert content["limit"] is None
-    assert from_json(content) == Diagnostic("elbow-overflexed", ERROR, "left_elbow", 2.967, None)
+    assert from_json(content) == Diagnostic("hinge-overflexed", ERROR, "left_elbow", 2.967, None, facts)
     content["text"] = {"title": "another"}
-    assert from_json(content).code == "elbow-overflexed"
+    assert from_json(content).code == "hinge-overflexed"
 
 
 @pytest.mark.parametrize(

@@ -81,8 +81,8 @@ def test_a_trunk_of_another_length_is_not_seen_from_the_shoulders() -> None:
         points[:, 2] += 0.02
     errors = evaluate(off, pose())
     assert errors.position["left_palm"].mean == pytest.approx(20.0)
-    assert errors.position_from_shoulders["left_palm"].mean == pytest.approx(0.0, abs=1e-9)
-    assert "left_shoulder" not in errors.position_from_shoulders
+    assert errors.position_on_limb["left_palm"].mean == pytest.approx(0.0, abs=1e-9)
+    assert "left_shoulder" not in errors.position_on_limb
 
 
 def test_the_reference_is_brought_to_the_poses_times_on_the_rotation() -> None:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from arms import person, write_arm
+from arms import FORE, HAND, UPPER, person, write_arm
 from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 from test_causal import first
@@ -32,6 +32,7 @@ from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, RobotStatusView, T
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.state import LivePose, Status, StreamInfo
+from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.retargeting import Robot, compute_arm_targets, find_map, load_robot
 from wepose_pin.retargeting.limits import read_joint_limits
@@ -196,7 +197,8 @@ def test_the_hands_uncertainty_is_that_of_the_pose(arm: Robot) -> None:
     at = [LENGTHS.index(f"right_{name}") for name in ("upper_arm", "forearm", "hand")]
     cov[np.ix_(at, at)] = population_subject().lengths_covariance()[np.ix_(at, at)]
     segment_cov = {name: np.tile(s**2 * np.eye(3), (50, 1, 1)) for name, s in zip(pose.quat_WL, std, strict=True)}
-    true = compute_axis_std(compute_point_covariances(pose.points, pose.quat_WL, segment_cov, cov)["right_palm"])
+    body = load_model(lengths={"right_upper_arm": UPPER, "right_forearm": FORE, "right_hand": HAND})
+    true = compute_axis_std(compute_point_covariances(body, pose.quat_WL, segment_cov, cov)["right_palm"])
     seer = ArmObserver(arm, stream_info(pose).segments, stream_info(pose).points, cov)
     for k, one in enumerate(live_poses(pose)):
         seen = seer.observe(one.quat_WL, one.points, std, one.lost)

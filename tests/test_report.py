@@ -9,6 +9,7 @@ from html import unescape
 
 import numpy as np
 import pytest
+from bodies import TABLE
 from reading import captions, headings, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
@@ -214,7 +215,7 @@ WHERE: Mapping[str, tuple[int, int]] = {
 def test_tilts_are_named_by_where_the_free_end_goes(segment: str, angle: float, across: int) -> None:
     rotvec = [angle, 0.0, 0.0] if across == 1 else [0.0, angle, 0.0]
     end = Rotation.from_rotvec(rotvec).apply([0.0, 0.0, 1.0 if segment == "torso" else -1.0])
-    said = direction(segment, across, angle)
+    said = direction(TABLE, segment, across, angle)
     side = "to the left" if segment.startswith("left") else "to the right"
     said = {"outwards": side, "inwards": "to the left" if side == "to the right" else "to the right"}.get(said, said)
     axis, sign = WHERE[said]

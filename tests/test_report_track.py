@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bodies import TABLE
 from PIL import Image
 from reading import captions, headings, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
@@ -29,9 +30,9 @@ from wepose_pin.report.measures import (
     compute_heading_uncertainties,
     compute_joint_heading_stds,
     longest_run_s,
-    measure_elbow,
-    measure_hands,
+    measure_hinge,
     measure_signal,
+    measure_tips,
 )
 from wepose_pin.report.track_diagnostics import diagnose_pose
 from wepose_pin.report.words import listed, signed, whole
@@ -72,10 +73,10 @@ def with_pose(tracked: TrackedRecording, **changes: Any) -> TrackedRecording:
 
 def looked_at(pose: TrackedRecording, known: Sequence[Diagnostic] = ()) -> list[Diagnostic]:
     signals = {name: measure_signal(pose.recording, name, pose) for name in pose.recording.sensors}
-    found = {side: measure_elbow(pose.pose, side, pose.subject) for side in ("left", "right")}
-    elbows = {side: elbow for side, elbow in found.items() if elbow is not None}
-    hands = measure_hands(pose.pose, pose.recording.rate_hz)
-    return diagnose_pose(pose, Measures(signals, compute_heading_uncertainties(pose), elbows, hands), known)
+    found = {name: measure_hinge(pose.pose, TABLE, name, pose.subject) for name in TABLE.hinges}
+    hinges = {name: hinge for name, hinge in found.items() if hinge is not None}
+    tips = measure_tips(pose.pose, pose.recording.rate_hz, TABLE)
+    return diagnose_pose(pose, Measures(signals, compute_heading_uncertainties(pose), hinges, tips), known)
 
 
 def the(code: str, pose: TrackedRecording, place: str | None = None) -> Diagnostic:
@@ -274,7 +275,7 @@ def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
     assert {d.severity for d in uncertain} == {WARNING}
     assert "calibrate the person" in render(uncertain[0]).do
     assert [d.value for d in uncertain] == sorted((d.value for d in uncertain), reverse=True)  # type: ignore[type-var]
-    assert len(compute_joint_heading_stds(compute_heading_uncertainties(wide))) == 4
+    assert len(compute_joint_heading_stds(compute_heading_uncertainties(wide), wide.model)) == 4
     assert the("method-needs-static", replace(wide, options=TrackOptions("smekf"))).severity == WARNING
 
 
@@ -305,15 +306,15 @@ def with_elbow(
 def test_elbows_that_cannot_be(pose: TrackedRecording) -> None:
     n = len(pose.time)
     usual = {each.code for each in looked_at(with_elbow(pose, np.linspace(-10.0, 140.0, n)))}
-    assert not usual & {"elbow-hyperextended", "elbow-overflexed", "forearm-out-of-plane"}
-    back = the("elbow-hyperextended", with_elbow(pose, np.full(n, -30.0)))
+    assert not usual & {"hinge-hyperextended", "hinge-overflexed", "hinge-out-of-plane"}
+    back = the("hinge-hyperextended", with_elbow(pose, np.full(n, -30.0)))
     assert (back.severity, back.place, back.value) == (WARNING, "left_elbow", pytest.approx(np.deg2rad(30.0)))
-    folded = the("elbow-overflexed", with_elbow(pose, np.full(n, 170.0)))
+    folded = the("hinge-overflexed", with_elbow(pose, np.full(n, 170.0)))
     assert (folded.severity, folded.place, folded.value) == (WARNING, "left_elbow", pytest.approx(np.deg2rad(170.0)))
-    turned = the("forearm-out-of-plane", with_elbow(pose, np.full(n, 90.0), 40.0))
+    turned = the("hinge-out-of-plane", with_elbow(pose, np.full(n, 90.0), 40.0))
     assert turned.value == pytest.approx(np.deg2rad(40.0))
     assert "variant" not in turned.facts
-    drifting = the("forearm-out-of-plane", with_elbow(pose, np.full(n, 90.0), np.linspace(0.0, 60.0, n)))
+    drifting = the("hinge-out-of-plane", with_elbow(pose, np.full(n, 90.0), np.linspace(0.0, 60.0, n)))
     assert "by 15° in the first half of the recording and by 45° in the second" in render(drifting).what
 
 
@@ -329,19 +330,19 @@ def test_new_strapping(simulation: Simulation, pose: TrackedRecording) -> None:
 def test_an_elbow_in_closed_form() -> None:
     forward = np.linspace(-40.0, 150.0, 39)
     pose = Pose(np.arange(39.0), bent(forward), {})
-    elbow = measure_elbow(pose, "left")
+    elbow = measure_hinge(pose, TABLE, "left_elbow")
     assert elbow is not None
-    assert measure_elbow(pose, "right") is None
-    np.testing.assert_allclose(np.degrees(elbow.forward), forward, atol=1e-9)
+    assert measure_hinge(pose, TABLE, "right_elbow") is None
+    np.testing.assert_allclose(np.degrees(elbow.flexion), forward, atol=1e-9)
     np.testing.assert_allclose(np.degrees(elbow.bend), np.abs(forward), atol=1e-6)
     np.testing.assert_allclose(elbow.aside, 0.0, atol=1e-12)
     # The same elbow about an axis that is turned with it.
     turn = Rotation.from_euler("z", 25.0, degrees=True)
     fore = (turn * Rotation.from_quat(pose.quat_WL["left_forearm"])).as_quat()
     subject = replace(population_subject(), hinges={"left_elbow": Hinge(turn.apply([0.0, 1.0, 0.0]), 0.05)})
-    again = measure_elbow(replace(pose, quat_WL={**pose.quat_WL, "left_forearm": fore}), "left", subject)
+    again = measure_hinge(replace(pose, quat_WL={**pose.quat_WL, "left_forearm": fore}), TABLE, "left_elbow", subject)
     assert again is not None
-    np.testing.assert_allclose(np.degrees(again.forward), forward, atol=1e-9)
+    np.testing.assert_allclose(np.degrees(again.flexion), forward, atol=1e-9)
     np.testing.assert_allclose(again.aside, 0.0, atol=1e-12)
 
 
@@ -353,7 +354,7 @@ def test_the_elbows_uncertainty_against_draws() -> None:
         root = np.deg2rad(1.5) * rng.normal(size=(3, 3))
         covs = {**covs, name: (root @ root.T)[None]}
     pose = Pose(np.zeros(1), quats, {}, segment_cov=covs)
-    elbow = measure_elbow(pose, "left")
+    elbow = measure_hinge(pose, TABLE, "left_elbow")
     assert elbow is not None
     assert elbow.std is not None
     n = 20000
@@ -364,7 +365,7 @@ def test_the_elbows_uncertainty_against_draws() -> None:
         ).as_quat()
         for name in covs
     }
-    draws = measure_elbow(Pose(np.arange(float(n)), drawn, {}), "left")
+    draws = measure_hinge(Pose(np.arange(float(n)), drawn, {}), TABLE, "left_elbow")
     assert draws is not None
     assert elbow.std[0] == pytest.approx(draws.bend.std(), rel=0.03)
 
@@ -389,7 +390,7 @@ def test_hands_are_seen_from_the_torso(pose: TrackedRecording) -> None:
         {"torso": (turn * Rotation.from_quat(pose.quat_WL["torso"])).as_quat()},
         {name: turn.apply(p) + 1.0 for name, p in pose.points.items()},
     )
-    as_was, now = (measure_hands(of, pose.recording.rate_hz) for of in (pose.pose, turned))
+    as_was, now = (measure_tips(of, pose.recording.rate_hz, TABLE) for of in (pose.pose, turned))
     for name in ("left_palm", "right_palm"):
         np.testing.assert_allclose(now[name].reach, as_was[name].reach, atol=1e-9)
         assert now[name].std is None

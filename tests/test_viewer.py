@@ -7,13 +7,22 @@ import re
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.model import Visual
-from wepose_pin.report.viewer import frame_indices, view_html
+from wepose_pin.model import Visual, load_model
+from wepose_pin.report.viewer import (
+    LEFT_COLOUR,
+    OTHER_COLOUR,
+    RIGHT_COLOUR,
+    Trail,
+    choose_trail_colour,
+    frame_indices,
+    view_html,
+)
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 ORANGE, BLUE = (1.0, 0.5, 0.0, 1.0), (0.0, 0.2, 1.0, 1.0)
@@ -148,15 +157,26 @@ def test_text_from_outside_stays_text(recording):
     assert data_of(page)["phases"] == [{"name": nasty, "spans": [[time[0], time[9]]]}]
 
 
-def test_trails_keep_gaps_and_take_the_colour_of_the_arm(recording):
+def test_trails_keep_gaps_and_their_colour(recording):
     time, placements = recording
     hand = np.ones((len(time), 3))
     hand[50:60] = np.nan
-    trails = {"left_palm": hand, "right_palm": hand, "nose": hand}
-    left, right, nose = data_of(view_html(VISUALS, time, placements, trails=trails, fps=200.0))["trails"]
+    trails = {"left_palm": Trail(hand, "#ff8000"), "nose": Trail(hand, "#0033ff")}
+    left, nose = data_of(view_html(VISUALS, time, placements, trails=trails, fps=200.0))["trails"]
     np.testing.assert_array_equal(floats(left["points"], -1, 3), hand)
-    assert (left["colour"], right["colour"]) == ("#ff8000", "#0033ff")
-    assert nose["colour"] not in ("#ff8000", "#0033ff")
+    assert (left["name"], left["colour"], nose["colour"]) == ("left_palm", "#ff8000", "#0033ff")
+
+
+def test_a_trail_has_the_colour_of_its_limb():
+    model = load_model()
+    rgb = {v.link: v.rgba[:3] for v in reversed(model.visuals)}
+    for side in ("left", "right"):
+        expected = "#" + "".join(f"{round(255 * c):02x}" for c in rgb[f"{side}_forearm"])
+        assert choose_trail_colour(f"{side}_palm", model) == expected
+    grey = replace(model, table=replace(model.table, limbs=()))  # no limbs: the colours of the sides
+    assert choose_trail_colour("left_palm", grey) == LEFT_COLOUR
+    assert choose_trail_colour("right_palm", grey) == RIGHT_COLOUR
+    assert choose_trail_colour("left_palm", replace(model, table=replace(model.table, pairs={}))) == OTHER_COLOUR
 
 
 def test_equal_motions_give_equal_pages_without_the_machines_address(recording):

@@ -13,7 +13,10 @@ from .angles import euler, joint_angles
 from .arguments import check_arguments
 from .errors import BadData, BadOption
 from .kinematics import Pose
+from .model import BodyTable, load_table
 from .recording import format_span
+
+SINGULAR = 1e-12  # ratio of a covariance's least variance to its largest, below which it states no error in a direction
 
 
 class AttitudeError(NamedTuple):
@@ -66,20 +69,23 @@ class Evaluation:
 
     attitude: dict[str, AttitudeError]
     joints: dict[str, dict[str, AngleError]]  # joint → angle → its error
-    position: dict[str, PositionError]  # relative to the root of the trunk
-    position_from_shoulders: dict[str, PositionError]  # relative to the middle of the shoulders: without the trunk
+    position: dict[str, PositionError]  # relative to the root
+    position_on_limb: dict[str, PositionError]  # relative to where its limb hangs, the middle of the shoulders say
     attitude_uncertainty: dict[str, Uncertainty]  # where the pose has covariances
     position_uncertainty: dict[str, Uncertainty]
     interval: tuple[float, float]
     samples: int
 
 
-def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = None) -> Evaluation:
+def evaluate(
+    pose: Pose, truth: Pose, interval: tuple[float, float] | None = None, table: BodyTable | None = None
+) -> Evaluation:
     """Errors of `pose` against `truth`, which is brought to the pose's times (rotations on the rotation).
 
     Parameters
     ----------
     interval : from, to [s]; None for all of the time both have. Samples whose truth is missing are left out.
+    table : of the body, which says where limbs hang; None: the upper body
 
     Raises
     ------
@@ -118,8 +124,8 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
             if segment in pose.segment_cov:
                 turn = (true * estimated.inv()).as_rotvec()
                 attitude_uncertainty[segment] = uncertainty(turn, pose.segment_cov[segment][inside][known])
-    middle = _shoulders(pose), _shoulders(truth)
-    from_shoulders = {}
+    table = table or load_table()
+    on_limb = {}
     for point in [p for p in pose.points if p in truth.points]:
         finite = np.isfinite(truth.points[point]).all(axis=1)
         known = _is_near(time, truth.time[finite])
@@ -131,12 +137,14 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         position[point] = position_error(difference)
         if point in pose.point_cov:
             position_uncertainty[point] = uncertainty(difference, pose.point_cov[point][inside][known])
-        if middle[0] is not None and middle[1] is not None and "shoulder" not in point:
-            known_shoulders = np.isfinite(middle[1]).all(axis=1)
-            both = _is_near(time[known], truth.time[known_shoulders])
-            shift = middle[0][inside][known] - _interpolate(time[known], truth.time, middle[1], known_shoulders)
+        limb = table.find_limb(point)
+        middle = [_find_middle(of, limb.origin) for of in (pose, truth)] if limb is not None else [None, None]
+        if middle[0] is not None and middle[1] is not None:
+            known_middle = np.isfinite(middle[1]).all(axis=1)
+            both = _is_near(time[known], truth.time[known_middle])
+            shift = middle[0][inside][known] - _interpolate(time[known], truth.time, middle[1], known_middle)
             if both.any():
-                from_shoulders[point] = position_error((difference - shift)[both])
+                on_limb[point] = position_error((difference - shift)[both])
     if not attitude and not position:
         raise BadData(
             "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
@@ -145,7 +153,7 @@ def evaluate(pose: Pose, truth: Pose, interval: tuple[float, float] | None = Non
         attitude,
         _joint_errors(pose, inside, true_WL),
         position,
-        from_shoulders,
+        on_limb,
         attitude_uncertainty,
         position_uncertainty,
         (float(time[0]), float(time[-1])),
@@ -179,10 +187,11 @@ def _joint_errors(pose: Pose, inside: np.ndarray, true_WL: dict[str, np.ndarray]
     return errors
 
 
-def _shoulders(pose: Pose) -> np.ndarray | None:
-    """Middle of the shoulders (n, 3) [m]; None where a shoulder is not known."""
-    ends = [pose.points.get(f"{side}_shoulder") for side in ("left", "right")]
-    return None if ends[0] is None or ends[1] is None else (ends[0] + ends[1]) / 2.0
+def _find_middle(pose: Pose, points: tuple[str, ...]) -> np.ndarray | None:
+    """Middle of points (n, 3) [m]; None where one is not known."""
+    if not set(points) <= set(pose.points):
+        return None
+    return np.asarray(np.mean([pose.points[point] for point in points], axis=0))
 
 
 def _interpolate(time: np.ndarray, known: np.ndarray, points: np.ndarray, finite: np.ndarray) -> np.ndarray:
@@ -224,7 +233,8 @@ def _rms(values: np.ndarray) -> float:
 def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
     """Errors (n, 3) against their stated covariances (n, 3, 3); samples without one are left out. NaN where all are."""
     stated = np.isfinite(cov).all(axis=(1, 2))
-    stated[stated] = np.linalg.eigvalsh(cov[stated])[:, 0] > 0.0
+    eigenvalues = np.linalg.eigvalsh(cov[stated])
+    stated[stated] = eigenvalues[:, 0] > SINGULAR * eigenvalues[:, 2]
     error, cov = error[stated], cov[stated]
     if not len(error):
         return Uncertainty(np.nan, np.nan, np.nan)

@@ -12,7 +12,17 @@ axes and sequence, and carries the uncertainty; `tables` gives ranges, rates and
 """
 
 from .euler import compose
-from .joints import ISB_AXES, JOINTS, KNEE_AXES, NEAR_LOCK, SHOULDER_SEQUENCES, Angles, JointAngles, joint_angles
+from .joints import (
+    ISB_AXES,
+    JOINTS,
+    KNEE_AXES,
+    NEAR_LOCK,
+    SHOULDER_SEQUENCES,
+    Angles,
+    JointAngles,
+    group_sides,
+    joint_angles,
+)
 from .tables import RATE_WINDOW_S, JointSummary, angle_table, summary, summary_table
 
 __all__ = [
@@ -27,6 +37,7 @@ __all__ = [
     "JointSummary",
     "angle_table",
     "compose",
+    "group_sides",
     "joint_angles",
     "summary",
     "summary_table",

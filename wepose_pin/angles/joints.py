@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -138,6 +138,15 @@ class Angles:
 
     def __getitem__(self, joint: str) -> JointAngles:
         return self.joints[joint]
+
+
+def group_sides(joints: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Joint without its side → side ("left", "right", or its name where it has none) → joint."""
+    groups: dict[str, dict[str, str]] = {}
+    for joint in joints:
+        group = joint.removeprefix("left_").removeprefix("right_")
+        groups.setdefault(group, {})[joint.removesuffix(f"_{group}")] = joint
+    return groups
 
 
 def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK) -> Angles:

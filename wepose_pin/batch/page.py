@@ -18,14 +18,14 @@ MAX_DEVIATIONS = 5.0  # robust standard deviations of a value that is no outlier
 MIN_VALUES = 8  # among which there can be an outlier
 MAX_ROWS = 2000  # of a table in the page; results.parquet has all
 MAX_HISTOGRAMS = 12
-# Columns shown first; others follow in the order in which steps give them.
-_MAIN = ("gap_mm", "right_palm_arm_error_mm", "left_palm_arm_error_mm", "right_palm_error_mm", "left_palm_error_mm")
+# Columns shown first, by the ends of their names; others follow in the order in which steps give them.
+_MAIN = ("gap_mm", "_error_mm")
 _TEXT = ("item", "session", "subject", "status", "error", "message", "page", "quality")
 _COST = ("seconds", "memory_mb")
 _UNITS = {"mm": "mm", "deg": "deg", "hz": "Hz", "s": "s"}
 _LABELS = {
     "seconds": "duration of the item [s]",
-    "gap_mm": "palm-to-palm gap [mm]",
+    "gap_mm": "gap of the closed chain [mm]",
     "memory_mb": "memory of the worker [MB]",
     "effective_sample_size": "effective sample size of the calibration",
     "static_share": "static share of the time",
@@ -85,7 +85,8 @@ def _select_columns(done: pl.DataFrame) -> list[str]:
         for name in done.columns
         if name not in _TEXT and done[name].dtype.is_numeric() and done[name].drop_nulls().len()
     ]
-    first = [name for name in _MAIN if name in known]
+    ends = [next((k for k, end in enumerate(_MAIN) if name.endswith(end)), len(_MAIN)) for name in known]
+    first = [name for end, name in sorted(zip(ends, known, strict=True), key=lambda item: item[0]) if end < len(_MAIN)]
     timed = [name for name in known if name in _COST or (name.endswith("_s") and name != "duration_s")]
     return [*first, *(name for name in known if name not in (*first, *timed)), *timed]
 

@@ -111,12 +111,17 @@ class ItemSteps:
         tracked = self._tracked
         truth = self._files.truth or (tracked.recording.truth if tracked is not None else None) or self._files.session
         job = build_job(EvaluateJob, options | {"result": self._files.folder / "track", "truth": truth})
-        errors = run_evaluate(job, pose=None if tracked is None else tracked.pose)
+        errors = run_evaluate(job, tracked=tracked)
         out.mkdir()
         text = json.dumps(as_json(asdict(errors)), indent=2)
         (out / "errors.json").write_text(text + "\n", encoding="utf-8")
-        row: Row = {f"{point}_error_mm": error.mean for point, error in errors.position.items()}
-        row |= {f"{point}_arm_error_mm": error.mean for point, error in errors.position_from_shoulders.items()}
+        tips = tracked.model.table.paths if tracked is not None else ()
+        points = sorted(errors.position, key=lambda point: point not in tips)  # those first whose path is drawn
+        row: Row = {}
+        for point in points:
+            if point in errors.position_on_limb:
+                row[f"{point}_limb_error_mm"] = errors.position_on_limb[point].mean
+            row[f"{point}_error_mm"] = errors.position[point].mean
         row |= {f"{segment}_error_deg": error.total_rmse for segment, error in errors.attitude.items()}
         return row
 

@@ -24,7 +24,7 @@ GAPS = {
 
 
 def run(job: CalibrateJob) -> int:
-    """Calibrate; print lengths, mounts, the gap between the palms and the quality."""
+    """Calibrate; print lengths, mounts, the gap of the closed chain and the quality."""
     with progress_bar() as progress:
         outcome = run_calibrate(job, progress)
     calibration, quality, protocol = outcome.calibration, outcome.quality, outcome.protocol

@@ -12,6 +12,8 @@ def run(job: DemoJob) -> int:
     """Run the whole chain; print the lengths and each method's errors beside the truth."""
     with progress_bar() as progress:
         outcome = run_demo(job, progress)
+    from ..simulation import CIRCLING_POINT
+
     person = outcome.person
     print_lengths("Lengths from the joined hands", outcome.best.subject, person.prior, person.measured, person.lengths)
     print_table(
@@ -20,8 +22,8 @@ def run(job: DemoJob) -> int:
         [
             (
                 method,
-                mean_std(error.position_from_shoulders["right_palm"]),
-                mean_std(error.position["right_palm"]),
+                mean_std(error.position_on_limb[CIRCLING_POINT]),
+                mean_std(error.position[CIRCLING_POINT]),
             )
             for method, error in outcome.errors.items()
         ],

@@ -40,12 +40,12 @@ def run(job: EvaluateJob) -> int:
             ],
         )
     if errors.position:
-        shoulders = errors.position_from_shoulders
+        on_limb = errors.position_on_limb
         print_table(
             "Position error [mm], mean ± std",
-            ("point", "from the root", "from the shoulders"),
+            ("point", "from the root", "from where its limb hangs"),
             [
-                (name, mean_std(error), mean_std(shoulders[name]) if name in shoulders else "")
+                (name, mean_std(error), mean_std(on_limb[name]) if name in on_limb else "")
                 for name, error in errors.position.items()
             ],
         )

@@ -11,7 +11,7 @@ from . import Progress, no_progress
 
 if TYPE_CHECKING:
     from ..evaluation import Evaluation
-    from ..kinematics import Pose
+    from ..tracking import TrackedRecording
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,9 @@ class EvaluateJob:
 
     Prints for each segment the attitude error (roll, pitch, yaw about the axes of W), inclination, heading and total
     RMSE [deg] and the drift of the heading [deg/min]; for each joint the error of its angles [deg]; for each point the
-    position error [mm], relative to the root and to the middle of the shoulders; and whether the stated standard
-    deviations are consistent with the errors. Headings are compared as they are, without alignment. Nothing is written.
+    position error [mm], relative to the root and to where its limb hangs, as the middle of the shoulders; and whether
+    the stated standard deviations are consistent with the errors. Headings are compared as they are, without alignment.
+    Nothing is written.
 
     Parameters
     ----------
@@ -45,12 +46,14 @@ class EvaluateJob:
             raise WrongOption("interval", f"{begin:g} {end:g}", needed)
 
 
-def run_evaluate(job: EvaluateJob, progress: Progress = no_progress, pose: Pose | None = None) -> Evaluation:
+def run_evaluate(
+    job: EvaluateJob, progress: Progress = no_progress, tracked: TrackedRecording | None = None
+) -> Evaluation:
     """The errors of a result; nothing is written.
 
     Parameters
     ----------
-    pose : that of the result with its covariances, where it is at hand; None: as the folder holds it
+    tracked : the result with its covariances, where it is at hand; None: as the folder holds it
 
     Raises
     ------
@@ -65,8 +68,11 @@ def run_evaluate(job: EvaluateJob, progress: Progress = no_progress, pose: Pose 
 
     job.check()
     progress("reading", 0.0)
-    if pose is None:
-        pose, _, _ = read_result(job.result)
+    if tracked is not None:
+        pose, table = tracked.pose, tracked.model.table
+    else:
+        pose, model, _ = read_result(job.result)
+        table = model.table
     truth: Path | None = job.truth
     if job.truth.suffix == ".toml" or job.truth.is_dir():
         truth = load_session(job.truth, gaps=True).truth
@@ -74,4 +80,4 @@ def run_evaluate(job: EvaluateJob, progress: Progress = no_progress, pose: Pose 
         raise BadOption(f"{job.truth}: data.truth is missing; the session names no reference to compare with")
     reference = parse_pose_table(read_table(truth), str(truth))
     progress("comparing", 0.5)
-    return evaluate(pose, reference, job.interval)
+    return evaluate(pose, reference, job.interval, table)

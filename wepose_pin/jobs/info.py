@@ -29,6 +29,8 @@ class InfoJob:
         Write the session to session.toml beside the file.
     out : FILE
         Write the session to this file.
+    model : URDF|TOML
+        Propose the segments of this body (docs/models.md). Without it those of the upper body.
     force
         Replace an existing session.
     """
@@ -36,6 +38,7 @@ class InfoJob:
     file: Path
     write: bool = False
     out: Path | None = None
+    model: Path | None = None
     force: bool = False
 
     @property
@@ -60,13 +63,15 @@ def run_info(job: InfoJob, progress: Progress = no_progress) -> InfoOutcome:
         No such file, or of no kind that is known; a session that exists or cannot be written, or that there is none of.
     """
     from ..documents import check_file, whole_file
+    from ..model import load_model
     from ..readers.describe import describe_file
 
     progress("reading", 0.0)
+    table = load_model(job.model).table if job.model is not None else None
     if not (job.write or job.out):
-        return InfoOutcome(describe_file(job.file, job.file.absolute().parent), None)
+        return InfoOutcome(describe_file(job.file, job.file.absolute().parent, table), None)
     check_file(job.session_file, job.force)
-    description = describe_file(job.file, job.session_file.absolute().parent)
+    description = describe_file(job.file, job.session_file.absolute().parent, table)
     if description.session is None:
         raise BadOption(f"--write: there is no session to write for {description.what}")
     with whole_file(job.session_file, job.force) as partial:

@@ -123,6 +123,7 @@ def run_retarget(
             robot,
             rate_hz=job.rate_hz,
             params=params,
+            table=body.table,
             scale=job.scale,
             smoothing_hz=job.smoothing_hz,
             strict=job.strict,

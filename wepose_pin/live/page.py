@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from ..kinematics import find_known_points
 from ..model import BodyModel
-from ..report.viewer import DARK, LIGHT, backdrop, filled, scene, trail_colour, view
+from ..report.viewer import DARK, LIGHT, backdrop, choose_trail_colour, filled, scene, view
 from .addresses import LOOPBACK
 from .encoder import PoseEncoder
 from .server import Server, ServerOptions
@@ -104,7 +104,7 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str
         "scene": scene(encoder.visuals, links),
         "backdrops": {"light": backdrop(LIGHT), "dark": backdrop(DARK)},
         "view": view(encoder.visuals, links, motion, [_find_reach(model)]),
-        "trails": [{"name": hand, "colour": trail_colour(hand, encoder.visuals)} for hand in model.table.paths],
+        "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.paths],
     }
     return filled("live/templates/live.html.j2", data, title or "wepose live")
 

@@ -18,12 +18,13 @@ from .anthropometry import SEXES, LengthPrior, compute_population_lengths
 from .body import BodyModel, load_model
 from .chains import Chain
 from .reaches import LinkVector, measure_reaches
-from .table import DEFAULT_BODY, BodyTable, HingeJoint, Segment, find_table, load_table, read_table
+from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, Segment, find_table, load_table, read_table
 from .tree import AxisLimits
 from .visuals import Visual
 
 __all__ = [
     "DEFAULT_BODY",
+    "ROOT",
     "SEXES",
     "AxisLimits",
     "BodyModel",
@@ -31,6 +32,7 @@ __all__ = [
     "Chain",
     "HingeJoint",
     "LengthPrior",
+    "Limb",
     "LinkVector",
     "Segment",
     "Visual",

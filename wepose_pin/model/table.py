@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -41,6 +42,7 @@ class Segment(NamedTuple):
     spine : whether it shares its rotation with all joints between it and the root
     rigid_without_sensor : whether it follows the segment above where it has no sensor; else it is unknown then
     labels : a regular expression of words that mean it in a sensor's name
+    joint : the name of the joint to the segment above, where no point is there to name it
     soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian
     point_twist_std : [rad] by which the points above which other segments hang turn about its long axis
     """
@@ -52,6 +54,7 @@ class Segment(NamedTuple):
     spine: bool = False
     rigid_without_sensor: bool = False
     labels: str = ""
+    joint: str = ""
     soft_tissue_std: float = float(np.deg2rad(0.6))
     point_twist_std: float = 0.0
 
@@ -107,6 +110,28 @@ class HingeJoint(NamedTuple):
     common_std: float = float(np.deg2rad(5.0))
     mirror_std: float = float(np.deg2rad(20.0))
     tilt_std: float = float(np.deg2rad(5.0))
+
+
+class Limb(NamedTuple):
+    """A line of points that hangs on the body.
+
+    Parameters
+    ----------
+    points : from the one at which it hangs to its tip
+    segments : between these points, from the body on; as far as they have lengths
+    base : the segment on which it hangs; None: the root
+    origin : its first point, with the counterpart of that where there is one, left before right; distances of the tip
+        are from their middle
+    """
+
+    points: tuple[str, ...]
+    segments: tuple[str, ...]
+    base: str | None
+    origin: tuple[str, ...]
+
+    @property
+    def tip(self) -> str:
+        return self.points[-1]
 
 
 class SensorPlace(NamedTuple):
@@ -189,6 +214,51 @@ class BodyTable:
     def side(self, name: str) -> str:
         """ "left", "right", or empty where it has no counterpart."""
         return "left" if name in self.pairs else "right" if name in self._counterparts else ""
+
+    def shared_name(self, name: str) -> str:
+        """What a name has in common with that of its counterpart; the name itself where there is none."""
+        other = set((self.counterpart(name) or name).split("_"))
+        return "_".join(word for word in name.split("_") if word in other)
+
+    def joint_name(self, segment: str) -> str:
+        """The joint between a segment and the one above: the point at which the segment begins, or the segment's own
+        name for it, or the segment.
+        """
+        ends = self.ends(segment)
+        beginning = ends[0] if ends else ()
+        return self.segments[segment].joint or (beginning[0] if len(beginning) == 1 else segment)
+
+    def find_length(self, *points: str) -> str | None:
+        """The length that lies between these points, some of them maybe as their middle; None: there is none."""
+        for name, length in self.lengths.items():
+            if len(length.stretches) == 1 and {*length.stretches[0].start, *length.stretches[0].end} == set(points):
+                return name
+        return None
+
+    def find_limb(self, point: str) -> Limb | None:
+        """The limb that a point ends; None where it lies on none, or at the beginning of one.
+
+        A line between a point and its counterpart, as between the shoulders, is no limb.
+        """
+        for line in self.limbs:
+            if point in line[1:] and self.counterpart(line[0]) not in line:
+                points = line[: line.index(point) + 1]
+                break
+        else:
+            return None
+        stretches = [part for length in self.lengths.values() for part in length.stretches]
+        between = {(*part.start, *part.end): part.segment for part in stretches}
+        own = [between[ends] for ends in pairwise(points) if ends in between]
+        above = (part.segment for part in stretches if points[0] in part.start + part.end and part.segment not in own)
+        other = self.counterpart(points[0])
+        left_first = (points[0], other) if points[0] in self.pairs else (other, points[0])
+        origin = tuple(point for point in left_first if point is not None)
+        return Limb(points, tuple(dict.fromkeys(own)), next(above, None), origin)
+
+    @property
+    def drawn_limbs(self) -> dict[str, Limb]:
+        """Point whose path is drawn → its limb."""
+        return {point: limb for point in self.paths if (limb := self.find_limb(point)) is not None}
 
     def ends(self, segment: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
         """The points between which a segment's own length lies; None where it has none."""
@@ -360,7 +430,7 @@ def _read_segments(top: TomlTable, base: BodyTable) -> dict[str, Segment]:
     segments = {}
     for name, entry in _read_links(top, "segments"):
         entry.allow(
-            *("link", "up", "forward", "along", "spine", "without_sensor", "labels"),
+            *("link", "up", "forward", "along", "spine", "without_sensor", "labels", "joint"),
             *("soft_tissue_deg", "point_twist_deg"),
         )
         own = base.segments.get(name)
@@ -381,6 +451,7 @@ def _read_segments(top: TomlTable, base: BodyTable) -> dict[str, Segment]:
             re.compile(labels)
         except re.error as error:
             raise BadModel(f"{entry.at('labels')} = {labels!r} is no regular expression: {error}") from None
+        joint = entry.text("joint", segment.joint or None) or ""
         soft, twist = (
             _read_angle(entry, key, value)
             for key, value in (
@@ -388,7 +459,7 @@ def _read_segments(top: TomlTable, base: BodyTable) -> dict[str, Segment]:
                 ("point_twist_deg", segment.point_twist_std),
             )
         )
-        segments[name] = segment._replace(labels=labels, soft_tissue_std=soft, point_twist_std=twist)
+        segments[name] = segment._replace(labels=labels, joint=joint, soft_tissue_std=soft, point_twist_std=twist)
     if base.segments and (not segments or not set(segments) & set(base.segments)):
         return {**base.segments, **segments}  # the same body with more on it
     lacking = [name for name in base.segments if name not in segments]
@@ -596,6 +667,7 @@ def format_table(table: BodyTable, urdf: str) -> str:
         lines += ["spine = true"] if segment.spine else []
         lines += ['without_sensor = "rigid"'] if segment.rigid_without_sensor else []
         lines += [f"labels = {toml_string(segment.labels)}"] if segment.labels else []
+        lines += [f"joint = {toml_string(segment.joint)}"] if segment.joint else []
         lines.append(f"soft_tissue_deg = {np.degrees(segment.soft_tissue_std):.6g}")
         lines.append(f"point_twist_deg = {np.degrees(segment.point_twist_std):.6g}")
     lines += ["", "[points]"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from ..diagnostics import ERROR, WARNING, Diagnostic
 from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
 from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
-from ..model import load_table
+from ..model import BodyTable, load_table
 from ..recording import AXES, CONFIGURATION, ImuSensor, OrientationSensor, Recording, format_span, format_time
 from ..recording.clocks import TIME_UNITS, guess_time_unit
 from ..recording.gaps import find_runs
@@ -37,8 +36,6 @@ BLOCK_S, STATIC_GYRO, STATIC_ACCEL = 0.25, np.deg2rad(3.0), 0.4
 SHORTEST_STATIC_S = 1.0
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
-# Segments with sensor mounts that `wepose calibrate` estimates.
-ARMS = frozenset(load_table().needed)
 
 
 class Description(NamedTuple):
@@ -73,8 +70,13 @@ class _Proposal:
     diagnostics: Sequence[Diagnostic] = ()
 
 
-def describe_file(path: Path, folder: Path | None = None) -> Description:
-    """Describe a file or folder; a proposed session is for `folder`, by default that of the file.
+def describe_file(path: Path, folder: Path | None = None, table: BodyTable | None = None) -> Description:
+    """Describe a file or folder.
+
+    Parameters
+    ----------
+    folder : for which a session is proposed; None: that of the file
+    table : of the body that wears the sensors; None: the upper body
 
     Raises
     ------
@@ -95,20 +97,21 @@ def describe_file(path: Path, folder: Path | None = None) -> Description:
         path = named
     if path.suffix.lower() == ".toml":
         return _describe_toml(path)
-    folder = folder or path.absolute().parent
+    folder, table = folder or path.absolute().parent, table or load_table()
     format = detect_format(path)
     if format:
-        return _propose_session(path, folder, _propose_from_device(path, folder, format))
+        return _propose_session(path, folder, _propose_from_device(path, folder, format, table), table)
     if is_array_file(path):
         arrays = ArrayFile(path)
-        return _propose_session(
-            path, folder, _propose_from_names(path, folder, guess_arrays(arrays.shapes), list(arrays.shapes), arrays)
-        )
+        guess = guess_arrays(arrays.shapes, table)
+        proposal = _propose_from_names(path, folder, guess, list(arrays.shapes), arrays)
+        return _propose_session(path, folder, proposal, table)
     if path.suffix.lower() in TABLES:
         names = Rows(path).names
-        if any(re.fullmatch(r"(left|right)_(elbow|wrist|hand)_x", name) for name in names):
+        if any(f"{point}_x" in names for point in table.points):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
-        return _propose_session(path, folder, _propose_from_names(path, folder, guess_columns(names), names, None))
+        proposal = _propose_from_names(path, folder, guess_columns(names, table), names, None)
+        return _propose_session(path, folder, proposal, table)
     known = (
         ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose; a result's folder, an "
         "x-IMU3's folder"
@@ -172,7 +175,7 @@ def _describe_toml(path: Path) -> Description:
 # Data: a session is proposed ---------------------------------------------------------------------------------------
 
 
-def _propose_session(path: Path, folder: Path, proposal: _Proposal) -> Description:
+def _propose_session(path: Path, folder: Path, proposal: _Proposal, table: BodyTable) -> Description:
     """Describe data and propose a session; the description has what this session reads."""
     what, diagnostics = f"{path}: {proposal.title}", tuple(proposal.diagnostics)
     if not proposal.tables:
@@ -198,26 +201,26 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal) -> Descripti
             fitting = f"{error.key} = {toml_string(error.unit)}"
             head = [fitting if line.startswith(error.key) else line for line in head]
     if recording is None:
-        text = _session_text(path, head, phases, proposal.tables, {})
+        text = _session_text(path, head, phases, proposal.tables, {}, table)
         return Description(what, tuple(proposal.facts), (), text, "mend what cannot be read", diagnostics)
     static = find_static_intervals(recording)
     comments = {segment: _mount_comment(recording, segment, static) for segment in proposal.tables}
-    text = _session_text(path, head, phases or _start_lines(static), proposal.tables, comments)
+    text = _session_text(path, head, phases or _start_lines(static), proposal.tables, comments, table)
     facts, rows = (*proposal.facts, *_facts(recording)), _rows(recording, proposal.labels)
     # A sensor on an unknown segment has its name in the file.
     read = (replace(each, place=each.place.removeprefix("?")) for each in recording.diagnostics)
-    return Description(what, facts, rows, text, _advise(recording), (*diagnostics, *read))
+    return Description(what, facts, rows, text, _advise(recording, table), (*diagnostics, *read))
 
 
-def _advise(recording: Recording) -> str:
+def _advise(recording: Recording, table: BodyTable) -> str:
     """Advise on the use of a session with these sensors, once its lines marked CHECK are right."""
-    worn = {segment: sensor for segment, sensor in recording.sensors.items() if segment in load_table().segments}
+    worn = {segment: sensor for segment, sensor in recording.sensors.items() if segment in table.segments}
     if not worn:
         return "name the segment of each sensor in place of SEGMENT"
     without = [segment for segment, sensor in worn.items() if not sensor.aligned and sensor.stated_quat_LS is None]
     if not without:
         return "wepose track SESSION -o result"
-    if set(worn) >= ARMS and set(without) <= ARMS:
+    if set(worn) >= set(table.needed) >= set(without):
         return (
             "name the seconds of clasp and wepose calibrate SESSION -o subject finds the mounts; or state them and "
             "wepose track SESSION -o result"
@@ -238,6 +241,7 @@ def _session_text(
     phases: list[str],
     tables: Mapping[str, list[str]],
     comments: Mapping[str, list[str]],
+    body: BodyTable,
 ) -> str:
     lines = [
         f"name = {toml_string(path.stem)}",
@@ -249,21 +253,28 @@ def _session_text(
         "[phases]   # seconds",
     ]
     lines += phases
-    if set(tables) >= ARMS or not any(name in load_table().segments for name in tables):
+    lacking = [segment for segment in body.needed if segment not in tables]
+    known = any(name in body.segments for name in tables)
+    if (not lacking or not known) and body.paths and all(body.counterpart(tip) in body.paths for tip in body.paths):
+        tips = " and ".join(dict.fromkeys(f"{body.shared_name(tip).replace('_', ' ')}s" for tip in body.paths))
         lines.append(
-            "# clasp = [[10.0, 70.0]]   # for wepose calibrate: the seconds in which the palms are held together"
+            f"# clasp = [[10.0, 70.0]]   # for wepose calibrate: the seconds in which the {tips} are held together"
         )
-    segments = list(load_table().segments)
+    if lacking and known:
+        lines += ["", f"# without a sensor here, and not known without one: {', '.join(lacking)}"]
+    segments = list(body.segments)
     for segment in sorted(tables, key=lambda name: segments.index(name) if name in segments else len(segments)):
         commented = segment not in segments
-        table = [f"[sensors.{'SEGMENT' if commented else segment}]", *tables[segment], *comments.get(segment, [])]
+        place = body.sensors[segment].place if segment in body.sensors else ""
+        title = f"[sensors.{'SEGMENT' if commented else segment}]{f'   # usually {place}' if place else ''}"
+        table = [title, *tables[segment], *comments.get(segment, [])]
         lines += ["", *(f"# {line}" if commented else line for line in table)]
     return "\n".join(lines) + "\n"
 
 
-def _propose_from_device(path: Path, folder: Path, format: str) -> _Proposal:
+def _propose_from_device(path: Path, folder: Path, format: str, table: BodyTable) -> _Proposal:
     """Propose a session for a file of a known format, with the files beside it where each sensor has one."""
-    device, rate = _read(path, format)
+    device, rate = _read(path, format, table)
     title = (
         f"{TITLES[format]}, {'gyroscope and accelerometer' if device.kind == 'raw' else 'orientations, no raw data'}"
     )
@@ -284,7 +295,7 @@ def _propose_from_device(path: Path, folder: Path, format: str) -> _Proposal:
     rates: list[list[str]] = []
     for file in _siblings(path, format):
         try:
-            its, its_rate = (device, rate) if file == path else _read(file, format)
+            its, its_rate = (device, rate) if file == path else _read(file, format, table)
         except WeposeError as error:
             diagnostics.append(Diagnostic("device-file-left-out", WARNING, file.name, facts={"reason": str(error)}))
             continue
@@ -349,12 +360,24 @@ def _siblings(path: Path, format: str) -> list[Path]:
     return found[:MOST_SIBLINGS] if path in found[:MOST_SIBLINGS] else [path]
 
 
-def _read(path: Path, format: str) -> tuple[Device, list[str]]:
+def _read(path: Path, format: str, table: BodyTable) -> tuple[Device, list[str]]:
     """Read a device's file; with the line that states a rate, where the file has none."""
     try:
-        return read_device(path, format), []
+        device, rate = read_device(path, format), list[str]()
     except MissingRate:
-        return read_device(path, format, None, 100.0), [f"rate_hz = 100.0{CHECK}the file does not say its rate"]
+        device = read_device(path, format, None, 100.0)
+        rate = [f"rate_hz = 100.0{CHECK}the file does not say its rate"]
+    return replace(device, labels=_find_segments(device.labels, path, table)), rate
+
+
+def _find_segments(labels: Mapping[str, str | None], path: Path, table: BodyTable) -> dict[str, str | None]:
+    """Find the segment of each label: what the reader says, where the body has it, else by the body's own labels."""
+    names = (path.stem,) if len(labels) == 1 else ()
+    guesses = {
+        label: next((own for text in (label, *names) if (own := table.guess_segment(text)) is not None), None)
+        for label in labels
+    }
+    return {label: segment if segment in table.segments else guesses[label] for label, segment in labels.items()}
 
 
 def _propose_from_names(

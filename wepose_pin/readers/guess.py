@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from ..model import load_table
+from ..model import BodyTable, load_table
 
 AXIS = re.compile(r"(?P<stem>.*?)[ _.\-\[(]*(?P<axis>[xyzw0-3])[\])]?\s*(?P<unit>[\[(].*[\])])?", re.IGNORECASE)
 # Signals in the order of the search; (?![a-z]) for names such as gx, ax.
@@ -38,8 +38,11 @@ class Guess(NamedTuple):
     g: bool  # a name has g
 
 
-def guess_columns(names: Iterable[str]) -> Guess:
-    """Guess signals from groups of three or four columns that differ only in the axis."""
+def guess_columns(names: Iterable[str], table: BodyTable | None = None) -> Guess:
+    """Guess signals from groups of three or four columns that differ only in the axis.
+
+    `table` : of the body whose segments carry the sensors; None: the upper body
+    """
     names = list(names)
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for name in names:
@@ -55,17 +58,19 @@ def guess_columns(names: Iterable[str]) -> Guess:
         elif not set(order) <= set(axes) and set("012") <= set(axes) and signal != "orientation":
             order = "012"
         if set(order) <= set(axes):
-            by_sensor.setdefault(_find_owner(stem), {}).setdefault(signal, [axes[axis] for axis in order])
+            by_sensor.setdefault(_find_owner(stem, table or load_table()), {}).setdefault(
+                signal, [axes[axis] for axis in order]
+            )
     return _make_guess(names, by_sensor)
 
 
-def guess_arrays(shapes: Mapping[str, tuple[int, ...]]) -> Guess:
-    """Guess signals from the paths of arrays (n, 3) and (n, 4)."""
+def guess_arrays(shapes: Mapping[str, tuple[int, ...]], table: BodyTable | None = None) -> Guess:
+    """Guess signals from the paths of arrays (n, 3) and (n, 4); `table` as for `guess_columns`."""
     by_sensor: dict[str, dict[str, list[str]]] = {}
     for path, shape in shapes.items():
         signal = guess_signal(path)
         if signal and len(shape) == 2 and len(ORDER[signal]) in shape:
-            by_sensor.setdefault(_find_owner(path), {}).setdefault(signal, [path])
+            by_sensor.setdefault(_find_owner(path, table or load_table()), {}).setdefault(signal, [path])
     times = {
         path.rpartition("/")[2]: path for path, shape in shapes.items() if max(shape, default=0) == _compute_size(shape)
     }
@@ -99,9 +104,9 @@ def _compute_size(shape: tuple[int, ...]) -> int:
     return size
 
 
-def _find_owner(stem: str) -> str:
+def _find_owner(stem: str, table: BodyTable) -> str:
     """Return the segment, or the name without its signal, which one sensor's signals have in common."""
-    segment = load_table().guess_segment(stem)
+    segment = table.guess_segment(stem)
     if segment:
         return segment
     text = stem.lower()

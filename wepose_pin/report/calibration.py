@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..alignment import START_POSE_STD
 from ..calibration import Calibration, CalibrationQuality
-from ..calibration.conditions import find_measured_lengths
+from ..calibration.conditions import find_measured_lengths, group_lengths
 from ..calibration.observability import find_intervals
 from ..calibration.priors import DRIFT_STD
 from ..calibration.protocols import Protocol, load_protocol
@@ -21,30 +22,30 @@ from ..diagnostics import WARNING, Diagnostic, lines, quantity
 from ..errors import WeposeError, reason
 from ..filters import BEST
 from ..kinematics import Pose
+from ..model import ROOT, BodyTable
 from ..recording import Recording, compute_mount, find_mount_axes
 from ..subject import Subject, mount_rows
 from ..tracking import TrackedRecording, track
 from .calibration_figures import (
-    Hands,
     Length,
+    Places,
     Sensor,
     direction,
     draw_gap,
-    draw_hands,
     draw_lengths,
+    draw_places,
     draw_posture,
     draw_sensors,
     smoothed,
 )
 from .page import Page, PageWriter, Table
 from .viewer import pose_html
-from .words import capital, degrees, intervals, plain, plus_minus, signed, versions
+from .words import capital, degrees, intervals, listed, plain, plural, plus_minus, signed, versions
 
 TEMPLATE = "report/templates/calibration.html.j2"
-SIDES, PARTS = ("left", "right"), ("upper_arm", "forearm", "hand")
 FRAMES_A_SECOND = 20.0  # of the 3D view
 UNOBSERVED = 0.97  # of the start pose's standard deviation, above which the motion showed nothing
-# Zones of the joined hands, seen from the middle of the shoulders [m], and of their distance over the arm's length.
+# Zones of the joined hands, seen from the middle of the shoulders [m], and of their distance over the limb's length.
 LOW, ASIDE, BENT, STRETCHED = -0.25, 0.10, 0.60, 0.80
 
 
@@ -104,12 +105,13 @@ def render_calibration_report(
     page.add("sensors", lambda: _build_sensors_section(calibration, recording), "Sensors")
     page.add("gap", lambda: _build_gap_section(calibration, contact), f"{capital(contact.gap)} over time")
     page.add(
-        "hands",
-        lambda: _build_hands_section(calibration, contact, None if tracked is None else tracked.pose),
+        "places",
+        lambda: _build_places_section(calibration, contact, None if tracked is None else tracked.pose),
         "Where the motion was informative",
     )
     page.add("posture", lambda: _build_posture_section(calibration), "The start pose")
-    page.add("elbows", lambda: _build_elbows_section(calibration), "The elbows as hinges")
+    joints = dict.fromkeys(plural(plain(calibration.model.table.shared_name(name))) for name in calibration.hinge_axes)
+    page.add("hinges", lambda: _build_hinges_section(calibration), f"The {listed([*joints])} as hinges")
     page.add("view", lambda: _build_view_section(calibration, recording, tracked), "The motion in 3D")
     page.add("checks", lambda: _build_checks_section(quality, contact), "Behind the quality")
     page.add("run", lambda: _build_run_section(calibration, recording, contact, method), "What was run")
@@ -120,21 +122,30 @@ class _Contact(NamedTuple):
     """The words for a protocol's closure."""
 
     protocol: str
-    hands: tuple[str, ...]
+    points: tuple[str, ...]
     noun: str
     gap: str
     chain: tuple[str, ...]  # lengths in it
 
 
 def _describe_contact(protocol: Protocol, calibration: Calibration) -> _Contact:
-    chain = find_measured_lengths(protocol, calibration.model)
-    hands = tuple(dict.fromkeys(p for c in protocol.closures for p in c.points if p.endswith("_palm")))
-    if len(hands) < 2:
-        noun = f"the {plain(hands[0])}" if hands else "the hands"
-        return _Contact(protocol.name, hands, noun, "palm to its point", chain)
-    bar = any(c.kind == "distance" for c in protocol.closures)
-    noun, gap = ("the hands on the handle", "palms against the handle") if bar else ("the joined hands", "palm to palm")
-    return _Contact(protocol.name, hands, noun, gap, chain)
+    chain, table = find_measured_lengths(protocol, calibration.model), calibration.model.table
+    points = tuple(dict.fromkeys(point for closure in protocol.closures for point in closure.points))
+    if not points:
+        return _Contact(protocol.name, (), "the limbs", "gap", chain)
+    closure, limbs = protocol.closures[0], table.drawn_limbs
+    ends = (limbs[point].segments[-1] if point in limbs and limbs[point].segments else point for point in points)
+    nouns = listed([plural(name) for name in dict.fromkeys(plain(table.shared_name(end)) for end in ends)])
+    each = [plain(table.shared_name(point)) for point in points]
+    several = listed([plural(name) for name in dict.fromkeys(each)])
+    if len(points) < 2:
+        return _Contact(protocol.name, points, f"the {plain(points[0])}", f"{each[0]} to its point", chain)
+    noun, gap = {
+        "coincide": (f"the joined {nouns}", " to ".join(each)),
+        "distance": (f"the {nouns} on the {closure.distance}", f"{several} against the {closure.distance}"),
+        "plane": (f"the {nouns}", f"{several} against the plane"),
+    }.get(closure.kind, (f"the {nouns}", f"{several} to their points"))
+    return _Contact(protocol.name, points, noun, gap, chain)
 
 
 # The sections: the values that the macros of the template take --------------------------------------------------------
@@ -170,13 +181,13 @@ def _build_summary_section(calibration: Calibration, contact: _Contact) -> dict[
 
 def _build_lengths_section(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
     subject, prior = calibration.subject, calibration.prior
-    rows, lines = [], []
-    for parts in _ROWS:
+    rows, lines, table = [], [], calibration.model.table
+    for parts in _list_lengths(table):
         weights = np.ones(len(parts))
         value, before = (sum(person.lengths.get(part, np.nan) for part in parts) for person in (subject, prior))
         std, before_std = (_std(person, parts, weights) for person in (subject, prior))
         measured = calibration.measured.get(parts[0], np.nan) if len(parts) == 1 else np.nan
-        label = _label(parts)
+        label = " + ".join(plain(table.shared_name(part) if k else part) for k, part in enumerate(parts))
         rows.append(Length(label, value, std, before, before_std, measured))
         learned = calibration.information_shares.get(" + ".join(parts))
         lines.append(
@@ -190,7 +201,11 @@ def _build_lengths_section(calibration: Calibration, contact: _Contact) -> dict[
         )
     header = ["length", "estimated", "population prior", "measured", "learned from the motion"]
     return {
-        "hands": any(f"{side}_hand" in contact.chain for side in SIDES),
+        "rigid": [
+            [plain(table.shared_name(part)) for part in reversed(parts)]
+            for parts in _list_lengths(table)
+            if len(parts) > 1 and set(parts) <= set(contact.chain) and table.side(parts[0]) != "right"
+        ],
         "outside": [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.measured],
         "learned": bool(calibration.information_shares),
         "picture": draw_lengths(rows),
@@ -254,7 +269,7 @@ def _build_gap_section(calibration: Calibration, contact: _Contact) -> dict[str,
     }
 
 
-def _build_hands_section(calibration: Calibration, contact: _Contact, pose: Pose | None) -> dict[str, Any] | None:
+def _build_places_section(calibration: Calibration, contact: _Contact, pose: Pose | None) -> dict[str, Any] | None:
     """Where the motion was informative."""
     if pose is None:
         return None
@@ -262,33 +277,41 @@ def _build_hands_section(calibration: Calibration, contact: _Contact, pose: Pose
         calibration.information_shares[name] for names in _group_shares(calibration, contact).values() for name in names
     ]
     order = _closure_order(calibration)
-    shoulders = [name.replace("palm", "shoulder") for name in contact.hands]
-    if not (shares and len(order) and contact.hands) or not {*contact.hands, *shoulders} <= set(pose.points):
+    table, lengths = calibration.model.table, calibration.subject.lengths
+    limbs = [limb for point in contact.points if (limb := table.find_limb(point)) is not None]
+    starts = [limb.points[0] for limb in limbs]
+    if not (shares and len(order) and limbs) or not {*contact.points, *starts} <= set(pose.points):
         return None
-    if "torso" not in pose.quat_WL:
+    base = limbs[0].base or ""
+    if len(limbs) < len(contact.points) or base not in pose.quat_WL or {limb.base or "" for limb in limbs} != {base}:
         return None
-    lengths = calibration.subject.lengths
     at = np.clip(np.searchsorted(pose.time, calibration.time[order] - 1e-6), 0, len(pose.time) - 1)
-    reach = np.mean([pose.points[name][at] for name in contact.hands], axis=0)
-    reach = reach - np.mean([pose.points[name][at] for name in shoulders], axis=0)
-    reach = Rotation.from_quat(pose.quat_WL["torso"][at]).inv().apply(reach)
+    reach = np.mean([pose.points[name][at] for name in contact.points], axis=0)
+    reach = reach - np.mean([pose.points[name][at] for name in starts], axis=0)
+    reach = Rotation.from_quat(pose.quat_WL[base][at]).inv().apply(reach)
     share = np.mean(shares, axis=0)[order]
     touched = (calibration.contact[order] >= MIN_CONTACT) & np.isfinite(reach).all(axis=1)
     if not touched.any():
         return None
-    arm = np.mean([[lengths[f"{name[:-5]}_{part}"] for part in PARTS] for name in contact.hands]) * len(PARTS)
-    far = np.linalg.norm(reach, axis=1) / arm
-    sides = [0.5 if name.startswith("left") else -0.5 for name in contact.hands]
-    reach = reach + [0.0, lengths["shoulder_width"] * float(np.mean(sides)), 0.0]
-    hands = Hands(reach, 100 * share, touched, lengths["shoulder_width"], lengths["trunk"])
+    parts = [[table.find_length(*ends) for ends in pairwise(limb.points)] for limb in limbs]
+    straight = float(np.mean([sum(lengths[name] for name in names if name is not None) for names in parts]))
+    far = np.linalg.norm(reach, axis=1) / straight
+    width, trunk = (
+        lengths.get(table.find_length(*points) or "") for points in (limbs[0].origin, (ROOT, *limbs[0].origin))
+    )
+    sides = [{"left": 0.5, "right": -0.5}.get(table.side(name), 0.0) for name in contact.points]
+    reach = reach + [0.0, (width or 0.0) * float(np.mean(sides)), 0.0]
+    origin = plain(table.shared_name(starts[0]))
+    origins = plural(origin) if len(limbs[0].origin) > 1 else origin
+    places = Places(reach, 100 * share, touched, width, trunk, origins, plain(base))
     zones = {
-        "above the shoulders": reach[:, 2] > 0.0,
-        f"from the shoulders to {-100 * LOW:.0f} cm below": (reach[:, 2] <= 0.0) & (reach[:, 2] > LOW),
+        f"above the {origins}": reach[:, 2] > 0.0,
+        f"from the {origins} to {-100 * LOW:.0f} cm below": (reach[:, 2] <= 0.0) & (reach[:, 2] > LOW),
         "lower": reach[:, 2] <= LOW,
         f"to the left by over {100 * ASIDE:.0f} cm": reach[:, 1] > ASIDE,
-        "in front of the chest": np.abs(reach[:, 1]) <= ASIDE,
+        f"in front of the {plain(base)}": np.abs(reach[:, 1]) <= ASIDE,
         f"to the right by over {100 * ASIDE:.0f} cm": reach[:, 1] < -ASIDE,
-        f"near: under {100 * BENT:.0f} % of the arm's length": far < BENT,
+        f"near: under {100 * BENT:.0f} % of the limb's length": far < BENT,
         "half stretched": (far >= BENT) & (far < STRETCHED),
         f"stretched: over {100 * STRETCHED:.0f} %": far >= STRETCHED,
     }
@@ -302,16 +325,16 @@ def _build_hands_section(calibration: Calibration, contact: _Contact, pose: Pose
             rare.append(name.split(":")[0])
     low, high = np.percentile(reach[touched], [2.0, 98.0], axis=0) * 100
     near, away = np.percentile(far[touched], [2.0, 98.0]) * 100
-    both = len(shoulders) > 1
+    both = len(starts) > 1
     header = [f"{contact.noun} {'were' if both else 'was'}", "of the time", "of what was learned", "per second"]
     return {
         "noun": contact.noun,
-        "both": both,
+        "origin": origins if both else origin,
         "across": [_format_side(end[1], "right", "left") for end in (low, high)],
         "up": [_format_side(end[2], "below", "above") for end in (low, high)],
         "stretch": [near, away],
         "rare": rare if both else [],
-        "picture": draw_hands(hands, contact.noun),
+        "picture": draw_places(places, contact.noun),
         "zones": Table(header, lines),
     }
 
@@ -321,40 +344,41 @@ def _build_posture_section(calibration: Calibration) -> dict[str, Any] | None:
     tilt = {name: t for name, t in tilt.items() if np.isfinite(t).all()}
     if not tilt:
         return None
-    lines, observed = [], {}
+    lines, observed, table = [], {}, calibration.model.table
     for name, (x, y) in tilt.items():
         std = np.degrees([calibration.subject.std(row) for row in mount_rows(name)[:2]])
         observed[name] = (~(std > UNOBSERVED * np.degrees(START_POSE_STD))).tolist()
         tilts = ((1, x, std[0], observed[name][0]), (0, y, std[1], observed[name][1]))
-        lines.append([plain(name), *(_format_tilt(name, *about) for about in tilts)])
-    elbows = {}
-    for side in SIDES:
-        upper, fore = (tilt.get(f"{side}_{part}") for part in ("upper_arm", "forearm"))
-        if upper is not None and fore is not None:
-            down = [Rotation.from_rotvec([*t, 0.0]).apply([0.0, 0.0, -1.0]) for t in (upper, fore)]
-            elbows[side] = float(np.degrees(np.arccos(np.clip(down[0] @ down[1], -1.0, 1.0))))
+        lines.append([plain(name), *(_format_tilt(table, name, *about) for about in tilts)])
+    hinges = {}
+    for name, hinge in table.hinges.items():
+        if hinge.on in tilt and hinge.moves in tilt:
+            along = [
+                Rotation.from_rotvec([*tilt[segment], 0.0]).apply(table.segments[segment].along)
+                for segment in (hinge.on, hinge.moves)
+            ]
+            hinges[plain(name)] = float(np.degrees(np.arccos(np.clip(along[0] @ along[1], -1.0, 1.0))))
     return {
-        "elbows": elbows,
-        "picture": draw_posture(tilt, observed, calibration.subject.lengths),
+        "hinges": hinges,
+        "picture": None if table.is_mechanism else draw_posture(tilt, observed, calibration.body),
         "tilts": Table(["segment", "sideways", "forwards or backwards"], lines),
     }
 
 
-def _build_elbows_section(calibration: Calibration) -> dict[str, Any] | None:
-    lines = []
+def _build_hinges_section(calibration: Calibration) -> dict[str, Any] | None:
+    lines, table = [], calibration.model.table
     for joint, axis in calibration.hinge_axes.items():
-        side = joint.removesuffix("_elbow")
         x, y, z = np.asarray(axis, dtype=float)
-        if side == "right":  # seen along its outer end
+        if table.side(joint) == "right":  # seen along its outer end
             x, y, z = -x, -y, -z
         forward, up = np.degrees(np.arctan2(x, abs(y))), np.degrees(np.arctan2(z, abs(y)))
         softness = float(np.degrees(calibration.hinge_rms.get(joint, np.nan)))
         if not np.isfinite([forward, up]).all():
             continue
         ends = f"{abs(forward):.1f}° {'forwards' if forward > 0 else 'backwards'}", f"{abs(up):.1f}° "
-        lines.append([side, ends[0], ends[1] + ("up" if up > 0 else "down"), degrees(softness)])
-    header = ["elbow", "axis turned", "axis raised", "softness"]
-    return {"elbows": Table(header, lines)} if lines else None
+        lines.append([plain(joint), ends[0], ends[1] + ("up" if up > 0 else "down"), degrees(softness)])
+    header = ["joint", "axis turned", "axis raised", "softness"]
+    return {"hinges": Table(header, lines)} if lines else None
 
 
 def _build_view_section(
@@ -418,19 +442,42 @@ def _build_checks_section(quality: CalibrationQuality | None, contact: _Contact)
 
 # Words and small sums -------------------------------------------------------------------------------------------------
 
-_SIDED = [((f"{s}_upper_arm",), (f"{s}_forearm",), (f"{s}_hand",), (f"{s}_forearm", f"{s}_hand")) for s in SIDES]
-_ROWS: list[tuple[str, ...]] = [("shoulder_width",), *_SIDED[0], *_SIDED[1], ("trunk",)]
+
+def _list_lengths(table: BodyTable) -> list[tuple[str, ...]]:
+    """The lengths of the page, those from the root last, each in a tuple.
+
+    A segment that lies rigidly along the one above where it has no sensor is followed by the sum of both lengths.
+    """
+    by_root = {
+        name: any(ROOT in part.start + part.end for part in length.stretches) for name, length in table.lengths.items()
+    }
+    rows: list[tuple[str, ...]] = []
+    for name in sorted(table.lengths, key=by_root.__getitem__):
+        rows.append((name,))
+        ends = {part.segment: part for part in table.lengths[name].stretches}
+        for segment, part in ends.items():
+            above = [
+                (other, stretch.segment)
+                for other, length in table.lengths.items()
+                for stretch in length.stretches
+                if stretch.end == part.start and other != name
+            ]
+            own = table.segments[segment]
+            if own.rigid_without_sensor and len(above) == 1 and table.segments[above[0][1]].along == own.along:
+                rows.append((above[0][0], name))
+    return rows
 
 
 def _group_shares(calibration: Calibration, contact: _Contact) -> dict[str, list[str]]:
     """Label → names in `Calibration.information_shares`, of the quantities that the motion can show."""
-    learned = calibration.information_shares
-    arms = [f"{s}_upper_arm" for s in SIDES] + [f"{s}_forearm + {s}_hand" for s in SIDES]
-    groups = {
-        "lengths": [name for name in arms if name in learned and set(name.split(" + ")) <= set(contact.chain)],
+    learned, table = calibration.information_shares, calibration.model.table
+    groups = group_lengths(calibration.conditions, calibration.model.lengths)
+    limbs = [" + ".join(names) for sensor, names in groups.items() if not table.segments[sensor].spine]
+    shown = {
+        "lengths": [name for name in limbs if name in learned and set(name.split(" + ")) <= set(contact.chain)],
         "headings": [name for name in learned if name.startswith("mounts.") and name.endswith(".z")],
     }
-    return {label: names for label, names in groups.items() if names}
+    return {label: names for label, names in shown.items() if names}
 
 
 def _closure_order(calibration: Calibration) -> np.ndarray:
@@ -457,10 +504,6 @@ def _std(subject: Subject, names: Sequence[str], weights: np.ndarray) -> float:
     return float(np.sqrt(weights @ subject.lengths_covariance(names) @ weights))
 
 
-def _label(parts: Sequence[str]) -> str:
-    return plain(parts[0]) if len(parts) == 1 else f"{plain(parts[0])} + hand"
-
-
 def _minus_sign(axis: str) -> str:
     return axis.replace("-", "−")
 
@@ -485,11 +528,11 @@ def _describe_check(check: Check, contact: _Contact) -> tuple[str, str]:
     }[check.diagnostic.code]
 
 
-def _format_tilt(name: str, across: int, angle: float, std: float, observed: bool) -> str:
+def _format_tilt(table: BodyTable, name: str, across: int, angle: float, std: float, observed: bool) -> str:
     deg = float(np.degrees(angle))
     if not observed:
         return f"not seen, ± {std:.1f}° assumed"
-    return f"{plus_minus(abs(deg), std, '°')} {direction(name, across, deg)}".replace(" °", "°")
+    return f"{plus_minus(abs(deg), std, '°')} {direction(table, name, across, deg)}".replace(" °", "°")
 
 
 def _format_side(value: float, negative: str, positive: str) -> str:

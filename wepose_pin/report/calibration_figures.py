@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..kinematics import compute_pose
+from ..model import ROOT, BodyModel, BodyTable
 from .chart import Anchor, Chart, Key, Panel, Picture, category_rows
 from .track_figures import TIME, body_views
-from .words import capital, plus_minus, signed
+from .words import capital, plain, plus_minus, signed
 
 CELL = 5.0  # [cm] of the map of the hands
 SHADES = 6  # of the map of the hands: classes shade1 to shade6
 SMOOTHED_S = 2.0
+HEAD_M = 0.2  # [m] from the middle of the shoulders to the head's
 EXAGGERATED_DEG = 24.0  # the largest tilt is drawn about so large
 MOST_EXAGGERATED = 6
 
@@ -39,14 +43,16 @@ class Sensor(NamedTuple):
     drift_deg_min: float
 
 
-class Hands(NamedTuple):
-    """Places of the joined hands."""
+class Places(NamedTuple):
+    """Places of the joined hands, or of what else a closure is of."""
 
     reach: np.ndarray  # (n, 3) [m] from the middle of the shoulders, in the torso's frame
     learned: np.ndarray  # (n,) [%] share of the information
     touched: np.ndarray  # (n,) bool
-    shoulder_width: float  # [m]
-    trunk: float  # [m]
+    width: float | None  # [m] of the shoulders
+    trunk: float | None  # [m]
+    origin: str  # "shoulders"
+    base: str  # "torso"
 
 
 def draw_lengths(rows: Sequence[Length]) -> Picture:
@@ -152,81 +158,93 @@ def draw_gap(
     return Picture("gap", caption, Chart([[panel] for panel in panels], [170.0, 120.0][: len(panels)], keys))
 
 
-def draw_hands(hands: Hands, noun: str) -> Picture:
-    """Where the hands were, and how much they showed there: from the front, from the right, from above."""
-    reach = 100 * hands.reach
-    views = body_views(50 * hands.shoulder_width, 100 * hands.trunk)
-    cells = [_cells(reach[hands.touched][:, [x, y]], hands.learned[hands.touched]) for _, x, y in views]
+def draw_places(places: Places, noun: str) -> Picture:
+    """Where the points of a closure were, and how much they showed there: from the front, the right, above."""
+    reach = 100 * places.reach
+    views = body_views(places.width, places.trunk, places.origin)
+    cells = [_cells(reach[places.touched][:, [x, y]], places.learned[places.touched]) for _, x, y in views]
     most = max([1e-9, *(float(total.max()) for _, total in cells)])
     for (panel, x, y), (corners, total) in zip(views, cells, strict=True):
         shade = np.ceil(SHADES * total / most).clip(1, SHADES)
         for k in range(1, SHADES + 1):
             at = corners[shade == k]
             panel.boxes(at[:, :1] + [0.0, CELL], at[:, 1:] + [0.0, CELL], f"shade{k}")
-        panel.markers(reach[~hands.touched, x], reach[~hands.touched, y], "cross", "before crosses", size=3.0)
+        panel.markers(reach[~places.touched, x], reach[~places.touched, y], "cross", "before crosses", size=3.0)
     keys = [Key(f"to {most * k / SHADES:.2g} %", f"shade{k}", "box") for k in range(1, SHADES + 1)]
-    caption = f"Where {noun} went, seen from the torso; the darker, the more was learned in a cell of {CELL:g} cm."
-    if not hands.touched.all():
+    seen = f"Where {noun} went, seen from the {places.base}"
+    caption = f"{seen}; the darker, the more was learned in a cell of {CELL:g} cm."
+    if not places.touched.all():
         caption += " Crosses: apart."
-    return Picture("hands", caption, Chart([[panel for panel, _, _ in views]], [260.0], keys))
+    return Picture("places", caption, Chart([[panel for panel, _, _ in views]], [260.0], keys))
 
 
-def draw_posture(
-    tilt: Mapping[str, np.ndarray], observed: Mapping[str, Sequence[bool]], lengths: Mapping[str, float]
-) -> Picture:
+def draw_posture(tilt: Mapping[str, np.ndarray], observed: Mapping[str, Sequence[bool]], body: BodyModel) -> Picture:
     """The start pose from the front and from both sides, with its tilts drawn larger than they are.
 
     Parameters
     ----------
     tilt, observed : segment → (2,) [rad] about x and y; whether the motion showed anything about it
+    body : with its lengths
     """
     largest = max([1e-9, *(float(np.degrees(np.linalg.norm(t))) for t in tilt.values())])
     factor = int(np.clip(round(EXAGGERATED_DEG / largest), 1, MOST_EXAGGERATED))
-    arms = [side for side in ("left", "right") if any(name.startswith(side) for name in tilt)]
-    tilted, exact = (_stick(tilt, lengths, f) for f in (factor, 0))
-    views = [("from the front", 1, arms), *((f"from the {side}", 0, [side]) for side in arms)]
+    table = body.table
+    sides = [side for side in ("left", "right") if any(table.side(name) == side for name in tilt)]
+    tilted, exact = (_stick(tilt, body, f) for f in (factor, 0))
+    views = [("from the front", 1, sides), *((f"from the {side}", 0, [side]) for side in sides)]
+    top = float(exact.trunk[1][2]) if exact.trunk is not None else 0.0
+    lowest = min([0.0, *(end[2] for name, ends in tilted.segments.items() if name in tilt for end in ends)])
+    low = -12.0 if 100 * lowest > -12.0 else 100 * lowest - 12.0
     panels = []
-    for title, across, sides in views:
-        panel = Panel(title, x=(-48.0, 48.0), y=(-12.0, 100 * lengths["trunk"] + 36.0), equal=True, bare=True)
+    for title, across, shown in views:
+        panel = Panel(title, x=(-48.0, 48.0), y=(low, 100 * top + 36.0), equal=True, bare=True)
         panel.flip_x = title == "from the left"
-        head = tilted["head"][1]
-        panel.disc(100 * head[across], 100 * head[2], 9.5, "band")
-        panel.line(*_ends(tilted["head"], across), "band limb")
+        if tilted.head is not None:
+            head = tilted.head[1]
+            panel.disc(100 * head[across], 100 * head[2], 9.5, "band")
+            panel.line(*_ends(tilted.head, across), "band limb")
         if across == 1:
-            shoulders = [tilted["left_shoulder"][0], tilted["right_shoulder"][0]]
-            panel.line(*_ends(shoulders, across), "other limb")
-        for name in ("torso", *(f"{side}_{part}" for side in sides for part in ("upper_arm", "forearm"))):
-            if name in tilt:
+            for line in tilted.girdles:
+                panel.line(*_ends(line, across), "other limb")
+        for name, ends in tilted.segments.items():
+            if name in tilt and (not table.side(name) or table.side(name) in shown):
                 about = 0 if across == 1 else 1
-                panel.line(*_ends(tilted[name], across), f"{name.split('_')[0] if name != 'torso' else 'other'} limb")
-                panel.line(*_ends(exact[name], across), "soft dotted")
+                panel.line(*_ends(ends, across), f"{table.side(name) or 'other'} limb")
+                panel.line(*_ends(exact.segments[name], across), "soft dotted")
                 angle = float(np.degrees(tilt[name][about]))
-                text = f"{abs(angle):.1f}° {direction(name, across, angle)}" if abs(angle) >= 0.05 else "0.0°"
+                text = f"{abs(angle):.1f}° {direction(table, name, across, angle)}" if abs(angle) >= 0.05 else "0.0°"
                 text = text if observed[name][about] else "not seen"
-                middle = 100 * np.mean(tilted[name], axis=0)
+                middle = 100 * np.mean(ends, axis=0)
                 right = (middle[1] >= 0.0) if across == 1 else title == "from the right"
                 anchor: Anchor = "start" if right else "end"
-                if name == "torso":
-                    panel.text(0.0, 0.0, f"torso {text}", "halo", "middle", dy=20.0)
+                if name == table.reference:
+                    panel.text(0.0, 0.0, f"{plain(name)} {text}", "halo", "middle", dy=20.0)
                 else:
                     panel.text(middle[across], middle[2], text, "halo", anchor, dx=14.0 if right else -14.0)
         panels.append(panel)
-    keys = [*(Key(side, f"{side} bold") for side in arms), Key("exact pose", "soft dotted")]
+    keys = [*(Key(side, f"{side} bold") for side in sides), Key("exact pose", "soft dotted")]
     drawn = f"drawn {factor} times as large as they are" if factor > 1 else "as they are"
     caption = f"The start pose; tilts are {drawn}, the degrees are the true ones."
     return Picture("posture", caption, Chart([panels], [320.0], keys))
 
 
-def direction(segment: str, across: int, angle: float) -> str:
-    """Where a tilt takes the free end: the torso's upper, an arm's lower; `across` 0: from the side, 1: from before."""
-    positive = angle > 0.0
-    if segment == "torso":
+def direction(table: BodyTable, segment: str, across: int, angle: float) -> str:
+    """Where a tilt takes the free end of a segment: a torso's upper one, an arm's lower one, a foot's front one.
+
+    `across` 0: from the side, 1: from before.
+    """
+    positive, own = angle > 0.0, table.segments[segment]
+    if abs(own.along[2]) < 0.5 and across == 0:
+        return "downwards" if positive else "upwards"
+    if own.spine or abs(own.along[2]) < 0.5:
         if across == 0:
             return "forwards" if positive else "backwards"
         return "to the right" if positive else "to the left"
     if across == 0:
         return "backwards" if positive else "forwards"
-    return "outwards" if positive == segment.startswith("left") else "inwards"
+    if not table.side(segment):
+        return "to the left" if positive else "to the right"
+    return "outwards" if positive == (table.side(segment) == "left") else "inwards"
 
 
 def smoothed(time: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -259,19 +277,35 @@ def _cells(at: np.ndarray, learned: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return CELL * corners, np.bincount(inverse.ravel(), weights=learned)
 
 
-def _stick(tilt: Mapping[str, np.ndarray], lengths: Mapping[str, float], factor: float) -> dict[str, list[np.ndarray]]:
-    """Segment → its two ends [m], root of the trunk at zero, each tilt `factor` times as large; head and shoulders."""
+class _Stick(NamedTuple):
+    """Lines between two ends (3,) [m], the root at zero; None: there is no such line."""
 
-    def turned(name: str, v: Sequence[float]) -> np.ndarray:
-        return Rotation.from_rotvec([*(factor * tilt.get(name, np.zeros(2))), 0.0]).apply(v)
+    trunk: list[np.ndarray] | None  # from the root to the middle of the shoulders
+    head: list[np.ndarray] | None
+    girdles: list[list[np.ndarray]]  # between the points at which limbs hang
+    segments: dict[str, list[np.ndarray]]
 
-    top = turned("torso", [0.0, 0.0, lengths["trunk"]])
-    ends = {"torso": [np.zeros(3), top], "head": [top, top + turned("torso", [0.0, 0.0, 0.2])]}
-    for side, sign in (("left", 0.5), ("right", -0.5)):
-        at = top + turned("torso", [0.0, sign * lengths["shoulder_width"], 0.0])
-        ends[f"{side}_shoulder"] = [at, at]
-        for part in ("upper_arm", "forearm"):
-            name = f"{side}_{part}"
-            ends[name] = [at, at + turned(name, [0.0, 0.0, -lengths[name]])]
-            at = ends[name][1]
-    return ends
+
+def _stick(tilt: Mapping[str, np.ndarray], body: BodyModel, factor: float) -> _Stick:
+    """The body in the start pose, each tilt `factor` times as large; segments without a tilt are exact."""
+    table = body.table
+    R = {name: Rotation.from_rotvec([*(factor * tilt.get(name, np.zeros(2))), 0.0]) for name in table.segments}
+    posed = [name for name, segment in table.segments.items() if name in tilt or not segment.rigid_without_sensor]
+    pose = compute_pose(body, np.zeros(1), {name: R[name].as_quat()[None] for name in posed})
+    points = {name: place[0] for name, place in pose.points.items()}
+    segments: dict[str, list[np.ndarray]] = {}
+    trunk = head = None
+    girdles: list[list[np.ndarray]] = []
+    for limb in table.drawn_limbs.values():
+        middle = np.mean([points[point] for point in limb.origin], axis=0)
+        line = [points[point] for point in limb.origin]
+        if len(line) > 1 and not any(np.array_equal(line, other) for other in girdles):
+            girdles.append(line)
+        if limb.base == table.reference and table.find_length(ROOT, *limb.origin) is not None:
+            trunk = [np.zeros(3), middle]
+            head = [middle, middle + R[table.reference].apply([0.0, 0.0, HEAD_M])]
+            segments[table.reference] = trunk
+    for limb in table.drawn_limbs.values():
+        for segment, (start, end) in zip(limb.segments, pairwise(limb.points), strict=False):
+            segments[segment] = [points[start], points[end]]
+    return _Stick(trunk, head, girdles, segments)

@@ -13,7 +13,7 @@ from ..diagnostics import Diagnostic
 from ..kinematics import Pose
 from ..recording import Intervals, join_recordings
 from ..tracking import TrackedRecording
-from .measures import Signal, measure_hands, measure_signal
+from .measures import Signal, measure_signal, measure_tips
 
 MOST = 20_000  # samples that are kept
 _OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov")  # in `Orientation`
@@ -27,7 +27,7 @@ class Totals:
     rate_hz: float
     steps_ms: tuple[float, float]  # shortest and longest step between samples
     signals: Mapping[str, Signal]  # a row for each kept sample, of all from it to the next
-    peak_speed: Mapping[str, float]  # hand → [m/s]
+    peak_speed: Mapping[str, float]  # point whose path is drawn → [m/s]
     diagnostics: Sequence[Diagnostic]
 
 
@@ -35,13 +35,13 @@ def compute_totals(tracked: TrackedRecording) -> Totals:
     """The totals of a pose with all its samples."""
     recording = tracked.recording
     steps = 1e3 * np.diff(recording.time)
-    hands = measure_hands(tracked.pose, recording.rate_hz)
+    tips = measure_tips(tracked.pose, recording.rate_hz, tracked.model.table)
     return Totals(
         len(recording),
         recording.rate_hz,
         (float(steps.min()), float(steps.max())),
         {name: measure_signal(recording, name, tracked) for name in recording.sensors},
-        {name: hand.peak_speed for name, hand in hands.items()},
+        {name: tip.peak_speed for name, tip in tips.items()},
         tracked.diagnostics,
     )
 
@@ -76,8 +76,8 @@ class Decimator:
         at = np.arange(-self._seen % self._every, len(recording), self._every)
         for name in recording.sensors:
             self._take_signal(name, measure_signal(recording, name, chunk), at)
-        for name, hand in measure_hands(chunk.pose, recording.rate_hz).items():
-            self._peak_speed[name] = max(self._peak_speed.get(name, 0.0), hand.peak_speed)
+        for name, tip in measure_tips(chunk.pose, recording.rate_hz, chunk.model.table).items():
+            self._peak_speed[name] = max(self._peak_speed.get(name, 0.0), tip.peak_speed)
         steps = 1e3 * np.diff(recording.time, prepend=self._last)
         self._steps = min(self._steps[0], float(np.nanmin(steps))), max(self._steps[1], float(np.nanmax(steps)))
         self._seen, self._last = self._seen + len(recording), float(recording.time[-1])

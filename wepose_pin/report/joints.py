@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from ..angles import JointAngles, joint_angles, summary
+from ..angles import JointAngles, group_sides, joint_angles, summary
 from ..errors import BadData
 from ..tracking import TrackedRecording
 from .measures import finite_median, has_stated_mounts
 from .page import Table
 from .track_figures import draw_over_time
-from .words import plain, whole
+from .words import plain, plural, whole
 
 FULL_TURN = 2.0 * np.pi - 1e-9
 
@@ -23,21 +23,18 @@ def build_joint_angles_section(tracked: TrackedRecording) -> dict[str, Any] | No
         angles = joint_angles(tracked.pose)
     except BadData:  # no joint has both of its segments
         return None
-    groups: dict[str, list[str]] = {}
-    for joint in angles.joints:
-        groups.setdefault(joint.removeprefix("left_").removeprefix("right_"), []).append(joint)
     pictures = []
-    for group, members in groups.items():
+    for group, members in group_sides(angles.joints).items():
         panels = {
-            f"{plain(name)} [°]": {
-                joint.removesuffix(f"_{group}"): np.degrees(_break_line(angles[joint], k)) for joint in members
-            }
-            for k, name in enumerate(angles[members[0]].names)
+            f"{plain(name)} [°]": {side: np.degrees(_break_line(angles[joint], k)) for side, joint in members.items()}
+            for k, name in enumerate(angles[next(iter(members.values()))].names)
         }
-        caption = f"The {plain(group) if len(members) == 1 else plain(group) + 's'} over time."
-        if any((angles[joint].near_lock | angles[joint].gap).any() for joint in members):
+        caption = f"The {plain(group) if len(members) == 1 else plural(plain(group))} over time."
+        if any((angles[joint].near_lock | angles[joint].gap).any() for joint in members.values()):
             caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
-        pictures.append(draw_over_time(angles.time, panels, f"angles-{group}", caption))
+        pictures.append(
+            draw_over_time(angles.time, panels, f"angles-{group}", caption, dict(zip(members, members, strict=True)))
+        )
     rows = []
     for joint, ranges in summary(angles).items():
         stds = angles[joint].std

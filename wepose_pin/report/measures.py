@@ -1,8 +1,8 @@
-"""Measures of a tracked recording's report: the sensors' signals, static phases, headings, elbows, hands."""
+"""Measures of a tracked recording's report: the sensors' signals, static phases, headings, hinges, tips of limbs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..kinematics import Pose, compute_axis_std
+from ..model import BodyModel, BodyTable, HingeJoint
 from ..recording import OrientationSensor, Recording
 from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
@@ -17,22 +18,8 @@ from ..recording.plausibility import find_cut_off
 from ..subject import Subject
 from ..tracking import TrackedRecording
 
-# Segments that meet in a joint, from the trunk outwards: their headings make an angle of that joint.
-JOINTS = (
-    ("neck", "torso", "head"),
-    ("waist", "pelvis", "torso"),
-    *(
-        (f"{side} {joint}", "torso" if above == "torso" else f"{side}_{above}", f"{side}_{below}")
-        for side in ("left", "right")
-        for joint, above, below in (
-            ("shoulder", "torso", "upper_arm"),
-            ("elbow", "upper_arm", "forearm"),
-            ("wrist", "forearm", "hand"),
-        )
-    ),
-)
-BENT = np.deg2rad(20.0)  # above which a forearm shows the plane of its elbow
-PEAK_OVER_S = 0.1  # a hand's speed is that of its mean over so long
+BENT = np.deg2rad(20.0)  # above which a hinge shows the plane in which it bends
+PEAK_OVER_S = 0.1  # a tip's speed is that of its mean over so long
 
 
 class Signal(NamedTuple):
@@ -112,14 +99,14 @@ class Measures:
     ----------
     signals : sensor → its signal
     budgets : segment → the uncertainty of its heading
-    elbows : side → its elbow
-    hands : point → the motion of the hand
+    hinges : name → its motion
+    tips : point whose path is drawn → its motion
     """
 
     signals: Mapping[str, Signal]
     budgets: Mapping[str, Budget]
-    elbows: Mapping[str, Elbow]
-    hands: Mapping[str, Hand]
+    hinges: Mapping[str, HingeMotion]
+    tips: Mapping[str, TipMotion]
 
 
 # Headings -------------------------------------------------------------------------------------------------------------
@@ -150,91 +137,108 @@ def compute_heading_uncertainties(tracked: TrackedRecording) -> dict[str, Budget
     return budgets
 
 
-def compute_joint_heading_stds(budgets: Mapping[str, Budget]) -> dict[str, np.ndarray]:
-    """Joint → (n,) [rad], one standard deviation of the heading between its segments, as if they were independent."""
-    return {
-        joint: np.hypot(budgets[above].std, budgets[below].std)
-        for joint, above, below in JOINTS
-        if above in budgets and below in budgets
-    }
+def compute_joint_heading_stds(budgets: Mapping[str, Budget], model: BodyModel) -> dict[str, np.ndarray]:
+    """Joint → (n,) [rad], one standard deviation of the heading between its segments, as if they were independent.
+
+    From the body outwards: all of a limb before the next.
+    """
+    stds = {}
+    for segment in _list_outwards(model.parents, None):
+        above = model.parents[segment]
+        if above is not None and {above, segment} <= set(budgets):
+            stds[model.table.joint_name(segment)] = np.hypot(budgets[above].std, budgets[segment].std)
+    return stds
 
 
-# Elbows ---------------------------------------------------------------------------------------------------------------
+def _list_outwards(parents: Mapping[str, str | None], above: str | None) -> Iterator[str]:
+    """The segments that hang on `above`, each followed by those that hang on it."""
+    for segment, parent in parents.items():
+        if parent == above:
+            yield segment
+            yield from _list_outwards(parents, segment)
 
 
-class Elbow(NamedTuple):
-    """An elbow over time, from the directions of upper arm and forearm; NaN where one of them is not known."""
+# Hinges ---------------------------------------------------------------------------------------------------------------
+
+
+class HingeMotion(NamedTuple):
+    """A hinge over time, from the directions of its two segments; NaN where one of them is not known."""
 
     bend: np.ndarray  # (n,) [rad] between the two, 0 in line
     std: np.ndarray | None  # (n,) [rad]; None where the filter has no covariance
-    forward: np.ndarray  # (n,) [rad], the bend in the plane of the hinge; negative: backward
-    aside: np.ndarray  # (n,) [rad], the forearm out of that plane
+    flexion: np.ndarray  # (n,) [rad], the bend in the plane of the hinge; negative: against the way it bends
+    aside: np.ndarray  # (n,) [rad], the moving segment out of that plane
 
 
-def measure_elbow(pose: Pose, side: str, subject: Subject | None = None) -> Elbow | None:
-    """An elbow; None where a segment is not known. Without a calibrated hinge its axis is the upper arm's y."""
-    names = f"{side}_upper_arm", f"{side}_forearm"
+def find_flexion_sign(hinge: HingeJoint) -> float:
+    """1 where a hinge bends by rotating about its axis, −1 where it does so against it: the wider end of its range."""
+    return -1.0 if hinge.range[0] + hinge.range[1] < 0.0 else 1.0
+
+
+def measure_hinge(pose: Pose, table: BodyTable, name: str, subject: Subject | None = None) -> HingeMotion | None:
+    """A hinge of the table; None where a segment is not known. Without a calibrated axis it has that of the table."""
+    hinge = table.hinges[name]
+    names = hinge.on, hinge.moves
     if not set(names) <= set(pose.quat_WL):
         return None
-    known: np.ndarray = np.all([np.isfinite(pose.quat_WL[name]).all(axis=1) for name in names], axis=0)
+    known: np.ndarray = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in names], axis=0)
     if not known.any():
         return None
-    R_U, R_F = (_rotations(pose.quat_WL[name], known) for name in names)
-    upper_W, fore_W = (R.apply([0.0, 0.0, -1.0]) for R in (R_U, R_F))
-    axis_W = np.cross(upper_W, fore_W)
-    sine = np.linalg.norm(axis_W, axis=1)
-    bend = np.arctan2(sine, np.sum(upper_W * fore_W, axis=1))
+    R_on, R_moves = (_rotations(pose.quat_WL[segment], known) for segment in names)
+    along_on, along_moves = (np.array(table.segments[segment].along) for segment in names)
+    on_W, moves_W = R_on.apply(along_on), R_moves.apply(along_moves)
+    across_W = np.cross(on_W, moves_W)
+    sine = np.linalg.norm(across_W, axis=1)
+    bend = np.arctan2(sine, np.sum(on_W * moves_W, axis=1))
     std = None
     if set(names) <= set(pose.segment_cov):
         # Only rotation errors about the axis across both segments change the angle.
         both = pose.segment_cov[names[0]] + pose.segment_cov[names[1]]
-        along = axis_W / np.maximum(sine, 1e-9)[:, None]
-        std = np.sqrt(np.einsum("na,nab,nb->n", along, both, along))
-    axis_U = np.array([0.0, 1.0, 0.0])
-    if subject is not None and f"{side}_elbow" in subject.hinges:
-        axis_U = subject.hinges[f"{side}_elbow"].axis
-    ahead_U = np.cross(axis_U, [0.0, 0.0, 1.0])
-    fore_U = R_U.inv().apply(fore_W)
-    forward = np.arctan2(fore_U @ (ahead_U / np.linalg.norm(ahead_U)), -fore_U[:, 2])
-    aside = np.arcsin(np.clip(fore_U @ axis_U, -1.0, 1.0))
-    for values in (bend, forward, aside):
+        across = across_W / np.maximum(sine, 1e-9)[:, None]
+        std = np.sqrt(np.einsum("na,nab,nb->n", across, both, across))
+    axis = np.array(hinge.axis)
+    if subject is not None and name in subject.hinges:
+        axis = subject.hinges[name].axis
+    flexed = find_flexion_sign(hinge) * np.cross(axis, along_on)  # where the moving segment points at 90° of flexion
+    moves_on = R_on.inv().apply(moves_W)
+    flexion = np.arctan2(moves_on @ (flexed / np.linalg.norm(flexed)), moves_on @ along_on)
+    aside = np.arcsin(np.clip(moves_on @ axis, -1.0, 1.0))
+    for values in (bend, flexion, aside):
         values[~known] = np.nan
-    return Elbow(bend, std, forward, aside)
+    return HingeMotion(bend, std, flexion, aside)
 
 
-# Hands ----------------------------------------------------------------------------------------------------------------
+# Tips of limbs --------------------------------------------------------------------------------------------------------
 
 
-class Hand(NamedTuple):
-    """The motion of a hand."""
+class TipMotion(NamedTuple):
+    """The motion of a point whose path is drawn, as of a hand."""
 
-    reach: np.ndarray  # (n, 3) [m] from the middle of the shoulders, in the torso's frame; NaN where not known
+    reach: np.ndarray  # (n, 3) [m] from the origin of its limb, in the segment on which that hangs; NaN: not known
     std: np.ndarray | None  # (n,) [m], one axis, from the root; None where the filter has no covariance
     peak_speed: float  # [m/s]
 
 
-def measure_hands(pose: Pose, rate_hz: float) -> dict[str, Hand]:
-    """Point → motion of the hand; only hands that are known."""
-    points = pose.points
-    if not {"left_shoulder", "right_shoulder"} <= set(points) or "torso" not in pose.quat_WL:
-        return {}
-    middle = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
-    known = np.isfinite(pose.quat_WL["torso"]).all(axis=1)
-    R_LW = _rotations(pose.quat_WL["torso"], known).inv()
-    hands = {}
-    for name in ("left_palm", "right_palm"):
-        if name not in points:
+def measure_tips(pose: Pose, rate_hz: float, table: BodyTable) -> dict[str, TipMotion]:
+    """Point whose path is drawn → its motion; only points that are known."""
+    tips = {}
+    for name, limb in table.drawn_limbs.items():
+        if not {name, *limb.origin} <= set(pose.points) or (limb.base is not None and limb.base not in pose.quat_WL):
             continue
-        reach = R_LW.apply(points[name] - middle)
-        reach[~known] = np.nan
+        middle = np.mean([pose.points[point] for point in limb.origin], axis=0)
+        reach = pose.points[name] - middle
+        if limb.base is not None:
+            known = np.isfinite(pose.quat_WL[limb.base]).all(axis=1)
+            reach = _rotations(pose.quat_WL[limb.base], known).inv().apply(reach)
+            reach[~known] = np.nan
         if not np.isfinite(reach).all(axis=1).any():
             continue
         size = max(1, round(PEAK_OVER_S * rate_hz))
         moved = reach[size:] - reach[:-size]
         peak = float(np.nan_to_num(np.linalg.norm(moved, axis=1)).max(initial=0.0)) * rate_hz / size
         std = compute_axis_std(pose.point_cov[name]) if name in pose.point_cov else None
-        hands[name] = Hand(reach, std, peak)
-    return hands
+        tips[name] = TipMotion(reach, std, peak)
+    return tips
 
 
 def _rotations(quat: np.ndarray, known: np.ndarray) -> Rotation:

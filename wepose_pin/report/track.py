@@ -9,15 +9,16 @@ import numpy as np
 
 from ..diagnostics import INFO, Diagnostic, lines
 from ..kinematics import compute_axis_std, compute_orientation_residuals
+from ..model import BodyTable
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
 from .decimation import Totals, compute_totals
 from .joints import build_joint_angles_section
 from .measures import (
     Budget,
-    Hand,
     Measures,
     Signal,
+    TipMotion,
     compute_heading_uncertainties,
     compute_joint_heading_stds,
     find_samples_after_start,
@@ -25,14 +26,23 @@ from .measures import (
     finite_median,
     has_stated_mounts,
     longest_run_s,
-    measure_elbow,
-    measure_hands,
+    measure_hinge,
+    measure_tips,
 )
 from .page import Page, Table
 from .track_diagnostics import GRAVITY_OFF, describe_heading_remedy, diagnose_pose
-from .track_figures import draw_headings, draw_noise, draw_paths, draw_reach, draw_timeline
+from .track_figures import (
+    draw_headings,
+    draw_noise,
+    draw_paths,
+    draw_reach,
+    draw_timeline,
+    find_sides,
+    group_tips,
+    line_style,
+)
 from .viewer import pose_html
-from .words import degrees, intervals, listed, plain, versions, whole
+from .words import capital, degrees, intervals, listed, plain, plural, versions, whole
 
 TEMPLATE = "report/templates/track.html.j2"
 FRAMES_A_SECOND = 20.0  # of the 3D view
@@ -62,24 +72,25 @@ def render_track_report(
     totals = totals or compute_totals(tracked)
     signals = totals.signals
     budgets = compute_heading_uncertainties(tracked)
-    sides = {side: measure_elbow(tracked.pose, side, tracked.subject) for side in ("left", "right")}
-    elbows = {side: elbow for side, elbow in sides.items() if elbow is not None}
-    hands = {
-        name: hand._replace(peak_speed=totals.peak_speed[name])
-        for name, hand in measure_hands(tracked.pose, recording.rate_hz).items()
+    table = tracked.model.table
+    measured = {name: measure_hinge(tracked.pose, table, name, tracked.subject) for name in table.hinges}
+    hinges = {name: motion for name, motion in measured.items() if motion is not None}
+    tips = {
+        name: tip._replace(peak_speed=totals.peak_speed[name])
+        for name, tip in measure_tips(tracked.pose, recording.rate_hz, table).items()
     }
-    measures = Measures(signals, budgets, elbows, hands)
+    measures = Measures(signals, budgets, hinges, tips)
     page = Page(TEMPLATE, f"Motion of {recording.name or 'a recording'}", failures)
     page.add(
         "first",
-        lambda: _build_diagnostics_section(diagnose_pose(tracked, measures, totals.diagnostics)),
+        lambda: _build_diagnostics_section(diagnose_pose(tracked, measures, totals.diagnostics), table),
         name="Diagnostics",
     )
     page.add("short", lambda: _build_summary_section(tracked, totals, budgets), name="In short")
-    page.add("recorded", lambda: _build_recorded_section(recording, totals), "What was recorded")
+    page.add("recorded", lambda: _build_recorded_section(recording, totals, table), "What was recorded")
     page.add("noise", lambda: _build_noise_section(signals), "Noise and bias")
     page.add("drift", lambda: _build_drift_section(tracked, budgets), "Drift of the headings")
-    page.add("hands", lambda: _build_hands_section(tracked, hands), "The hands")
+    page.add("tips", lambda: _build_tips_section(tracked, tips), f"The {_name_tips(table)}")
     page.add("angles", lambda: build_joint_angles_section(tracked), "Joint angles")
     page.add("view", lambda: _build_view_section(tracked, view), "The motion in 3D")
     page.add("run", lambda: _build_run_section(tracked), "What was run")
@@ -89,17 +100,18 @@ def render_track_report(
 # The sections: the values that the macros of the template take --------------------------------------------------------
 
 
-def _build_diagnostics_section(diagnostics: Sequence[Diagnostic]) -> dict[str, Any]:
+def _build_diagnostics_section(diagnostics: Sequence[Diagnostic], table: BodyTable) -> dict[str, Any]:
     has_warning = any(diagnostic.severity != INFO for diagnostic in diagnostics)
-    return {"has_warning": has_warning, "entries": lines(diagnostics, titled=True)}
+    checked = listed(["Rates", "ranges", "static phases", "headings", *_name_hinges(table)])
+    return {"has_warning": has_warning, "entries": lines(diagnostics, titled=True), "checked": checked}
 
 
 def _build_summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping[str, Budget]) -> dict[str, Any]:
     recording = tracked.recording
     after_start = find_samples_after_start(tracked)
     headings = {
-        joint: float(np.degrees(finite_max(std[after_start])))
-        for joint, std in compute_joint_heading_stds(budgets).items()
+        plain(joint): float(np.degrees(finite_max(std[after_start])))
+        for joint, std in compute_joint_heading_stds(budgets, tracked.model).items()
     }
     stds = {name: compute_axis_std(cov[after_start]) for name, cov in tracked.pose.point_cov.items()}
     return {
@@ -107,14 +119,15 @@ def _build_summary_section(tracked: TrackedRecording, totals: Totals, budgets: M
         "rate_hz": totals.rate_hz,
         "sensors": len(totals.signals),
         "worst": max(headings.items(), key=lambda item: item[1]) if headings else None,
-        "hands": {name: 1e3 * finite_median(stds[name]) for name in ("left_palm", "right_palm") if name in stds},
+        "tips": {name: 1e3 * finite_median(stds[name]) for name in tracked.model.table.paths if name in stds},
+        "root": _name_root(tracked.model.table),
         "lengths": plain(tracked.subject.note or tracked.subject.name),
         "shown_samples": len(recording),
         "samples": totals.samples,
     }
 
 
-def _build_recorded_section(recording: Recording, totals: Totals) -> dict[str, Any]:
+def _build_recorded_section(recording: Recording, totals: Totals, table: BodyTable) -> dict[str, Any]:
     rows = [
         [
             plain(name),
@@ -144,7 +157,9 @@ def _build_recorded_section(recording: Recording, totals: Totals) -> dict[str, A
         "end": recording.time[-1],
         "step": low if low == high else f"{low} to {high}",
         "phases": [f"{name} {intervals(spans)}" for name, spans in recording.phases.items()],
-        "picture": draw_timeline(recording.time, totals.signals, recording.phases),
+        "picture": draw_timeline(
+            recording.time, totals.signals, recording.phases, {name: line_style(name, table) for name in totals.signals}
+        ),
         "sensors": Table(header, rows),
     }
 
@@ -184,11 +199,11 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
     ]
     joints = [
         [
-            joint,
+            plain(joint),
             degrees(float(np.degrees(finite_median(std[after_start])))),
             degrees(float(np.degrees(finite_max(std[after_start])))),
         ]
-        for joint, std in compute_joint_heading_stds(budgets).items()
+        for joint, std in compute_joint_heading_stds(budgets, tracked.model).items()
     ]
     header = [
         "segment, ±",
@@ -210,7 +225,9 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
         "corrected": max(tracked.correction.max_correction_deg.values(), default=0.0)
         if tracked.correction is not None
         else None,
-        "has_clasp": has_clasp,
+        "correctors": listed(
+            [*(f"{name}' hinges" for name in _name_hinges(tracked.model.table)), *["the joined hands"] * has_clasp]
+        ),
         "segments_without_covariance": [plain(name) for name in recording.sensors if name not in budgets],
         "time_before_start": _format_time_before(tracked),
         "has_stated_mounts": has_stated_mounts(tracked),
@@ -218,33 +235,52 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
             recording.time,
             {name: np.degrees(budget.std) for name, budget in budgets.items()},
             recording.phases.get("clasp", ()) if has_clasp else (),
+            {name: line_style(name, tracked.model.table) for name in budgets},
         ),
         "segments": Table(header, segments),
         "joints": Table(["joint, ±", "median", "largest"], joints) if joints else None,
     }
 
 
-def _build_hands_section(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, Any] | None:
-    if not hands:
+def _build_tips_section(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> dict[str, Any] | None:
+    if not tips:
         return None
-    after_start = find_samples_after_start(tracked)
-    rows = []
-    for name, hand in hands.items():
-        low, high = np.nanpercentile(100 * hand.reach, [1.0, 99.0], axis=0)
-        usual, largest = ("not known", "not known")
-        if hand.std is not None:
-            usual, largest = (
-                f"± {whole(1e3 * statistic(hand.std[after_start]))} mm" for statistic in (finite_median, finite_max)
-            )
-        ranges = [f"{whole(a)} to {whole(b)}" for a, b in zip(low, high, strict=True)]
-        rows.append([plain(name), *ranges, f"{hand.peak_speed:.1f} m/s", usual, largest])
-    header = ["", "forwards [cm]", "to the left [cm]", "above shoulders [cm]", "highest speed", "median ±", "largest ±"]
-    lengths = tracked.subject.lengths
+    table, after_start = tracked.model.table, find_samples_after_start(tracked)
+    sides, limbs = find_sides(tips, table), table.drawn_limbs
+    header = ["", "forwards [cm]", "to the left [cm]"]
+    groups, rigid = [], dict[str, list[str]]()
+    for k, group in enumerate(group_tips(tips, table, tracked.subject.lengths)):
+        rows = []
+        for name, tip in group.tips.items():
+            low, high = np.nanpercentile(100 * tip.reach, [1.0, 99.0], axis=0)
+            usual, largest = ("not known", "not known")
+            if tip.std is not None:
+                usual, largest = (
+                    f"± {whole(1e3 * statistic(tip.std[after_start]))} mm" for statistic in (finite_median, finite_max)
+                )
+            ranges = [f"{whole(a)} to {whole(b)}" for a, b in zip(low, high, strict=True)]
+            rows.append([plain(name), *ranges, f"{tip.peak_speed:.1f} m/s", usual, largest])
+            segments = limbs[name].segments
+            if len(segments) > 1 and segments[-1] not in tracked.quat_WL:
+                end, above = (plain(table.shared_name(segment)) for segment in (segments[-1], segments[-2]))
+                rigid.setdefault(f"A {end} without a sensor is assumed rigid with its {above}", []).append(plain(name))
+        number = f"-{k + 1}" if k else ""
+        groups.append(
+            {
+                "points": capital(listed([plain(name) for name in group.tips])),
+                "start": group.start,
+                "frame": group.frame,
+                "paths": draw_paths(group, sides, f"paths{number}"),
+                "reach": draw_reach(tracked.time, group, sides, f"reach{number}"),
+                "ranges": Table(
+                    [*header, f"above {group.origin} [cm]", "highest speed", "median ±", "largest ±"], rows
+                ),
+            }
+        )
     return {
-        "rigid_hands": [plain(name) for name in hands if name not in tracked.quat_WL],
-        "paths": draw_paths(hands, lengths["shoulder_width"], lengths["trunk"]),
-        "reach": draw_reach(tracked.time, hands),
-        "ranges": Table(header, rows),
+        "groups": groups,
+        "rigid": [f"{text}: {listed(names)}." for text, names in rigid.items()],
+        "root": _name_root(table),
         "time_before_start": _format_time_before(tracked),
     }
 
@@ -288,6 +324,22 @@ def _build_run_section(tracked: TrackedRecording) -> dict[str, Any]:
 
 
 # Words ----------------------------------------------------------------------------------------------------------------
+
+
+def _name_tips(table: BodyTable) -> str:
+    """Return what the points whose path is drawn are on, as "hands"."""
+    ends = ((limb.segments or (name,))[-1] for name, limb in table.drawn_limbs.items())
+    return listed([plural(name) for name in dict.fromkeys(plain(table.shared_name(end)) for end in ends)])
+
+
+def _name_hinges(table: BodyTable) -> list[str]:
+    """Return the joints that are hinges, as "elbows"."""
+    return [plural(name) for name in dict.fromkeys(plain(table.shared_name(hinge)) for hinge in table.hinges)]
+
+
+def _name_root(table: BodyTable) -> str:
+    """Return what the origin of W is."""
+    return "the root" if table.is_mechanism else "the middle of the hips"
 
 
 def _format_duration(seconds: float) -> str:

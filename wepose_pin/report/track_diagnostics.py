@@ -1,4 +1,4 @@
-"""Diagnostics of a tracked recording: signals, headings, hands, elbows, subject."""
+"""Diagnostics of a tracked recording: signals, headings, tips of limbs, hinges, subject."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from ..tracking import TrackedRecording
 from .measures import (
     BENT,
     Budget,
-    Elbow,
-    Hand,
+    HingeMotion,
     Measures,
     Signal,
+    TipMotion,
     compute_joint_heading_stds,
+    find_flexion_sign,
     find_samples_after_start,
     finite_max,
     longest_run_s,
 )
+from .words import plain
 
 GRAVITY_OFF = 0.02
 BIAS_LARGE = np.deg2rad(1.5)  # [rad/s], three times what is usual from the factory
@@ -31,10 +33,11 @@ LATE_START_S = 10.0
 LOST = 0.01  # share of samples
 JITTER = 0.2  # of a step, one standard deviation
 HEADING = np.deg2rad(10.0)  # one standard deviation, between the segments of a joint
-PLACE = 0.1  # [m], one standard deviation of a hand: what 10 deg of heading do at the end of an arm
-TURNED = np.deg2rad(10.0)  # by which elbows and joined hands corrected a heading
-# In the start pose a hanging elbow is bent by some 5 to 15 deg; few elbows open by more than 10 deg beyond straight.
-BACKWARD, FOLDED = np.deg2rad(-20.0), np.deg2rad(160.0)
+PLACE = 0.1  # [m], one standard deviation of a tip: what 10 deg of heading do at the end of an arm
+TURNED = np.deg2rad(10.0)  # by which hinges and joined hands corrected a heading
+# Beyond the range of a hinge while it extends, and before its end while it flexes, where flesh meets flesh. Of an elbow
+# 20 and 160 deg: in the start pose a hanging one is bent by 5 to 15 deg; few open by more than 10 deg beyond straight.
+RANGE_MARGIN = np.deg2rad(5.0)
 ASIDE = np.deg2rad(30.0)
 APART = np.deg2rad(15.0)  # between the halves of a recording
 LASTING_S = 1.0
@@ -42,14 +45,14 @@ LASTING_S = 1.0
 
 def diagnose_pose(tracked: TrackedRecording, measures: Measures, known: Sequence[Diagnostic]) -> list[Diagnostic]:
     """All diagnostics, the gravest first; `known` are those of the pose's summary."""
-    budgets, hands = measures.budgets, measures.hands
+    budgets, tips = measures.budgets, measures.tips
     diagnostics = [
         *_diagnose_signals(tracked, measures.signals),
         *_diagnose_headings(tracked, budgets),
-        *_diagnose_hands(tracked, hands),
-        *_diagnose_method(tracked, budgets, hands),
-        *_diagnose_time_before_start(tracked, budgets, hands),
-        *_diagnose_elbows(tracked.recording.rate_hz, measures.elbows),
+        *_diagnose_tips(tracked, tips),
+        *_diagnose_method(tracked, budgets, tips),
+        *_diagnose_time_before_start(tracked, budgets, tips),
+        *_diagnose_hinges(tracked, measures.hinges),
         *_diagnose_subject(tracked),
     ]
     return gravest_first(merge(known, diagnostics))
@@ -96,24 +99,23 @@ def _diagnose_signals(tracked: TrackedRecording, signals: Mapping[str, Signal]) 
 def _diagnose_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> Iterator[Diagnostic]:
     wide = _find_uncertain_headings(tracked, budgets)
     for joint in sorted(wide, key=wide.__getitem__, reverse=True):
-        place = joint.replace(" ", "_")
-        yield Diagnostic("heading-uncertain", WARNING, place, wide[joint], HEADING, _remedy_variant(tracked))
+        yield Diagnostic("heading-uncertain", WARNING, joint, wide[joint], HEADING, _remedy_variant(tracked))
     if tracked.correction is not None:
         for name, turned in tracked.correction.max_correction_deg.items():
             if np.deg2rad(turned) > TURNED:
                 yield Diagnostic("heading-corrected-far", WARNING, name, np.deg2rad(turned), TURNED)
 
 
-def _diagnose_hands(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> Iterator[Diagnostic]:
-    for name, std in _find_uncertain_hands(tracked, hands).items():
+def _diagnose_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> Iterator[Diagnostic]:
+    for name, std in _find_uncertain_tips(tracked, tips).items():
         yield Diagnostic("position-uncertain", WARNING, name, std, PLACE, _remedy_variant(tracked))
 
 
 def _diagnose_method(
-    tracked: TrackedRecording, budgets: Mapping[str, Budget], hands: Mapping[str, Hand]
+    tracked: TrackedRecording, budgets: Mapping[str, Budget], tips: Mapping[str, TipMotion]
 ) -> Iterator[Diagnostic]:
     if tracked.options.method == "smekf" and (
-        _find_uncertain_headings(tracked, budgets) or _find_uncertain_hands(tracked, hands)
+        _find_uncertain_headings(tracked, budgets) or _find_uncertain_tips(tracked, tips)
     ):
         yield Diagnostic("method-needs-static", WARNING, facts={"method": tracked.options.method})
 
@@ -123,22 +125,22 @@ def _find_uncertain_headings(tracked: TrackedRecording, budgets: Mapping[str, Bu
     since = find_samples_after_start(tracked)
     return {
         joint: most
-        for joint, std in compute_joint_heading_stds(budgets).items()
+        for joint, std in compute_joint_heading_stds(budgets, tracked.model).items()
         if (most := finite_max(std[since])) > HEADING
     }
 
 
-def _find_uncertain_hands(tracked: TrackedRecording, hands: Mapping[str, Hand]) -> dict[str, float]:
+def _find_uncertain_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> dict[str, float]:
     """Point → uncertainty [m], of those beyond the limit."""
     since = find_samples_after_start(tracked)
-    stds = {name: finite_max(hand.std[since]) for name, hand in hands.items() if hand.std is not None}
+    stds = {name: finite_max(tip.std[since]) for name, tip in tips.items() if tip.std is not None}
     return {name: most for name, most in stds.items() if most > PLACE}
 
 
 def _diagnose_time_before_start(
-    tracked: TrackedRecording, budgets: Mapping[str, Budget], hands: Mapping[str, Hand]
+    tracked: TrackedRecording, budgets: Mapping[str, Budget], tips: Mapping[str, TipMotion]
 ) -> Iterator[Diagnostic]:
-    """Headings and hands that are less certain before the start pose than after it, longer than filters converge."""
+    """Headings and tips that are less certain before the start pose than after it, longer than filters converge."""
     since, before = find_samples_after_start(tracked), tracked.time < tracked.segments.start[0]
     rate_hz = tracked.recording.rate_hz
     facts = {"before": float(tracked.segments.start[0] - tracked.time[0])}
@@ -147,12 +149,12 @@ def _diagnose_time_before_start(
         wide = [std[before & (std > max(limit, finite_max(std[since])))] for std in stds]
         return max((finite_max(std) for std in wide if len(std) / rate_hz > LASTING_S), default=0.0)
 
-    heading = widest(list(compute_joint_heading_stds(budgets).values()), HEADING)
+    heading = widest(list(compute_joint_heading_stds(budgets, tracked.model).values()), HEADING)
     if heading:
         yield Diagnostic("heading-uncertain-before-start", INFO, "", heading, HEADING, facts)
-    hand = widest([hand.std for hand in hands.values() if hand.std is not None], PLACE)
-    if hand:
-        yield Diagnostic("position-uncertain-before-start", INFO, "", hand, PLACE, facts)
+    position = widest([tip.std for tip in tips.values() if tip.std is not None], PLACE)
+    if position:
+        yield Diagnostic("position-uncertain-before-start", INFO, "", position, PLACE, facts)
 
 
 def _remedy_variant(tracked: TrackedRecording) -> dict[str, str]:
@@ -169,32 +171,40 @@ def describe_heading_remedy(tracked: TrackedRecording) -> str:
     return render(Diagnostic("heading-uncertain", INFO, facts=_remedy_variant(tracked))).do
 
 
-def _diagnose_elbows(rate_hz: float, elbows: Mapping[str, Elbow]) -> Iterator[Diagnostic]:
-    for side, elbow in elbows.items():
-        in_plane = np.abs(elbow.aside) < np.deg2rad(45.0)
-        back = in_plane & (elbow.forward < BACKWARD) & (elbow.bend < np.deg2rad(90.0))
+def _diagnose_hinges(tracked: TrackedRecording, hinges: Mapping[str, HingeMotion]) -> Iterator[Diagnostic]:
+    rate_hz, table = tracked.recording.rate_hz, tracked.model.table
+    for name, motion in hinges.items():
+        hinge = table.hinges[name]
+        ends = sorted(find_flexion_sign(hinge) * end for end in hinge.range)
+        extended, flexed = float(ends[0] - RANGE_MARGIN), float(ends[1] - RANGE_MARGIN)
+        in_plane = np.abs(motion.aside) < np.deg2rad(45.0)
+        back = in_plane & (motion.flexion < extended) & (motion.bend < np.deg2rad(90.0))
         seconds = np.count_nonzero(back) / rate_hz
+        facts: dict[str, float | str] = {
+            "joint": plain(table.shared_name(name)),
+            "above": plain(table.shared_name(hinge.on)),
+            "below": plain(table.shared_name(hinge.moves)),
+        }
         if seconds > LASTING_S:
-            most = float(-elbow.forward[back].min())
-            facts = {"duration": seconds}
-            yield Diagnostic("elbow-hyperextended", WARNING, f"{side}_elbow", most, float(-BACKWARD), facts)
-        folded = elbow.bend > FOLDED
-        if np.count_nonzero(folded) / rate_hz > LASTING_S:
-            yield Diagnostic("elbow-overflexed", WARNING, f"{side}_elbow", finite_max(elbow.bend), float(FOLDED))
-        aside = (elbow.bend > BENT) & (np.abs(elbow.aside) > ASIDE)
+            most = float(-motion.flexion[back].min())
+            yield Diagnostic("hinge-hyperextended", WARNING, name, most, -extended, {**facts, "duration": seconds})
+        folded = motion.bend > flexed
+        if ends[1] < np.pi and np.count_nonzero(folded) / rate_hz > LASTING_S:
+            yield Diagnostic("hinge-overflexed", WARNING, name, finite_max(motion.bend), flexed, facts)
+        aside = (motion.bend > BENT) & (np.abs(motion.aside) > ASIDE)
         if np.count_nonzero(aside) / rate_hz > LASTING_S:
-            most = float(np.abs(elbow.aside[aside]).max())
-            early, late = _median_of_halves(elbow)
-            halves: dict[str, float | str] = {"first_half": early, "second_half": late}
+            most = float(np.abs(motion.aside[aside]).max())
+            early, late = _median_of_halves(motion)
+            facts |= {"first_half": early, "second_half": late}
             if abs(late - early) > APART:
-                halves["variant"] = "drifting"
-            yield Diagnostic("forearm-out-of-plane", WARNING, f"{side}_forearm", most, float(ASIDE), halves)
+                facts["variant"] = "drifting"
+            yield Diagnostic("hinge-out-of-plane", WARNING, hinge.moves, most, float(ASIDE), facts)
 
 
-def _median_of_halves(elbow: Elbow) -> tuple[float, float]:
-    """Median [rad] by which the bent forearm is out of plane, in the first and the second half."""
-    half = len(elbow.bend) // 2
-    parts = [elbow.aside[rows][elbow.bend[rows] > BENT] for rows in (slice(half), slice(half, None))]
+def _median_of_halves(motion: HingeMotion) -> tuple[float, float]:
+    """Median [rad] by which the moving segment is out of plane while bent, in the first and the second half."""
+    half = len(motion.bend) // 2
+    parts = [motion.aside[rows][motion.bend[rows] > BENT] for rows in (slice(half), slice(half, None))]
     if not all(len(part) for part in parts):
         return 0.0, 0.0
     return float(np.median(parts[0])), float(np.median(parts[1]))

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from ..model import ROOT, BodyTable
 from ..recording.gaps import find_runs
 from .chart import WIDTH, Chart, Key, Panel, Picture, category_rows, envelope
-from .measures import Hand, Signal, finite_max
-from .words import plain
+from .measures import Signal, TipMotion, finite_max
+from .words import listed, plain, plural
 
 TIME = "time in the recording [s]"
 PATH_POINTS = 3000
 Spans = Sequence[tuple[float, float]]
 
 
-def draw_timeline(time: np.ndarray, signals: Mapping[str, Signal], phases: Mapping[str, Spans]) -> Picture:
-    """Each sensor over time: how fast it rotated, where it was static, lost, or cut off by its range."""
+def draw_timeline(
+    time: np.ndarray, signals: Mapping[str, Signal], phases: Mapping[str, Spans], styles: Mapping[str, str]
+) -> Picture:
+    """Each sensor over time: how fast it rotated, where it was static, lost, or cut off by its range.
+
+    `styles`: of each sensor's line, of `line_style`.
+    """
     ends = _ends(time)
     most = 1.08 * max(1.0, max(float(np.degrees(signal.rate.max())) for signal in signals.values()))
     rows = []
@@ -36,7 +43,7 @@ def draw_timeline(time: np.ndarray, signals: Mapping[str, Signal], phases: Mappi
         panel.y_ticks = [(0.0, "0"), (_round_below(most), f"{_round_below(most):g}")]
         for spans in phases.values():
             panel.spans(spans, "phase")
-        panel.area(*envelope(time, np.degrees(signal.rate)), line_style(name).split()[0])
+        panel.area(*envelope(time, np.degrees(signal.rate)), styles[name].split()[0])
         if signal.static is not None:
             panel.boxes(_times(time, signal.static), (-0.13 * most, 0.0), "ink")
         panel.spans(_times(time, signal.gap), "hatched")
@@ -80,98 +87,161 @@ def draw_noise(signals: Mapping[str, Signal]) -> Picture:
     return Picture("noise", caption, Chart([panels], [26.0 * len(rows) + 6.0], keys))
 
 
-def draw_headings(time: np.ndarray, std_deg: Mapping[str, np.ndarray], clasps: Spans) -> Picture:
-    """What each segment's heading may be off by, over time; `clasps`: spans of joined hands [s]."""
+def draw_headings(
+    time: np.ndarray, std_deg: Mapping[str, np.ndarray], clasps: Spans, styles: Mapping[str, str]
+) -> Picture:
+    """What each segment's heading may be off by, over time; `clasps`: spans of joined hands [s], `styles`: of lines."""
     most = 1.06 * max(0.1, *(finite_max(values) for values in std_deg.values()))
     panel = Panel("heading, ± [°]", TIME, x=_ends(time), y=(0.0, most))
     panel.spans(clasps, "phase")
     for name, values in std_deg.items():
-        panel.line(*envelope(time, values), line_style(name))
-    keys = [Key(plain(name), line_style(name)) for name in std_deg]
+        panel.line(*envelope(time, values), styles[name])
+    keys = [Key(plain(name), styles[name]) for name in std_deg]
     keys += [Key("hands joined", "phase", "box")] if clasps else []
     caption = "What each segment's heading may be off by: one standard deviation."
     return Picture("headings", caption, Chart([[panel]], [230.0], keys))
 
 
-def draw_paths(hands: Mapping[str, Hand], shoulder_width: float, trunk: float) -> Picture:
-    """Where the hands went, seen from the torso: from the front, from the right, from above."""
-    panels = []
-    for panel, across, up in body_views(50.0 * shoulder_width, 100.0 * trunk):
-        for name, hand in hands.items():
-            at = 100.0 * hand.reach[:: max(1, len(hand.reach) // PATH_POINTS)][:, [across, up]]
-            side = line_style(name).split()[0]
-            panel.line(at[:, 0], at[:, 1], f"{side} faint")
-            panel.markers(at[0, 0], at[0, 1], "circle" if side == "left" else "square", side)
-        panels.append(panel)
-    keys = [
-        Key(f"{plain(name)}, mark: beginning", line_style(name).split()[0], "square" if "right" in name else "circle")
-        for name in hands
-    ]
-    return Picture(
-        "paths",
-        "Where the hands went, seen from the torso, which is taken as upright and facing ahead.",
-        Chart([panels], [260.0], keys),
-    )
-
-
-def body_views(half: float, trunk: float) -> list[tuple[Panel, int, int]]:
-    """Panels with head, shoulders and trunk [cm], origin between the shoulders, and the axes that each shows.
+class TipGroup(NamedTuple):
+    """Points whose paths are drawn together, for their limbs hang on the same points.
 
     Parameters
     ----------
-    half, trunk : half of the shoulders' width, the trunk's length [cm]
+    tips : point → its motion
+    nouns : what the points are on, as "hands"
+    origin, start : what the limbs hang at, as "shoulders", and where a reach begins, as "the middle of the shoulders"
+    base : the segment there; empty: the root
+    width, trunk : [m] between the points at which they hang, and from the root to their middle; None: no such length
     """
-    labels = ("forwards [cm]", "to the person's left [cm]", "above the shoulders [cm]")
+
+    tips: Mapping[str, TipMotion]
+    nouns: str
+    origin: str
+    start: str
+    base: str
+    width: float | None
+    trunk: float | None
+
+    @property
+    def frame(self) -> str:
+        """Whose axes its coordinates are along, in words."""
+        return f"the {self.base}'s axes" if self.base else "the axes of W"
+
+
+def group_tips(tips: Mapping[str, TipMotion], table: BodyTable, lengths: Mapping[str, float]) -> list[TipGroup]:
+    """The tips by the points at which their limbs hang; `lengths` [m] are the person's."""
+    by_origin: dict[tuple[str, ...], list[str]] = {}
+    limbs = table.drawn_limbs
+    for name in tips:
+        by_origin.setdefault(limbs[name].origin, []).append(name)
+    groups = []
+    for origin, names in by_origin.items():
+        width, trunk = (lengths.get(table.find_length(*points) or "") for points in (origin, (ROOT, *origin)))
+        nouns = (table.shared_name((limbs[name].segments or (name,))[-1]) for name in names)
+        hangs_at = plain(table.shared_name(origin[0]))
+        hangs_at, start = (plural(hangs_at), "the middle of the ") if len(origin) > 1 else (hangs_at, "the ")
+        groups.append(
+            TipGroup(
+                {name: tips[name] for name in names},
+                listed([plural(plain(noun)) for noun in dict.fromkeys(nouns)]),
+                hangs_at,
+                start + hangs_at,
+                plain(limbs[names[0]].base or ""),
+                width,
+                trunk,
+            )
+        )
+    return groups
+
+
+def draw_paths(group: TipGroup, sides: Mapping[str, str], stem: str) -> Picture:
+    """Where the tips went, seen from the body: from the front, from the right, from above.
+
+    `sides`: of each tip, as the first word of `line_style`.
+    """
+    panels = []
+    for panel, across, up in body_views(group.width, group.trunk, group.origin):
+        for name, tip in group.tips.items():
+            at = 100.0 * tip.reach[:: max(1, len(tip.reach) // PATH_POINTS)][:, [across, up]]
+            panel.line(at[:, 0], at[:, 1], f"{sides[name]} faint")
+            panel.markers(at[0, 0], at[0, 1], "square" if sides[name] == "right" else "circle", sides[name])
+        panels.append(panel)
+    keys = [
+        Key(f"{plain(name)}, mark: beginning", sides[name], "square" if sides[name] == "right" else "circle")
+        for name in group.tips
+    ]
+    seen = f", seen from the {group.base}, which is taken as upright and facing ahead" if group.base else ""
+    return Picture(stem, f"Where the {group.nouns} went{seen}.", Chart([panels], [260.0], keys))
+
+
+def body_views(width: float | None, trunk: float | None, origin: str) -> list[tuple[Panel, int, int]]:
+    """Panels with head, shoulders and trunk [cm], and the axes that each shows; zero is between the shoulders.
+
+    Parameters
+    ----------
+    width, trunk : [m] of the shoulders, or of what else the limbs hang at, and from there to the root; None: not drawn
+    origin : what the limbs hang at, as "shoulders"
+    """
+    labels = ("forwards [cm]", "to the person's left [cm]", f"above the {origin} [cm]")
     views = []
     for view, across, up in (("from the front", 1, 2), ("from the right", 0, 2), ("from above", 1, 0)):
         panel = Panel(f"{view}: {labels[up]}", labels[across], equal=True, flip_x=view == "from above")
-        panel.disc(0.0, 0.0 if up == 0 else 20.0, 10.0, "band")
-        if across == 1:
-            panel.line(np.array([-half, half]), np.zeros(2), "band limb")
-        if up == 2:
-            panel.line(np.zeros(2), np.array([0.0, -trunk]), "band limb")
+        if trunk is not None:
+            panel.disc(0.0, 0.0 if up == 0 else 20.0, 10.0, "band")
+        if across == 1 and width is not None:
+            panel.line(np.array([-50.0, 50.0]) * width, np.zeros(2), "band limb")
+        if up == 2 and trunk is not None:
+            panel.line(np.zeros(2), np.array([0.0, -100.0 * trunk]), "band limb")
         views.append((panel, across, up))
     return views
 
 
-def draw_reach(time: np.ndarray, hands: Mapping[str, Hand]) -> Picture:
-    """The hands over time, along the torso's axes."""
+def draw_reach(time: np.ndarray, group: TipGroup, sides: Mapping[str, str], stem: str) -> Picture:
+    """The tips over time, along the axes of the segment on which their limbs hang."""
     panels = {
-        label: {name: 100.0 * hand.reach[:, k] for name, hand in hands.items()}
-        for k, label in enumerate(("forwards [cm]", "to the left [cm]", "above the shoulders [cm]"))
+        label: {name: 100.0 * tip.reach[:, k] for name, tip in group.tips.items()}
+        for k, label in enumerate(("forwards [cm]", "to the left [cm]", f"above the {group.origin} [cm]"))
     }
-    caption = "The hands over time, from the middle of the shoulders along the torso's axes."
-    return draw_over_time(time, panels, "reach", caption)
+    caption = f"The {group.nouns} over time, from {group.start} along {group.frame}."
+    return draw_over_time(time, panels, stem, caption, sides)
 
 
 def draw_over_time(
-    time: np.ndarray, panels: Mapping[str, Mapping[str, np.ndarray]], stem: str, caption: str
+    time: np.ndarray,
+    panels: Mapping[str, Mapping[str, np.ndarray]],
+    stem: str,
+    caption: str,
+    sides: Mapping[str, str],
 ) -> Picture:
-    """A panel for each title, with its lines by name: left in full, right dashed; NaN breaks a line."""
+    """A panel for each title, with its lines by name: left in full, right dashed; NaN breaks a line.
+
+    `sides`: of each line, "left", "right", or another that is neither.
+    """
+    styles = {name: {"left": "left", "right": "right dashed"}.get(side, "other") for name, side in sides.items()}
     rows = []
     for title, lines in panels.items():
         panel = Panel(title, x=_ends(time), shown_x=False)
         panel.rule("soft thin", y=0.0)
         for name, values in lines.items():
-            panel.line(*envelope(time, values), _side(name))
+            panel.line(*envelope(time, values), styles[name])
         rows.append([panel])
     rows[-1][0].shown_x, rows[-1][0].x_label = True, TIME
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
-    keys = [Key(plain(name), _side(name)) for name in names] if len(names) > 1 else []
+    keys = [Key(plain(name), styles[name]) for name in names] if len(names) > 1 else []
     return Picture(stem, caption, Chart(rows, [105.0] * len(rows), keys))
 
 
-def line_style(segment: str) -> str:
-    """The style of a segment's line: the side by colour, the part by dashes."""
-    side, _, part = segment.partition("_") if segment.startswith(("left_", "right_")) else ("other", "", segment)
-    return (
-        f"{side} {'dashed' if part in ('forearm', 'pelvis') else 'dotted' if part in ('hand', 'palm', 'head') else ''}"
-    )
+def line_style(name: str, table: BodyTable) -> str:
+    """The style of a segment's line: the side by colour, its place among the segments of that side by dashes."""
+    side = table.side(name)
+    members = [segment for segment in table.segments if table.side(segment) == side]
+    rank = members.index(name) if name in members else 0
+    return f"{side or 'other'} {('', 'dashed', 'dotted')[rank % 3]}"
 
 
-def _side(name: str) -> str:
-    side = {"l": "left", "r": "right"}.get(name[:1], "other")
-    return f"{side} dashed" if side == "right" else side
+def find_sides(names: Iterable[str], table: BodyTable) -> dict[str, str]:
+    """Name → its side as a style: "left", "right" or "other"."""
+    return {name: table.side(name) or "other" for name in names}
 
 
 def _name_phases(panel: Panel, phases: Mapping[str, Spans], ends: tuple[float, float]) -> None:

@@ -54,6 +54,13 @@ LIGHT = Backdrop((0.985, 0.99, 0.995), (0.89, 0.91, 0.935), (0.70, 0.74, 0.79))
 DARK = Backdrop((0.085, 0.105, 0.130), (0.135, 0.160, 0.190), (0.30, 0.34, 0.39))
 
 
+class Trail(NamedTuple):
+    """The way of a point, whose last seconds are drawn behind it."""
+
+    points: np.ndarray  # (n, 3) [m] in W, may hold NaN
+    colour: str  # as in CSS
+
+
 class Mesh(NamedTuple):
     """The triangles of a link, in its frame."""
 
@@ -71,10 +78,10 @@ def pose_html(
     title: str = "",
     fps: float = 30.0,
 ) -> str:
-    """The page that plays `pose` on `model`, with trails of the hands; parameters as `view_html`.
+    """The page that plays `pose` on `model`, with trails of the points whose path is drawn; parameters as `view_html`.
 
-    Segments that no sensor measured are drawn rigid with the one above where that is the rule for points too (a hand),
-    or where nothing hangs on it (head, pelvis); what is not known is not drawn.
+    Segments that no sensor measured are drawn rigid with the one above where the model's table says so; what is not
+    known is not drawn.
     """
     frames = frame_indices(pose.time, fps)
     if pose.q is not None:
@@ -87,15 +94,21 @@ def pose_html(
         visuals,
         pose.time[frames],
         compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals)),
-        trails={name: pose.points[name][frames] for name in ("left_palm", "right_palm") if name in pose.points},
+        trails={
+            name: Trail(pose.points[name][frames], choose_trail_colour(name, model))
+            for name in model.table.paths
+            if name in pose.points
+        },
         phases=phases,
         title=title,
         fps=fps,
+        floor_z=0.0 if model.table.is_mechanism else FLOOR_Z,
     )
 
 
 def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "", fps: float = 30.0) -> str:
     """The page on which a person and the robot that does as they do move together, on the robot's time."""
+    from ..retargeting.targets import find_person_arm
     from ..retargeting.visuals import build_parts, compute_placements, place_beside_person
 
     frames = frame_indices(trajectory.time, fps)
@@ -106,11 +119,14 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     placed = compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals))
     robot = trajectory.robot
     drawn = build_parts(robot)
-    shoulder_z = float(np.nanmedian([pose.points[f"{arm.side}_shoulder"][:, 2] for arm in robot.arms]))
+    arms = {arm.side: find_person_arm(model.table, arm.side) for arm in robot.arms}
+    shoulder_z = float(np.nanmedian([pose.points[arm.points[0]][:, 2] for arm in arms.values()]))
     R_WB, p_WB = place_beside_person(robot, drawn, shoulder_z, FLOOR_Z)
     moved = compute_placements(trajectory, drawn, frames, R_WB, p_WB)
-    trails = {arm.side: pose.points[f"{arm.side}_palm"][nearest] for arm in robot.arms}  # short: heads are beside them
-    trails |= {f"{arm.side}_robot": trajectory.hand[arm.side][frames] @ R_WB.T + p_WB for arm in robot.arms}
+    colours = {side: choose_trail_colour(arm.tip, model) for side, arm in arms.items()}
+    # Short names: heads are beside them.
+    trails = {side: Trail(pose.points[arm.tip][nearest], colours[side]) for side, arm in arms.items()}
+    trails |= {f"{side}_robot": Trail(trajectory.hand[side][frames] @ R_WB.T + p_WB, colours[side]) for side in arms}
     return view_html(
         visuals,
         trajectory.time[frames],
@@ -129,7 +145,7 @@ def view_html(
     placements: Mapping[str, tuple[np.ndarray, np.ndarray]],
     *,
     meshes: Sequence[Mesh] = (),
-    trails: Mapping[str, np.ndarray] | None = None,
+    trails: Mapping[str, Trail] | None = None,
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     title: str = "",
     fps: float = 30.0,
@@ -150,8 +166,7 @@ def view_html(
     meshes
         More shapes of links.
     trails
-        Point -> (n, 3) [m] in W, may hold NaN: the last seconds are drawn behind the point. A name that
-        begins with left or right takes the colour of that arm.
+        Point -> its way.
     phases
         Name -> spans (begin, end) [s] on the same time axis as `time`.
     title
@@ -168,7 +183,7 @@ def view_html(
     """
     time = np.asarray(time, dtype=float)
     frames = frame_indices(time, fps)
-    trails = {name: np.asarray(points, dtype=float)[frames] for name, points in (trails or {}).items()}
+    ways = {name: np.asarray(trail.points, dtype=float)[frames] for name, trail in (trails or {}).items()}
     drawn = visible(v for v in visuals if v.link in placements)
     meshes = [mesh for mesh in meshes if mesh.link in placements]
     links = list(dict.fromkeys([*(v.link for v in drawn), *(mesh.link for mesh in meshes)]))
@@ -184,14 +199,14 @@ def view_html(
         "links": links,
         "motion": _base64(motion),
         "trails": [
-            {"name": name, "colour": trail_colour(name, visuals), "points": _base64(points)}
-            for name, points in trails.items()
+            {"name": name, "colour": trail.colour, "points": _base64(ways[name])}
+            for name, trail in (trails or {}).items()
         ],
         "phases": [
             {"name": name, "spans": [[float(begin), float(end)] for begin, end in spans]}
             for name, spans in (phases or {}).items()
         ],
-        "view": view([*drawn, *map(_box_of, meshes)], links, motion, list(trails.values())),
+        "view": view([*drawn, *map(_box_of, meshes)], links, motion, list(ways.values())),
         "scene": scene(drawn, links, meshes),
         "backdrop": backdrop(LIGHT, floor_z),
     }
@@ -331,17 +346,25 @@ def _half_edges(visual: Visual) -> np.ndarray:
     return np.array([radius, radius, visual.size[1] / 2.0 if visual.kind == "cylinder" else radius])
 
 
-def trail_colour(point: str, visuals: Sequence[Visual]) -> str:
-    """The colour that most of that arm's visuals have, where the other arm has another; else one of ours."""
-    most = {}
-    for side in ("left", "right"):
-        arm = [v for v in visuals if v.link.lower().startswith(side) and "arm" in v.link.lower()]
-        most[side] = [colour for colour, _ in Counter(v.rgba[:3] for v in arm).most_common(1)]
-    for side, otherwise in (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)):
-        if point.lower().startswith(side):
-            own = most[side] and most["left"] != most["right"]
-            return "#" + "".join(f"{round(255 * c):02x}" for c in most[side][0]) if own else otherwise
-    return OTHER_COLOUR
+def choose_trail_colour(point: str, model: BodyModel) -> str:
+    """The colour of most visuals of a point's limb, its tip left out, where the other side has another; else ours."""
+    other = model.table.counterpart(point)
+    if other is None:
+        return OTHER_COLOUR
+    own, others = (_find_limb_colour(name, model) for name in (point, other))
+    if own and own != others:
+        return "#" + "".join(f"{round(255 * c):02x}" for c in own[:3])
+    return LEFT_COLOUR if model.table.side(point) == "left" else RIGHT_COLOUR
+
+
+def _find_limb_colour(point: str, model: BodyModel) -> tuple[float, ...]:
+    """The colour that most visuals of a point's limb have; empty where there is none."""
+    limb = model.table.find_limb(point)
+    chains = [model.chains[segment] for segment in limb.segments[:-1]] if limb is not None else []
+    joints = {joint for chain in chains for joint in chain.joints}
+    m = model.pin
+    colours = (v.rgba[:3] for v in visible(model.visuals) if m.frames[m.getFrameId(v.link)].parentJoint in joints)
+    return next((colour for colour, _ in Counter(colours).most_common(1)), ())
 
 
 def _meshcat_source() -> Markup:

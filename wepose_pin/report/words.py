@@ -25,6 +25,11 @@ def plain(name: str) -> str:
     return name.replace("_", " ")
 
 
+def plural(noun: str) -> str:
+    """The plural of a segment's or point's name."""
+    return {"foot": "feet"}.get(noun, f"{noun}s")
+
+
 def listed(parts: Sequence[str]) -> str:
     """``a, b and c``."""
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)

@@ -52,6 +52,12 @@ class ArmMap:
     thumb: str
     reach: float | None = None
 
+    @property
+    def points(self) -> dict[str, LinkPoint]:
+        """Key of the map → the point that it names."""
+        points = {"shoulder": self.shoulder, "elbow": self.elbow, "hand": self.hand}
+        return {key: point for key, point in points.items() if point is not None}
+
 
 @dataclass(frozen=True)
 class RobotMap:

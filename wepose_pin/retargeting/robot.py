@@ -158,9 +158,9 @@ def _distinguish_frames(model: pin.Model) -> pin.Model:
 def _build_arm(robot: Robot, side: str, arm: ArmMap) -> Arm:
     """An arm, whose points become frames of the robot's model."""
     model = robot.model
-    shoulder = _add_frame(model, arm.shoulder, f"{side}_shoulder")
-    hand = _add_frame(model, arm.hand, f"{side}_palm", _hand_rotation(arm))
-    elbow = _add_frame(model, arm.elbow, f"{side}_elbow") if arm.elbow else -1
+    shoulder = _add_frame(model, arm.shoulder, f"shoulder {side}")
+    hand = _add_frame(model, arm.hand, f"hand {side}", _hand_rotation(arm))
+    elbow = _add_frame(model, arm.elbow, f"elbow {side}") if arm.elbow else -1
     joints = np.array([robot.names.index(name) for name in arm.joints if name in robot.names])
     data = model.createData()
     pin.framesForwardKinematics(model, data, robot.configuration(robot.rest))
@@ -181,8 +181,8 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
     joints = [name for arm in arms.values() for name in arm.joints]
     for side, arm in arms.items():
         where = f"{robot.where}: arms.{side}"
-        for key, point in (("shoulder", arm.shoulder), ("elbow", arm.elbow), ("hand", arm.hand)):
-            if point is not None and point.link not in links:
+        for key, point in arm.points.items():
+            if point.link not in links:
                 raise BadModel(
                     f"{where}.{key}: no link '{point.link}' in {robot.urdf.name}; {one_of(links, point.link)}"
                 )

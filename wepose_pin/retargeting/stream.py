@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -17,12 +18,11 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, BadOption
-from ..model import load_table
+from ..model import BodyTable, load_table
 from .collision import CollisionModel
 from .controller import ControllerParams, HandTarget, JointState, PostureReference, QpController, StepCounts
 from .robot import Arm, Robot
 from .targets import (
-    ARM_POINTS,
     JUMP_SPEED,
     STD_GOOD,
     STD_POOR,
@@ -30,6 +30,9 @@ from .targets import (
     clamp_to_reach,
     compute_swivel,
     compute_target_reach,
+    find_hand_segment,
+    find_person_arm,
+    list_needed_segments,
 )
 
 SMOOTHING_HZ = 6.0  # natural frequency of the low-pass, which halves the amplitude there as the zero-phase one does
@@ -185,7 +188,8 @@ class ArmObserver:
     Parameters
     ----------
     segments, points : rows of a live pose
-    lengths_cov : (8, 8) [m²] of the person's lengths in the order of the table; None: exact
+    table : of the person's body; None: the upper body
+    lengths_cov : (k, k) [m²] of the person's lengths in the order of the table; None: exact
     scale : metres of the robot for one of the person; None: a straight arm becomes `compute_target_reach`
 
     Raises
@@ -201,20 +205,22 @@ class ArmObserver:
         points: Sequence[str],
         lengths_cov: np.ndarray | None = None,
         scale: float | None = None,
+        table: BodyTable | None = None,
     ) -> None:
-        check_segments(robot, segments)
+        table = table or load_table()
+        check_segments(robot, segments, table)
         self._robot, self._scale = robot, scale
-        lengths = list(load_table().lengths)
+        lengths = list(table.lengths)
         self._lengths_cov = np.zeros((len(lengths), len(lengths))) if lengths_cov is None else lengths_cov
         self._segments = tuple(segments)
         self._points, self._rows, self._lengths = [], [], []  # of each arm, into points, segments, lengths
         for arm in robot.arms:
-            self._points.append([points.index(f"{arm.side}_{name}") for name in ARM_POINTS])
-            hand = f"{arm.side}_hand" if f"{arm.side}_hand" in segments else f"{arm.side}_forearm"
-            chain = ("torso", f"{arm.side}_upper_arm", f"{arm.side}_forearm", hand)
+            limb = find_person_arm(table, arm.side)
+            self._points.append([points.index(name) for name in limb.points])
+            chain = (*list_needed_segments(limb), find_hand_segment(limb, segments))
             self._rows.append([self._segments.index(name) for name in chain])
-            names = (f"{arm.side}_{part}" for part in ("upper_arm", "forearm", "hand"))
-            self._lengths.append([lengths.index(name) for name in names])
+            names = (table.find_length(*ends) for ends in pairwise(limb.points))
+            self._lengths.append([lengths.index(name) for name in names if name is not None])
         self.scales: list[float] = []
 
     def observe(
@@ -252,9 +258,9 @@ class ArmObserver:
         As `kinematics.compute_point_covariances`, whose hand is against the root: a robot's shoulder does not depend on
         the trunk. The covariance of a segment is known here only as its mean over the axes.
         """
-        torso, upper, fore, hand = self._rows[i]
+        base, upper, fore, hand = self._rows[i]
         links = np.diff(p, axis=0)
-        levers = {torso: p[3] - p[0], upper: p[1] - p[0], fore: p[2] - p[1] if hand != fore else p[3] - p[1]}
+        levers = {base: p[3] - p[0], upper: p[1] - p[0], fore: p[2] - p[1] if hand != fore else p[3] - p[1]}
         levers |= {} if hand == fore else {hand: p[3] - p[2]}
         rotated = sum(2.0 * std[row] ** 2 * float(lever @ lever) for row, lever in levers.items())
         along = (links / np.linalg.norm(links, axis=1, keepdims=True)).T
@@ -263,10 +269,10 @@ class ArmObserver:
         return float(np.sqrt((rotated + lengths) / 3.0))
 
 
-def check_segments(robot: Robot, segments: Sequence[str]) -> None:
+def check_segments(robot: Robot, segments: Sequence[str], table: BodyTable | None = None) -> None:
     """Raise `BadData` where an arm of the robot has no sensors to follow."""
     for arm in robot.arms:
-        needed = ("torso", f"{arm.side}_upper_arm", f"{arm.side}_forearm")
+        needed = list_needed_segments(find_person_arm(table or load_table(), arm.side))
         missing = [name for name in needed if name not in segments]
         if missing:
             raise BadData(

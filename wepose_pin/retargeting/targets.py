@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -12,6 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import BadData, WrongOption
 from ..kinematics import Pose, compute_axis_std
+from ..model import BodyTable, Limb, load_table
+from .maps import SIDES
 from .robot import Arm, Robot
 
 REACH_SHARE = 0.95  # of the robot's reach for a straight arm: its elbow stays flexed, far from the singularity
@@ -22,7 +25,7 @@ MAX_SLOWDOWN = 3.0  # times longer, where tracking is poor
 WEIGHT_POOR = 0.1  # of the hand's tasks, where tracking is poor
 JUMP_SPEED = 12.0  # [m/s] in the person's size: no hand is faster, so the tracking has jumped
 JUMP_S = 0.25  # [s] bridged on each side of a jump
-ARM_POINTS = ("shoulder", "elbow", "wrist", "palm")
+LINKS = 3  # of an arm: upper arm, forearm, hand
 
 
 class HandPath(NamedTuple):
@@ -56,17 +59,37 @@ class ArmTargets:
     scale: dict[str, float]
 
 
+def find_person_arm(table: BodyTable, side: str) -> Limb:
+    """The limb of a person that the robot's arm of this side ("left" or "right") follows: the first one there.
+
+    Raises
+    ------
+    BadData
+        The body has none with three segments on a base: upper arm, forearm, hand.
+    """
+    for tip, limb in table.drawn_limbs.items():
+        if table.side(tip) == side and limb.base is not None and len(limb.segments) == len(limb.points) - 1 == LINKS:
+            return limb
+    raise BadData(f"{table.name} has no {side} arm of {LINKS} segments, as shoulder, elbow, wrist and palm bound them")
+
+
 def compute_arm_targets(
-    pose: Pose, robot: Robot, *, scale: float | None = None, smoothing_hz: float = SMOOTHING_HZ
+    pose: Pose,
+    robot: Robot,
+    *,
+    table: BodyTable | None = None,
+    scale: float | None = None,
+    smoothing_hz: float = SMOOTHING_HZ,
 ) -> ArmTargets:
     """Targets of the robot's hands for a person's pose.
 
-    Each hand is taken relative to its shoulder and to the torso, so leaning and walking do not move the robot's base.
-    Distances are scaled by the ratio of the reaches, orientations are not. NaN, gaps and jumps are bridged and count as
-    poor tracking.
+    Each hand is taken relative to its shoulder and to the segment that carries this, so leaning and walking do not move
+    the robot's base. Distances are scaled by the ratio of the reaches, orientations are not. NaN, gaps and jumps are
+    bridged and count as poor tracking.
 
     Parameters
     ----------
+    table : of the person's body; None: the upper body
     scale : metres of the robot for one of the person; None: a straight arm becomes `compute_target_reach`
     smoothing_hz : cut-off of the zero-phase low-pass; 0: none
 
@@ -81,13 +104,14 @@ def compute_arm_targets(
     time = np.asarray(pose.time, dtype=float)
     if len(time) < 10:
         raise BadData(f"{len(time)} samples in the pose; a motion has at least 10")
-    _check_arms(pose, robot)
-    R_TW = Rotation.from_quat(pose.quat_WL["torso"]).inv()
+    table = table or load_table()
+    _check_arms(pose, robot, table)
     R_BT = Rotation.from_matrix(robot.R_BT)
     hands, scales, slowdown = [], {}, np.ones(len(time))
     for arm in robot.arms:
-        side = arm.side
-        shoulder, elbow, wrist, hand = (pose.points[f"{side}_{name}"] for name in ARM_POINTS)
+        side, limb = arm.side, find_person_arm(table, arm.side)
+        shoulder, elbow, wrist, hand = (pose.points[name] for name in limb.points)
+        R_TW = Rotation.from_quat(pose.quat_WL[str(limb.base)]).inv()
         links = (elbow - shoulder, wrist - elbow, hand - wrist)
         if not all(np.isfinite(link).all(axis=1).any() for link in links):
             raise BadData(f"the {side} arm is not known anywhere in the pose: its points are missing")
@@ -95,14 +119,13 @@ def compute_arm_targets(
         factor = scales[side] = scale or compute_target_reach(robot, arm) / length
         offset = factor * (R_BT * R_TW).apply(hand - shoulder)
         upper = factor * (R_BT * R_TW).apply(elbow - shoulder)
-        segment = f"{side}_hand" if f"{side}_hand" in pose.quat_WL else f"{side}_forearm"
-        rotation = R_BT * R_TW * Rotation.from_quat(pose.quat_WL[segment])
+        rotation = R_BT * R_TW * Rotation.from_quat(pose.quat_WL[find_hand_segment(limb, pose.quat_WL)])
         known = np.isfinite(offset).all(axis=1) & np.isfinite(upper).all(axis=1)
-        known &= np.isfinite(rotation.as_quat()).all(axis=1) & ~_find_gaps(pose, side)
+        known &= np.isfinite(rotation.as_quat()).all(axis=1) & ~_find_gaps(pose, limb)
         known &= ~_find_jumps(time, offset / factor)
         if known.sum() < 2:
             raise BadData(f"the {side} arm is not known anywhere in the pose: its orientations are missing, or lost")
-        measured = _MeasuredArm(time, offset, upper, rotation, known, _hand_std(pose, side, known))
+        measured = _MeasuredArm(time, offset, upper, rotation, known, _hand_std(pose, limb, known))
         hands.append(_smooth(measured, arm, smoothing_hz))
         slowdown = np.maximum(slowdown, 1.0 + (MAX_SLOWDOWN - 1.0) * (1.0 - hands[-1].weight))
     return ArmTargets(time, tuple(hands), slowdown, scales)
@@ -204,9 +227,22 @@ def _nearest_rotations(matrices: np.ndarray) -> np.ndarray:
     return U @ Vt
 
 
-def _check_arms(pose: Pose, robot: Robot) -> None:
+def find_hand_segment(limb: Limb, measured: Collection[str]) -> str:
+    """The segment whose orientation a hand has: its own, or that above where the hand is not measured."""
+    return limb.segments[-1] if limb.segments[-1] in measured else limb.segments[-2]
+
+
+def list_needed_segments(limb: Limb) -> tuple[str, ...]:
+    """The segments that must be measured for an arm to be followed, from the body on."""
+    return (str(limb.base), *limb.segments[:-1])
+
+
+def _check_arms(pose: Pose, robot: Robot, table: BodyTable) -> None:
     """Raise `BadData` where the pose lacks an arm of the robot's."""
-    missing = {side: _missing_names(pose, side) for side in ("left", "right")}
+    followed = {arm.side for arm in robot.arms}
+    sides = [side for side in SIDES if side in followed or side in {table.side(tip) for tip in table.drawn_limbs}]
+    limbs = {side: find_person_arm(table, side) for side in sides}
+    missing = {side: _missing_names(pose, limb) for side, limb in limbs.items()}
     lacking = [arm.side for arm in robot.arms if missing[arm.side]]
     if not lacking:
         return
@@ -217,20 +253,20 @@ def _check_arms(pose: Pose, robot: Robot) -> None:
     present = next((side for side in missing if not missing[side]), None)
     if present is not None:
         raise BadData(f"{text}; {robot.map.name} has no arm for the {present} one, which is there")
-    raise BadData(f"{text}; an arm needs sensors on torso, upper arm and forearm")
+    needed = [table.shared_name(name).replace("_", " ") for name in list_needed_segments(limbs[lacking[0]])]
+    raise BadData(f"{text}; an arm needs sensors on {', '.join(needed[:-1])} and {needed[-1]}")
 
 
-def _missing_names(pose: Pose, side: str) -> list[str]:
+def _missing_names(pose: Pose, limb: Limb) -> list[str]:
     """Segments and points of an arm that the pose lacks."""
-    segments = ("torso", f"{side}_upper_arm", f"{side}_forearm")
-    points = (f"{side}_{name}" for name in ARM_POINTS)
-    return [name for name in segments if name not in pose.quat_WL] + [n for n in points if n not in pose.points]
+    segments = [name for name in list_needed_segments(limb) if name not in pose.quat_WL]
+    return segments + [name for name in limb.points if name not in pose.points]
 
 
-def _find_gaps(pose: Pose, side: str) -> np.ndarray:
+def _find_gaps(pose: Pose, limb: Limb) -> np.ndarray:
     """(n,) bool: a sensor of the arm has a gap."""
     gaps = np.zeros(len(pose.time), dtype=bool)
-    for segment in ("torso", f"{side}_upper_arm", f"{side}_forearm", f"{side}_hand"):
+    for segment in (str(limb.base), *limb.segments):
         if segment in pose.gap:
             gaps |= np.asarray(pose.gap[segment], dtype=bool)
     return gaps
@@ -246,8 +282,8 @@ def _find_jumps(time: np.ndarray, offset: np.ndarray) -> np.ndarray:
     return near
 
 
-def _hand_std(pose: Pose, side: str, known: np.ndarray) -> np.ndarray:
+def _hand_std(pose: Pose, limb: Limb, known: np.ndarray) -> np.ndarray:
     """(n,) [m] of the hand; poor where it is not known."""
-    cov = pose.point_cov.get(f"{side}_palm")
+    cov = pose.point_cov.get(limb.tip)
     std = np.zeros(len(known)) if cov is None else np.nan_to_num(compute_axis_std(cov), nan=STD_POOR)
     return np.where(known, std, STD_POOR)

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..arguments import check_arguments
 from ..errors import NoSolution, WrongOption
 from ..kinematics import Pose
+from ..model import BodyTable
 from .collision import CollisionModel
 from .controller import (
     ActiveConstraints,
@@ -141,6 +142,7 @@ def retarget(
     *,
     rate_hz: float = RATE_HZ,
     params: ControllerParams | None = None,
+    table: BodyTable | None = None,
     scale: float | None = None,
     smoothing_hz: float = SMOOTHING_HZ,
     strict: bool = False,
@@ -153,7 +155,7 @@ def retarget(
     robot : of `load_robot`; or a name such as "panda", or a file, as for `find_map`, then with all its arms
     rate_hz : of the trajectory
     params : of the controller; None: default weights and gains
-    scale, smoothing_hz : as for `compute_arm_targets`
+    table, scale, smoothing_hz : as for `compute_arm_targets`
     strict : raise `NoSolution` for a motion that is too fast for the robot, instead of slowing it
     progress : called with the current stage (`STAGES`) and the fraction of it that is done
 
@@ -169,7 +171,7 @@ def retarget(
         robot = load_robot(find_map(str(robot)))
     check_rate(rate_hz)
     params, dt = params or ControllerParams(), 1.0 / rate_hz
-    arm_targets = compute_arm_targets(pose, robot, scale=scale, smoothing_hz=smoothing_hz)
+    arm_targets = compute_arm_targets(pose, robot, table=table, scale=scale, smoothing_hz=smoothing_hz)
     collision = CollisionModel(robot)
     uniform_time = np.arange(0.0, arm_targets.time[-1] - arm_targets.time[0] + 0.5 * dt, dt)
     motion = resample_targets(arm_targets, arm_targets.time[0] + uniform_time, uniform_time)

@@ -13,12 +13,13 @@ the table, and sensors with noise and bias only. `Imperfections` add those of re
 from .activities import ACTIVITIES, simulate_activity
 from .imperfections import IDEAL_PRESET, MILD_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, NOISE_FREE, Device, ImuNoise
-from .motion import SEGMENTS, SIDES
+from .motion import CIRCLING_POINT, SEGMENTS, SIDES
 from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
 from .subject import MOUNT, Person, Simulation, simulate, simulate_person
 
 __all__ = [
     "ACTIVITIES",
+    "CIRCLING_POINT",
     "GRAVITY",
     "IDEAL_PRESET",
     "MILD_PRESET",

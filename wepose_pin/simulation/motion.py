@@ -18,6 +18,7 @@ from ..errors import BadOption
 from .imperfections import Imperfections
 
 SIDES = {"left": 1.0, "right": -1.0}  # y of the side in W
+CIRCLING_POINT = "right_palm"  # draws the circles after the protocol
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 ARM = ("upper_arm", "forearm", "hand")
 

@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from ..calibration import calibrate_lengths
 from ..evaluation import evaluate
 from ..model import load_table
-from ..simulation import MILD_PRESET, Person, Simulation, simulate, simulate_person
+from ..simulation import CIRCLING_POINT, MILD_PRESET, Person, Simulation, simulate, simulate_person
 from ..subject import Subject, mount_rows
 from ..tracking import track
 from .jobs import Job, Result
+from .paper import list_closed_lengths
 from .tables import ARBITRARY_MOUNTING
 
 METHODS = ("amekf", "smekf")
@@ -37,8 +38,8 @@ def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
         ).subject
         errors = evaluate(track(recording, subject, method=method).pose, truth, simulation.phases["circles"][0])
         figures = _compute_calibration_errors(subject, person, simulation) | {
-            "hand_mm": errors.position["right_palm"]._asdict(),
-            "hand_from_shoulders_mm": errors.position_from_shoulders["right_palm"]._asdict(),
+            "hand_mm": errors.position[CIRCLING_POINT]._asdict(),
+            "hand_from_shoulders_mm": errors.position_on_limb[CIRCLING_POINT]._asdict(),
         }
         results.append(Result(experiment, trial, method, figures))
     return results
@@ -46,7 +47,8 @@ def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
 
 def _compute_calibration_errors(subject: Subject, person: Person, simulation: Simulation) -> dict[str, float]:
     """Compute errors of the calibration, also as multiples of its standard deviations."""
-    names = [name for name in load_table().lengths if name != "trunk"]  # joined hands do not observe the trunk
+    table = load_table()
+    names = list_closed_lengths(table)
     lengths = np.array([subject.lengths[name] - person.lengths[name] for name in names])
     order = list(simulation.quat_LS)
     mounts = np.array(
@@ -60,7 +62,7 @@ def _compute_calibration_errors(subject: Subject, person: Person, simulation: Si
     return {
         "lengths_rms_mm": 1e3 * _rms(lengths),
         "headings_rms_deg": float(np.degrees(_rms(mounts[:, 2]))),
-        "torso_heading_rms_deg": float(np.degrees(abs(mounts[order.index("torso"), 2]))),
+        f"{table.reference}_heading_rms_deg": float(np.degrees(abs(mounts[order.index(table.reference), 2]))),
         "tilts_rms_deg": float(np.degrees(_rms(mounts[:, :2]))),
         "errors_by_std_rms": _rms(np.array(by_std)),
     }

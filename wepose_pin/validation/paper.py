@@ -19,8 +19,10 @@ from .. import rotations
 from ..calibration import Formulation, calibrate_lengths
 from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
 from ..filters.noise import estimate_noise
+from ..model import ROOT, BodyTable, load_table
 from ..recording import OrientationSensor, Recording
 from ..simulation import (
+    CIRCLING_POINT,
     IDEAL_PRESET,
     MILD_PRESET,
     Imperfections,
@@ -142,9 +144,9 @@ def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfect
         series = {}
         if seed == 0:
             inside = recording.span(circles)
-            off = pose.points["right_palm"][inside] - truth.points["right_palm"][inside]
-            paths = {f"{axis}_mm": 1e3 * pose.points["right_palm"][inside, k] for k, axis in enumerate("xyz")}
-            paths |= {f"true_{axis}_mm": 1e3 * truth.points["right_palm"][inside, k] for k, axis in enumerate("xyz")}
+            off = pose.points[CIRCLING_POINT][inside] - truth.points[CIRCLING_POINT][inside]
+            paths = {f"{axis}_mm": 1e3 * pose.points[CIRCLING_POINT][inside, k] for k, axis in enumerate("xyz")}
+            paths |= {f"true_{axis}_mm": 1e3 * truth.points[CIRCLING_POINT][inside, k] for k, axis in enumerate("xyz")}
             series = decimate_curves(recording.time[inside], error_mm=1e3 * np.linalg.norm(off, axis=1), **paths)
         figures = _collect_hand_errors(evaluate(pose, truth, circles)) | {
             "lengths_rms_mm": _compute_lengths_rms(subject, person)
@@ -208,19 +210,23 @@ def _calibrate(
 
 def _collect_hand_errors(errors: Evaluation) -> dict[str, dict[str, float]]:
     figures = {
-        "hand_mm": errors.position["right_palm"]._asdict(),
-        "hand_from_shoulders_mm": errors.position_from_shoulders["right_palm"]._asdict(),
+        "hand_mm": errors.position[CIRCLING_POINT]._asdict(),
+        "hand_from_shoulders_mm": errors.position_on_limb[CIRCLING_POINT]._asdict(),
     }
-    if "right_palm" in errors.position_uncertainty:
-        figures["hand_uncertainty"] = errors.position_uncertainty["right_palm"]._asdict()
+    if CIRCLING_POINT in errors.position_uncertainty:
+        figures["hand_uncertainty"] = errors.position_uncertainty[CIRCLING_POINT]._asdict()
     return figures
 
 
 def _compute_lengths_rms(subject: Subject, person: Person) -> float:
-    """Compute the rms error [mm] of the lengths that the closed chain observes: all but the trunk."""
-    return 1e3 * float(
-        np.sqrt(np.mean([(subject.lengths[n] - person.lengths[n]) ** 2 for n in person.lengths if n != "trunk"]))
-    )
+    """Compute the rms error [mm] of the lengths that the closed chain observes."""
+    errors = [subject.lengths[name] - person.lengths[name] for name in list_closed_lengths(load_table())]
+    return 1e3 * float(np.sqrt(np.mean([error**2 for error in errors])))
+
+
+def list_closed_lengths(table: BodyTable) -> list[str]:
+    """List the lengths that joined hands observe: all but those from the root, as the trunk's."""
+    return [name for name, length in table.lengths.items() if all(ROOT not in part.start for part in length.stretches)]
 
 
 def set_exact_mounts(subject: Subject, simulation: Simulation) -> Subject:

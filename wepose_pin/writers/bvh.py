@@ -15,67 +15,117 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..kinematics import compute_link_poses, compute_pose, solve_configuration
+from ..kinematics import compute_link_poses, find_known_points, solve_configuration
 from ..rotations import conjugate, multiply
 from .motion import Motion, check_complete, diagnose_gaps, resample_evenly
 
 _ROTATIONS = "Zrotation Xrotation Yrotation"
-_NAMES = {"upper_arm": "Arm", "forearm": "ForeArm", "hand": "Hand"}
-_POINT_ABOVE = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist"}
+# Segment → joint, as other programs name them; those of other bodies have the segment's name in capitals.
+NAMES = {
+    "pelvis": "Hips",
+    "torso": "Spine",
+    "head": "Head",
+    **{
+        f"{side}_{segment}": f"{side.capitalize()}{name}"
+        for side in ("left", "right")
+        for segment, name in (
+            *(("upper_arm", "Arm"), ("forearm", "ForeArm"), ("hand", "Hand")),
+            *(("thigh", "UpLeg"), ("shank", "Leg"), ("foot", "Foot")),
+        )
+    },
+}
+ROOTS = ("Hips", "Root")  # the root of a person, whose orientation is that of the segment of this name; of a mechanism
+SHORT_M, LONG_M = 0.2, 0.3  # [m] of a bone whose end is not known: of a segment without a length, and of others
 
 
 class Bone(NamedTuple):
     """A joint and what hangs on it."""
 
     name: str
-    segment: str  # whose orientation it has
+    segment: str | None  # whose orientation it has; None: W's
     at: np.ndarray  # (3,) [m] in W, in the N-pose
     children: list[Bone]
     end: np.ndarray  # (3,) [m] in W, in the N-pose: where it ends, if it has no children
 
 
-def skeleton(motion: Motion) -> Bone:
-    """The bones that are known: Hips, Spine, Head, and of each arm as much as has sensors.
+def build_skeleton(motion: Motion) -> Bone:
+    """The bones that are known: of a person hips, spine, and of each limb as much as has sensors.
 
     Raises
     ------
     BadData
-        The torso is not known, to which the rest is tied.
+        The segment is not known to which the rest is tied.
     """
-    pose, model = motion.pose, motion.model
-    measured = set(pose.quat_WL)
-    if "torso" not in measured:
-        raise BadData(f"{motion.where}: no orientation of the torso in pose.parquet; a .bvh ties the arms to it")
-    upright = {segment: np.array([[0.0, 0.0, 0.0, 1.0]]) for segment in measured}
-    points = {name: p[0] for name, p in compute_pose(model, np.zeros(1), upright).points.items()}
-    middle = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
-    children = [bone for side in ("left", "right") if (bone := _arm(side, "upper_arm", measured, points)) is not None]
-    if "head" in measured:
-        _, p_W = compute_link_poses(model, solve_configuration(model, upright), ["head"], rotations=False)
-        children.append(Bone("Head", "head", p_W[0, 0], [], p_W[0, 0] + [0.0, 0.0, 0.2]))
-    spine = Bone("Spine", "torso", np.zeros(3), children, middle)
-    return Bone("Hips", "pelvis" if "pelvis" in measured else "torso", np.zeros(3), [spine], middle)
+    model, table = motion.model, motion.model.table
+    measured = motion.pose.quat_WL
+    if not table.is_mechanism and table.reference not in measured:
+        raise BadData(
+            f"{motion.where}: no orientation of the {table.reference} in pose.parquet; a .bvh ties the rest to it"
+        )
+    starts, points = _find_places(motion)
+    hips = next((segment for segment in table.segments if NAMES.get(segment) == ROOTS[0]), None)
+
+    def hang(segment: str, above: str | None, above_at: np.ndarray) -> Bone | None:
+        """The bone of a segment; None where it has no sensor and does not lie rigidly between points."""
+        rigid = table.segments[segment].rigid_without_sensor and table.ends(segment) is not None and above is not None
+        if segment not in measured and not rigid:
+            return None
+        at = np.zeros(3) if segment == table.reference and not table.is_mechanism else starts[segment]
+        own = segment if segment in measured else above
+        below = [s for s, parent in model.parents.items() if parent == segment and s != hips]
+        children = [bone for s in below if (bone := hang(s, own, at)) is not None]
+        name = NAMES.get(segment) or "".join(word.capitalize() for word in segment.split("_"))
+        return Bone(name, own, at, children, _find_end(motion, segment, at, above_at, points))
+
+    zero = np.zeros(3)
+    on_hips = [s for s, parent in model.parents.items() if parent is None or parent == hips]
+    bones = [bone for s in on_hips if s != hips and (bone := hang(s, None, zero)) is not None]
+    if table.is_mechanism:
+        return Bone(ROOTS[1], None, zero, bones, zero)
+    return Bone(ROOTS[0], hips if hips in measured else table.reference, zero, bones, bones[0].end)
 
 
-def _arm(side: str, part: str, measured: set[str], points: dict[str, np.ndarray]) -> Bone | None:
-    """An arm from this part down; None where its orientation is not known. A hand may be rigid with its forearm."""
-    segment = f"{side}_{part}"
-    if part == "hand" and segment not in measured:
-        segment = f"{side}_forearm"
-    if segment not in measured:
-        return None
-    at = points[f"{side}_{_POINT_ABOVE[part]}"]
-    if part == "hand":
-        return Bone(f"{side.capitalize()}Hand", segment, at, [], points[f"{side}_palm"])
-    below = "forearm" if part == "upper_arm" else "hand"
-    child = _arm(side, below, measured, points)
-    lower = points.get(f"{side}_{_POINT_ABOVE[below]}", at + [0.0, 0.0, -0.3])
-    return Bone(f"{side.capitalize()}{_NAMES[part]}", segment, at, [child] if child else [], lower)
+def _find_places(motion: Motion) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Where segments begin and points are (3,) [m] in W, in the N-pose; a mechanism's while its joints are at zero."""
+    model = motion.model
+    if model.table.is_mechanism:
+        q = pin.neutral(model.pin)[None]
+    else:
+        q = solve_configuration(model, {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in motion.pose.quat_WL})
+    known = find_known_points(model, motion.pose.quat_WL)
+    links = [*model.table.segments, *(model.point_frames[point] for point in known)]
+    _, p_W = compute_link_poses(model, q, links, rotations=False)
+    placed = [p_W[0, k] for k in range(len(links))]
+    count = len(model.table.segments)
+    return dict(zip(model.table.segments, placed, strict=False)), dict(zip(known, placed[count:], strict=True))
+
+
+def _find_end(
+    motion: Motion, segment: str, at: np.ndarray, above_at: np.ndarray, points: dict[str, np.ndarray]
+) -> np.ndarray:
+    """Where the bone of a segment ends (3,) [m]."""
+    table = motion.model.table
+    if segment == table.reference and (anchors := _find_anchors(motion)):
+        return np.asarray(np.mean([points[point] for point in anchors], axis=0))
+    own = [place for point, place in points.items() if next(reversed(motion.model.reaches[point]), None) == segment]
+    if own:
+        return np.asarray(np.mean(own, axis=0))
+    if table.ends(segment) is not None:
+        return at + LONG_M * np.array(table.segments[segment].along)
+    away = at - above_at
+    return at + SHORT_M * away / max(float(np.linalg.norm(away)), 1e-9)
+
+
+def _find_anchors(motion: Motion) -> tuple[str, ...]:
+    """The points at which limbs hang on the reference segment, as the shoulders; none: no limb does."""
+    table = motion.model.table
+    return next((limb.origin for limb in table.drawn_limbs.values() if limb.base == table.reference), ())
 
 
 def _to_file_axes(v_W: np.ndarray) -> np.ndarray:
@@ -89,11 +139,11 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
     Raises
     ------
     BadData
-        The torso is not known, or a sample has no orientation.
+        A segment to which the rest is tied is not known, or a sample has no orientation.
     """
     check_complete(motion, "a .bvh")
     motion, diagnostics = resample_evenly(motion)
-    root = skeleton(motion)
+    root = build_skeleton(motion)
     columns = [100.0 * _to_file_axes(_root_position(motion, root)), *_rotations(motion, root, None)]
     lines = ["HIERARCHY", *_hierarchy(root, root.at, 0), "MOTION"]
     lines += [f"Frames: {len(motion.pose.time)}", f"Frame Time: {1.0 / motion.rate_hz:.8f}"]
@@ -105,17 +155,32 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
 
 def _root_position(motion: Motion, root: Bone) -> np.ndarray:
     """Where the hips are (n, 3) [m], so that the shoulders are where they were found; a spine of many joints bends."""
-    pose = motion.pose
-    for point in ("left_shoulder", "right_shoulder"):
+    pose, anchors = motion.pose, _find_anchors(motion)
+    if root.segment is None or not anchors:
+        return np.zeros((len(pose.time), 3))
+    for point in anchors:
         if point not in pose.points:
-            raise BadData(f"{motion.where}: no columns {point}_x … in pose.parquet; a .bvh needs both shoulders")
-    middle = 0.5 * (pose.points["left_shoulder"] + pose.points["right_shoulder"])
-    return middle - Rotation.from_quat(pose.quat_WL["torso"]).apply(root.end)
+            raise BadData(
+                f"{motion.where}: no columns {point}_x … in pose.parquet; a .bvh needs {' and '.join(anchors)}"
+            )
+    middle = np.mean([pose.points[point] for point in anchors], axis=0)
+    return np.asarray(middle - Rotation.from_quat(pose.quat_WL[motion.model.table.reference]).apply(root.end))
+
+
+def _orientation(motion: Motion, segment: str | None) -> np.ndarray:
+    """(n, 4) xyzw, the rotation of a segment from the pose of the file's zero."""
+    if segment is None:
+        return np.tile([0.0, 0.0, 0.0, 1.0], (len(motion.pose.time), 1))
+    quat_WL, model = motion.pose.quat_WL[segment], motion.model
+    if not model.table.is_mechanism:
+        return quat_WL
+    R_WL, _ = compute_link_poses(model, pin.neutral(model.pin)[None], [segment])
+    return multiply(quat_WL, conjugate(Rotation.from_matrix(R_WL[0, 0]).as_quat()))
 
 
 def _rotations(motion: Motion, bone: Bone, above: np.ndarray | None) -> Iterator[np.ndarray]:
     """Angles (n, 3) [deg] about z, x, y of each bone, in the order of the hierarchy."""
-    quat_WL = motion.pose.quat_WL[bone.segment]
+    quat_WL = _orientation(motion, bone.segment)
     quat = quat_WL if above is None else multiply(conjugate(above), quat_WL)
     turned = np.column_stack([_to_file_axes(quat[:, :3]), quat[:, 3]])
     yield np.degrees(euler.follow(euler.decompose(turned, "ZXY"), "ZXY", NEAR_LOCK))

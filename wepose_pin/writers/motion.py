@@ -17,8 +17,6 @@ from ..recording import format_span
 EVEN = 0.1
 # Up to so many new samples for one, or up to a few, times are filled; 10 kHz of 100 Hz are a hundred for one.
 _MOST_NEW, _FEW = 200, 1_000_000
-# What moves a point: the segments on its way from the root.
-_WAY = {"shoulder": (), "elbow": ("upper_arm",), "wrist": ("upper_arm", "forearm")}
 
 
 @dataclass(frozen=True)
@@ -138,12 +136,12 @@ def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:
     """
     pose = motion.pose
     if not pose.points:
-        raise BadData(f"{motion.where}: no points in pose.parquet, for lack of a torso sensor; this format needs them")
+        first = motion.model.table.reference
+        raise BadData(
+            f"{motion.where}: no points in pose.parquet, for lack of a sensor on the {first}; this format needs them"
+        )
     points = {}
     for point, p_W in pose.points.items():
-        side, part = point.split("_", 1)
-        hand = ("hand",) if f"{side}_hand" in pose.quat_WL else ()
-        way = ("torso", *(f"{side}_{link}" for link in _WAY.get(part, (*_WAY["wrist"], *hand))))
-        lost = [pose.gap[segment] for segment in way if segment in pose.gap]
+        lost = [pose.gap[link] for link in motion.model.reaches[point] if link in pose.gap]
         points[point] = np.where(np.any(lost, axis=0)[:, None], np.nan, p_W) if lost else p_W
     return points

@@ -1,0 +1,293 @@
+"""The rooms after tracking on a body that is no upper body: legs, by a URDF and a table made here."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reading import headings, rows, text_of
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.evaluation import evaluate
+from wepose_pin.kinematics import Pose, compute_pose
+from wepose_pin.model import BodyModel, load_model
+from wepose_pin.model.table import format_table
+from wepose_pin.readers.describe import describe_file
+from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
+from wepose_pin.report import render_track_report
+from wepose_pin.report.calibration_figures import direction
+from wepose_pin.report.measures import measure_hinge, measure_tips
+from wepose_pin.report.viewer import pose_html
+from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.writers.bvh import write_bvh
+from wepose_pin.writers.export import export
+from wepose_pin.writers.motion import Motion, find_measured_points
+from wepose_pin.writers.result import read_result, write_result
+
+THIGH, SHANK, FOOT, HIP = 0.42, 0.40, 0.18, 0.09  # [m]
+SEGMENTS = ("pelvis", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot")
+
+TABLE = """
+urdf = "legs.urdf"
+[segments]
+pelvis = { spine = true, labels = "pelvis|sacrum" }
+left_thigh = { labels = "thigh|femur" }
+left_shank = { labels = "shank|tibia" }
+left_foot = { along = "+x", without_sensor = "rigid", labels = "foot" }
+right_thigh = { labels = "thigh|femur" }
+right_shank = { labels = "shank|tibia" }
+right_foot = { along = "+x", without_sensor = "rigid", labels = "foot" }
+[points]
+left_hip = "left_thigh"
+left_knee = "left_shank"
+left_ankle = "left_foot"
+left_toe = "left_toe"
+right_hip = "right_thigh"
+right_knee = "right_shank"
+right_ankle = "right_foot"
+right_toe = "right_toe"
+[lengths]
+hip_width = { segment = "pelvis", from = "right_hip", to = "left_hip" }
+left_thigh = { segment = "left_thigh", from = "left_hip", to = "left_knee" }
+left_shank = { segment = "left_shank", from = "left_knee", to = "left_ankle" }
+left_foot = { segment = "left_foot", from = "left_ankle", to = "left_toe" }
+right_thigh = { segment = "right_thigh", from = "right_hip", to = "right_knee" }
+right_shank = { segment = "right_shank", from = "right_knee", to = "right_ankle" }
+right_foot = { segment = "right_foot", from = "right_ankle", to = "right_toe" }
+[hinges]
+left_knee = { on = "left_thigh", moves = "left_shank", axis = [0.0, 1.0, 0.0], range_deg = [-10.0, 150.0] }
+right_knee = { on = "right_thigh", moves = "right_shank", axis = [0.0, 1.0, 0.0], range_deg = [-10.0, 150.0] }
+[pairs]
+left_thigh = "right_thigh"
+left_shank = "right_shank"
+left_foot = "right_foot"
+left_hip = "right_hip"
+left_knee = "right_knee"
+left_ankle = "right_ankle"
+left_toe = "right_toe"
+[sensors]
+left_thigh = { place = "outside, above the knee" }
+[draw]
+limbs = [
+    ["right_hip", "left_hip"],
+    ["left_hip", "left_knee", "left_ankle", "left_toe"],
+    ["right_hip", "right_knee", "right_ankle", "right_toe"],
+]
+paths = ["left_toe", "right_toe"]
+"""
+
+
+def spherical(parent: str, child: str, origin: str) -> str:
+    """Three revolute joints between two links of a URDF."""
+    links = [parent, f"{child}_x_link", f"{child}_y_link", child]
+    text = "".join(f'<link name="{link}"/>' for link in links[1:3])
+    for k, axis in enumerate(("1 0 0", "0 1 0", "0 0 1")):
+        text += (
+            f'<joint name="{child}_{"xyz"[k]}" type="revolute">'
+            f'<parent link="{links[k]}"/><child link="{links[k + 1]}"/>'
+            f'<origin xyz="{origin if k == 0 else "0 0 0"}"/><axis xyz="{axis}"/>'
+            '<limit lower="-3.14" upper="3.14" effort="100" velocity="40"/></joint>'
+        )
+    return text
+
+
+def cylinder(link: str, length: float) -> str:
+    return (
+        f'<link name="{link}"><visual><origin xyz="0 0 {-length / 2}"/><geometry><cylinder radius="0.05" '
+        f'length="{length}"/></geometry></visual></link>'
+    )
+
+
+@pytest.fixture(scope="module")
+def body(tmp_path_factory: pytest.TempPathFactory) -> BodyModel:
+    urdf = '<robot name="legs"><link name="ground"/>' + cylinder("pelvis", 0.1) + spherical("ground", "pelvis", "0 0 0")
+    for side, y in (("left", HIP), ("right", -HIP)):
+        urdf += spherical("pelvis", f"{side}_thigh", f"0 {y} 0") + cylinder(f"{side}_thigh", THIGH)
+        urdf += spherical(f"{side}_thigh", f"{side}_shank", f"0 0 {-THIGH}") + cylinder(f"{side}_shank", SHANK)
+        urdf += spherical(f"{side}_shank", f"{side}_foot", f"0 0 {-SHANK}") + cylinder(f"{side}_foot", 0.05)
+        urdf += (
+            f'<link name="{side}_toe"/><joint name="{side}_toe" type="fixed"><parent link="{side}_foot"/>'
+            f'<child link="{side}_toe"/><origin xyz="{FOOT} 0 0"/></joint>'
+        )
+    folder = tmp_path_factory.mktemp("legs")
+    (folder / "legs.urdf").write_text(urdf + "</robot>", encoding="utf-8")
+    (folder / "legs.toml").write_text(TABLE, encoding="utf-8")
+    return load_model(folder / "legs.toml")
+
+
+def squats(time: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Flexion of the knees [deg], and the orientations of the segments; it begins with 4 s of standing."""
+    flexion = 45.0 * (1.0 - np.cos(2.0 * np.pi * 0.3 * np.clip(time - 4.0, 0.0, None)))
+    tilts = {"pelvis": 0.2 * flexion, "thigh": -0.5 * flexion, "shank": 0.5 * flexion, "foot": 0.0 * flexion}
+    return flexion, {
+        name: Rotation.from_euler("y", tilts[name.split("_")[-1]][:, None], degrees=True).as_quat() for name in SEGMENTS
+    }
+
+
+@pytest.fixture(scope="module")
+def tracked(body: BodyModel) -> TrackedRecording:
+    time = np.arange(0.0, 20.0, 0.02)
+    sensors: Mapping[str, OrientationSensor] = {
+        name: OrientationSensor(quat_WS=quat, stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]))
+        for name, quat in squats(time)[1].items()
+    }
+    return track(Recording("squats", time, 50.0, sensors, phases={"start": ((0.5, 3.5),)}), model=body)
+
+
+def test_knees_bend_forwards_and_toes_are_seen_from_the_hips(tracked: TrackedRecording) -> None:
+    flexion, _ = squats(tracked.time)
+    table = tracked.model.table
+    knee = measure_hinge(tracked.pose, table, "left_knee")
+    assert knee is not None
+    np.testing.assert_allclose(np.degrees(knee.flexion), flexion, atol=0.01)
+    np.testing.assert_allclose(knee.aside, 0.0, atol=1e-4)
+    tips = measure_tips(tracked.pose, 50.0, table)
+    assert set(tips) == {"left_toe", "right_toe"}
+    np.testing.assert_allclose(tips["left_toe"].reach[0], [FOOT, HIP, -THIGH - SHANK], atol=1e-6)
+    R_PW = Rotation.from_euler("y", -0.2 * flexion[:, None], degrees=True)
+    deep = int(np.argmax(flexion))
+    expected = R_PW[deep].apply(tracked.points["right_toe"][deep])
+    np.testing.assert_allclose(tips["right_toe"].reach[deep], expected, atol=1e-6)
+
+
+def test_its_report_has_its_words(tracked: TrackedRecording) -> None:
+    """From gyroscopes and accelerometers, so that the page has all its sections."""
+    rng = np.random.default_rng(4)
+    sensors = {}
+    for name, quat in squats(tracked.time)[1].items():
+        R = Rotation.from_quat(quat)
+        rate = np.concatenate([np.zeros((1, 3)), (R[:-1].inv() * R[1:]).as_rotvec() * 50.0])
+        force = R.inv().apply([0.0, 0.0, 9.81])
+        sensors[name] = ImuSensor(
+            rate + rng.normal(0.0, 0.003, rate.shape),
+            force + rng.normal(0.0, 0.02, force.shape),
+            np.array([0.0, 0.0, 0.0, 1.0]),
+        )
+    measured = track(replace(tracked.recording, sensors=sensors), model=tracked.model)
+    failures: list[str] = []
+    page = render_track_report(measured, failures=failures)
+    assert failures == []
+    assert "The feet" in headings(page)
+    text = text_of(page)
+    assert [row[0] for row in rows(page) if row[0].endswith(("hip", "knee", "ankle"))] == [
+        f"{side} {joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle")
+    ]
+    assert "Left toe and right toe, from the middle of the hips along the pelvis's own axes" in text
+    assert not re.search(
+        r"elbow|forearm|shoulder|palm|\bhands\b", text.split("What was run")[0].split("Joint angles")[0]
+    )
+
+
+@pytest.mark.parametrize("angle", [0.1, -0.1])
+def test_tilts_of_legs_are_named_by_where_the_free_end_goes(body: BodyModel, angle: float) -> None:
+    toe = Rotation.from_euler("y", angle).apply([1.0, 0.0, 0.0])
+    assert direction(body.table, "left_foot", 0, angle) == ("downwards" if toe[2] < 0.0 else "upwards")
+    knee = Rotation.from_euler("x", angle).apply([0.0, 0.0, -1.0])
+    assert direction(body.table, "right_thigh", 1, angle) == ("inwards" if knee[1] > 0.0 else "outwards")
+
+
+def test_its_page_draws_trails_of_the_toes(tracked: TrackedRecording) -> None:
+    page = pose_html(tracked.model, tracked.pose)
+    assert '"left_toe"' in page
+    assert '"right_toe"' in page
+
+
+def test_its_result_is_read_exported_and_evaluated(tracked: TrackedRecording, tmp_path: Path) -> None:
+    folder = tmp_path / "result"
+    folder.mkdir()
+    write_result(folder, tracked)
+    (folder / "model.toml").write_text(format_table(tracked.model.table, "subject.urdf"), encoding="utf-8")
+    pose, model, _ = read_result(folder)
+    assert model.table.paths == ("left_toe", "right_toe")
+    for suffix in ("bvh", "csv", "trc"):
+        export(folder, tmp_path / f"m.{suffix}")
+    bvh = (tmp_path / "m.bvh").read_text(encoding="utf-8")
+    bones = re.findall(r"(?:ROOT|JOINT) (\w+)", bvh)
+    assert bones == ["Hips", "LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "RightLeg", "RightFoot"]
+    errors = evaluate(pose, tracked.pose, table=model.table)
+    assert set(errors.position_on_limb) == {
+        f"{side}_{p}" for side in ("left", "right") for p in ("knee", "ankle", "toe")
+    }
+    assert max(error.worst for error in errors.position_on_limb.values()) < 0.01
+
+
+def test_a_point_is_lost_where_a_segment_on_its_way_is(tracked: TrackedRecording) -> None:
+    lost = np.zeros(len(tracked.time), dtype=bool)
+    lost[100:200] = True
+    gaps = Pose(tracked.time, tracked.quat_WL, tracked.points, gap={"left_shank": lost})
+    points = find_measured_points(Motion(gaps, tracked.model, "squats", "here"))
+    for point, there in points.items():
+        assert np.isnan(there[150]).all() == (point in ("left_ankle", "left_toe")), point
+
+
+def test_info_proposes_its_segments(body: BodyModel, tmp_path: Path) -> None:
+    time = np.arange(0.0, 3.0, 0.01)
+    names = [
+        f"{place}_{signal}_{axis}" for place in ("femur_l", "sacrum") for signal in ("gyr", "acc") for axis in "xyz"
+    ]
+    rows = np.column_stack([time, np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (len(time), 2))])
+    np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header=",".join(["time", *names]), comments="")
+    session = describe_file(tmp_path / "d.csv", table=body.table).session
+    assert session is not None
+    assert "[sensors.left_thigh]   # usually outside, above the knee" in session
+    assert "[sensors.pelvis]" in session
+    assert "not known without one: left_shank, right_thigh, right_shank" in session
+
+
+# A robot --------------------------------------------------------------------------------------------------------------
+
+ROBOT = """<robot name="arm"><link name="base"/><link name="upper"/><link name="lower"/><link name="tip"/>
+<joint name="lift" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.3" rpy="0.5 0 0"/>
+<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="10" velocity="3"/></joint>
+<joint name="bend" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0.4 0 0"/>
+<axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="10" velocity="3"/></joint>
+<joint name="end" type="fixed"><parent link="lower"/><child link="tip"/><origin xyz="0.3 0 0"/></joint></robot>"""
+ROBOT_TABLE = """
+urdf = "arm.urdf"
+kind = "mechanism"
+[segments]
+upper = { along = "+x" }
+lower = { along = "+x" }
+[points]
+shoulder = "upper"
+elbow = "lower"
+tip = "tip"
+[draw]
+limbs = [["shoulder", "elbow", "tip"]]
+paths = ["tip"]
+"""
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> BodyModel:
+    folder = tmp_path_factory.mktemp("arm")
+    (folder / "arm.urdf").write_text(ROBOT, encoding="utf-8")
+    (folder / "arm.toml").write_text(ROBOT_TABLE, encoding="utf-8")
+    return load_model(folder / "arm.toml")
+
+
+def test_a_robots_skeleton_has_its_links_and_its_tip_lies_where_it_is(robot: BodyModel, tmp_path: Path) -> None:
+    time = np.arange(0.0, 2.0, 0.02)
+    lift, bend = (Rotation.from_euler(axis, np.sin(time)[:, None]) for axis in ("z", "y"))
+    R_upper = Rotation.from_euler("x", 0.5) * lift
+    quat_WL = {"upper": R_upper.as_quat(), "lower": (R_upper * bend).as_quat()}
+    pose = compute_pose(robot, time, quat_WL)
+    expected = [0.0, 0.0, 0.3] + R_upper.apply([0.4, 0.0, 0.0]) + (R_upper * bend).apply([0.3, 0.0, 0.0])
+    np.testing.assert_allclose(pose.points["tip"], expected, atol=1e-9)
+    tips = measure_tips(pose, 50.0, robot.table)
+    np.testing.assert_allclose(tips["tip"].reach, expected - [0.0, 0.0, 0.3], atol=1e-9)  # from its shoulder, along W
+    write_bvh(tmp_path / "m.bvh", Motion(pose, robot, "arm", "here"))
+    bvh = (tmp_path / "m.bvh").read_text(encoding="utf-8")
+    assert re.findall(r"(?:ROOT|JOINT) (\w+)", bvh) == ["Root", "Upper", "Lower"]
+    # Forward kinematics by the file: x left, y up, z forward, in cm; rotations by z, x, y.
+    offsets = [np.array(row.split(), float) for row in re.findall(r"OFFSET (.*)", bvh)]
+    row = np.array(bvh.strip().split("\n")[-1].split(), float)
+    turns = [Rotation.from_euler("ZXY", row[k : k + 3], degrees=True) for k in (3, 6, 9)]
+    tip = offsets[1] + turns[1].apply(offsets[2] + turns[2].apply(offsets[3]))
+    np.testing.assert_allclose(tip, 100.0 * expected[-1][[1, 2, 0]], atol=1e-3)
+    assert '"tip"' in pose_html(robot, pose)
+    assert evaluate(pose, pose, table=robot.table).position_on_limb["tip"].worst == pytest.approx(0.0, abs=1e-9)
