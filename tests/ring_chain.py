@@ -17,6 +17,7 @@ from wepose_pin.validation import real
 START_S = 0.7  # until seg1 is taken up; nothing moves before
 MOTION_S = (real.UNSCORED_S, 66.0)  # that on which the validation's own script fits its lengths
 LINK = 0.2  # [m] of each link in arm.xml
+END = np.array([LINK, 0.0, 0.0])  # [m] a point on seg5 from its marker; the marker is too near to the joint
 
 # arm.xml: seg1 free, seg2 on a ball joint, then hinges about x, y and z. What is free to turn is three hinges here.
 JOINTS = {"seg1": "zyx", "seg2": "zyx", "seg3": "x", "seg4": "y", "seg5": "z"}
@@ -114,14 +115,15 @@ def write_ring_session(files: RingFiles, mount: str, folder: Path) -> RingSessio
         A = np.concatenate([true[near][known].as_matrix(), -true[far][known].as_matrix()], axis=2).reshape(-1, 6)
         b = R_WV.apply(chain.origin_V[far][known] - chain.origin_V[near][known]).ravel()
         centres[near, far] = np.linalg.lstsq(A, b, rcond=1e-6)[0]
-    head, end = -centres["seg1", "seg2"][:3], -centres["seg4", "seg5"][3:]
+    # Each link's own frame has its origin at its joint, seg1's before its end by `LINK`.
+    head, end = [LINK, 0.0, 0.0] - centres["seg1", "seg2"][:3], END - centres["seg4", "seg5"][3:]
     ball = R_WV.apply(np.nan_to_num(chain.origin_V["seg2"])) + true["seg2"].apply(centres["seg1", "seg2"][3:])
     tip = ball + R_WV.apply(np.nan_to_num(links.tip_V))
     points = {
         "ball": ball,
         "tip": tip,
         "head": R_WV.apply(np.nan_to_num(chain.origin_V["seg1"])),
-        "end": R_WV.apply(np.nan_to_num(chain.origin_V["seg5"])),
+        "end": R_WV.apply(np.nan_to_num(chain.origin_V["seg5"])) + true["seg5"].apply(END),
     }
     columns = {"time": time}
     for name, place in points.items():

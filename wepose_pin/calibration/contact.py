@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .conditions import Loop
 from .least_squares import Observations, residuals
 
 WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
@@ -40,7 +41,11 @@ def find_contact_start(
 
     best = start_from(observations)
     lowest = score(best)
-    if observations.closed.all() and np.mean(gap_ratios(best, few) > 1.0) > MANY_WIDE and n > 2 * WINDOWS * window:
+    # Recorded places are those of the point at any time: no contact is lost.
+    touching = observations.closed.all() and any(
+        c.kind != "recorded" for c in observations.conditions if isinstance(c, Loop)
+    )
+    if touching and np.mean(gap_ratios(best, few) > 1.0) > MANY_WIDE and n > 2 * WINDOWS * window:
         rng = np.random.default_rng(0)
         windows = [np.array_split(np.arange(n)[span], (span.stop - span.start) // window or 1) for span in spans]
         for _ in range(SUBSETS):
