@@ -31,7 +31,7 @@ def ring_urdf() -> str:
             child = segment if k == len(axes) - 1 else f"{segment}_{axis}_link"
             at = f"{LINK} 0 0" if k == 0 and segment != "seg1" else "0 0 0"
             text += (
-                f'<link name="{child}"/><joint name="{segment}_{axis}" type="revolute"><parent link="{parent}"/>'
+                f'<link name="{child}"/><joint name="{segment}_{axis}" type="continuous"><parent link="{parent}"/>'
                 f'<child link="{child}"/><origin xyz="{at}"/><axis xyz="{AXES[axis]}"/>'
                 f'<limit lower="-6.3" upper="6.3" effort="1" velocity="100"/></joint>'
             )

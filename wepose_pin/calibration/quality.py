@@ -436,7 +436,7 @@ def document(calibration: Calibration, quality: CalibrationQuality) -> dict[str,
         ],
         "protocol": calibration.protocol,
         "measured": dict(calibration.measured),
-        "scale_std": calibration.scale_std,
+        "scale_std": _number(calibration.scale_std),
         "lengths": {n: {"value": v, "std": _number(subject.std(n))} for n, v in subject.lengths.items()},
         "mounts": {
             segment: {
@@ -467,7 +467,7 @@ def document(calibration: Calibration, quality: CalibrationQuality) -> dict[str,
             "condition": _number(quality.condition),
             "directions": quality.directions,
         },
-        "motion_deg": quality.motion,
+        "motion_deg": {**quality.motion._asdict(), "lean": _number(quality.motion.lean)},
         "labels": {"doubt": _number(calibration.labels.doubt), "moved": dict(calibration.labels.moved)},
     }
 
