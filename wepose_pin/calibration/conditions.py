@@ -161,12 +161,7 @@ def resolve_conditions(
 def _resolve_closure(
     closure: Closure, protocol: Protocol, model: BodyModel, start: StartPose, sensors: Collection[str]
 ) -> Loop:
-    if closure.kind in ("coincide", "distance"):
-        first, last = closure.points
-        signed = [[(first, 1.0), (last, -1.0)]]
-    else:
-        signed = [[(point, 1.0)] for point in closure.points]
-    ways = tuple(find_parts(model, start, sensors, points) for points in signed)
+    ways = tuple(find_parts(model, start, sensors, points) for points in closure.ways)
     if not any(part.sensor != UNIVERSE for way in ways for part in way):
         raise BadSession(f"protocol '{protocol.name}': no sensor moves {' and '.join(closure.points)}")
     return Loop(closure, ways)
@@ -241,9 +236,8 @@ def find_measured_lengths(protocol: Protocol, model: BodyModel) -> tuple[str, ..
     """The lengths in some closure of a protocol."""
     names: dict[str, None] = {}
     for closure in protocol.closures:
-        signs = (1.0, -1.0) if closure.kind in ("coincide", "distance") else (1.0,) * len(closure.points)
         total: dict[str, np.ndarray] = {}
-        for point, sign in zip(closure.points, signs, strict=True):
+        for point, sign in (signed for way in closure.ways for signed in way):
             for link, part in model.reaches.get(point, {}).items():
                 total[link] = total.get(link, 0.0) + sign * part.by_length
                 if closure.kind == "plane":
@@ -263,9 +257,19 @@ def find_segments(protocol: Protocol, model: BodyModel) -> frozenset[str]:
     if any(isinstance(condition, Direction) for condition in protocol.conditions):
         used.add(model.table.reference)
     for closure in protocol.closures:
-        for link in {link for point in closure.points for link in model.reaches.get(point, {})}:
+        points = {point for way in closure.ways for point, _ in way}
+        for link in {link for point in points for link in model.reaches.get(point, {})}:
             used |= {link} & set(model.table.segments)
     return frozenset(used & set(model.table.segments))
+
+
+def fix_scale(constraints: Collection[Constraint]) -> bool:
+    """Whether the closures have a scale of their own: a recorded or known place, or a link of known size."""
+    loops = [constraint for constraint in constraints if isinstance(constraint, Loop)]
+    return any(
+        loop.kind == "recorded" or loop.closure.at is not None or any(np.any(part.constant) for part in loop.parts)
+        for loop in loops
+    )
 
 
 def group_lengths(constraints: Collection[Constraint], lengths: Collection[str]) -> dict[str, tuple[str, ...]]:

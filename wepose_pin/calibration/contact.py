@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .conditions import Loop
 from .least_squares import Observations, residuals
 
 WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
@@ -28,7 +29,7 @@ def find_contact_start(
     ----------
     start_from : observations → x (m,), the prior's mean with headings from the closure of these observations
     """
-    n = len(observations)
+    n, spans = len(observations), [span for _, span in observations.spans()]
     window = max(5, round(WINDOW_S / max(float(np.median(np.diff(observations.data[-1]))), 1e-3)))
     few = observations.take(np.linspace(0, n - 1, min(n, SCORED)).astype(int))
 
@@ -40,12 +41,16 @@ def find_contact_start(
 
     best = start_from(observations)
     lowest = score(best)
-    if observations.closed.all() and np.mean(gap_ratios(best, few) > 1.0) > MANY_WIDE and n > 2 * WINDOWS * window:
+    # Recorded places are those of the point at any time: no contact is lost.
+    touching = observations.closed.all() and any(
+        c.kind != "recorded" for c in observations.conditions if isinstance(c, Loop)
+    )
+    if touching and np.mean(gap_ratios(best, few) > 1.0) > MANY_WIDE and n > 2 * WINDOWS * window:
         rng = np.random.default_rng(0)
-        windows = np.array_split(np.arange(n), n // window)
+        windows = [np.array_split(np.arange(n)[span], (span.stop - span.start) // window or 1) for span in spans]
         for _ in range(SUBSETS):
-            chosen = rng.choice(len(windows), WINDOWS, replace=False)
-            x = start_from(observations.take(np.concatenate([windows[k] for k in np.sort(chosen)])))
+            chosen = [own[k] for own in windows for k in np.sort(rng.choice(len(own), min(WINDOWS, len(own)), False))]
+            x = start_from(observations.take(np.concatenate(chosen)))
             cost = score(x)
             if cost < lowest:
                 best, lowest = x, cost

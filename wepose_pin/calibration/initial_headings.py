@@ -197,14 +197,17 @@ def _find_minima(
     """Headings and log sizes (`nearer`, 2 m) at the minima that the best of many starts reach, the lowest first."""
     sensors, layout = observations.layout.sensors, observations.layout
     m = len(sensors)
-    parts = []  # of each way of a closure: it, Q (m, n, 3, 3), u (m, 3) each sensor's part, what does not move (3,)
+    # Of each way of a closure: it, Q (m, n, 3, 3), u (m, 3) each sensor's part, what does not move (3,), or less the
+    # recorded places (n, 3).
+    parts = []
     for loop, span in observations.spans():
         if not isinstance(loop, Loop):
             continue
         few = np.unique(np.linspace(span.start, span.stop - 1, SEARCH_SAMPLES).astype(int))
         Q = np.stack([R.as_matrix() for R in _rotations(observations.take(few)).values()])
+        places = observations.data[layout.place][:, few].T if loop.kind == "recorded" else np.zeros(3)
         for way in loop.ways:
-            u, still = np.zeros((m, 3)), np.zeros(3)
+            u, still = np.zeros((m, 3)), -places
             for part in way:
                 if part.sensor == UNIVERSE:
                     still = still + part.vector(known_x[layout.length])

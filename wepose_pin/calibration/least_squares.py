@@ -51,6 +51,7 @@ class Layout(NamedTuple):
     planes : how many level planes of unknown height
     distance_names : of the unknown distances outside the body
     steps : the sensor of each heading step
+    recorded : whether the samples hold a recorded place
     """
 
     lengths: tuple[str, ...]
@@ -61,6 +62,7 @@ class Layout(NamedTuple):
     planes: int = 0
     distance_names: tuple[str, ...] = ()
     steps: tuple[str, ...] = ()
+    recorded: bool = False
 
     @property
     def length(self) -> slice:
@@ -124,7 +126,17 @@ class Layout(NamedTuple):
     @property
     def rows(self) -> int:
         """Length of a sample's data."""
-        return 4 * len(self.sensors) + len(self.steps) + 1
+        return self.place.stop + 1
+
+    @property
+    def beyond(self) -> slice:
+        """Of a sample's data: whether it is beyond each heading step."""
+        return slice(4 * len(self.sensors), 4 * len(self.sensors) + len(self.steps))
+
+    @property
+    def place(self) -> slice:
+        """Of a sample's data: the recorded place (3,) [m] in W."""
+        return slice(self.beyond.stop, self.beyond.stop + 3 * self.recorded)
 
     @property
     def residuals(self) -> int:
@@ -144,7 +156,7 @@ class Observations:
     """n samples, each of one condition."""
 
     layout: Layout
-    data: np.ndarray  # (rows, n): Q of each sensor xyzw, whether it is beyond each step, [s] since the start pose
+    data: np.ndarray  # (rows, n): Q of each sensor xyzw, `Layout.beyond`, `Layout.place`, [s] since the start pose
     conditions: tuple[Constraint, ...]
     condition_index: np.ndarray  # (n,) of each sample's condition, never falling
     step_std: np.ndarray = field(default_factory=lambda: np.empty(0))  # [rad] of each step, before the motion
@@ -159,7 +171,7 @@ class Observations:
     @property
     def beyond(self) -> np.ndarray:
         """(steps, n) bool: which samples are beyond each heading step."""
-        return self.data[4 * len(self.layout.sensors) : -1] > 0.5
+        return self.data[self.layout.beyond] > 0.5
 
     def apply_steps(self, x: np.ndarray) -> Observations:
         """The same samples with the heading steps of `x` applied to Q."""
@@ -168,7 +180,7 @@ class Observations:
             i = 4 * self.layout.sensors.index(name)
             Q = Rotation.from_quat(data[i : i + 4, beyond].T)
             data[i : i + 4, beyond] = (Rotation.from_rotvec([0.0, 0.0, step]) * Q).as_quat().T
-        data = np.delete(data, np.arange(4 * len(self.layout.sensors), len(data) - 1), axis=0)
+        data = np.delete(data, self.layout.beyond, axis=0)
         return replace(self, layout=self.layout._replace(steps=()), data=data, step_std=np.empty(0))
 
     def spans(self) -> list[tuple[Constraint, slice]]:
@@ -253,7 +265,7 @@ def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any
         now = heading[i] + drift[i] * data[-1]
         for k, sensor in enumerate(layout.steps):
             if sensor == name:
-                now += x[layout.step.start + k] * data[4 * len(sensors) + k]
+                now += x[layout.step.start + k] * data[layout.beyond.start + k]
         turned = product(about_z(now), data[4 * i : 4 * i + 4])
         turned = product(turned, about_z(-heading[i]))
         quat = product(turned, small_turn(ca.vertcat(tilt[2 * i], tilt[2 * i + 1], 0.0)))
@@ -261,7 +273,7 @@ def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any
         quat_WL[name] = product(quat, small_turn(A @ (rotate(inverse(quat), _UP) - _UP)))
     gap, hinges = ca.SX.zeros(3), ca.SX.zeros(len(layout.hinges))
     if isinstance(condition, Loop):
-        whitened, gap = _closure_residual(layout, condition, x, quat_WL, place)
+        whitened, gap = _closure_residual(layout, condition, x, quat_WL, place, data[layout.place])
         hinges = _hinge_residuals(layout, x, quat_WL)
     elif isinstance(condition, Pointing):
         along = rotate(
@@ -299,8 +311,10 @@ def orient_parts(layout: Layout, x: Any, quat_WL: Mapping[str, Any], parts: Sequ
     return vectors
 
 
-def _closure_residual(layout: Layout, loop: Loop, x: Any, quat_WL: Mapping[str, Any], place: int) -> tuple[Any, Any]:
-    """Whitened residual (3) and gap (3) [m] of a closure."""
+def _closure_residual(
+    layout: Layout, loop: Loop, x: Any, quat_WL: Mapping[str, Any], place: int, recorded: Any
+) -> tuple[Any, Any]:
+    """Whitened residual (3) and gap (3) [m] of a closure; `recorded` (3) [m] is the sample's recorded place."""
     gaps, covariances = [], []
     for way in loop.ways:
         gap, covariance = ca.SX.zeros(3), loop.closure.slip**2 * ca.SX.eye(3)
@@ -325,6 +339,8 @@ def _closure_residual(layout: Layout, loop: Loop, x: Any, quat_WL: Mapping[str, 
     if loop.kind == "fixed_point":
         first = layout.points.start + 3 * place
         gap -= x[first : first + 3]
+    elif loop.kind == "recorded":
+        gap -= recorded
     return ca.solve(ca.chol(covariance).T, gap), gap
 
 

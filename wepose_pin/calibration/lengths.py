@@ -42,7 +42,7 @@ from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
 from .anatomy import BETTER, LabelCheck, check_labels
-from .conditions import find_hinges, find_measured_lengths, group_lengths
+from .conditions import find_hinges, find_measured_lengths, fix_scale, group_lengths
 from .contact import find_contact_start
 from .doubled import add_second_mounts
 from .joints import add_couplings, estimate_couplings
@@ -278,7 +278,10 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
     hinges = _hinges(fit.hinge[observations.closed], fit.x[layout.hinge], problem) if observations.closed.any() else {}
     offsets = Rotation.from_rotvec(np.pad(fit.x[layout.tilt].reshape(-1, 2), ((0, 0), (0, 1)))).as_rotvec()[:, :2]
     subject = _make_subject(problem, solution, {joint: hinge for joint, (hinge, _) in hinges.items()}, offsets)
-    scale = f"measured: {', '.join(scale_lengths)}" if scale_lengths else "of the population prior"
+    scale_observed = fix_scale(problem.conditions)
+    scale = "of the population prior"
+    if scale_lengths or scale_observed:
+        scale = f"measured: {', '.join(scale_lengths)}" if scale_lengths else "of the closure"
 
     prior_x = fit.x.copy()
     prior_x[layout.length] = [prior.lengths[name] for name in layout.lengths]
@@ -289,8 +292,9 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
 
     diagnostics = list(problem.filtered.diagnostics)
     prior_lengths_cov = np.linalg.inv(solution.prior.information[layout.length, layout.length])
-    free_scale_std = None if scale_lengths else scale_std
-    diagnostics += diagnose_lengths(problem, lengths, covariance, prior_lengths_cov, free_scale_std)
+    if not scale_observed:
+        free_scale_std = None if scale_lengths else scale_std
+        diagnostics += diagnose_lengths(problem, lengths, covariance, prior_lengths_cov, free_scale_std)
     diagnostics += diagnose_distances(problem)
     diagnostics += diagnose_ambiguity(solution.alternatives, layout)
     diagnostics += diagnose_mounts([name for name in problem.filtered.R_VS if name not in subject.mounts], problem)

@@ -31,6 +31,7 @@ from .initial_headings import is_linear
 from .least_squares import Layout, Observations
 from .losses import check_start_pose, find_losses, find_unknown_tilt, group_steps, mask_connected
 from .protocols import Protocol
+from .recorded import read_recorded_places
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
@@ -194,11 +195,12 @@ class CalibrationProblem:
             sum(closure.kind == "fixed_point" for closure in protocol.closures),
             sum(closure.kind == "plane" for closure in protocol.closures),
             protocol.distances,
+            recorded=any(closure.kind == "recorded" for closure in protocol.closures),
         )
         losses = find_losses(recording, filtered.start, layout.sensors)
         # Only the linear start can estimate a heading step of any size.
         separate = [] if is_linear(self.conditions) else [loss for loss in losses if loss.free]
-        parts = []
+        parts, places = [], []
         gaps = {name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None}
         for condition, constraint in zip(protocol.conditions, self.conditions, strict=True):
             spans = [recording.span(interval) for interval in recording.phase(condition.phase)]
@@ -209,7 +211,16 @@ class CalibrationProblem:
                 missing[name] = missing[name] | find_unknown_tilt(filtered.orientation[name], phase)
             lost = [name for name, rows in missing.items() if rows.any()]
             measured = phase[~np.any([missing[name] for name in lost], axis=0)] if lost else phase
-            parts.append(measured[mask_connected(separate, measured)])
+            measured = measured[mask_connected(separate, measured)]
+            place = np.zeros((len(measured), 3))
+            unseen = ""
+            if isinstance(constraint, Loop) and constraint.kind == "recorded":
+                place = read_recorded_places(recording, constraint.closure, recording.time[measured])
+                known = np.isfinite(place).all(axis=1)
+                unseen = "" if known.all() else f"; {np.sum(~known)} more are without a recorded place"
+                measured, place = measured[known], place[known]
+            parts.append(measured)
+            places.append(place)
             if len(parts[-1]) < MIN_SAMPLES * rate_hz / SAMPLE_RATE_HZ:
                 lost += [loss.sensor for loss in separate if loss.beyond(measured).any()]
                 raise BadPhase(
@@ -222,6 +233,7 @@ class CalibrationProblem:
                         else ""
                     )
                     + (", or their tilt is not known again" if losses else "")
+                    + unseen
                 )
         samples = np.concatenate(parts)
         steps, step_std, beyond = group_steps(losses, samples)
@@ -230,7 +242,8 @@ class CalibrationProblem:
             (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
         ]
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        data = np.vstack([*turns, beyond, recording.time[samples] - filtered.start[1]])
+        recorded = np.concatenate(places).T if layout.recorded else np.empty((0, len(samples)))
+        data = np.vstack([*turns, beyond, recorded, recording.time[samples] - filtered.start[1]])
         return Observations(layout, data, self.conditions, condition_index, step_std), samples
 
     def check_start_pose(self) -> None:

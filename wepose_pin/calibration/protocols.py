@@ -4,8 +4,9 @@ A ``calibration/<name>.toml`` lists steps for the person and conditions for the 
 those of the body's table (`wepose_pin.model.BodyTable`). There are three kinds of conditions:
 
 - ``[[closure]]``: two points coincide (``kind = "coincide"``) or keep a distance (``"distance"``), one stays at a point
-  of W (``"fixed_point"``), unknown or stated by ``at``, or points move on a level plane of unknown height
-  (``"plane"``). All of them show lengths and headings by motion.
+  of W (``"fixed_point"``), unknown or stated by ``at``, points move on a level plane of unknown height
+  (``"plane"``), or a point is where the session's truth recorded it (``"recorded"``). All of them show lengths and
+  headings by motion.
 - ``[[pose]]``: segments point in given directions of the body's first segment; `std_deg` is how well a person does it.
 - ``[[axis]]``: a segment turns forwards about its own y, as the torso in a bow.
 
@@ -27,12 +28,19 @@ from ..errors import BadOption, one_of
 from ..model import BodyTable
 
 PROTOCOLS = ("clasp", "clasp_measured", "handle", "poses", "table", "tip", "touch_left", "touch_right")
-KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3)}  # how many points each takes
+# How many points each kind takes, and the keys that are its own.
+KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}
+_KEYS = ("phase", "kind", "points", "slip", "in_front_of")
+_OWN_KEYS: dict[str, tuple[str, ...]] = {
+    "distance": ("distance", "metres", "metres_std"),
+    "fixed_point": ("at", "at_std"),
+    "recorded": ("origin",),
+}
 
 
 @dataclass(frozen=True)
 class Closure:
-    """Points that stay together, at a distance, on a point of W, or on a level plane.
+    """Points that stay together, at a distance, on a point of W, on a level plane, or where they were recorded.
 
     Parameters
     ----------
@@ -43,6 +51,7 @@ class Closure:
     distance : its name, as in ``--measured handle=0.4``; empty for other kinds
     metres, metres_std : the distance where the user gives none, and one standard deviation [m]
     at, at_std : (3,) [m] the fixed point in W and its standard deviation, where it is known
+    origin : the point from which a recorded place is counted; empty: the root
     in_front_of : segment behind which a person does not bring the points; empty: they may be anywhere
     """
 
@@ -55,12 +64,22 @@ class Closure:
     metres_std: float = 0.003
     at: tuple[float, float, float] | None = None
     at_std: float = 0.005
+    origin: str = ""
     in_front_of: str = ""
 
     @property
     def rows(self) -> int:
         """How many residuals a sample has."""
         return {"distance": 1, "plane": len(self.points)}.get(self.kind, 3)
+
+    @property
+    def ways(self) -> tuple[tuple[tuple[str, float], ...], ...]:
+        """Each way that it closes, as a signed sum of points."""
+        if self.kind in ("coincide", "distance"):
+            return (((self.points[0], 1.0), (self.points[1], -1.0)),)
+        if self.origin:
+            return (((self.points[0], 1.0), (self.origin, -1.0)),)
+        return tuple(((point, 1.0),) for point in self.points)
 
 
 @dataclass(frozen=True)
@@ -130,7 +149,7 @@ class Protocol:
         """Raise `BadOption` where the body lacks a point or a segment of the protocol."""
         where = f"protocol '{self.name}': "
         for closure in self.closures:
-            for point in closure.points:
+            for point in (*closure.points, *filter(None, [closure.origin])):
                 if point not in table.points:
                     raise BadOption(f"{where}'{point}' is no point of {table.name}; {one_of(table.points, point)}")
         named = [c.segment for c in self.conditions if not isinstance(c, Closure)]
@@ -208,7 +227,15 @@ def _closure(entry: dict[str, Any], place: str) -> Closure:
     if len(points) not in KINDS[kind] or len(set(points)) < len(points):
         counts = " or ".join(map(str, KINDS[kind]))
         raise BadOption(f"{place}: points = {list(points)}; kind '{kind}' takes {counts} different ones")
+    known = (*_KEYS, *_OWN_KEYS.get(kind, ()))
+    for key in entry:
+        if key not in known:
+            raise BadOption(f"{place}: '{key}' is no key of kind '{kind}'; {one_of(known, key)}")
     more: dict[str, Any] = {"in_front_of": str(entry.get("in_front_of", ""))}
+    if kind == "recorded":
+        more["origin"] = str(entry.get("origin", ""))
+        if more["origin"] in points:
+            raise BadOption(f"{place}: origin = {more['origin']!r} is the point itself; another one is needed")
     if kind == "fixed_point" and "at" in entry:
         at = entry["at"]
         if not isinstance(at, list) or len(at) != 3 or not all(is_number(v, 100.0) for v in at):

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
 from ..errors import BadSession
 from ..model.table import ROOT
-from .conditions import find_parts, group_lengths
+from .conditions import find_parts, fix_scale, group_lengths
 from .observability import MOST_OPEN, find_intervals, format_longest
 from .result import Calibration
 from .weights import CONTRADICTED, MIN_CONTACT
@@ -216,8 +216,8 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
     lengths = np.array([subject.lengths[name] for name in names])
     covariance = subject.lengths_covariance(names)
     # Errors of the scale change all lengths together; they have their own check.
-    shape = covariance
-    if len(names) > 1:
+    shape, scale_observed = covariance, fix_scale(calibration.conditions)
+    if len(names) > 1 and not scale_observed:
         common = 1.0 / float(lengths @ np.linalg.solve(covariance, lengths))
         shape = covariance - common * np.outer(lengths, lengths)
 
@@ -269,6 +269,8 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
             facts={"variant": calibration.variant or "poses"},
         )
         checks.append(_check(uncertain, limits, cause))
+    if scale_observed:
+        return checks
     prior = calibration.prior
     facts = {"measured": calibration.measured_example}
     if calibration.scale_lengths:
@@ -435,7 +437,7 @@ def document(calibration: Calibration, quality: CalibrationQuality) -> dict[str,
         ],
         "protocol": calibration.protocol,
         "measured": dict(calibration.measured),
-        "scale_std": calibration.scale_std,
+        "scale_std": _number(calibration.scale_std),
         "lengths": {n: {"value": v, "std": _number(subject.std(n))} for n, v in subject.lengths.items()},
         "mounts": {
             segment: {
