@@ -15,7 +15,6 @@ from test_chain import urdf  # noqa: F401  the arm's URDF
 from wepose_pin.calibration import Calibration, Protocol, assess, calibrate_lengths
 from wepose_pin.calibration.protocols import Closure
 from wepose_pin.cli import main
-from wepose_pin.errors import WeposeError
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording
 from wepose_pin.simulation import MTI_3
@@ -192,9 +191,7 @@ def test_recorded_places_of_the_tip_close_the_chain(arm: BodyModel, tmp_path: Pa
     assert "scale" not in {check.diagnostic.code.partition("-")[0] for check in assess(calibration).checks}
 
 
-def test_a_lost_sensor_is_named_in_one_line(
-    arm: BodyModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_lost_sensor_is_named_in_one_line(arm: BodyModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = move_arm(arm, 0, seconds=20.0).recording
     sensors = {link: sensor for link, sensor in recording.sensors.items() if link != "forearm_link"}
     session = write_session(tmp_path / "session", replace(recording, sensors=sensors))
