@@ -5,26 +5,37 @@ inputs and samples, `chain` is the model's chains in CasADi, `least_squares` unk
 problem and its solution by `nlpsol`, `priors` what is known before. `initial_headings` and `contact` give the start,
 `joints` adds what accelerations show of headings, `losses` what lost samples change, `weights` weighs the samples,
 `alternatives` searches other minima, `anatomy` checks sensors and mounts. `paper` is the published calibration of the
-lengths alone. `result` is the outcome, `observability` and `quality` assess it.
+lengths alone. `result` is the outcome, `observability` and `quality` assess it, `outcome` gives a subject that passed.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from ..diagnostics import lines
-from ..errors import CalibrationFailed, WeposeWarning
-from ..filters import BEST
-from ..model import BodyModel
-from ..recording import Recording
-from ..subject import Subject
-from .lengths import MEASURED_STD, calibrate_lengths
-from .paper import Formulation
-from .protocols import PROTOCOLS, Protocol, load_protocol
-from .quality import CalibrationQuality, Check, assess, document
-from .result import Calibration
+if TYPE_CHECKING:
+    from .lengths import MEASURED_STD, calibrate_lengths
+    from .outcome import calibrate
+    from .paper import Formulation
+    from .protocols import PROTOCOLS, Protocol, load_protocol
+    from .quality import CalibrationQuality, Check, assess, document
+    from .result import Calibration
 
+# Loaded on first use: tracking takes protocols and conditions from here, and does not need CasADi.
+_WHERE = {
+    "MEASURED_STD": "lengths",
+    "PROTOCOLS": "protocols",
+    "Calibration": "result",
+    "CalibrationQuality": "quality",
+    "Check": "quality",
+    "Formulation": "paper",
+    "Protocol": "protocols",
+    "assess": "quality",
+    "calibrate": "outcome",
+    "calibrate_lengths": "lengths",
+    "document": "quality",
+    "load_protocol": "protocols",
+}
 __all__ = [
     "MEASURED_STD",
     "PROTOCOLS",
@@ -41,50 +52,7 @@ __all__ = [
 ]
 
 
-def calibrate(
-    recording: Recording,
-    *,
-    measured: Mapping[str, float] | None = None,
-    prior: Subject | None = None,
-    model: BodyModel | None = None,
-    protocol: str | Protocol = "clasp",
-    method: str = BEST,
-    measured_std: float = MEASURED_STD,
-    formulation: Formulation = "full",
-) -> Subject:
-    """The subject of a hands-together recording, if the calibration does not fail. Parameters as `calibrate_lengths`.
-
-    `calibrate_lengths` gives all results, and `assess` their quality.
-
-    Raises
-    ------
-    CalibrationFailed
-        Its quality is "fail"; the error holds the `calibration` and its `quality`.
-    WeposeError
-        As `calibrate_lengths`.
-
-    Warns
-    -----
-    WeposeWarning
-        Its quality is "poor": what is uncertain, and what to do.
-    """
-    calibration = calibrate_lengths(
-        recording,
-        measured=measured,
-        prior=prior,
-        model=model,
-        protocol=protocol,
-        method=method,
-        measured_std=measured_std,
-        formulation=formulation,
-    )
-    quality = assess(calibration)
-    reasons = " ".join(line for _, line in lines(quality.reasons))
-    text = f"{recording.where()}: the calibration's quality is '{quality.quality}'. {reasons}"
-    if quality.quality == "fail":
-        raise CalibrationFailed(
-            f"{text} The subject all the same: this error's calibration.subject.", calibration, quality
-        )
-    if quality.quality == "poor":
-        warnings.warn(text, WeposeWarning, stacklevel=2)
-    return calibration.subject
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module 'wepose_pin.calibration' has no attribute '{name}'")
+    return getattr(import_module(f".{_WHERE[name]}", __name__), name)
