@@ -261,6 +261,8 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
         )
         if len(calibration.hinge_rms) < 2:
             limits = LONE_HEADING
+        if table.is_mechanism:  # a link that turns about the vertical alone needs no heading of its mount
+            limits = limits._replace(poor=np.pi)
         uncertain = Diagnostic(
             "mount-heading-uncertain",
             INFO,
