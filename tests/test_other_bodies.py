@@ -16,7 +16,7 @@ from wepose_pin.evaluation import evaluate
 from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.table import format_table
-from wepose_pin.readers.describe import describe_file
+from wepose_pin.readers.describe import Wearer, describe_file
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report import render_track_report
 from wepose_pin.report.calibration_figures import direction
@@ -231,8 +231,9 @@ def test_info_proposes_its_segments(body: BodyModel, tmp_path: Path) -> None:
     ]
     rows = np.column_stack([time, np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (len(time), 2))])
     np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header=",".join(["time", *names]), comments="")
-    session = describe_file(tmp_path / "d.csv", table=body.table).session
+    session = describe_file(tmp_path / "d.csv", wearer=Wearer(body.table, Path("whole_body"))).session
     assert session is not None
+    assert 'model = "whole_body"' in session
     assert "[sensors.left_thigh]   # usually outside, above the knee" in session
     assert "[sensors.pelvis]" in session
     assert "not known without one: left_shank, right_thigh, right_shank" in session

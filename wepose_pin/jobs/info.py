@@ -29,8 +29,9 @@ class InfoJob:
         Write the session to session.toml beside the file.
     out : FILE
         Write the session to this file.
-    model : URDF|TOML
-        Propose the segments of this body (docs/models.md). Without it those of the upper body.
+    model : URDF|TOML|NAME
+        Propose the segments of this body: a URDF, a TOML that names one, or the name of a body of the package, such as
+        whole_body (docs/models.md). Without it those of the upper body.
     force
         Replace an existing session.
     """
@@ -64,14 +65,14 @@ def run_info(job: InfoJob, progress: Progress = no_progress) -> InfoOutcome:
     """
     from ..documents import check_file, whole_file
     from ..model import load_model
-    from ..readers.describe import describe_file
+    from ..readers.describe import Wearer, describe_file
 
     progress("reading", 0.0)
-    table = load_model(job.model).table if job.model is not None else None
+    wearer = Wearer(load_model(job.model).table, job.model) if job.model is not None else None
     if not (job.write or job.out):
-        return InfoOutcome(describe_file(job.file, job.file.absolute().parent, table), None)
+        return InfoOutcome(describe_file(job.file, job.file.absolute().parent, wearer), None)
     check_file(job.session_file, job.force)
-    description = describe_file(job.file, job.session_file.absolute().parent, table)
+    description = describe_file(job.file, job.session_file.absolute().parent, wearer)
     if description.session is None:
         raise BadOption(f"--write: there is no session to write for {description.what}")
     with whole_file(job.session_file, job.force) as partial:

@@ -70,13 +70,26 @@ class _Proposal:
     diagnostics: Sequence[Diagnostic] = ()
 
 
-def describe_file(path: Path, folder: Path | None = None, table: BodyTable | None = None) -> Description:
+class Wearer(NamedTuple):
+    """The body that bears the sensors."""
+
+    table: BodyTable
+    model: Path | None = None  # its file, or its name in the package; None: the upper body's
+
+    def name_model(self, folder: Path) -> str:
+        """The line of a session in `folder` that names it."""
+        if self.model is None:
+            return ""
+        return f"model = {_relative(self.model, folder) if self.model.is_file() else toml_string(str(self.model))}"
+
+
+def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None = None) -> Description:
     """Describe a file or folder.
 
     Parameters
     ----------
     folder : for which a session is proposed; None: that of the file
-    table : of the body that wears the sensors; None: the upper body
+    wearer : of the sensors; None: the upper body
 
     Raises
     ------
@@ -97,21 +110,22 @@ def describe_file(path: Path, folder: Path | None = None, table: BodyTable | Non
         path = named
     if path.suffix.lower() == ".toml":
         return _describe_toml(path)
-    folder, table = folder or path.absolute().parent, table or load_table()
+    folder, wearer = folder or path.absolute().parent, wearer or Wearer(load_table())
+    table = wearer.table
     format = detect_format(path)
     if format:
-        return _propose_session(path, folder, _propose_from_device(path, folder, format, table), table)
+        return _propose_session(path, folder, _propose_from_device(path, folder, format, table), wearer)
     if is_array_file(path):
         arrays = ArrayFile(path)
         guess = guess_arrays(arrays.shapes, table)
         proposal = _propose_from_names(path, folder, guess, list(arrays.shapes), arrays)
-        return _propose_session(path, folder, proposal, table)
+        return _propose_session(path, folder, proposal, wearer)
     if path.suffix.lower() in TABLES:
         names = Rows(path).names
         if any(f"{point}_x" in names for point in table.points):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
         proposal = _propose_from_names(path, folder, guess_columns(names, table), names, None)
-        return _propose_session(path, folder, proposal, table)
+        return _propose_session(path, folder, proposal, wearer)
     known = (
         ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose; a result's folder, an "
         "x-IMU3's folder"
@@ -175,11 +189,13 @@ def _describe_toml(path: Path) -> Description:
 # Data: a session is proposed ---------------------------------------------------------------------------------------
 
 
-def _propose_session(path: Path, folder: Path, proposal: _Proposal, table: BodyTable) -> Description:
+def _propose_session(path: Path, folder: Path, proposal: _Proposal, wearer: Wearer) -> Description:
     """Describe data and propose a session; the description has what this session reads."""
     what, diagnostics = f"{path}: {proposal.title}", tuple(proposal.diagnostics)
     if not proposal.tables:
         return Description(what, tuple(proposal.facts), (), None, diagnostics=diagnostics)
+    model = wearer.name_model(folder)
+    title = [f"name = {toml_string(path.stem)}", *([model] if model else [])]
     phases = [line for line in proposal.head if line.startswith("start = ")]
     head = [line for line in proposal.head if line not in phases]
     recording: Recording | None = None
@@ -201,15 +217,15 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal, table: BodyT
             fitting = f"{error.key} = {toml_string(error.unit)}"
             head = [fitting if line.startswith(error.key) else line for line in head]
     if recording is None:
-        text = _session_text(path, head, phases, proposal.tables, {}, table)
+        text = _session_text(title, head, phases, proposal.tables, {}, wearer.table)
         return Description(what, tuple(proposal.facts), (), text, "mend what cannot be read", diagnostics)
     static = find_static_intervals(recording)
     comments = {segment: _mount_comment(recording, segment, static) for segment in proposal.tables}
-    text = _session_text(path, head, phases or _start_lines(static), proposal.tables, comments, table)
+    text = _session_text(title, head, phases or _start_lines(static), proposal.tables, comments, wearer.table)
     facts, rows = (*proposal.facts, *_facts(recording)), _rows(recording, proposal.labels)
     # A sensor on an unknown segment has its name in the file.
     read = (replace(each, place=each.place.removeprefix("?")) for each in recording.diagnostics)
-    return Description(what, facts, rows, text, _advise(recording, table), (*diagnostics, *read))
+    return Description(what, facts, rows, text, _advise(recording, wearer.table), (*diagnostics, *read))
 
 
 def _advise(recording: Recording, table: BodyTable) -> str:
@@ -236,7 +252,7 @@ def _start_lines(static: list[tuple[float, float]]) -> list[str]:
 
 
 def _session_text(
-    path: Path,
+    title: list[str],
     head: list[str],
     phases: list[str],
     tables: Mapping[str, list[str]],
@@ -244,7 +260,7 @@ def _session_text(
     body: BodyTable,
 ) -> str:
     lines = [
-        f"name = {toml_string(path.stem)}",
+        *title,
         'start_pose = "n_pose"',
         "",
         "[data]",
@@ -266,8 +282,8 @@ def _session_text(
     for segment in sorted(tables, key=lambda name: segments.index(name) if name in segments else len(segments)):
         commented = segment not in segments
         place = body.sensors[segment].place if segment in body.sensors else ""
-        title = f"[sensors.{'SEGMENT' if commented else segment}]{f'   # usually {place}' if place else ''}"
-        table = [title, *tables[segment], *comments.get(segment, [])]
+        first = f"[sensors.{'SEGMENT' if commented else segment}]{f'   # usually {place}' if place else ''}"
+        table = [first, *tables[segment], *comments.get(segment, [])]
         lines += ["", *(f"# {line}" if commented else line for line in table)]
     return "\n".join(lines) + "\n"
 
