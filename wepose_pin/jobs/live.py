@@ -160,7 +160,7 @@ def run_live(
             timing = StreamOptions(job.robot_hz, job.hold_after, job.stop_after)
             options = RobotOptions(job.robot, arm_sides(job.arm), job.map, job.to or str(PORT), timing)
             speed = float(job.speed.replace("max", "inf")) if job.replays else 1.0
-            robot, source = connect_robot(options, source, setup, speed)
+            robot, source = connect_robot(options, source, setup, speed, model.table)
             outputs.append(robot)
         if job.udp is not None:
             from ..live.outputs import UdpOutput

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption
+from ..model import BodyTable, load_table
 from ..retargeting import Robot, find_map, load_robot, read_map
 from ..retargeting.stream import ArmObserver, Command, CommandStream, StreamOptions, check_segments
 from ..subject import population_subject
@@ -68,8 +69,9 @@ class RobotOutput(Output):
     Parameters
     ----------
     to : ``PORT`` of this machine, or ``HOST:PORT``
-    lengths_cov : (8, 8) [m²] of the person's lengths; None: exact
+    lengths_cov : (k, k) [m²] of the person's lengths in the order of the table; None: exact
     speed : of a replay; infinite: time is that of the ticks
+    table : of the person's body; None: the upper body
 
     Raises
     ------
@@ -78,11 +80,17 @@ class RobotOutput(Output):
     """
 
     def __init__(
-        self, stream: CommandStream, to: str = str(PORT), *, lengths_cov: np.ndarray | None = None, speed: float = 1.0
+        self,
+        stream: CommandStream,
+        to: str = str(PORT),
+        *,
+        lengths_cov: np.ndarray | None = None,
+        speed: float = 1.0,
+        table: BodyTable | None = None,
     ) -> None:
         self.stream, self.robot = stream, stream.robot
         self._sender = UdpSender(to, "--to", PORT)
-        self._lengths_cov, self._by_ticks = lengths_cov, math.isinf(speed)
+        self._lengths_cov, self._table, self._by_ticks = lengths_cov, table, math.isinf(speed)
         self._speed = 1.0 if self._by_ticks else speed
         self._observer: ArmObserver | None = None
         self._newest: tuple[float, LivePose] | None = None  # with its time of arrival [s]
@@ -107,7 +115,7 @@ class RobotOutput(Output):
 
     def start(self, info: StreamInfo) -> None:
         """Tracking starts; raises `BadData` where an arm has no sensors."""
-        self._observer = ArmObserver(self.robot, info.segments, info.points, self._lengths_cov)
+        self._observer = ArmObserver(self.robot, info.segments, info.points, self._lengths_cov, table=self._table)
         self.open()
 
     def show(self, pose: LivePose) -> None:
@@ -295,13 +303,14 @@ class RobotOptions:
 
 
 def connect_robot(
-    options: RobotOptions, source: Source, setup: SensorSetup, speed: float = 1.0
+    options: RobotOptions, source: Source, setup: SensorSetup, speed: float = 1.0, table: BodyTable | None = None
 ) -> tuple[RobotOutput, Source]:
     """The robot's output, and the source as it needs it; neither is opened.
 
     Parameters
     ----------
     speed : of a replay; infinite: as fast as possible
+    table : of the person's body; None: the upper body
 
     Raises
     ------
@@ -314,12 +323,12 @@ def connect_robot(
     robot_map = find_map(options.robot) if options.map_file is None else read_map(options.map_file, urdf=path)
     robot = load_robot(robot_map, options.arms)
     if source.sensors:
-        check_segments(robot, source.sensors)
+        check_segments(robot, source.sensors, table)
     if isinstance(source, ReplaySource) and math.isinf(speed):
         source = TickReplay(source.recording, speed)
-    lengths_cov = (setup.subject or population_subject()).lengths_covariance()
+    lengths_cov = (setup.subject or population_subject(body=table)).lengths_covariance((table or load_table()).lengths)
     stream = CommandStream(robot, options.stream)
-    return RobotOutput(stream, options.to, lengths_cov=lengths_cov, speed=speed), source
+    return RobotOutput(stream, options.to, lengths_cov=lengths_cov, speed=speed, table=table), source
 
 
 def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:
