@@ -21,7 +21,7 @@ from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report import render_track_report
 from wepose_pin.report.calibration_figures import direction
 from wepose_pin.report.measures import measure_hinge, measure_tips
-from wepose_pin.report.viewer import pose_html
+from wepose_pin.report.viewer import FLOOR_Z, find_floor, pose_html
 from wepose_pin.tracking import TrackedRecording, track
 from wepose_pin.writers.bvh import write_bvh
 from wepose_pin.writers.export import export
@@ -191,6 +191,7 @@ def test_tilts_of_legs_are_named_by_where_the_free_end_goes(body: BodyModel, ang
 
 
 def test_its_page_draws_trails_of_the_toes(tracked: TrackedRecording) -> None:
+    assert find_floor(tracked.model) == pytest.approx(-THIGH - SHANK)
     page = pose_html(tracked.model, tracked.pose)
     assert '"left_toe"' in page
     assert '"right_toe"' in page
@@ -291,4 +292,6 @@ def test_a_robots_skeleton_has_its_links_and_its_tip_lies_where_it_is(robot: Bod
     tip = offsets[1] + turns[1].apply(offsets[2] + turns[2].apply(offsets[3]))
     np.testing.assert_allclose(tip, 100.0 * expected[-1][[1, 2, 0]], atol=1e-3)
     assert '"tip"' in pose_html(robot, pose)
+    assert find_floor(robot) == 0.0
+    assert find_floor(load_model()) == FLOOR_Z
     assert evaluate(pose, pose, table=robot.table).position_on_limb["tip"].worst == pytest.approx(0.0, abs=1e-9)

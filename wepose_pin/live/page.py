@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from ..kinematics import find_known_points
 from ..model import BodyModel
-from ..report.viewer import DARK, LIGHT, backdrop, choose_trail_colour, filled, scene, view
+from ..report.viewer import DARK, LIGHT, backdrop, choose_trail_colour, filled, find_floor, scene, view
 from .addresses import LOOPBACK
 from .encoder import PoseEncoder
 from .server import Server, ServerOptions
@@ -98,11 +98,12 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str
     neutral = np.frombuffer(encoder.encode(None), "<f4", 12 * len(links), offset=8).reshape(-1, 12)
     motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(links), 1, 1)).astype("<f4")
     motion[:, 0, 4:] = neutral[:, 9:]
+    floor = find_floor(model)
     data = {
         "id": identity,
         "links": list(links),
         "scene": scene(encoder.visuals, links),
-        "backdrops": {"light": backdrop(LIGHT), "dark": backdrop(DARK)},
+        "backdrops": {name: backdrop(colours, floor) for name, colours in (("light", LIGHT), ("dark", DARK))},
         "view": view(encoder.visuals, links, motion, [_find_reach(model)]),
         "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.paths],
     }

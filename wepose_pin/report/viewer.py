@@ -26,7 +26,8 @@ from .page import load_template
 if TYPE_CHECKING:
     from ..retargeting import Trajectory
 
-FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips
+FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips, of a body without feet
+FEET_Z = -0.6  # [m] below which a point of a person is at a foot
 GRID_CELL = 0.25  # [m]
 GRID_RADIUS = 3.0  # [m] where the grid has faded away
 CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
@@ -102,8 +103,21 @@ def pose_html(
         phases=phases,
         title=title,
         fps=fps,
-        floor_z=0.0 if model.table.is_mechanism else FLOOR_Z,
+        floor_z=find_floor(model),
     )
+
+
+def find_floor(model: BodyModel) -> float:
+    """Height [m] of the ground in W: below the feet of a person, at the root of a mechanism."""
+    if model.table.is_mechanism:
+        return 0.0
+    lengths = np.array(list(model.lengths.values()))
+    heights = (
+        sum(float(part.by_length[2] @ lengths + part.constant[2]) for part in way.values())
+        for way in model.reaches.values()
+    )
+    lowest = min(heights, default=FLOOR_Z)
+    return lowest if lowest < FEET_Z else FLOOR_Z
 
 
 def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "", fps: float = 30.0) -> str:
@@ -121,7 +135,8 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     drawn = build_parts(robot)
     arms = {arm.side: find_person_arm(model.table, arm.side) for arm in robot.arms}
     shoulder_z = float(np.nanmedian([pose.points[arm.points[0]][:, 2] for arm in arms.values()]))
-    R_WB, p_WB = place_beside_person(robot, drawn, shoulder_z, FLOOR_Z)
+    floor_z = find_floor(model)
+    R_WB, p_WB = place_beside_person(robot, drawn, shoulder_z, floor_z)
     moved = compute_placements(trajectory, drawn, frames, R_WB, p_WB)
     colours = {side: choose_trail_colour(arm.tip, model) for side, arm in arms.items()}
     # Short names: heads are beside them.
@@ -136,6 +151,7 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
         phases={"approach": [(0.0, float(trajectory.time[trajectory.approach_samples]))]},
         title=title,
         fps=fps,
+        floor_z=floor_z,
     )
 
 
