@@ -37,7 +37,13 @@ JOBS = {
     "track": TrackJob(
         Path("s.toml"), Path("out"), Path("anna"), method="smekf", open_loop=True, limits=False, chunk_seconds=20.0
     ),
-    "calibrate": CalibrateJob(Path("s.toml"), Path("out"), "handle", {"handle": 0.4, "trunk": 0.5}, 1.7, "f", "paper"),
+    "calibrate": CalibrateJob(
+        *(Path("s.toml"), Path("out"), "handle"),
+        measured={"handle": 0.4, "trunk": 0.5},
+        stature=1.7,
+        sex="f",
+        formulation="paper",
+    ),
     "simulate": SimulateJob(Path("out"), 3, 50.0, preset="mild", imperfection={"bits": 12.0, "mount": "any"}),
     "retarget": RetargetJob(Path("result"), "panda", Path("out"), "both", scale=0.8, episode=True),
     "demo": DemoJob(Path("out"), 4),
