@@ -44,6 +44,7 @@ tip = {{ link = "wrist_3_link", at = [0.0, 0.15, 0.0] }}
 upper_arm = {{ segment = "upper_arm_link", from = "base", to = "elbow", std_percent = 10 }}
 forearm = {{ segment = "forearm_link", from = "elbow", to = "wrist", std_percent = 10 }}
 """
+START_STD = np.deg2rad(0.3)  # [rad] of each joint against the stated start pose
 SENSOR_AT = np.array([0.05, 0.03, 0.02])  # [m] in its link
 BIAS_STD, ACCEL_BIAS_STD = np.deg2rad(0.2), 0.02  # [rad/s], [m/s²]
 AWAY = np.array([0.10, -0.15, 0.08])  # [m] the second point from the first
@@ -78,7 +79,7 @@ def move_arm(body: BodyModel, seed: int, *, seconds: float = 45.0, points: int =
     wave = np.sin(2.0 * np.pi * frequency * (time[:, None, None] - MOVE_S) + phase)
     wanted = 0.9 * rise[:, None] * (amplitude * wave).sum(axis=2)  # [rad/s]
     q = np.empty((len(time), 6))
-    q[0] = [HOME[name] for name in model.names[1:]]
+    q[0] = [HOME[name] for name in model.names[1:]] + rng.normal(scale=START_STD, size=6)
     pin.framesForwardKinematics(model, data, q[0])
     target = data.oMf[tip_frame].translation + change * AWAY * np.ones((len(time), 1))
     tip = np.empty((len(time), 3))
@@ -148,9 +149,9 @@ def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> 
     calibration = calibrate(arm, moved)
     describe(f"one point, seed {seed}", calibration, moved)
     assert np.abs(deviations(calibration, moved)).max() < 3.0
-    assert calibration.rms_gap < 0.1 * calibration.prior_rms_gap
+    assert calibration.rms_gap < 0.2 * calibration.prior_rms_gap
     for name in TRUE:  # a tenth before the motion
-        assert calibration.subject.std(name) < 0.02 * moved.lengths[name]
+        assert calibration.subject.std(name) < 0.01 * moved.lengths[name]
 
 
 def test_a_known_point_two_points_and_stated_mounts(arm: BodyModel) -> None:
@@ -194,10 +195,10 @@ def test_recorded_places_of_the_tip_close_the_chain(arm: BodyModel, tmp_path: Pa
 def test_a_lost_sensor_is_named_in_one_line(arm: BodyModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = move_arm(arm, 0, seconds=20.0).recording
     sensors = {link: sensor for link, sensor in recording.sensors.items() if link != "forearm_link"}
-    session = write_session(tmp_path / "session", replace(recording, sensors=sensors))
+    write_session(tmp_path, replace(recording, sensors=sensors))
     model = Path(arm.table.where)
     with pytest.raises(SystemExit) as stopped:
-        main(["calibrate", str(session), "--model", str(model), "--protocol", "tip", "-o", str(tmp_path / "out")])
+        main(["calibrate", str(tmp_path), "--model", str(model), "--protocol", "tip", "-o", str(tmp_path / "out")])
     assert stopped.value.code == 2
     [line] = capsys.readouterr().err.strip().splitlines()
     assert "forearm_link" in line

@@ -196,6 +196,7 @@ class CalibrationProblem:
             sum(closure.kind == "plane" for closure in protocol.closures),
             protocol.distances,
             recorded=any(closure.kind == "recorded" for closure in protocol.closures),
+            rigid=tuple(name for name in sensors if self.model.table.segments[name].soft_tissue_std == 0.0),
         )
         losses = find_losses(recording, filtered.start, layout.sensors)
         # Only the linear start can estimate a heading step of any size.

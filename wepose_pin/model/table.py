@@ -43,7 +43,7 @@ class Segment(NamedTuple):
     rigid_without_sensor : whether it follows the segment above where it has no sensor; else it is unknown then
     labels : a regular expression of words that mean it in a sensor's name
     joint : the name of the joint to the segment above, where no point is there to name it
-    soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian
+    soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian; none on a mechanism
     point_twist_std : [rad] by which the points above which other segments hang turn about its long axis
     """
 
@@ -379,7 +379,8 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
     like = top.text("like", None)
     base = load_table(like) if like is not None else BodyTable(name, {}, where=where)
     new = like is None
-    segments = _read_segments(top, base)
+    kind: Any = top.choice("kind", (PERSON, MECHANISM), base.kind)
+    segments = _read_segments(top, base, kind)
     if not segments:
         raise BadModel(f'{where}: [segments] is missing; each segment\'s link is needed, as in torso = "chest_link"')
     up, forward = read_axes(top, base.up if new else "+z", base.forward if new else "+x")
@@ -388,7 +389,7 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
         name=name,
         segments=segments,
         points=_read_points(top, base, segments),
-        kind=top.choice("kind", (PERSON, MECHANISM), base.kind),  # type: ignore[arg-type]
+        kind=kind,
         up=up,
         forward=forward,
         root=_read_names(top, "root"),
@@ -426,8 +427,9 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
     )
 
 
-def _read_segments(top: TomlTable, base: BodyTable) -> dict[str, Segment]:
+def _read_segments(top: TomlTable, base: BodyTable, kind: str) -> dict[str, Segment]:
     segments = {}
+    new = Segment("", soft_tissue_std=0.0) if kind == MECHANISM else Segment("")
     for name, entry in _read_links(top, "segments"):
         entry.allow(
             *("link", "up", "forward", "along", "spine", "without_sensor", "labels", "joint"),
@@ -437,7 +439,7 @@ def _read_segments(top: TomlTable, base: BodyTable) -> dict[str, Segment]:
         if ("up" in entry) != ("forward" in entry):
             raise BadModel(f'{entry.where}: up and forward go together, as in up = "+z", forward = "+x"')
         up, forward = read_axes(entry) if "up" in entry else (None, None)
-        segment = (own or Segment(name))._replace(link=entry.text("link", name) or name, up=up, forward=forward)
+        segment = (own or new)._replace(link=entry.text("link", name) or name, up=up, forward=forward)
         if "along" in entry:
             x, y, z = (float(v) for v in AXES[entry.choice("along", AXES)])
             segment = segment._replace(along=(x, y, z))
