@@ -1,4 +1,4 @@
-"""The calibration of a robot's arm: a simulated UR5 with sensors on its links, its tip on points, two lengths unknown."""
+"""A simulated UR5 with a sensor on each link, its tip on points: two lengths are calibrated."""
 
 from __future__ import annotations
 

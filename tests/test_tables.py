@@ -7,15 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_chain_calibration import HOME, LINKS, TABLE, arm  # noqa: F401
 from test_chain import urdf  # noqa: F401
+from test_chain_calibration import HOME, LINKS, TABLE, arm  # noqa: F401
 
 from wepose_pin.cli import main
 from wepose_pin.model import BodyModel
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.writers import write_session
 
-GOOD = TABLE.format(segments="\n".join(f'{link} = "{link}"' for link in LINKS))
+GOOD = TABLE.format(segments="\n".join(f'{link} = "{link}"' for link in LINKS)).replace(
+    "[points]", '[points]\nfoot = "base_link"'
+)
 UPPER_BODY = 'urdf = "upper_body.urdf"\nlike = "upper_body"\n'
 HINGE = '[hinges.bend]\non = "upper_arm_link"\nmoves = "forearm_link"\naxis = [0.0, 1.0, 0.0]\n'
 LENGTH = '{ segment = "upper_arm_link", from = "base", to = "elbow" }'
@@ -36,7 +38,7 @@ TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "two lengths of a segment in one direction": (
         GOOD + f"again = {LENGTH}\n",
-        ("lengths.again", "upper_arm_link", "different directions"),
+        ("lengths.upper_arm, lengths.again", "upper_arm_link", "different directions"),
     ),
     "a length to a point that is none": (
         GOOD.replace('to = "elbow"', 'to = "elbov"'),
@@ -83,7 +85,10 @@ TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
     "an unknown kind": (GOOD.replace('"mechanism"', '"robot"'), ("kind", "robot", "mechanism")),
     "an unknown key": ("colour = 3\n" + GOOD, ("colour", "segments")),
     "no URDF": (GOOD.replace("arm.urdf", "leg.urdf"), ("leg.urdf", "no such file")),
-    "a tree with a fixed arm": (UPPER_BODY, ("left_upper_arm", "left_upper_arm_z", "fixed", "revolute joints")),
+    "a tree with a fixed arm": (
+        UPPER_BODY,
+        ("upper_body.urdf", "left_upper_arm", "left_upper_arm_z", "fixed", "revolute joints"),
+    ),
 }
 PROTOCOL = """name = "mine"
 [[closure]]
@@ -110,18 +115,18 @@ PROTOCOLS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("session.toml", "data.truth is missing", "tip_x"),
     ),
     "no conditions": ('name = "mine"\n', ("[[closure]]", "[[pose]]")),
-    "points that no sensor moves": (PROTOCOL.replace('["tip"]', '["base"]'), ("no sensor", "base")),
+    "points that no sensor moves": (PROTOCOL.replace('["tip"]', '["foot"]'), ("no sensor moves foot",)),
 }
 
 
 @pytest.fixture(scope="module")
 def folder(arm: BodyModel, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
-    """A session of an arm that does not move, with the sensors of all links but the first two, and its URDF."""
+    """A session of an arm that does not move, and its URDF."""
     folder = tmp_path_factory.mktemp("bad")
     time = np.arange(0.0, 20.0, 0.02)
     rng = np.random.default_rng(0)
     sensors = {}
-    for link in LINKS[2:]:
+    for link in LINKS:
         accel = [0.0, 0.0, 9.81] + rng.normal(scale=0.01, size=(len(time), 3))
         gyro = rng.normal(scale=1e-3, size=(len(time), 3))
         sensors[link] = ImuSensor(gyro_S=gyro, accel_S=accel, stated_quat_LS=compute_mount("+z", "+x"))
@@ -159,8 +164,9 @@ def test_a_bad_table_says_what_and_where(case: str, folder: Path, capsys: pytest
         (folder / "upper_body.urdf").write_text(fixed, encoding="utf-8")
     for command in ("calibrate", "track"):
         line = refuse(capsys, command, folder, "--model", folder / "bad.toml", "-o", folder / "out")
-        for part in ("bad.toml", *named):
+        for part in named:
             assert part in line
+        assert "bad.toml: " in line or "upper_body.urdf: " in line
     assert not (folder / "out").exists()
 
 
