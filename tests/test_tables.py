@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from test_chain import urdf  # noqa: F401
 from test_chain_calibration import HOME, LINKS, TABLE, arm  # noqa: F401
+from test_model import example_robot_data_human
 
 from wepose_pin.cli import main
-from wepose_pin.model import BodyModel
+from wepose_pin.model import BodyModel, load_model
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.writers import write_session
 
@@ -180,3 +181,92 @@ def test_a_bad_protocol_says_what_and_where(case: str, folder: Path, capsys: pyt
         assert part in line
     assert "bad_protocol.toml" in line or "'mine'" in line or "session.toml" in line
     assert not (folder / "out").exists()
+
+
+# Foreign bodies ------------------------------------------------------------------------------------------------------
+
+GAZEBO = 'like = "human_gazebo"\nroot = "Pelvis"\n'
+COSMIK = """like = "upper_body"
+up = "+y"
+root = "pelvis"
+segments.torso = "torso"
+segments.left_upper_arm = "upperarmL"
+segments.left_forearm = "lowerarmL"
+segments.right_upper_arm = "upperarmR"
+segments.right_forearm = "lowerarmR"
+points = { left_wrist = {link = "lowerarmL", at = [0, -0.26, 0]}, right_wrist = {link = "lowerarmR", at = [0, -0.26, 0]} }
+"""
+HUMAN = """like = "example_robot_data_human"
+up = "+y"
+root = ["left_upperleg", "right_upperleg"]
+"""
+UR = """kind = "mechanism"
+segments = { upper_arm_link = "upper_arm_link", forearm_link = "forearm_link", wrist_3_link = "wrist_3_link" }
+points = { base = "upper_arm_link", elbow = "forearm_link", wrist = "wrist_1_link", tip = "tool0" }
+[lengths]
+upper_arm = { segment = "upper_arm_link", from = "base", to = "elbow" }
+forearm = { segment = "forearm_link", from = "elbow", to = "wrist" }
+"""
+PANDA = """kind = "mechanism"
+segments = { panda_link2 = "panda_link2", panda_link4 = "panda_link4", panda_link7 = "panda_link7" }
+points = { shoulder = "panda_link2", elbow = "panda_link4", wrist = "panda_link5", tip = "panda_hand" }
+[lengths]
+upper_arm = { segment = "panda_link2", from = "shoulder", to = "elbow" }
+forearm = { segment = "panda_link4", from = "elbow", to = "wrist" }
+"""
+Z1 = """kind = "mechanism"
+segments = { link02 = "link02", link03 = "link03", link06 = "link06" }
+points = { shoulder = "link02", elbow = "link03", wrist = "link04", tip = "link06" }
+[lengths]
+upper_arm = { segment = "link02", from = "shoulder", to = "elbow" }
+forearm = { segment = "link03", from = "elbow", to = "wrist" }
+"""
+# URDF, its table without the line that names it, and what the line says that asks for a table where none is needed.
+HUMANS = {
+    "cosmik_human.urdf": (COSMIK, ("sensors.shoulder_link", "no link of human_wb", "upperarmL")),
+    "humanSubject01_48dof.urdf": (GAZEBO, ()),
+    "humanSubject01_66dof.urdf": (GAZEBO, ()),
+    "humanSubjectWithSpinalCordMeshes.urdf": (GAZEBO, ()),
+}
+ROBOTS = {
+    "human_description/robots/human.urdf": (HUMAN, ()),
+    "ur_description/urdf/ur5_robot.urdf": (UR, ("ur5_robot.urdf", "no lengths", "docs/models.md")),
+    "panda_description/urdf/panda.urdf": (PANDA, ("sensors.shoulder_link", "no link of panda", "panda_link5")),
+    "z1_description/urdf/z1.urdf": (Z1, ("sensors.shoulder_link", "no link of z1", "link05")),
+}
+
+
+def check_foreign(
+    path: Path, text: str, named: tuple[str, ...], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The body loads by the table, with lengths that scale it; without it, or one line says what is missing."""
+    table = folder / "foreign.toml"
+    table.write_text(f'urdf = "{path}"\n{text}', encoding="utf-8")
+    assert len(table.read_text(encoding="utf-8").splitlines()) <= 10
+    body = load_model(table)
+    assert len(body.lengths) >= 2
+    assert set(body.reaches) == set(body.table.points)  # raises where a length does not act as the table says
+    for name, value in body.lengths.items():
+        assert body.with_lengths({name: 1.1 * value}).lengths[name] == pytest.approx(1.1 * value, rel=1e-9)
+    if named:
+        line = refuse(capsys, "calibrate", folder, "--model", path, "-o", folder / "out")
+        for part in named:
+            assert part in line
+    else:
+        assert list(load_model(path).lengths) == list(body.lengths)
+
+
+@pytest.mark.parametrize("name", list(HUMANS))
+def test_a_foreign_person_loads(name: str, data: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, named = HUMANS[name]
+    check_foreign(data / "human_urdf" / name, text, named, folder, capsys)
+
+
+def test_all_foreign_persons_are_tested(data: Path) -> None:
+    assert {path.name for path in (data / "human_urdf").glob("*.urdf")} == set(HUMANS)
+
+
+@pytest.mark.parametrize("name", list(ROBOTS))
+def test_a_foreign_robot_loads(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, named = ROBOTS[name]
+    check_foreign(example_robot_data_human().parents[2] / name, text, named, folder, capsys)
