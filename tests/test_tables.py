@@ -194,7 +194,7 @@ segments.left_upper_arm = "upperarmL"
 segments.left_forearm = "lowerarmL"
 segments.right_upper_arm = "upperarmR"
 segments.right_forearm = "lowerarmR"
-points = { left_wrist = {link = "lowerarmL", at = [0, -0.26, 0]}, right_wrist = {link = "lowerarmR", at = [0, -0.26, 0]} }
+points = { left_wrist = {link="lowerarmL", at=[0, -0.26, 0]}, right_wrist = {link="lowerarmR", at=[0, -0.26, 0]} }
 """
 HUMAN = """like = "example_robot_data_human"
 up = "+y"
