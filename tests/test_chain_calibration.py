@@ -14,7 +14,9 @@ from test_chain import urdf  # noqa: F401  the arm's URDF
 
 from wepose_pin.calibration import Calibration, Protocol, assess, calibrate_lengths
 from wepose_pin.calibration.protocols import Closure
+from wepose_pin.calibration.recorded import interpolate_places
 from wepose_pin.cli import main
+from wepose_pin.errors import WeposeError
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording
 from wepose_pin.simulation import MTI_3
@@ -190,6 +192,33 @@ def test_recorded_places_of_the_tip_close_the_chain(arm: BodyModel, tmp_path: Pa
     assert seen.min() == 1.0
     assert len(calibration.time) < 0.9 * 8.0 * (moved.recording.phases["tip"][0][1] - MOVE_S - 2.0)
     assert "scale" not in {check.diagnostic.code.partition("-")[0] for check in assess(calibration).checks}
+
+
+def test_places_are_interpolated_between_rows_that_have_them() -> None:
+    known_time, lost = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 1.0, 1.1]), np.nan
+    places = np.array([0.0, 1.0, 2.0, lost, 4.0, 10.0, 11.0])[:, None] * [1.0, 2.0, -1.0]
+    time = np.array([-0.05, 0.0, 0.05, 0.2, 0.25, 0.35, 0.4, 0.7, 1.05, 1.1, 1.15])
+    expected = np.array([lost, 0.0, 0.5, 2.0, lost, lost, 4.0, lost, 10.5, 11.0, lost])  # 0.4 to 1.0: rows are missing
+    found = interpolate_places(time, known_time, places)
+    np.testing.assert_allclose(found, expected[:, None] * [1.0, 2.0, -1.0], atol=1e-9)
+
+
+def test_what_a_truth_lacks_is_said_in_one_line(arm: BodyModel, tmp_path: Path) -> None:
+    recording = replace(move_arm(arm, 0, seconds=12.0).recording, truth=tmp_path / "optical.parquet")
+    time = np.arange(0.0, 12.0, 0.1)
+    lost = np.full(len(time), np.nan)
+    good = {"time": time, "tip_x": time, "tip_y": time, "tip_z": time}
+    closure = Closure("tip", "recorded", ("tip",), slip=0.001)
+    for table, named in (
+        ({"time": time, "tip_x": time, "tip_y": time}, "no column 'tip_z' in optical.parquet"),
+        (good | {"time": time[::-1]}, "time of optical.parquet does not increase"),
+        (good | {"tip_x": lost}, "are without a recorded place"),
+    ):
+        pl.DataFrame(table).write_parquet(tmp_path / "optical.parquet")
+        with pytest.raises(WeposeError) as raised:
+            calibrate(arm, Moved(recording, {}, lost), closure)
+        assert named in str(raised.value)
+        assert "\n" not in str(raised.value)
 
 
 def test_a_lost_sensor_is_named_in_one_line(arm: BodyModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,8 +24,8 @@ JOINTS = {
 }
 START = (0.0, 0.4)  # [s]; the orientations are the segments' own, so that it sets the heading of x alone
 # [mm] mean and largest distance of a point, a tenth above what was found. All of it is where the shoulders are from the
-# hips: our trunk is one segment that turns as T8; the 66-DoF spine bends, but its pelvis is the root, which stays upright
-# where the person's leans by 17 deg. Both have no clavicles that move. From the shoulder on the arms are Xsens's own.
+# hips. Our trunk is one segment that turns as T8. The 66-DoF spine bends, but its pelvis is the root and stays upright:
+# the person's is 17 deg off. Neither moves its clavicles. From the shoulder on the arms are Xsens's own.
 BOUNDS = {"upper_body": (79.0, 88.0), "humanSubject01_66dof": (55.0, 61.0)}
 ARM = 0.5  # [mm] largest, from the shoulder on
 
