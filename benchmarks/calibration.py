@@ -146,7 +146,7 @@ def pose(problem: CalibrationProblem, rate_hz: float) -> Posed:
     """The last least squares of a calibration."""
     observations, _ = problem.observe(rate_hz)
     prior = build_prior(problem, observations)
-    start, contact = find_contact_start(observations, lambda some: build_prior(problem, some).mean)
+    start, contact = find_contact_start(observations, prior.mean, lambda some: build_prior(problem, some).mean)
     weights = solve_reweighted(observations, prior, start, contact).weights
     return Posed(LeastSquares(observations, prior, weights), start)
 

@@ -41,11 +41,7 @@ def ring_urdf() -> str:
 
 TABLE = """kind = "mechanism"
 [segments]
-seg1 = "seg1"
-seg2 = "seg2"
-seg3 = "seg3"
-seg4 = "seg4"
-seg5 = "seg5"
+{segments}
 [points]
 head = {{ link = "seg1", at = {head} }}
 ball = "seg2"
@@ -154,7 +150,10 @@ def write_ring_session(files: RingFiles, mount: str, folder: Path) -> RingSessio
         encoding="utf-8",
     )
     (folder / "ring.urdf").write_text(ring_urdf(), encoding="utf-8")
-    (folder / "ring.toml").write_text(TABLE.format(head=head.tolist(), end=end.tolist()), encoding="utf-8")
+    foam = "{ soft_tissue_deg = 0.6 }"  # turns as soft tissue does
+    segments = "\n".join(f"{name} = {foam if mount == 'loose' else repr(name)}" for name in RING_SEGMENTS)
+    table = TABLE.format(segments=segments, head=head.tolist(), end=end.tolist())
+    (folder / "ring.toml").write_text(table, encoding="utf-8")
     (folder / "optical.toml").write_text(PROTOCOL, encoding="utf-8")
     both = 0.5 * (links.lengths["seg2"] + links.lengths["seg3"])  # the table's length is that of each of the two
     lengths = {"seg2_and_seg3": both, "seg4": links.lengths["seg4"]}

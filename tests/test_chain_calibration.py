@@ -1,4 +1,4 @@
-"""The calibration of a robot's arm: a simulated UR5 with sensors on its links, its tip on points, two lengths unknown."""
+"""A simulated UR5 with a sensor on each link, its tip on points: two lengths are calibrated."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from test_chain import urdf  # noqa: F401  the arm's URDF
 
 from wepose_pin.calibration import Calibration, Protocol, assess, calibrate_lengths
 from wepose_pin.calibration.protocols import Closure
+from wepose_pin.calibration.recorded import interpolate_places
 from wepose_pin.cli import main
+from wepose_pin.errors import WeposeError
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording
 from wepose_pin.simulation import MTI_3
@@ -44,6 +46,7 @@ tip = {{ link = "wrist_3_link", at = [0.0, 0.15, 0.0] }}
 upper_arm = {{ segment = "upper_arm_link", from = "base", to = "elbow", std_percent = 10 }}
 forearm = {{ segment = "forearm_link", from = "elbow", to = "wrist", std_percent = 10 }}
 """
+START_STD = np.deg2rad(0.3)  # [rad] of each joint against the stated start pose
 SENSOR_AT = np.array([0.05, 0.03, 0.02])  # [m] in its link
 BIAS_STD, ACCEL_BIAS_STD = np.deg2rad(0.2), 0.02  # [rad/s], [m/s²]
 AWAY = np.array([0.10, -0.15, 0.08])  # [m] the second point from the first
@@ -78,7 +81,7 @@ def move_arm(body: BodyModel, seed: int, *, seconds: float = 45.0, points: int =
     wave = np.sin(2.0 * np.pi * frequency * (time[:, None, None] - MOVE_S) + phase)
     wanted = 0.9 * rise[:, None] * (amplitude * wave).sum(axis=2)  # [rad/s]
     q = np.empty((len(time), 6))
-    q[0] = [HOME[name] for name in model.names[1:]]
+    q[0] = [HOME[name] for name in model.names[1:]] + rng.normal(scale=START_STD, size=6)
     pin.framesForwardKinematics(model, data, q[0])
     target = data.oMf[tip_frame].translation + change * AWAY * np.ones((len(time), 1))
     tip = np.empty((len(time), 3))
@@ -148,9 +151,9 @@ def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> 
     calibration = calibrate(arm, moved)
     describe(f"one point, seed {seed}", calibration, moved)
     assert np.abs(deviations(calibration, moved)).max() < 3.0
-    assert calibration.rms_gap < 0.1 * calibration.prior_rms_gap
+    assert calibration.rms_gap < 0.2 * calibration.prior_rms_gap
     for name in TRUE:  # a tenth before the motion
-        assert calibration.subject.std(name) < 0.02 * moved.lengths[name]
+        assert calibration.subject.std(name) < 0.01 * moved.lengths[name]
 
 
 def test_a_known_point_two_points_and_stated_mounts(arm: BodyModel) -> None:
@@ -191,13 +194,40 @@ def test_recorded_places_of_the_tip_close_the_chain(arm: BodyModel, tmp_path: Pa
     assert "scale" not in {check.diagnostic.code.partition("-")[0] for check in assess(calibration).checks}
 
 
+def test_places_are_interpolated_between_rows_that_have_them() -> None:
+    known_time, lost = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 1.0, 1.1]), np.nan
+    places = np.array([0.0, 1.0, 2.0, lost, 4.0, 10.0, 11.0])[:, None] * [1.0, 2.0, -1.0]
+    time = np.array([-0.05, 0.0, 0.05, 0.2, 0.25, 0.35, 0.4, 0.7, 1.05, 1.1, 1.15])
+    expected = np.array([lost, 0.0, 0.5, 2.0, lost, lost, 4.0, lost, 10.5, 11.0, lost])  # 0.4 to 1.0: rows are missing
+    found = interpolate_places(time, known_time, places)
+    np.testing.assert_allclose(found, expected[:, None] * [1.0, 2.0, -1.0], atol=1e-9)
+
+
+def test_what_a_truth_lacks_is_said_in_one_line(arm: BodyModel, tmp_path: Path) -> None:
+    recording = replace(move_arm(arm, 0, seconds=12.0).recording, truth=tmp_path / "optical.parquet")
+    time = np.arange(0.0, 12.0, 0.1)
+    lost = np.full(len(time), np.nan)
+    good = {"time": time, "tip_x": time, "tip_y": time, "tip_z": time}
+    closure = Closure("tip", "recorded", ("tip",), slip=0.001)
+    for table, named in (
+        ({"time": time, "tip_x": time, "tip_y": time}, "no column 'tip_z' in optical.parquet"),
+        (good | {"time": time[::-1]}, "time of optical.parquet does not increase"),
+        (good | {"tip_x": lost}, "are without a recorded place"),
+    ):
+        pl.DataFrame(table).write_parquet(tmp_path / "optical.parquet")
+        with pytest.raises(WeposeError) as raised:
+            calibrate(arm, Moved(recording, {}, lost), closure)
+        assert named in str(raised.value)
+        assert "\n" not in str(raised.value)
+
+
 def test_a_lost_sensor_is_named_in_one_line(arm: BodyModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = move_arm(arm, 0, seconds=20.0).recording
     sensors = {link: sensor for link, sensor in recording.sensors.items() if link != "forearm_link"}
-    session = write_session(tmp_path / "session", replace(recording, sensors=sensors))
+    write_session(tmp_path, replace(recording, sensors=sensors))
     model = Path(arm.table.where)
     with pytest.raises(SystemExit) as stopped:
-        main(["calibrate", str(session), "--model", str(model), "--protocol", "tip", "-o", str(tmp_path / "out")])
+        main(["calibrate", str(tmp_path), "--model", str(model), "--protocol", "tip", "-o", str(tmp_path / "out")])
     assert stopped.value.code == 2
     [line] = capsys.readouterr().err.strip().splitlines()
     assert "forearm_link" in line

@@ -22,6 +22,7 @@ from wepose_pin.calibration.conditions import (
     resolve_conditions,
 )
 from wepose_pin.calibration.least_squares import Layout, Observations, residuals
+from wepose_pin.calibration.protocols import Closure
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, render, render_all
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
@@ -127,9 +128,13 @@ def test_what_is_in_the_chain_follows_from_the_points() -> None:
     assert load_protocol("handle").distances == ("handle",)
 
 
-@pytest.mark.parametrize("name", ["clasp", "handle", "touch_right", "poses"])
+@pytest.mark.parametrize("name", ["clasp", "handle", "touch_right", "poses", "recorded"])
 def test_jacobians_are_those_of_differences(name: str) -> None:
-    protocol = load_protocol(name)
+    recorded = name == "recorded"
+    protocol = load_protocol("touch_right" if recorded else name)
+    if recorded:
+        closure = Closure("touch", "recorded", ("right_palm",), origin="left_shoulder")
+        protocol = replace(protocol, conditions=(closure,))
     rng = np.random.default_rng(1)
     model, sensors, closures = load_model(), protocol.needs, protocol.closures
     start = StartPose(orient_links(model, pin.neutral(model.pin)))
@@ -142,10 +147,14 @@ def test_jacobians_are_those_of_differences(name: str) -> None:
         fixed=sum(c.kind == "fixed_point" for c in closures),
         planes=sum(c.kind == "plane" for c in closures),
         distance_names=protocol.distances,
+        recorded=recorded,
+        rigid=sensors[:1] if recorded else (),
     )
     n = 2 * len(protocol.conditions)
     turns = [Rotation.random(n, random_state=rng).as_quat().T for _ in sensors]
-    observations = Observations(layout, np.vstack([*turns, rng.uniform(0, 60, n)]), conditions, np.arange(n) // 2)
+    places = rng.normal(size=(3 if recorded else 0, n))
+    data = np.vstack([*turns, places, rng.uniform(0, 60, n)])
+    observations = Observations(layout, data, conditions, np.arange(n) // 2)
     x = rng.normal(scale=0.1, size=layout.size)
     x[:8] = rng.uniform(0.1, 0.5, 8)
     x[layout.heading] = rng.uniform(-3, 3, len(sensors))

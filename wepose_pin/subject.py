@@ -20,13 +20,14 @@ from .arguments import (
     check_names,
     check_unit,
 )
-from .documents import TomlTable, is_number, parse_toml, read_toml, toml_string, toml_strings
+from .documents import TomlTable, is_number, parse_toml, read_toml, toml_key, toml_string, toml_strings
 from .errors import BadData, BadModel, BadOption, BadSubject, one_of
 from .model import BodyModel, BodyTable, compute_population_lengths, load_table
 
 _MOUNT_ROW = re.compile(r"mounts\..+\.[xyz]")  # of a covariance
 LONGEST = 3.0  # [m] of a plausible length
-_TABLES = ("lengths", "lengths_std", "mounts", "hinges", "start_pose_offset", "heading_drift", "covariance")
+_LEARNED = ("mounts", "hinges", "start_pose_offset", "heading_drift", "doubled")
+_TABLES = ("lengths", "lengths_std", *_LEARNED, "covariance")
 FORMAT = 2
 MOST_OFFSET_DEG = 180.0  # of a file; the calibration checks whether it is plausible
 MOST_DRIFT_DEG_MIN = 6000.0  # of a heading: 100 deg/s, beyond any gyroscope's bias
@@ -68,6 +69,7 @@ class Subject:
     hinges : joint → its axis, where a calibration estimated it
     start_pose_offset : segment → its offset from the start pose in the calibration, which a person nearly repeats
     heading_drift : segment → that of its sensor in the calibration; on another day it has a similar size
+    doubled : second sensor → its segment; its mount is under its own name
     """
 
     name: str
@@ -79,6 +81,7 @@ class Subject:
     hinges: Mapping[str, Hinge] = field(default_factory=dict)
     start_pose_offset: Mapping[str, StartPoseOffset] = field(default_factory=dict)
     heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
+    doubled: Mapping[str, str] = field(default_factory=dict)
 
     def check(self) -> Subject:
         """The same subject, if all its fields are valid.
@@ -121,7 +124,9 @@ class Subject:
             missing = [name for name in table.lengths if name not in self.lengths]
             if missing:
                 raise BadOption(f"{where}lengths: {', '.join(missing)} of the body {table.name} is missing")
-            for name in ("start_pose_offset", "heading_drift"):  # mounts may be of a segment's second sensor
+            check_names(f"{where}mounts", self.mounts, (*table.segments, *self.doubled))
+            check_names(f"{where}doubled", self.doubled.values(), table.segments)
+            for name in ("start_pose_offset", "heading_drift"):
                 check_names(f"{where}{name}", getattr(self, name), table.segments)
             check_names(f"{where}hinges", self.hinges, table.hinges)
         except BadOption as error:
@@ -197,10 +202,15 @@ def population_subject(
     BadOption
         A stature outside 1.0 to 2.5 m, or another sex.
     BadModel
-        The table names a share that is not known, or a length that is none without a model.
+        The table has no lengths, names a share that is not known, or a length that is none without a model.
     """
     check_arguments(population_subject, locals())
     table = load_table() if body is None else body if isinstance(body, BodyTable) else body.table
+    if not table.lengths:
+        raise BadModel(
+            f"{table.where}: this body has no lengths; a table beside the URDF names its points and [lengths], as "
+            f"docs/models.md shows"
+        )
     people = compute_population_lengths(table, stature, sex)
     lengths, variances = dict(zip(people.names, people.mean.tolist(), strict=True)), {}
     for name, length in table.lengths.items():
@@ -243,6 +253,9 @@ def subject_toml(subject: Subject) -> str:
         lines += ["", f"[heading_drift.{segment}]   # of its sensor's heading in the calibration"]
         rates = {"rate_deg_min": drift.rate, "std_deg_min": drift.std}
         lines += [f"{key} = {60.0 * np.degrees(value):.4f}" for key, value in rates.items()]
+    if subject.doubled:
+        lines += ["", "[doubled]   # second sensors, and their segments"]
+        lines += [f"{toml_key(name)} = {toml_string(segment)}" for name, segment in subject.doubled.items()]
     if subject.order:
         lines += ["", "[covariance]    # of lengths [m] and mount errors [rad], jointly"]
         lines.append(f"order = {toml_strings(subject.order)}")
@@ -316,6 +329,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         hinges={joint: _read_hinge(entry) for joint, entry in hinges.items()},
         start_pose_offset={segment: StartPoseOffset(v[:2], float(v[2])) for segment, v in offset.items()},
         heading_drift={segment: HeadingDrift(float(rate), float(std)) for segment, (rate, std) in drift.items()},
+        doubled={name: tables["doubled"].text(name, None) or "" for name in tables["doubled"].values},
     )
 
 

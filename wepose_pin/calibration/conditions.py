@@ -163,7 +163,9 @@ def _resolve_closure(
 ) -> Loop:
     ways = tuple(find_parts(model, start, sensors, points) for points in closure.ways)
     if not any(part.sensor != UNIVERSE for way in ways for part in way):
-        raise BadSession(f"protocol '{protocol.name}': no sensor moves {' and '.join(closure.points)}")
+        raise BadSession(
+            f"protocol '{protocol.name}': no sensor moves {' and '.join(closure.points)}; a point that moves is needed"
+        )
     return Loop(closure, ways)
 
 
@@ -190,7 +192,10 @@ def find_parts(
         carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
         if carrier is None:
             names = " and ".join(point for point, _ in points)
-            raise BadSession(f"no sensor on {link}: where {names} is cannot be told without it")
+            raise BadSession(
+                f"sensors.{link} is missing: without it the place of {names} is not known; add it, or use a protocol "
+                f"without that point"
+            )
         R = start.R_WK.get(link, np.eye(3))
         B, c = sums.get(carrier, (np.zeros((3, lengths)), np.zeros(3)))
         sums[carrier] = B + R @ by_length, c + R @ constant

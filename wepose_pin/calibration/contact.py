@@ -21,12 +21,13 @@ SCORED = 120  # samples by which a start is scored
 
 
 def find_contact_start(
-    observations: Observations, start_from: Callable[[Observations], np.ndarray]
+    observations: Observations, start: np.ndarray, start_from: Callable[[Observations], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """A start x (m,) and the weight (n,) of each sample's gap in it, near 0 where the palms are apart.
 
     Parameters
     ----------
+    start : x (m,) from all observations
     start_from : observations → x (m,), the prior's mean with headings from the closure of these observations
     """
     n, spans = len(observations), [span for _, span in observations.spans()]
@@ -39,7 +40,7 @@ def find_contact_start(
     def score(x: np.ndarray) -> float:
         return float(np.mean(np.minimum(gap_ratios(x, few), 1.0)))
 
-    best = start_from(observations)
+    best = start
     lowest = score(best)
     # Recorded places are those of the point at any time: no contact is lost.
     touching = observations.closed.all() and any(

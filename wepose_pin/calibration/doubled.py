@@ -38,7 +38,9 @@ def add_second_mounts(calibration: Calibration, recording: Recording, method: st
         first = calibration.subject.mount_covariance(segment)
         own = difference**2 * np.eye(3)
         covariances[doubled.name] = own if first is None else first + own
-    return replace(calibration, subject=_add(calibration.subject, mounts, covariances))
+    names = {doubled.name: segment for segment, doubled in second.items()}
+    subject = _add(calibration.subject, mounts, covariances)
+    return replace(calibration, subject=replace(subject, doubled={**subject.doubled, **names}))
 
 
 def _estimate_mount(R_WL: Rotation, R_VS: Rotation) -> tuple[np.ndarray, float]:

@@ -52,6 +52,7 @@ class Layout(NamedTuple):
     distance_names : of the unknown distances outside the body
     steps : the sensor of each heading step
     recorded : whether the samples hold a recorded place
+    rigid : sensors without a soft-tissue artefact
     """
 
     lengths: tuple[str, ...]
@@ -63,6 +64,12 @@ class Layout(NamedTuple):
     distance_names: tuple[str, ...] = ()
     steps: tuple[str, ...] = ()
     recorded: bool = False
+    rigid: tuple[str, ...] = ()
+
+    @property
+    def soft(self) -> tuple[str, ...]:
+        """Sensors with a soft-tissue artefact."""
+        return tuple(name for name in self.sensors if name not in self.rigid)
 
     @property
     def length(self) -> slice:
@@ -91,8 +98,8 @@ class Layout(NamedTuple):
 
     @property
     def soft_tissue(self) -> slice:
-        """A (3, 3) of each sensor, column by column [rad]."""
-        return slice(self.hinge.stop, self.hinge.stop + 9 * len(self.sensors))
+        """A (3, 3) of each of the `soft` sensors, column by column [rad]."""
+        return slice(self.hinge.stop, self.hinge.stop + 9 * len(self.soft))
 
     @property
     def twist(self) -> slice:
@@ -269,8 +276,11 @@ def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any
         turned = product(about_z(now), data[4 * i : 4 * i + 4])
         turned = product(turned, about_z(-heading[i]))
         quat = product(turned, small_turn(ca.vertcat(tilt[2 * i], tilt[2 * i + 1], 0.0)))
-        A = ca.reshape(soft_tissue[9 * i : 9 * i + 9], 3, 3)
-        quat_WL[name] = product(quat, small_turn(A @ (rotate(inverse(quat), _UP) - _UP)))
+        if name in layout.soft:
+            k = 9 * layout.soft.index(name)
+            A = ca.reshape(soft_tissue[k : k + 9], 3, 3)
+            quat = product(quat, small_turn(A @ (rotate(inverse(quat), _UP) - _UP)))
+        quat_WL[name] = quat
     gap, hinges = ca.SX.zeros(3), ca.SX.zeros(len(layout.hinges))
     if isinstance(condition, Loop):
         whitened, gap = _closure_residual(layout, condition, x, quat_WL, place, data[layout.place])

@@ -221,7 +221,7 @@ def _solve(problem: CalibrationProblem) -> _Solution:
     observations, samples = problem.observe(SAMPLE_RATE_HZ)
     layout, recording = observations.layout, problem.recording
     prior = build_prior(problem, observations)
-    start, contact = find_contact_start(observations, lambda some: build_prior(problem, some).mean)
+    start, contact = find_contact_start(observations, prior.mean, lambda some: build_prior(problem, some).mean)
     spans = [span for closure in problem.protocol.closures for span in recording.phase(closure.phase)]
     neighbours = [(problem.model.parents[name], name) for name in layout.sensors]
     pairs = [(above, name) for above, name in neighbours if above is not None and above in layout.sensors]

@@ -60,7 +60,7 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
         mean[rows] += offset
     information[layout.drift, layout.drift] = np.eye(len(layout.sensors)) / DRIFT_STD**2
     segments = problem.model.table.segments
-    soft_tissue = [segments[name].soft_tissue_std for name in layout.sensors]
+    soft_tissue = [segments[name].soft_tissue_std for name in layout.soft]
     information[layout.soft_tissue, layout.soft_tissue] = np.diag(np.repeat(soft_tissue, 9) ** -2.0)
     twists = [segments[twist.sensor].point_twist_std for twist in layout.twists]
     information[layout.twist, layout.twist] = np.diag(np.array(twists) ** -2.0)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
-from ..errors import BadPhase
+from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
 from ..model import BodyModel
 from ..model.start_pose import compute_start_configuration, orient_links
@@ -69,8 +69,17 @@ class CalibrationProblem:
 
     @cached_property
     def conditions(self) -> tuple[Constraint, ...]:
-        """The protocol's conditions on the body with these sensors."""
-        return resolve_conditions(self.protocol, self.model, self.start_pose, self.filtered.R_VS)
+        """The protocol's conditions on the body with these sensors.
+
+        Raises
+        ------
+        BadSession
+            A closure between points that no sensor determines.
+        """
+        try:
+            return resolve_conditions(self.protocol, self.model, self.start_pose, self.filtered.R_VS)
+        except BadSession as error:
+            raise BadSession(f"{self.recording.where()}: {error}") from error
 
     @cached_property
     def lengths_in_closures(self) -> tuple[str, ...]:
@@ -196,6 +205,7 @@ class CalibrationProblem:
             sum(closure.kind == "plane" for closure in protocol.closures),
             protocol.distances,
             recorded=any(closure.kind == "recorded" for closure in protocol.closures),
+            rigid=tuple(name for name in sensors if self.model.table.segments[name].soft_tissue_std == 0.0),
         )
         losses = find_losses(recording, filtered.start, layout.sensors)
         # Only the linear start can estimate a heading step of any size.

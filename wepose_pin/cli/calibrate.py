@@ -20,6 +20,7 @@ GAPS = {
     "distance": "Error of the distance between {}",
     "fixed_point": "Gap from {} to its place",
     "plane": "Height of {} off the plane",
+    "recorded": "Gap from {} to its recorded place",
 }
 
 

@@ -231,7 +231,7 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: 
                 f"{where}: sensors.{name} is no link of {robot.name}; {one_of(tree.below, name, MOST_LINKS)}"
             )
     links = sorted(sensors, key=lambda name: len(tree.path(name)))
-    segments = {name: Segment(name, rigid_without_sensor=True) for name in links}
+    segments = {name: Segment(name, rigid_without_sensor=True, soft_tissue_std=0.0) for name in links}
     body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(file)), str(file))
     if not body.pin.nv:
         raise BadModel(f"{file}: no joint moves; a chain of revolute or prismatic joints is needed")

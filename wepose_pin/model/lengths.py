@@ -120,8 +120,12 @@ def _segment_stretch(
     directions = np.array([line for line, _ in lines])  # (k, 3)
     if len(lines) == 2:
         directions = np.vstack([directions, np.cross(directions[1], directions[0])])
-    if len(lines) > 3 or abs(np.linalg.det(directions)) < 1e-9 * np.prod(np.linalg.norm(directions, axis=1)):
-        raise BadModel(f"{table.where}: the lengths of segment '{segment}' do not lie in different directions")
+    if len(lines) > 3 or abs(np.linalg.det(directions)) <= 1e-9 * np.prod(np.linalg.norm(directions, axis=1)):
+        names = [name for name, length in table.lengths.items() if any(p.segment == segment for p in length.stretches)]
+        raise BadModel(
+            f"{table.where}: lengths.{', lengths.'.join(names)}: all of segment '{segment}', which they cannot stretch "
+            f"independently; up to three lengths in different directions are possible"
+        )
     basis = directions.T
     factors = [factor for _, factor in lines] + [1.0] * (3 - len(lines))
     return basis @ np.diag(factors) @ np.linalg.inv(basis)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..assets import asset
 from ..documents import TomlTable, is_number, read_toml, toml_key, toml_string, toml_strings
-from ..errors import BadModel, one_of
+from ..errors import BadModel, MissingFile, one_of
 from ..recording.sensors import AXES, read_axes
 
 DEFAULT_BODY = "upper_body"
@@ -43,7 +43,7 @@ class Segment(NamedTuple):
     rigid_without_sensor : whether it follows the segment above where it has no sensor; else it is unknown then
     labels : a regular expression of words that mean it in a sensor's name
     joint : the name of the joint to the segment above, where no point is there to name it
-    soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian
+    soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian; none on a mechanism
     point_twist_std : [rad] by which the points above which other segments hang turn about its long axis
     """
 
@@ -360,6 +360,8 @@ def read_table(path: Path, *, needs_urdf: bool = False) -> tuple[BodyTable, Path
     file = path.parent / urdf if urdf is not None else beside if beside.is_file() else None
     if needs_urdf and file is None:
         raise BadModel(f'{path}: names no URDF; urdf = "body.urdf" is wanted, a file beside this one')
+    if urdf is not None and needs_urdf and file is not None and not file.is_file():
+        raise MissingFile(f"{path}: urdf = {urdf!r}: no such file beside it; the name of a URDF is wanted")
     return parse_table(values, str(path), path.stem), file
 
 
@@ -377,9 +379,13 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
     top = TomlTable(values, where, error=BadModel)
     top.allow("like", *_SETTINGS, *_KEYS)
     like = top.text("like", None)
+    known = _list_bodies()
+    if like is not None and like not in known:
+        raise BadModel(f"{top.at('like')} = {like!r}: no such body comes with the package; {one_of(known, like)}")
     base = load_table(like) if like is not None else BodyTable(name, {}, where=where)
     new = like is None
-    segments = _read_segments(top, base)
+    kind: Any = top.choice("kind", (PERSON, MECHANISM), base.kind)
+    segments = _read_segments(top, base, kind)
     if not segments:
         raise BadModel(f'{where}: [segments] is missing; each segment\'s link is needed, as in torso = "chest_link"')
     up, forward = read_axes(top, base.up if new else "+z", base.forward if new else "+x")
@@ -388,7 +394,7 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
         name=name,
         segments=segments,
         points=_read_points(top, base, segments),
-        kind=top.choice("kind", (PERSON, MECHANISM), base.kind),  # type: ignore[arg-type]
+        kind=kind,
         up=up,
         forward=forward,
         root=_read_names(top, "root"),
@@ -426,8 +432,9 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
     )
 
 
-def _read_segments(top: TomlTable, base: BodyTable) -> dict[str, Segment]:
+def _read_segments(top: TomlTable, base: BodyTable, kind: str) -> dict[str, Segment]:
     segments = {}
+    new = Segment("", soft_tissue_std=0.0) if kind == MECHANISM else Segment("")
     for name, entry in _read_links(top, "segments"):
         entry.allow(
             *("link", "up", "forward", "along", "spine", "without_sensor", "labels", "joint"),
@@ -437,7 +444,7 @@ def _read_segments(top: TomlTable, base: BodyTable) -> dict[str, Segment]:
         if ("up" in entry) != ("forward" in entry):
             raise BadModel(f'{entry.where}: up and forward go together, as in up = "+z", forward = "+x"')
         up, forward = read_axes(entry) if "up" in entry else (None, None)
-        segment = (own or Segment(name))._replace(link=entry.text("link", name) or name, up=up, forward=forward)
+        segment = (own or new)._replace(link=entry.text("link", name) or name, up=up, forward=forward)
         if "along" in entry:
             x, y, z = (float(v) for v in AXES[entry.choice("along", AXES)])
             segment = segment._replace(along=(x, y, z))
@@ -522,7 +529,10 @@ def _read_lengths(top: TomlTable, table: BodyTable) -> dict[str, Length]:
                 if point not in table.points and point != ROOT:
                     raise BadModel(f"{entry.where}: '{point}' is no point; {one_of((*table.points, ROOT), point)}")
             if not start or not end or start == end:
-                raise BadModel(f"{entry.where}: scales nothing: it needs from and to, two different points")
+                raise BadModel(
+                    f"{entry.where}: from = {list(start)}, to = {list(end)} scales nothing; two different points are "
+                    f"needed"
+                )
             stretches.append(Stretch(entry.choice("segment", table.segments), start, end))
             if "share" in entry or "std_percent" in entry:
                 settings = entry
@@ -540,7 +550,10 @@ def _read_hinges(top: TomlTable, table: BodyTable) -> dict[str, HingeJoint]:
         axis = _read_numbers(entry, "axis", 3, None)
         size = float(np.linalg.norm(axis))
         if size < 1e-6 or on == moves:
-            raise BadModel(f"{entry.where}: is no hinge: it needs two different segments and an axis of some length")
+            raise BadModel(
+                f"{entry.where}: on = {on!r}, moves = {moves!r}, axis = {entry.values.get('axis')} is no hinge; two "
+                f"different segments and an axis of some length are needed"
+            )
         x, y, z = (float(v) / size for v in axis)
         low, high = np.deg2rad(_read_numbers(entry, "range_deg", 2, [-180.0, 180.0])).tolist()
         if low >= high:
@@ -553,7 +566,10 @@ def _read_hinges(top: TomlTable, table: BodyTable) -> dict[str, HingeJoint]:
             )
         )
         if abs(np.dot((x, y, z), table.segments[on].along)) > 0.7:
-            raise BadModel(f"{entry.at('axis')}: lies along the segment '{on}'; no hinge bends about that")
+            raise BadModel(
+                f"{entry.at('axis')} = {entry.values['axis']} lies along the segment '{on}', about which no hinge "
+                f"bends; an axis across it is needed"
+            )
         hinges[name] = defaults._replace(softness=softness, common_std=common, mirror_std=mirror, tilt_std=tilt)
     return hinges
 

@@ -121,6 +121,7 @@ def _rename_mounts(subject: Subject | None, names: Mapping[str, str]) -> Subject
         mounts=mounts,
         order=tuple(new.get(subject.order[k], subject.order[k]) for k in kept),
         covariance=subject.covariance[np.ix_(kept, kept)],
+        doubled={},
         start_pose_offset={},
         heading_drift={},
         hinges={},

@@ -1,0 +1,272 @@
+"""Bad tables and protocols give one line that says file, key, value and what would be right; foreign bodies load."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_chain import urdf  # noqa: F401
+from test_chain_calibration import HOME, LINKS, TABLE, arm  # noqa: F401
+from test_model import example_robot_data_human
+
+from wepose_pin.cli import main
+from wepose_pin.model import BodyModel, load_model
+from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
+from wepose_pin.writers import write_session
+
+GOOD = TABLE.format(segments="\n".join(f'{link} = "{link}"' for link in LINKS)).replace(
+    "[points]", '[points]\nfoot = "base_link"'
+)
+UPPER_BODY = 'urdf = "upper_body.urdf"\nlike = "upper_body"\n'
+HINGE = '[hinges.bend]\non = "upper_arm_link"\nmoves = "forearm_link"\naxis = [0.0, 1.0, 0.0]\n'
+LENGTH = '{ segment = "upper_arm_link", from = "base", to = "elbow" }'
+
+# What is wrong, the table, and what the line names.
+TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "a length of a segment that does not lie between its points": (
+        GOOD.replace('segment = "forearm_link", from = "elbow"', 'segment = "wrist_3_link", from = "elbow"'),
+        ("lengths.forearm", "wrist_3_link", "name the segment between them"),
+    ),
+    "a length from a point to itself": (
+        GOOD.replace('from = "base", to = "elbow"', 'from = "base", to = "base"'),
+        ("lengths.upper_arm", "base", "two different points"),
+    ),
+    "a length between points in one place": (
+        GOOD.replace('elbow = "forearm_link"', 'elbow = "upper_arm_link"'),
+        ("lengths.upper_arm", "one place"),
+    ),
+    "two lengths of a segment in one direction": (
+        GOOD + f"again = {LENGTH}\n",
+        ("lengths.upper_arm, lengths.again", "upper_arm_link", "different directions"),
+    ),
+    "a length to a point that is none": (
+        GOOD.replace('to = "elbow"', 'to = "elbov"'),
+        ("lengths.upper_arm", "elbov", "did you mean 'elbow'"),
+    ),
+    "a hinge of a segment with itself": (
+        GOOD + HINGE.replace('moves = "forearm_link"', 'moves = "upper_arm_link"'),
+        ("hinges.bend", "upper_arm_link", "two different segments"),
+    ),
+    "a hinge along the segment": (
+        GOOD + HINGE.replace("[0.0, 1.0, 0.0]", "[0.0, 0.1, 1.0]"),
+        ("hinges.bend.axis", "0.1", "along the segment 'upper_arm_link'"),
+    ),
+    "a hinge between no neighbours": (
+        GOOD + HINGE.replace('moves = "forearm_link"', 'moves = "wrist_1_link"'),
+        ("hinges.bend", "wrist_1_link hangs on forearm_link", "not on upper_arm_link"),
+    ),
+    "a hinge without an axis": (GOOD + HINGE.replace("[0.0, 1.0, 0.0]", "[0, 0, 0]"), ("hinges.bend", "[0, 0, 0]")),
+    "a hinge on nothing": (
+        GOOD + HINGE.replace('on = "upper_arm_link"', 'on = "uper_arm_link"'),
+        ("hinges.bend.on", "uper_arm_link", "did you mean 'upper_arm_link'"),
+    ),
+    "a pose outside its limits": (
+        GOOD + "[poses.folded]\nelbow_joint = 9.0\n",
+        ("poses.folded.elbow_joint", "9", "-6.3 to 6.3"),
+    ),
+    "a pose with a joint that is none": (
+        GOOD + "[poses.folded]\nelbow = 1.0\n",
+        ("poses.folded.elbow", "did you mean 'elbow_joint'"),
+    ),
+    "no segments": ('urdf = "arm.urdf"\nkind = "mechanism"\n', ("[segments]", "missing")),
+    "an unknown body that it is like": (
+        'urdf = "arm.urdf"\nlike = "uper_body"\n',
+        ("like", "uper_body", "did you mean 'upper_body'"),
+    ),
+    "a segment on a link that is none": (
+        GOOD.replace('forearm_link = "forearm_link"', 'forearm_link = "forearm"'),
+        ("segments.forearm_link", "forearm", "did you mean 'forearm_link'"),
+    ),
+    "a point on a link that is none": (
+        GOOD.replace('wrist = "wrist_1_link"', 'wrist = "wrist_link"'),
+        ("points.wrist", "wrist_link", "did you mean"),
+    ),
+    "an unknown kind": (GOOD.replace('"mechanism"', '"robot"'), ("kind", "robot", "mechanism")),
+    "an unknown key": ("colour = 3\n" + GOOD, ("colour", "segments")),
+    "no URDF": (GOOD.replace("arm.urdf", "leg.urdf"), ("leg.urdf", "no such file")),
+    "a tree with a fixed arm": (
+        UPPER_BODY,
+        ("upper_body.urdf", "left_upper_arm", "left_upper_arm_z", "fixed", "revolute joints"),
+    ),
+}
+PROTOCOL = """name = "mine"
+[[closure]]
+phase = "tip"
+kind = "fixed_point"
+points = ["tip"]
+"""
+PROTOCOLS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "a point that is none": (PROTOCOL.replace('["tip"]', '["tipp"]'), ("'tipp'", "did you mean 'tip'")),
+    "an unknown kind": (PROTOCOL.replace("fixed_point", "fixed"), ("closure 1: kind", "'fixed'", "fixed_point")),
+    "two points of one": (PROTOCOL.replace('["tip"]', '["tip", "elbow"]'), ("closure 1: points", "elbow", "takes 1")),
+    "a key of another kind": (PROTOCOL + 'origin = "base"\n', ("closure 1", "'origin'", "fixed_point")),
+    "a place that is none": (PROTOCOL + "at = [1.0, 2.0]\n", ("closure 1: at", "[1.0, 2.0]", "three numbers")),
+    "an origin that is none": (
+        PROTOCOL.replace("fixed_point", "recorded") + 'origin = "bass"\n',
+        ("'bass'", "did you mean 'base'"),
+    ),
+    "an origin that is the point": (
+        PROTOCOL.replace("fixed_point", "recorded") + 'origin = "tip"\n',
+        ("closure 1: origin", "'tip'", "another one"),
+    ),
+    "recorded places without a truth": (
+        PROTOCOL.replace("fixed_point", "recorded"),
+        ("session.toml", "data.truth is missing", "tip_x"),
+    ),
+    "no conditions": ('name = "mine"\n', ("[[closure]]", "[[pose]]")),
+    "points that no sensor moves": (PROTOCOL.replace('["tip"]', '["foot"]'), ("no sensor moves foot",)),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(arm: BodyModel, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
+    """A session of an arm that does not move, and its URDF."""
+    folder = tmp_path_factory.mktemp("bad")
+    time = np.arange(0.0, 20.0, 0.02)
+    rng = np.random.default_rng(0)
+    sensors = {}
+    for link in LINKS:
+        accel = [0.0, 0.0, 9.81] + rng.normal(scale=0.01, size=(len(time), 3))
+        gyro = rng.normal(scale=1e-3, size=(len(time), 3))
+        sensors[link] = ImuSensor(gyro_S=gyro, accel_S=accel, stated_quat_LS=compute_mount("+z", "+x"))
+    phases = {"start": ((0.5, 4.5),), "tip": ((5.0, 19.0),)}
+    recording = Recording("arm", time, 50.0, sensors, phases=phases, start_pose=CONFIGURATION, joints=HOME)
+    write_session(folder, recording)
+    shutil.copyfile(Path(arm.table.where).with_name("arm.urdf"), folder / "arm.urdf")
+    (folder / "arm.toml").write_text(GOOD, encoding="utf-8")
+    return folder
+
+
+def refuse(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """The one line with which a command ends, exit 2."""
+    with pytest.raises(SystemExit) as stopped:
+        main([str(argument) for argument in arguments])
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert stopped.value.code == 2, lines
+    assert len(lines) == 1, lines
+    print(lines[0])
+    return lines[0]
+
+
+@pytest.mark.parametrize("case", list(TABLES))
+def test_a_bad_table_says_what_and_where(case: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, named = TABLES[case]
+    (folder / "bad.toml").write_text(text, encoding="utf-8")
+    if "upper_body.urdf" in text:
+        ours = Path(__file__).parents[1] / "urdf" / "upper_body.urdf"
+        fixed = ours.read_text(encoding="utf-8")
+        for axis in "xyz":
+            fixed = fixed.replace(
+                f'name="left_upper_arm_{axis}" type="revolute"', f'name="left_upper_arm_{axis}" type="fixed"'
+            )
+        assert fixed != ours.read_text(encoding="utf-8")
+        (folder / "upper_body.urdf").write_text(fixed, encoding="utf-8")
+    for command in ("calibrate", "track"):
+        line = refuse(capsys, command, folder, "--model", folder / "bad.toml", "-o", folder / "out")
+        for part in named:
+            assert part in line
+        assert "bad.toml: " in line or "upper_body.urdf: " in line
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize("case", list(PROTOCOLS))
+def test_a_bad_protocol_says_what_and_where(case: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, named = PROTOCOLS[case]
+    (folder / "bad_protocol.toml").write_text(text, encoding="utf-8")
+    model = ("--model", folder / "arm.toml", "--protocol", folder / "bad_protocol.toml")
+    line = refuse(capsys, "calibrate", folder, *model, "-o", folder / "out")
+    for part in named:
+        assert part in line
+    assert "bad_protocol.toml" in line or "'mine'" in line or "session.toml" in line
+    assert not (folder / "out").exists()
+
+
+# Foreign bodies ------------------------------------------------------------------------------------------------------
+
+GAZEBO = 'like = "human_gazebo"\nroot = "Pelvis"\n'
+COSMIK = """like = "upper_body"
+up = "+y"
+root = "pelvis"
+segments.torso = "torso"
+segments.left_upper_arm = "upperarmL"
+segments.left_forearm = "lowerarmL"
+segments.right_upper_arm = "upperarmR"
+segments.right_forearm = "lowerarmR"
+points = { left_wrist = {link="lowerarmL", at=[0, -0.26, 0]}, right_wrist = {link="lowerarmR", at=[0, -0.26, 0]} }
+"""
+HUMAN = """like = "example_robot_data_human"
+up = "+y"
+root = ["left_upperleg", "right_upperleg"]
+"""
+UR = """kind = "mechanism"
+segments = { upper_arm_link = "upper_arm_link", forearm_link = "forearm_link", wrist_3_link = "wrist_3_link" }
+points = { base = "upper_arm_link", elbow = "forearm_link", wrist = "wrist_1_link", tip = "tool0" }
+[lengths]
+upper_arm = { segment = "upper_arm_link", from = "base", to = "elbow" }
+forearm = { segment = "forearm_link", from = "elbow", to = "wrist" }
+"""
+PANDA = """kind = "mechanism"
+segments = { panda_link2 = "panda_link2", panda_link4 = "panda_link4", panda_link7 = "panda_link7" }
+points = { shoulder = "panda_link2", elbow = "panda_link4", wrist = "panda_link5", tip = "panda_hand" }
+[lengths]
+upper_arm = { segment = "panda_link2", from = "shoulder", to = "elbow" }
+forearm = { segment = "panda_link4", from = "elbow", to = "wrist" }
+"""
+Z1 = """kind = "mechanism"
+segments = { link02 = "link02", link03 = "link03", link06 = "link06" }
+points = { shoulder = "link02", elbow = "link03", wrist = "link04", tip = "link06" }
+[lengths]
+upper_arm = { segment = "link02", from = "shoulder", to = "elbow" }
+forearm = { segment = "link03", from = "elbow", to = "wrist" }
+"""
+# URDF, its table without the line that names it, and what the line says that asks for a table where none is needed.
+HUMANS = {
+    "cosmik_human.urdf": (COSMIK, ("sensors.shoulder_link", "no link of human_wb", "upperarmL")),
+    "humanSubject01_48dof.urdf": (GAZEBO, ()),
+    "humanSubject01_66dof.urdf": (GAZEBO, ()),
+    "humanSubjectWithSpinalCordMeshes.urdf": (GAZEBO, ()),
+}
+ROBOTS = {
+    "human_description/robots/human.urdf": (HUMAN, ()),
+    "ur_description/urdf/ur5_robot.urdf": (UR, ("ur5_robot.urdf", "no lengths", "docs/models.md")),
+    "panda_description/urdf/panda.urdf": (PANDA, ("sensors.shoulder_link", "no link of panda", "panda_link5")),
+    "z1_description/urdf/z1.urdf": (Z1, ("sensors.shoulder_link", "no link of z1", "link05")),
+}
+
+
+def check_foreign(
+    path: Path, text: str, named: tuple[str, ...], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The body loads by the table, with lengths that scale it; without it, or one line says what is missing."""
+    table = folder / "foreign.toml"
+    table.write_text(f'urdf = "{path}"\n{text}', encoding="utf-8")
+    assert len(table.read_text(encoding="utf-8").splitlines()) <= 10
+    body = load_model(table)
+    assert len(body.lengths) >= 2
+    assert set(body.reaches) == set(body.table.points)  # raises where a length does not act as the table says
+    for name, value in body.lengths.items():
+        assert body.with_lengths({name: 1.1 * value}).lengths[name] == pytest.approx(1.1 * value, rel=1e-9)
+    if named:
+        line = refuse(capsys, "calibrate", folder, "--model", path, "-o", folder / "out")
+        for part in named:
+            assert part in line
+    else:
+        assert list(load_model(path).lengths) == list(body.lengths)
+
+
+@pytest.mark.parametrize("name", list(HUMANS))
+def test_a_foreign_person_loads(name: str, data: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, named = HUMANS[name]
+    check_foreign(data / "human_urdf" / name, text, named, folder, capsys)
+
+
+def test_all_foreign_persons_are_tested(data: Path) -> None:
+    assert {path.name for path in (data / "human_urdf").glob("*.urdf")} == set(HUMANS)
+
+
+@pytest.mark.parametrize("name", list(ROBOTS))
+def test_a_foreign_robot_loads(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, named = ROBOTS[name]
+    check_foreign(example_robot_data_human().parents[2] / name, text, named, folder, capsys)
