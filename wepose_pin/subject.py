@@ -93,7 +93,10 @@ class Subject:
         check_fields(self, where)
         try:
             check_lengths(f"{where}lengths", self.lengths)
-            check_names(f"{where}order", [row for row in self.order if not _MOUNT_ROW.fullmatch(row)], self.lengths)
+            named = [row for row in self.order if not _MOUNT_ROW.fullmatch(row)]
+            if named and not self.lengths:
+                raise BadData(f"{where}lengths is empty; it needs the lengths [m] that order names")
+            check_names(f"{where}order", named, self.lengths)
             if len(set(self.order)) < len(self.order):
                 raise BadData(f"{where}order = {self.order}: each name once")
             check_array(f"{where}covariance", self.covariance, (len(self.order), len(self.order)))
