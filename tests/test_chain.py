@@ -15,12 +15,13 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.cli import main
 from wepose_pin.errors import BadModel, BadSession, BadSubject, WeposeError
 from wepose_pin.jobs.track import TrackJob, run_track
-from wepose_pin.kinematics import LiveKinematics
+from wepose_pin.kinematics import LiveKinematics, compute_link_poses, compute_point_covariances
 from wepose_pin.live import LivePose, Output, SensorSetup, run_session
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.body import load_sensed_model
 from wepose_pin.model.configurations import joint_values
+from wepose_pin.model.fit import fit
 from wepose_pin.model.start_pose import compute_start_configuration
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe_file
@@ -387,7 +388,7 @@ def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Pat
     for name, values in bare.joints.items():
         np.testing.assert_allclose(tracked.joints[name], values, atol=1e-9)
     model, body = load_model(table), load(urdf).pin
-    assert set(tracked.points) == {"elbow", "wrist", "tip"}
+    assert set(tracked.points) == {"elbow", "wrist", "tip"} == set(tracked.pose.point_cov)
     data = body.createData()
     for k in (0, 600, 1100):
         pin.framesForwardKinematics(body, data, q[k])
@@ -399,6 +400,41 @@ def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Pat
     assert again.model.lengths["upper"] == pytest.approx(0.5)
     reach = np.linalg.norm(again.points["wrist"] - again.points["elbow"], axis=1)
     np.testing.assert_allclose(reach, 0.5, atol=1e-9)
+
+
+def test_the_covariance_of_points_is_that_of_many_fits(urdf: Path, table: Path) -> None:
+    """Orientations and the length drawn from what is stated of them; two of the arm's six axes carry no sensor."""
+    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    subject = Subject("s", {"upper": 0.392}, ("upper",), np.array([[0.01**2]]))
+    tracked = track(replace(as_segments(recording), model=str(table)), subject)
+    at, rng, n = 700, np.random.default_rng(0), 600
+    cov = {name: np.diag(rng.uniform(0.5, 2.0, 3) * 1e-4) for name in tracked.quat_WL}
+    quat = {
+        name: (
+            Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), cov[name], n)) * Rotation.from_quat(q[at])
+        ).as_quat()
+        for name, q in tracked.quat_WL.items()
+    }
+    start = np.tile(tracked.q[at], (n, 1))
+    segments = list(quat)
+    q = fit(tracked.model.pin, quat, range(1, tracked.model.pin.njoints), start)
+    lengths = rng.normal(0.392, 0.01, n)
+    placed = {point: [] for point in tracked.points}
+    for row, length in zip(q, lengths, strict=True):
+        body = tracked.model.with_lengths({"upper": float(length)})
+        _, p_W = compute_link_poses(body, row[None], [body.point_frames[point] for point in placed], rotations=False)
+        for k, point in enumerate(placed):
+            placed[point].append(p_W[0, k])
+    stated = compute_point_covariances(
+        tracked.model,
+        {name: tracked.quat_WL[name][at : at + 1] for name in segments},
+        {name: cov[name][None] for name in segments},
+        subject.lengths_covariance(["upper"]),
+        tracked.q[at : at + 1],
+    )
+    for point, positions in placed.items():
+        sampled, expected = np.cov(np.array(positions).T), stated[point][0]
+        assert np.linalg.norm(sampled - expected) < 0.25 * np.linalg.norm(expected)
 
 
 def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> None:
