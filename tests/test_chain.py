@@ -358,7 +358,7 @@ elbow = "forearm_link"
 wrist = "wrist_1_link"
 tip = { link = "wrist_3_link", at = [0.0, 0.0, -0.1] }
 [lengths]
-upper = { segment = "upper", from = "elbow", to = "wrist" }
+upper = { segment = "fore", from = "elbow", to = "wrist" }
 [poses.home]
 shoulder_lift_joint = -1.5707963267948966
 wrist_1_joint = -1.5707963267948966
@@ -369,8 +369,7 @@ wrist_1_joint = -1.5707963267948966
 def table(urdf: Path, tmp_path: Path) -> Path:
     """A table of the arm's own, and the URDF beside it."""
     (tmp_path / "arm.urdf").write_bytes(urdf.read_bytes())
-    text = TABLE.replace('{ segment = "upper", from = "elbow"', '{ segment = "fore", from = "elbow"')
-    (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "arm.toml").write_text(TABLE, encoding="utf-8")
     return tmp_path / "arm.toml"
 
 
@@ -435,6 +434,25 @@ def test_the_covariance_of_points_is_that_of_many_fits(urdf: Path, table: Path) 
     for point, positions in placed.items():
         sampled, expected = np.cov(np.array(positions).T), stated[point][0]
         assert np.linalg.norm(sampled - expected) < 0.25 * np.linalg.norm(expected)
+
+
+def test_a_joint_that_slides_stays_where_it_is(urdf: Path, tmp_path: Path) -> None:
+    """Orientations do not tell of it: it is undetermined, and what it moves is not written."""
+    slider = (
+        '<link name="rod"/><joint name="slider" type="prismatic"><parent link="wrist_1_link"/><child link="rod"/>'
+        '<axis xyz="1 0 0"/><limit lower="0" upper="0.5" effort="1" velocity="1"/></joint></robot>'
+    )
+    text = urdf.read_text(encoding="utf-8").replace("</robot>", slider)
+    (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
+    table = TABLE.replace("[lengths]", 'rod = "rod"\n[lengths]')
+    table = table.replace("[poses.home]", "[poses.home]\nslider = 0.2")
+    (tmp_path / "arm.toml").write_text(table, encoding="utf-8")
+    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    subject = Subject("s", {"upper": 0.392}, ("upper",), np.array([[0.01**2]]))
+    tracked = track(replace(as_segments(recording), model=str(tmp_path / "arm.toml")), subject)
+    assert tracked.find_undetermined_joints() == ["slider"]
+    assert set(tracked.points) == {"elbow", "wrist", "tip"}
+    np.testing.assert_allclose(tracked.joints["slider"], 0.2, atol=1e-9)
 
 
 def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> None:

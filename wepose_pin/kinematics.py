@@ -480,6 +480,8 @@ def _propagate_through_joints(
     The fit turns errors δ of the orientations into errors J⁺ δ of the joints, with J the Jacobian of all orientations.
     """
     m, data, k = model.pin, model.pin.createData(), len(segment_cov)
+    if lengths_cov.any() and _slides(model):
+        return {}
     segments = [m.getFrameId(segment) for segment in segment_cov]
     frames = [m.getFrameId(model.point_frames[point]) for point in points]
     cov_W = np.stack(list(segment_cov.values()), axis=1)  # (n, k, 3, 3)
@@ -498,6 +500,13 @@ def _propagate_through_joints(
                 along = sum(R_WK @ part for R_WK, part in by_length[i])
                 out[i, row] += along @ lengths_cov @ along.T
     return dict(zip(points, out, strict=True))
+
+
+def _slides(model: BodyModel) -> bool:
+    """Whether a joint that slides moves some point: its way has no constant parts link by link."""
+    frames = [model.pin.frames[model.pin.getFrameId(link)] for link in model.point_frames.values()]
+    above = {joint for frame in frames for joint in model.pin.supports[frame.parentJoint]}
+    return any(model.pin.joints[joint].shortname().startswith("JointModelP") for joint in above if joint)
 
 
 def _find_length_vectors(model: BodyModel, data: pin.Data, point: str) -> list[tuple[np.ndarray, np.ndarray]]:
