@@ -13,21 +13,26 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
-from wepose_pin.errors import BadModel, BadSession, WeposeError
-from wepose_pin.kinematics import LiveKinematics
+from wepose_pin.errors import BadModel, BadSession, BadSubject, WeposeError
+from wepose_pin.jobs.track import TrackJob, run_track
+from wepose_pin.kinematics import LiveKinematics, compute_link_poses, compute_point_covariances
+from wepose_pin.live import LivePose, Output, SensorSetup, run_session
+from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.body import load_sensed_model
 from wepose_pin.model.configurations import joint_values
+from wepose_pin.model.fit import fit
 from wepose_pin.model.start_pose import compute_start_configuration
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe_file
+from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.readers.trials import find_ur5, read_ur5
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
-from wepose_pin.subject import Subject
+from wepose_pin.subject import Subject, load_subject
 from wepose_pin.tracking import Tracker, track
 from wepose_pin.validation.real import UNSCORED_S, UR5_EXCLUDED
 from wepose_pin.writers import write_session
-from wepose_pin.writers.result import read_result
+from wepose_pin.writers.result import read_result, write_subject
 
 RATE = 100.0
 # The axes of a UR5's joints while all are at zero, the arm stretched out along x.
@@ -353,7 +358,7 @@ elbow = "forearm_link"
 wrist = "wrist_1_link"
 tip = { link = "wrist_3_link", at = [0.0, 0.0, -0.1] }
 [lengths]
-upper = { segment = "upper", from = "elbow", to = "wrist" }
+upper = { segment = "fore", from = "elbow", to = "wrist" }
 [poses.home]
 shoulder_lift_joint = -1.5707963267948966
 wrist_1_joint = -1.5707963267948966
@@ -364,8 +369,7 @@ wrist_1_joint = -1.5707963267948966
 def table(urdf: Path, tmp_path: Path) -> Path:
     """A table of the arm's own, and the URDF beside it."""
     (tmp_path / "arm.urdf").write_bytes(urdf.read_bytes())
-    text = TABLE.replace('{ segment = "upper", from = "elbow"', '{ segment = "fore", from = "elbow"')
-    (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "arm.toml").write_text(TABLE, encoding="utf-8")
     return tmp_path / "arm.toml"
 
 
@@ -383,7 +387,7 @@ def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Pat
     for name, values in bare.joints.items():
         np.testing.assert_allclose(tracked.joints[name], values, atol=1e-9)
     model, body = load_model(table), load(urdf).pin
-    assert set(tracked.points) == {"elbow", "wrist", "tip"}
+    assert set(tracked.points) == {"elbow", "wrist", "tip"} == set(tracked.pose.point_cov)
     data = body.createData()
     for k in (0, 600, 1100):
         pin.framesForwardKinematics(body, data, q[k])
@@ -395,6 +399,60 @@ def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Pat
     assert again.model.lengths["upper"] == pytest.approx(0.5)
     reach = np.linalg.norm(again.points["wrist"] - again.points["elbow"], axis=1)
     np.testing.assert_allclose(reach, 0.5, atol=1e-9)
+
+
+def test_the_covariance_of_points_is_that_of_many_fits(urdf: Path, table: Path) -> None:
+    """Orientations and the length drawn from what is stated of them; two of the arm's six axes carry no sensor."""
+    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    subject = Subject("s", {"upper": 0.392}, ("upper",), np.array([[0.01**2]]))
+    tracked = track(replace(as_segments(recording), model=str(table)), subject)
+    at, rng, n = 700, np.random.default_rng(0), 600
+    cov = {name: np.diag(rng.uniform(0.5, 2.0, 3) * 1e-4) for name in tracked.quat_WL}
+    quat = {
+        name: (
+            Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), cov[name], n)) * Rotation.from_quat(q[at])
+        ).as_quat()
+        for name, q in tracked.quat_WL.items()
+    }
+    start = np.tile(tracked.q[at], (n, 1))
+    segments = list(quat)
+    q = fit(tracked.model.pin, quat, range(1, tracked.model.pin.njoints), start)
+    lengths = rng.normal(0.392, 0.01, n)
+    placed = {point: [] for point in tracked.points}
+    for row, length in zip(q, lengths, strict=True):
+        body = tracked.model.with_lengths({"upper": float(length)})
+        _, p_W = compute_link_poses(body, row[None], [body.point_frames[point] for point in placed], rotations=False)
+        for k, point in enumerate(placed):
+            placed[point].append(p_W[0, k])
+    stated = compute_point_covariances(
+        tracked.model,
+        {name: tracked.quat_WL[name][at : at + 1] for name in segments},
+        {name: cov[name][None] for name in segments},
+        subject.lengths_covariance(["upper"]),
+        tracked.q[at : at + 1],
+    )
+    for point, positions in placed.items():
+        sampled, expected = np.cov(np.array(positions).T), stated[point][0]
+        assert np.linalg.norm(sampled - expected) < 0.25 * np.linalg.norm(expected)
+
+
+def test_a_joint_that_slides_stays_where_it_is(urdf: Path, tmp_path: Path) -> None:
+    """Orientations do not tell of it: it is undetermined, and what it moves is not written."""
+    slider = (
+        '<link name="rod"/><joint name="slider" type="prismatic"><parent link="wrist_1_link"/><child link="rod"/>'
+        '<axis xyz="1 0 0"/><limit lower="0" upper="0.5" effort="1" velocity="1"/></joint></robot>'
+    )
+    text = urdf.read_text(encoding="utf-8").replace("</robot>", slider)
+    (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
+    table = TABLE.replace("[lengths]", 'rod = "rod"\n[lengths]')
+    table = table.replace("[poses.home]", "[poses.home]\nslider = 0.2")
+    (tmp_path / "arm.toml").write_text(table, encoding="utf-8")
+    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    subject = Subject("s", {"upper": 0.392}, ("upper",), np.array([[0.01**2]]))
+    tracked = track(replace(as_segments(recording), model=str(tmp_path / "arm.toml")), subject)
+    assert tracked.find_undetermined_joints() == ["slider"]
+    assert set(tracked.points) == {"elbow", "wrist", "tip"}
+    np.testing.assert_allclose(tracked.joints["slider"], 0.2, atol=1e-9)
 
 
 def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> None:
@@ -442,20 +500,101 @@ def test_live_kinematics_follow_a_mechanism(urdf: Path) -> None:
         assert off < 1e-5
 
 
-def test_a_person_may_begin_in_another_pose(simulation_t_pose: Recording) -> None:
+def test_a_mechanism_live(urdf: Path, tmp_path: Path, data: Path) -> None:
+    """What is displayed and recorded live is what causal tracking of the recording gives."""
+    ur5_session(data, "circle-250", tmp_path)
+    recording = replace(load_session(tmp_path), model=str(urdf))
+    shown: list[LivePose] = []
+
+    class Shown(Output):
+        def show(self, pose: LivePose) -> None:
+            shown.append(pose)
+
+    setup = SensorSetup.from_recording(recording.cut(slice(0, 1200)))
+    source = ReplaySource(recording.cut(slice(0, 1200)), np.inf)
+    file = tmp_path / "live.wepose"
+    summary = run_session(source, setup, record=file, outputs=[Shown()])
+    log = read_live_log(file)
+    assert (log.recording.start_pose, log.recording.model) == (CONFIGURATION, str(urdf))
+    assert log.recording.joints == recording.joints
+    tracked = track(log.recording, causal=True)
+    assert len(tracked.time) == summary.poses == len(log.quat_WL)
+    for i, name in enumerate(recording.sensors):
+        np.testing.assert_array_equal(tracked.segments.quat_WL[name], log.quat_WL[:, i])
+        at = int(np.argmin(np.abs(tracked.time - shown[-1].time)))
+        off = Rotation.from_quat(shown[-1].quat_WL[i]).inv() * Rotation.from_quat(tracked.quat_WL[name][at])
+        assert off.magnitude() < np.deg2rad(0.2)
+
+
+def test_a_subject_of_a_body_without_lengths(urdf: Path, tmp_path: Path) -> None:
+    """It holds mounts alone; its files give the same result again."""
+    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    tracked = track(recording, model=urdf)
+    person = replace(tracked.subject, mounts=dict(tracked.segments.quat_LS))
+    write_subject(tmp_path, person, tracked.model)
+    again = track(recording, load_subject(tmp_path), model=tmp_path / "subject.urdf")
+    assert again.model.table.is_mechanism
+    for name, values in tracked.joints.items():
+        np.testing.assert_allclose(again.joints[name], values, atol=1e-6)
+    with pytest.raises(BadSubject, match=r"trunk, shoulder_width.* of the body upper_body is missing"):
+        track(replace(recording, sensors={"torso": recording.sensors["forearm_link"]}, start_pose="n_pose"), person)
+
+
+def test_a_result_on_another_body_does_not_stay(urdf: Path, data: Path, tmp_path: Path) -> None:
+    """Its table and its joints would be read with the next result in the same folder."""
+    ur5_session(data, "circle-100", tmp_path)
+    out = tmp_path / "out"
+    run_track(TrackJob(tmp_path, out, model=urdf, view=False, report=False))
+    assert (out / "model.toml").is_file()
+    assert (out / "joints.parquet").is_file()
+    (tmp_path / "person").mkdir()
+    write_session(tmp_path / "person", replace(t_pose_recording(), start_pose="n_pose"))
+    run_track(TrackJob(tmp_path / "person", out, view=False, report=False, force=True))
+    assert not (out / "model.toml").exists()
+    assert not (out / "joints.parquet").exists()
+    assert not read_result(out)[1].table.is_mechanism
+
+
+def test_a_person_may_begin_in_another_pose() -> None:
     """Segment frames are W's in the N-pose; in the T-pose the arms' are turned by a right angle."""
-    tracked = track(simulation_t_pose)
-    begin = {name: Rotation.from_quat(quat[0]) for name, quat in tracked.quat_WL.items()}
-    for side, angle_deg in (("left", 90.0), ("right", -90.0)):
-        turn = Rotation.from_euler("x", angle_deg, degrees=True)
-        assert np.degrees((begin[f"{side}_upper_arm"] * turn.inv()).magnitude()) < 1.0
-        palm, shoulder = tracked.points[f"{side}_palm"][0], tracked.points[f"{side}_shoulder"][0]
-        assert abs((palm - shoulder)[2]) < 0.01
-    assert np.degrees(begin["torso"].magnitude()) < 1.0
+    recording = t_pose_recording()
+    by_name = track(recording)
+    joints = {"left_upper_arm_x": 1.5708, "right_upper_arm_x": -1.5708}
+    by_joints = track(replace(recording, start_pose=CONFIGURATION, joints=joints))
+    for tracked in (by_name, by_joints):
+        begin = {name: Rotation.from_quat(quat[0]) for name, quat in tracked.quat_WL.items()}
+        for side, angle_deg in (("left", 90.0), ("right", -90.0)):
+            turn = Rotation.from_euler("x", angle_deg, degrees=True)
+            assert np.degrees((begin[f"{side}_upper_arm"] * turn.inv()).magnitude()) < 1.0
+            palm, shoulder = tracked.points[f"{side}_palm"][0], tracked.points[f"{side}_shoulder"][0]
+            assert abs((palm - shoulder)[2]) < 0.01
+        assert np.degrees(begin["torso"].magnitude()) < 1.0
+    with pytest.raises(BadSession, match=r"joints\.left_upper_arm_x = 9 is outside its limits"):
+        track(replace(recording, start_pose=CONFIGURATION, joints={"left_upper_arm_x": 9.0}))
 
 
-@pytest.fixture
-def simulation_t_pose() -> Recording:
+def test_a_session_names_a_body_of_the_package(tmp_path: Path) -> None:
+    recording = replace(t_pose_recording(), start_pose="n_pose", model="whole_body")
+    write_session(tmp_path, recording)
+    assert load_session(tmp_path).model == "whole_body"
+    tracked = track(load_session(tmp_path))
+    assert {"pelvis", "left_thigh"} <= set(tracked.model.table.segments)
+    out = tmp_path / "out"
+    run_track(TrackJob(tmp_path, out, view=False, report=False))
+    pose, model, _ = read_result(out)
+    assert list(model.table.segments) == list(tracked.model.table.segments)
+    assert list(model.table.lengths) == list(tracked.model.table.lengths)
+    assert list(model.table.poses) == list(tracked.model.table.poses)
+    np.testing.assert_allclose(pose.quat_WL["torso"], tracked.quat_WL["torso"], atol=1e-15)
+    for wrong in ("whole_boddy", "none.urdf"):
+        text = (tmp_path / "session.toml").read_text(encoding="utf-8").replace('"whole_body"', f'"{wrong}"')
+        (tmp_path / "session.toml").write_text(text, encoding="utf-8")
+        with pytest.raises(WeposeError, match=r"did you mean 'whole_body'|no such file 'none\.urdf' beside"):
+            track(load_session(tmp_path))
+        (tmp_path / "session.toml").write_text(text.replace(wrong, "whole_body"), encoding="utf-8")
+
+
+def t_pose_recording() -> Recording:
     """A person of five sensors, put on squarely, in the T-pose."""
     n = 600
     mount = compute_mount("+z", "+x")

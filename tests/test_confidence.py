@@ -33,7 +33,7 @@ def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None
     still = {name: rotation.as_quat()[None] for name, rotation in mean.items()}
     model = load_model(lengths=body.lengths)
     points = compute_pose(model, np.zeros(1), still).points
-    found = compute_point_covariances(points, still, {name: c[None] for name, c in cov.items()}, lengths_cov)
+    found = compute_point_covariances(model, still, {name: c[None] for name, c in cov.items()}, lengths_cov)
     assert set(found) == set(points)
 
     drawn = {
@@ -53,11 +53,11 @@ def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None
 
 def test_points_beyond_a_segment_without_covariance_have_none() -> None:
     still = {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in ("torso", *ARMS)}
-    points = compute_pose(load_model(), np.zeros(1), still).points
+    model = load_model()
     cov = {name: np.eye(3)[None] * 1e-4 for name in ("torso", "left_upper_arm", "right_forearm")}
-    found = compute_point_covariances(points, still, cov, np.zeros((8, 8)))
+    found = compute_point_covariances(model, still, cov, np.zeros((8, 8)))
     assert set(found) == {"left_shoulder", "left_elbow", "right_shoulder"}
-    assert compute_point_covariances(points, still, {}, np.zeros((8, 8))) == {}
+    assert compute_point_covariances(model, still, {}, np.zeros((8, 8))) == {}
 
 
 @pytest.mark.monte_carlo
@@ -114,7 +114,7 @@ def test_a_hand_that_is_segment_and_point_has_a_column_each() -> None:
     cov = {name: np.eye(3)[None] * 1e-4 for name in still}
     from dataclasses import replace
 
-    points = compute_point_covariances(pose.points, still, cov, np.zeros((8, 8)))
+    points = compute_point_covariances(load_model(), still, cov, np.zeros((8, 8)))
     table = build_pose_table(replace(pose, segment_cov=cov, point_cov=points))
     assert table["left_hand_std"][0] == pytest.approx(0.01)
     assert table["left_palm_std"][0] == pytest.approx(compute_axis_std(points["left_palm"])[0])

@@ -284,6 +284,11 @@ def test_an_axis_that_is_not_three_numbers(axis: str, tmp_path: Path) -> None:
     assert "three numbers each" in told("body", tmp_path, text, BadModel)
 
 
+def test_a_mimic_joint_that_names_no_other(tmp_path: Path) -> None:
+    text = seeds.URDF.replace('<mimic joint="shoulder"', "<mimic")
+    assert "joint 'elbow' mimics '', which is no joint" in told("robot", tmp_path, text.encode(), BadModel)
+
+
 def test_pinocchio_is_silent_on_a_urdf_that_it_refuses(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     try_one(BY_NAME["robot"], tmp_path, seeds.URDF.replace(' effort="10"', "").encode())
     assert capfd.readouterr().err == ""

@@ -133,7 +133,7 @@ def check_covariance(place: str, matrices: np.ndarray) -> None:
     known = matrices[np.isfinite(matrices).all(axis=(-2, -1))]
     scale = np.max(np.abs(known), axis=(-2, -1), initial=0.0)
     skew = np.max(np.abs(known - np.swapaxes(known, -2, -1)), axis=(-2, -1), initial=0.0)
-    if (skew > 1e-6 * scale).any() or (np.linalg.eigvalsh(known)[..., 0] < -1e-6 * scale).any():
+    if (skew > 1e-6 * scale).any() or (np.linalg.eigvalsh(known) < -1e-6 * scale[..., None]).any():
         raise BadData(f"{place} is not symmetric and positive semidefinite")
 
 

@@ -414,23 +414,28 @@ def compute_point_covariances(
     quat_WL: Mapping[str, np.ndarray],
     segment_cov: Mapping[str, np.ndarray],
     lengths_cov: np.ndarray,
+    q: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """Compute the covariance (n, 3, 3) [m²] in W of the known points.
 
     Only of points for which every segment between root and point has a covariance. A point is the sum of vectors v that
     rotate with segments: an error δ of a segment's orientation moves the point by δ × v, errors of different sensors
-    are independent, errors of the lengths act along the vectors.
+    are independent, errors of the lengths act along the vectors. The points of a mechanism move with the joints, which
+    the fit takes from all orientations.
 
     Parameters
     ----------
     model : with its lengths
     segment_cov : segment → (n, 3, 3) [rad²] in W
     lengths_cov : (k, k) [m²] in the order of the model's lengths; zeros: known exactly
+    q : (n, nq) of a mechanism; without it its points have none
     """
     covariances: dict[str, np.ndarray] = {}
     points = find_known_points(model, quat_WL)
-    if not points or _slides(model):
-        return covariances
+    if model.table.is_mechanism:
+        if not points or q is None or not set(quat_WL) <= set(segment_cov):
+            return covariances
+        return _propagate_through_joints(model, q, segment_cov, lengths_cov, points)
     lengths = np.array(list(model.lengths.values()))
     R_WK: dict[str, np.ndarray] = {}
     carriers = {link: find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
@@ -463,11 +468,58 @@ def compute_point_covariances(
     return covariances
 
 
+def _propagate_through_joints(
+    model: BodyModel,
+    q: np.ndarray,
+    segment_cov: Mapping[str, np.ndarray],
+    lengths_cov: np.ndarray,
+    points: Sequence[str],
+) -> dict[str, np.ndarray]:
+    """Compute the covariances of a mechanism's points in `q` (n, nq), as `compute_point_covariances`.
+
+    The fit turns errors δ of the orientations into errors J⁺ δ of the joints, with J the Jacobian of all orientations.
+    """
+    m, data, k = model.pin, model.pin.createData(), len(segment_cov)
+    if lengths_cov.any() and _slides(model):
+        return {}
+    segments = [m.getFrameId(segment) for segment in segment_cov]
+    frames = [m.getFrameId(model.point_frames[point]) for point in points]
+    cov_W = np.stack(list(segment_cov.values()), axis=1)  # (n, k, 3, 3)
+    by_length = [_find_length_vectors(model, data, point) if lengths_cov.any() else [] for point in points]
+    out = np.empty((len(points), len(q), 3, 3))
+    for row, values in enumerate(np.ascontiguousarray(q)):
+        pin.computeJointJacobians(m, data, values)
+        pin.updateFramePlacements(m, data)
+        J = np.concatenate([pin.getFrameJacobian(m, data, frame, pin.LOCAL_WORLD_ALIGNED)[3:] for frame in segments])
+        inverse = np.linalg.pinv(J, rcond=1e-6)
+        for i, frame in enumerate(frames):
+            gain = pin.getFrameJacobian(m, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3] @ inverse  # (3, 3 k)
+            parts = gain.reshape(3, k, 3).swapaxes(0, 1)
+            out[i, row] = np.sum(parts @ cov_W[row] @ parts.swapaxes(1, 2), axis=0)
+            if by_length[i]:
+                along = sum(R_WK @ part for R_WK, part in by_length[i])
+                out[i, row] += along @ lengths_cov @ along.T
+    return dict(zip(points, out, strict=True))
+
+
 def _slides(model: BodyModel) -> bool:
-    """Whether a joint that slides moves some point: orientations alone do not tell where that is."""
+    """Whether a joint that slides moves some point: its way has no constant parts link by link."""
     frames = [model.pin.frames[model.pin.getFrameId(link)] for link in model.point_frames.values()]
     above = {joint for frame in frames for joint in model.pin.supports[frame.parentJoint]}
     return any(model.pin.joints[joint].shortname().startswith("JointModelP") for joint in above if joint)
+
+
+def _find_length_vectors(model: BodyModel, data: pin.Data, point: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Find the links whose part of the way to a point depends on lengths: a view of their rotation, and the part."""
+    m = model.pin
+    return [
+        (
+            data.oMf[m.getFrameId(link)].rotation if m.existFrame(link) else data.oMi[m.getJointId(link)].rotation,
+            part.by_length,
+        )
+        for link, part in model.reaches[point].items()
+        if part.by_length.any()
+    ]
 
 
 def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str | None:

@@ -95,10 +95,11 @@ class Subject:
         where = f"subject {self.name!r}: "
         check_fields(self, where)
         try:
-            if not self.lengths:
-                raise BadData(f"{where}lengths is empty; it needs the lengths of the body [m]")
             check_lengths(f"{where}lengths", self.lengths)
-            check_names(f"{where}order", [row for row in self.order if not _MOUNT_ROW.fullmatch(row)], self.lengths)
+            named = [row for row in self.order if not _MOUNT_ROW.fullmatch(row)]
+            if named and not self.lengths:
+                raise BadData(f"{where}lengths is empty; it needs the lengths [m] that order names")
+            check_names(f"{where}order", named, self.lengths)
             if len(set(self.order)) < len(self.order):
                 raise BadData(f"{where}order = {self.order}: each name once")
             check_array(f"{where}covariance", self.covariance, (len(self.order), len(self.order)))
@@ -315,6 +316,8 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         for segment, entry in of_segments["heading_drift"].items()
     }
     hinges = {joint: tables["hinges"].table(joint) for joint in tables["hinges"].values}
+    if "lengths" not in top:
+        raise BadSubject(f"{path}: lengths is missing; it needs the lengths of the body [m], none where it has none")
     lengths = _read_lengths(tables["lengths"])
     order, matrix = _read_covariance(tables["covariance"], tables["lengths_std"], tuple(lengths))
     return Subject(
@@ -335,8 +338,6 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
 
 def _read_lengths(table: TomlTable) -> dict[str, float]:
     """The lengths [m]."""
-    if not table.values:
-        raise BadSubject(f"{table.where} is empty or missing; it needs the lengths of the body [m]")
     for name, value in table.values.items():
         if not is_number(value, LONGEST) or value <= 0.0:
             raise BadSubject(f"{table.at(name)} = {value!r}; a number in metres is needed, above 0")

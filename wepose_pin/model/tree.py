@@ -257,7 +257,7 @@ def _add_single(model: pin.Model, parent: int, M: pin.SE3, joint: Any, where: st
 
 def _mimicking(model: pin.Model, joint: Any, where: str) -> pin.Model:
     """The model in which `joint` follows the one it mimics."""
-    leader = joint.mimic.joint
+    leader = joint.mimic.joint or ""
     if not model.existJointName(joint.name) or not model.existJointName(leader) or leader == joint.name:
         raise BadModel(f"{where}: joint '{joint.name}' mimics '{leader}', which is no joint that it could follow")
     leader_id, to = model.getJointId(leader), model.getJointId(joint.name)

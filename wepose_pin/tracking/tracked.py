@@ -184,6 +184,7 @@ class SummaryAccumulator:
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """As `TrackedRecording.diagnostics`, of all chunks; of later ones a day's would be too many to read."""
         last = self.last
+        variant = {"variant": "mechanism"} if last.model.table.is_mechanism else {}
         more = len(self._later) - _MOST_LATER
         return (
             *last.segments.diagnostics,
@@ -192,7 +193,7 @@ class SummaryAccumulator:
             *_diagnose_unknown_points(last),
             *_diagnose_undetermined_joints(last),
             *(
-                Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
+                Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL, variant)
                 for segment, rms in self._residual_rms().items()
                 if rms > MOST_RESIDUAL
             ),

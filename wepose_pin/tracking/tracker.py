@@ -126,7 +126,7 @@ class Tracker:
         pose = replace(
             pose,
             segment_cov=segments.covariance_W,
-            point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, lengths_cov),
+            point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, lengths_cov, pose.q),
             gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         )
         correction = None if self._headings is None else self._headings.summarize()
