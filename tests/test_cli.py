@@ -218,11 +218,17 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["evaluate", "a", "b", "--interval", "3"], "--interval: expected 2 arguments"),
         (["simulate", "-o", "OUT", "--rate-hz", "fast"], "--rate-hz: 'fast' is not a number; see wepose simulate"),
         (["simulate", "-o", "OUT", "--prset", "ideal"], "not an option of wepose simulate; did you mean '--preset'?"),
-        (["calibrate", "s.toml", "-o", "OUT", "--measured", "handle=0.4"], "a distance of --protocol handle"),
+        (
+            ["calibrate", "s.toml", "-o", "OUT", "--model", "upper_body", "--measured", "handle=0.4"],
+            "a distance of --protocol handle",
+        ),
         (["track", "s.toml"], "wepose track needs -o DIR"),
         (["track", "s.toml", "-o", "OUT", "--method", "ekf"], "--method: 'ekf' is not known; did you mean 'smekf'?"),
         (["track", "nowhere.toml", "-o", "OUT"], "nowhere.toml: no such file"),
-        (["calibrate", "s.toml", "-o", "OUT", "--measured", "shoulder=0.4"], "did you mean 'shoulder_width'"),
+        (
+            ["calibrate", "s.toml", "-o", "OUT", "--model", "upper_body", "--measured", "shoulder=0.4"],
+            "did you mean 'shoulder_width'",
+        ),
         (
             ["calibrate", "s.toml", "-o", "OUT", "--measured", "shoulder_width=wide"],
             "'wide' is not a number; NAME=METRES",

@@ -78,10 +78,15 @@ class CalibrateJob:
     force: bool = False
 
     def check(self) -> None:
-        """Raise `WeposeError` where the protocol is none."""
+        """Raise `WeposeError` where an option is wrong whatever the session holds."""
         from ..calibration import load_protocol
+        from ..model import load_model
+        from ..model.anthropometry import check_stature
 
         load_protocol(self.protocol)
+        check_stature(self.stature)
+        if self.model is not None:
+            _check_measured(self, load_model(self.model))
 
 
 def _check_measured(job: CalibrateJob, model: BodyModel) -> None:

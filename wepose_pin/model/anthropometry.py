@@ -23,6 +23,12 @@ class LengthPrior(NamedTuple):
     note: str
 
 
+def check_stature(stature: float | None) -> None:
+    """Raise `BadOption` where a stature is not between 1.0 and 2.5 m."""
+    if stature is not None and not 1.0 <= stature <= 2.5:
+        raise BadOption(f"stature {stature:g} is not a body height in metres; between 1.0 and 2.5")
+
+
 def compute_population_lengths(table: BodyTable, stature: float | None = None, sex: str | None = None) -> LengthPrior:
     """The lengths of a table that people have; of those that name a share of stature.
 
@@ -41,8 +47,7 @@ def compute_population_lengths(table: BodyTable, stature: float | None = None, s
     BadModel
         The table names a share that is not known.
     """
-    if stature is not None and not 1.0 <= stature <= 2.5:
-        raise BadOption(f"stature {stature:g} is not a body height in metres; between 1.0 and 2.5")
+    check_stature(stature)
     if sex is not None and sex not in SEXES:
         raise BadOption(f"sex '{sex}' is not known; {one_of(SEXES)}")
     numbers = read_toml(asset("calibration", "anthropometry.toml"), "the anthropometric prior")
