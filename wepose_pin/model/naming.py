@@ -64,6 +64,9 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
         if begins is not None and not any(point.at):
             points[name] = Point(begins)
             continue
+        if point.link == name and not any(point.at):  # the link is there already
+            points[name] = point
+            continue
         carrier = begins or _segment_above(tree, point.link, segment_of)
         link = point.link if carrier is None or table.is_mechanism else table.segments[carrier].link
         frames[name] = link, M_WK[link][:3, :3] if carrier is None else R_WL[carrier], p_W[name]
