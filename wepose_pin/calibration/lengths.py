@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG
 from ..arguments import Positive, check_arguments
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadOption, BadSession, NoSolution, one_of
+from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
 from ..model import BodyModel
@@ -100,6 +100,8 @@ def calibrate_lengths(
         An unknown protocol or formulation, or a measured length that is none, not plausible, or missing.
     BadSession, BadPhase
         A sensor that the protocol needs is missing; there is no such phase.
+    BadModel
+        The body has no lengths.
     """
     check_arguments(calibrate_lengths, locals())
     check_method(method)
@@ -109,6 +111,11 @@ def calibrate_lengths(
     model = model or load_sensed_model(recording.model or None, recording.sensors, recording.where())
     table = model.table
     table.check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
+    if not table.lengths:
+        raise BadModel(
+            f"{table.where}: this body has no lengths; a table beside the URDF names its points and [lengths], as "
+            f"docs/models.md shows"
+        )
     protocol.check_body(table)
     for segment in protocol.needs:
         if segment not in recording.sensors:

@@ -85,7 +85,8 @@ class CalibrateJob:
 
         load_protocol(self.protocol)
         check_stature(self.stature)
-        if self.model is not None:
+        # A URDF without a table has the sensors' links as segments, and those are in the session.
+        if self.model is not None and Path(self.model).suffix.lower() != ".urdf":
             _check_measured(self, load_model(self.model))
 
 
