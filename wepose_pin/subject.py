@@ -203,15 +203,10 @@ def population_subject(
     BadOption
         A stature outside 1.0 to 2.5 m, or another sex.
     BadModel
-        The table has no lengths, names a share that is not known, or a length that is none without a model.
+        The table names a share that is not known, or a length that is none without a model.
     """
     check_arguments(population_subject, locals())
     table = load_table() if body is None else body if isinstance(body, BodyTable) else body.table
-    if not table.lengths:
-        raise BadModel(
-            f"{table.where}: this body has no lengths; a table beside the URDF names its points and [lengths], as "
-            f"docs/models.md shows"
-        )
     people = compute_population_lengths(table, stature, sex)
     lengths, variances = dict(zip(people.names, people.mean.tolist(), strict=True)), {}
     for name, length in table.lengths.items():
