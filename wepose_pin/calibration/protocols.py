@@ -148,6 +148,11 @@ class Protocol:
     def check_body(self, table: BodyTable) -> None:
         """Raise `BadOption` where the body lacks a point or a segment of the protocol."""
         where = f"protocol '{self.name}': "
+        if self.closures and not table.points:
+            raise BadOption(
+                f"{where}{table.where} has no points and no lengths; a table beside the URDF names them, as "
+                f"docs/models.md shows"
+            )
         for closure in self.closures:
             for point in (*closure.points, *filter(None, [closure.origin])):
                 if point not in table.points:
