@@ -12,18 +12,17 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin.kinematics import compute_orientation_residuals, solve_configuration
-from wepose_pin.model import chains
 
 N = 200  # random poses: every segment up to 60 deg from the one above
 for path in sys.argv[1:] or [None]:
     body = wp.load_model(path)
-    chain_of = chains(body.pin)
+    chain_of = body.chains
     rng = np.random.default_rng(0)
     quat_WL = {}
     for segment in chain_of:
-        above = segment.replace("forearm", "upper_arm").replace("hand", "forearm")
+        above = body.parents[segment]
         R = Rotation.from_rotvec(np.radians(60.0) * rng.uniform(-0.57, 0.57, (N, 3)))
-        R_WA = Rotation.from_quat(quat_WL[above]) if above in quat_WL and above != segment else Rotation.identity()
+        R_WA = Rotation.from_quat(quat_WL[above]) if above in quat_WL else Rotation.identity()
         quat_WL[segment] = (R_WA * R).as_quat()
     residuals = compute_orientation_residuals(body, solve_configuration(body, quat_WL), quat_WL)
 

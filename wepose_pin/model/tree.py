@@ -130,6 +130,7 @@ def build(robot: Any, where: str, *, spherical: bool = True) -> Built:
     tree = parse_tree(robot, where)
     links = {link.name: link for link in robot.links}
     mimicked = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
+    coupled = mimicked | {joint.name for joint in robot.joints if joint.mimic is not None}
     model = pin.Model()
     model.name = robot.name or "body"
     joints: dict[str, int] = {}
@@ -151,7 +152,7 @@ def build(robot: Any, where: str, *, spherical: bool = True) -> Built:
                 continue
             triple = _triple(first, tree, links, mimicked) if spherical else None
             if triple is None and first.type != "floating":
-                grow(first.child, *_add_single(model, parent, M_Jc, first, where))
+                grow(first.child, *_add_single(model, parent, M_Jc, first, coupled, where))
                 continue
             child = first.child
             if triple is not None:
@@ -230,8 +231,13 @@ def find_bounds(joint: Any, unbounded: float) -> tuple[float, float]:
     return (-unbounded if low is None else float(low)), (unbounded if high is None else float(high))
 
 
-def _add_single(model: pin.Model, parent: int, M: pin.SE3, joint: Any, where: str) -> tuple[int, pin.SE3]:
-    """Add a joint of one axis with its limits; gives it, and the placement of the child link on it."""
+def _add_single(
+    model: pin.Model, parent: int, M: pin.SE3, joint: Any, coupled: set[str], where: str
+) -> tuple[int, pin.SE3]:
+    """Add a joint of one axis with its limits; gives it, and the placement of the child link on it.
+
+    `coupled`: joints that mimic another or are mimicked; Pinocchio couples angles, not the unbounded joint's cosine.
+    """
     if joint.type not in ("revolute", "continuous", "prismatic"):
         raise BadModel(
             f"{where}: joint '{joint.name}' is of type '{joint.type}'; known are fixed, revolute, continuous, "
@@ -244,7 +250,7 @@ def _add_single(model: pin.Model, parent: int, M: pin.SE3, joint: Any, where: st
     effort = np.inf if limit is None or limit.effort is None else float(limit.effort)
     velocity = np.inf if limit is None or limit.velocity is None else float(limit.velocity)
     of_rate = np.array([effort]), np.array([velocity])
-    if joint.type == "continuous":
+    if joint.type == "continuous" and joint.name not in coupled:
         # Python cannot give Pinocchio's unbounded joint an axis: its own z is turned onto ours. q: cosine and sine.
         turn = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix(), np.zeros(3))
         bounds = np.full(2, -1.01), np.full(2, 1.01)
