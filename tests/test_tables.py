@@ -223,16 +223,16 @@ forearm = { segment = "link03", from = "elbow", to = "wrist" }
 """
 # URDF, its table without the line that names it, and what the line says that asks for a table where none is needed.
 HUMANS = {
-    "cosmik_human.urdf": (COSMIK, ("sensors.shoulder_link", "no link of human_wb", "upperarmL")),
+    "cosmik_human.urdf": (COSMIK, ("cosmik_human.urdf: no link", "upperarmL", "docs/models.md")),
     "humanSubject01_48dof.urdf": (GAZEBO, ()),
     "humanSubject01_66dof.urdf": (GAZEBO, ()),
     "humanSubjectWithSpinalCordMeshes.urdf": (GAZEBO, ()),
 }
 ROBOTS = {
     "human_description/robots/human.urdf": (HUMAN, ()),
-    "ur_description/urdf/ur5_robot.urdf": (UR, ("ur5_robot.urdf", "no lengths", "docs/models.md")),
-    "panda_description/urdf/panda.urdf": (PANDA, ("sensors.shoulder_link", "no link of panda", "panda_link5")),
-    "z1_description/urdf/z1.urdf": (Z1, ("sensors.shoulder_link", "no link of z1", "link05")),
+    "ur_description/urdf/ur5_robot.urdf": (UR, ("ur5_robot.urdf: no link", "upper_arm_link", "docs/models.md")),
+    "panda_description/urdf/panda.urdf": (PANDA, ("panda.urdf: no link", "panda_link5", "docs/models.md")),
+    "z1_description/urdf/z1.urdf": (Z1, ("z1.urdf: no link", "link05", "docs/models.md")),
 }
 
 
@@ -270,3 +270,15 @@ def test_all_foreign_persons_are_tested(data: Path) -> None:
 def test_a_foreign_robot_loads(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text, named = ROBOTS[name]
     check_foreign(example_robot_data_human().parents[2] / name, text, named, folder, capsys)
+
+
+def test_a_session_on_a_robot_without_a_table_says_what_is_missing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("recording.parquet", "arm.urdf"):
+        shutil.copyfile(folder / name, tmp_path / name)
+    text = (folder / "session.toml").read_text(encoding="utf-8")
+    (tmp_path / "session.toml").write_text('model = "arm.urdf"\n' + text, encoding="utf-8")
+    line = refuse(capsys, "calibrate", tmp_path, "--protocol", "tip", "-o", tmp_path / "out")
+    for part in ("'tip'", "arm.urdf has no points and no lengths", "docs/models.md"):
+        assert part in line
