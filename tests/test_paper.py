@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from arms import write_arm
 from bodies import LENGTHS, SEGMENTS
 from scipy.spatial.transform import Rotation
 
@@ -335,22 +334,6 @@ def test_the_commands(
     palm = pl.read_parquet(out / "pose.parquet", columns=["right_palm_x"]).to_series().to_numpy()
     np.testing.assert_allclose(palm, tracked.points["right_palm"][:, 0], atol=1e-9)
 
-
-def test_open_loop_is_for_a_person(
-    made: tuple[Person, Simulation, Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    urdf = write_arm(tmp_path)
-    (tmp_path / "session").mkdir()
-    write_session(tmp_path / "session", made[2], None)
-    text = (tmp_path / "session" / "session.toml").read_text()
-    text = text.replace('start_pose = "n_pose"', 'start_pose = "configuration"')
-    text = text.replace("[sensors.left_upper_arm]", "[sensors.upper_arm]").replace(
-        "[sensors.left_forearm]", "[sensors.forearm]"
-    )
-    (tmp_path / "session" / "session.toml").write_text(text)
-    words = ["track", tmp_path / "session", "--model", urdf, "--open-loop", "-o", tmp_path / "out"]
-    assert run(*words) == 2
-    assert "--open-loop: for a person; " in capsys.readouterr().err
 
 
 # Validation -----------------------------------------------------------------------------------------------------------
