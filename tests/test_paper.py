@@ -335,7 +335,6 @@ def test_the_commands(
     np.testing.assert_allclose(palm, tracked.points["right_palm"][:, 0], atol=1e-9)
 
 
-
 # Validation -----------------------------------------------------------------------------------------------------------
 
 
