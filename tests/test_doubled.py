@@ -70,9 +70,21 @@ def test_the_mounts_of_both_are_calibrated(made: tuple[Person, Simulation, Recor
     off = (Rotation.from_quat(subject.mounts["torso_back"]) * true.inv()).magnitude()
     covariance = subject.mount_covariance("torso_back")
     assert covariance is not None
-    assert off < 2.0 * np.sqrt(np.trace(covariance))
+    assert off < min(np.deg2rad(1.0), 2.0 * np.sqrt(np.trace(covariance)))
     assert set(parse_subject(subject_toml(subject), Path("subject.toml")).mounts) == set(subject.mounts)
     assert errors_deg(simulation, recording.time, track(recording, subject).quat_WL["torso"]).max() < 5.0
+
+
+def test_a_session_is_written_with_both(made: tuple[Person, Simulation, Recording], tmp_path: Path) -> None:
+    write_session(tmp_path, made[2])
+    read = load_session(tmp_path)
+    assert set(read.sensors) == set(made[2].sensors)
+    second = read.doubled["torso"]
+    assert second.name == "torso_back"
+    assert isinstance(second.sensor, ImuSensor)
+    expected = made[2].doubled["torso"].sensor
+    assert isinstance(expected, ImuSensor)
+    np.testing.assert_allclose(second.sensor.gyro_S, expected.gyro_S, atol=1e-12)
 
 
 def test_a_session_names_the_segment_of_both(made: tuple[Person, Simulation, Recording], tmp_path: Path) -> None:
