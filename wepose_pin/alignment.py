@@ -31,10 +31,10 @@ from .subject import Subject
 MAX_MOUNT_ERROR_DEG = 60.0
 MOUNT_WARNING_DEG = 35.0
 
-# Standard deviations per axis; assumptions.
-START_POSE_STD = np.deg2rad(4.0)  # [rad] between a segment and the start pose: the elbows are never quite straight
-MECHANISM_START_POSE_STD = np.deg2rad(0.5)  # [rad] between a mechanism's link and its start configuration
-START_POSE_REPEATABILITY_STD = np.deg2rad(2.0)  # [rad] between two start poses of one person
+# Standard deviations per axis; assumptions. Those of start poses and soft tissue are the body's, in its table.
+# [rad] of a device's own orientation about each axis: segments against optical motion capture, walking and turning, have
+# 1.1 to 5.5 deg rms in all (Lebel et al. 2017, BioMed Eng OnLine 16:56), soft tissue included.
+MEASURED_ORIENTATION_STD = np.deg2rad(2.0)
 SEGMENT_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation in motion, mostly by soft tissue
 PALM_SLIP_STD = 0.005  # [m] by which joined palms slip
 # A calibrated mount has moved where gravity contradicts it by more standard deviations than this.
@@ -59,10 +59,13 @@ class StartFrames:
         """Whether a person stands in it, whom nothing holds still."""
         return not self.table.is_mechanism
 
-    @property
-    def std(self) -> float:
-        """[rad] between a segment and the start pose, one standard deviation about each axis."""
-        return START_POSE_STD if self.sways else MECHANISM_START_POSE_STD
+    def std(self, segment: str) -> np.ndarray:
+        """(3,) [rad] between a segment and the start pose, one standard deviation about each axis."""
+        return np.array(self.table.segments[segment].start_std)
+
+    def repeat_std(self, segment: str) -> np.ndarray:
+        """(3,) [rad] the same between two start poses of one person."""
+        return np.array(self.table.segments[segment].repeat_std)
 
     def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
         """R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
@@ -105,8 +108,8 @@ class SegmentOrientations:
     heading_offset : segment → ψ [rad], heading of its sensor's world V in W
     orientation : segment → result of its sensor's filter; no entry for measured orientations
     covariance_W : segment → (n, 3, 3) [rad²] of the error on the left of `quat_WL`, in W: the sum of the filter's
-        covariance, the tilt by the accelerometer's bias, and the uncertainty of a calibrated mount; a
-        stated mount counts as exact. No entry for filters without a covariance (ncf, gdc)
+        covariance, the tilt by the accelerometer's bias, the uncertainty of mount and start pose, and soft tissue. No
+        entry for filters without a covariance (ncf, gdc)
     start, static_phase : intervals [s]; headings and mounts are from the first, noise and bias from the second
     diagnostics : of the recording, its start pose and its mounts
     """
@@ -246,14 +249,14 @@ def align_sensors(
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
             misfit = (R_LS * R_nominal.inv()).as_rotvec()[:2]
-            misfit_cov = mount_cov[:2, :2] + start_frames.std**2 * np.eye(2)
+            misfit_cov = mount_cov[:2, :2] + np.diag(start_frames.std(segment)[:2] ** 2)
             R_LS = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_nominal
             psi = compute_heading_offset(R_VS_start, R_LS)
             calibrated_offset = subject.start_pose_offset.get(segment) if subject is not None else None
             if calibrated_offset is not None:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
                 misfit = misfit - calibrated_offset.tilt
-                misfit_cov = min(START_POSE_REPEATABILITY_STD, start_frames.std) ** 2 * np.eye(2)
+                misfit_cov = np.diag(start_frames.repeat_std(segment)[:2] ** 2)
             if misfit @ np.linalg.solve(misfit_cov, misfit) > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
                 diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOUNT_MOVED_STDS, facts))
@@ -275,13 +278,20 @@ def orient_segments(
         R_WS, R_LS = alignment.R_WV[segment] * R_VS, alignment.R_LS[segment]
         if chunk.sensors[segment].aligned:
             quat_WL[segment] = R_WS.as_quat()
+            covariance_W[segment] = np.tile(MEASURED_ORIENTATION_STD**2 * np.eye(3), (len(chunk), 1, 1))
             continue
         quat_WL[segment] = (R_WS * R_LS.inv()).as_quat()
         filtered = orientation.get(segment)
-        if filtered is not None and filtered.attitude_cov is not None:
+        attitude_cov = None if filtered is None else filtered.attitude_cov
+        if filtered is None:
+            attitude_cov = np.tile(MEASURED_ORIENTATION_STD**2 * np.eye(3), (len(chunk), 1, 1))
+        if attitude_cov is not None:
             covariance_W[segment] = compute_segment_covariance(
-                chunk, segment, subject, R_WS, R_LS, filtered.attitude_cov, start_frames
+                chunk, segment, subject, R_WS, R_LS, attitude_cov, start_frames
             )
+    for segment, cov in compute_soft_tissue_covariances(start_frames.table, quat_WL).items():
+        if segment in covariance_W:
+            covariance_W[segment] = covariance_W[segment] + cov
     return SegmentOrientations(
         chunk.time,
         quat_WL,
@@ -340,18 +350,54 @@ def compute_segment_covariance(
     cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
     # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
-    mount_cov = _find_start_mount_covariance(recording, segment, subject, start_frames)
+    # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes off
+    # the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
+    R_WL = (R_WS * start_frames.to_world(segment, R_LS).inv()).as_matrix()
+    mount_cov, start_var = _find_start_mount_covariance(recording, segment, subject, start_frames), start_frames.std(segment) ** 2
+    vertical = np.array([0.0, 0.0, 1.0])
     if mount_cov is not None:
-        # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount,
-        # takes off the vertical component ε_z, so that in the start pose the heading has no error.
-        R_WL = (R_WS * start_frames.to_world(segment, R_LS).inv()).as_matrix()
-        error_jacobian = R_WL - np.array([0.0, 0.0, 1.0])[:, None] * np.array([0.0, 0.0, 1.0])
-        tilt = mount_cov[:2]
-        # What is left after the start pose has corrected the tilt, as in `align_sensors`.
-        remaining_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + start_frames.std**2 * np.eye(2), tilt)
-        cov_W += error_jacobian @ remaining_cov @ error_jacobian.swapaxes(1, 2)
-        cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_frames)
+        error_jacobian = R_WL - np.outer(vertical, vertical)
+        assert subject is not None  # it has the mount
+        if segment not in subject.start_pose_offset:
+            # What is left after the start pose has corrected the tilt, as in `align_sensors`. A person repeats the offset
+            # of the calibration's own start pose: then the start pose tells nothing new.
+            tilt = mount_cov[:2]
+            mount_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + np.diag(start_var[:2]), tilt)
+        if segment != start_frames.table.reference:
+            # By how much the person turned the segment about the vertical in the calibration's start pose is not known.
+            cov_W += start_var[2] * np.einsum("na,nb->nab", R_WL[:, :, 2], R_WL[:, :, 2])
+    else:
+        # The tilt of a stated mount is gravity's in the start pose, so that it has the error of the start pose.
+        error_jacobian, mount_cov = R_WL, np.diag([start_var[0], start_var[1], 0.0])
+    cov_W += error_jacobian @ mount_cov @ error_jacobian.swapaxes(1, 2)
+    cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_frames)
     return cov_W
+
+
+def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Compute segment → covariance (n, 3, 3) [rad²] in W by which soft tissue turns its sensor in motion."""
+    covariances = {}
+    R_WL = {segment: Rotation.from_quat(quat) for segment, quat in quat_WL.items()}
+    elevation = {}
+    for segment, R in R_WL.items():
+        tissue = table.segments[segment].soft_tissue
+        along = np.array(table.segments[segment].along)
+        relative = R_WL[tissue.relative_to].inv() * R if tissue.relative_to in R_WL else R
+        elevation[segment] = np.arccos(np.clip(relative.apply(along) @ along, -1.0, 1.0))
+    for segment, R in R_WL.items():
+        tissue = table.segments[segment].soft_tissue
+        along = np.array(table.segments[segment].along)
+        var = np.square(tissue.std) + np.square(np.outer(elevation[segment], tissue.per_tilt))
+        raised = [elevation[other] for other in tissue.raised if other in elevation]
+        if raised:
+            var = var + np.square(np.outer(np.mean(raised, axis=0), tissue.per_raised))
+        if tissue.per_twist and tissue.relative_to in R_WL:
+            quat = (R_WL[tissue.relative_to].inv() * R).as_quat()
+            twist = 2.0 * np.arctan2(np.abs(quat[:, :3] @ along), np.abs(quat[:, 3]))
+            var = var + np.square(np.outer(tissue.per_twist * twist, along))
+        matrix = R.as_matrix()
+        covariances[segment] = (matrix * var[:, None, :]) @ matrix.swapaxes(1, 2)
+    return covariances
 
 
 def compute_start_heading_var(
@@ -359,10 +405,14 @@ def compute_start_heading_var(
 ) -> float:
     """Compute the variance [rad²] of a segment's heading offset by the inexact start pose.
 
-    Zero for the segment whose heading defines x, and for a stated mount, which is stated relative to the start pose.
+    Zero for the segment whose heading defines x. A calibrated mount turns as the person stood then, which is nearly
+    repeated; a stated one is as far off as people are off the start pose.
     """
+    if segment == start_frames.table.reference:
+        return 0.0
     calibrated = find_mount_covariance(recording, segment, subject) is not None
-    return start_frames.std**2 if calibrated and segment != start_frames.table.reference else 0.0
+    std = start_frames.repeat_std(segment) if calibrated else start_frames.std(segment)
+    return float(std[2] ** 2)
 
 
 def find_mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:

@@ -17,6 +17,7 @@ from .errors import BadData, BadModel, one_of
 from .model import BodyModel
 from .model.configurations import find_determined_frames, joint_values
 from .model.fit import Fit
+from .model.girdle import PARAMETERS, move_girdles
 from .model.orientation_ik import OrientationIk, find_groups
 from .model.reaches import UNIVERSE
 from .recording import EACH_TIME, check_time
@@ -127,6 +128,7 @@ class KinematicsSolver:
     def solve_chunk(self, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
         """Compute the pose of the next chunk: `time` (n,) [s], segment → (n, 4) xyzw."""
         q = self._ik.run(quat_WL, warm_start=True)
+        _write_girdles(self._model, q, quat_WL)
         frames, joints = [self._model.point_frames[point] for point in self._points], {}
         if self._model.table.is_mechanism:
             R_WL, p_W = compute_link_poses(self._model, q, [*frames, *quat_WL])
@@ -225,7 +227,21 @@ def solve_configuration(
     """
     if not quat_WL:
         raise BadData("no segment has an orientation: a pose needs one")
-    return _make_ik(model, quat_WL, limits, weights).run(quat_WL)
+    q = _make_ik(model, quat_WL, limits, weights).run(quat_WL)
+    _write_girdles(model, q, quat_WL)
+    return q
+
+
+def _write_girdles(model: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> None:
+    """Write the joints of the girdles into `q` (n, nq): they follow the limbs."""
+    R_WL = {name: Rotation.from_quat(quat_WL[name]) for name in _girdle_segments(model) if name in quat_WL}
+    for name, motion in move_girdles(model, R_WL).items():
+        for joint, values in zip(model.table.girdles[name].joints, motion.displacement.T, strict=True):
+            q[:, model.pin.idx_qs[model.pin.getJointId(joint)]] = values
+
+
+def _girdle_segments(model: BodyModel) -> set[str]:
+    return {segment for girdle in model.table.girdles.values() for segment in (girdle.on, girdle.moves)}
 
 
 class _MechanismIk:
@@ -372,6 +388,7 @@ class LiveKinematics:
             self._q = self._previous_q = self._ik.run(rows, self._previous_q)[0]
         for q_index, row, parent_row in self._spherical_joints or ():
             set_relative_rotation(quat_WL, row, parent_row, self._q, q_index)
+        _write_girdles(self._model, self._q[None], {name: quat_WL[i : i + 1] for i, name in enumerate(self.segments)})
         pin.framesForwardKinematics(self._model.pin, self.data, self._q)
         return np.array(self._views)
 
@@ -413,21 +430,23 @@ def compute_point_covariances(
     model: BodyModel,
     quat_WL: Mapping[str, np.ndarray],
     segment_cov: Mapping[str, np.ndarray],
-    lengths_cov: np.ndarray,
+    shape_cov: np.ndarray,
     q: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """Compute the covariance (n, 3, 3) [m²] in W of the known points.
 
     Only of points for which every segment between root and point has a covariance. A point is the sum of vectors v that
     rotate with segments: an error δ of a segment's orientation moves the point by δ × v, errors of different sensors
-    are independent, errors of the lengths act along the vectors. The points of a mechanism move with the joints, which
+    are independent, errors of the lengths act along the vectors. A girdle adds the errors of its parameters and what leaves its law. The
+    points of a mechanism move with the joints, which
     the fit takes from all orientations.
 
     Parameters
     ----------
     model : with its lengths
     segment_cov : segment → (n, 3, 3) [rad²] in W
-    lengths_cov : (k, k) [m²] in the order of the model's lengths; zeros: known exactly
+    shape_cov : (k + 7 g, k + 7 g) of the model's lengths and then its girdles' parameters, in the order of the
+        table, as `Subject.shape_covariance`; zeros: known exactly
     q : (n, nq) of a mechanism; without it its points have none
     """
     covariances: dict[str, np.ndarray] = {}
@@ -435,8 +454,11 @@ def compute_point_covariances(
     if model.table.is_mechanism:
         if not points or q is None or not set(quat_WL) <= set(segment_cov):
             return covariances
-        return _propagate_through_joints(model, q, segment_cov, lengths_cov, points)
+        return _propagate_through_joints(model, q, segment_cov, shape_cov, points)
     lengths = np.array(list(model.lengths.values()))
+    girdles = list(model.table.girdles)
+    known = {name: Rotation.from_quat(quat_WL[name]) for name in _girdle_segments(model) if name in quat_WL}
+    motions = move_girdles(model, known)
     R_WK: dict[str, np.ndarray] = {}
     carriers = {link: find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
     for link, carrier in carriers.items():
@@ -451,16 +473,23 @@ def compute_point_covariances(
             continue
         vectors: dict[str, np.ndarray] = {}
         n = len(next(iter(quat_WL.values())))
-        length_jacobian = np.zeros((n, 3, len(lengths)))
+        shape_jacobian = np.zeros((n, 3, len(shape_cov)))
         for link, part in way.items():
             if link == UNIVERSE:
-                length_jacobian += part.by_length
+                shape_jacobian[:, :, : len(lengths)] += part.by_length
                 continue
             carrier = carriers[link]
             assert carrier is not None  # it has a rotation
             vectors[carrier] = vectors.get(carrier, 0.0) + R_WK[link] @ (part.by_length @ lengths + part.constant)
-            length_jacobian += R_WK[link] @ part.by_length
-        cov = length_jacobian @ lengths_cov @ length_jacobian.swapaxes(1, 2)
+            shape_jacobian[:, :, : len(lengths)] += R_WK[link] @ part.by_length
+        residual = np.zeros((n, 3, 3))
+        for name in model.point_girdles[point]:
+            girdle, motion, first = model.table.girdles[name], motions[name], len(lengths) + len(PARAMETERS) * girdles.index(name)
+            R_on = known[girdle.on].as_matrix()
+            vectors[girdle.on] = vectors.get(girdle.on, 0.0) + known[girdle.on].apply(motion.displacement)
+            shape_jacobian[:, :, first : first + len(PARAMETERS)] += R_on @ motion.jacobian
+            residual += (R_on * motion.residual_covariance(girdle)[:, None, :]) @ R_on.swapaxes(1, 2)
+        cov = shape_jacobian @ shape_cov @ shape_jacobian.swapaxes(1, 2) + residual
         for moving_segment, vector in vectors.items():
             skew = _build_skew_matrices(vector)
             cov = cov + skew @ segment_cov[moving_segment] @ skew.swapaxes(1, 2)

@@ -23,10 +23,11 @@ from .arguments import (
 from .documents import TomlTable, is_number, parse_toml, read_toml, toml_key, toml_string, toml_strings
 from .errors import BadData, BadModel, BadOption, BadSubject, one_of
 from .model import BodyModel, BodyTable, compute_population_lengths, load_table
+from .model.girdle import PARAMETERS
 
-_MOUNT_ROW = re.compile(r"mounts\..+\.[xyz]")  # of a covariance
+_ROW = re.compile(r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law")  # of a covariance, other than lengths
 LONGEST = 3.0  # [m] of a plausible length
-_LEARNED = ("mounts", "hinges", "start_pose_offset", "heading_drift", "doubled")
+_LEARNED = ("mounts", "hinges", "girdles", "start_pose_offset", "heading_drift", "doubled")
 _TABLES = ("lengths", "lengths_std", *_LEARNED, "covariance")
 FORMAT = 2
 MOST_OFFSET_DEG = 180.0  # of a file; the calibration checks whether it is plausible
@@ -62,7 +63,7 @@ class Subject:
     ----------
     lengths : name → [m], as the table of the body names them
     order : the rows of `covariance`: names of lengths [m], then ``mounts.<segment>.x``, ``.y``, ``.z``
-        [rad], the error of a mount as a small turn about the segment's axes
+        [rad], the error of a mount as a small turn about the segment's axes, then ``girdles.<point>.rest_x`` … [m]
     covariance : (k, k)
     mounts : segment → `quat_LS` (4,) xyzw, the calibrated mounts; empty where none are calibrated
     note : where the numbers come from, in a few words
@@ -70,6 +71,7 @@ class Subject:
     start_pose_offset : segment → its offset from the start pose in the calibration, which a person nearly repeats
     heading_drift : segment → that of its sensor in the calibration; on another day it has a similar size
     doubled : second sensor → its segment; its mount is under its own name
+    girdles : point that a girdle moves → (7,) what the person differs by from its law, `model.girdle.PARAMETERS`
     """
 
     name: str
@@ -82,6 +84,7 @@ class Subject:
     start_pose_offset: Mapping[str, StartPoseOffset] = field(default_factory=dict)
     heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
     doubled: Mapping[str, str] = field(default_factory=dict)
+    girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def check(self) -> Subject:
         """The same subject, if all its fields are valid.
@@ -96,7 +99,7 @@ class Subject:
         check_fields(self, where)
         try:
             check_lengths(f"{where}lengths", self.lengths)
-            named = [row for row in self.order if not _MOUNT_ROW.fullmatch(row)]
+            named = [row for row in self.order if not _ROW.fullmatch(row)]
             if named and not self.lengths:
                 raise BadData(f"{where}lengths is empty; it needs the lengths [m] that order names")
             check_names(f"{where}order", named, self.lengths)
@@ -108,10 +111,11 @@ class Subject:
             arrays = [(f"mounts.{s}", quat, (4,)) for s, quat in self.mounts.items()]
             arrays += [(f"hinges.{joint}.axis", hinge.axis, (3,)) for joint, hinge in self.hinges.items()]
             arrays += [(f"start_pose_offset.{s}.tilt", start.tilt, (2,)) for s, start in self.start_pose_offset.items()]
+            arrays += [(f"girdles.{point}", values, (len(PARAMETERS),)) for point, values in self.girdles.items()]
             for name, values, shape in arrays:
                 check_array(f"{where}{name}", values, shape)
                 check_finite(f"{where}{name}", values)
-                if shape != (2,):
+                if shape in ((3,), (4,)):
                     check_unit(f"{where}{name}", values, 1e-3)
         except (BadData, BadOption) as error:
             raise BadSubject(str(error)) from None
@@ -130,8 +134,14 @@ class Subject:
             for name in ("start_pose_offset", "heading_drift"):
                 check_names(f"{where}{name}", getattr(self, name), table.segments)
             check_names(f"{where}hinges", self.hinges, table.hinges)
+            check_names(f"{where}girdles", self.girdles, table.girdles)
         except BadOption as error:
             raise BadSubject(str(error)) from None
+
+    def shape(self, body: BodyModel) -> BodyModel:
+        """The body with this person's lengths and girdles."""
+        body = body.with_lengths({name: self.lengths[name] for name in body.lengths if name in self.lengths})
+        return replace(body, girdles=self.girdles)
 
     def std(self, name: str) -> float:
         """One standard deviation of a length [m], or of a mount's axis [rad]; NaN where nothing is known."""
@@ -147,6 +157,25 @@ class Subject:
         rows = [self.order.index(names[k]) for k in known]
         covariance = np.zeros((len(names), len(names)))
         covariance[np.ix_(known, known)] = self.covariance[np.ix_(rows, rows)]
+        return covariance
+
+    def shape_covariance(self, table: BodyTable) -> np.ndarray:
+        """Covariance (k + 7 g, k + 7 g) [m², or a share of the law] of a body's lengths and then its girdles' parameters.
+
+        Parameters of which nothing is known have the spread that the table states.
+        """
+        rows = girdle_rows(table)
+        k = len(table.lengths)
+        covariance = np.zeros((k + len(rows), k + len(rows)))
+        covariance[k:, k:] = compute_girdle_prior(table)
+        if set(rows) <= set(self.order):
+            at = [self.order.index(row) for row in rows]
+            covariance[k:, k:] = self.covariance[np.ix_(at, at)]
+            known = [i for i, name in enumerate(table.lengths) if name in self.order]
+            of_lengths = [self.order.index(name) for name in table.lengths if name in self.order]
+            covariance[np.ix_(known, range(k, k + len(rows)))] = self.covariance[np.ix_(of_lengths, at)]
+            covariance[k:, :k] = covariance[:k, k:].T
+        covariance[:k, :k] = self.lengths_covariance(table.lengths)
         return covariance
 
     def mount_covariance(self, segment: str) -> np.ndarray | None:
@@ -175,6 +204,25 @@ class Subject:
 def mount_rows(segment: str) -> list[str]:
     """The names of a mount's rows in a subject's covariance."""
     return [f"mounts.{segment}.{axis}" for axis in "xyz"]
+
+
+def girdle_rows(table: BodyTable) -> list[str]:
+    """The names of the rows of all girdles' parameters in a subject's covariance."""
+    return [f"girdles.{name}.{parameter}" for name in table.girdles for parameter in PARAMETERS]
+
+
+def compute_girdle_prior(table: BodyTable) -> np.ndarray:
+    """Covariance (7 g, 7 g) of the girdles' parameters before a calibration."""
+    names = list(table.girdles)
+    std = np.array([table.girdles[name].parameter_std for name in names]).reshape(len(names), len(PARAMETERS))
+    correlation = np.eye(std.size)
+    for i, name in enumerate(names):
+        other = table.counterpart(name)
+        if other in names:
+            j = names.index(other)
+            for k in range(4):  # the law and the place at rest
+                correlation[len(PARAMETERS) * i + k, len(PARAMETERS) * j + k] = table.girdles[name].alike
+    return correlation * np.outer(std, std)
 
 
 def check_lengths(place: str, lengths: Mapping[str, float]) -> None:
@@ -241,6 +289,9 @@ def subject_toml(subject: Subject) -> str:
         lines += ["", f"[hinges.{joint}]   # the axis in the upper arm's frame"]
         lines += [f"{key} = {value:.9f}" for key, value in zip("xyz", hinge.axis, strict=True)]
         lines.append(f"std_deg = {np.degrees(hinge.std):.3f}")
+    for point, values in subject.girdles.items():
+        lines += ["", f"[girdles.{point}]   # m, off the law of the body's table: its place at rest, and what is added at 90 deg"]
+        lines += [f"{key} = {value:.6f}" for key, value in zip(PARAMETERS, values, strict=True)]
     for segment, start in subject.start_pose_offset.items():
         lines += ["", f"[start_pose_offset.{segment}]   # off the start pose in the calibration, about x and y of W"]
         lines += [f"{key} = {np.degrees(value):.4f}" for key, value in zip(("x_deg", "y_deg"), start.tilt, strict=True)]
@@ -253,7 +304,7 @@ def subject_toml(subject: Subject) -> str:
         lines += ["", "[doubled]   # second sensors, and their segments"]
         lines += [f"{toml_key(name)} = {toml_string(segment)}" for name, segment in subject.doubled.items()]
     if subject.order:
-        lines += ["", "[covariance]    # of lengths [m] and mount errors [rad], jointly"]
+        lines += ["", "[covariance]    # of lengths [m], mount errors [rad] and girdles [m], jointly"]
         lines.append(f"order = {toml_strings(subject.order)}")
         lines.append("matrix = [")
         lines += ["    [" + ", ".join(f"{v:.9e}" for v in row) + "]," for row in subject.covariance]
@@ -311,6 +362,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         for segment, entry in of_segments["heading_drift"].items()
     }
     hinges = {joint: tables["hinges"].table(joint) for joint in tables["hinges"].values}
+    girdles = {point: tables["girdles"].table(point) for point in tables["girdles"].values}
     if "lengths" not in top:
         raise BadSubject(f"{path}: lengths is missing; it needs the lengths of the body [m], none where it has none")
     lengths = _read_lengths(tables["lengths"])
@@ -327,6 +379,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         hinges={joint: _read_hinge(entry) for joint, entry in hinges.items()},
         start_pose_offset={segment: StartPoseOffset(v[:2], float(v[2])) for segment, v in offset.items()},
         heading_drift={segment: HeadingDrift(float(rate), float(std)) for segment, (rate, std) in drift.items()},
+        girdles={point: np.array(entry.numbers(*PARAMETERS, most=LONGEST)) for point, entry in girdles.items()},
         doubled={name: tables["doubled"].text(name, None) or "" for name in tables["doubled"].values},
     )
 
@@ -353,7 +406,7 @@ def _read_covariance(table: TomlTable, std: TomlTable, lengths: Collection[str])
     if not isinstance(order, list | tuple) or len(set(map(str, order))) != len(order):
         raise BadSubject(f"{table.at('order')} = {order!r}; a list of names is needed, each once")
     for name in order:
-        if name not in lengths and not _MOUNT_ROW.fullmatch(str(name)):
+        if name not in lengths and not _ROW.fullmatch(str(name)):
             raise BadSubject(f"{table.at('order')}: {name!r} is not known; {one_of(lengths, str(name))}")
     place = table.at("matrix")
     try:

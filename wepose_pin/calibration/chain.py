@@ -62,8 +62,3 @@ def small_turn(rotvec: Any) -> Any:
     """The unit quaternion (4,) xyzw of a turn by about `rotvec` (3,) [rad], in CasADi: to third order of its size."""
     half = rotvec / 2.0
     return ca.vertcat(half, 1.0) / ca.sqrt(1.0 + ca.sumsqr(half))
-
-
-def about_axis(axis: tuple[float, float, float], angle: Any) -> Any:
-    """The unit quaternion (4,) xyzw of a turn about a unit axis (3,) [rad], in CasADi."""
-    return ca.vertcat(ca.DM(axis) * ca.sin(angle / 2.0), ca.cos(angle / 2.0))

@@ -15,7 +15,8 @@ import numpy as np
 
 from ..errors import BadOption, BadSession
 from ..kinematics import find_carrier
-from ..model import BodyModel
+from ..model import BodyModel, Girdle
+from ..model.girdle import find_girdle_scale
 from ..model.reaches import UNIVERSE
 from .protocols import Axis, Closure, Direction, Protocol
 
@@ -41,10 +42,12 @@ class Loop:
     Parameters
     ----------
     ways : parts from the root to a point, or from one point to another where the closure is between two
+    girdles : of each way, the girdles that move its points, each with its sign
     """
 
     closure: Closure
     ways: tuple[tuple[Part, ...], ...]
+    girdles: tuple[tuple[tuple[str, float], ...], ...] = ()
 
     @property
     def kind(self) -> str:
@@ -104,11 +107,21 @@ class HingeUnknown(NamedTuple):
     along: Vector
 
 
-class Twist(NamedTuple):
-    """Points above which other segments hang, turned about the long axis of a sensor's segment."""
+class GirdleTerm(NamedTuple):
+    """A girdle with sensors on both its segments.
 
-    sensor: str
-    axis: Vector  # (3,) in S'
+    Parameters
+    ----------
+    along : (3,) of the limb, in S' of `law.moves`
+    R_on : (3, 3), row by row: the frame of `law.on` in its S'
+    scale : of the law
+    """
+
+    name: str
+    law: Girdle
+    along: Vector
+    R_on: tuple[float, ...]
+    scale: float
 
 
 @dataclass(frozen=True)
@@ -166,7 +179,17 @@ def _resolve_closure(
         raise BadSession(
             f"protocol '{protocol.name}': no sensor moves {' and '.join(closure.points)}; a point that moves is needed"
         )
-    return Loop(closure, ways)
+    girdles = tuple(find_girdle_signs(model, points) for points in closure.ways)
+    return Loop(closure, ways, girdles)
+
+
+def find_girdle_signs(model: BodyModel, points: Collection[tuple[str, float]]) -> tuple[tuple[str, float], ...]:
+    """The girdles that move a signed sum of points, each with the sign of its displacement."""
+    signs: dict[str, float] = {}
+    for point, sign in points:
+        for name in model.point_girdles[point]:
+            signs[name] = signs.get(name, 0.0) + sign
+    return tuple((name, sign) for name, sign in signs.items() if sign)
 
 
 def find_parts(
@@ -229,12 +252,15 @@ def find_hinges(model: BodyModel, start: StartPose, sensors: Collection[str]) ->
     return tuple(hinges)
 
 
-def find_twists(model: BodyModel, start: StartPose, sensors: Collection[str]) -> tuple[Twist, ...]:
-    """The segments with sensors whose points turn about their long axis."""
-    segments = model.table.segments
-    return tuple(
-        Twist(name, start.turn(name, segments[name].along)) for name in sensors if segments[name].point_twist_std > 0.0
-    )
+def find_girdles(model: BodyModel, start: StartPose, sensors: Collection[str]) -> tuple[GirdleTerm, ...]:
+    """The girdles of the body whose two segments both have sensors."""
+    terms = []
+    for name, girdle in model.table.girdles.items():
+        if {girdle.on, girdle.moves} <= set(sensors):
+            along = start.turn(girdle.moves, model.table.segments[girdle.moves].along)
+            R_on = tuple(float(v) for v in start.R_WK[girdle.on].ravel())
+            terms.append(GirdleTerm(name, girdle, along, R_on, find_girdle_scale(girdle, model.lengths)))
+    return tuple(terms)
 
 
 def find_measured_lengths(protocol: Protocol, model: BodyModel) -> tuple[str, ...]:

@@ -8,8 +8,8 @@ stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(st
 
 with ψ the heading, d its drift since the start, s its steps where samples were lost since (`losses`), and A the
 soft-tissue artefact: soft tissue rotates a sensor as the direction of gravity in the segment changes. A segment's
-points may turn about its long axis, as the shoulders do by collarbones and shoulder blades while the arms are raised.
-That twist, d, s, A and the hinges are nuisance parameters: the covariance of lengths and mounts includes their
+points may move, as the shoulders do by collarbones and shoulder blades while the arms are raised (`model.girdle`). d, s, A
+and the hinges are nuisance parameters: the covariance of lengths and mounts includes their
 effect.
 
 A sample is one of the protocol's condition that holds then. A closure gives the gap, whitened by the covariance that
@@ -31,9 +31,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import SEGMENT_ATTITUDE_STD
+from ..model.girdle import MEAN_RAISED, PARAMETERS, displace
 from ..model.reaches import UNIVERSE
-from .chain import about_axis, about_z, inverse, product, rotate, small_turn
-from .conditions import Constraint, HingeUnknown, Loop, Part, Pointing, Twist
+from .chain import about_z, inverse, product, rotate, small_turn
+from .conditions import Constraint, GirdleTerm, HingeUnknown, Loop, Part, Pointing
 
 HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
 GAP_ROWS = 3  # residuals of a sample's condition
@@ -46,7 +47,7 @@ class Layout(NamedTuple):
     ----------
     lengths : names, in the order of the table
     sensors : by their segments, in the order of the table
-    hinges, twists : of these sensors
+    hinges, girdles : of these sensors
     fixed : how many unknown points
     planes : how many level planes of unknown height
     distance_names : of the unknown distances outside the body
@@ -58,7 +59,7 @@ class Layout(NamedTuple):
     lengths: tuple[str, ...]
     sensors: tuple[str, ...]
     hinges: tuple[HingeUnknown, ...] = ()
-    twists: tuple[Twist, ...] = ()
+    girdles: tuple[GirdleTerm, ...] = ()
     fixed: int = 0
     planes: int = 0
     distance_names: tuple[str, ...] = ()
@@ -102,14 +103,14 @@ class Layout(NamedTuple):
         return slice(self.hinge.stop, self.hinge.stop + 9 * len(self.soft))
 
     @property
-    def twist(self) -> slice:
-        """Rotation of points about the long axis of their segment [rad]."""
-        return slice(self.soft_tissue.stop, self.soft_tissue.stop + len(self.twists))
+    def girdle(self) -> slice:
+        """`model.girdle.PARAMETERS` of each girdle [m]."""
+        return slice(self.soft_tissue.stop, self.soft_tissue.stop + len(PARAMETERS) * len(self.girdles))
 
     @property
     def points(self) -> slice:
         """Unknown points of W (3,) each [m]."""
-        return slice(self.twist.stop, self.twist.stop + 3 * self.fixed)
+        return slice(self.girdle.stop, self.girdle.stop + 3 * self.fixed)
 
     @property
     def heights(self) -> slice:
@@ -302,23 +303,25 @@ _UP = ca.vertcat(0.0, 0.0, 1.0)
 
 def orient_parts(layout: Layout, x: Any, quat_WL: Mapping[str, Any], parts: Sequence[Part]) -> list[tuple[str, Any]]:
     """Sensor and vector (3,) [m] in W of each part of a way, in CasADi."""
-    lengths, twists = x[layout.length], {twist.sensor: k for k, twist in enumerate(layout.twists)}
-    vectors = []
+    lengths, vectors = x[layout.length], []
     for part in parts:
         rows = [
             sum((row[i] * lengths[i] for i in map(int, np.flatnonzero(row))), start=ca.SX(c))
             for row, c in zip(np.array(part.by_length), part.constant, strict=True)
         ]
         vector = ca.vertcat(*rows)
-        if part.sensor == UNIVERSE:
-            vectors.append((part.sensor, vector))
-            continue
-        quat = quat_WL[part.sensor]
-        if part.sensor in twists:
-            k = twists[part.sensor]
-            quat = product(quat, about_axis(layout.twists[k].axis, x[layout.twist][k]))
-        vectors.append((part.sensor, rotate(quat, vector)))
+        vectors.append((part.sensor, vector if part.sensor == UNIVERSE else rotate(quat_WL[part.sensor], vector)))
     return vectors
+
+
+def _displace_girdle(layout: Layout, x: Any, quat_WL: Mapping[str, Any], k: int) -> Any:
+    """The displacement (3,) [m] in W of what the k-th girdle moves, in CasADi."""
+    term = layout.girdles[k]
+    R_on, law = ca.DM(np.reshape(term.R_on, (3, 3))), term.law
+    along = R_on.T @ rotate(inverse(quat_WL[law.on]), rotate(quat_WL[law.moves], ca.DM(term.along)))
+    by_law, raised = displace(law, (along[0], along[1], along[2]), term.scale, ca)
+    own = x[layout.girdle][len(PARAMETERS) * k : len(PARAMETERS) * (k + 1)]
+    return rotate(quat_WL[law.on], R_on @ ((1.0 + own[0]) * ca.vertcat(*by_law) + own[1:4] + raised * own[4:]))
 
 
 def _closure_residual(
@@ -326,8 +329,15 @@ def _closure_residual(
 ) -> tuple[Any, Any]:
     """Whitened residual (3) and gap (3) [m] of a closure; `recorded` (3) [m] is the sample's recorded place."""
     gaps, covariances = [], []
-    for way in loop.ways:
+    names = [term.name for term in layout.girdles]
+    for way, girdles in zip(loop.ways, loop.girdles, strict=True):
         gap, covariance = ca.SX.zeros(3), loop.closure.slip**2 * ca.SX.eye(3)
+        for name, sign in girdles:
+            if name in names:
+                law = layout.girdles[names.index(name)].law
+                gap += sign * _displace_girdle(layout, x, quat_WL, names.index(name))
+                left = np.square(law.residual_std) + np.square(MEAN_RAISED * np.array(law.residual_raised_std))
+                covariance += float(np.mean(left)) * ca.SX.eye(3)
         for sensor, v in orient_parts(layout, x, quat_WL, way):
             gap += v
             # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ).

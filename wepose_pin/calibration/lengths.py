@@ -38,6 +38,7 @@ from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
 from ..model import BodyModel
 from ..model.body import load_sensed_model
+from ..model.girdle import PARAMETERS
 from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
@@ -386,6 +387,10 @@ def _make_subject(
             for name, rate, rate_std in zip(layout.sensors, x[layout.drift], std[layout.drift], strict=True)
         },
         lengths=dict(zip(layout.lengths, x[layout.length].tolist(), strict=True)),
+        girdles={
+            term.name: values
+            for term, values in zip(layout.girdles, x[layout.girdle].reshape(-1, len(PARAMETERS)), strict=True)
+        },
         order=order,
         covariance=covariance,
         mounts=mounts,

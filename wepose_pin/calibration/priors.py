@@ -10,9 +10,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import START_POSE_STD, find_mount_covariance
+from ..alignment import MEASURED_ORIENTATION_STD, find_mount_covariance
 from ..errors import BadSubject
 from ..model import BodyTable
+from ..model.girdle import PARAMETERS
 from ..subject import Subject
 from .conditions import Loop
 from .initial_headings import estimate_headings
@@ -22,10 +23,9 @@ from .problem import CalibrationProblem
 
 # Priors, one standard deviation. A stated mount names sensor axes, estimated by eye.
 STATED_STD = np.deg2rad(10.0)  # [rad] of a stated mount's heading
-MEASURED_ORIENTATION_STD = np.deg2rad(2.0)  # [rad] about each axis, of segments that a device aligned itself
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
+LEAST_GIRDLE_STD = 1e-5  # [m] of a parameter that a table states as exact
 POINT_STD = 3.0  # [m] of an unknown point of W
-MECHANISM_START_STD = np.deg2rad(0.5)  # [rad] of a mechanism's links in its start configuration; assumption
 
 
 def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaussian:
@@ -62,10 +62,20 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     segments = problem.model.table.segments
     soft_tissue = [segments[name].soft_tissue_std for name in layout.soft]
     information[layout.soft_tissue, layout.soft_tissue] = np.diag(np.repeat(soft_tissue, 9) ** -2.0)
-    twists = [segments[twist.sensor].point_twist_std for twist in layout.twists]
-    information[layout.twist, layout.twist] = np.diag(np.array(twists) ** -2.0)
+    mean[layout.girdle], information[layout.girdle, layout.girdle] = _girdle_prior(problem, layout)
     _add_hinges(information, layout, problem.model.table)
     return Gaussian(place_points(mean, observations), information)
+
+
+def _girdle_prior(problem: CalibrationProblem, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (7 g,) and information of the girdles' parameters: of the prior, else of the table."""
+    table, names = problem.model.table, [term.name for term in layout.girdles]
+    first = len(table.lengths)
+    all_names, size = list(table.girdles), len(PARAMETERS)
+    rows = [first + size * all_names.index(name) + k for name in names for k in range(size)]
+    covariance = problem.prior.shape_covariance(table)[np.ix_(rows, rows)]
+    mean = [problem.prior.girdles.get(name, np.zeros(size)) for name in names]
+    return np.concatenate([*mean, np.empty(0)]), np.linalg.inv(covariance + LEAST_GIRDLE_STD**2 * np.eye(len(rows)))
 
 
 def _add_places(mean: np.ndarray, information: np.ndarray, observations: Observations) -> None:
@@ -100,8 +110,11 @@ def _mount_prior(problem: CalibrationProblem, segment: str, heading: float | Non
     The person stands nearly in the start pose. A mount R_LS = exp(m) R_0 has a small error m = μ − ε + ψ e_z, with μ
     the misfit of the start pose at the heading nearest to R_0.
     """
-    start_std = MECHANISM_START_STD if problem.model.table.is_mechanism else START_POSE_STD
-    information = np.diag([start_std**-2, start_std**-2, HEADING_STD**-2])
+    R_start = problem.start_pose.R_WK[segment]
+    start_cov = R_start @ np.diag(np.square(problem.model.table.segments[segment].start_std)) @ R_start.T
+    information = np.zeros((3, 3))
+    information[:2, :2] = np.linalg.inv(start_cov[:2, :2])
+    information[2, 2] = HEADING_STD**-2
     mount = problem.mount(segment)
     if mount is None or heading is None:
         return np.zeros(3), information

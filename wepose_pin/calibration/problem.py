@@ -22,9 +22,9 @@ from .conditions import (
     Loop,
     Pointing,
     StartPose,
+    find_girdles,
     find_hinges,
     find_measured_lengths,
-    find_twists,
     resolve_conditions,
 )
 from .initial_headings import is_linear
@@ -200,7 +200,7 @@ class CalibrationProblem:
             tuple(self.model.lengths),
             sensors,
             find_hinges(self.model, start, sensors),
-            find_twists(self.model, start, sensors),
+            find_girdles(self.model, start, sensors),
             sum(closure.kind == "fixed_point" for closure in protocol.closures),
             sum(closure.kind == "plane" for closure in protocol.closures),
             protocol.distances,

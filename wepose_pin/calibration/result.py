@@ -89,7 +89,7 @@ class Calibration:
     @property
     def body(self) -> BodyModel:
         """The body with the estimated lengths."""
-        return self.model.with_lengths({name: self.subject.lengths[name] for name in self.model.lengths})
+        return self.subject.shape(self.model)
 
     def limbs(self) -> LimbMotion:
         """How the limbs moved while the chain was closed."""

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..model.girdle import PARAMETERS
 from ..subject import mount_rows
 from .conditions import Loop, StartPose
 from .least_squares import GAP_ROWS, Gaussian, Layout, Observations
@@ -191,20 +192,23 @@ def compare_measured(
 
 
 def project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names and covariance of the lengths and mount errors, from x's covariance: R_LS = exp(−ε) Rz(ψ) R_VS(start).
+    """Names and covariance of the lengths, mount errors and girdles, from x's covariance: R_LS = exp(−ε) Rz(ψ) R_VS(start).
 
-    Errors of mounts are turned from the frames that equal W in the start pose to those of the segments.
+    Errors of mounts are turned from the frames that equal W in the start pose to those of the segments. By how much a
+    person turns a segment about the vertical in the start pose is not in them: no closure shows it.
     """
     K, rows = len(layout.lengths), [row for name in layout.sensors for row in mount_rows(name)]
-    T = np.zeros((K + len(rows), layout.size))
+    of_girdles = [f"girdles.{term.name}.{parameter}" for term in layout.girdles for parameter in PARAMETERS]
+    T = np.zeros((K + len(rows) + len(of_girdles), layout.size))
     T[:K, :K] = np.eye(K)
+    T[K + len(rows) :, layout.girdle] = np.eye(len(of_girdles))
     for i, name in enumerate(layout.sensors):
         own = np.zeros((3, layout.size))
         own[0, layout.tilt.start + 2 * i] = -1.0
         own[1, layout.tilt.start + 2 * i + 1] = -1.0
         own[2, layout.heading.start + i] = 1.0
         T[K + 3 * i : K + 3 * i + 3] = start.R_WK[name].T @ own
-    return (*layout.lengths, *rows), T @ covariance @ T.T
+    return (*layout.lengths, *rows, *of_girdles), T @ covariance @ T.T
 
 
 def compute_information_shares(

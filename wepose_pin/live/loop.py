@@ -441,8 +441,7 @@ def build_subject_model(
         body = load_sensed_model(body, tuple(sensors) or tuple(setup.mounts), setup.name)
     if setup.subject is None and chosen is not None:
         return body
-    lengths = (setup.subject or population_subject(body=body)).lengths
-    return body.with_lengths({name: value for name, value in lengths.items() if name in body.lengths})
+    return (setup.subject or population_subject(body=body)).shape(body)
 
 
 def _measure_rate(times: Sequence[np.ndarray]) -> float:

@@ -11,12 +11,13 @@ for them, fixed to its own.
 
 `tree` reads the joints, `table` the table, `naming` gives links its names, `lengths` measures and stretches,
 `anthropometry` has the lengths of people, `chains` turns a segment's orientation into joint values, `reaches` has the
-way from the root to each point, `visuals` reads the shapes of the links.
+way from the root to each point, `girdle` moves shoulders on the trunk, `visuals` reads the shapes of the links.
 """
 
 from .anthropometry import SEXES, LengthPrior, compute_population_lengths
 from .body import BodyModel, load_model
 from .chains import Chain
+from .girdle import Girdle, GirdleMotion, move_girdles
 from .reaches import LinkVector, measure_reaches
 from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, Segment, find_table, load_table, read_table
 from .tree import AxisLimits
@@ -30,6 +31,8 @@ __all__ = [
     "BodyModel",
     "BodyTable",
     "Chain",
+    "Girdle",
+    "GirdleMotion",
     "HingeJoint",
     "LengthPrior",
     "Limb",
@@ -41,5 +44,6 @@ __all__ = [
     "load_model",
     "load_table",
     "measure_reaches",
+    "move_girdles",
     "read_table",
 ]

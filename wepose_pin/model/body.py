@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from . import lengths as _lengths
 from . import visuals as _visuals
 from .anthropometry import compute_population_lengths
 from .chains import Chain, find_chains, find_parents
+from .girdle import PARAMETERS
 from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
 from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, parse_table, read_table
@@ -44,6 +45,7 @@ class BodyModel:
     table : what there is on it; its links bear the names of segments and points
     joints : child link of a spherical joint → its Pinocchio joint
     limits : the same → what its three axes may do; without an entry for a `floating` joint
+    girdles : girdle → (7,) what a person differs by from its law, `girdle.PARAMETERS`; zeros where it is not named
     """
 
     pin: pin.Model
@@ -51,6 +53,21 @@ class BodyModel:
     table: BodyTable
     joints: Mapping[str, int]
     limits: Mapping[str, AxisLimits]
+    girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def girdle_parameters(self, name: str) -> np.ndarray:
+        """(7,) what a girdle differs by from its law."""
+        return self.girdles.get(name, np.zeros(len(PARAMETERS)))
+
+    @cached_property
+    def point_girdles(self) -> dict[str, tuple[str, ...]]:
+        """Point → the girdles that move it."""
+        m = self.pin
+        joints = {name: m.getJointId(girdle.joints[-1]) for name, girdle in self.table.girdles.items()}
+        supports = {point: m.supports[m.frames[m.getFrameId(at)].parentJoint] for point, at in self.point_frames.items()}
+        return {
+            point: tuple(name for name, joint in joints.items() if joint in above) for point, above in supports.items()
+        }
 
     @cached_property
     def lengths(self) -> dict[str, float]:
@@ -126,7 +143,8 @@ class BodyModel:
                 raise BadModel(
                     f"{self.robot.name}: length {name} = {value!r} is no length of a body: above 0 and below 10 m"
                 )
-        return _body(_lengths.with_lengths(self.robot, self.table, lengths), self.table, self.robot.name)
+        body = _body(_lengths.with_lengths(self.robot, self.table, lengths), self.table, self.robot.name)
+        return replace(body, girdles=self.girdles)
 
     def urdf(self) -> str:
         """This body as the text of a URDF that any tool reads."""
@@ -195,11 +213,13 @@ def load_model(
             f"{path}: no link {format_closest_links(lacking, tree.below, default)}; name the segments' links in a "
             f"table, as docs/models.md shows; {one_of(tree.below, most=MOST_LINKS)}"
         )
+    joints = {joint.name for joint in robot.joints}
+    girdles = {name: girdle for name, girdle in table.girdles.items() if joints.issuperset(girdle.joints)}
     if own:
         _check_poses(robot, table)
     else:  # the names fit; joints may have others
-        joints = {joint.name for joint in robot.joints}
         table = replace(table, poses={name: pose for name, pose in table.poses.items() if joints.issuperset(pose)})
+    table = replace(table, girdles=girdles)
     robot, table = rename_links(robot, table)
     body = _body(robot, table, str(path))
     _check_segments_move(body, str(path))
@@ -231,7 +251,7 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: 
                 f"{where}: sensors.{name} is no link of {robot.name}; {one_of(tree.below, name, MOST_LINKS)}"
             )
     links = sorted(sensors, key=lambda name: len(tree.path(name)))
-    segments = {name: Segment(name, rigid_without_sensor=True, soft_tissue_std=0.0) for name in links}
+    segments = {name: Segment.of_mechanism(name) for name in links}
     body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(file)), str(file))
     if not body.pin.nv:
         raise BadModel(f"{file}: no joint moves; a chain of revolute or prismatic joints is needed")

@@ -1,7 +1,8 @@
 """The way from the root to each point of a body, link by link: vectors that are affine in the lengths.
 
 A point is p_W = Σ R_WK (B l + c) over the links K between the root and the point, with l the lengths: each link
-contributes a vector that is affine in the lengths and constant in the link.
+contributes a vector that is affine in the lengths and constant in the link. The joints of a girdle stand at zero here:
+what they add is in `girdle`.
 """
 
 from __future__ import annotations
@@ -67,13 +68,14 @@ _Offsets = dict[str, dict[str, np.ndarray]]  # point → link → (3,) [m] in th
 def _link_offsets(model: BodyModel) -> _Offsets:
     """Point → link → its part (3,) [m] of the chain from the root, from the placements of joints and frames."""
     m, name_of = model.pin, _name_links(model)
+    follow = {joint for girdle in model.table.girdles.values() for joint in girdle.joints}
     offsets: _Offsets = {}
     for point, link in model.point_frames.items():
         frame = m.frames[m.getFrameId(link)]
         offsets[point], joint, translation = {}, frame.parentJoint, frame.placement.translation
         parts: list[tuple[int, np.ndarray]] = [(joint, translation)]
         while joint:
-            if m.joints[joint].shortname().startswith("JointModelP"):
+            if m.joints[joint].shortname().startswith("JointModelP") and m.names[joint] not in follow:
                 raise BadModel(f"{m.name}: joint '{m.names[joint]}' slides: orientations do not tell where {point} is")
             translation, joint = m.jointPlacements[joint].translation, m.parents[joint]
             parts.append((joint, translation))

@@ -21,14 +21,40 @@ from ..assets import asset
 from ..documents import TomlTable, is_number, read_toml, toml_key, toml_string, toml_strings
 from ..errors import BadModel, MissingFile, one_of
 from ..recording.sensors import AXES, read_axes
+from .girdle import Girdle
 
 DEFAULT_BODY = "upper_body"
 ROOT = "root"  # the origin of W, as the end of a length
 MODEL_TABLE = "model.toml"
 PERSON, MECHANISM = "person", "mechanism"
 NEUTRAL_POSE = "n_pose"
-_KEYS = ("segments", "points", "lengths", "hinges", "poses", "pairs", "sensors", "draw")
+_KEYS = ("segments", "points", "lengths", "hinges", "girdles", "poses", "pairs", "sensors", "draw")
 _SETTINGS = ("kind", "up", "forward", "root")
+
+
+class SoftTissue(NamedTuple):
+    """How much soft tissue turns a sensor on its segment in motion; standard deviations about x, y, z of the segment.
+
+    Parameters
+    ----------
+    std : (3,) [rad] in any pose
+    relative_to : the segment against which tilt and twist count; empty: W
+    per_tilt : (3,) per angle by which the long axis is tilted since the start pose
+    per_twist : about the long axis, per angle by which the segment is turned about it since the start pose
+    raised, per_raised : segments, and (3,) per angle by which they are raised off hanging, their mean
+    """
+
+    std: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    relative_to: str = ""
+    per_tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    per_twist: float = 0.0
+    raised: tuple[str, ...] = ()
+    per_raised: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def _same(degrees: float) -> tuple[float, float, float]:
+    angle = float(np.deg2rad(degrees))
+    return angle, angle, angle
 
 
 class Segment(NamedTuple):
@@ -43,8 +69,10 @@ class Segment(NamedTuple):
     rigid_without_sensor : whether it follows the segment above where it has no sensor; else it is unknown then
     labels : a regular expression of words that mean it in a sensor's name
     joint : the name of the joint to the segment above, where no point is there to name it
-    soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian; none on a mechanism
-    point_twist_std : [rad] by which the points above which other segments hang turn about its long axis
+    soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian, in a calibration
+    soft_tissue : by how much it turns a sensor while the body is tracked
+    start_std : (3,) [rad] between the segment and the start pose about its axes, one person to another
+    repeat_std : (3,) [rad] the same between two start poses of one person
     """
 
     link: str
@@ -56,7 +84,15 @@ class Segment(NamedTuple):
     labels: str = ""
     joint: str = ""
     soft_tissue_std: float = float(np.deg2rad(0.6))
-    point_twist_std: float = 0.0
+    soft_tissue: SoftTissue = SoftTissue(_same(1.5))
+    start_std: tuple[float, float, float] = _same(4.0)
+    repeat_std: tuple[float, float, float] = _same(2.0)
+
+    @classmethod
+    def of_mechanism(cls, link: str) -> Segment:
+        """A link of a mechanism, on which nothing is soft; its start configuration is known well (assumption)."""
+        rigid = SoftTissue()
+        return cls(link, rigid_without_sensor=True, soft_tissue_std=0.0, soft_tissue=rigid, start_std=_same(0.5), repeat_std=_same(0.5))
 
 
 class Point(NamedTuple):
@@ -153,6 +189,7 @@ class BodyTable:
     points : name → its link
     lengths : name → what it scales
     hinges : name → joint of nearly one axis
+    girdles : point that moves on the segment on which its limb hangs → how
     poses : name → joint of the URDF → value [rad or m]
     pairs : what lies left → its counterpart on the right: segments, points, lengths, hinges
     sensors : segment → where its sensor usually sits
@@ -171,6 +208,7 @@ class BodyTable:
     points: Mapping[str, Point] = field(default_factory=dict)
     lengths: Mapping[str, Length] = field(default_factory=dict)
     hinges: Mapping[str, HingeJoint] = field(default_factory=dict)
+    girdles: Mapping[str, Girdle] = field(default_factory=dict)
     poses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     pairs: Mapping[str, str] = field(default_factory=dict)
     sensors: Mapping[str, SensorPlace] = field(default_factory=dict)
@@ -306,6 +344,11 @@ def _prune(table: BodyTable) -> BodyTable:
         if all(part.segment in table.segments and points.issuperset(part.start + part.end) for part in length.stretches)
     }
     hinges = {name: hinge for name, hinge in table.hinges.items() if {hinge.on, hinge.moves} <= set(table.segments)}
+    girdles = {
+        name: girdle
+        for name, girdle in table.girdles.items()
+        if name in table.points and {girdle.on, girdle.moves} <= set(table.segments)
+    }
     names = {*table.segments, *table.points, *lengths, *hinges}
     limbs = tuple(limb for limb in table.limbs if set(limb) <= set(table.points))
     return replace(
@@ -313,6 +356,7 @@ def _prune(table: BodyTable) -> BodyTable:
         lengths=lengths,
         absent=tuple(name for name in (*table.absent, *table.lengths) if name not in lengths),
         hinges=hinges,
+        girdles=girdles,
         pairs={left: right for left, right in table.pairs.items() if {left, right} <= names},
         sensors={name: place for name, place in table.sensors.items() if name in table.segments},
         limbs=limbs,
@@ -406,7 +450,8 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
     lengths = {**table.lengths, **_read_lengths(top, table)}
     table = replace(table, lengths=lengths)
     hinges = {**table.hinges, **_read_hinges(top, table)}
-    table = replace(table, hinges=hinges, poses=_read_poses(top))
+    girdles = {**table.girdles, **_read_girdles(top, table)}
+    table = replace(table, hinges=hinges, girdles=girdles, poses=_read_poses(top))
     names = {*table.segments, *table.points, *table.lengths, *table.hinges}
     pairs = top.table("pairs", {})
     for left, right in pairs.values.items():
@@ -423,6 +468,7 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
     for point in (*(point for limb in limbs for point in limb), *_read_names(draw, "paths")):
         if point not in table.points:
             raise BadModel(f"{draw.where}: '{point}' is no point; {one_of(table.points, str(point))}")
+    table = _check_soft_tissue(table)
     return replace(
         table,
         pairs={**table.pairs, **pairs.values},
@@ -434,11 +480,11 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
 
 def _read_segments(top: TomlTable, base: BodyTable, kind: str) -> dict[str, Segment]:
     segments = {}
-    new = Segment("", soft_tissue_std=0.0) if kind == MECHANISM else Segment("")
+    new = Segment.of_mechanism("")._replace(rigid_without_sensor=False) if kind == MECHANISM else Segment("")
     for name, entry in _read_links(top, "segments"):
         entry.allow(
             *("link", "up", "forward", "along", "spine", "without_sensor", "labels", "joint"),
-            *("soft_tissue_deg", "point_twist_deg"),
+            *("soft_tissue_deg", "soft_tissue", "start_std_deg", "repeat_std_deg"),
         )
         own = base.segments.get(name)
         if ("up" in entry) != ("forward" in entry):
@@ -459,14 +505,19 @@ def _read_segments(top: TomlTable, base: BodyTable, kind: str) -> dict[str, Segm
         except re.error as error:
             raise BadModel(f"{entry.at('labels')} = {labels!r} is no regular expression: {error}") from None
         joint = entry.text("joint", segment.joint or None) or ""
-        soft, twist = (
-            _read_angle(entry, key, value)
-            for key, value in (
-                ("soft_tissue_deg", segment.soft_tissue_std),
-                ("point_twist_deg", segment.point_twist_std),
-            )
+        soft = _read_angle(entry, "soft_tissue_deg", segment.soft_tissue_std)
+        start, repeat = (
+            _read_angles(entry, key, value)
+            for key, value in (("start_std_deg", segment.start_std), ("repeat_std_deg", segment.repeat_std))
         )
-        segments[name] = segment._replace(labels=labels, joint=joint, soft_tissue_std=soft, point_twist_std=twist)
+        segments[name] = segment._replace(
+            labels=labels,
+            joint=joint,
+            soft_tissue_std=soft,
+            soft_tissue=_read_soft_tissue(entry, segment.soft_tissue),
+            start_std=start,
+            repeat_std=repeat,
+        )
     if base.segments and (not segments or not set(segments) & set(base.segments)):
         return {**base.segments, **segments}  # the same body with more on it
     lacking = [name for name in base.segments if name not in segments]
@@ -476,6 +527,34 @@ def _read_segments(top: TomlTable, base: BodyTable, kind: str) -> dict[str, Segm
             raise BadModel(f"{top.at('segments')}.{name}: did you mean '{close[0]}'? {base.name} has that")
     order = [*base.segments, *segments]
     return dict(sorted(segments.items(), key=lambda item: order.index(item[0])))
+
+
+def _read_soft_tissue(entry: TomlTable, default: SoftTissue) -> SoftTissue:
+    if "soft_tissue" not in entry:
+        return default
+    table = entry.table("soft_tissue")
+    table.allow("std_deg", "relative_to", "per_tilt", "per_twist", "raised", "per_raised")
+    tilt, raised = (_read_triple(table, key, value) for key, value in (("per_tilt", default.per_tilt), ("per_raised", default.per_raised)))
+    return SoftTissue(
+        _read_angles(table, "std_deg", default.std),
+        table.text("relative_to", default.relative_to or None) or "",
+        tilt,
+        table.number("per_twist", default.per_twist) or 0.0,
+        _read_names(table, "raised") or default.raised,
+        raised,
+    )
+
+
+def _check_soft_tissue(table: BodyTable) -> BodyTable:
+    """The table without what a segment's soft tissue has of segments that the body lacks, as one like another may."""
+    segments = {}
+    for name, segment in table.segments.items():
+        tissue = segment.soft_tissue
+        raised = tuple(other for other in tissue.raised if other in table.segments)
+        if tissue.relative_to and tissue.relative_to not in table.segments:
+            tissue = tissue._replace(relative_to="", per_tilt=(0.0, 0.0, 0.0), per_twist=0.0)
+        segments[name] = segment._replace(soft_tissue=tissue._replace(raised=raised))
+    return replace(table, segments=segments)
 
 
 def _check_ends(table: BodyTable, base: BodyTable) -> None:
@@ -574,6 +653,50 @@ def _read_hinges(top: TomlTable, table: BodyTable) -> dict[str, HingeJoint]:
     return hinges
 
 
+def _read_girdles(top: TomlTable, table: BodyTable) -> dict[str, Girdle]:
+    girdles = {}
+    for name, entry in _read_tables(top, "girdles"):
+        spreads = ("rest_std_mm", "raised_std_mm", "residual_std_mm", "residual_raised_std_mm")
+        law = ("up_mm", "middle_mm", "back_mm", "back_angle_deg")
+        entry.allow("on", "moves", "joints", "outward", *law, "scaled_by", "scale", "law_std", "alike", *spreads)
+        if name not in table.points:
+            raise BadModel(f"{entry.where}: '{name}' is no point; {one_of(table.points, name)}")
+        on, moves = (entry.choice(key, table.segments) for key in ("on", "moves"))
+        joints = _read_names(entry, "joints")
+        if len(joints) != 3 or on == moves:
+            raise BadModel(
+                f"{entry.where}: on = {on!r}, moves = {moves!r}, joints = {list(joints)}; two different segments and "
+                f"three joints of the URDF are needed, which slide along x, y and z of '{on}'"
+            )
+        x, y, z = (float(v) for v in AXES[entry.choice("outward", AXES)])
+        up, middle, back = (tuple(_read_millimetres(entry, key, 2, None)) for key in law[:3])
+        stds = [tuple(_read_millimetres(entry, key, 3, [0.0, 0.0, 0.0], least=0.0)) for key in spreads]
+        scaled_by = entry.choice("scaled_by", table.lengths) if "scaled_by" in entry else ""
+        scale, angle = entry.number("scale", 1.0, positive=True), entry.number("back_angle_deg", None, positive=True)
+        alike, law_std = entry.number("alike", 0.0) or 0.0, entry.number("law_std", 0.0) or 0.0
+        if angle is None or not -1.0 < alike < 1.0:
+            raise BadModel(
+                f"{entry.where}: back_angle_deg = {angle}, alike = {alike:g}; an angle, and a correlation between -1 "
+                f"and 1 are needed"
+            )
+        girdles[name] = Girdle(
+            *(on, moves, (joints[0], joints[1], joints[2]), (x, y, z)),
+            *((up[0], up[1]), (middle[0], middle[1]), (back[0], back[1]), float(np.deg2rad(angle))),
+            *(scaled_by, scale or 1.0, law_std, stds[0], stds[1], alike, stds[2], stds[3]),
+        )
+    return girdles
+
+
+def _read_millimetres(
+    table: TomlTable, key: str, count: int, default: Sequence[float] | None, least: float = -1e3
+) -> list[float]:
+    """Numbers [m] of a key in millimetres."""
+    values = _read_numbers(table, key, count, default)
+    if min(values) < least:
+        raise BadModel(f"{table.at(key)} = {values}; numbers of at least {least:g} mm are needed")
+    return [1e-3 * v for v in values]
+
+
 def _read_poses(top: TomlTable) -> dict[str, dict[str, float]]:
     poses: dict[str, dict[str, float]] = {NEUTRAL_POSE: {}}
     for name, entry in _read_tables(top, "poses"):
@@ -626,6 +749,22 @@ def _read_numbers(table: TomlTable, key: str, count: int, default: Sequence[floa
     if not isinstance(value, list) or len(value) != count or not all(is_number(v, 1e6) for v in value):
         raise BadModel(f"{table.at(key)} = {value!r}; {count} numbers are wanted")
     return [float(v) for v in value]
+
+
+def _read_triple(table: TomlTable, key: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Three numbers of at least 0."""
+    x, y, z = _read_numbers(table, key, 3, list(default))
+    if min(x, y, z) < 0.0:
+        raise BadModel(f"{table.at(key)} = {[x, y, z]}; numbers from 0 on are needed")
+    return x, y, z
+
+
+def _read_angles(table: TomlTable, key: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Three angles [rad] of a key in degrees."""
+    if key not in table:
+        return default
+    x, y, z = np.deg2rad(_read_triple(table, key, default)).tolist()
+    return x, y, z
 
 
 def _read_angle(table: TomlTable, key: str, default: float) -> float:
@@ -685,7 +824,14 @@ def format_table(table: BodyTable, urdf: str) -> str:
         lines += [f"labels = {toml_string(segment.labels)}"] if segment.labels else []
         lines += [f"joint = {toml_string(segment.joint)}"] if segment.joint else []
         lines.append(f"soft_tissue_deg = {np.degrees(segment.soft_tissue_std):.6g}")
-        lines.append(f"point_twist_deg = {np.degrees(segment.point_twist_std):.6g}")
+        lines.append(f"start_std_deg = {np.degrees(segment.start_std).round(6).tolist()}")
+        lines.append(f"repeat_std_deg = {np.degrees(segment.repeat_std).round(6).tolist()}")
+        tissue = segment.soft_tissue
+        parts = [f"std_deg = {np.degrees(tissue.std).round(6).tolist()}", f"per_tilt = {list(tissue.per_tilt)}"]
+        parts += [f"per_twist = {tissue.per_twist!r}"]
+        parts += [f"relative_to = {toml_string(tissue.relative_to)}"] if tissue.relative_to else []
+        parts += [f"raised = {toml_strings(tissue.raised)}", f"per_raised = {list(tissue.per_raised)}"] if tissue.raised else []
+        lines.append(f"soft_tissue = {{ {', '.join(parts)} }}")
     lines += ["", "[points]"]
     for name, point in table.points.items():
         at = f", at = {list(point.at)}" if any(point.at) else ""
@@ -711,6 +857,17 @@ def format_table(table: BodyTable, urdf: str) -> str:
             ("tilt_std_deg", hinge.tilt_std),
         ):
             lines.append(f"{key} = {np.degrees(value):.6g}")
+    for name, girdle in table.girdles.items():
+        lines += ["", f"[girdles.{toml_key(name)}]", f"on = {toml_string(girdle.on)}"]
+        lines += [f"moves = {toml_string(girdle.moves)}", f"joints = {toml_strings(girdle.joints)}"]
+        lines.append(f"outward = {toml_string(axes[girdle.outward])}")
+        lines += [
+            f"{key}_mm = {np.round(1e3 * np.array(getattr(girdle, key)), 6).tolist()}"
+            for key in ("up", "middle", "back", "rest_std", "raised_std", "residual_std", "residual_raised_std")
+        ]
+        lines.append(f"back_angle_deg = {np.degrees(girdle.back_angle):.6g}")
+        lines += [f"scaled_by = {toml_string(girdle.scaled_by)}"] if girdle.scaled_by else []
+        lines += [f"scale = {girdle.scale!r}", f"law_std = {girdle.law_std!r}", f"alike = {girdle.alike!r}"]
     for name, joints in table.poses.items():
         lines += ["", f"[poses.{toml_key(name)}]"]
         lines += [f"{toml_key(joint)} = {value!r}" for joint, value in joints.items()]

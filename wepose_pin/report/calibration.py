@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import START_POSE_STD
 from ..calibration import Calibration, CalibrationQuality
 from ..calibration.conditions import find_measured_lengths, group_lengths
 from ..calibration.observability import find_intervals
@@ -238,7 +237,8 @@ def _build_sensors_section(calibration: Calibration, recording: Recording) -> di
     if not rows:
         return None
     header = ["sensor", "nearest axes in the start pose", "stated before", "tilt ±", "heading ±", "heading drift"]
-    picture = draw_sensors(rows, float(np.degrees(START_POSE_STD)), float(np.degrees(DRIFT_STD)) * 60.0)
+    starts = [calibration.model.table.segments[name].start_std[:2] for name in calibration.start_pose_offset]
+    picture = draw_sensors(rows, float(np.degrees(_rms(np.array(starts)))), float(np.degrees(DRIFT_STD)) * 60.0)
     return {"picture": picture, "sensors": Table(header, lines)}
 
 
@@ -347,7 +347,7 @@ def _build_posture_section(calibration: Calibration) -> dict[str, Any] | None:
     lines, observed, table = [], {}, calibration.model.table
     for name, (x, y) in tilt.items():
         std = np.degrees([calibration.subject.std(row) for row in mount_rows(name)[:2]])
-        observed[name] = (~(std > UNOBSERVED * np.degrees(START_POSE_STD))).tolist()
+        observed[name] = (~(std > UNOBSERVED * np.degrees(table.segments[name].start_std[:2]))).tolist()
         tilts = ((1, x, std[0], observed[name][0]), (0, y, std[1], observed[name][1]))
         lines.append([plain(name), *(_format_tilt(table, name, *about) for about in tilts)])
     hinges = {}
@@ -537,3 +537,7 @@ def _format_tilt(table: BodyTable, name: str, across: int, angle: float, std: fl
 
 def _format_side(value: float, negative: str, positive: str) -> str:
     return f"{abs(value):.0f} cm {positive if value >= 0.0 else negative}"
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")

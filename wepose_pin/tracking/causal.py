@@ -22,6 +22,7 @@ from ..alignment import (
     compute_heading_offset,
     compute_heading_variance,
     compute_segment_covariance,
+    compute_soft_tissue_covariances,
     orient_segments,
 )
 from ..compilation import kernel
@@ -238,7 +239,12 @@ class CausalSegmentEstimator:
         if covs:
             last = np.stack([covs[name][-1] for name in self.names])
             self._run_var = compute_heading_variance(quat_VS[-1], last)
-            covariance_W = {name: self._covariance_W(i, quat_VS[:, i], covs[name]) for i, name in enumerate(self.names)}
+            soft = compute_soft_tissue_covariances(
+                self._start_frames.table, {name: quat_WL[:, i] for i, name in enumerate(self.names)}
+            )
+            covariance_W = {
+                name: self._covariance_W(i, quat_VS[:, i], covs[name]) + soft[name] for i, name in enumerate(self.names)
+            }
         return replace(
             self.start,
             time=chunk.time,
@@ -287,7 +293,12 @@ class CausalSegmentEstimator:
         if cov is None:
             return np.full((len(self.names), 3, 3), np.nan)
         newest = self._recent[self._oldest - 1]
-        return np.concatenate([self._covariance_W(i, newest[i : i + 1], cov[i : i + 1]) for i in range(len(cov))])
+        soft = compute_soft_tissue_covariances(
+            self._start_frames.table, {name: self.quat_WL[i : i + 1] for i, name in enumerate(self.names)}
+        )
+        return np.concatenate(
+            [self._covariance_W(i, newest[i : i + 1], cov[i : i + 1]) + soft[name] for i, name in enumerate(self.names)]
+        )
 
     def _covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment, error on the left of `quat_WL`, in W.
@@ -305,7 +316,8 @@ class CausalSegmentEstimator:
             grown = np.maximum(0.0, var - self._var_at_reset[i])
             # The mount's part of the heading stays: the reset has set that of the start pose alone.
             of_mount = np.maximum(cov[:, 2, 2] - var, 0.0)
-            std_ratio = np.sqrt((of_mount + grown + self._start_frames.std**2) / cov[:, 2, 2])
+            start_var = self._start_frames.repeat_std(self.names[i])[2] ** 2
+            std_ratio = np.sqrt((of_mount + grown + start_var) / cov[:, 2, 2])
             cov[:, 2, :] *= std_ratio[:, None]
             cov[:, :, 2] *= std_ratio[:, None]
         return cov

@@ -26,15 +26,15 @@ from scipy.spatial.transform import Rotation
 from ..alignment import (
     PALM_SLIP_STD,
     SEGMENT_ATTITUDE_STD,
-    START_POSE_STD,
     SegmentOrientations,
     StartFrames,
     compute_start_heading_var,
 )
 from ..calibration import PROTOCOLS, load_protocol
-from ..calibration.conditions import Part, StartPose, find_parts
+from ..calibration.conditions import Part, StartPose, find_girdle_signs, find_parts
 from ..errors import BadSession
-from ..model import BodyModel, BodyTable
+from ..model import BodyModel, BodyTable, move_girdles
+from ..model.girdle import PARAMETERS
 from ..model.start_pose import orient_links
 from ..recording import Recording
 from ..subject import Subject
@@ -145,7 +145,10 @@ class HeadingCorrector:
                 variance_at_knots = np.concatenate([variance_at_knots, np.full(missing, self._last_variance[name][1])])
                 step_variances[:, i] = np.maximum(np.diff(variance_at_knots), MIN_STEP_VARIANCE)
         start_stds = [
-            REFERENCE_START_STD if name == self._model.table.reference else START_POSE_STD for name in self._chain
+            REFERENCE_START_STD
+            if name == self._model.table.reference
+            else self._model.table.segments[name].repeat_std[2]
+            for name in self._chain
         ]
         self._heading_errors, self._cov = _smooth_random_walk(
             information, information_vector, step_variances, np.array(start_stds)
@@ -283,6 +286,7 @@ class _Closure(NamedTuple):
 
     intervals: tuple[tuple[float, float], ...]
     parts: tuple[Part, ...]  # of the way from the second point to the first one, in frames that equal W at zero
+    girdles: tuple[tuple[str, float], ...]  # that move its points, each with its sign
     neutral: StartPose
 
     def holds(self, time: np.ndarray) -> np.ndarray:
@@ -304,7 +308,13 @@ class _Closure(NamedTuple):
         """The vectors (k, n, 3) [m] in W of the parts; their sum is the gap."""
         lengths = np.array(list(model.lengths.values()))
         turned = zip(self.rotations(R), self.parts, strict=True)
-        return np.array([rotation.apply(part.vector(lengths)) for rotation, part in turned])
+        vectors = np.array([rotation.apply(part.vector(lengths)) for rotation, part in turned])
+        sensors = [part.sensor for part in self.parts]
+        motions = move_girdles(model, R, [name for name, _ in self.girdles])
+        for name, sign in self.girdles:
+            on = model.table.girdles[name].on
+            vectors[sensors.index(on)] += sign * R[on].apply(motions[name].displacement)
+        return vectors
 
 
 def _find_closures(
@@ -329,7 +339,8 @@ def _find_closures(
                 parts = find_parts(model, neutral, segments, [(first, 1.0), (last, -1.0)])
             except BadSession:
                 continue
-            closures.append(_Closure(tuple(recording.phases.get(closure.phase, ())), parts, neutral))
+            girdles = find_girdle_signs(model, [(first, 1.0), (last, -1.0)])
+            closures.append(_Closure(tuple(recording.phases.get(closure.phase, ())), parts, girdles, neutral))
     return tuple(closures), of_body
 
 
@@ -353,7 +364,17 @@ def _build_gap_rows(
         )
     by_length = zip(closure.rotations(R), closure.parts, strict=True)
     J = sum(rotation.as_matrix()[closed] @ np.array(part.by_length) for rotation, part in by_length)  # (n, 3, lengths)
-    covariance += J @ subject.lengths_covariance(model.lengths) @ np.swapaxes(J, 1, 2)
+    shape_cov, k = subject.shape_covariance(model.table), len(model.lengths)
+    J = np.concatenate((J, np.zeros((n, 3, len(shape_cov) - k))), axis=2)
+    R_closed = {name: rotation[closed] for name, rotation in R.items()}
+    motions = move_girdles(model, R_closed, [name for name, _ in closure.girdles]) if n else {}
+    for name, sign in closure.girdles if n else ():
+        girdle, motion = model.table.girdles[name], motions[name]
+        R_on = R_closed[girdle.on].as_matrix()
+        columns = np.arange(len(PARAMETERS)) + k + len(PARAMETERS) * list(model.table.girdles).index(name)
+        J[:, :, columns] += sign * R_on @ motion.jacobian
+        covariance += (R_on * motion.residual_covariance(girdle)[:, None, :]) @ R_on.swapaxes(1, 2)
+    covariance += J @ shape_cov @ np.swapaxes(J, 1, 2)
     names = list(R)
     H = np.zeros((n, 3, len(names)))
     for part, link in zip(closure.parts, v, strict=True):

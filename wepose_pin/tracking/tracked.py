@@ -288,6 +288,6 @@ def make_body(subject: Subject | None, model: BodyModel | str | Path | None, rec
     person.check_body(body.table)
     if subject is None and chosen is not None:  # a chosen model has its person's lengths
         person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
-    body = body.with_lengths({name: person.lengths[name] for name in body.table.lengths})
+    body = person.shape(body)
     start = compute_start_configuration(body, recording.start_pose, recording.joints, where)
     return TrackedBody(person, body, start_frames, start)

@@ -122,11 +122,11 @@ class Tracker:
                 body, segments.quat_WL, limits=self.options.limits, start=self._body.start
             )
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
-        lengths_cov = person.lengths_covariance(body.lengths)
+        shape_cov = person.shape_covariance(body.table)
         pose = replace(
             pose,
             segment_cov=segments.covariance_W,
-            point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, lengths_cov, pose.q),
+            point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, shape_cov, pose.q),
             gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         )
         correction = None if self._headings is None else self._headings.summarize()

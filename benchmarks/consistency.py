@@ -1,0 +1,147 @@
+"""Whether stated standard deviations hold on simulated people: root mean square of error over standard deviation.
+
+One person after another is drawn, calibrated with arbitrary mounts and tracked on six circles of the right hand after the
+clasp. A value of 1 is exact, above it the statement is too small, below it too large.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.calibration import assess, calibrate_lengths
+from wepose_pin.errors import WeposeError
+from wepose_pin.kinematics import compute_axis_std
+from wepose_pin.simulation import PRESETS, Person, Simulation, simulate, simulate_person
+from wepose_pin.subject import Subject, mount_rows
+from wepose_pin.tracking import TrackedRecording, track
+
+FIRST_SEED = 5000  # of persons that no other measurement or test draws
+CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand")
+
+
+def measure_person(seed: int, preset: str, mount: str = "any", protocol: str = "clasp") -> dict[str, Any]:
+    """Errors [m, rad] and errors over standard deviations of a person, by quantity: lists of numbers."""
+    person = simulate_person(seed, preset=preset)
+    simulation = simulate(
+        person.lengths, seed=seed, imperfections=replace(PRESETS[preset], mount=mount), protocol=protocol
+    )
+    recording = simulation.recording()
+    try:
+        calibration = calibrate_lengths(
+            recording, measured=person.measured, prior=person.prior, measured_std=person.measured_std, protocol=protocol
+        )
+    except WeposeError as error:
+        return {"seed": seed, "error": str(error)}
+    tracked = track(recording, calibration.subject)
+    return {
+        "seed": seed,
+        "quality": assess(calibration).quality,
+        **_compare_subject(calibration.subject, person, simulation),
+        **_compare_pose(tracked, simulation),
+    }
+
+
+def _compare_subject(subject: Subject, person: Person, simulation: Simulation) -> dict[str, Any]:
+    lengths = [(subject.lengths[name] - person.lengths[name], subject.std(name)) for name in CLOSED]
+    arms = []
+    for side in ("left", "right"):
+        names = [name for name in CLOSED if name.startswith(side)]
+        error = sum(subject.lengths[name] - person.lengths[name] for name in names)
+        arms.append((error, float(np.sqrt(subject.lengths_covariance(names).sum()))))
+    tilts, headings = [], []
+    start = simulation.time <= simulation.phases["start"][0][1]
+    for name, quat in simulation.quat_LS.items():
+        R_LS = Rotation.from_quat(subject.mounts[name])
+        tilt = (R_LS * Rotation.from_quat(quat).inv()).as_rotvec()[:2]
+        # A mount's heading is relative to the start pose, however the person turned the segment in it.
+        heading = (R_LS * Rotation.from_quat(simulation.quat_WS[name][start]).mean().inv()).as_rotvec()[2]
+        std = [subject.std(row) for row in mount_rows(name)]
+        tilts += list(zip(tilt, std[:2], strict=True))
+        headings.append((heading, std[2]))
+    return {"lengths": lengths, "whole arms": arms, "mounts, tilt": tilts, "mounts, heading": headings}
+
+
+def _compare_pose(tracked: TrackedRecording, simulation: Simulation) -> dict[str, Any]:
+    begin, end = simulation.phases["circles"][0]
+    rows = np.flatnonzero((tracked.time >= begin) & (tracked.time <= end))[::10]
+    segments, points, out = [], {}, {}
+    for name, quat in simulation.quat_WL.items():
+        error = (Rotation.from_quat(tracked.quat_WL[name][rows]) * Rotation.from_quat(quat[rows]).inv()).as_rotvec()
+        std = compute_axis_std(tracked.pose.segment_cov[name][rows])
+        segments += list(zip(np.sqrt(np.mean(error**2, axis=1)), std, strict=True))
+        out[f"segment {name}"] = list(zip(np.sqrt(np.mean(error**2, axis=1)), std, strict=True))
+    for name in ("left_shoulder", "right_shoulder", "right_elbow", "right_palm"):
+        error = tracked.points[name][rows] - simulation.points[name][rows]
+        std = compute_axis_std(tracked.pose.point_cov[name][rows])
+        points[f"point {name}"] = list(zip(np.sqrt(np.mean(error**2, axis=1)), std, strict=True))
+    middle = {
+        source: 0.5 * (p["left_shoulder"][rows] + p["right_shoulder"][rows])
+        for source, p in (("estimated", tracked.points), ("true", simulation.points))
+    }
+    from_shoulders = (tracked.points["right_palm"][rows] - middle["estimated"]) - (
+        simulation.points["right_palm"][rows] - middle["true"]
+    )
+    out["palm from shoulders"] = [(float(e), np.nan) for e in np.sqrt(np.mean(from_shoulders**2, axis=1))]
+    return {"segments": segments, **points, **out}
+
+
+def summarize(results: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Quantity → rms of the error [m or rad], of the standard deviation, and of error over standard deviation."""
+    rows: dict[str, dict[str, float]] = {}
+    good = [result for result in results if "error" not in result]
+    for quantity in good[0] if good else ():
+        if quantity in ("seed", "quality"):
+            continue
+        # A person counts as one, however many samples: errors of a person's samples are alike.
+        each = [np.array(result[quantity]) for result in good]
+        by_std = np.sqrt([np.mean((pairs[:, 0] / pairs[:, 1]) ** 2) for pairs in each])
+        rows[quantity] = {
+            "error": float(np.sqrt(np.mean([np.mean(pairs[:, 0] ** 2) for pairs in each]))),
+            "std": float(np.sqrt(np.mean([np.mean(pairs[:, 1] ** 2) for pairs in each]))),
+            "by_std": float(np.sqrt(np.mean(by_std**2))),
+            "largest": float(np.max(by_std)),
+        }
+    return rows
+
+
+def print_summary(preset: str, results: list[dict[str, Any]]) -> None:
+    """Print the table of a preset."""
+    failed = [result for result in results if "error" in result]
+    grades = [result["quality"] for result in results if "quality" in result]
+    counts = ", ".join(f"{grades.count(grade)} {grade}" for grade in sorted(set(grades)))
+    print(f"\n{preset}: {len(results)} persons; {counts}; {len(failed)} without a result")
+    print(f"{'':24}{'error rms':>12}{'std rms':>12}{'error/std':>12}{'worst person':>14}")
+    for quantity, row in summarize(results).items():
+        length = quantity.startswith(("lengths", "whole", "point", "palm"))
+        factor, unit = (1e3, "mm") if length else (float(np.degrees(1.0)), "deg")
+        print(
+            f"{quantity:24}{factor * row['error']:9.2f} {unit:3}{factor * row['std']:8.2f} {unit:3}"
+            f"{row['by_std']:12.2f}{row['largest']:14.2f}"
+        )
+
+
+def run(presets: list[str], persons: int, first: int = FIRST_SEED, workers: int = 2, protocol: str = "clasp") -> None:
+    """Measure and print."""
+    for preset in presets:
+        with ProcessPoolExecutor(workers) as pool:
+            seeds = range(first, first + persons)
+            results = list(pool.map(measure_person, seeds, [preset] * persons, ["any"] * persons, [protocol] * persons))
+        print_summary(preset, results)
+
+
+if __name__ == "__main__":
+    import argparse
+
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.consistency", description=__doc__)
+    parser.add_argument("--preset", action="append", choices=sorted(PRESETS), help="of people; may be repeated")
+    parser.add_argument("--persons", type=int, default=60, help="number of persons")
+    parser.add_argument("--first", type=int, default=FIRST_SEED, help="seed of the first person")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--protocol", default="clasp", help="of the calibration")
+    options = parser.parse_args()
+    run(options.preset or list(PRESETS), options.persons, options.first, options.workers, options.protocol)

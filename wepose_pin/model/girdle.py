@@ -1,0 +1,153 @@
+"""The shoulder girdle: the centre of the shoulder moves on the trunk as the arm is raised.
+
+A `Girdle` is a part of the body's table: three joints of the URDF that slide along x, y and z of the segment on which the
+limb hangs, and follow the direction of the limb by a law. With e the limb's angle off hanging (at most `MAX_ELEVATION`),
+s = e / 90° and cos φ the outward part of its direction over sin e:
+
+    up = (a + b cos φ) s        back = c s² + d (1 − exp(−e / ε)) cos φ        middle = (f + g cos φ) s
+
+A person differs from the law by seven parameters: the share by which the law is more or less, and along x, y and z of that
+segment [m] a place at rest, and a displacement at 90° that grows with s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from .body import BodyModel
+
+MAX_ELEVATION = np.deg2rad(130.0)  # [rad] up to which the law holds; it stays there beyond
+# Of a person: a share of the law, then [m].
+PARAMETERS = ("law", "rest_x", "rest_y", "rest_z", "raised_x", "raised_y", "raised_z")
+# s that stands for the limb's elevation where it has no sensor: arms at 50 ± 35° in mixed planes.
+MEAN_RAISED = 0.55
+_LEAST_SINE = 1e-9
+
+
+class Girdle(NamedTuple):
+    """How the first point of a limb moves on the segment on which the limb hangs.
+
+    Parameters
+    ----------
+    on, moves : segments; the limb hangs on `on` and begins with `moves`
+    joints : of the URDF, which slide along x, y and z of `on`
+    outward : (3,) axis of `on` that points away from the body's middle
+    up, middle : (2,) [m] (a, b) and (f, g) of the law
+    back : (2,) [m] (c, d) of the law
+    back_angle : ε [rad] of the law
+    scaled_by : length that scales the law; empty: it is not scaled
+    scale : [m] that length where the law's scale is one
+    law_std : of the share by which a person's law is more or less
+    rest_std, raised_std : (3,) [m] of a person's other parameters, one standard deviation
+    alike : correlation of both sides' law and place at rest
+    residual_std, residual_raised_std : (3,) [m] by which the point leaves law and parameters, at rest and per s
+    """
+
+    on: str
+    moves: str
+    joints: tuple[str, str, str]
+    outward: tuple[float, float, float]
+    up: tuple[float, float]
+    middle: tuple[float, float]
+    back: tuple[float, float]
+    back_angle: float
+    scaled_by: str = ""
+    scale: float = 1.0
+    law_std: float = 0.0
+    rest_std: tuple[float, ...] = (0.0, 0.0, 0.0)
+    raised_std: tuple[float, ...] = (0.0, 0.0, 0.0)
+    alike: float = 0.0
+    residual_std: tuple[float, ...] = (0.0, 0.0, 0.0)
+    residual_raised_std: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @property
+    def parameter_std(self) -> np.ndarray:
+        """(7,) of `PARAMETERS`, before a calibration."""
+        return np.array((self.law_std, *self.rest_std, *self.raised_std))
+
+
+def displace(girdle: Girdle, along: Any, scale: Any, math: Any) -> tuple[tuple[Any, Any, Any], Any]:
+    """The law's displacement (x, y, z) [m] in the frame of `on`, and s.
+
+    Parameters
+    ----------
+    along : (x, y, z) of the limb's unit direction, from its first point on, in the frame of `on`
+    math : `numpy`, or `casadi` for symbols
+    """
+    x, y, z = along
+    outward = sum(part * axis for part, axis in zip(along, girdle.outward, strict=True) if axis)
+    sine = math.sqrt(x * x + y * y + _LEAST_SINE)
+    e = math.fmin(math.arctan2(sine, -z), MAX_ELEVATION)
+    s, cos_phi = e / (0.5 * np.pi), outward / sine
+    up = (girdle.up[0] + girdle.up[1] * cos_phi) * s
+    middle = (girdle.middle[0] + girdle.middle[1] * cos_phi) * s
+    back = girdle.back[0] * s * s + girdle.back[1] * (1.0 - math.exp(-e / girdle.back_angle)) * cos_phi
+    return (
+        (
+            scale * (-back - middle * girdle.outward[0]),
+            -scale * middle * girdle.outward[1],
+            scale * (up - middle * girdle.outward[2]),
+        ),
+        s,
+    )
+
+
+def find_girdle_scale(girdle: Girdle, lengths: Mapping[str, float]) -> float:
+    """The law's scale for a body of these lengths [m]."""
+    return lengths[girdle.scaled_by] / girdle.scale if girdle.scaled_by in lengths else 1.0
+
+
+class GirdleMotion(NamedTuple):
+    """A girdle's displacement over n samples."""
+
+    displacement: np.ndarray  # (n, 3) [m] in the frame of `on`
+    by_law: np.ndarray  # (n, 3) [m] of it, of the law as it stands
+    raised: np.ndarray  # (n,) s of the law; `MEAN_RAISED` where the limb's direction is not known
+    is_known: bool  # whether the limb's direction is known
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """(n, 3, 7) of the displacement by `PARAMETERS`."""
+        eye = np.tile(np.eye(3), (len(self.raised), 1, 1))
+        return np.concatenate((self.by_law[:, :, None], eye, self.raised[:, None, None] * eye), axis=2)
+
+    def residual_covariance(self, girdle: Girdle) -> np.ndarray:
+        """(n, 3) [m²] in the frame of `on`, by which the point leaves law and parameters."""
+        rest, raised = np.square(girdle.residual_std), np.square(girdle.residual_raised_std)
+        if not self.is_known:  # what the law would have said is not known either
+            raised = raised + np.square((girdle.back[1], girdle.middle[0], girdle.up[0]))
+        return rest + self.raised[:, None] ** 2 * raised
+
+
+def move_girdles(
+    model: BodyModel, R_WL: Mapping[str, Rotation], names: Iterable[str] | None = None
+) -> dict[str, GirdleMotion]:
+    """Girdle → its motion, of those that hang on a measured segment.
+
+    Parameters
+    ----------
+    R_WL : segment → n orientations
+    names : of girdles; None: all of the body
+    """
+    motions = {}
+    for name in model.table.girdles if names is None else names:
+        girdle = model.table.girdles[name]
+        if girdle.on not in R_WL:
+            continue
+        parameters = model.girdle_parameters(name)
+        n = len(R_WL[girdle.on])
+        if girdle.moves not in R_WL:
+            raised = np.full(n, MEAN_RAISED)
+            motions[name] = GirdleMotion(np.tile(parameters[1:4], (n, 1)), np.zeros((n, 3)), raised, False)
+            continue
+        along = R_WL[girdle.on].inv().apply(R_WL[girdle.moves].apply(model.table.segments[girdle.moves].along))
+        law, s = displace(girdle, along.T, find_girdle_scale(girdle, model.lengths), np)
+        by_law = np.column_stack(law)
+        displacement = (1.0 + parameters[0]) * by_law + parameters[1:4] + s[:, None] * parameters[4:]
+        motions[name] = GirdleMotion(displacement, by_law, np.asarray(s), True)
+    return motions
