@@ -22,7 +22,8 @@ from ..kinematics import compute_link_poses, solve_configuration
 from ..model import BodyModel, load_model
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
-from .motion import MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, make_pulse, place_sensors
+from .motion import MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, place_sensors
+from .signals import integrate_pulse, make_pulse
 from .subject import Simulation, measure_motion, spawn_streams
 
 WHOLE_BODY = "whole_body"
@@ -80,6 +81,9 @@ class Activity(BodyMotion):
 
     def activity(self, t: np.ndarray) -> np.ndarray:
         return make_pulse(t, STAND_S, STAND_S + self.seconds, _RAMP_S)
+
+    def moving_time(self, t: np.ndarray, segment: str = "") -> np.ndarray:
+        return integrate_pulse(t, STAND_S, STAND_S + self.seconds, _RAMP_S)
 
     def phases(self) -> dict[str, list[tuple[float, float]]]:
         stop = STAND_S + self.seconds

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,10 @@ from ..errors import BadOption
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Sizes of the imperfections; the defaults are `IDEAL_PRESET`, without any, and `MILD_PRESET` has usual sizes.
+    """Sizes of the imperfections; the defaults are `IDEAL_PRESET`, without any.
+
+    `MILD_PRESET` is a careful subject with sensors strapped well. `PEOPLE_PRESET` has the sizes that the literature
+    gives for people; [assumption] marks what it does not give.
 
     An imperfection is off at zero, or a range at infinity. Each has its own stream of random numbers, and the number of
     draws does not depend on the size: a change of one imperfection does not change the draws of the others, of the
@@ -52,6 +55,40 @@ class Imperfections:
     dropped : share of samples that each sensor loses, in runs of up to 50 ms (mean 20 ms, one sample at least).
         Mild: 0.002, assumption
     mount : "stated": within 10 deg of stated axes; "any": uniformly random, nothing stated. Mild: "stated"
+    tissue_gain : the part of soft-tissue motion that follows the joints, times the literature's size; the gains are
+        those of `soft_tissue.GAINS`. People: 1
+    tissue_random : its random part, times the size of `soft_tissue.RANDOM_DEG`. People: 1
+    breath_deg : pitch of the sensor on the sternum, rms, at about 0.25 Hz. People: 0.7 [assumption: quiet breath]
+    creep_deg : random walk of each strap about each axis, after 10 min. People: 1 [assumption]
+    strap_slip_deg : a strap slips about the long axis by this much, with probability 0.05 in 10 min. People: 3
+        [assumption]
+    wobble_deg : [deg per g] across a segment, under acceleration. People: 0.5, from the stiffness of skin (Karlsson &
+        Tranberg 1999, Hum Mov Sci 18, 627) for 20 g of sensor
+    upper_arm_place, forearm_place : of the sensor, as a share of the segment's length from its upper joint; 0: half-way.
+        People: 0.6, 0.85
+    girdle : the shoulder's centre follows the arm by the regression of de Groot & Brand 2001, Clin Biomech 16, 735,
+        times this. People: 1
+    girdle_person : what one shoulder does differently, in proportion to elevation, times (6, 5, 8) mm at 90 deg (the
+        spread between people of Matsuki 2011-14, Henninger 2020). People: 1
+    girdle_wander : shrugs and reaching, times (7, 4, 8) mm rms. People: 1 [assumption: 3 to 4 deg of girdle]
+    girdle_hysteresis : share of elevation by which girdle angles lead while the arm is raised and lag while it is
+        lowered. People: 0.03 (Braman 2009, J Shoulder Elbow Surg 18, 960)
+    girdle_rest : a person's shoulders at rest, times (18, 12, 13) mm (same sources as girdle_person), correlation 0.7
+        between left and right [assumption]. The lengths are those of the mean place: see `girdle.Girdle`. People: 1
+    carrying_angle : of the elbow, times 11.6 (3.2) deg for men and 16.7 (2.6) for women (Van Roy 2005, Ergonomics 48,
+        1645), half in the humerus and half in the forearm. People: 1
+    elbow_abduction_deg : what else the elbow does beside a hinge, rms over flexion. People: 1.5 [assumption]
+    start_pose : offsets of the start pose, times those of `people.START_POSE`. People: 1
+    start_heading_deg : the torso's heading against W in the start pose, standard deviation. W's x is then where
+        the feet point, no longer where the torso faces. People: 4 [assumption]
+    sway_tilt_deg : the slow part of a standing person's sway, rms about x and y together. People: 0.22, with which the
+        whole sway has 0.3 deg [assumption]
+    wrist_flexion_deg, wrist_deviation_deg : of the hands against straight wrists, rms over the clasp; four parts
+        follow the distance of the hands from the chest, three wander (as 0.8 : 0.6). People: 12, 8 [assumption]
+    handle_slip : [m] as `palm_slip`, which it replaces, of hands on a handle. People: 4 mm [assumption]
+    gyro_warm_up_deg_s : most change of the bias in the first 15 min, log-uniform from a tenth of it. People: 0.2, a
+        sensor that warms by 5 to 10 K under its strap, with data sheets of BMI055, BMI160, ICM-20602, ICM-42688
+    clock_drift_ppm : standard deviation of each clock's rate. People: 5, after synchronisation
     """
 
     soft_tissue_deg: float = 0.0
@@ -71,6 +108,29 @@ class Imperfections:
     clock_offset: float = 0.0  # [s]
     dropped: float = 0.0
     mount: Literal["stated", "any"] = "stated"
+    tissue_gain: float = 0.0
+    tissue_random: float = 0.0
+    breath_deg: float = 0.0
+    creep_deg: float = 0.0  # per sqrt(10 min)
+    strap_slip_deg: float = 0.0
+    wobble_deg: float = 0.0  # per g
+    upper_arm_place: float = 0.0
+    forearm_place: float = 0.0
+    girdle: float = 0.0
+    girdle_person: float = 0.0
+    girdle_wander: float = 0.0
+    girdle_hysteresis: float = 0.0
+    girdle_rest: float = 0.0
+    carrying_angle: float = 0.0
+    elbow_abduction_deg: float = 0.0
+    start_pose: float = 0.0
+    start_heading_deg: float = 0.0
+    sway_tilt_deg: float = 0.0
+    wrist_flexion_deg: float = 0.0
+    wrist_deviation_deg: float = 0.0
+    handle_slip: float = 0.0  # [m]
+    gyro_warm_up_deg_s: float = 0.0
+    clock_drift_ppm: float = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self, "")
@@ -83,6 +143,9 @@ class Imperfections:
             raise BadOption(f"bits {self.bits} need a finite gyro_range_deg_s and accel_range_g")
         if self.dropped > 0.2:
             raise BadOption(f"dropped {self.dropped} must be at most 0.2: runs of 50 ms would meet")
+        for name in ("upper_arm_place", "forearm_place"):
+            if getattr(self, name) > 1.0:
+                raise BadOption(f"{name} {getattr(self, name)} must be at most 1, the end of the segment")
 
 
 IDEAL_PRESET = Imperfections()
@@ -104,3 +167,36 @@ MILD_PRESET = Imperfections(
     clock_offset=1e-3,
     dropped=0.002,
 )
+PEOPLE_PRESET = replace(
+    MILD_PRESET,
+    soft_tissue_deg=0.0,  # tissue_… replace it
+    shoulder_wander=0.0,  # girdle_… replace it
+    start_elbow_deg=0.0,  # start_pose replaces these two
+    start_segment_deg=0.0,
+    palm_slip=0.010,  # [assumption]
+    sway_deg_s=0.5,  # 0.5 torso, 0.7 a hanging arm in W [assumption]; the sternum's breath comes on top
+    tissue_gain=1.0,
+    tissue_random=1.0,
+    breath_deg=0.7,
+    creep_deg=1.0,
+    strap_slip_deg=3.0,
+    wobble_deg=0.5,
+    upper_arm_place=0.6,
+    forearm_place=0.85,
+    girdle=1.0,
+    girdle_person=1.0,
+    girdle_wander=1.0,
+    girdle_hysteresis=0.03,
+    girdle_rest=1.0,
+    carrying_angle=1.0,
+    elbow_abduction_deg=1.5,
+    start_pose=1.0,
+    start_heading_deg=4.0,
+    sway_tilt_deg=0.22,
+    wrist_flexion_deg=12.0,
+    wrist_deviation_deg=8.0,
+    handle_slip=0.004,
+    gyro_warm_up_deg_s=0.2,
+    clock_drift_ppm=5.0,
+)
+PRESETS = {"ideal": IDEAL_PRESET, "mild": MILD_PRESET, "people": PEOPLE_PRESET}

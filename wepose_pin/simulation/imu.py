@@ -17,6 +17,7 @@ _GYRO_DENSITY = np.deg2rad(0.007)  # [rad/s/sqrt(Hz)]
 _GYRO_BIAS_STD = np.deg2rad(0.2)  # [rad/s], turn-on, each axis
 LONGEST_RUN_S = 0.05  # of lost samples
 _MEAN_RUN_S = 0.02
+_WARM_UP_S = 900.0
 
 
 @dataclass(frozen=True)
@@ -61,16 +62,20 @@ class Device:
     gyro_matrix: np.ndarray  # (3, 3)
     accel_matrix: np.ndarray  # (3, 3)
     g_matrix: np.ndarray  # (3, 3) [rad/s per m/s^2]
+    warm_up: np.ndarray  # (3,) [rad/s] by which the gyroscope's bias changes in the first 15 min
 
     @staticmethod
-    def sample(rng: np.random.Generator, imperfections: Imperfections) -> Device:
-        """Sample a sensor's errors."""
+    def sample(rng: np.random.Generator, imperfections: Imperfections, warm_up: np.random.Generator) -> Device:
+        """Sample a sensor's errors; those of a gyroscope that warms up have their own stream."""
+        direction = warm_up.standard_normal(3)
+        change = np.deg2rad(imperfections.gyro_warm_up_deg_s) * 10.0 ** warm_up.uniform(-1.0, 0.0)
         scale, tilt, g = rng.standard_normal((2, 3)), rng.standard_normal((2, 3, 3)), rng.standard_normal((3, 3))
         tilt *= np.deg2rad(imperfections.misalignment_deg) * (1.0 - np.eye(3))
         return Device(
             np.eye(3) + imperfections.gyro_scale * np.diag(scale[0]) + tilt[0],
             np.eye(3) + imperfections.accel_scale * np.diag(scale[1]) + tilt[1],
             np.deg2rad(imperfections.g_sensitivity_deg_s) / GRAVITY * g,
+            change / np.linalg.norm(direction) * direction,
         )
 
     def measure(
@@ -96,6 +101,8 @@ class Device:
             gyro_S = gyro_S + force_S @ self.g_matrix.T
         if imperfections.accel_scale or imperfections.misalignment_deg:
             accel_S = force_S @ self.accel_matrix.T
+        if self.warm_up.any():
+            gyro_bias = gyro_bias + np.minimum(np.arange(n) / (rate_hz * _WARM_UP_S), 1.0)[:, None] * self.warm_up
         gyro_S = gyro_S + gyro_bias + noise.gyro_density * white[0]
         accel_S = accel_S + accel_bias + noise.accel_density * white[1]
         return Readings(

@@ -8,14 +8,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import reduce
+from operator import mul
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadOption
-from .imperfections import Imperfections
+from .girdle import Girdle
+from .imperfections import IDEAL_PRESET, Imperfections
+from .people import Elbow, StartPose, Wrists
+from .signals import Process, Sway, Wander, integrate_pulse, make_pulse, make_step
 
 SIDES = {"left": 1.0, "right": -1.0}  # y of the side in W
 CIRCLING_POINT = "right_palm"  # draws the circles after the protocol
@@ -30,6 +36,12 @@ _REST_S = (2.5, 2.0)  # first rest on the table, each later one
 _LIFT_S = 1.5  # table to circle, circle to table
 MARGIN_S = 0.1  # the stated phases keep this distance from the motion beside them
 _FLEXION = np.deg2rad((8.0, 140.0))  # of the elbow while the hand is led to a point
+_LEAST_FLEXION = np.deg2rad(3.0)  # at which a hand is out of reach
+_PERSON_LEAST_FLEXION = np.deg2rad(15.0)  # the same where shoulders move with the arm, which a straight arm cannot solve
+_SLACKS = np.arange(0.012, 0.2, 0.01)  # [m] tried in turn, by which the hands stay nearer than the arms are long
+_REACH_ROUNDS = 14  # to 1e-6 m, tests hold it
+_RATE_STEP_S = 0.02  # for the rate of elevation
+_TILT_S = 1.5  # correlation time of the slow part of the sway, assumption
 
 
 class BodyPose(NamedTuple):
@@ -66,54 +78,26 @@ class BodyMotion(ABC):
         """Return the activity (n,): 1 in free motion, 0 where the segments are static."""
 
     @abstractmethod
+    def moving_time(self, t: np.ndarray, segment: str = "") -> np.ndarray:
+        """Return the time (n,) [s] that a segment has moved up to `t`: the integral of its activity."""
+
+    @abstractmethod
     def phases(self) -> dict[str, list[tuple[float, float]]]:
         """Return the phases of the recording: phase → intervals [s]."""
-
-
-def make_step(t: np.ndarray, start: float, duration: float) -> np.ndarray:
-    """Make a step (n,): 0 before `start`, 1 after `start + duration`, with four continuous derivatives."""
-    x = np.clip((t - start) / duration, 0.0, 1.0)
-    return x**5 * (126.0 + x * (-420.0 + x * (540.0 + x * (-315.0 + x * 70.0))))
-
-
-def make_pulse(t: np.ndarray, start: float, stop: float, ramp: float) -> np.ndarray:
-    """Make a pulse (n,): 1 between `start + ramp` and `stop - ramp`, exactly 0 outside `start` and `stop`."""
-    return make_step(t, start, ramp) * (1.0 - make_step(t, stop - ramp, ramp))
-
-
-class Wander:
-    """A smooth random signal between -1 and 1: four sinusoids of 0.1 to 0.6 Hz, limited by tanh."""
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        # One frequency from each part of the band: every seed gives slow and fast parts.
-        self.frequency_hz = np.array((0.1, 0.2, 0.33, 0.46)) + rng.uniform(0.0, 0.13, 4)
-        self.phase = rng.uniform(0.0, 2.0 * np.pi, 4)
-
-    def __call__(self, t: np.ndarray) -> np.ndarray:
-        total = np.zeros_like(t)
-        for frequency_hz, phase in zip(self.frequency_hz, self.phase, strict=True):
-            total += np.sin(2.0 * np.pi * frequency_hz * t + phase) / np.sqrt(10.0 * frequency_hz)
-        return np.tanh(0.9 * total)
-
-
-class Sway:
-    """A slow sway about x and y: three sinusoids of 0.3 to 0.5 Hz each, with a total rms rate of 1 rad/s."""
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.omega = 2.0 * np.pi * (np.array((0.3, 0.37, 0.44)) + rng.uniform(0.0, 0.06, (2, 3)))  # [rad/s]
-        self.phase = rng.uniform(0.0, 2.0 * np.pi, (2, 3))
-
-    def __call__(self, t: np.ndarray) -> np.ndarray:
-        """Angles (n, 2) [rad]."""
-        waves = np.sin(self.omega * t[:, None, None] + self.phase) / self.omega
-        return waves.sum(axis=2) / np.sqrt(3.0)  # each wave has the mean square 1/2, there are six
 
 
 class Flaws:
     """Random imperfections of the subject's motion; the sizes scale draws that do not depend on them."""
 
-    def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator]) -> None:
+    def __init__(
+        self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], shoulder_width: float = 0.34
+    ) -> None:
         self.sizes = sizes
+        self.girdle = Girdle(sizes, rngs, shoulder_width)
+        self.elbow_joint = Elbow(sizes, rngs)
+        self.wrists = Wrists(sizes, rngs)
+        self.start_pose = StartPose(sizes, rngs, SIDES)
+        self.tilt = Process(rngs["sway_tilt"], _TILT_S, 2)
         self.slip = [Wander(rngs["palm_slip"]) for _ in range(3)]
         self.shoulder = {}  # side -> (3,) [m] in T at 90 deg of elevation
         for side, y in SIDES.items():
@@ -126,6 +110,11 @@ class Flaws:
         self.sway = {name: Sway(rngs["sway"]) for name in ("torso", *SIDES)}
         # The arms need slack for palm slip and shoulder motion.
         self.slack = max(0.012, sizes.palm_slip + sizes.shoulder_wander) if self.stretches else 0.0
+
+    @property
+    def iterates(self) -> bool:
+        """True where the place of a hand follows from the arm's angles in steps only."""
+        return self.girdle.moves or self.wrists.bend or not self.elbow_joint.is_ideal
 
     @property
     def stretches(self) -> bool:
@@ -153,6 +142,17 @@ class _Circle:
         angle = 2.0 * np.pi * self.sense * make_step(t, self.start + _LIFT_S - 0.5, self.duration)
         circle_W = self.centre_W + np.cos(angle)[:, None] * self.axes_W[0] + np.sin(angle)[:, None] * self.axes_W[1]
         return make_pulse(t, self.start, self.stop, _LIFT_S)[:, None] * (circle_W - table_W)
+
+
+class _Aim(NamedTuple):
+    """What torso and hands do at n times, whatever the shoulders do; by side but for the torso."""
+
+    R_WT: Rotation
+    palm_T: dict[str, np.ndarray]  # (n, 3) [m]
+    lead: dict[str, np.ndarray]  # (n,) share by which the palm leads its arm; 0: the arm hangs
+    swivel: dict[str, np.ndarray]  # (n,) [rad]
+    pronation: dict[str, np.ndarray]  # (n,) [rad] about z of the forearm
+    hand_F: dict[str, Rotation]  # hand in the forearm; empty: straight
 
 
 class Motion(BodyMotion):
@@ -185,7 +185,8 @@ class Motion(BodyMotion):
     ) -> None:
         self.flaws = flaws
         self.lengths = lengths
-        self.p_LS = place_sensors(lengths)
+        self.p_LS = place_sensors(lengths, flaws.sizes)
+        self.least_flexion = _LEAST_FLEXION
         self.half_width = 0.5 * lengths["shoulder_width"]
         self.arm = {s: (lengths[f"{s}_upper_arm"], lengths[f"{s}_forearm"] + lengths[f"{s}_hand"]) for s in SIDES}
         self.reach = min(sum(arm) for arm in self.arm.values())
@@ -214,11 +215,48 @@ class Motion(BodyMotion):
         grid = np.arange(*self.clasp, 0.05)
         gate = make_pulse(grid, *self.clasp, _RAMP_S)
         rms = np.array([np.sqrt(np.mean((gate * wander(grid)) ** 2)) for wander in flaws.slip])
-        self.slip_gain = flaws.sizes.palm_slip / np.sqrt(3.0) / rms
+        self.slip_gain = self._slip(flaws.sizes) / np.sqrt(3.0) / rms
+
+    def _slip(self, sizes: Imperfections) -> float:
+        """Return the slip of the palms, rms [m]."""
+        return sizes.palm_slip
+
+    def fit_to_person(self, rng: np.random.Generator, pose_deg: float) -> None:
+        """Prepare the motion; where shoulders and wrists move, hands stay as near as the arms then need.
+
+        Raises
+        ------
+        BadOption
+            The arms do not reach at all.
+        """
+        flaws = self.flaws
+        if not flaws.iterates:
+            self.prepare(rng, pose_deg)
+            return
+        for slack in _SLACKS:
+            flaws.slack = slack
+            self.prepare(deepcopy(rng), pose_deg)
+            grid = np.arange(*self.span, 0.05)
+            clasp_t = np.arange(*self.clasp, 0.05)
+            moving = self._motion_share(clasp_t)
+            flaws.wrists.fit(clasp_t, moving, np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1))
+            self.least_flexion = _PERSON_LEAST_FLEXION
+            try:
+                self(grid)
+            except BadOption:
+                if slack == _SLACKS[-1]:
+                    raise
+            else:
+                break
+        self.least_flexion = _LEAST_FLEXION
 
     def activity(self, t: np.ndarray) -> np.ndarray:
         moving = make_pulse(t, *self.clasp, _RAMP_S)
         return moving + sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
+
+    def moving_time(self, t: np.ndarray, segment: str = "") -> np.ndarray:
+        moving = integrate_pulse(t, *self.clasp, _RAMP_S)
+        return moving + sum((integrate_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
 
     def _clasp_point(self, t: np.ndarray, moving: np.ndarray) -> np.ndarray:
         """Return the point where the palms meet (n, 3) [m] in T, from midway between the shoulders, in reach."""
@@ -268,7 +306,7 @@ class Motion(BodyMotion):
         upper, lower = self.arm[side]
         distance = np.linalg.norm(palm_T, axis=1)
         cos_flexion = (distance**2 - upper**2 - lower**2) / (2.0 * upper * lower)
-        if not np.all(np.abs(cos_flexion) < np.cos(np.deg2rad(3.0))):
+        if not np.all(np.abs(cos_flexion) < np.cos(self.least_flexion)):
             raise BadOption(
                 f"lengths: the {side} arm ({upper:.3f} m + {lower:.3f} m) does not reach through the motion"
             )
@@ -283,8 +321,8 @@ class Motion(BodyMotion):
         x = sin_alpha[:, None] * n - cos_alpha[:, None] * m  # into which the forearm flexes
         return Rotation.from_matrix(np.stack((x, np.cross(n, m), -u), axis=2)), flexion
 
-    def __call__(self, t: np.ndarray, segments: Collection[str] = SEGMENTS) -> BodyPose:
-        """Return the exact pose of the torso and of the arms of the segments' sides at the times `t` (n,) [s]."""
+    def _aim(self, t: np.ndarray) -> _Aim:
+        """Compute what torso and hands do at the times `t` (n,) [s]."""
         moving = self._motion_share(t)
         circling = sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
         led = make_step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
@@ -296,41 +334,114 @@ class Motion(BodyMotion):
         sway = np.deg2rad(flaws.sizes.sway_deg_s)
         if sway:
             lean[:, 1:] += sway * flaws.sway["torso"](t)
+        if flaws.sizes.sway_tilt_deg:
+            lean[:, 1:] += np.deg2rad(flaws.sizes.sway_tilt_deg) / np.sqrt(2.0) * flaws.tilt(t)
         R_WT = self._torso(t, lean)
-        clasp_T = self._clasp_point(t, moving) + self.lengths["trunk"] * E_Z
+        if flaws.start_pose.torso.any():
+            R_WT = R_WT * Rotation.from_rotvec((1.0 - led)[:, None] * flaws.start_pose.torso)
+        centred_T = self._clasp_point(t, moving)
+        clasp_T = centred_T + self.lengths["trunk"] * E_Z
         hand_W = self.table_W + sum((c.offset_W(t, self.table_W) for c in self.circles), np.zeros((len(t), 3)))
         palm_T = self._palms(t, moving, clasp_T, R_WT)
         palm_T["right"] = palm_T["right"] + table[:, None] * (R_WT.inv().apply(hand_W) - palm_T["right"])
-        if flaws.sizes.palm_slip:
+        if self.slip_gain.any():
             slip_T = moving[:, None] * np.column_stack(
                 [g * w(t) for g, w in zip(self.slip_gain, flaws.slip, strict=True)]
             )
             palm_T = {"left": palm_T["left"] + 0.5 * slip_T, "right": palm_T["right"] - 0.5 * slip_T}
-        led_by = self._lead_share(t, led, table)
-        palm_down = {"left": 0.0 * t, "right": np.deg2rad(40.0) * table}
+        swivel, pronation = {}, {}
+        for side in SIDES:
+            wander = self.wander[f"{side}_swivel"](t)
+            swivel[side] = np.deg2rad(35.0 + 30.0 * (moving + 0.3 * circling) * wander)
+            palm_down = np.deg2rad(40.0) * table if side == "right" else 0.0 * t
+            wander = np.deg2rad(55.0 * moving + 15.0 * circling) * self.wander[f"{side}_pronation"](t)
+            pronation[side] = wander + palm_down
+        hand_F: dict[str, Rotation] = {}
+        if flaws.wrists.bend:
+            distance = np.linalg.norm(centred_T, axis=1)
+            hand_F = {side: flaws.wrists.rotate(y, t, moving, circling, distance) for side, y in SIDES.items()}
+        return _Aim(R_WT, palm_T, self._lead_share(t, led, table), swivel, pronation, hand_F)
 
+    def _shoulder(self, side: str) -> np.ndarray:
+        """Return the shoulder's place (3,) [m] in T, by the lengths."""
+        return np.array((0.0, SIDES[side] * self.half_width, self.lengths["trunk"]))
+
+    def _raising(self, t: np.ndarray, side: str) -> np.ndarray:
+        """Compute the rate (n,) [deg/s] at which the arm is raised, the shoulder at rest."""
+        elevation = []
+        for step in (-_RATE_STEP_S, _RATE_STEP_S):
+            aim = self._aim(t + step)
+            R_TU, _ = self._arm(side, aim.palm_T[side] - self._shoulder(side), aim.swivel[side])
+            along_T = Rotation.from_rotvec(aim.lead[side][:, None] * R_TU.as_rotvec()).apply(-E_Z)
+            elevation.append(np.rad2deg(np.arctan2(np.hypot(along_T[:, 0], along_T[:, 1]), -along_T[:, 2])))
+        return (elevation[1] - elevation[0]) / (2.0 * _RATE_STEP_S)
+
+    def _reach(
+        self, t: np.ndarray, side: str, aim: _Aim, hang: Rotation
+    ) -> tuple[np.ndarray, Rotation, np.ndarray]:
+        """Shoulder (n, 3) [m] in T, upper arm in T and elbow flexion (n,) [rad] that bring the palm to its aim.
+
+        The shoulder follows the arm, elbow and wrist are not straight: each round corrects the aim of the straight arm by
+        the palm's distance from it. A fixed number of rounds is a smooth function of time.
+        """
+        flaws, y = self.flaws, SIDES[side]
+        upper, blend = self.lengths[f"{side}_upper_arm"], aim.lead[side][:, None]
+        palm_F = self._palm_F(side, aim)
+        moving_time = self.moving_time(t)
+        hysteresis = flaws.sizes.girdle and flaws.sizes.girdle_hysteresis
+        raising = self._raising(t, side) if hysteresis else np.zeros_like(t)
+        centre_T = self._shoulder(side)
+        shoulder_T, correction = np.tile(centre_T, (len(t), 1)), np.zeros((len(t), 3))
+        for _ in range(_REACH_ROUNDS):
+            R_TU, flexion = self._arm(side, aim.palm_T[side] + correction - shoulder_T, aim.swivel[side])
+            along_T = (Rotation.from_rotvec(blend * R_TU.as_rotvec()) * hang).apply(-E_Z)
+            shoulder_T = centre_T + flaws.girdle.displace(along_T, y, moving_time, raising)
+            palm_U = flaws.elbow_joint.rotate(y, flexion, aim.pronation[side]).apply(palm_F) - upper * E_Z
+            correction = correction + aim.palm_T[side] - (shoulder_T + R_TU.apply(palm_U))
+        return shoulder_T, R_TU, flexion
+
+    def _palm_F(self, side: str, aim: _Aim) -> np.ndarray:
+        """Palm (n, 3) [m] in the forearm, from the elbow."""
+        hand = np.array((0.0, 0.0, -self.lengths[f"{side}_hand"]))
+        bent = aim.hand_F[side].apply(hand) if aim.hand_F else np.tile(hand, (len(aim.lead[side]), 1))
+        return bent - self.lengths[f"{side}_forearm"] * E_Z
+
+    def __call__(self, t: np.ndarray, segments: Collection[str] = SEGMENTS) -> BodyPose:
+        """Return the exact pose of the torso and of the arms of the segments' sides at the times `t` (n,) [s]."""
+        aim, flaws = self._aim(t), self.flaws
+        sway = np.deg2rad(flaws.sizes.sway_deg_s)
+        R_WT = aim.R_WT
         R_WL, points, origins = {"torso": R_WT}, {}, {"torso": np.zeros(3)}
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
-            y, blend = SIDES[side], led_by[side]
-            shoulder_T = np.array((0.0, y * self.half_width, self.lengths["trunk"]))
-            swivel = np.deg2rad(35.0 + 30.0 * (moving + 0.3 * circling) * self.wander[f"{side}_swivel"](t))
-            R_TU, flexion = self._arm(side, palm_T[side] - shoulder_T, swivel)
+            y, blend = SIDES[side], aim.lead[side]
+            hanging = (1.0 - blend)[:, None]
+            turns = []  # of a hanging arm
+            if sway:
+                turns.append(hanging * sway * np.pad(flaws.sway[side](t), ((0, 0), (0, 1))))
+            if flaws.sizes.start_segment_deg:
+                turns.append(hanging * flaws.start[f"{side}_upper_arm"])
+            if flaws.sizes.start_pose:
+                turns.append(hanging * flaws.start_pose.upper_arm[side])
+            if flaws.iterates:
+                hang = reduce(mul, (Rotation.from_rotvec(turn) for turn in turns), Rotation.identity(len(t)))
+                shoulder_T, R_TU, flexion = self._reach(t, side, aim, hang)
+            else:
+                shoulder_T = self._shoulder(side)
+                R_TU, flexion = self._arm(side, aim.palm_T[side] - shoulder_T, aim.swivel[side])
             if flaws.sizes.shoulder_wander:
                 # The elevation is that of the arm from the mean centre: the same to within a degree.
                 along_T = Rotation.from_rotvec(blend[:, None] * R_TU.as_rotvec()).apply(-E_Z)
                 shoulder_T = shoulder_T + (1.0 + along_T[:, 2:]) * flaws.shoulder[side]
-                R_TU, flexion = self._arm(side, palm_T[side] - shoulder_T, swivel)
-            wander = np.deg2rad(55.0 * moving + 15.0 * circling) * self.wander[f"{side}_pronation"](t)
-            bend = np.column_stack((-blend * flexion, blend * (wander + palm_down[side])))
+                R_TU, flexion = self._arm(side, aim.palm_T[side] - shoulder_T, aim.swivel[side])
+            bend = np.column_stack((-blend * flexion, blend * aim.pronation[side]))
             if flaws.sizes.start_elbow_deg:
                 bend[:, 0] -= (1.0 - blend) * flaws.elbow[side]
+            if flaws.sizes.start_pose:
+                bend -= hanging * np.array((flaws.start_pose.flexion[side], -flaws.start_pose.pronation[side]))
             R_WU = R_WT * Rotation.from_rotvec(blend[:, None] * R_TU.as_rotvec())
-            hanging = (1.0 - blend)[:, None]
-            if sway:
-                R_WU = R_WU * Rotation.from_rotvec(hanging * sway * np.pad(flaws.sway[side](t), ((0, 0), (0, 1))))
-            if flaws.sizes.start_segment_deg:
-                R_WU = R_WU * Rotation.from_rotvec(hanging * flaws.start[f"{side}_upper_arm"])
-            R_WF = R_WU * Rotation.from_euler("YZ", bend)  # a hinge about -y, then pronation
+            for turn in turns:
+                R_WU = R_WU * Rotation.from_rotvec(turn)
+            R_WF = R_WU * flaws.elbow_joint.rotate(y, -bend[:, 0], bend[:, 1])  # a hinge about -y, then pronation
             if flaws.sizes.start_segment_deg:
                 R_WF = R_WF * Rotation.from_rotvec(hanging * flaws.start[f"{side}_forearm"])
             R_WL[f"{side}_upper_arm"], R_WL[f"{side}_forearm"] = R_WU, R_WF
@@ -339,7 +450,7 @@ class Motion(BodyMotion):
             for part, end, R_WL_part in (
                 ("upper_arm", "elbow", R_WU),
                 ("forearm", "wrist", R_WF),
-                ("hand", "palm", R_WF),
+                ("hand", "palm", R_WF * aim.hand_F[side] if aim.hand_F else R_WF),
             ):
                 p_W = p_W + R_WL_part.apply((0.0, 0.0, -self.lengths[f"{side}_{part}"]))
                 points[f"{side}_{end}"] = p_W
@@ -347,12 +458,13 @@ class Motion(BodyMotion):
         return BodyPose(R_WL, points, origins)
 
 
-def place_sensors(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """Place each sensor in L [m]: on the sternum, and half-way along the outer side of the arm segments."""
+def place_sensors(lengths: Mapping[str, float], sizes: Imperfections = IDEAL_PRESET) -> dict[str, np.ndarray]:
+    """Place each sensor in L [m]: on the sternum, and on the outer side of the arm segments, half-way if not told."""
     places = {"torso": np.array((0.11, 0.0, 0.8 * lengths["trunk"]))}
+    upper_arm, forearm = sizes.upper_arm_place or 0.5, sizes.forearm_place or 0.5
     for side, y in SIDES.items():
-        places[f"{side}_upper_arm"] = np.array((0.0, 0.045 * y, -0.5 * lengths[f"{side}_upper_arm"]))
-        places[f"{side}_forearm"] = np.array((0.01, 0.03 * y, -0.5 * lengths[f"{side}_forearm"]))
+        places[f"{side}_upper_arm"] = np.array((0.0, 0.045 * y, -upper_arm * lengths[f"{side}_upper_arm"]))
+        places[f"{side}_forearm"] = np.array((0.01, 0.03 * y, -forearm * lengths[f"{side}_forearm"]))
     return places
 
 

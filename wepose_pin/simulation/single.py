@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, jitter_time
-from .motion import E_Z, make_pulse
+from .motion import E_Z
+from .signals import make_pulse
 
 _STENCIL_S = 1e-3
 _GRID_HZ = 200.0  # sampling rate for the scaling of the motion to its peaks
@@ -96,7 +97,7 @@ def _record(
     noise: ImuNoise,
     imperfections: Imperfections,
 ) -> SingleSensor:
-    noise_rng, device_rng, jitter_rng = rng.spawn(3)
+    noise_rng, device_rng, jitter_rng, warm_up_rng = rng.spawn(4)
     n = int(np.floor(duration * rate_hz)) + 1
     time = np.arange(n) / rate_hz
     own_time = jitter_time(jitter_rng, time, rate_hz, imperfections.clock_jitter)
@@ -104,7 +105,7 @@ def _record(
     turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(own_time)[:, None]
     rate_S = np.vstack((np.zeros(3), turned))
     force_S = R_WS.inv().apply(motion.acceleration(own_time) + GRAVITY * E_Z)
-    readings = Device.sample(device_rng, imperfections).measure(
+    readings = Device.sample(device_rng, imperfections, warm_up_rng).measure(
         rate_S, force_S, rate_hz, noise, imperfections, noise_rng
     )
     return SingleSensor(

@@ -19,7 +19,9 @@ from ..recording.gaps import bridge, mark_lost_samples
 from ..subject import Subject, check_lengths, population_subject
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
-from .motion import E_Z, BodyMotion, BodyPose, Flaws, Wander, locate_sensor
+from .motion import E_Z, SEGMENTS, STAND_S, BodyMotion, BodyPose, Flaws, locate_sensor
+from .signals import Wander
+from .soft_tissue import JointRotations, SoftTissue, is_on, read_joints
 from .tasks import TASKS
 
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
@@ -43,6 +45,22 @@ _STREAMS = (
     "dropped",
     "mount",
     "task",
+    "tissue_gain",
+    "tissue_random",
+    "breath",
+    "creep",
+    "strap_slip",
+    "girdle_person",
+    "girdle_wander",
+    "girdle_rest",
+    "carrying_angle",
+    "elbow_abduction",
+    "start_pose",
+    "start_heading",
+    "sway_tilt",
+    "wrist",
+    "gyro_warm_up",
+    "clock_drift",
 )
 
 
@@ -116,11 +134,12 @@ class _Moved(NamedTuple):
 class _Sampled:
     """The motion at n times, and at neighbouring times for numerical derivatives."""
 
-    def __init__(self, motion: BodyMotion, t: np.ndarray, segment: str = "") -> None:
-        """Sample all segments, or one segment and those that carry it."""
+    def __init__(self, motion: BodyMotion, t: np.ndarray, segment: str = "", *, joints: bool = False) -> None:
+        """Sample all segments, or one segment and those that carry it; `joints`: with the rotations of the joints."""
         segments = [segment] if segment else list(motion.p_LS)
         self.time = t
-        self.pose: BodyPose = motion(t, segments)
+        self.pose: BodyPose = motion(t, [*segments, *SEGMENTS] if joints else segments)
+        self.joints: JointRotations | None = read_joints(self.pose) if joints else None
         self.neighbours = [motion(t + k * _STENCIL_S, segments) for k in (-2, -1, 1, 2)]
 
     def segment(self, segment: str, p_LS: np.ndarray) -> _Moved:
@@ -133,7 +152,7 @@ class _Sampled:
 
 
 class _SoftTissue:
-    """Soft-tissue rotation of a sensor on its segment: a mixture of specific force and rate, and a slow wandering."""
+    """Soft-tissue rotation of a sensor of the mild preset: a mixture of specific force and rate, a slow wandering."""
 
     def __init__(self, rng: np.random.Generator, rms_deg: float) -> None:
         self.mixture = rng.standard_normal((6, 3))
@@ -220,8 +239,8 @@ def simulate(
         raise BadOption(f"protocol {protocol!r} must be one of {', '.join(TASKS)}; with 'poses' circles must be 0")
     lengths = {name: float(lengths[name]) for name in names}
     rngs = spawn_streams(seed)
-    motion = TASKS[protocol](lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs))
-    motion.prepare(rngs["task"], pose_deg)
+    motion = TASKS[protocol](lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs, lengths["shoulder_width"]))
+    motion.fit_to_person(rngs["task"], pose_deg)
     return measure_motion(motion, rngs, rate_hz, noise, imperfections)
 
 
@@ -242,9 +261,13 @@ def measure_motion(
     time = np.arange(n) / rate_hz
     N = Rotation.from_matrix([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # x_S to z_L, -z_S to x_L
 
-    stated_time = _Sampled(motion, time)
-    own_clocks = imperfections.clock_jitter > 0.0 or imperfections.clock_offset > 0.0
-    never_still = own_clocks or imperfections.sway_deg_s > 0.0
+    stated_time = _Sampled(motion, time, joints=is_on(imperfections))
+    sizes = imperfections
+    own_clocks = any((sizes.clock_jitter, sizes.clock_offset, sizes.clock_drift_ppm))
+    never_still = own_clocks or any((sizes.sway_deg_s, sizes.sway_tilt_deg, sizes.breath_deg, sizes.creep_deg))
+    by_joints = is_on(imperfections)
+    start = read_joints(motion(np.array([0.5 * STAND_S]), SEGMENTS)) if by_joints else None
+    duration = motion.span[1]
     coarse_t = np.arange(*motion.span, 1.0 / _GAIN_RATE_HZ)
     coarse = _Sampled(motion, coarse_t) if imperfections.soft_tissue_deg else None
 
@@ -258,27 +281,44 @@ def measure_motion(
             R_LS = Rotation.from_quat(any_quat / np.linalg.norm(any_quat))
         own_time = jitter_time(rngs["clock_jitter"], time, rate_hz, imperfections.clock_jitter)
         own_time = own_time + imperfections.clock_offset * rngs["clock_offset"].standard_normal()
+        drift = 1e-6 * imperfections.clock_drift_ppm * rngs["clock_drift"].standard_normal()
+        if drift:
+            own_time = own_time + drift * time
 
         tissue = _SoftTissue(rngs["soft_tissue"], imperfections.soft_tissue_deg)
         if coarse is not None:
             tissue.scale(coarse.segment(segment, p_LS), motion.activity(coarse_t))
 
-        sampled = _Sampled(motion, own_time, segment) if own_clocks else stated_time
-        moved = sampled.segment(segment, p_LS)
-        soft_L = tissue(moved, motion.activity(own_time))
+        place = -p_LS[2] / motion.lengths.get(segment, 1.0)
+        strap = SoftTissue(segment, place, imperfections, rngs, duration)
+
+        def turn_sensor(sampled: _Sampled, segment: str = segment, tissue: _SoftTissue = tissue,
+                        strap: SoftTissue = strap, p_LS: np.ndarray = p_LS) -> tuple[_Moved, np.ndarray]:
+            moved = sampled.segment(segment, p_LS)
+            soft_L = tissue(moved, motion.activity(sampled.time))
+            if start is not None and sampled.joints is not None:
+                accel_L = moved.R_WL.inv().apply(moved.p_ddot)
+                moving_time = motion.moving_time(sampled.time, segment)
+                soft_L = soft_L + strap(sampled.time, moving_time, (sampled.joints, start), accel_L)
+            return moved, soft_L
+
+        sampled = _Sampled(motion, own_time, segment, joints=by_joints) if own_clocks else stated_time
+        moved, soft_L = turn_sensor(sampled)
         # A product with the identity would not keep the last bit.
-        R_WS = (moved.R_WL * Rotation.from_rotvec(soft_L) if tissue.rms else moved.R_WL) * R_LS
+        R_WS = (moved.R_WL * Rotation.from_rotvec(soft_L) if tissue.rms or by_joints else moved.R_WL) * R_LS
         rotvec = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec()
         rate_S = np.vstack((np.zeros(3), rotvec * rate_hz))  # static before the first sample
         if own_clocks:
             rate_S[1:] = rotvec / np.diff(own_time)[:, None]
         if never_still:  # a sample before the first one, for the rate that ends there
-            before = _Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment).segment(segment, p_LS)
-            R_before = before.R_WL * Rotation.from_rotvec(tissue(before, motion.activity(before.time))) * R_LS
+            before, soft_before = turn_sensor(
+                _Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment, joints=by_joints)
+            )
+            R_before = before.R_WL * Rotation.from_rotvec(soft_before) * R_LS
             rate_S[0] = (R_before[0].inv() * R_WS[0]).as_rotvec() * rate_hz
         force_S = R_WS.inv().apply(moved.p_ddot + GRAVITY * E_Z)
 
-        device = Device.sample(rngs["device"], imperfections)
+        device = Device.sample(rngs["device"], imperfections, rngs["gyro_warm_up"])
         readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, rngs["noise"])
         dropped = draw_lost(rngs["dropped"], n, rate_hz, imperfections.dropped)
         readings.gyro_S[dropped] = readings.accel_S[dropped] = np.nan

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .motion import MARGIN_S, SIDES, Motion, Wander, make_pulse, make_step
+from .imperfections import Imperfections
+from .motion import MARGIN_S, SIDES, Motion
+from .signals import Wander, make_pulse, make_step
 
 _T_POSE_S = (7.5, 12.5)
 _BOW_S = (15.5, 22.0)
@@ -26,6 +28,9 @@ class Handle(Motion):
 
     phase = "handle"
     length = 0.40  # [m] between the palms
+
+    def _slip(self, sizes: Imperfections) -> float:
+        return sizes.handle_slip or sizes.palm_slip
 
     def prepare(self, rng: np.random.Generator, _pose_deg: float) -> None:
         self.bar = [Wander(rng) for _ in range(2)]

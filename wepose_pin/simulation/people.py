@@ -1,0 +1,152 @@
+"""How people differ from the model: the pose they start in, their elbows and their wrists."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .imperfections import Imperfections
+from .signals import Process, Wander
+
+
+class Offset(NamedTuple):
+    """A person's offset from the ideal pose, in degrees."""
+
+    mean: float
+    std: float  # between people
+
+
+# The N-pose on request, each person's own: assumptions, held to the drop from acromion to wrist of ANSUR II (Gordon
+# 2014; a straight arm would be tilted by 10 to 12 deg), to N-pose errors in Bouvier 2015 and Bonfiglio 2024a.
+START_POSE = {
+    "torso_pitch": Offset(0.0, 3.0),
+    "torso_roll": Offset(0.0, 1.5),
+    "upper_arm_outwards": Offset(8.0, 4.0),
+    "upper_arm_forwards": Offset(0.0, 5.0),
+    "upper_arm_inward_twist": Offset(5.0, 12.0),
+    "elbow_flexion": Offset(12.0, 5.0),
+    "forearm_inward_twist": Offset(5.0, 12.0),
+}
+_SIDES_CORRELATION = 0.5  # of the arms' offsets, assumption
+_LEAST_FLEXION_DEG = 0.0
+
+# Carrying angle, extended and supinated: Van Roy 2005, Ergonomics 48, 1645; in neutral pronation: as in START_POSE.
+_CARRYING = {"m": Offset(11.6, 3.2), "f": Offset(16.7, 2.6)}
+_NEUTRAL_CARRYING = Offset(5.0, 3.0)
+_SUPINATION_DEG = 80.0  # full; Zwerus 2019, Shoulder Elbow 11, 215
+_ABDUCTION_PERIOD_DEG = 120.0  # of flexion, in which the residual abduction goes once to and fro
+
+_WRIST_SHARE = (0.8, 0.6)  # of the hands' distance from the chest, and of a wandering
+_WRIST_S = 2.0  # correlation time of the wandering, assumption
+
+
+class StartPose:
+    """One person's offsets in the start pose; rotation vectors [rad] of torso and upper arms, angles of the elbows."""
+
+    def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], sides: Mapping[str, float]):
+        draw = rngs["start_pose"].standard_normal(2)
+        heading = np.deg2rad(sizes.start_heading_deg) * rngs["start_heading"].standard_normal()
+        pitch, roll = (
+            sizes.start_pose * np.deg2rad(START_POSE[name].std) * z
+            for name, z in zip(("torso_pitch", "torso_roll"), draw, strict=True)
+        )
+        self.torso = np.array((roll, pitch, heading))
+        self.upper_arm: dict[str, np.ndarray] = {}
+        self.flexion: dict[str, float] = {}
+        self.pronation: dict[str, float] = {}  # about z of the forearm
+        names = [name for name in START_POSE if not name.startswith("torso")]
+        both = rngs["start_pose"].standard_normal((3, len(names)))
+        for side, own in zip(sides, both[1:], strict=True):
+            z = np.sqrt(_SIDES_CORRELATION) * both[0] + np.sqrt(1.0 - _SIDES_CORRELATION) * own
+            size = {
+                name: sizes.start_pose * np.deg2rad(START_POSE[name].mean + START_POSE[name].std * np.clip(u, -2.3, 2.3))
+                for name, u in zip(names, z, strict=True)
+            }
+            y = sides[side]
+            self.upper_arm[side] = np.array(
+                (y * size["upper_arm_outwards"], -size["upper_arm_forwards"], -y * size["upper_arm_inward_twist"])
+            )
+            self.flexion[side] = size["elbow_flexion"]
+            self.pronation[side] = -y * size["forearm_inward_twist"]
+
+
+class Elbow:
+    """One person's elbows: an oblique hinge, an abduction that varies with flexion, and pronation about the forearm.
+
+    Half of the carrying angle tilts the axis of flexion in the humerus, half the forearm on that axis, so that it goes as
+    the elbow flexes. Pronation carries the wrist inwards: from the carrying angle in full supination to that of the
+    neutral forearm, and as far again.
+    """
+
+    def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator]) -> None:
+        rng = rngs["carrying_angle"]
+        sex = ("f", "m")[int(rng.integers(2))]
+        supinated, neutral = (
+            offset.mean + offset.std * np.clip(rng.standard_normal(), -2.5, 2.5)
+            for offset in (_CARRYING[sex], _NEUTRAL_CARRYING)
+        )
+        self.carrying, self.neutral = sizes.carrying_angle * np.deg2rad((supinated, neutral))
+        self.abduction = np.deg2rad(sizes.elbow_abduction_deg) * np.sqrt(2.0)
+        self.phase = rngs["elbow_abduction"].uniform(0.0, 2.0 * np.pi)
+
+    @property
+    def is_ideal(self) -> bool:
+        """True where the elbow is a hinge across both segments."""
+        return not (self.carrying or self.abduction)
+
+    def rotate(self, y: float, flexion: np.ndarray, pronation: np.ndarray) -> Rotation:
+        """R_UF from flexion (n,) and pronation about z (n,) [rad] of the side y."""
+        if self.is_ideal:
+            return Rotation.from_euler("YZ", np.column_stack((-flexion, pronation)))
+        inwards = (self.carrying - self.neutral) * (1.0 - y * pronation / np.deg2rad(_SUPINATION_DEG))
+        varying = self.abduction * np.sin(2.0 * np.pi * flexion / np.deg2rad(_ABDUCTION_PERIOD_DEG) + self.phase)
+        half = 0.5 * self.carrying
+        forearm = y * (half - inwards + varying)
+        humerus = np.full_like(flexion, y * half)
+        return Rotation.from_euler("XYXZ"[:3], np.column_stack((humerus, -flexion, forearm))) * Rotation.from_euler(
+            "Z", pronation[:, None]
+        )
+
+
+class Wrists:
+    """One person's wrists, which bend as the hands come near the chest, and wander; hands have no sensor."""
+
+    def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator]) -> None:
+        self.rms = np.deg2rad((sizes.wrist_flexion_deg, sizes.wrist_deviation_deg))
+        # Hands near the chest extend the wrists; a deviation goes either way.
+        self.sign = np.array((-1.0, rngs["wrist"].choice((-1.0, 1.0))))
+        self.wander = Process(rngs["wrist"], _WRIST_S, 4)
+        self.mean, self.std = 0.0, 1.0  # of the distance [m]
+        self.gain = np.ones((2, 2))  # side, angle
+
+    @property
+    def bend(self) -> bool:
+        """True where they do."""
+        return bool(self.rms.any())
+
+    def _parts(self, t: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parts (n, 2, 2) of the angles: by the distance (n,) [m] of the hands from the chest, wandering."""
+        near = (distance - self.mean) / self.std
+        follows = _WRIST_SHARE[0] * near[:, None, None] * self.sign * np.ones((2, 1))
+        return follows, _WRIST_SHARE[1] * self.wander(t).reshape(-1, 2, 2)
+
+    def fit(self, t: np.ndarray, moving: np.ndarray, distance: np.ndarray) -> None:
+        """Set the gains so that the angles have their rms at these times (n,) of the clasp, where hands move at all."""
+        if not moving.any():
+            return
+        self.mean, self.std = float(np.mean(distance)), max(float(np.std(distance)), 0.01)
+        angles = moving[:, None, None] * sum(self._parts(t, distance))
+        self.gain = 1.0 / np.sqrt(np.mean(angles**2, axis=0))
+
+    def rotate(
+        self, y: float, t: np.ndarray, moving: np.ndarray, circling: np.ndarray, distance: np.ndarray
+    ) -> Rotation:
+        """R_FH of the side y; both parts in the clasp, the wandering in the circles."""
+        side = 0 if y > 0.0 else 1
+        follows, wanders = self._parts(t, distance)
+        angles = moving[:, None, None] * (follows + wanders) + circling[:, None, None] * wanders
+        flexion, deviation = (self.rms * self.gain[side] * angles[:, side]).T
+        return Rotation.from_euler("YX", np.column_stack((-flexion, y * deviation)))

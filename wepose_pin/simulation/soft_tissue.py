@@ -1,0 +1,202 @@
+"""Soft-tissue artefact: how a sensor turns on its segment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .imperfections import Imperfections
+from .imu import GRAVITY
+from .motion import E_Z, SEGMENTS, SIDES, STAND_S, BodyPose
+from .signals import Process, RandomWalk, Wander, integrate_step, make_step
+
+
+class Gain(NamedTuple):
+    """Rotation of a sensor on its segment, degree per degree of a joint's."""
+
+    mean: float
+    std: float  # between people and strappings
+
+
+GAINS = {
+    # A bow turns the sternum more than the trunk, assumption.
+    "torso_flexion": Gain(0.12, 0.05),
+    # The chest extends by 12.8 (7.6) deg when both arms go up: Edmondston 2012, J Orthop Sports Phys Ther 42, 861.
+    "torso_elevation": Gain(-0.04, 0.025),
+    # One arm up bends and turns the chest to either side: Stewart 1995, J Man Manip Ther 3, 15.
+    "torso_sides": Gain(0.0, 0.02),
+    "upper_arm_elevation": Gain(-0.05, 0.04),  # Hamming 2012 J Biomech; Jackson 2015 Appl Ergon 47, 242
+    "upper_arm_flexion": Gain(0.02, 0.02),  # biceps and triceps bulge, either sign, assumption
+    "forearm_flexion": Gain(0.01, 0.01),  # assumption, either sign
+    "pelvis_flexion": Gain(-0.08, 0.04),  # assumption
+}
+_TWIST_STD = 0.08  # of the two gains of twist, between people
+# rms across and about the segment's long axis [deg], correlation time [s]; assumptions, held to Lebel 2017.
+RANDOM_DEG = {
+    "torso": (1.5, 1.5, 3.0),
+    "upper_arm": (2.0, 2.5, 2.0),
+    "forearm": (2.0, 2.0, 2.0),
+    "hand": (1.5, 1.5, 1.0),
+    "pelvis": (2.0, 1.5, 3.0),
+    "head": (1.0, 1.0, 5.0),
+}
+_ONSET = np.deg2rad((20.0, 20.0))  # elevation is read too small from 30 deg on: this far below, and so softly
+_ROUND = np.deg2rad(3.0)  # an angle from hanging has a kink there: rounded off
+_BREATH_HZ = (0.22, 0.28)
+_CREEP_S = 600.0
+_SLIPS_PER_S = 0.05 / 600.0
+_SLIP_S = 0.5
+
+
+def lost_twist(part: str, place: float) -> float:
+    """Return the share of a segment's twist that its sensor does not follow, 0 at the upper and 1 at the lower joint.
+
+    Upper arm: a line through the 35 to 48 % of Cutti 2005 (Gait Posture 21, 341), the cluster gains of 0.64 to 0.74 of
+    PubMed 40222145 and the ranges of Warner & Heller 2025. Forearm: an assumption, of which only the direction is known
+    (Charles group 2022, J Biomech Eng 144, 071007).
+    """
+    return 0.55 - 0.40 * place if part == "upper_arm" else 0.95 - 0.90 * place
+
+
+class JointRotations(NamedTuple):
+    """What the joints of trunk and arms do at n times; sides as keys."""
+
+    trunk_flexion: np.ndarray  # (n,) [rad] of the torso against W, forward
+    elevation: dict[str, np.ndarray]  # (n,) [rad] of the upper arm in T
+    swing: dict[str, np.ndarray]  # (n, 3) [rad] rotation vector of the elevation, in the upper arm
+    twist: dict[str, np.ndarray]  # (n,) [rad] of the upper arm against the torso, about its long axis
+    flexion: dict[str, np.ndarray]  # (n,) [rad] of the elbow
+    pronation: dict[str, np.ndarray]  # (n,) [rad] of the forearm against the upper arm, about its long axis
+
+
+def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
+    """Split R into swing @ twist about z: the swing's rotation vector (n, 3) after the twist, and the twist (n,) [rad]."""
+    x, y, z, w = R.as_quat().T
+    twist = 2.0 * np.arctan2(np.where(w < 0.0, -z, z), np.abs(w))
+    about_z = Rotation.from_rotvec(twist[:, None] * E_Z)
+    return about_z.inv().apply((R * about_z.inv()).as_rotvec()), twist
+
+
+def read_joints(pose: BodyPose) -> JointRotations:
+    """Read the rotations of the joints that soft tissue follows, from a pose of trunk and arms."""
+    tilt, _ = _split(pose.R_WL["torso"])
+    by_side: tuple[dict[str, np.ndarray], ...] = ({}, {}, {}, {}, {})
+    for side in SIDES:
+        R_WU = pose.R_WL[f"{side}_upper_arm"]
+        swing, twist = _split(pose.R_WL["torso"].inv() * R_WU)
+        bend, pronation = _split(R_WU.inv() * pose.R_WL[f"{side}_forearm"])
+        angles = [np.hypot(np.linalg.norm(vector, axis=1), _ROUND) - _ROUND for vector in (swing, bend)]
+        for values, value in zip(by_side, (angles[0], swing, twist, angles[1], pronation), strict=True):
+            values[side] = value
+    return JointRotations(tilt[:, 1], *by_side)
+
+
+class SoftTissue:
+    """The rotation of one sensor on its segment: by the joints, at random, by breath, creep, slips and acceleration."""
+
+    def __init__(
+        self,
+        segment: str,
+        place: float,
+        sizes: Imperfections,
+        rngs: Mapping[str, np.random.Generator],
+        duration: float,
+    ) -> None:
+        side, _, part = segment.partition("_")
+        self.side, self.part = (side, part) if part else ("", segment)
+        self.sizes = sizes
+        draw = np.clip(rngs["tissue_gain"].standard_normal(4), -2.5, 2.5)
+        sign = rngs["tissue_gain"].choice((-1.0, 1.0), 2)
+        heading = rngs["tissue_gain"].uniform(0.0, 2.0 * np.pi)
+        self.draw, self.sign = sizes.tissue_gain * draw, sign
+        self.across = np.array((np.cos(heading), np.sin(heading), 0.0))
+        self.lost = lost_twist(self.part, place)
+        across_deg, twist_deg, correlation_s = RANDOM_DEG.get(self.part, (0.0, 0.0, 1.0))
+        self.random_rms = sizes.tissue_random * np.deg2rad((across_deg, across_deg, twist_deg))
+        self.random = Process(rngs["tissue_random"], correlation_s, 3)
+        self.breath = 2.0 * np.pi * rngs["breath"].uniform(*_BREATH_HZ), rngs["breath"].uniform(0.0, 2.0 * np.pi)
+        self.creep = RandomWalk(rngs["creep"], duration, 3)
+        self.creep_rms = np.deg2rad(sizes.creep_deg) * np.sqrt(duration / _CREEP_S)
+        self.slips = self._draw_slips(rngs["strap_slip"], duration)
+
+    @staticmethod
+    def _draw_slips(rng: np.random.Generator, duration: float) -> list[tuple[float, float]]:
+        """Draw the slips of a strap: time [s] and direction."""
+        slips, at = [], STAND_S
+        while True:
+            at += rng.exponential(1.0 / _SLIPS_PER_S)
+            if at > duration:
+                return slips
+            slips.append((at, rng.choice((-1.0, 1.0))))
+
+    def _gain(self, name: str, k: int, sign: float = 1.0) -> float:
+        """Return this person's gain, with the draw k."""
+        return sign * (self.sizes.tissue_gain * GAINS[name].mean + self.draw[k] * GAINS[name].std)
+
+    def follow(self, now: JointRotations, start: JointRotations) -> np.ndarray:
+        """Rotation vectors (n, 3) [rad] in L by the joints' rotation since the start pose."""
+        turn = np.zeros((len(now.trunk_flexion), 3))
+        flexion = now.trunk_flexion - start.trunk_flexion
+        side = self.side
+        if self.part == "torso":
+            left, right = (now.elevation[side] - start.elevation[side] for side in ("left", "right"))
+            turn[:, 1] = self._gain("torso_flexion", 0) * flexion
+            turn[:, 1] += self._gain("torso_elevation", 1) * 0.5 * (left + right)
+            turn[:, 0] = self._gain("torso_sides", 2) * (right - left)
+            turn[:, 2] = self._gain("torso_sides", 3) * (right - left)
+        elif self.part == "pelvis":
+            turn[:, 1] = self._gain("pelvis_flexion", 0) * flexion
+        elif self.part == "upper_arm":
+            twist = now.twist[side] - start.twist[side]
+            turn[:, 2] = -(self.sizes.tissue_gain * self.lost + self.draw[0] * _TWIST_STD) * twist
+            # The angle above 30 deg, about the axis of elevation; none below 20 deg, where that axis has no meaning.
+            angle = np.linalg.norm(now.swing[side], axis=1)
+            above = integrate_step(angle, *_ONSET) / np.maximum(angle, _ONSET[0])
+            turn += self._gain("upper_arm_elevation", 1) * above[:, None] * now.swing[side]
+            bend = now.flexion[side] - start.flexion[side]
+            turn += self._gain("upper_arm_flexion", 2, self.sign[0]) * bend[:, None] * self.across
+            turn[:, 2] += self._gain("upper_arm_flexion", 3, self.sign[1]) * bend
+        elif self.part == "forearm":
+            pronation = now.pronation[side] - start.pronation[side]
+            turn[:, 2] = -(self.sizes.tissue_gain * self.lost + self.draw[0] * _TWIST_STD) * pronation
+            bend = now.flexion[side] - start.flexion[side]
+            turn += self._gain("forearm_flexion", 1, self.sign[0]) * bend[:, None] * self.across
+        return turn
+
+    def __call__(
+        self,
+        t: np.ndarray,
+        moving_time: np.ndarray,
+        joints: tuple[JointRotations, JointRotations],
+        accel_L: np.ndarray,
+    ) -> np.ndarray:
+        """Return rotation vectors (n, 3) [rad] in L.
+
+        Parameters
+        ----------
+        t : (n,) [s]
+        moving_time : (n,) [s] that the segment has moved; the random part stands where the segment does
+        joints : at `t`, and in the start pose (n = 1)
+        accel_L : (n, 3) [m/s^2] of the sensor, in L. Limbs move below 5 Hz: the low-pass of a strap at 15 Hz, which
+            the literature gives, would change nothing
+        """
+        turn = self.random_rms * self.random(moving_time)
+        if self.sizes.tissue_gain:
+            turn = turn + self.follow(*joints)
+        if self.sizes.breath_deg and self.part == "torso":
+            rate, phase = self.breath
+            turn[:, 1] += np.sqrt(2.0) * np.deg2rad(self.sizes.breath_deg) * np.sin(rate * t + phase)
+        turn = turn + self.creep_rms * self.creep(t)
+        for at, direction in self.slips:
+            turn[:, 2] += direction * np.deg2rad(self.sizes.strap_slip_deg) * make_step(t, at, _SLIP_S)
+        across = np.cross(E_Z, accel_L)  # the free side of the strap lags
+        return turn - np.deg2rad(self.sizes.wobble_deg) / GRAVITY * across
+
+
+def is_on(sizes: Imperfections) -> bool:
+    """Return whether sensors turn on their segments in a way of this module."""
+    names = ("tissue_gain", "tissue_random", "breath_deg", "creep_deg", "strap_slip_deg", "wobble_deg")
+    return any(getattr(sizes, name) for name in names)
