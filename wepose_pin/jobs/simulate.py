@@ -40,8 +40,10 @@ class SimulateJob:
         Simulate the whole body in place of a protocol, with sensors on pelvis, head, hands and legs too: walking on the
         spot (walk), or sitting down and standing up (sit). Of the body's imperfections it has soft-tissue artefacts.
     preset
-        Simulate only the sensors' noise and bias (ideal), or also soft-tissue artefacts, slip, sway and sensor errors
-        (mild); their sizes and sources are in wepose_pin/simulation/imperfections.py.
+        Simulate only the sensors' noise and bias (ideal), or also small soft-tissue artefacts, slip, sway and sensor
+        errors (mild), or all of them and more as the literature has them (people): soft tissue that follows the joints,
+        shoulders that move with the arms, start poses as people hold them, wrists that bend. Their sizes and sources
+        are in wepose_pin/simulation/imperfections.py.
     imperfection : NAME=VALUE
         Simulate one imperfection at this size; may be given several times. mount=any: arbitrary sensor mounting, which
         the session does not state. All others are numbers; 0 is off, for the two ranges inf. Of the body, rms:
@@ -49,7 +51,13 @@ class SimulateJob:
         mean: start_elbow_deg (flexion in the start pose), shoulder_wander [m] (translation at 90 deg of elevation). Of
         the sensors, standard deviation: gyro_scale, accel_scale (of the scale factors, 0.01 is 1 %), misalignment_deg,
         g_sensitivity_deg_s (per g), clock_jitter [s], clock_offset [s]; full scale: gyro_range_deg_s, accel_range_g;
-        bits: of a sample over the full scale; dropped: fraction of samples lost, at most 0.2.
+        bits: of a sample over the full scale; dropped: fraction of samples lost, at most 0.2. Of people, times the
+        literature's size: tissue_gain (soft tissue that follows the joints), tissue_random, girdle (shoulders that
+        follow the arms), girdle_person, girdle_wander, girdle_rest, carrying_angle, start_pose; others: breath_deg,
+        creep_deg (a strap in 10 min), strap_slip_deg, wobble_deg (per g), upper_arm_place and forearm_place (of the
+        sensor, share of the length), girdle_hysteresis (share of elevation), elbow_abduction_deg, start_heading_deg
+        (torso against W), sway_tilt_deg, wrist_flexion_deg, wrist_deviation_deg, handle_slip [m], gyro_warm_up_deg_s
+        (of the bias, in 15 min), clock_drift_ppm.
     force
         Replace the files of an earlier run in DIR.
     """
@@ -59,7 +67,7 @@ class SimulateJob:
     rate_hz: float = 100.0
     protocol: Literal["clasp", "handle", "touch_left", "touch_right", "poses"] = "clasp"
     activity: Literal["walk", "sit"] | None = None
-    preset: Literal["ideal", "mild"] = "ideal"
+    preset: Literal["ideal", "mild", "people"] = "ideal"
     imperfection: Mapping[str, float | str] = field(default_factory=dict)
     force: bool = False
 
@@ -76,9 +84,9 @@ class SimulateJob:
         """Those of the preset, with the sizes that were given."""
         from dataclasses import fields, replace
 
-        from ..simulation import IDEAL_PRESET, MILD_PRESET
+        from ..simulation import PRESETS
 
-        sizes = MILD_PRESET if self.preset == "mild" else IDEAL_PRESET
+        sizes = PRESETS[self.preset]
         names = [each.name for each in fields(sizes)]
         for name, value in self.imperfection.items():
             option = f"--imperfection {name}={value}"
@@ -114,7 +122,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
     import numpy as np
 
     from ..documents import whole_folder
-    from ..simulation import simulate, simulate_activity, simulate_person
+    from ..simulation import MEASURED_STD, PEOPLE_MEASURED_STD, simulate, simulate_activity, simulate_person
     from ..subject import mount_rows, subject_toml
     from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
@@ -122,7 +130,8 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
     job.check()
     with whole_folder(job.out, job.force) as folder:
         progress("simulating a person", 0.0)
-        person = simulate_person(job.seed, body="whole_body" if job.activity else "upper_body")
+        measured_std = PEOPLE_MEASURED_STD if job.preset == "people" else MEASURED_STD
+        person = simulate_person(job.seed, measured_std, "whole_body" if job.activity else "upper_body")
         if job.activity:
             simulation = simulate_activity(
                 job.activity,

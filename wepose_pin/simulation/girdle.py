@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .imperfections import Imperfections
-from .signals import Process
+from .signals import Process, rotate_about
 
 # Regression of de Groot & Brand 2001 (Clin Biomech 16, 735; 10 people, 23 arm positions), with the rest angles of the
 # Delft arm model: constant, slope in the plane of elevation, slope in elevation, gain of the angle at rest, that angle.
@@ -20,6 +20,7 @@ _SCAPULA = np.array(
 _CLAVICLE_LENGTH = 0.150  # [m] Bernat 2014 (149 ± 10 mm), of a shoulder width of _WIDTH
 _WIDTH = 0.340  # [m] between the shoulder centres of the arm model of Holzbaur 2005
 _AC_TO_GH = np.array((0.008, -0.036, 0.003))  # [m] at rest, outer end of the clavicle to the shoulder's centre
+_AC_TO_GH_SCAPULA = Rotation.from_euler("YZX", _SCAPULA[:, 4], degrees=True).inv().apply(_AC_TO_GH)
 _ONSET_DEG = 15.0  # the regression holds from about 30 deg of elevation: below, its angles grow from those at rest
 _PLANE_BLUR = np.sin(np.deg2rad(8.0))  # the plane of a hanging arm has no meaning: it is blurred there
 _ROUND = np.deg2rad(3.0)
@@ -48,18 +49,19 @@ def compute_girdle(along_T: np.ndarray, side: float, gain: np.ndarray | float = 
     plane = 45.0 + np.rad2deg(2.0 * np.arctan2(b, a + np.sqrt(horizontal**2 + _PLANE_BLUR**2)))
     onset = 1.0 - np.exp(-((elevation / _ONSET_DEG) ** 2))
 
-    def angles(rows: np.ndarray) -> np.ndarray:
-        """Change (k, n) [deg] of the angles against rest."""
-        constant, by_plane, by_elevation, by_rest, rest = (column[:, None] for column in rows.T)
-        return onset * (constant + by_plane * plane + by_elevation * elevation + (by_rest - 1.0) * rest)
+    def locate(clavicle: np.ndarray, scapula: np.ndarray) -> np.ndarray:
+        """Place (n, 3) [m] of the shoulder's centre by the angles (k, n) [deg] of clavicle and scapula."""
+        clavicle, scapula = np.deg2rad(clavicle), np.deg2rad(scapula)
+        outer_end = rotate_about(1, clavicle[0], rotate_about(2, clavicle[1], np.array((_CLAVICLE_LENGTH, 0.0, 0.0))))
+        about_x = rotate_about(0, scapula[2], _AC_TO_GH_SCAPULA)
+        return outer_end + rotate_about(1, scapula[0], rotate_about(2, scapula[1], about_x))
 
-    clavicle = Rotation.from_euler("YZ", (_CLAVICLE[:, 4:] + angles(_CLAVICLE)).T, degrees=True)
-    at_rest = Rotation.from_euler("YZ", _CLAVICLE[:, 4], degrees=True)
-    scapula = Rotation.from_euler("YZX", (_SCAPULA[:, 4:] + angles(_SCAPULA)).T, degrees=True)
-    scapula_at_rest = Rotation.from_euler("YZX", _SCAPULA[:, 4], degrees=True)
-    ray = np.array((_CLAVICLE_LENGTH, 0.0, 0.0))
-    moved = clavicle.apply(ray) - at_rest.apply(ray)
-    moved = moved + (scapula * scapula_at_rest.inv()).apply(_AC_TO_GH) - _AC_TO_GH
+    def angles(rows: np.ndarray) -> np.ndarray:
+        """Angles (k, n) [deg]."""
+        constant, by_plane, by_elevation, by_rest, rest = (column[:, None] for column in rows.T)
+        return rest + onset * (constant + by_plane * plane + by_elevation * elevation + (by_rest - 1.0) * rest)
+
+    moved = locate(angles(_CLAVICLE), angles(_SCAPULA)) - locate(_CLAVICLE[:, 4:], _SCAPULA[:, 4:])
     return np.column_stack((-moved[:, 2], side * moved[:, 0], moved[:, 1]))
 
 
@@ -77,9 +79,7 @@ class Girdle:
         draws = np.clip(rngs["girdle_person"].standard_normal((2, 3)), -2.5, 2.5)
         wander = Process(rngs["girdle_wander"], _WANDER_S, 6)
         common, left, right = np.clip(rngs["girdle_rest"].standard_normal((3, 3)), -2.5, 2.5)
-        both = [
-            np.sqrt(_REST_CORRELATION) * common + np.sqrt(1.0 - _REST_CORRELATION) * own for own in (left, right)
-        ]
+        both = [np.sqrt(_REST_CORRELATION) * common + np.sqrt(1.0 - _REST_CORRELATION) * own for own in (left, right)]
         rest = sizes.girdle_rest * _REST * np.array(both)  # y is outwards here
         shift, tilt = 0.5 * (rest[0] - rest[1])[1:]
         rest[:, 1], rest[:, 2] = shift, (tilt, -tilt)
@@ -93,28 +93,32 @@ class Girdle:
         sizes = self.sizes
         return any((sizes.girdle, sizes.girdle_person, sizes.girdle_wander, sizes.girdle_rest))
 
-    def displace(self, along_T: np.ndarray, side: float, moving_time: np.ndarray, raising: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) [m] in T of a shoulder from its place in the model.
+    def displace(self, along_T: np.ndarray, side: float, raising: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) [m] in T of a shoulder by its arm.
 
         Parameters
         ----------
         along_T : (n, 3) unit, direction of the upper arm in T
         side : 1 left, -1 right
-        moving_time : (n,) [s] that the person has moved
         raising : (n,) rate of elevation [deg/s]
         """
         sizes = self.sizes
-        moved = np.tile(self.rest[side], (len(along_T), 1))
+        moved = np.zeros_like(along_T)
         if sizes.girdle:
             gain = 1.0 + sizes.girdle_hysteresis * np.tanh(raising / _HYSTERESIS_RATE)
-            moved += sizes.girdle * self.scale * compute_girdle(along_T, side, gain)
+            moved = moved + sizes.girdle * self.scale * compute_girdle(along_T, side, gain)
         if sizes.girdle_person:
             horizontal = np.hypot(along_T[:, 0], along_T[:, 1])
             # An angle from hanging has a kink there: rounded off within a few degrees.
             elevation = np.hypot(np.arctan2(horizontal, -along_T[:, 2]), _ROUND) - _ROUND
             share = elevation / (0.5 * np.pi)
-            moved += sizes.girdle_person * share[:, None] * _PERSON * self.person[side]
-        if sizes.girdle_wander:
-            first = 0 if side > 0.0 else 3
-            moved += sizes.girdle_wander * _WANDER * self.wander(moving_time)[:, first : first + 3]
+            moved = moved + sizes.girdle_person * share[:, None] * _PERSON * self.person[side]
         return moved
+
+    def place(self, side: float, moving_time: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) [m] in T of a shoulder whatever its arm does, after that time of motion (n,) [s]."""
+        place = np.tile(self.rest[side], (len(moving_time), 1))
+        if self.sizes.girdle_wander:
+            first = 0 if side > 0.0 else 3
+            place += self.sizes.girdle_wander * _WANDER * self.wander(moving_time)[:, first : first + 3]
+        return place

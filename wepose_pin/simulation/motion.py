@@ -37,9 +37,12 @@ _LIFT_S = 1.5  # table to circle, circle to table
 MARGIN_S = 0.1  # the stated phases keep this distance from the motion beside them
 _FLEXION = np.deg2rad((8.0, 140.0))  # of the elbow while the hand is led to a point
 _LEAST_FLEXION = np.deg2rad(3.0)  # at which a hand is out of reach
-_PERSON_LEAST_FLEXION = np.deg2rad(15.0)  # the same where shoulders move with the arm, which a straight arm cannot solve
-_SLACKS = np.arange(0.012, 0.2, 0.01)  # [m] tried in turn, by which the hands stay nearer than the arms are long
-_REACH_ROUNDS = 14  # to 1e-6 m, tests hold it
+_PERSON_LEAST_FLEXION = np.deg2rad(
+    15.0
+)  # the same where shoulders move with the arm, which a straight arm cannot solve
+_SLACKS = np.arange(0.02, 0.2, 0.01)  # [m] tried in turn, by which the hands stay nearer than the arms are long
+_REACH_ROUNDS = 8
+_MOST_MISSING = 5e-6  # [m] from a hand to its aim after these rounds
 _RATE_STEP_S = 0.02  # for the rate of elevation
 _TILT_S = 1.5  # correlation time of the slow part of the sway, assumption
 
@@ -155,10 +158,17 @@ class _Aim(NamedTuple):
     hand_F: dict[str, Rotation]  # hand in the forearm; empty: straight
 
 
+def _turn_to(vectors: np.ndarray, directions: np.ndarray) -> Rotation:
+    """Return the least rotations (n) of vectors (n, 3) to the directions (n, 3), below a half turn."""
+    a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (vectors, directions))
+    return Rotation.from_quat(np.column_stack((np.cross(a, b), 1.0 + np.sum(a * b, axis=1))))
+
+
 class Motion(BodyMotion):
     """The motion of a protocol, with torso and arms; `tasks` holds those of other protocols than the clasp."""
 
     phase = "clasp"
+    leads = True  # the palms lead the arms
     lean_deg: float | np.ndarray = 15.0  # yaw, pitch, roll of the torso in the clasp
 
     def prepare(self, rng: np.random.Generator, pose_deg: float) -> None:
@@ -186,7 +196,7 @@ class Motion(BodyMotion):
         self.flaws = flaws
         self.lengths = lengths
         self.p_LS = place_sensors(lengths, flaws.sizes)
-        self.least_flexion = _LEAST_FLEXION
+        self.least_flexion, self.most_missing = _LEAST_FLEXION, np.inf
         self.half_width = 0.5 * lengths["shoulder_width"]
         self.arm = {s: (lengths[f"{s}_upper_arm"], lengths[f"{s}_forearm"] + lengths[f"{s}_hand"]) for s in SIDES}
         self.reach = min(sum(arm) for arm in self.arm.values())
@@ -240,7 +250,7 @@ class Motion(BodyMotion):
             clasp_t = np.arange(*self.clasp, 0.05)
             moving = self._motion_share(clasp_t)
             flaws.wrists.fit(clasp_t, moving, np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1))
-            self.least_flexion = _PERSON_LEAST_FLEXION
+            self.least_flexion, self.most_missing = _PERSON_LEAST_FLEXION, _MOST_MISSING
             try:
                 self(grid)
             except BadOption:
@@ -248,7 +258,7 @@ class Motion(BodyMotion):
                     raise
             else:
                 break
-        self.least_flexion = _LEAST_FLEXION
+        self.least_flexion, self.most_missing = _LEAST_FLEXION, np.inf
 
     def activity(self, t: np.ndarray) -> np.ndarray:
         moving = make_pulse(t, *self.clasp, _RAMP_S)
@@ -376,28 +386,45 @@ class Motion(BodyMotion):
             elevation.append(np.rad2deg(np.arctan2(np.hypot(along_T[:, 0], along_T[:, 1]), -along_T[:, 2])))
         return (elevation[1] - elevation[0]) / (2.0 * _RATE_STEP_S)
 
-    def _reach(
-        self, t: np.ndarray, side: str, aim: _Aim, hang: Rotation
-    ) -> tuple[np.ndarray, Rotation, np.ndarray]:
+    def _reach(self, t: np.ndarray, side: str, aim: _Aim, hang: Rotation) -> tuple[np.ndarray, Rotation, np.ndarray]:
         """Shoulder (n, 3) [m] in T, upper arm in T and elbow flexion (n,) [rad] that bring the palm to its aim.
 
-        The shoulder follows the arm, elbow and wrist are not straight: each round corrects the aim of the straight arm by
-        the palm's distance from it. A fixed number of rounds is a smooth function of time.
+        The shoulder follows the arm, elbow and wrist are not straight. Each round bends the elbow towards the distance
+        from shoulder to palm and turns the straight arm's solution to the palm. A fixed number of rounds is a smooth
+        function of time.
         """
         flaws, y = self.flaws, SIDES[side]
         upper, blend = self.lengths[f"{side}_upper_arm"], aim.lead[side][:, None]
         palm_F = self._palm_F(side, aim)
-        moving_time = self.moving_time(t)
+        lower = np.linalg.norm(palm_F, axis=1)
         hysteresis = flaws.sizes.girdle and flaws.sizes.girdle_hysteresis
         raising = self._raising(t, side) if hysteresis else np.zeros_like(t)
-        centre_T = self._shoulder(side)
-        shoulder_T, correction = np.tile(centre_T, (len(t), 1)), np.zeros((len(t), 3))
+        centre_T = self._shoulder(side) + flaws.girdle.place(y, self.moving_time(t))
+        down_U = hang.apply(-E_Z)
+
+        def bend(flexion: np.ndarray) -> np.ndarray:
+            """Palm (n, 3) [m] in the upper arm, from the shoulder."""
+            return flaws.elbow_joint.rotate_vectors(y, flexion, aim.pronation[side], palm_F) - upper * E_Z
+
+        def opening(palm: np.ndarray) -> np.ndarray:
+            """Angle (n,) [rad] at the elbow, 0 where the arm is straight, from the palm seen from the shoulder."""
+            cos = (np.sum(palm**2, axis=1) - upper**2 - lower**2) / (2.0 * upper * lower)
+            return np.arccos(np.clip(cos, -1.0, 1.0))
+
+        shoulder_T, flexion = centre_T, np.empty(0)
         for _ in range(_REACH_ROUNDS):
-            R_TU, flexion = self._arm(side, aim.palm_T[side] + correction - shoulder_T, aim.swivel[side])
-            along_T = (Rotation.from_rotvec(blend * R_TU.as_rotvec()) * hang).apply(-E_Z)
-            shoulder_T = centre_T + flaws.girdle.displace(along_T, y, moving_time, raising)
-            palm_U = flaws.elbow_joint.rotate(y, flexion, aim.pronation[side]).apply(palm_F) - upper * E_Z
-            correction = correction + aim.palm_T[side] - (shoulder_T + R_TU.apply(palm_U))
+            palm_T = aim.palm_T[side] - shoulder_T
+            R_TU, straight = self._arm(side, palm_T, aim.swivel[side])
+            flexion = flexion if flexion.size else straight
+            if self.leads:
+                flexion = flexion + opening(palm_T) - opening(bend(flexion))
+                R_TU = _turn_to(R_TU.apply(bend(flexion)), palm_T) * R_TU
+            along_T = Rotation.from_rotvec(blend * R_TU.as_rotvec()).apply(down_U)
+            shoulder_T = centre_T + flaws.girdle.displace(along_T, y, raising)
+        missing = np.linalg.norm(aim.palm_T[side] - shoulder_T - R_TU.apply(bend(flexion)), axis=1)
+        worst = float(np.max(missing * (aim.lead[side] == 1.0), initial=0.0))
+        if self.leads and worst > self.most_missing:
+            raise BadOption(f"lengths: the {side} arm does not reach through the motion, by {1e3 * worst:.2g} mm")
         return shoulder_T, R_TU, flexion
 
     def _palm_F(self, side: str, aim: _Aim) -> np.ndarray:

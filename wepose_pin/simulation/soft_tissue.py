@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from .imperfections import Imperfections
 from .imu import GRAVITY
-from .motion import E_Z, SEGMENTS, SIDES, STAND_S, BodyPose
-from .signals import Process, RandomWalk, Wander, integrate_step, make_step
+from .motion import E_Z, SIDES, STAND_S, BodyPose
+from .signals import Process, RandomWalk, integrate_step, make_step
 
 
 class Gain(NamedTuple):
@@ -81,10 +81,12 @@ def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_joints(pose: BodyPose) -> JointRotations:
-    """Read the rotations of the joints that soft tissue follows, from a pose of trunk and arms."""
+    """Read the rotations of the joints that soft tissue follows, from a pose of trunk and at least one arm."""
     tilt, _ = _split(pose.R_WL["torso"])
     by_side: tuple[dict[str, np.ndarray], ...] = ({}, {}, {}, {}, {})
     for side in SIDES:
+        if f"{side}_upper_arm" not in pose.R_WL:
+            continue
         R_WU = pose.R_WL[f"{side}_upper_arm"]
         swing, twist = _split(pose.R_WL["torso"].inv() * R_WU)
         bend, pronation = _split(R_WU.inv() * pose.R_WL[f"{side}_forearm"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,10 @@ from .tasks import TASKS
 
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
+MEASURED_STD = 0.003  # [m] of shoulder width and trunk
+# [m] Shoulder width as 0.83 of the biacromial breadth (ANSUR II against the arm models of de Leva 1996 and Holzbaur 2005):
+# the share has ± 0.03, 12 mm of 400, a landmark under the skin 5 mm or more, half of which counts on either side.
+PEOPLE_MEASURED_STD = 0.012
 _STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
 _GAIN_RATE_HZ = 20.0  # at which soft-tissue motion is scaled to its rms
 # Streams of random numbers: new ones go to the end.
@@ -138,9 +143,15 @@ class _Sampled:
         """Sample all segments, or one segment and those that carry it; `joints`: with the rotations of the joints."""
         segments = [segment] if segment else list(motion.p_LS)
         self.time = t
-        self.pose: BodyPose = motion(t, [*segments, *SEGMENTS] if joints else segments)
+        all_arms = joints and segment in ("", "torso")  # the sensor on the chest follows both
+        self.pose: BodyPose = motion(t, [*segments, *SEGMENTS] if all_arms else segments)
         self.joints: JointRotations | None = read_joints(self.pose) if joints else None
-        self.neighbours = [motion(t + k * _STENCIL_S, segments) for k in (-2, -1, 1, 2)]
+        self._at = lambda step: motion(t + step * _STENCIL_S, segments)
+
+    @cached_property
+    def neighbours(self) -> list[BodyPose]:
+        """The poses two steps and one step before, one and two after."""
+        return [self._at(step) for step in (-2, -1, 1, 2)]
 
     def segment(self, segment: str, p_LS: np.ndarray) -> _Moved:
         # Differences to the middle first: for a static segment they are exactly zero.
@@ -239,7 +250,9 @@ def simulate(
         raise BadOption(f"protocol {protocol!r} must be one of {', '.join(TASKS)}; with 'poses' circles must be 0")
     lengths = {name: float(lengths[name]) for name in names}
     rngs = spawn_streams(seed)
-    motion = TASKS[protocol](lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs, lengths["shoulder_width"]))
+    motion = TASKS[protocol](
+        lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs, lengths["shoulder_width"])
+    )
     motion.fit_to_person(rngs["task"], pose_deg)
     return measure_motion(motion, rngs, rate_hz, noise, imperfections)
 
@@ -292,8 +305,13 @@ def measure_motion(
         place = -p_LS[2] / motion.lengths.get(segment, 1.0)
         strap = SoftTissue(segment, place, imperfections, rngs, duration)
 
-        def turn_sensor(sampled: _Sampled, segment: str = segment, tissue: _SoftTissue = tissue,
-                        strap: SoftTissue = strap, p_LS: np.ndarray = p_LS) -> tuple[_Moved, np.ndarray]:
+        def turn_sensor(
+            sampled: _Sampled,
+            segment: str = segment,
+            tissue: _SoftTissue = tissue,
+            strap: SoftTissue = strap,
+            p_LS: np.ndarray = p_LS,
+        ) -> tuple[_Moved, np.ndarray]:
             moved = sampled.segment(segment, p_LS)
             soft_L = tissue(moved, motion.activity(sampled.time))
             if start is not None and sampled.joints is not None:
@@ -311,9 +329,7 @@ def measure_motion(
         if own_clocks:
             rate_S[1:] = rotvec / np.diff(own_time)[:, None]
         if never_still:  # a sample before the first one, for the rate that ends there
-            before, soft_before = turn_sensor(
-                _Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment, joints=by_joints)
-            )
+            before, soft_before = turn_sensor(_Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment, joints=by_joints))
             R_before = before.R_WL * Rotation.from_rotvec(soft_before) * R_LS
             rate_S[0] = (R_before[0].inv() * R_WS[0]).as_rotvec() * rate_hz
         force_S = R_WS.inv().apply(moved.p_ddot + GRAVITY * E_Z)
@@ -357,8 +373,12 @@ class Person(NamedTuple):
     prior: Subject  # the population prior of that stature and sex
 
 
-def simulate_person(seed: int, measured_std: float = 0.003, body: str = DEFAULT_BODY) -> Person:
-    """Sample a person of the population, with the lengths of a `body` and measured shoulder width and trunk."""
+def simulate_person(seed: int, measured_std: float = MEASURED_STD, body: str = DEFAULT_BODY) -> Person:
+    """Sample a person of the population, with the lengths of a `body` and measured shoulder width and trunk.
+
+    `measured_std` [m] is the error of both: by default that of a careful measurement between the joint centres
+    themselves. Nobody can reach them: `PEOPLE_MEASURED_STD` is the error of 0.83 times the biacromial breadth.
+    """
     rng = np.random.default_rng([seed, 7])
     sex = SEXES[int(rng.integers(2))]
     mean, std = {"f": (1.63, 0.064), "m": (1.756, 0.069)}[sex]  # [m], ANSUR II (Gordon et al. 2014)

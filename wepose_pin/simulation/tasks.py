@@ -95,6 +95,8 @@ class TouchLeft(Touch):
 class Poses(Motion):
     """T-pose, then a bow, each with a person's errors."""
 
+    leads = False
+
     def prepare(self, rng: np.random.Generator, pose_deg: float) -> None:
         self.clasp = (_T_POSE_S[0], _BOW_S[1])
         end = self.clasp[1]
