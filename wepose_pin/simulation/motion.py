@@ -81,7 +81,7 @@ class BodyMotion(ABC):
         """Return the activity (n,): 1 in free motion, 0 where the segments are static."""
 
     @abstractmethod
-    def moving_time(self, t: np.ndarray, segment: str = "") -> np.ndarray:
+    def moving_time(self, t: np.ndarray, segment: str = "", /) -> np.ndarray:
         """Return the time (n,) [s] that a segment has moved up to `t`: the integral of its activity."""
 
     @abstractmethod
@@ -249,7 +249,8 @@ class Motion(BodyMotion):
             grid = np.arange(*self.span, 0.05)
             clasp_t = np.arange(*self.clasp, 0.05)
             moving = self._motion_share(clasp_t)
-            flaws.wrists.fit(clasp_t, moving, np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1))
+            distance = np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1)
+            flaws.wrists.fit(clasp_t, moving, np.column_stack((distance, distance)))
             self.least_flexion, self.most_missing = _PERSON_LEAST_FLEXION, _MOST_MISSING
             try:
                 self(grid)
@@ -264,7 +265,7 @@ class Motion(BodyMotion):
         moving = make_pulse(t, *self.clasp, _RAMP_S)
         return moving + sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
 
-    def moving_time(self, t: np.ndarray, segment: str = "") -> np.ndarray:
+    def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
         moving = integrate_pulse(t, *self.clasp, _RAMP_S)
         return moving + sum((integrate_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
 
@@ -438,7 +439,8 @@ class Motion(BodyMotion):
         aim, flaws = self._aim(t), self.flaws
         sway = np.deg2rad(flaws.sizes.sway_deg_s)
         R_WT = aim.R_WT
-        R_WL, points, origins = {"torso": R_WT}, {}, {"torso": np.zeros(3)}
+        R_WL, origins = {"torso": R_WT}, {"torso": np.zeros(3)}
+        points: dict[str, np.ndarray] = {}
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
             y, blend = SIDES[side], aim.lead[side]
             hanging = (1.0 - blend)[:, None]
@@ -472,17 +474,22 @@ class Motion(BodyMotion):
             if flaws.sizes.start_segment_deg:
                 R_WF = R_WF * Rotation.from_rotvec(hanging * flaws.start[f"{side}_forearm"])
             R_WL[f"{side}_upper_arm"], R_WL[f"{side}_forearm"] = R_WU, R_WF
-            p_W = R_WT.apply(shoulder_T)
-            points[f"{side}_shoulder"] = p_W
-            for part, end, R_WL_part in (
-                ("upper_arm", "elbow", R_WU),
-                ("forearm", "wrist", R_WF),
-                ("hand", "palm", R_WF * aim.hand_F[side] if aim.hand_F else R_WF),
-            ):
-                p_W = p_W + R_WL_part.apply((0.0, 0.0, -self.lengths[f"{side}_{part}"]))
-                points[f"{side}_{end}"] = p_W
+            R_WH = R_WF * aim.hand_F[side] if aim.hand_F else R_WF
+            points |= place_arm(R_WT.apply(shoulder_T), side, (R_WU, R_WF, R_WH), self.lengths)
             origins |= {f"{side}_upper_arm": points[f"{side}_shoulder"], f"{side}_forearm": points[f"{side}_elbow"]}
         return BodyPose(R_WL, points, origins)
+
+
+def place_arm(
+    shoulder_W: np.ndarray, side: str, R_WL: tuple[Rotation, Rotation, Rotation], lengths: Mapping[str, float]
+) -> dict[str, np.ndarray]:
+    """Place the points (n, 3) [m] in W of an arm, from its shoulder (n, 3) and the rotations of its three segments."""
+    points = {f"{side}_shoulder": shoulder_W}
+    p_W = shoulder_W
+    for part, end, R in zip(ARM, ("elbow", "wrist", "palm"), R_WL, strict=True):
+        p_W = p_W + R.apply((0.0, 0.0, -lengths[f"{side}_{part}"]))
+        points[f"{side}_{end}"] = p_W
+    return points
 
 
 def place_sensors(lengths: Mapping[str, float], sizes: Imperfections = IDEAL_PRESET) -> dict[str, np.ndarray]:
