@@ -1,9 +1,9 @@
 """Activities with known truth: walking on the spot, sitting down and standing up; `arm_tasks` has that of the arms.
 
 One of the whole body is a set of joint angles as closed forms of time, of the hips and ankles after Wu et al. 2002, of
-the knees after Grood and Suntay 1983; segment orientations are put together from them here, without the code of the angles room.
-Where the segments and their sensors are follows from the model by Pinocchio: the root, midway between the hips, stays
-where it is, so a person who sits down raises the feet.
+the knees after Grood and Suntay 1983; segment orientations are put together from them here, without the code of the
+angles room. Where the segments and their sensors are follows from the model by Pinocchio: the root, midway between the
+hips, stays where it is, so a person who sits down raises the feet.
 """
 
 from __future__ import annotations
@@ -302,8 +302,8 @@ def simulate_activity(
     ----------
     activity : one of `ACTIVITIES`
     imperfections : as in `simulate`. Of the mild preset's body only soft tissue counts. Walking and sitting leave sway,
-        wrists and the hysteresis of the girdle out; the legs have no soft tissue of the people preset, for lack of a
-        source here, and what people hold in the start pose they hold throughout
+        wrists and the hysteresis of the girdle out; of the people preset's soft tissue the legs have creep, slips and
+        wobble only, and what people hold in the start pose they hold throughout
     lengths : of the body [m]; those not named, or None: a person of 1.75 m
     seed, rate_hz, noise : as in `simulate`
 

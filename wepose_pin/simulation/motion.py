@@ -37,11 +37,14 @@ _LIFT_S = 1.5  # table to circle, circle to table
 MARGIN_S = 0.1  # the stated phases keep this distance from the motion beside them
 _FLEXION = np.deg2rad((8.0, 140.0))  # of the elbow while the hand is led to a point
 _LEAST_FLEXION = np.deg2rad(3.0)  # at which a hand is out of reach
-_PERSON_LEAST_FLEXION = np.deg2rad(
-    15.0
-)  # the same where shoulders move with the arm, which a straight arm cannot solve
-_SLACKS = np.arange(0.02, 0.2, 0.01)  # [m] tried in turn, by which the hands stay nearer than the arms are long
-_REACH_ROUNDS = 8
+_PERSON_LEAST_FLEXION = np.deg2rad(15.0)  # the same where shoulders move: below, the rounds would not settle
+# Tried in turn: rounds in which an arm's reach is solved, and the distance [m] by which the hands stay nearer than the
+# arms are long.
+_REACHES = [
+    (rounds, slack)
+    for rounds, most in ((8, 0.08), (16, 0.08), (32, 0.2))
+    for slack in np.arange(0.02, most, 0.01).tolist()
+]
 _MOST_MISSING = 5e-6  # [m] from a hand to its aim after these rounds
 _RATE_STEP_S = 0.02  # for the rate of elevation
 _TILT_S = 1.5  # correlation time of the slow part of the sway, assumption
@@ -196,7 +199,7 @@ class Motion(BodyMotion):
         self.flaws = flaws
         self.lengths = lengths
         self.p_LS = place_sensors(lengths, flaws.sizes)
-        self.least_flexion, self.most_missing = _LEAST_FLEXION, np.inf
+        self.least_flexion, self.most_missing, self.rounds = _LEAST_FLEXION, np.inf, 1
         self.half_width = 0.5 * lengths["shoulder_width"]
         self.arm = {s: (lengths[f"{s}_upper_arm"], lengths[f"{s}_forearm"] + lengths[f"{s}_hand"]) for s in SIDES}
         self.reach = min(sum(arm) for arm in self.arm.values())
@@ -243,19 +246,17 @@ class Motion(BodyMotion):
         if not flaws.iterates:
             self.prepare(rng, pose_deg)
             return
-        for slack in _SLACKS:
-            flaws.slack = slack
+        self.least_flexion, self.most_missing = _PERSON_LEAST_FLEXION, _MOST_MISSING
+        for self.rounds, flaws.slack in _REACHES:
             self.prepare(deepcopy(rng), pose_deg)
-            grid = np.arange(*self.span, 0.05)
-            clasp_t = np.arange(*self.clasp, 0.05)
+            grid, clasp_t = np.arange(*self.span, 0.05), np.arange(*self.clasp, 0.05)
             moving = self._motion_share(clasp_t)
             distance = np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1)
             flaws.wrists.fit(clasp_t, moving, np.column_stack((distance, distance)))
-            self.least_flexion, self.most_missing = _PERSON_LEAST_FLEXION, _MOST_MISSING
             try:
                 self(grid)
             except BadOption:
-                if slack == _SLACKS[-1]:
+                if (self.rounds, flaws.slack) == _REACHES[-1]:
                     raise
             else:
                 break
@@ -413,7 +414,7 @@ class Motion(BodyMotion):
             return np.arccos(np.clip(cos, -1.0, 1.0))
 
         shoulder_T, flexion = centre_T, np.empty(0)
-        for _ in range(_REACH_ROUNDS):
+        for _ in range(self.rounds):
             palm_T = aim.palm_T[side] - shoulder_T
             R_TU, straight = self._arm(side, palm_T, aim.swivel[side])
             flexion = flexion if flexion.size else straight
