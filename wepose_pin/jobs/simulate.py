@@ -14,6 +14,9 @@ from .fields import field_values
 if TYPE_CHECKING:
     from ..simulation import Imperfections, Person
 
+ACTIVITY_S = 40.0
+PROTOCOL_S = 60.0  # of the clasp, or what is done in its place
+LONGEST_S = 7200.0
 CIRCLES = 6  # drawn by the right hand after the protocol
 
 
@@ -23,7 +26,7 @@ class SimulateJob:
 
     The person stands in the start pose, does the motion of the protocol, then draws circles with the right hand (not
     after poses). The sensors have the noise and bias of an Xsens MTi-3. Continue with `wepose calibrate DIR --measured
-    ...` and `wepose track DIR`; after an activity with `wepose track DIR --model whole_body`.
+    ...` and `wepose track DIR`; after walk or sit with `wepose track DIR --model whole_body`.
 
     Parameters
     ----------
@@ -37,8 +40,11 @@ class SimulateJob:
     protocol
         Simulate the motion of this calibration protocol (see `wepose calibrate --help`).
     activity
-        Simulate the whole body in place of a protocol, with sensors on pelvis, head, hands and legs too: walking on the
-        spot (walk), or sitting down and standing up (sit). Of the body's imperfections it has soft-tissue artefacts.
+        Simulate an activity in place of a protocol. Of the whole body, with sensors on pelvis, head, hands and legs
+        too: walking on the spot (walk), or sitting down and standing up (sit). Of the upper body: reaches, rests and
+        typing of both arms, hands apart (tasks). Of the body's imperfections of `mild` it has soft-tissue artefacts.
+    seconds
+        Simulate the activity (40) or the protocol's motion (60) for so long; at least 5.
     preset
         Simulate only the sensors' noise and bias (ideal), or also small soft-tissue artefacts, slip, sway and sensor
         errors (mild), or all of them and more as the literature has them (people): soft tissue that follows the joints,
@@ -66,7 +72,8 @@ class SimulateJob:
     seed: int = 1
     rate_hz: float = 100.0
     protocol: Literal["clasp", "handle", "touch_left", "touch_right", "poses"] = "clasp"
-    activity: Literal["walk", "sit"] | None = None
+    activity: Literal["walk", "sit", "tasks"] | None = None
+    seconds: float | None = None
     preset: Literal["ideal", "mild", "people"] = "ideal"
     imperfection: Mapping[str, float | str] = field(default_factory=dict)
     force: bool = False
@@ -78,6 +85,8 @@ class SimulateJob:
             raise BadOption(f"--rate-hz {self.rate_hz:g}: between 20 and 2000 samples a second")
         if self.activity is not None and self.protocol != "clasp":
             raise BadOption(f"--activity {self.activity} with --protocol {self.protocol}: one of them; leave one out")
+        if self.seconds is not None and not 5.0 <= self.seconds <= LONGEST_S:
+            raise BadOption(f"--seconds {self.seconds:g}: between 5 and {LONGEST_S:g}")
         self.imperfections()
 
     def imperfections(self) -> Imperfections:
@@ -122,7 +131,15 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
     import numpy as np
 
     from ..documents import whole_folder
-    from ..simulation import MEASURED_STD, PEOPLE_MEASURED_STD, simulate, simulate_activity, simulate_person
+    from ..model import DEFAULT_BODY
+    from ..simulation import (
+        ACTIVITIES,
+        MEASURED_STD,
+        PEOPLE_MEASURED_STD,
+        simulate,
+        simulate_activity,
+        simulate_person,
+    )
     from ..subject import mount_rows, subject_toml
     from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
@@ -131,13 +148,15 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
     with whole_folder(job.out, job.force) as folder:
         progress("simulating a person", 0.0)
         measured_std = PEOPLE_MEASURED_STD if job.preset == "people" else MEASURED_STD
-        person = simulate_person(job.seed, measured_std, "whole_body" if job.activity else "upper_body")
+        body = ACTIVITIES[job.activity].body if job.activity else DEFAULT_BODY
+        person = simulate_person(job.seed, measured_std, body)
         if job.activity:
             simulation = simulate_activity(
                 job.activity,
                 seed=job.seed,
                 rate_hz=job.rate_hz,
                 imperfections=job.imperfections(),
+                seconds=ACTIVITY_S if job.seconds is None else job.seconds,
                 lengths=person.lengths,
             )
         else:
@@ -146,6 +165,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
                 seed=job.seed,
                 rate_hz=job.rate_hz,
                 imperfections=job.imperfections(),
+                clasp_s=PROTOCOL_S if job.seconds is None else job.seconds,
                 protocol=job.protocol,
                 circles=0 if job.protocol == "poses" else CIRCLES,
             )

@@ -1,9 +1,9 @@
-"""Activities of the whole body with known truth: walking on the spot, sitting down and standing up.
+"""Activities with known truth: walking on the spot, sitting down and standing up; `arm_tasks` has that of the arms.
 
-An activity is a set of joint angles as closed forms of time, of the hips and ankles after Wu et al. 2002, of the knees
-after Grood and Suntay 1983; segment orientations are put together from them here, without the code of the angles room.
-Where the segments and their sensors are follows from the model by Pinocchio: the root, midway between the hips, stays
-where it is, so a person who sits down raises the feet.
+One of the whole body is a set of joint angles as closed forms of time, of the hips and ankles after Wu et al. 2002, of
+the knees after Grood and Suntay 1983; segment orientations are put together from them here, without the code of the
+angles room. Where the segments and their sensors are follows from the model by Pinocchio: the root, midway between the
+hips, stays where it is, so a person who sits down raises the feet.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from ..arguments import Count, Positive, check_arguments
 from ..errors import BadOption, one_of
 from ..kinematics import compute_link_poses, solve_configuration
 from ..model import BodyModel, load_model
+from .arm_tasks import ArmTasks
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
-from .motion import MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, place_sensors
+from .motion import ARM, E_Z, MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, Flaws, place_arm, place_sensors
 from .signals import integrate_pulse, make_pulse
 from .subject import Simulation, measure_motion, spawn_streams
 
@@ -51,11 +52,13 @@ class Activity(BodyMotion):
     """An activity of a body with legs, with a sensor on each segment."""
 
     phase = ""
+    body = WHOLE_BODY
 
-    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float) -> None:
+    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws | None = None) -> None:
         self.model = model
+        self.flaws = flaws
         self.lengths = model.lengths
-        self.p_LS = _place_sensors(self.lengths)
+        self.p_LS = _place_sensors(self.lengths, flaws.sizes if flaws else IDEAL_PRESET)
         self.seconds = seconds
         self.prepare(rng)
 
@@ -82,7 +85,7 @@ class Activity(BodyMotion):
     def activity(self, t: np.ndarray) -> np.ndarray:
         return make_pulse(t, STAND_S, STAND_S + self.seconds, _RAMP_S)
 
-    def moving_time(self, t: np.ndarray, segment: str = "") -> np.ndarray:
+    def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
         return integrate_pulse(t, STAND_S, STAND_S + self.seconds, _RAMP_S)
 
     def phases(self) -> dict[str, list[tuple[float, float]]]:
@@ -100,14 +103,46 @@ class Activity(BodyMotion):
         frames = self.model.point_frames
         _, p_W = compute_link_poses(self.model, q, [*R_WL, *frames.values()], rotations=False)
         origins = {segment: p_W[:, k] for k, segment in enumerate(R_WL)}
-        return BodyPose(R_WL, {point: p_W[:, len(R_WL) + k] for k, point in enumerate(frames)}, origins)
+        points = {point: p_W[:, len(R_WL) + k] for k, point in enumerate(frames)}
+        if self.flaws and self.flaws.girdle.moves:
+            points |= self._move_shoulders(t, R_WL, origins)
+        return BodyPose(R_WL, points, origins)
+
+    def _move_shoulders(
+        self, t: np.ndarray, R_WL: dict[str, Rotation], origins: dict[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Place the arms' points (n, 3) [m] on shoulders that move, and correct the arms' `origins`."""
+        assert self.flaws is not None
+        girdle, R_WT = self.flaws.girdle, R_WL["torso"]
+        points: dict[str, np.ndarray] = {}
+        for side, y in SIDES.items():
+            along_T = (R_WT.inv() * R_WL[f"{side}_upper_arm"]).apply(-E_Z)
+            shoulder_T = np.array((0.0, 0.5 * y * self.lengths["shoulder_width"], self.lengths["trunk"]))
+            shoulder_T = shoulder_T + girdle.place(y, self.moving_time(t))
+            shoulder_T = shoulder_T + girdle.displace(along_T, y, np.zeros_like(t))
+            shoulder_W = origins["torso"] + R_WT.apply(shoulder_T)
+            R_arm = (R_WL[f"{side}_upper_arm"], R_WL[f"{side}_forearm"], R_WL[f"{side}_hand"])
+            points |= place_arm(shoulder_W, side, R_arm, self.lengths)
+            for part, start in zip(ARM, ("shoulder", "elbow", "wrist"), strict=True):
+                origins[f"{side}_{part}"] = points[f"{side}_{start}"]
+        return points
 
     def _orientations(self, t: np.ndarray) -> dict[str, Rotation]:
         R_WL = {name: Rotation.from_rotvec(turn) for name, turn in self.trunk(t)._asdict().items()}
+        start = self.flaws.start_pose if self.flaws else None
+        if start is not None and (start.torso.any() or start.head.any()):
+            R_WL["torso"] = R_WL["torso"] * Rotation.from_rotvec(start.torso)
+            R_WL["head"] = R_WL["head"] * Rotation.from_rotvec(start.head)
         for side, y in SIDES.items():
             shoulder, elbow = self.arm(side, t).T
             R_WU = R_WL["torso"] * Rotation.from_euler("y", -shoulder[:, None])
-            R_WF = R_WU * Rotation.from_euler("y", -elbow[:, None])
+            if self.flaws is None or start is None:
+                R_WF = R_WU * Rotation.from_euler("y", -elbow[:, None])
+            else:
+                if start.upper_arm[side].any():
+                    R_WU = R_WU * Rotation.from_rotvec(start.upper_arm[side])
+                flexion, pronation = elbow + start.flexion[side], np.full_like(t, start.pronation[side])
+                R_WF = R_WU * self.flaws.elbow_joint.rotate(y, flexion, pronation)
             leg = self.leg(side, t)
             # A right leg, y = −1: flexion about −y, adduction about x, internal rotation about z. Its knee: y, x, −z.
             R_WT = R_WL["pelvis"] * Rotation.from_euler("YXZ", leg.hip * (-1.0, -y, -y))
@@ -246,7 +281,7 @@ class Sit(Activity):
         return self._moving(t)[:, None] * reach + self._seated(t)[:, None] * rest
 
 
-ACTIVITIES: dict[str, type[Activity]] = {"walk": Walk, "sit": Sit}
+ACTIVITIES: dict[str, type[Activity | ArmTasks]] = {"walk": Walk, "sit": Sit, "tasks": ArmTasks}
 
 
 def simulate_activity(
@@ -259,14 +294,16 @@ def simulate_activity(
     seconds: Positive = 40.0,
     lengths: Mapping[str, float] | None = None,
 ) -> Simulation:
-    """Simulate an activity of the whole body with known truth: a sensor on each of 15 segments.
+    """Simulate an activity with known truth: of the whole body with a sensor on each of 15 segments, or of the arms.
 
     0 to 5 s static in the N-pose, `seconds` of the activity, 2 s static.
 
     Parameters
     ----------
     activity : one of `ACTIVITIES`
-    imperfections : as in `simulate`, but of the body's only soft tissue
+    imperfections : as in `simulate`. Of the mild preset's body only soft tissue counts. Walking and sitting leave sway,
+        wrists and the hysteresis of the girdle out; of the people preset's soft tissue the legs have creep, slips and
+        wobble only, and what people hold in the start pose they hold throughout
     lengths : of the body [m]; those not named, or None: a person of 1.75 m
     seed, rate_hz, noise : as in `simulate`
 
@@ -279,13 +316,18 @@ def simulate_activity(
     if activity not in ACTIVITIES:
         raise BadOption(f"activity {activity!r} is not known; {one_of(ACTIVITIES, activity)}")
     rngs = spawn_streams(seed)
-    motion = ACTIVITIES[activity](load_model(WHOLE_BODY, lengths), rngs["motion"], seconds)
+    model = load_model(ACTIVITIES[activity].body, lengths)
+    flaws = Flaws(imperfections, rngs, model.lengths["shoulder_width"])
+    motion = ACTIVITIES[activity](model, rngs["motion"], seconds, flaws)
     return measure_motion(motion, rngs, rate_hz, noise, imperfections)
 
 
-def _place_sensors(lengths: Mapping[str, float]) -> dict[str, np.ndarray]:
+def _place_sensors(lengths: Mapping[str, float], sizes: Imperfections) -> dict[str, np.ndarray]:
     """Place each sensor in L [m]: the upper body's, and those of head, hands, pelvis and legs."""
-    places = place_sensors(lengths) | {"pelvis": np.array((-0.1, 0.0, 0.02)), "head": np.array((-0.1, 0.0, 0.15))}
+    places = place_sensors(lengths, sizes) | {
+        "pelvis": np.array((-0.1, 0.0, 0.02)),
+        "head": np.array((-0.1, 0.0, 0.15)),
+    }
     for side, y in SIDES.items():
         places[f"{side}_hand"] = np.array((0.0, 0.02 * y, -lengths[f"{side}_hand"]))
         places[f"{side}_thigh"] = np.array((0.0, 0.07 * y, -0.7 * lengths[f"{side}_thigh"]))

@@ -64,8 +64,8 @@ class Imperfections:
         [assumption]
     wobble_deg : [deg per g] across a segment, under acceleration. People: 0.5, from the stiffness of skin (Karlsson &
         Tranberg 1999, Hum Mov Sci 18, 627) for 20 g of sensor
-    upper_arm_place, forearm_place : of the sensor, as a share of the segment's length from its upper joint; 0: half-way.
-        People: 0.6, 0.85
+    upper_arm_place, forearm_place : of the sensor, as a share of the segment's length from its upper joint; 0:
+        half-way. People: 0.6, 0.85
     girdle : the shoulder's centre follows the arm by the regression of de Groot & Brand 2001, Clin Biomech 16, 735,
         times this. People: 1
     girdle_person : what one shoulder does differently, in proportion to elevation, times (6, 5, 8) mm at 90 deg (the

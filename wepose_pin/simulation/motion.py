@@ -37,11 +37,14 @@ _LIFT_S = 1.5  # table to circle, circle to table
 MARGIN_S = 0.1  # the stated phases keep this distance from the motion beside them
 _FLEXION = np.deg2rad((8.0, 140.0))  # of the elbow while the hand is led to a point
 _LEAST_FLEXION = np.deg2rad(3.0)  # at which a hand is out of reach
-_PERSON_LEAST_FLEXION = np.deg2rad(
-    15.0
-)  # the same where shoulders move with the arm, which a straight arm cannot solve
-_SLACKS = np.arange(0.02, 0.2, 0.01)  # [m] tried in turn, by which the hands stay nearer than the arms are long
-_REACH_ROUNDS = 8
+_PERSON_LEAST_FLEXION = np.deg2rad(15.0)  # the same where shoulders move: below, the rounds would not settle
+# Tried in turn: rounds in which an arm's reach is solved, and the distance [m] by which the hands stay nearer than the
+# arms are long.
+_REACHES = [
+    (rounds, slack)
+    for rounds, most in ((8, 0.08), (16, 0.08), (32, 0.2))
+    for slack in np.arange(0.02, most, 0.01).tolist()
+]
 _MOST_MISSING = 5e-6  # [m] from a hand to its aim after these rounds
 _RATE_STEP_S = 0.02  # for the rate of elevation
 _TILT_S = 1.5  # correlation time of the slow part of the sway, assumption
@@ -81,7 +84,7 @@ class BodyMotion(ABC):
         """Return the activity (n,): 1 in free motion, 0 where the segments are static."""
 
     @abstractmethod
-    def moving_time(self, t: np.ndarray, segment: str = "") -> np.ndarray:
+    def moving_time(self, t: np.ndarray, segment: str = "", /) -> np.ndarray:
         """Return the time (n,) [s] that a segment has moved up to `t`: the integral of its activity."""
 
     @abstractmethod
@@ -196,7 +199,7 @@ class Motion(BodyMotion):
         self.flaws = flaws
         self.lengths = lengths
         self.p_LS = place_sensors(lengths, flaws.sizes)
-        self.least_flexion, self.most_missing = _LEAST_FLEXION, np.inf
+        self.least_flexion, self.most_missing, self.rounds = _LEAST_FLEXION, np.inf, 1
         self.half_width = 0.5 * lengths["shoulder_width"]
         self.arm = {s: (lengths[f"{s}_upper_arm"], lengths[f"{s}_forearm"] + lengths[f"{s}_hand"]) for s in SIDES}
         self.reach = min(sum(arm) for arm in self.arm.values())
@@ -243,18 +246,17 @@ class Motion(BodyMotion):
         if not flaws.iterates:
             self.prepare(rng, pose_deg)
             return
-        for slack in _SLACKS:
-            flaws.slack = slack
+        self.least_flexion, self.most_missing = _PERSON_LEAST_FLEXION, _MOST_MISSING
+        for self.rounds, flaws.slack in _REACHES:
             self.prepare(deepcopy(rng), pose_deg)
-            grid = np.arange(*self.span, 0.05)
-            clasp_t = np.arange(*self.clasp, 0.05)
+            grid, clasp_t = np.arange(*self.span, 0.05), np.arange(*self.clasp, 0.05)
             moving = self._motion_share(clasp_t)
-            flaws.wrists.fit(clasp_t, moving, np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1))
-            self.least_flexion, self.most_missing = _PERSON_LEAST_FLEXION, _MOST_MISSING
+            distance = np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1)
+            flaws.wrists.fit(clasp_t, moving, np.column_stack((distance, distance)))
             try:
                 self(grid)
             except BadOption:
-                if slack == _SLACKS[-1]:
+                if (self.rounds, flaws.slack) == _REACHES[-1]:
                     raise
             else:
                 break
@@ -264,7 +266,7 @@ class Motion(BodyMotion):
         moving = make_pulse(t, *self.clasp, _RAMP_S)
         return moving + sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
 
-    def moving_time(self, t: np.ndarray, segment: str = "") -> np.ndarray:
+    def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
         moving = integrate_pulse(t, *self.clasp, _RAMP_S)
         return moving + sum((integrate_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
 
@@ -412,7 +414,7 @@ class Motion(BodyMotion):
             return np.arccos(np.clip(cos, -1.0, 1.0))
 
         shoulder_T, flexion = centre_T, np.empty(0)
-        for _ in range(_REACH_ROUNDS):
+        for _ in range(self.rounds):
             palm_T = aim.palm_T[side] - shoulder_T
             R_TU, straight = self._arm(side, palm_T, aim.swivel[side])
             flexion = flexion if flexion.size else straight
@@ -438,7 +440,8 @@ class Motion(BodyMotion):
         aim, flaws = self._aim(t), self.flaws
         sway = np.deg2rad(flaws.sizes.sway_deg_s)
         R_WT = aim.R_WT
-        R_WL, points, origins = {"torso": R_WT}, {}, {"torso": np.zeros(3)}
+        R_WL, origins = {"torso": R_WT}, {"torso": np.zeros(3)}
+        points: dict[str, np.ndarray] = {}
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
             y, blend = SIDES[side], aim.lead[side]
             hanging = (1.0 - blend)[:, None]
@@ -472,17 +475,22 @@ class Motion(BodyMotion):
             if flaws.sizes.start_segment_deg:
                 R_WF = R_WF * Rotation.from_rotvec(hanging * flaws.start[f"{side}_forearm"])
             R_WL[f"{side}_upper_arm"], R_WL[f"{side}_forearm"] = R_WU, R_WF
-            p_W = R_WT.apply(shoulder_T)
-            points[f"{side}_shoulder"] = p_W
-            for part, end, R_WL_part in (
-                ("upper_arm", "elbow", R_WU),
-                ("forearm", "wrist", R_WF),
-                ("hand", "palm", R_WF * aim.hand_F[side] if aim.hand_F else R_WF),
-            ):
-                p_W = p_W + R_WL_part.apply((0.0, 0.0, -self.lengths[f"{side}_{part}"]))
-                points[f"{side}_{end}"] = p_W
+            R_WH = R_WF * aim.hand_F[side] if aim.hand_F else R_WF
+            points |= place_arm(R_WT.apply(shoulder_T), side, (R_WU, R_WF, R_WH), self.lengths)
             origins |= {f"{side}_upper_arm": points[f"{side}_shoulder"], f"{side}_forearm": points[f"{side}_elbow"]}
         return BodyPose(R_WL, points, origins)
+
+
+def place_arm(
+    shoulder_W: np.ndarray, side: str, R_WL: tuple[Rotation, Rotation, Rotation], lengths: Mapping[str, float]
+) -> dict[str, np.ndarray]:
+    """Place the points (n, 3) [m] in W of an arm, from its shoulder (n, 3) and the rotations of its three segments."""
+    points = {f"{side}_shoulder": shoulder_W}
+    p_W = shoulder_W
+    for part, end, R in zip(ARM, ("elbow", "wrist", "palm"), R_WL, strict=True):
+        p_W = p_W + R.apply((0.0, 0.0, -lengths[f"{side}_{part}"]))
+        points[f"{side}_{end}"] = p_W
+    return points
 
 
 def place_sensors(lengths: Mapping[str, float], sizes: Imperfections = IDEAL_PRESET) -> dict[str, np.ndarray]:

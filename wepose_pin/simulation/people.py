@@ -24,6 +24,9 @@ class Offset(NamedTuple):
 START_POSE = {
     "torso_pitch": Offset(0.0, 3.0),
     "torso_roll": Offset(0.0, 1.5),
+    "head_pitch": Offset(0.0, 5.0),
+    "head_roll": Offset(0.0, 2.0),
+    "head_heading": Offset(0.0, 5.0),
     "upper_arm_outwards": Offset(8.0, 4.0),
     "upper_arm_forwards": Offset(0.0, 5.0),
     "upper_arm_inward_twist": Offset(5.0, 12.0),
@@ -31,7 +34,6 @@ START_POSE = {
     "forearm_inward_twist": Offset(5.0, 12.0),
 }
 _SIDES_CORRELATION = 0.5  # of the arms' offsets, assumption
-_LEAST_FLEXION_DEG = 0.0
 
 # Carrying angle, extended and supinated: Van Roy 2005, Ergonomics 48, 1645; in neutral pronation: as in START_POSE.
 _CARRYING = {"m": Offset(11.6, 3.2), "f": Offset(16.7, 2.6)}
@@ -47,17 +49,16 @@ class StartPose:
     """One person's offsets in the start pose; rotation vectors [rad] of torso and upper arms, angles of the elbows."""
 
     def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], sides: Mapping[str, float]):
-        draw = rngs["start_pose"].standard_normal(2)
+        trunk = [name for name in START_POSE if name.startswith(("torso", "head"))]
+        drawn = dict(zip(trunk, rngs["start_pose"].standard_normal(len(trunk)), strict=True))
+        turn = {name: sizes.start_pose * np.deg2rad(START_POSE[name].std) * z for name, z in drawn.items()}
         heading = np.deg2rad(sizes.start_heading_deg) * rngs["start_heading"].standard_normal()
-        pitch, roll = (
-            sizes.start_pose * np.deg2rad(START_POSE[name].std) * z
-            for name, z in zip(("torso_pitch", "torso_roll"), draw, strict=True)
-        )
-        self.torso = np.array((roll, pitch, heading))
+        self.torso = np.array((turn["torso_roll"], turn["torso_pitch"], heading))
+        self.head = np.array((turn["head_roll"], turn["head_pitch"], turn["head_heading"]))
         self.upper_arm: dict[str, np.ndarray] = {}
         self.flexion: dict[str, float] = {}
         self.pronation: dict[str, float] = {}  # about z of the forearm
-        names = [name for name in START_POSE if not name.startswith("torso")]
+        names = [name for name in START_POSE if name not in trunk]
         both = rngs["start_pose"].standard_normal((3, len(names)))
         for side, own in zip(sides, both[1:], strict=True):
             z = np.sqrt(_SIDES_CORRELATION) * both[0] + np.sqrt(1.0 - _SIDES_CORRELATION) * own
@@ -77,8 +78,8 @@ class StartPose:
 class Elbow:
     """One person's elbows: an oblique hinge, an abduction that varies with flexion, and pronation about the forearm.
 
-    Half of the carrying angle tilts the axis of flexion in the humerus, half the forearm on that axis, so that it goes as
-    the elbow flexes. Pronation carries the wrist inwards: from the carrying angle in full supination to that of the
+    Half of the carrying angle tilts the axis of flexion in the humerus, half the forearm on that axis, so that it goes
+    as the elbow flexes. Pronation carries the wrist inwards: from the carrying angle in full supination to that of the
     neutral forearm, and as far again.
     """
 
@@ -137,13 +138,16 @@ class Wrists:
         return bool(self.rms.any())
 
     def _parts(self, t: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the parts (n, 2, 2) of the angles: by the distance (n,) [m] of the hands from the chest, wandering."""
+        """Return the parts (n, 2, 2) of the angles: by the distance (n, 2) [m] of hands from the chest, at random."""
         near = (distance - self.mean) / self.std
-        follows = _WRIST_SHARE[0] * near[:, None, None] * self.sign * np.ones((2, 1))
+        follows = _WRIST_SHARE[0] * near[:, :, None] * self.sign
         return follows, _WRIST_SHARE[1] * self.wander(t).reshape(-1, 2, 2)
 
     def fit(self, t: np.ndarray, moving: np.ndarray, distance: np.ndarray) -> None:
-        """Set the gains so that the angles have their rms at these times (n,) of the clasp, where hands move at all."""
+        """Set the gains so that the angles have their rms at these times (n,), where hands move at all.
+
+        `moving` (n,) is the share of the motion, `distance` (n, 2) [m] that of each hand from the chest.
+        """
         if not moving.any():
             return
         self.mean, self.std = float(np.mean(distance)), max(float(np.std(distance)), 0.01)
@@ -153,9 +157,9 @@ class Wrists:
     def rotate(
         self, y: float, t: np.ndarray, moving: np.ndarray, circling: np.ndarray, distance: np.ndarray
     ) -> Rotation:
-        """R_FH of the side y; both parts in the clasp, the wandering in the circles."""
+        """R_FH of the side y, its hand at that distance (n,); both parts in the clasp, the wandering in the circles."""
         side = 0 if y > 0.0 else 1
-        follows, wanders = self._parts(t, distance)
+        follows, wanders = self._parts(t, np.column_stack((distance, distance)))
         angles = moving[:, None, None] * (follows + wanders) + circling[:, None, None] * wanders
         flexion, deviation = (self.rms * self.gain[side] * angles[:, side]).T
         return Rotation.from_euler("YX", np.column_stack((-flexion, y * deviation)))

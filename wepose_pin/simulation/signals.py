@@ -54,7 +54,7 @@ class Process:
 
 
 class RandomWalk:
-    """A smooth random walk (k components) from 0 with variance t/duration: the first terms of the Karhunen-Loève sum."""
+    """A smooth random walk (k components) from 0, of variance t/duration: the first terms of its Karhunen-Loève sum."""
 
     def __init__(self, rng: np.random.Generator, duration: float, components: int) -> None:
         self.rate = (np.arange(20) + 0.5) * np.pi / duration  # [rad/s]

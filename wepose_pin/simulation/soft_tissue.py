@@ -73,8 +73,8 @@ class JointRotations(NamedTuple):
 
 
 def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
-    """Split R into swing @ twist about z: the swing's rotation vector (n, 3) after the twist, and the twist (n,) [rad]."""
-    x, y, z, w = R.as_quat().T
+    """Split R into swing @ twist about z: the swing's rotation vector (n, 3) after the twist, the twist (n,) [rad]."""
+    z, w = R.as_quat()[:, 2:].T
     twist = 2.0 * np.arctan2(np.where(w < 0.0, -z, z), np.abs(w))
     about_z = Rotation.from_rotvec(twist[:, None] * E_Z)
     return about_z.inv().apply((R * about_z.inv()).as_rotvec()), twist
@@ -127,7 +127,8 @@ class SoftTissue:
     @staticmethod
     def _draw_slips(rng: np.random.Generator, duration: float) -> list[tuple[float, float]]:
         """Draw the slips of a strap: time [s] and direction."""
-        slips, at = [], STAND_S
+        slips: list[tuple[float, float]] = []
+        at = STAND_S
         while True:
             at += rng.exponential(1.0 / _SLIPS_PER_S)
             if at > duration:

@@ -28,8 +28,8 @@ from .tasks import TASKS
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
 MEASURED_STD = 0.003  # [m] of shoulder width and trunk
-# [m] Shoulder width as 0.83 of the biacromial breadth (ANSUR II against the arm models of de Leva 1996 and Holzbaur 2005):
-# the share has ± 0.03, 12 mm of 400, a landmark under the skin 5 mm or more, half of which counts on either side.
+# [m] Shoulder width as 0.83 of the biacromial breadth (ANSUR II against the arm model of Holzbaur 2005); the factor has
+# ± 0.03: 12 mm of 400 mm.
 PEOPLE_MEASURED_STD = 0.012
 _STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
 _GAIN_RATE_HZ = 20.0  # at which soft-tissue motion is scaled to its rms
@@ -146,12 +146,12 @@ class _Sampled:
         all_arms = joints and segment in ("", "torso")  # the sensor on the chest follows both
         self.pose: BodyPose = motion(t, [*segments, *SEGMENTS] if all_arms else segments)
         self.joints: JointRotations | None = read_joints(self.pose) if joints else None
-        self._at = lambda step: motion(t + step * _STENCIL_S, segments)
+        self._motion, self._segments = motion, segments
 
     @cached_property
     def neighbours(self) -> list[BodyPose]:
         """The poses two steps and one step before, one and two after."""
-        return [self._at(step) for step in (-2, -1, 1, 2)]
+        return [self._motion(self.time + step * _STENCIL_S, self._segments) for step in (-2, -1, 1, 2)]
 
     def segment(self, segment: str, p_LS: np.ndarray) -> _Moved:
         # Differences to the middle first: for a static segment they are exactly zero.
@@ -162,7 +162,7 @@ class _Sampled:
         return _Moved(self.time, self.pose.R_WL[segment], p_ddot, turn.as_rotvec() / (2.0 * _STENCIL_S))
 
 
-class _SoftTissue:
+class _MildTissue:
     """Soft-tissue rotation of a sensor of the mild preset: a mixture of specific force and rate, a slow wandering."""
 
     def __init__(self, rng: np.random.Generator, rms_deg: float) -> None:
@@ -192,6 +192,36 @@ class _SoftTissue:
         return self.gains[0] * follows + self.gains[1] * wanders
 
 
+class _Skin:
+    """What turns one sensor on its segment."""
+
+    def __init__(
+        self,
+        motion: BodyMotion,
+        segment: str,
+        imperfections: Imperfections,
+        rngs: Mapping[str, np.random.Generator],
+        start: JointRotations | None,
+    ) -> None:
+        """`start`: the joints in the start pose; None where soft tissue does not follow them."""
+        self.motion, self.segment, self.start = motion, segment, start
+        self.p_LS = motion.p_LS[segment]
+        self.mild = _MildTissue(rngs["soft_tissue"], imperfections.soft_tissue_deg)
+        place = -self.p_LS[2] / motion.lengths.get(segment, 1.0)
+        self.tissue = SoftTissue(segment, place, imperfections, rngs, motion.span[1])
+        self.moves = bool(self.mild.rms) or start is not None
+
+    def turn(self, sampled: _Sampled) -> tuple[_Moved, np.ndarray]:
+        """Return the segment's motion and the sensor's rotation vectors (n, 3) [rad] in L."""
+        moved = sampled.segment(self.segment, self.p_LS)
+        soft_L = self.mild(moved, self.motion.activity(sampled.time))
+        if self.start is not None and sampled.joints is not None:
+            accel_L = moved.R_WL.inv().apply(moved.p_ddot)
+            moving_time = self.motion.moving_time(sampled.time, self.segment)
+            soft_L = soft_L + self.tissue(sampled.time, moving_time, (sampled.joints, self.start), accel_L)
+        return moved, soft_L
+
+
 def simulate(
     lengths: Mapping[str, float],
     *,
@@ -218,7 +248,8 @@ def simulate(
         own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
     rate_hz : samples a second.
     noise : of gyroscope and accelerometer; `NOISE_FREE` for none.
-    imperfections : of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for usual ones.
+    imperfections : of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for a careful subject,
+        `PEOPLE_PRESET` for what the literature has.
     clasp_s : [s] duration of the clasp, palms together, at least 5.
     circles : number of circles, 0 or more.
     protocol : what is done in place of the clasp, one of `TASKS`; "handle": 0.4 m between the palms; "touch_left" and
@@ -274,13 +305,11 @@ def measure_motion(
     time = np.arange(n) / rate_hz
     N = Rotation.from_matrix([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # x_S to z_L, -z_S to x_L
 
-    stated_time = _Sampled(motion, time, joints=is_on(imperfections))
     sizes = imperfections
     own_clocks = any((sizes.clock_jitter, sizes.clock_offset, sizes.clock_drift_ppm))
     never_still = own_clocks or any((sizes.sway_deg_s, sizes.sway_tilt_deg, sizes.breath_deg, sizes.creep_deg))
-    by_joints = is_on(imperfections)
-    start = read_joints(motion(np.array([0.5 * STAND_S]), SEGMENTS)) if by_joints else None
-    duration = motion.span[1]
+    start = read_joints(motion(np.array([0.5 * STAND_S]), SEGMENTS)) if is_on(imperfections) else None
+    stated_time = _Sampled(motion, time, joints=start is not None)
     coarse_t = np.arange(*motion.span, 1.0 / _GAIN_RATE_HZ)
     coarse = _Sampled(motion, coarse_t) if imperfections.soft_tissue_deg else None
 
@@ -298,38 +327,21 @@ def measure_motion(
         if drift:
             own_time = own_time + drift * time
 
-        tissue = _SoftTissue(rngs["soft_tissue"], imperfections.soft_tissue_deg)
+        skin = _Skin(motion, segment, imperfections, rngs, start)
         if coarse is not None:
-            tissue.scale(coarse.segment(segment, p_LS), motion.activity(coarse_t))
+            skin.mild.scale(coarse.segment(segment, p_LS), motion.activity(coarse.time))
 
-        place = -p_LS[2] / motion.lengths.get(segment, 1.0)
-        strap = SoftTissue(segment, place, imperfections, rngs, duration)
-
-        def turn_sensor(
-            sampled: _Sampled,
-            segment: str = segment,
-            tissue: _SoftTissue = tissue,
-            strap: SoftTissue = strap,
-            p_LS: np.ndarray = p_LS,
-        ) -> tuple[_Moved, np.ndarray]:
-            moved = sampled.segment(segment, p_LS)
-            soft_L = tissue(moved, motion.activity(sampled.time))
-            if start is not None and sampled.joints is not None:
-                accel_L = moved.R_WL.inv().apply(moved.p_ddot)
-                moving_time = motion.moving_time(sampled.time, segment)
-                soft_L = soft_L + strap(sampled.time, moving_time, (sampled.joints, start), accel_L)
-            return moved, soft_L
-
-        sampled = _Sampled(motion, own_time, segment, joints=by_joints) if own_clocks else stated_time
-        moved, soft_L = turn_sensor(sampled)
+        sampled = _Sampled(motion, own_time, segment, joints=start is not None) if own_clocks else stated_time
+        moved, soft_L = skin.turn(sampled)
         # A product with the identity would not keep the last bit.
-        R_WS = (moved.R_WL * Rotation.from_rotvec(soft_L) if tissue.rms or by_joints else moved.R_WL) * R_LS
+        R_WS = (moved.R_WL * Rotation.from_rotvec(soft_L) if skin.moves else moved.R_WL) * R_LS
         rotvec = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec()
         rate_S = np.vstack((np.zeros(3), rotvec * rate_hz))  # static before the first sample
         if own_clocks:
             rate_S[1:] = rotvec / np.diff(own_time)[:, None]
         if never_still:  # a sample before the first one, for the rate that ends there
-            before, soft_before = turn_sensor(_Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment, joints=by_joints))
+            before_first = _Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment, joints=start is not None)
+            before, soft_before = skin.turn(before_first)
             R_before = before.R_WL * Rotation.from_rotvec(soft_before) * R_LS
             rate_S[0] = (R_before[0].inv() * R_WS[0]).as_rotvec() * rate_hz
         force_S = R_WS.inv().apply(moved.p_ddot + GRAVITY * E_Z)
