@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.calibration import assess, calibrate_lengths
 from wepose_pin.errors import WeposeError
 from wepose_pin.kinematics import compute_axis_std
+from wepose_pin.rotations import heading
 from wepose_pin.simulation import PRESETS, Person, Simulation, simulate, simulate_person
 from wepose_pin.subject import Subject, mount_rows
 from wepose_pin.tracking import TrackedRecording, track
@@ -25,21 +26,25 @@ CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "rig
 
 
 def measure_person(seed: int, preset: str, mount: str = "any", protocol: str = "clasp") -> dict[str, Any]:
-    """Errors [m, rad] and errors over standard deviations of a person, by quantity: lists of numbers."""
-    person = simulate_person(seed, preset=preset)
+    """Errors [m, rad] and standard deviations of a person, by quantity: lists of pairs."""
+    person = simulate_person(seed, 0.012 if preset == "people" else 0.003)
     simulation = simulate(
         person.lengths, seed=seed, imperfections=replace(PRESETS[preset], mount=mount), protocol=protocol
     )
+    return {"seed": seed, **measure_simulation(person, simulation, protocol)}
+
+
+def measure_simulation(person: Person, simulation: Simulation, protocol: str = "clasp") -> dict[str, Any]:
+    """As `measure_person`, of what was simulated."""
     recording = simulation.recording()
     try:
         calibration = calibrate_lengths(
             recording, measured=person.measured, prior=person.prior, measured_std=person.measured_std, protocol=protocol
         )
     except WeposeError as error:
-        return {"seed": seed, "error": str(error)}
+        return {"error": str(error)}
     tracked = track(recording, calibration.subject)
     return {
-        "seed": seed,
         "quality": assess(calibration).quality,
         **_compare_subject(calibration.subject, person, simulation),
         **_compare_pose(tracked, simulation),
@@ -54,37 +59,48 @@ def _compare_subject(subject: Subject, person: Person, simulation: Simulation) -
         error = sum(subject.lengths[name] - person.lengths[name] for name in names)
         arms.append((error, float(np.sqrt(subject.lengths_covariance(names).sum()))))
     tilts, headings = [], []
-    start = simulation.time <= simulation.phases["start"][0][1]
+    start, turn = _face_forward(simulation)
     for name, quat in simulation.quat_LS.items():
         R_LS = Rotation.from_quat(subject.mounts[name])
         tilt = (R_LS * Rotation.from_quat(quat).inv()).as_rotvec()[:2]
         # A mount's heading is relative to the start pose, however the person turned the segment in it.
-        heading = (R_LS * Rotation.from_quat(simulation.quat_WS[name][start]).mean().inv()).as_rotvec()[2]
+        R_WS_start = turn * Rotation.from_quat(simulation.quat_WS[name][start]).mean()
+        off = (R_LS * R_WS_start.inv()).as_rotvec()[2]
         std = [subject.std(row) for row in mount_rows(name)]
         tilts += list(zip(tilt, std[:2], strict=True))
-        headings.append((heading, std[2]))
+        headings.append((off, std[2]))
     return {"lengths": lengths, "whole arms": arms, "mounts, tilt": tilts, "mounts, heading": headings}
 
 
+def _face_forward(simulation: Simulation) -> tuple[np.ndarray, Rotation]:
+    """The samples of the start pose (n,) bool, and the turn of the simulation's W to where the torso faces in it."""
+    start = simulation.time <= simulation.phases["start"][0][1]
+    facing = float(heading(Rotation.from_quat(simulation.quat_WL["torso"][start]).mean().as_quat()))
+    return start, Rotation.from_rotvec([0.0, 0.0, -facing])
+
+
 def _compare_pose(tracked: TrackedRecording, simulation: Simulation) -> dict[str, Any]:
+    _, turn = _face_forward(simulation)
+    quat_WL = {name: (turn * Rotation.from_quat(quat)).as_quat() for name, quat in simulation.quat_WL.items()}
+    true_points = {name: turn.apply(p) for name, p in simulation.points.items()}
     begin, end = simulation.phases["circles"][0]
     rows = np.flatnonzero((tracked.time >= begin) & (tracked.time <= end))[::10]
     segments, points, out = [], {}, {}
-    for name, quat in simulation.quat_WL.items():
+    for name, quat in quat_WL.items():
         error = (Rotation.from_quat(tracked.quat_WL[name][rows]) * Rotation.from_quat(quat[rows]).inv()).as_rotvec()
         std = compute_axis_std(tracked.pose.segment_cov[name][rows])
         segments += list(zip(np.sqrt(np.mean(error**2, axis=1)), std, strict=True))
         out[f"segment {name}"] = list(zip(np.sqrt(np.mean(error**2, axis=1)), std, strict=True))
     for name in ("left_shoulder", "right_shoulder", "right_elbow", "right_palm"):
-        error = tracked.points[name][rows] - simulation.points[name][rows]
+        error = tracked.points[name][rows] - true_points[name][rows]
         std = compute_axis_std(tracked.pose.point_cov[name][rows])
         points[f"point {name}"] = list(zip(np.sqrt(np.mean(error**2, axis=1)), std, strict=True))
     middle = {
         source: 0.5 * (p["left_shoulder"][rows] + p["right_shoulder"][rows])
-        for source, p in (("estimated", tracked.points), ("true", simulation.points))
+        for source, p in (("estimated", tracked.points), ("true", true_points))
     }
     from_shoulders = (tracked.points["right_palm"][rows] - middle["estimated"]) - (
-        simulation.points["right_palm"][rows] - middle["true"]
+        true_points["right_palm"][rows] - middle["true"]
     )
     out["palm from shoulders"] = [(float(e), np.nan) for e in np.sqrt(np.mean(from_shoulders**2, axis=1))]
     return {"segments": segments, **points, **out}
@@ -95,7 +111,7 @@ def summarize(results: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     rows: dict[str, dict[str, float]] = {}
     good = [result for result in results if "error" not in result]
     for quantity in good[0] if good else ():
-        if quantity in ("seed", "quality"):
+        if not isinstance(good[0][quantity], list):
             continue
         # A person counts as one, however many samples: errors of a person's samples are alike.
         each = [np.array(result[quantity]) for result in good]

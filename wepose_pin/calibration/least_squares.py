@@ -30,7 +30,6 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import SEGMENT_ATTITUDE_STD
 from ..model.girdle import MEAN_RAISED, PARAMETERS, displace
 from ..model.reaches import UNIVERSE
 from .chain import about_z, inverse, product, rotate, small_turn
@@ -54,6 +53,7 @@ class Layout(NamedTuple):
     steps : the sensor of each heading step
     recorded : whether the samples hold a recorded place
     rigid : sensors without a soft-tissue artefact
+    attitude_std : [rad] of each sensor's orientation about an axis across its segment; only the ratios matter
     """
 
     lengths: tuple[str, ...]
@@ -66,6 +66,7 @@ class Layout(NamedTuple):
     steps: tuple[str, ...] = ()
     recorded: bool = False
     rigid: tuple[str, ...] = ()
+    attitude_std: tuple[float, ...] = ()
 
     @property
     def soft(self) -> tuple[str, ...]:
@@ -343,7 +344,8 @@ def _closure_residual(
             # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ).
             # Only the ratios of these weights matter here.
             if sensor != UNIVERSE:
-                covariance += SEGMENT_ATTITUDE_STD**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
+                std = layout.attitude_std[layout.sensors.index(sensor)]
+                covariance += std**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
         gaps.append(gap)
         covariances.append(covariance)
     if loop.kind == "plane":

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
 from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
-from ..model import BodyModel
+from ..model import BodyModel, Segment
 from ..model.start_pose import compute_start_configuration, orient_links
 from ..recording import Recording
 from ..subject import Subject
@@ -36,6 +36,8 @@ from .recorded import read_recorded_places
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
 MIN_SAMPLES = 10  # of each condition
+USUAL_ELEVATION = np.deg2rad(60.0)  # [rad] of arms, hands joined before the chest
+RIGID_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a link's orientation where nothing is soft; only ratios matter
 
 _T = TypeVar("_T")
 
@@ -206,6 +208,7 @@ class CalibrationProblem:
             protocol.distances,
             recorded=any(closure.kind == "recorded" for closure in protocol.closures),
             rigid=tuple(name for name in sensors if self.model.table.segments[name].soft_tissue_std == 0.0),
+            attitude_std=tuple(_estimate_attitude_std(self.model.table.segments[name]) for name in sensors),
         )
         losses = find_losses(recording, filtered.start, layout.sensors)
         # Only the linear start can estimate a heading step of any size.
@@ -263,3 +266,10 @@ class CalibrationProblem:
         unknown = [name for name in sensors if self.mount(name) is None]
         losses = find_losses(self.recording, self.filtered.start, sensors)
         check_start_pose(self.recording, losses, samples, unknown, self.model.table.reference, MIN_SAMPLES)
+
+
+def _estimate_attitude_std(segment: Segment) -> float:
+    """[rad] of a sensor's orientation about an axis across its segment while the arms are half raised."""
+    tissue = segment.soft_tissue
+    growth = USUAL_ELEVATION * np.hypot(tissue.per_tilt, tissue.per_raised)
+    return float(np.sqrt(np.mean(np.square(tissue.std) + growth**2))) or RIGID_ATTITUDE_STD
