@@ -30,7 +30,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..model.girdle import MEAN_RAISED, PARAMETERS, displace
+from ..model.girdle import PARAMETERS, displace
 from ..model.reaches import UNIVERSE
 from .chain import about_z, inverse, product, rotate, small_turn
 from .conditions import Constraint, GirdleTerm, HingeUnknown, Loop, Part, Pointing
@@ -337,8 +337,7 @@ def _closure_residual(
             if name in names:
                 law = layout.girdles[names.index(name)].law
                 gap += sign * _displace_girdle(layout, x, quat_WL, names.index(name))
-                left = np.square(law.residual_std) + np.square(MEAN_RAISED * np.array(law.residual_raised_std))
-                covariance += float(np.mean(left)) * ca.SX.eye(3)
+                covariance += float(np.mean(np.square(law.residual_std))) * ca.SX.eye(3)
         for sensor, v in orient_parts(layout, x, quat_WL, way):
             gap += v
             # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ).

@@ -30,6 +30,8 @@ def _print_pose(job: TrackJob, outcome: TrackOutcome) -> None:
     )
     if "joints" in summary:
         _print_joints(summary)
+    if job.error_budget:
+        _print_error_budget(summary["error_budget_mm"])
     print_diagnostics(outcome.page_failures)
     motion = "Motion" + (f", {rate_hz:.2g} frames a second" if rate_hz else "")
     pages = {"Report": "report.html"} if job.report else {}
@@ -65,6 +67,18 @@ def _print_joints(summary: Mapping[str, Any]) -> None:
             )
             for name, values in summary["joints"].items()
         ],
+    )
+
+
+def _print_error_budget(budget: Mapping[str, Mapping[str, float]]) -> None:
+    parts = list(dict.fromkeys(part for point in budget.values() for part in point))
+    print_table(
+        "Error budget: one standard deviation of an axis [mm], root mean square over the recording",
+        ("part", *budget),
+        [
+            (part, *(f"{point[part]:.1f}" if part in point else "" for point in budget.values())) for part in parts
+        ]
+        + [("all", *(f"{sum(value**2 for value in point.values()) ** 0.5:.1f}" for point in budget.values()))],
     )
 
 

@@ -55,6 +55,9 @@ class TrackJob:
         is an error.
     covariance
         Write the covariance of each orientation and point too, not only the standard deviations.
+    error_budget
+        Print what each part is worth in the standard deviation of each point: soft tissue, sensors with their mounts and
+        start poses, lengths, the shoulder girdle. summary.json and report.html have it in any case.
     limits
         Keep joints with one or two axes within the limits of the model.
     torques
@@ -81,6 +84,7 @@ class TrackJob:
     open_loop: bool = False
     gaps: bool = False
     covariance: bool = False
+    error_budget: bool = False
     limits: bool = True
     torques: bool = False
     view: bool = True

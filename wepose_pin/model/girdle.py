@@ -45,7 +45,7 @@ class Girdle(NamedTuple):
     law_std : of the share by which a person's law is more or less
     rest_std, raised_std : (3,) [m] of a person's other parameters, one standard deviation
     alike : correlation of both sides' law and place at rest
-    residual_std, residual_raised_std : (3,) [m] by which the point leaves law and parameters, at rest and per s
+    residual_std : (3,) [m] by which the point leaves law and parameters
     """
 
     on: str
@@ -63,7 +63,6 @@ class Girdle(NamedTuple):
     raised_std: tuple[float, ...] = (0.0, 0.0, 0.0)
     alike: float = 0.0
     residual_std: tuple[float, ...] = (0.0, 0.0, 0.0)
-    residual_raised_std: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     @property
     def parameter_std(self) -> np.ndarray:
@@ -118,10 +117,10 @@ class GirdleMotion(NamedTuple):
 
     def residual_covariance(self, girdle: Girdle) -> np.ndarray:
         """(n, 3) [m²] in the frame of `on`, by which the point leaves law and parameters."""
-        rest, raised = np.square(girdle.residual_std), np.square(girdle.residual_raised_std)
+        var = np.tile(np.square(girdle.residual_std), (len(self.raised), 1))
         if not self.is_known:  # what the law would have said is not known either
-            raised = raised + np.square((girdle.back[1], girdle.middle[0], girdle.up[0]))
-        return rest + self.raised[:, None] ** 2 * raised
+            var += self.raised[:, None] ** 2 * np.square((girdle.back[1], girdle.middle[0], girdle.up[0]))
+        return var
 
 
 def move_girdles(

@@ -656,7 +656,7 @@ def _read_hinges(top: TomlTable, table: BodyTable) -> dict[str, HingeJoint]:
 def _read_girdles(top: TomlTable, table: BodyTable) -> dict[str, Girdle]:
     girdles = {}
     for name, entry in _read_tables(top, "girdles"):
-        spreads = ("rest_std_mm", "raised_std_mm", "residual_std_mm", "residual_raised_std_mm")
+        spreads = ("rest_std_mm", "raised_std_mm", "residual_std_mm")
         law = ("up_mm", "middle_mm", "back_mm", "back_angle_deg")
         entry.allow("on", "moves", "joints", "outward", *law, "scaled_by", "scale", "law_std", "alike", *spreads)
         if name not in table.points:
@@ -682,7 +682,7 @@ def _read_girdles(top: TomlTable, table: BodyTable) -> dict[str, Girdle]:
         girdles[name] = Girdle(
             *(on, moves, (joints[0], joints[1], joints[2]), (x, y, z)),
             *((up[0], up[1]), (middle[0], middle[1]), (back[0], back[1]), float(np.deg2rad(angle))),
-            *(scaled_by, scale or 1.0, law_std, stds[0], stds[1], alike, stds[2], stds[3]),
+            *(scaled_by, scale or 1.0, law_std, stds[0], stds[1], alike, stds[2]),
         )
     return girdles
 
@@ -863,7 +863,7 @@ def format_table(table: BodyTable, urdf: str) -> str:
         lines.append(f"outward = {toml_string(axes[girdle.outward])}")
         lines += [
             f"{key}_mm = {np.round(1e3 * np.array(getattr(girdle, key)), 6).tolist()}"
-            for key in ("up", "middle", "back", "rest_std", "raised_std", "residual_std", "residual_raised_std")
+            for key in ("up", "middle", "back", "rest_std", "raised_std", "residual_std")
         ]
         lines.append(f"back_angle_deg = {np.degrees(girdle.back_angle):.6g}")
         lines += [f"scaled_by = {toml_string(girdle.scaled_by)}"] if girdle.scaled_by else []

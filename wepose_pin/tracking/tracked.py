@@ -20,6 +20,7 @@ from ..model.start_pose import compute_start_configuration
 from ..recording import Recording
 from ..subject import Subject, population_subject
 from .headings import HeadingCorrection
+from .error_budget import ErrorBudget
 from .options import TrackOptions
 
 MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment
@@ -108,6 +109,7 @@ class SummaryAccumulator:
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
         self._ranges: dict[str, tuple[float, float]] = {}  # joint of a mechanism → least and largest value [rad or m]
         self._later: list[Diagnostic] = []  # of reading later chunks than the first
+        self._error_budget = ErrorBudget()
 
     @property
     def last(self) -> TrackedRecording:
@@ -141,6 +143,7 @@ class SummaryAccumulator:
         for joint, values in tracked.joints.items():
             low, high = self._ranges.get(joint, (np.inf, -np.inf))
             self._ranges[joint] = min(low, float(values.min())), max(high, float(values.max()))
+        self._error_budget.add(tracked)
         self._last = tracked
 
     def summary(self) -> dict[str, Any]:
@@ -178,6 +181,10 @@ class SummaryAccumulator:
             "orientation_residual_rms_deg": {name: round(float(np.degrees(v)), 3) for name, v in residual_rms.items()},
             **self._summarize_joints(),
             "heading_correction": _correction_json(last.correction),
+            "error_budget_mm": {
+                point: {part: round(1e3 * std, 1) for part, std in parts.items()}
+                for point, parts in self._error_budget.summarize().items()
+            },
             "diagnostics": [as_json(diagnostic) for diagnostic in self.diagnostics()],
         }
 
