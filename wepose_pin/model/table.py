@@ -712,6 +712,8 @@ def format_table(table: BodyTable, urdf: str) -> str:
         ):
             lines.append(f"{key} = {np.degrees(value):.6g}")
     for name, joints in table.poses.items():
+        if name == NEUTRAL_POSE and not joints:
+            continue  # reading adds it
         lines += ["", f"[poses.{toml_key(name)}]"]
         lines += [f"{toml_key(joint)} = {value!r}" for joint, value in joints.items()]
     lines += ["", "[pairs]"]

@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # it loads scipy.signal, which few results need
 
 
 JOINTS = "joints.parquet"
+SUBJECT_URDF = "subject.urdf"
 
 
 def write_result(
@@ -107,9 +108,9 @@ def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
     comment = re.sub(
         "-(?=-)", "- ", f"{subject.name}: lengths in metres ± one standard deviation. {text}"
     )  # no -- in XML
-    (folder / "subject.urdf").write_text(f"{head}\n<!-- {comment} -->\n{body}", encoding="utf-8")
+    (folder / SUBJECT_URDF).write_text(f"{head}\n<!-- {comment} -->\n{body}", encoding="utf-8")
     if _strip_origin(model.table) != _strip_origin(load_table()):
-        (folder / MODEL_TABLE).write_text(format_table(model.table, "subject.urdf"), encoding="utf-8")
+        (folder / MODEL_TABLE).write_text(format_table(model.table, SUBJECT_URDF), encoding="utf-8")
 
 
 def _strip_origin(table: BodyTable) -> BodyTable:
@@ -137,7 +138,7 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
         raise BadData(f"{summary_file}: is damaged, no JSON: {error}") from error
     if not isinstance(summary, dict):
         raise BadData(f"{summary_file}: is damaged: {str(summary)[:40]!r} in place of an object")
-    return pose, load_model(folder / "subject.urdf"), summary
+    return pose, load_model(folder / SUBJECT_URDF), summary
 
 
 def _read_joints(file: Path, samples: int) -> dict[str, np.ndarray]:
