@@ -13,12 +13,13 @@ from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from .. import __version__
+from ..angles.torques import Torques, torque_table
 from ..errors import BadData, ExistingOutput, MissingFile
 from ..kinematics import Pose, build_pose_table, parse_pose_table
 from ..model import BodyModel, BodyTable, load_model, load_table
@@ -26,10 +27,6 @@ from ..model.table import MODEL_TABLE, format_table
 from ..readers.tables import read_table
 from ..subject import Subject, subject_toml
 from ..tracking import TrackedRecording
-
-if TYPE_CHECKING:  # it loads scipy.signal, which few results need
-    from ..angles.torques import Torques
-
 
 JOINTS = "joints.parquet"
 SUBJECT_URDF = "subject.urdf"
@@ -53,8 +50,6 @@ def write_result(
         write_table(folder / JOINTS, build_joint_table(tracked.pose))
     summary = tracked.summary()
     if torques is not None:
-        from ..angles.torques import torque_table
-
         write_table(folder / "torques.parquet", torque_table(torques))
         summary["torques"] = torques.summary()
     write_about(folder, tracked, summary, phases, provenance)
