@@ -39,8 +39,8 @@ class Program(NamedTuple):
 
     Parameters
     ----------
-    operations : (k, 4) our code, place of the result, places of one or two arguments; of an input and an output which one
-        it is, and which of its entries
+    operations : (k, 4) our code, place of the result, places of one or two arguments; of an input and an output also
+        which one it is, and which of its entries
     constants : (k,) of operations that give one
     results : length of each output
     places : of intermediate values
