@@ -7,41 +7,58 @@ import numpy as np
 import pytest
 
 from wepose_pin.calibration.blocks import BLOCK, evaluate, make_program
-from wepose_pin.calibration.conditions import StartPose, find_hinges, find_twists, resolve_conditions
-from wepose_pin.calibration.least_squares import Layout, _residual_function
-from wepose_pin.calibration.protocols import PROTOCOLS, load_protocol
+from wepose_pin.calibration.least_squares import _residual_function, residuals
+from wepose_pin.calibration.priors import build_prior
+from wepose_pin.calibration.problem import CalibrationProblem
+from wepose_pin.calibration.protocols import load_protocol
+from wepose_pin.filters.sensors import filter_recording
 from wepose_pin.model import load_model
+from wepose_pin.simulation import simulate, simulate_person
 
-SENSORS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+
+@pytest.mark.parametrize("name", ["clasp", "handle", "touch_left", "poses"])
+def test_residuals_and_jacobians_are_bit_identical(name: str) -> None:
+    person = simulate_person(3)
+    recording = simulate(person.lengths, seed=3, clasp_s=20.0, circles=0, protocol=name).recording()
+    filtered = filter_recording(recording)
+    problem = CalibrationProblem(recording, filtered, load_protocol(name), person.prior, {}, load_model())
+    observations, _ = problem.observe()
+    assert len(observations) % BLOCK
+    x = build_prior(problem, observations).mean + np.random.default_rng(0).normal(
+        scale=0.01, size=observations.layout.size
+    )
+    r, J, gaps = residuals(x, observations)
+    for condition, span in observations.spans():
+        function = _residual_function(observations.layout, condition, 0)
+        for k in range(span.start, span.stop):
+            expected = [np.asarray(result) for result in function(x, observations.data[:, k])]
+            for result, value in zip((r[k], J[k].T, gaps[k]), expected, strict=True):
+                np.testing.assert_array_equal(result, value.reshape(result.shape))
 
 
-@pytest.mark.parametrize("name", [name for name in PROTOCOLS if name != "tip"])  # that is of a robot's arm
-def test_every_protocols_residuals_and_jacobians_are_bit_identical(name: str) -> None:
-    model, protocol, start = load_model(), load_protocol(name), StartPose({})
-    conditions = resolve_conditions(protocol, model, start, SENSORS)
-    hinges, twists = find_hinges(model, start, SENSORS), find_twists(model, start, SENSORS)
-    points = {kind: sum(closure.kind == kind for closure in protocol.closures) for kind in ("fixed_point", "plane")}
-    layout = Layout(tuple(model.lengths), SENSORS, hinges, twists, *points.values(), protocol.distances, ("torso",))
-    rng, n = np.random.default_rng(0), 2 * BLOCK + 1
-    quats = rng.normal(size=(len(SENSORS), 4, n))
-    turns = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).reshape(-1, n)
-    data = np.vstack([turns, rng.integers(0, 2, size=(1, n)), rng.uniform(0.0, 60.0, size=(1, n))])
-    x = rng.normal(scale=0.2, size=layout.size)
-    x[layout.length] = list(model.lengths.values())
-    for condition in conditions:
-        function = _residual_function(layout, condition, 0)
-        program = make_program(function)
-        for samples in (1, BLOCK - 1, BLOCK, n):
-            results = evaluate(program, x, data[:, :samples])
-            for k in {0, samples // 2, samples - 1}:
-                for result, expected in zip(results, function(x, data[:, k]), strict=True):
-                    np.testing.assert_array_equal(result[k], np.asarray(expected).ravel(order="F"))
+@pytest.mark.parametrize("samples", [1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK])
+def test_any_number_of_samples(samples: int) -> None:
+    x, data = ca.SX.sym("x", 2), ca.SX.sym("data", 3)
+    program = make_program(ca.Function("sum", [x, data], [x[0] * data + x[1], data[2]]))
+    rows = np.random.default_rng(0).normal(size=(3, samples))
+    first, second = evaluate(program, np.array([2.0, 3.0]), rows)
+    np.testing.assert_array_equal(first, (2.0 * rows + 3.0).T)
+    np.testing.assert_array_equal(second, rows[2:].T)
+
+
+def test_operations_and_their_derivatives_are_bit_identical() -> None:
+    x, data = ca.SX.sym("x", 3), ca.SX.sym("data", 2)
+    angle = ca.fmin(ca.atan2(x[0] * data[0], -data[1]), x[2])
+    values = ca.vertcat(-x[0] / data[0], 1.0 / x[0], 2.0 * x[1], 0.0, ca.exp(-angle / x[2]), ca.sqrt(x[0] ** 2 + angle))
+    function = ca.Function("all", [x, data], [values, ca.densify(ca.jacobian(values, x))])
+    rows, at = np.random.default_rng(0).uniform(0.1, 2.0, size=(2, 200)), np.array([0.7, 1.3, 2.2])
+    results = evaluate(make_program(function), at, rows)
+    for k in range(200):
+        for result, expected in zip(results, function(at, rows[:, k]), strict=True):
+            np.testing.assert_array_equal(result[k], np.asarray(expected).ravel(order="F"))
 
 
 def test_an_operation_that_is_not_known_is_an_error() -> None:
-    x, data = ca.SX.sym("x", 2), ca.SX.sym("data", 1)
-    known = ca.Function("known", [x, data], [ca.vertcat(-x[0] / x[1], 1.0 / x[0], 2.0 * x[1], 0.0, data)])
-    [result] = evaluate(make_program(known), np.array([3.0, 4.0]), np.array([[5.0, 6.0]]))
-    np.testing.assert_array_equal(result, [[-0.75, 1.0 / 3.0, 8.0, 0.0, 5.0], [-0.75, 1.0 / 3.0, 8.0, 0.0, 6.0]])
+    x, data = ca.SX.sym("x"), ca.SX.sym("data")
     with pytest.raises(NotImplementedError, match="operation"):
         make_program(ca.Function("unknown", [x, data], [ca.tanh(x)]))

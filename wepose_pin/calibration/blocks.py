@@ -14,7 +14,8 @@ import numpy as np
 from ..compilation import kernel
 
 BLOCK = 128  # samples, whose intermediate values stay in the processor's cache
-_CONST, _INPUT, _OUTPUT, _ADD, _SUB, _MUL, _DIV, _NEG, _SQ, _TWICE, _INV, _SQRT, _SIN, _COS = range(14)
+_CONST, _INPUT, _OUTPUT, _ADD, _SUB, _MUL, _DIV, _NEG, _SQ, _TWICE, _INV = range(11)
+_SQRT, _SIN, _COS, _EXP, _ATAN2, _FMIN, _LE, _NOT = range(11, 19)
 # CasADi's own codes may change with its version, and what is compiled is kept.
 _CODES: dict[int, int] = {
     ca.OP_CONST: _CONST,
@@ -31,6 +32,11 @@ _CODES: dict[int, int] = {
     ca.OP_SQRT: _SQRT,
     ca.OP_SIN: _SIN,
     ca.OP_COS: _COS,
+    ca.OP_EXP: _EXP,
+    ca.OP_ATAN2: _ATAN2,
+    ca.OP_FMIN: _FMIN,
+    ca.OP_LE: _LE,
+    ca.OP_NOT: _NOT,
 }
 
 
@@ -136,6 +142,21 @@ def _evaluate(
             elif code == _COS:
                 for s in range(n):
                     work[i, s] = np.cos(work[j, s])
+            elif code == _EXP:
+                for s in range(n):
+                    work[i, s] = np.exp(work[j, s])
+            elif code == _ATAN2:
+                for s in range(n):
+                    work[i, s] = np.arctan2(work[j, s], work[m, s])
+            elif code == _FMIN:
+                for s in range(n):
+                    work[i, s] = min(work[j, s], work[m, s])
+            elif code == _LE:
+                for s in range(n):
+                    work[i, s] = 1.0 if work[j, s] <= work[m, s] else 0.0
+            elif code == _NOT:
+                for s in range(n):
+                    work[i, s] = 0.0 if work[j, s] else 1.0
             elif code == _CONST:
                 for s in range(n):
                     work[i, s] = constants[k]
