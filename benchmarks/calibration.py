@@ -17,8 +17,9 @@ import numpy as np
 from scipy import optimize
 
 from wepose_pin.calibration import least_squares, solver
+from wepose_pin.calibration.blocks import evaluate, make_program
 from wepose_pin.calibration.contact import find_contact_start
-from wepose_pin.calibration.least_squares import Observations, evaluate_into, residuals
+from wepose_pin.calibration.least_squares import Observations, residuals
 from wepose_pin.calibration.priors import build_prior
 from wepose_pin.calibration.problem import SAMPLE_RATE_HZ, CalibrationProblem
 from wepose_pin.calibration.protocols import load_protocol
@@ -167,7 +168,7 @@ def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Tab
         notes=[
             "Processor time of all threads, medians; no compiler. Memory: by how much a new process grows at most.",
             "least_squares: trf, scaled by the Jacobian, default tolerances. Whole: search for a start, all rounds of",
-            "weights, the last solve, without the filters. Building: CasADi's functions, once for a number of samples.",
+            "weights, the last solve, without the filters. Building: CasADi's functions, once.",
         ],
     )
     for posed, calibrate in pose_problems(made.recording(), person, rates_hz):
@@ -201,11 +202,10 @@ def pose_problems(
 
 
 def building(posed: Posed) -> float:
-    """Seconds that CasADi's functions take to build, once for a number of samples."""
-    least_squares._residual_function.cache_clear()
-    least_squares._mapped_residuals.cache_clear()
+    """Seconds that CasADi's functions take to build, once."""
+    least_squares._residual_program.cache_clear()
     observations, begin = posed.problem.observations, time.perf_counter()
-    least_squares._mapped_residuals(observations.layout, observations.conditions[0], 0, len(observations))
+    least_squares._residual_program(observations.layout, observations.conditions[0], 0)
     return time.perf_counter() - begin
 
 
@@ -214,16 +214,14 @@ def solvers(posed: Posed) -> dict[str, Callable[[], float]]:
     problem, start = posed.problem, posed.start
     observations, prior, weights = problem.observations, problem.prior, problem.weights
     root_w, root_prior = np.sqrt(weights), np.linalg.cholesky(prior.information).T
-    n, m = len(weights), len(prior.mean)
+    m = len(prior.mean)
     sample = least_squares._residual_function(observations.layout, observations.conditions[0], 0)
     one = [ca.SX.sym("x", m), ca.SX.sym("data", observations.data.shape[0])]
-    alone = ca.Function("alone", one, sample(*one)[:1])  # without the Jacobian that `residuals` gives as well
-    x, data = ca.MX.sym("x", m), ca.MX.sym("data", *observations.data.shape)
-    every = ca.Function("all", [x, data], [alone.map(n)(ca.repmat(x, 1, n), data)])
-    columns, r = np.ascontiguousarray(observations.data.T), np.empty((n, 5))
+    # Without the Jacobian that `residuals` gives as well.
+    alone = make_program(ca.Function("alone", one, sample(*one)[:1]))
 
     def value(x: np.ndarray) -> np.ndarray:
-        evaluate_into(every, (np.ascontiguousarray(x), columns), (r,))
+        (r,) = evaluate(alone, x, observations.data)
         return np.concatenate(((root_w * r).ravel(), root_prior @ (x - prior.mean)))
 
     def slope(x: np.ndarray) -> np.ndarray:

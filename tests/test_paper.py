@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ from wepose_pin.cli import main
 from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadOption, BadSession, NoSolution
 from wepose_pin.model import load_model
-from wepose_pin.recording import OrientationSensor, Recording
+from wepose_pin.model.table import NEUTRAL_POSE
+from wepose_pin.recording import CONFIGURATION, OrientationSensor, Recording
 from wepose_pin.report.track_diagnostics import describe_heading_remedy
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.subject import load_subject
@@ -205,13 +207,22 @@ def test_what_it_needs_is_said(options: dict[str, Any], said: str, made: tuple[P
         calibrate_lengths(made[2], **({"formulation": "paper"} | options))
 
 
+@pytest.mark.parametrize("start_pose", ["t_pose", CONFIGURATION])
+def test_another_start_pose_is_refused(start_pose: str, made: tuple[Person, Simulation, Recording]) -> None:
+    """Its orientations are relative to the start pose: in the T-pose they would be those of other arms."""
+    recording = replace(made[2], start_pose=start_pose)
+    said = f"start_pose = '{start_pose}'; record a start in n_pose, or use --formulation full"
+    with pytest.raises(BadOption, match=re.escape(said)):
+        calibrate_lengths(recording, measured={"shoulder_width": 0.4}, formulation="paper")
+
+
 def test_a_hand_with_a_sensor_fixes_the_scale_and_one_without_does_not() -> None:
     clasp = load_protocol("clasp")
-    check_paper_formulation(clasp, load_model(), ["left_hand"], [*SENSORS, "left_hand"])
-    check_paper_formulation(clasp, load_model(), ["left_forearm", "left_hand"], SENSORS)
+    check_paper_formulation(clasp, load_model(), ["left_hand"], [*SENSORS, "left_hand"], NEUTRAL_POSE)
+    check_paper_formulation(clasp, load_model(), ["left_forearm", "left_hand"], SENSORS, NEUTRAL_POSE)
     for measured in (["left_hand"], ["left_forearm", "right_hand"], ["trunk"]):
         with pytest.raises(BadOption, match="fixes the scale"):
-            check_paper_formulation(clasp, load_model(), measured, SENSORS)
+            check_paper_formulation(clasp, load_model(), measured, SENSORS, NEUTRAL_POSE)
 
 
 def test_every_mount_must_be_stated(made: tuple[Person, Simulation, Recording]) -> None:

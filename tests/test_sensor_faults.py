@@ -21,7 +21,7 @@ from wepose_pin.readers.session import SessionReader
 from wepose_pin.readers.trials import read_broad
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.recording.clocks import build_clock
-from wepose_pin.recording.faults import find_faults, scan_sensor
+from wepose_pin.recording.faults import SensorScan, find_faults, scan_sensor
 from wepose_pin.recording.plausibility import check_signals
 from wepose_pin.simulation import NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.tracking import TrackOptions, track, track_session
@@ -259,6 +259,45 @@ def test_a_signal_that_stops_in_quiet_work_is_found_by_its_own_noise(signal: str
     coarse = {f"{signal}_S": digit * np.round(getattr(quiet, f"{signal}_S") / digit)}
     coarse = replace(made.recording().imus[BROKEN], **coarse)
     assert BROKEN not in find_faults({BROKEN: scan_sensor(time, coarse.gyro_S, coarse.accel_S)})
+
+
+def gated(recording: Recording, zone_deg_s: float, by_axis: bool) -> Recording:
+    """Gyroscopes that take off their bias and have a dead zone: rates below it are zero."""
+    sensors = {}
+    for name, sensor in recording.imus.items():
+        rate = sensor.gyro_S - sensor.gyro_S[recording.span((0.5, 4.5))].mean(axis=0)
+        small = np.abs(rate) < np.deg2rad(zone_deg_s)
+        sensors[name] = replace(sensor, gyro_S=np.where(small if by_axis else small.all(axis=1)[:, None], 0.0, rate))
+    return replace(recording, sensors={**recording.sensors, **sensors})
+
+
+@pytest.mark.parametrize("by_axis", [False, True])
+@pytest.mark.parametrize("zone_deg_s", [0.3, 1.0])
+def test_a_dead_zone_is_no_fault(zone_deg_s: float, by_axis: bool, made: Simulation) -> None:
+    """Zeros at rest, for seconds, from a gyroscope that shows noise as soon as it moves."""
+    recording = gated(made.recording(), zone_deg_s, by_axis)
+    scans = {n: scan_sensor(recording.time, imu.gyro_S, imu.accel_S) for n, imu in recording.imus.items()}
+    assert any(scan.long_runs(axis) for scan in scans.values() for axis in ("gyro", *AXES[:3]))
+    assert find_faults(scans) == {}
+    # Once the accelerometer moves they are.
+    assert found(stopped(recording, "gyro", 9.0, value=0.0)) == {BROKEN: [("gyro", 9.0)]}
+
+
+def test_a_sensor_with_a_dead_zone_that_lies_still_beside_one_that_moves_measures(made: Simulation) -> None:
+    recording = gated(made.recording(), 0.3, False)
+    rows = np.random.default_rng(0).standard_normal((len(recording), 3))
+    lying = with_sensor(recording, BROKEN, gyro_S=np.zeros_like(rows), accel_S=[0.0, 0.0, 9.81] + 0.03 * rows)
+    assert found(lying) == {}
+    tilt = np.clip(0.02 * (recording.time - 5.0), 0.0, None)  # 0.02 rad/s about y
+    force = 9.81 * np.stack([-np.sin(tilt), np.zeros_like(tilt), np.cos(tilt)], axis=1)
+    assert found(with_sensor(lying, BROKEN, accel_S=force + 0.03 * rows)) == {BROKEN: [("gyro", -0.0)]}
+    # The same by blocks that are shorter than what the force is averaged over.
+    scans = {name: SensorScan() for name in recording.sensors}
+    for name, sensor in lying.imus.items():
+        for first in range(0, len(lying), 64):
+            rows = np.column_stack([sensor.gyro_S, sensor.accel_S])[first : first + 64]
+            scans[name].push(lying.time[first : first + 64], rows)
+    assert find_faults(scans) == {}
 
 
 @pytest.mark.parametrize("bias_deg", [0.0, 4.9, 5.1])

@@ -133,7 +133,12 @@ def check_covariance(place: str, matrices: np.ndarray) -> None:
     known = matrices[np.isfinite(matrices).all(axis=(-2, -1))]
     scale = np.max(np.abs(known), axis=(-2, -1), initial=0.0)
     skew = np.max(np.abs(known - np.swapaxes(known, -2, -1)), axis=(-2, -1), initial=0.0)
-    if (skew > 1e-6 * scale).any() or (np.linalg.eigvalsh(known) < -1e-6 * scale[..., None]).any():
+    wrong = bool((skew > 1e-6 * scale).any())
+    try:  # faster than eigenvalues
+        np.linalg.cholesky(known + (1e-6 * scale + 1e-300)[..., None, None] * np.eye(known.shape[-1]))
+    except np.linalg.LinAlgError:
+        wrong = True
+    if wrong:
         raise BadData(f"{place} is not symmetric and positive semidefinite")
 
 

@@ -302,6 +302,8 @@ def compute_orientation_residuals(
         limited = [
             name for name, chain in model.chains.items() if name in quat_WL and (name in fitted or not chain.exact)
         ]
+    if not limited:
+        return {}
     R_WL, _ = compute_link_poses(model, q, limited)
     R_model = {segment: Rotation.from_matrix(R_WL[:, k]) for k, segment in enumerate(limited)}
     return {segment: (R_model[segment].inv() * Rotation.from_quat(quat_WL[segment])).magnitude() for segment in limited}

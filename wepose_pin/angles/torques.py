@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import polars as pl
-from scipy.signal import butter, sosfiltfilt
 
 from ..errors import BadData, BadModel, BadOption
+from ..filters.butterworth import low_pass
 from ..rotations import unwrap_signs
 from ..tracking import TrackedRecording
 
@@ -95,7 +95,7 @@ def joint_torques(
     pad = min(len(time) - 1, max(10, round(rate_hz)))
     if pad < 10:
         raise BadData(f"{len(time)} samples are too few for torques; at least 11 are needed")
-    smooth = sosfiltfilt(butter(2, cutoff_hz, fs=rate_hz, output="sos"), _unwrap(model, q), axis=0, padlen=pad)
+    smooth = low_pass(_unwrap(model, q), cutoff_hz, rate_hz, pad)
     q = np.array([pin.normalize(model, row) for row in smooth])
     v, a = derivatives(model, q, rate_hz)
     data = model.createData()

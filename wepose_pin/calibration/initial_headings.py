@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import qmc
 
 from ..model.reaches import UNIVERSE
 from .conditions import Constraint, Level, Loop, Part, Pointing
@@ -195,6 +194,8 @@ def _find_minima(
     observations: Observations, known_x: np.ndarray, known: Mapping[str, float], nearer: int
 ) -> np.ndarray:
     """Headings and log sizes (`nearer`, 2 m) at the minima that the best of many starts reach, the lowest first."""
+    from scipy.stats import qmc  # takes half a second to load, and is seldom needed
+
     sensors, layout = observations.layout.sensors, observations.layout
     m = len(sensors)
     # Of each way of a closure: it, Q (m, n, 3, 3), u (m, 3) each sensor's part, what does not move (3,), or less the

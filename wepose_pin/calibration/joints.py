@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
+from ..filters.butterworth import band_pass, low_pass
 from ..filters.sensors import FilteredRecording
 from ..recording import Recording
 from .least_squares import Gaussian, Layout
@@ -106,13 +106,12 @@ def add_couplings(prior: Gaussian, layout: Layout, couplings: Sequence[Coupling]
 def _joint_forces(recording: Recording, filtered: FilteredRecording, name: str, samples: np.ndarray) -> np.ndarray:
     """(n, 3, 4) in V: specific force, and what a lever of 1 m along each axis of the sensor adds to the joint's."""
     sensor, rate_hz = recording.imus[name], recording.rate_hz
-    smooth = butter(2, min(RATE_HZ, 0.4 * rate_hz), fs=rate_hz, output="sos")
-    gyro_S = sosfiltfilt(smooth, _interpolate_missing(sensor.gyro_S), axis=0)
+    gyro_S = low_pass(_interpolate_missing(sensor.gyro_S), min(RATE_HZ, 0.4 * rate_hz), rate_hz)
     turning_S = np.gradient(gyro_S, 1.0 / rate_hz, axis=0)
     columns = [_interpolate_missing(sensor.accel_S)]
     columns += [-(np.cross(turning_S, axis) + np.cross(gyro_S, np.cross(gyro_S, axis))) for axis in np.eye(3)]
-    band = butter(2, BAND_HZ, "band", fs=rate_hz, output="sos")
-    return np.stack([sosfiltfilt(band, filtered.R_VS[name].apply(c), axis=0)[samples] for c in columns], axis=2)
+    forces_V = [band_pass(filtered.R_VS[name].apply(column), BAND_HZ, rate_hz) for column in columns]
+    return np.stack([force_V[samples] for force_V in forces_V], axis=2)
 
 
 def _interpolate_missing(values: np.ndarray) -> np.ndarray:

@@ -32,6 +32,7 @@ from scipy.spatial.transform import Rotation
 
 from ..model.girdle import PARAMETERS, displace
 from ..model.reaches import UNIVERSE
+from .blocks import Program, evaluate, make_program
 from .chain import about_z, inverse, product, rotate, small_turn
 from .conditions import Constraint, GirdleTerm, HingeUnknown, Loop, Part, Pointing
 
@@ -207,11 +208,9 @@ def residuals(x: np.ndarray, observations: Observations) -> tuple[np.ndarray, np
     """Residuals (n, k), their Jacobian (n, k, len(x)), gaps (n, 3) [m], which are zero without a closure."""
     parts, k = [], observations.layout.residuals
     for (condition, span), place in zip(observations.spans(), _unknown_places(observations.conditions), strict=True):
-        n = span.stop - span.start
-        r, J, gap = np.empty((n, k)), np.empty((n, len(x), k)), np.empty((n, 3))
-        inputs = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(observations.data[:, span].T, dtype=float)
-        evaluate_into(_mapped_residuals(observations.layout, condition, place, n), inputs, (r, J, gap))
-        parts.append((r, np.ascontiguousarray(J.swapaxes(1, 2)), gap))
+        program = _residual_program(observations.layout, condition, place)
+        r, J, gap = evaluate(program, x, observations.data[:, span])
+        parts.append((r, J.reshape(-1, k, len(x)), gap))
     if len(parts) == 1:
         return parts[0]
     r, J, gap = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -229,19 +228,6 @@ def _unknown_places(conditions: Sequence[Constraint]) -> list[int]:
     return places
 
 
-def evaluate_into(function: Any, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-    """Evaluate a CasADi function from contiguous arrays into others; a row of an array is a column of CasADi's.
-
-    CasADi's own matrices would double the time.
-    """
-    buffer, evaluate = function.buffer()
-    for i, array in enumerate(arguments):
-        buffer.set_arg(i, array.data)
-    for i, array in enumerate(results):
-        buffer.set_res(i, array.data)
-    evaluate()
-
-
 def place_points(x: np.ndarray, observations: Observations) -> np.ndarray:
     """The same x with each unknown point and height at the mean of the body's points."""
     layout = observations.layout
@@ -257,15 +243,12 @@ def place_points(x: np.ndarray, observations: Observations) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def _mapped_residuals(layout: Layout, condition: Constraint, place: int, n: int) -> Any:
-    x, data = ca.MX.sym("x", layout.size), ca.MX.sym("data", layout.rows, n)
-    r, J, gap = _residual_function(layout, condition, place).map(n)(ca.repmat(x, 1, n), data)
-    return ca.Function("samples", [x, data], [r, J, gap])
+def _residual_program(layout: Layout, condition: Constraint, place: int) -> Program:
+    return make_program(_residual_function(layout, condition, place))
 
 
-@lru_cache(maxsize=32)
 def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any:
-    """CasADi function of a sample: (x, data) → residuals (k), Jacobian (k, len(x)), gap (3)."""
+    """CasADi function of a sample: (x, data) → residuals (k), transposed Jacobian (len(x), k), gap (3)."""
     sensors = layout.sensors
     x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", layout.rows)
     heading, tilt, drift, soft_tissue = x[layout.heading], x[layout.tilt], x[layout.drift], x[layout.soft_tissue]
@@ -296,7 +279,7 @@ def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any
         level = rotate(quat_WL[condition.segment], ca.DM(condition.axis))[2]
         whitened = ca.vertcat(level / condition.std, 0.0, 0.0)
     r = ca.cse(ca.vertcat(whitened, hinges))
-    return ca.Function("sample", [x, data], ca.cse([r, ca.densify(ca.jacobian(r, x)), ca.densify(gap)]))
+    return ca.Function("sample", [x, data], ca.cse([r, ca.densify(ca.jacobian(r, x)).T, ca.densify(gap)]))
 
 
 _UP = ca.vertcat(0.0, 0.0, 1.0)

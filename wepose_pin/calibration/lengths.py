@@ -128,7 +128,7 @@ def calibrate_lengths(
     prior.check_body(table)
     _check_measured(with_std, protocol, model)
     if formulation == "paper":
-        check_paper_formulation(protocol, model, with_std, recording.sensors)
+        check_paper_formulation(protocol, model, with_std, recording.sensors, recording.start_pose)
     for condition in protocol.conditions:
         recording.phase(condition.phase)
     filtered = filter_recording(recording, method=method, sways=not table.is_mechanism)

@@ -33,6 +33,7 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, NoSolution, one_of
 from ..model import BodyModel
 from ..model.start_pose import orient_links
+from ..model.table import NEUTRAL_POSE
 from ..subject import Subject
 from .anatomy import LabelCheck
 from .chain import rotate
@@ -52,15 +53,21 @@ DECIMALS = 9  # of a length's effect on the chain, by which lengths that rotate 
 
 
 def check_paper_formulation(
-    protocol: Protocol, model: BodyModel, measured: Collection[str], sensors: Collection[str]
+    protocol: Protocol, model: BodyModel, measured: Collection[str], sensors: Collection[str], start_pose: str
 ) -> None:
-    """Check that the protocol has the paper's closure, and that a measured length fixes the scale.
+    """Check that the recording starts in the N-pose, the protocol has the paper's closure, and the scale is measured.
 
     Raises
     ------
     BadOption
-        It has another condition than points that coincide, or no such length is measured.
+        The start pose is another, some condition is none of points that coincide, or no measured length fixes the
+        scale.
     """
+    if start_pose != NEUTRAL_POSE:
+        raise BadOption(
+            f"formulation 'paper' takes orientations from the N-pose on, and the recording has start_pose = "
+            f"'{start_pose}'; record a start in {NEUTRAL_POSE}, or use --formulation full"
+        )
     if not all(isinstance(c, Closure) and c.kind == "coincide" for c in protocol.conditions):
         raise BadOption(
             f"formulation 'paper' needs a protocol in which points of the body coincide and nothing else is asked, "

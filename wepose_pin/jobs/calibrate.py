@@ -129,18 +129,18 @@ def run_calibrate(
         What the session, the protocol or an option lacks.
     """
     from ..calibration import assess, calibrate_lengths, load_protocol
-    from ..documents import whole_folder
     from ..model.body import load_sensed_model
     from ..readers import load_session
     from ..report import write_calibration_page
     from ..subject import population_subject
     from ..writers.calibration import write_calibration
+    from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance
     from ..writers.result import write_subject
 
     job.check()
     protocol = load_protocol(job.protocol)
-    with whole_folder(job.out, job.force) as folder:
+    with result_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
         recording = load_session(job.session, gaps=job.gaps)
         model = load_sensed_model(job.model or recording.model or None, recording.sensors, recording.where())

@@ -142,16 +142,16 @@ def run_track(
 
 
 def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
-    from ..documents import whole_folder
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
     from ..report import write_track_pages
     from ..subject import load_subject, parse_subject
     from ..tracking import track
     from ..writers import write_result
+    from ..writers.folder import result_folder
 
     method, causal = job.method or BEST, job.causal
-    with whole_folder(job.out, job.force) as folder:
+    with result_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
         subject = load_subject(job.subject) if job.subject else None
         if is_live_log(job.session):
@@ -178,8 +178,6 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
 
             torques = pose_torques(tracked)
         write_result(folder, tracked, job.covariance, recording.phases, torques, _provenance_of(job, provenance))
-        written = {file.name for file in folder.iterdir()}
-    _remove_outdated(job.out, written)
     failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 2 / 3)
@@ -189,7 +187,6 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
 
 def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
     """In a memory that does not grow with the recording."""
-    from ..documents import whole_folder
     from ..filters import BEST
     from ..readers.session import SessionReader
     from ..report import write_decimated_pages
@@ -198,8 +195,9 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
     from ..subject import load_subject
     from ..tracking import TrackOptions, track_session
     from ..writers.chunks import ChunkWriter
+    from ..writers.folder import result_folder
 
-    with whole_folder(job.out, job.force) as folder:
+    with result_folder(job.out, job.force) as folder:
         progress("reading the times", 0.0)
         subject = load_subject(job.subject) if job.subject else None
         reader = SessionReader(job.session, gaps=job.gaps, in_memory=False)
@@ -213,29 +211,15 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
         progress("writing the result", 1.0)
         writer.finish(reader.phases, _provenance_of(job, provenance))
         summary = writer.accumulator.summary()
-        written = {file.name for file in folder.iterdir()}
-    _remove_outdated(job.out, written)
     view_rate_hz = min(30.0, MOST_FRAMES / max(summary["duration_s"], 1e-3))
     failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 1.0)
         diagnostics = [from_json(each) for each in summary["diagnostics"]]
         failures = write_decimated_pages(
-            job.out, decimator, reader.phases, diagnostics, report=job.report, fps=view_rate_hz
+            job.out, decimator, reader.phases, diagnostics, view=job.view, report=job.report, fps=view_rate_hz
         )
-    if not job.view:
-        (job.out / "view.html").unlink(missing_ok=True)
     return TrackOutcome(summary, failures, view_rate_hz)
-
-
-def _remove_outdated(out: Path, written: set[str]) -> None:
-    """Remove what an earlier run on another body left: it would be read with this result."""
-    from ..model.table import MODEL_TABLE
-    from ..writers.result import JOINTS
-
-    for name in (MODEL_TABLE, JOINTS):
-        if name not in written:
-            (out / name).unlink(missing_ok=True)
 
 
 def _provenance_of(job: TrackJob, stated: Mapping[str, Any] | None) -> Mapping[str, Any]:

@@ -869,6 +869,8 @@ def format_table(table: BodyTable, urdf: str) -> str:
         lines += [f"scaled_by = {toml_string(girdle.scaled_by)}"] if girdle.scaled_by else []
         lines += [f"scale = {girdle.scale!r}", f"law_std = {girdle.law_std!r}", f"alike = {girdle.alike!r}"]
     for name, joints in table.poses.items():
+        if name == NEUTRAL_POSE and not joints:
+            continue  # reading adds it
         lines += ["", f"[poses.{toml_key(name)}]"]
         lines += [f"{toml_key(joint)} = {value!r}" for joint, value in joints.items()]
     lines += ["", "[pairs]"]

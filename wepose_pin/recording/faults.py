@@ -9,6 +9,9 @@ a fault where it contradicts physics, or where the sensor is noisy whenever it d
 - a constant rate, or a constant force, where the noise that this signal has elsewhere makes so many repetitions
   improbable.
 
+Some gyroscopes report exactly zero at rest: their firmware has a dead zone. Zeros while the specific force shows no
+motion are therefore no fault.
+
 A single axis may be constant during motion about another axis. It is a fault where
 
 - the noise of the other axes makes so many repetitions improbable; or
@@ -20,7 +23,7 @@ The scan works block by block, so that a recording in chunks has the same faults
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 from typing import NamedTuple
 
@@ -43,6 +46,10 @@ STUCK_S = 1.0  # [s] the same for rate or force alone, or for one axis
 # While accel is constant: rate [rad/s] at which gyro tilts it, above any bias, and total tilt [rad].
 TIPS, TIPPED = 0.2, 1.0
 MOVES = 2.0  # [m/s²] change of accel on an axis that proves motion
+# A gyroscope with a dead zone reports zero [rad/s]; at rest the mean force over some time [s] is constant to [m/s²],
+# a degree of tilt. Noise is some 0.05 m/s² a sample.
+ZERO_RATE = 1e-4
+REST_WINDOW_S, REST_FORCE = 0.5, 0.2
 # Noise reverses at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
 TURNS_BACK, TURNS_BACK_HZ = 0.3, 15.0
 NOISY_S = 1.5  # [s] of noise that prove a sensor to be noisy
@@ -96,6 +103,8 @@ class _Run:
     value: np.ndarray  # (6,) gyro and accel of the first row
     low: np.ndarray  # (3,) of accel
     high: np.ndarray  # (3,)
+    mean_low: np.ndarray  # (3,) of accel's means over `REST_WINDOW_S`
+    mean_high: np.ndarray  # (3,)
     tipped: float  # [rad], ∫ |gyro × up|
     up_off: float  # [rad] change of up by the whole sensor; 0: not computed
     distinct: int  # rows in which other axes of the signal differ from the row before
@@ -103,14 +112,27 @@ class _Run:
 
     def join(self, after: _Run) -> _Run:
         """Join this run and the one after it, which have one row in common."""
-        low, high = np.minimum(self.low, after.low), np.maximum(self.high, after.high)
-        rows, tipped = self.rows + after.rows - 1, self.tipped + after.tipped
-        up_off, distinct = max(self.up_off, after.up_off), self.distinct + after.distinct
-        return _Run(rows, self.first, after.last, self.value, low, high, tipped, up_off, distinct, self.first_row)
+        return replace(
+            self,
+            rows=self.rows + after.rows - 1,
+            last=after.last,
+            low=np.minimum(self.low, after.low),
+            high=np.maximum(self.high, after.high),
+            mean_low=np.minimum(self.mean_low, after.mean_low),
+            mean_high=np.maximum(self.mean_high, after.mean_high),
+            tipped=self.tipped + after.tipped,
+            up_off=max(self.up_off, after.up_off),
+            distinct=self.distinct + after.distinct,
+        )
 
     @property
     def seconds(self) -> float:
         return self.last - self.first
+
+    def rests(self, name: str) -> bool:
+        """Return whether gyro, or this axis of it, reports zero while accel shows no motion."""
+        zero = np.abs(self.value[_SIGNALS[name]]).max() < ZERO_RATE
+        return bool(name.startswith("gyro") and zero and 0.0 <= np.max(self.mean_high - self.mean_low) < REST_FORCE)
 
     @property
     def tips(self) -> float:
@@ -314,8 +336,17 @@ def _make_run(rows: np.ndarray, name: str, first_row: bool) -> _Run:
     if name in _AXES:
         signal = rows[:, 1:4] if name.startswith("gyro") else rows[:, 4:]
         up_off, distinct = _compute_up_change(rows), int(np.count_nonzero((np.diff(signal, axis=0) != 0.0).any(axis=1)))
-    value = rows[0, 1:].copy()
-    return _Run(len(rows), float(time[0]), float(time[-1]), value, low, high, tipped, up_off, distinct, first_row)
+    value, means = rows[0, 1:].copy(), _average_force(time[1:], accel)
+    mean_low, mean_high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
+    ends = float(time[0]), float(time[-1])
+    return _Run(len(rows), *ends, value, low, high, mean_low, mean_high, tipped, up_off, distinct, first_row)
+
+
+def _average_force(time: np.ndarray, accel: np.ndarray) -> np.ndarray:
+    """Compute the mean specific forces (m, 3) over the complete windows of `REST_WINDOW_S`."""
+    window = np.floor((time - time[0]) / REST_WINDOW_S).astype(int)
+    edges = np.flatnonzero(np.diff(window, prepend=-1))  # of windows that hold samples; the last one is not complete
+    return np.add.reduceat(accel, edges)[:-1] / np.diff(edges)[:, None]
 
 
 def _compute_up_change(rows: np.ndarray) -> float:
@@ -355,7 +386,7 @@ def find_faults(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
             dead = scan.constant("gyro") and not scan.constant("accel") and noisy[name]
             dead &= any(not scans[other].constant("gyro") for other in others)
             stuck = dead or np.max(run.high - run.low) > MOVES or run.rows * improbable["gyro"] > IMPROBABLE
-            if stuck and not _is_within(run, whole):
+            if stuck and not run.rests("gyro") and not _is_within(run, whole):
                 faults.append(_make_fault("gyro", run))
         for run in scan.long_runs("accel"):
             stuck = (run.tipped > TIPPED and run.tips > TIPS) or run.rows * improbable["accel"] > IMPROBABLE
@@ -368,7 +399,8 @@ def find_faults(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
             for run in scan.long_runs(signals):
                 stuck = run.distinct * repeats > IMPROBABLE or run.up_off > UP_OFF
                 # A constant value at the end of the range is saturation.
-                if stuck and abs(run.value[axis]) < limit and not _is_within(run, whole):
+                saturated = abs(run.value[axis]) >= limit
+                if stuck and not saturated and not run.rests(signals) and not _is_within(run, whole):
                     faults.append(_make_fault(signals, run))
         if faults:
             all_faults[name] = sorted(faults, key=lambda fault: fault.first)

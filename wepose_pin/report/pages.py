@@ -61,6 +61,7 @@ def write_decimated_pages(
     phases: Mapping[str, Intervals],
     diagnostics: Sequence[Diagnostic],
     *,
+    view: bool = True,
     report: bool = True,
     fps: float = 30.0,
 ) -> list[Diagnostic]:
@@ -72,4 +73,4 @@ def write_decimated_pages(
         writer.diagnostics.append(page_incomplete(" and ".join(PAGES), f"cannot be made: {reason(error)}"))
         writer.save_diagnostics("summary.json")
         return writer.diagnostics
-    return write_track_pages(folder, pose, report=report, totals=totals, fps=fps)
+    return write_track_pages(folder, pose, view=view, report=report, totals=totals, fps=fps)

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline, interp1d
-from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import BadData, WrongOption
+from ..filters.butterworth import low_pass
 from ..kinematics import Pose, compute_axis_std
 from ..model import BodyTable, Limb, load_table
 from .maps import SIDES
@@ -206,9 +206,9 @@ def _smooth(measured: _MeasuredArm, arm: Arm, smoothing_hz: float) -> HandPath:
     rotation = Slerp(t, measured.rotation[known])(np.clip(time, t[0], t[-1]))
     rate_hz = (len(time) - 1) / (time[-1] - time[0])
     if 0.0 < smoothing_hz < 0.45 * rate_hz and len(time) > 30:
-        low = butter(2, smoothing_hz, fs=rate_hz, output="sos")
-        offset, upper = sosfiltfilt(low, offset, axis=0), sosfiltfilt(low, upper, axis=0)
-        matrices = sosfiltfilt(low, rotation.as_matrix().reshape(-1, 9), axis=0)
+        offset, upper, matrices = (
+            low_pass(values, smoothing_hz, rate_hz) for values in (offset, upper, rotation.as_matrix().reshape(-1, 9))
+        )
         rotation = Rotation.from_matrix(_nearest_rotations(matrices))
     poorness = np.clip((measured.std - STD_GOOD) / (STD_POOR - STD_GOOD), 0.0, 1.0)
     weight = 1.0 - (1.0 - WEIGHT_POOR) * poorness**2 * (3.0 - 2.0 * poorness)

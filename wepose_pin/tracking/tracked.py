@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -71,12 +72,13 @@ class TrackedRecording:
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """What the user should know."""
-        return self._accumulated().diagnostics()
+        return self._accumulated.diagnostics()
 
     def summary(self) -> dict[str, Any]:
         """The content of ``summary.json``: inputs, options and results."""
-        return self._accumulated().summary()
+        return self._accumulated.summary()
 
+    @cached_property
     def _accumulated(self) -> SummaryAccumulator:
         accumulator = SummaryAccumulator()
         accumulator.add(self)

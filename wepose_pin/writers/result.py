@@ -13,12 +13,13 @@ from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from .. import __version__
+from ..angles.torques import Torques, torque_table
 from ..errors import BadData, ExistingOutput, MissingFile
 from ..kinematics import Pose, build_pose_table, parse_pose_table
 from ..model import BodyModel, BodyTable, load_model, load_table
@@ -27,11 +28,8 @@ from ..readers.tables import read_table
 from ..subject import Subject, subject_toml
 from ..tracking import TrackedRecording
 
-if TYPE_CHECKING:  # it loads scipy.signal, which few results need
-    from ..angles.torques import Torques
-
-
 JOINTS = "joints.parquet"
+SUBJECT_URDF = "subject.urdf"
 
 
 def write_result(
@@ -52,8 +50,6 @@ def write_result(
         write_table(folder / JOINTS, build_joint_table(tracked.pose))
     summary = tracked.summary()
     if torques is not None:
-        from ..angles.torques import torque_table
-
         write_table(folder / "torques.parquet", torque_table(torques))
         summary["torques"] = torques.summary()
     write_about(folder, tracked, summary, phases, provenance)
@@ -107,9 +103,9 @@ def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
     comment = re.sub(
         "-(?=-)", "- ", f"{subject.name}: lengths in metres ± one standard deviation. {text}"
     )  # no -- in XML
-    (folder / "subject.urdf").write_text(f"{head}\n<!-- {comment} -->\n{body}", encoding="utf-8")
+    (folder / SUBJECT_URDF).write_text(f"{head}\n<!-- {comment} -->\n{body}", encoding="utf-8")
     if _strip_origin(model.table) != _strip_origin(load_table()):
-        (folder / MODEL_TABLE).write_text(format_table(model.table, "subject.urdf"), encoding="utf-8")
+        (folder / MODEL_TABLE).write_text(format_table(model.table, SUBJECT_URDF), encoding="utf-8")
 
 
 def _strip_origin(table: BodyTable) -> BodyTable:
@@ -137,7 +133,7 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
         raise BadData(f"{summary_file}: is damaged, no JSON: {error}") from error
     if not isinstance(summary, dict):
         raise BadData(f"{summary_file}: is damaged: {str(summary)[:40]!r} in place of an object")
-    return pose, load_model(folder / "subject.urdf"), summary
+    return pose, load_model(folder / SUBJECT_URDF), summary
 
 
 def _read_joints(file: Path, samples: int) -> dict[str, np.ndarray]:

@@ -1,0 +1,148 @@
+"""A result in a folder that holds an earlier result, or files of the user: `--force` deletes and replaces only ours."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from wepose_pin.errors import ExistingOutput
+from wepose_pin.jobs.calibrate import CalibrateJob, run_calibrate
+from wepose_pin.jobs.track import TrackJob, run_track
+from wepose_pin.model import load_model
+from wepose_pin.model.table import format_table, load_table
+from wepose_pin.simulation import simulate, simulate_person
+from wepose_pin.subject import population_subject
+from wepose_pin.writers import write_session
+from wepose_pin.writers.folder import result_folder
+from wepose_pin.writers.result import write_subject
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("session")
+    person = simulate_person(5)
+    write_session(folder, simulate(person.lengths, seed=5, clasp_s=10.0, circles=0).recording("session"))
+    return folder
+
+
+def calibrate(session: Path, out: Path) -> None:
+    run_calibrate(CalibrateJob(session, out, report=False, force=True))
+
+
+def track(session: Path, out: Path) -> None:
+    run_track(TrackJob(session, out, view=False, report=False, force=True))
+
+
+def track_in_chunks(session: Path, out: Path) -> None:
+    run_track(TrackJob(session, out, view=False, report=False, force=True, chunk_seconds=5.0))
+
+
+WRITERS = pytest.mark.parametrize("write", [calibrate, track, track_in_chunks])
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def put_earlier_result(out: Path, name: str) -> None:
+    """A result on another body, which has joints of one axis."""
+    body = load_model("whole_body")
+    write_subject(out, population_subject(body=body), body)
+    (out / name).write_text('{"joints": {"elbow": {}}}', encoding="utf-8")
+    pl.DataFrame({"time": [0.0], "elbow": [0.1]}).write_parquet(out / "joints.parquet")
+
+
+@WRITERS
+def test_the_body_of_an_earlier_result_does_not_stay(
+    write: Callable[[Path, Path], None], session: Path, tmp_path: Path
+) -> None:
+    """It would be read with the new subject."""
+    put_earlier_result(tmp_path, "summary.json")
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    assert "left_thigh" in load_model(tmp_path / "subject.urdf").table.segments
+    write(session, tmp_path)
+    assert not (tmp_path / "model.toml").exists()
+    assert not (tmp_path / "joints.parquet").exists()
+    assert (tmp_path / "notes.txt").read_text(encoding="utf-8") == "mine"
+    assert "left_thigh" not in load_model(tmp_path / "subject.urdf").table.segments
+
+
+def test_the_body_of_an_earlier_calibration_does_not_stay(session: Path, tmp_path: Path) -> None:
+    put_earlier_result(tmp_path, "calibration.json")
+    (tmp_path / "joints.parquet").unlink()
+    calibrate(session, tmp_path)
+    assert not (tmp_path / "model.toml").exists()
+
+
+@WRITERS
+@pytest.mark.parametrize("name", ["model.toml", "joints.parquet"])
+def test_a_file_of_the_user_is_neither_deleted_nor_replaced(
+    name: str, write: Callable[[Path, Path], None], session: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "model.toml").write_text(format_table(load_table("whole_body"), "subject.urdf"), encoding="utf-8")
+    pl.DataFrame({"time": [0.0], "wrist": [0.1]}).write_parquet(tmp_path / "joints.parquet")
+    (tmp_path / ({"model.toml", "joints.parquet"} - {name}).pop()).unlink()
+    before = contents(tmp_path)
+    with pytest.raises(ExistingOutput, match=rf"{name}: is no file of an earlier result.* name another folder by -o$"):
+        write(session, tmp_path)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda out: (out / "model.toml").write_text((out / "model.toml").read_text() + "# mine\n"),
+        lambda out: (out / "model.toml").write_text("urdf ="),
+        lambda out: (out / "joints.parquet").write_text("mine"),
+        lambda out: (out / "summary.json").write_text("{"),
+        lambda out: (out / "summary.json").write_text("[]"),
+        lambda out: (out / "summary.json").unlink(),
+        lambda out: (out / "session.toml").write_text('model = "model.toml"'),
+        lambda out: (out / "session.toml").write_text('[data]\nfile = "./joints.parquet"'),
+    ],
+)
+def test_what_is_no_longer_as_the_result_wrote_it_is_the_users(spoil: Callable[[Path], None], tmp_path: Path) -> None:
+    put_earlier_result(tmp_path, "summary.json")
+    with result_folder(tmp_path, force=True):
+        pass
+    put_earlier_result(tmp_path, "summary.json")
+    spoil(tmp_path)
+    before = contents(tmp_path)
+    with pytest.raises(ExistingOutput, match="is no file of an earlier result"), result_folder(tmp_path, force=True):
+        pass
+    assert contents(tmp_path) == before
+
+
+@WRITERS
+def test_what_a_session_in_the_folder_needs_is_not_replaced(
+    write: Callable[[Path, Path], None], session: Path, tmp_path: Path
+) -> None:
+    """A result may lie beside the session that it is made from, under other names."""
+    for file in session.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    write(tmp_path, tmp_path)
+    write(tmp_path, tmp_path)
+    assert {"session.toml", "recording.parquet", "subject.toml"} <= set(contents(tmp_path))
+    (tmp_path / "me.toml").write_text('urdf = "subject.urdf"\nlike = "upper_body"\n', encoding="utf-8")
+    text = (session / "session.toml").read_text(encoding="utf-8")
+    (tmp_path / "session.toml").write_text(f'model = "me.toml"\n{text}', encoding="utf-8")
+    before = contents(tmp_path)
+    with pytest.raises(ExistingOutput, match=r"subject\.urdf: is an input of .*session\.toml, and would be replaced"):
+        write(tmp_path, tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_a_page_of_the_user_stays_where_none_is_wanted(session: Path, tmp_path: Path) -> None:
+    (tmp_path / "view.html").write_text("mine", encoding="utf-8")
+    track_in_chunks(session, tmp_path)
+    assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"
+    run_track(TrackJob(session, tmp_path, view=False, force=True, chunk_seconds=5.0))
+    assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"
+    assert "Noise" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["samples"] > 0
+    assert np.isfinite(pl.read_parquet(tmp_path / "pose.parquet")["torso_qw"].to_numpy()).all()
