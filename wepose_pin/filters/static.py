@@ -4,6 +4,11 @@ Conditions (1) to (4) of Lisini Baldi 2019 bound how much gyro and accel vary, a
 varies nothing: an office chair passes them, and a filter that reads the gyroscope's bias in static phases takes the
 chair's rate for it. Condition (5), ours, compares the mean rate about the vertical with the known bias: that of the
 start phase, then of each accepted static phase. Rotation about horizontal axes turns gravity in S, which (2) detects.
+
+(1) to (4) compare samples with the noise of samples, which grows with the rate of sampling, so that at 1 kHz the start
+of a smooth motion hides in it three times as long as at 100 Hz, 0.13 s in the paper's dynamic experiment: a filter takes
+that motion for bias. Condition (6), ours, compares the mean gyro of the window's newest part with that of the window. The
+noise of these means does not depend on the rate of sampling.
 """
 
 from __future__ import annotations
@@ -45,6 +50,9 @@ DETECTOR = np.dtype(
         ("accel_limit", float, 6),
         ("norm_variance", float),
         ("norm_error", float),
+        # condition (6)
+        ("newest", np.int64),  # samples of the newest part
+        ("rate_change", float, 3),  # [rad/s] its mean gyro off the window's, at most
         # condition (5): the known bias
         ("bias", float, 3),  # [rad/s]
         ("bias_var", float),  # [rad²/s²]
@@ -65,10 +73,11 @@ _UPPER = np.triu_indices(3)
 class StaticTest:
     """When a sensor counts as static; the defaults of (1) to (4) are the paper's, which leaves the window open.
 
-    The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite. Condition (5) is ours, and
-    ``rate_stds=inf`` leaves the paper's test alone. It holds for the window and for an average over `averaging_s`, in
-    which sway cancels; the standard deviation is that of the known bias, which grows by `bias_walk`, of the mean's
-    noise and sway as measured in the start phase, and of `bias_spread`.
+    The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite. Conditions (5) and (6) are
+    ours, and ``rate_stds=inf`` leaves the paper's test alone. (5) holds for the window and for an average over
+    `averaging_s`, in which sway cancels; the standard deviation is that of the known bias, which grows by `bias_walk`,
+    of the mean's noise and sway as measured in the start phase, and of `bias_spread`. (6) holds for each axis; the
+    standard deviation is that of the noise and sway of the start phase.
     """
 
     window_s: Annotated[float, Range(0.0, closed=False, high=60.0)] = 0.5  # [s] W
@@ -76,7 +85,9 @@ class StaticTest:
     beta: NonNegative = 2.0  # (2) accel/g covariance against that of the static phase
     gamma1: NonNegative = 0.01  # (3) |mean ‖accel/g‖ − 1| at most
     gamma2: NonNegative = 0.01  # (4) variance of ‖accel/g‖ at most
-    rate_stds: float = 3.0  # (5) standard deviations by which the rate about the vertical may be off the known bias
+    # standard deviations by which (5) the rate about the vertical may be off the known bias, (6) the rate may change
+    rate_stds: float = 3.0
+    newest_s: Positive = 0.05  # [s] of (6)'s newest part: about the fastest that a smooth motion begins
     averaging_s: Positive = 4.0  # [s] of (5)'s average, about two periods of a standing person's sway
     # [rad/s] by which the bias depends on how the sensor lies; 0.01 deg/s, twice what BROAD's sensors show at rest
     bias_spread: NonNegative = float(np.deg2rad(0.01))
@@ -143,10 +154,16 @@ class StaticDetector:
 def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> StaticState:
     """The state of one detector before its first sample."""
     n = test.samples(rate_hz)
+    newest = max(1, round(test.newest_s * rate_hz))
     dt, window_s = 1.0 / rate_hz, n / rate_hz
     white, sway = np.trace(noise.gyro_cov) / 3.0 / n, 0.0
+    half_second = np.zeros(3)
     if noise.gyro_half_second_cov is not None:
-        sway = np.trace(noise.gyro_half_second_cov) / 3.0 * BLOCK_S / window_s
+        half_second = np.diag(noise.gyro_half_second_cov)
+        sway = half_second.mean() * BLOCK_S / window_s
+    rate_change = np.full(3, np.inf)  # where the newest part is the window
+    if newest < n and np.isfinite(test.rate_stds):
+        rate_change = test.rate_stds * np.sqrt(np.diag(noise.gyro_cov) * (1.0 / newest - 1.0 / n) + half_second)
     detector = np.zeros(1, DETECTOR)
     values = {
         "inverse_gravity": 1.0 / noise.gravity,
@@ -154,6 +171,8 @@ def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> Static
         "accel_limit": (n - 1) * test.beta * noise.accel_cov[_UPPER],
         "norm_error": test.gamma1,
         "norm_variance": (n - 1) * test.gamma2,
+        "newest": min(newest, n),
+        "rate_change": rate_change,
         "bias": noise.gyro_bias,
         "bias_var": np.trace(noise.gyro_bias_cov) / 3.0,
         "squared_stds": test.rate_stds**2,
@@ -234,11 +253,27 @@ def _is_within(limit, sums, tail_sums, products, tail_products, share):  # type:
 
 
 @inlined
+def _rate_is_steady(detector, block, at, gx, gy, gz):  # type: ignore[no-untyped-def]
+    """Condition (6) for a window of mean rate g that ends with sample `at` of the block."""
+    n, newest = len(block), detector.newest
+    x = y = z = 0.0
+    for back in range(newest):
+        k = at - back
+        if k < 0:
+            k += n
+        x += block[k, 0] - gx
+        y += block[k, 1] - gy
+        z += block[k, 2] - gz
+    limit = detector.rate_change
+    return abs(x) <= newest * limit[0] and abs(y) <= newest * limit[1] and abs(z) <= newest * limit[2]
+
+
+@inlined
 def _bias_agrees(detector, window, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
     """Condition (5) for a window of mean rate g and mean specific force a; learns the bias.
 
-    `window`: its length in samples where it passes (1) to (4); 0 where it does not: the average fades and the known
-    bias ages.
+    `window`: its length in samples where it passes (1) to (4) and (6); 0 where it does not: the average fades and the
+    known bias ages.
     """
     bias = detector.bias
     detector.bias_var += detector.walk_var
@@ -299,12 +334,16 @@ def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[
             detector.accel_limit, head.accel, rest.accel, head.accel_products, rest.accel_products, share
         )  # (2)
     )
+    gx = anchor[0] + (head.gyro[0] + rest.gyro[0]) * share
+    gy = anchor[1] + (head.gyro[1] + rest.gyro[1]) * share
+    gz = anchor[2] + (head.gyro[2] + rest.gyro[2]) * share
+    static = static and _rate_is_steady(detector, block, at, gx, gy, gz)  # (6)
     return _bias_agrees(
         detector,
         n if static else 0,
-        anchor[0] + (head.gyro[0] + rest.gyro[0]) * share,
-        anchor[1] + (head.gyro[1] + rest.gyro[1]) * share,
-        anchor[2] + (head.gyro[2] + rest.gyro[2]) * share,
+        gx,
+        gy,
+        gz,
         anchor[3] + (head.accel[0] + rest.accel[0]) * share,
         anchor[4] + (head.accel[1] + rest.accel[1]) * share,
         anchor[5] + (head.accel[2] + rest.accel[2]) * share,
