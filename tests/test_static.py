@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import run_filter
@@ -257,20 +258,21 @@ def test_the_start_of_a_smooth_motion_is_not_static(rate_hz: float) -> None:
     assert late[PaperTest()] > (0.12 if rate_hz > 500.0 else 0.0)
 
 
-def test_condition_6_is_what_it_says() -> None:
+@pytest.mark.parametrize("sway", [None, 1e-7 * np.diag([1.0, 2.0, 0.5])])
+def test_condition_6_is_what_it_says(sway: np.ndarray | None) -> None:
     gyro, accel = stop_and_go(np.random.default_rng(9))
     noise = estimate_noise(gyro[:500], accel[:500], RATE)
     # Condition (5) is left out by a bias without bounds.
-    unknown = replace(noise, gyro_bias_cov=1e6 * np.eye(3))
+    unknown = replace(noise, gyro_bias_cov=1e6 * np.eye(3), gyro_half_second_cov=sway)
     found = StaticDetector(unknown, RATE, StaticTest(bias_spread=1e3)).run(gyro, accel)
     paper = by_the_book(gyro, accel, noise, PaperTest(), RATE)
-    half_second = np.diag(noise.gyro_half_second_cov)
-    limit = 3.0 * np.sqrt(np.diag(noise.gyro_cov) * (1 / 5 - 1 / 50) + half_second)
+    inverse = np.linalg.inv(noise.gyro_cov * (1 / 5 - 1 / 50) + (0.0 if sway is None else sway))
+    bound = chi2.ppf(chi2.cdf(9.0, 1), 3)
     steady = np.zeros(len(gyro), dtype=bool)
     for k in range(49, len(gyro)):
         change = gyro[k - 4 : k + 1].mean(axis=0) - gyro[k - 49 : k + 1].mean(axis=0)
-        steady[k] = (np.abs(change) <= limit).all()
-    assert (paper & ~steady).sum() > 20
+        steady[k] = change @ inverse @ change <= bound
+    assert (paper & ~steady).sum() > 10
     np.testing.assert_array_equal(found, paper & steady)
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
+from scipy.special import gammainc, gammaincinv
 
 from ..arguments import NonNegative, Positive, Range, check_fields
 from ..compilation import inlined, kernel
@@ -52,7 +53,7 @@ DETECTOR = np.dtype(
         ("norm_error", float),
         # condition (6)
         ("newest", np.int64),  # samples of the newest part
-        ("rate_change", float, 3),  # [rad/s] its mean gyro off the window's, at most
+        ("rate_change", float, 6),  # [s²/rad²] dᵀ M d ≤ 1 for the change d of the mean gyro; M zero: no condition
         # condition (5): the known bias
         ("bias", float, 3),  # [rad/s]
         ("bias_var", float),  # [rad²/s²]
@@ -76,8 +77,8 @@ class StaticTest:
     The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite. Conditions (5) and (6) are
     ours, and ``rate_stds=inf`` leaves the paper's test alone. (5) holds for the window and for an average over
     `averaging_s`, in which sway cancels; the standard deviation is that of the known bias, which grows by `bias_walk`,
-    of the mean's noise and sway as measured in the start phase, and of `bias_spread`. (6) holds for each axis; the
-    standard deviation is that of the noise and sway of the start phase.
+    of the mean's noise and sway as measured in the start phase, and of `bias_spread`. (6) is an ellipsoid of noise and
+    sway of the start phase, as probable as that many standard deviations of one axis.
     """
 
     window_s: Annotated[float, Range(0.0, closed=False, high=60.0)] = 0.5  # [s] W
@@ -157,13 +158,8 @@ def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> Static
     newest = max(1, round(test.newest_s * rate_hz))
     dt, window_s = 1.0 / rate_hz, n / rate_hz
     white, sway = np.trace(noise.gyro_cov) / 3.0 / n, 0.0
-    half_second = np.zeros(3)
     if noise.gyro_half_second_cov is not None:
-        half_second = np.diag(noise.gyro_half_second_cov)
-        sway = half_second.mean() * BLOCK_S / window_s
-    rate_change = np.full(3, np.inf)  # where the newest part is the window
-    if newest < n and np.isfinite(test.rate_stds):
-        rate_change = test.rate_stds * np.sqrt(np.diag(noise.gyro_cov) * (1.0 / newest - 1.0 / n) + half_second)
+        sway = np.trace(noise.gyro_half_second_cov) / 3.0 * BLOCK_S / window_s
     detector = np.zeros(1, DETECTOR)
     values = {
         "inverse_gravity": 1.0 / noise.gravity,
@@ -172,7 +168,7 @@ def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> Static
         "norm_error": test.gamma1,
         "norm_variance": (n - 1) * test.gamma2,
         "newest": min(newest, n),
-        "rate_change": rate_change,
+        "rate_change": _bound_rate_change(noise, newest, n, test.rate_stds)[_UPPER],
         "bias": noise.gyro_bias,
         "bias_var": np.trace(noise.gyro_bias_cov) / 3.0,
         "squared_stds": test.rate_stds**2,
@@ -185,6 +181,15 @@ def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> Static
     for name, value in values.items():
         detector[name] = value
     return StaticState(detector, np.zeros((1, n, SIGNALS)), np.zeros((1, n), SUMS))
+
+
+def _bound_rate_change(noise: SensorNoise, newest: int, n: int, rate_stds: float) -> np.ndarray:
+    """M (3, 3) of condition (6): the inverse covariance of the change, over the square of its bound."""
+    squared_bound = 2.0 * gammaincinv(1.5, gammainc(0.5, rate_stds**2 / 2.0))  # χ² of three axes, as probable as of one
+    if newest >= n or not 0.0 < squared_bound < np.inf:
+        return np.zeros((3, 3))
+    sway = 0.0 if noise.gyro_half_second_cov is None else noise.gyro_half_second_cov
+    return np.linalg.inv(noise.gyro_cov * (1.0 / newest - 1.0 / n) + sway) / squared_bound
 
 
 @inlined
@@ -264,8 +269,9 @@ def _rate_is_steady(detector, block, at, gx, gy, gz):  # type: ignore[no-untyped
         x += block[k, 0] - gx
         y += block[k, 1] - gy
         z += block[k, 2] - gz
-    limit = detector.rate_change
-    return abs(x) <= newest * limit[0] and abs(y) <= newest * limit[1] and abs(z) <= newest * limit[2]
+    M = detector.rate_change
+    across = M[1] * x * y + M[2] * x * z + M[4] * y * z
+    return M[0] * x * x + M[3] * y * y + M[5] * z * z + 2.0 * across <= newest * newest
 
 
 @inlined
