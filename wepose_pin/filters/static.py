@@ -5,10 +5,10 @@ varies nothing: an office chair passes them, and a filter that reads the gyrosco
 chair's rate for it. Condition (5), ours, compares the mean rate about the vertical with the known bias: that of the
 start phase, then of each accepted static phase. Rotation about horizontal axes turns gravity in S, which (2) detects.
 
-(1) to (4) compare samples with the noise of samples, which grows with the rate of sampling, so that at 1 kHz the start
-of a smooth motion hides in it three times as long as at 100 Hz, 0.13 s in the paper's dynamic experiment: a filter takes
-that motion for bias. Condition (6), ours, compares the mean gyro of the window's newest part with that of the window. The
-noise of these means does not depend on the rate of sampling.
+(1) to (4) compare samples with the noise of samples, which grows with the rate of sampling. At 1 kHz the start of a
+smooth motion hides in it for 0.13 s in the paper's dynamic experiment, and a filter takes that motion for bias.
+Condition (6), ours, compares the mean gyro of the window's newest part with that of the window. The noise of these
+means does not depend on the rate of sampling.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ the table, and sensors with noise and bias only. `Imperfections` add those of re
 """
 
 from .activities import ACTIVITIES, simulate_activity
-from .imperfections import IDEAL_PRESET, MILD_PRESET, Imperfections
+from .imperfections import IDEAL_PRESET, MILD_PRESET, PRESETS, Imperfections
 from .imu import GRAVITY, MTI_3, NOISE_FREE, Device, ImuNoise
 from .motion import CIRCLING_POINT, SEGMENTS, SIDES
 from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
@@ -26,6 +26,7 @@ __all__ = [
     "MOUNT",
     "MTI_3",
     "NOISE_FREE",
+    "PRESETS",
     "SEGMENTS",
     "SIDES",
     "Device",

@@ -104,3 +104,4 @@ MILD_PRESET = Imperfections(
     clock_offset=1e-3,
     dropped=0.002,
 )
+PRESETS = {"ideal": IDEAL_PRESET, "mild": MILD_PRESET}

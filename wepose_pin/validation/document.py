@@ -6,14 +6,14 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import UnionType
 from typing import Any, NamedTuple
 
 from ..errors import BadData, MissingFile
-from ..simulation import MTI_3
+from ..simulation import MTI_3, PRESETS, simulate_person
 from .contenders import DEFAULT_GAINS
 from .gains import STATED
 from .jobs import Result, Skipped
-from .paper import WORLDS
 
 
 class Document(NamedTuple):
@@ -22,14 +22,20 @@ class Document(NamedTuple):
     results: list[Result]
     quick: bool
     versions: dict[str, str]
-    worlds: dict[str, dict[str, Any]]  # name → mounts_known, and imperfections with their sizes
+    presets: dict[str, dict[str, Any]]  # name → imperfections with their sizes
     noise: dict[str, float]  # of the simulated sensors, in `ImuNoise`'s units
     gains: dict[str, dict[str, Any]]  # setting → "ncf", "gdc" → gains as stated
     skipped: list[Skipped] = []  # trials that could not be scored  # noqa: RUF012
+    trials: int = 0  # at most so many of a simulated experiment; 0: all
+    measured_std: float = 0.0  # [m] of the lengths that are measured beforehand
 
 
 def format_document(
-    results: Sequence[Result], quick: bool, versions: Mapping[str, str], skipped: Sequence[Skipped] = ()
+    results: Sequence[Result],
+    quick: bool,
+    versions: Mapping[str, str],
+    skipped: Sequence[Skipped] = (),
+    trials: int | None = None,
 ) -> str:
     """Format the file's text, one line a result, without a time stamp: two runs give the same file.
 
@@ -38,11 +44,10 @@ def format_document(
     head = {
         "versions": dict(versions),
         "quick": quick,
+        "trials": trials or 0,
+        "measured_std": simulate_person(0).measured_std,
         **({"skipped": [each._asdict() for each in skipped]} if skipped else {}),
-        "worlds": {
-            name: {"mounts_known": True, "imperfections": asdict(imperfections)}
-            for name, imperfections in WORLDS.items()
-        },
+        "presets": {name: asdict(imperfections) for name, imperfections in PRESETS.items()},
         "noise": asdict(MTI_3),
         "gains": {
             setting: {name: asdict(params) for name, params in gains.items()}
@@ -87,11 +92,12 @@ def parse_document(content: Any, where: str) -> Document:
         A key is missing or its value is of the wrong kind.
     """
 
-    def read_value(table: Any, key: str, kind: type, place: str, default: Any = None) -> Any:
+    def read_value(table: Any, key: str, kind: type | UnionType, place: str, default: Any = None) -> Any:
         value = table.get(key, default) if isinstance(table, dict) else None
         if not isinstance(value, kind):
             shown = "nothing" if value is None else type(value).__name__
-            raise BadData(f"{where}: {place}{key}: {shown}, a {kind.__name__} is wanted; is it `wepose validate`'s?")
+            wanted = getattr(kind, "__name__", "number")
+            raise BadData(f"{where}: {place}{key}: {shown}, a {wanted} is wanted; is it `wepose validate`'s?")
         return value
 
     results = []
@@ -108,13 +114,15 @@ def parse_document(content: Any, where: str) -> Document:
         results,
         read_value(content, "quick", bool, "", False),
         read_value(content, "versions", dict, "", {}),
-        read_value(content, "worlds", dict, "", {}),
+        read_value(content, "presets", dict, "", {}),
         read_value(content, "noise", dict, "", {}),
         read_value(content, "gains", dict, "", {}),
         [
             Skipped(*(read_value(item, key, str, f"skipped[{k}].") for key in Skipped._fields))
             for k, item in enumerate(read_value(content, "skipped", list, "", []))
         ],
+        read_value(content, "trials", int, "", 0),
+        float(read_value(content, "measured_std", int | float, "", 0.0)),
     )
 
 

@@ -122,7 +122,8 @@ def _authors(experiment: str, name: str, path: Path, scored: tuple[float, float]
 
     Vicon's samples are late by 16 to 18 ms and stand 2.5 deg askew, which every filter would have as an error of its
     own. A pose is compared once, where it arrives: it is repeated until the next, 1 to 40 ms later. That its arrival is
-    so irregular stays in the errors of every filter, about 1 deg at the 150 deg/s of this trial.
+    so irregular stays in the errors of every filter: of the integrated gyroscope's 1.2 deg (rms) against Vicon 0.14 deg
+    are left where each pose has a time of its own, which then varies by 7 ms.
     """
     trial = read_authors_trial(path)
     fresh = trial.scored.copy()
