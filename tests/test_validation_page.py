@@ -99,9 +99,9 @@ def test_the_file_comes_back_as_it_was(document: Document, file: Path) -> None:
     assert [result[:3] for result in document.results] == [result[:3] for result in RESULTS]
     assert document.quick
     assert document.results[-1].figures["depth_mm"] is None
-    assert document.presets["mild"]["soft_tissue_deg"] == 1.5
-    assert document.presets["ideal"]["gyro_range_deg_s"] is None
-    assert document.measured_std == 0.003
+    assert document.presets["mild"]["imperfections"]["soft_tissue_deg"] == 1.5
+    assert document.presets["ideal"]["imperfections"]["gyro_range_deg_s"] is None
+    assert document.presets["mild"]["measured_std"] == 0.003
     assert len(file.read_text(encoding="utf-8").split('"results": [\n')[1].splitlines()) == len(RESULTS) + 2
 
 

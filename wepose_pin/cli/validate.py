@@ -49,7 +49,7 @@ def print_experiments(document: Document) -> None:
         header = [name if len(name) < LONGEST_HEADER else "\n".join(name.rsplit(" ", 1)) for name in header]
         title = f"{experiment}, {trials} trial{'s' * (trials != 1)}" + (f" [{unit}]" if unit else "")
         print_table(title + ", a quick run" * document.quick, header, [[str(cell) for cell in line] for line in lines])
-        known = describe_known(experiment, document.measured_std)
+        known = describe_known(experiment, document.presets)
         if known:
             say(fill(f"Known beforehand: {known}", LINE))
         say("")

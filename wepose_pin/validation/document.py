@@ -6,14 +6,14 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from types import UnionType
 from typing import Any, NamedTuple
 
 from ..errors import BadData, MissingFile
-from ..simulation import MTI_3, PRESETS, simulate_person
+from ..simulation import MTI_3
 from .contenders import DEFAULT_GAINS
 from .gains import STATED
 from .jobs import Result, Skipped
+from .presets import PRESETS
 
 
 class Document(NamedTuple):
@@ -22,12 +22,11 @@ class Document(NamedTuple):
     results: list[Result]
     quick: bool
     versions: dict[str, str]
-    presets: dict[str, dict[str, Any]]  # name → imperfections with their sizes
+    presets: dict[str, dict[str, Any]]  # name → "imperfections" with their sizes, "measured_std" [m] of lengths
     noise: dict[str, float]  # of the simulated sensors, in `ImuNoise`'s units
     gains: dict[str, dict[str, Any]]  # setting → "ncf", "gdc" → gains as stated
     skipped: list[Skipped] = []  # trials that could not be scored  # noqa: RUF012
     trials: int = 0  # at most so many of a simulated experiment; 0: all
-    measured_std: float = 0.0  # [m] of the lengths that are measured beforehand
 
 
 def format_document(
@@ -45,9 +44,11 @@ def format_document(
         "versions": dict(versions),
         "quick": quick,
         "trials": trials or 0,
-        "measured_std": simulate_person(0).measured_std,
         **({"skipped": [each._asdict() for each in skipped]} if skipped else {}),
-        "presets": {name: asdict(imperfections) for name, imperfections in PRESETS.items()},
+        "presets": {
+            name: {"imperfections": asdict(preset.imperfections), "measured_std": preset.measured_std}
+            for name, preset in PRESETS.items()
+        },
         "noise": asdict(MTI_3),
         "gains": {
             setting: {name: asdict(params) for name, params in gains.items()}
@@ -92,12 +93,11 @@ def parse_document(content: Any, where: str) -> Document:
         A key is missing or its value is of the wrong kind.
     """
 
-    def read_value(table: Any, key: str, kind: type | UnionType, place: str, default: Any = None) -> Any:
+    def read_value(table: Any, key: str, kind: type, place: str, default: Any = None) -> Any:
         value = table.get(key, default) if isinstance(table, dict) else None
         if not isinstance(value, kind):
             shown = "nothing" if value is None else type(value).__name__
-            wanted = getattr(kind, "__name__", "number")
-            raise BadData(f"{where}: {place}{key}: {shown}, a {wanted} is wanted; is it `wepose validate`'s?")
+            raise BadData(f"{where}: {place}{key}: {shown}, a {kind.__name__} is wanted; is it `wepose validate`'s?")
         return value
 
     results = []
@@ -122,7 +122,6 @@ def parse_document(content: Any, where: str) -> Document:
             for k, item in enumerate(read_value(content, "skipped", list, "", []))
         ],
         read_value(content, "trials", int, "", 0),
-        float(read_value(content, "measured_std", int | float, "", 0.0)),
     )
 
 

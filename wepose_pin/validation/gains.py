@@ -23,8 +23,9 @@ from ..filters import Gdc, GdcParams, Ncf, NcfParams
 from ..filters.noise import SensorNoise, estimate_noise
 from ..filters.static import StaticTest
 from ..readers.trials import read_broad
-from ..simulation import PRESETS, Imperfections, simulate, simulate_paper_dynamic, simulate_person
+from ..simulation import simulate, simulate_paper_dynamic
 from .jobs import Job, Result
+from .presets import PRESETS, Preset
 from .series import align_rotation
 from .tables import UPPER_BODY
 
@@ -37,7 +38,7 @@ DYNAMIC_SEEDS = range(100, 106)  # the experiments have 0 to 11
 PERSON_SEEDS = range(100, 103)  # of five sensors each; the experiments have 0 to 9
 HALVES = ({"01", "05", "09", "14", "21", "27", "31", "35"}, {"03", "07", "11", "16", "25", "29", "33"})  # of BROAD
 RATES = {"simulated 100 Hz": 100.0, "simulated 1 kHz": 1000.0}
-PEOPLE = {f"{UPPER_BODY}, {preset}": imperfections for preset, imperfections in PRESETS.items()}
+PEOPLE = {f"{UPPER_BODY}, {label}": preset for label, preset in PRESETS.items()}
 BROAD = {"BROAD, first half": HALVES[0], "BROAD, second half": HALVES[1], "BROAD": HALVES[0] | HALVES[1]}
 
 _SCORED_HZ = 25.0  # [Hz] rate of the scored samples: errors are slow
@@ -148,9 +149,9 @@ def _make_dynamic_trial(seed: int, rate_hz: float) -> TuningTrial:
     return _make_trial(sensor.gyro_S, sensor.accel_S, rate_hz, sensor.quat_WS, static, moving)
 
 
-def _make_person_trials(seed: int, imperfections: Imperfections) -> list[TuningTrial]:
+def _make_person_trials(seed: int, preset: Preset) -> list[TuningTrial]:
     """Make the trials of a person's sensors over clasp and circles; the truth is the sensors' own orientation."""
-    simulation = simulate(simulate_person(seed).lengths, seed=seed, imperfections=imperfections)
+    simulation = simulate(preset.sample_person(seed).lengths, seed=seed, imperfections=preset.imperfections)
     recording = simulation.recording()
     static, moving = (np.zeros(len(recording.time), dtype=bool) for _ in range(2))
     static[recording.span(recording.phases["start"][0])] = True

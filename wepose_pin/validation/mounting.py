@@ -9,11 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from ..evaluation import evaluate
 from ..model import load_table
-from ..simulation import IDEAL_PRESET, PRESETS, Imperfections, Person, Simulation, simulate, simulate_person
+from ..simulation import IDEAL_PRESET, Person, Simulation, simulate
 from ..subject import Subject, mount_rows
 from ..tracking import track
 from .jobs import Job, Result
 from .paper import MEASURED, MEASURED_WITH_TRUNK, calibrate_person, collect_hand_errors, list_closed_lengths
+from .presets import PRESETS, Preset
 from .tables import ARBITRARY_MOUNTING, DEFAULT, DEFAULT_WITH_TRUNK, OURS
 
 TRIALS = 10
@@ -24,17 +25,17 @@ def list_experiments(quick: bool = False, trials: int | None = None) -> dict[str
     """List the jobs of each experiment; `quick`: one trial; `trials`: at most so many."""
     count = 1 if quick else min(TRIALS, trials or TRIALS)
     jobs = {}
-    for preset, imperfections in PRESETS.items():
-        name = f"{ARBITRARY_MOUNTING}, {preset}"
-        if imperfections != IDEAL_PRESET:
-            jobs[name] = [Job(name, str(k), _arbitrary_mounting, (k, imperfections)) for k in range(count)]
+    for label, preset in PRESETS.items():
+        name = f"{ARBITRARY_MOUNTING}, {label}"
+        if preset.imperfections != IDEAL_PRESET:
+            jobs[name] = [Job(name, str(k), _arbitrary_mounting, (k, preset)) for k in range(count)]
     return jobs
 
 
-def _arbitrary_mounting(experiment: str, trial: str, seed: int, imperfections: Imperfections) -> list[Result]:
+def _arbitrary_mounting(experiment: str, trial: str, seed: int, preset: Preset) -> list[Result]:
     """Calibrate without stated mounts, then track six circles."""
-    person = simulate_person(seed)
-    simulation = simulate(person.lengths, seed=seed, imperfections=replace(imperfections, mount="any"))
+    person = preset.sample_person(seed)
+    simulation = simulate(person.lengths, seed=seed, imperfections=replace(preset.imperfections, mount="any"))
     recording, truth = simulation.recording(), simulation.truth()
     results = []
     for label, (method, measured) in ROWS.items():

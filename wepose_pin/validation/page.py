@@ -60,7 +60,7 @@ def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str
         own_rows = [row for row in rows if row.experiment == name]
         experiments[name] = {
             "trials": len({result.trial for result in document.results if result.experiment == name}),
-            "known": describe_known(name, document.measured_std),
+            "known": describe_known(name, document.presets),
             "table": make_experiment_table(own_rows, True),
             "note": describe_table(own_rows),
             "pictures": [picture for experiment, picture in drawn if experiment == name],

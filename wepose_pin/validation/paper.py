@@ -23,7 +23,6 @@ from ..recording import OrientationSensor, Recording
 from ..simulation import (
     CIRCLING_POINT,
     IDEAL_PRESET,
-    PRESETS,
     Imperfections,
     Person,
     Simulation,
@@ -31,12 +30,12 @@ from ..simulation import (
     simulate,
     simulate_paper_drift,
     simulate_paper_dynamic,
-    simulate_person,
 )
 from ..subject import Subject, mount_rows
 from ..tracking import track
 from .contenders import Contender, list_contenders
 from .jobs import Job, Result
+from .presets import PRESETS, Preset
 from .series import align_rotation, decimate_curves
 from .tables import (
     AS_COMMANDED,
@@ -89,13 +88,13 @@ def list_experiments(quick: bool = False, trials: int | None = None) -> dict[str
         name = f"dynamic {rate}"
         jobs[name] = [Job(name, str(k), _dynamic, (k, rate, rate_hz)) for k in count("dynamic")]
     jobs["drift"] = [Job("drift", str(k), _drift, (k,)) for k in count("drift")]
-    for preset, imperfections in PRESETS.items():
-        name = f"{UPPER_BODY}, {preset}"
-        jobs[name] = [Job(name, str(k), _upper_body, (k, imperfections)) for k in count(UPPER_BODY)]
-    for preset, imperfections in PRESETS.items():
-        if not quick and imperfections != IDEAL_PRESET:
-            name = f"{ERROR_BUDGET}, {preset}"
-            jobs[name] = [Job(name, str(k), _error_budget, (k, imperfections)) for k in count(ERROR_BUDGET)]
+    for label, preset in PRESETS.items():
+        name = f"{UPPER_BODY}, {label}"
+        jobs[name] = [Job(name, str(k), _upper_body, (k, preset)) for k in count(UPPER_BODY)]
+    for label, preset in PRESETS.items():
+        if not quick and preset.imperfections != IDEAL_PRESET:
+            name = f"{ERROR_BUDGET}, {label}"
+            jobs[name] = [Job(name, str(k), _error_budget, (k, preset)) for k in count(ERROR_BUDGET)]
     return jobs
 
 
@@ -161,18 +160,18 @@ def _run_single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, Attit
 
 
 @lru_cache(maxsize=1)
-def _simulate_person(seed: int, imperfections: Imperfections) -> tuple[Person, Simulation]:
-    person = simulate_person(seed)
-    return person, simulate(person.lengths, seed=seed, imperfections=imperfections)
+def _simulate_person(seed: int, preset: Preset) -> tuple[Person, Simulation]:
+    person = preset.sample_person(seed)
+    return person, simulate(person.lengths, seed=seed, imperfections=preset.imperfections)
 
 
-def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfections) -> list[Result]:
+def _upper_body(experiment: str, trial: str, seed: int, preset: Preset) -> list[Result]:
     """Calibrate by each filter with a measured shoulder width and known mounts, then track six circles.
 
     smekf has a row for each part of the paper's protocol, one for the whole of it, and one with a measured trunk;
     amekf, the default, has one with the mounts that a session states.
     """
-    person, simulation = _simulate_person(seed, imperfections)
+    person, simulation = _simulate_person(seed, preset)
     recorded, truth = simulation.recording(), simulation.truth()
     circles = simulation.phases["circles"][0]
     exact, stated = set_exact_mounts(person.prior, simulation), person.prior
@@ -209,11 +208,12 @@ def _upper_body(experiment: str, trial: str, seed: int, imperfections: Imperfect
     return results
 
 
-def _error_budget(experiment: str, trial: str, seed: int, imperfections: Imperfections) -> list[Result]:
+def _error_budget(experiment: str, trial: str, seed: int, preset: Preset) -> list[Result]:
     """Run smekf with one group of imperfections switched off, or one part known exactly, at a time."""
     results = []
-    for label, others in (dict.fromkeys(CHAIN_PARTS, imperfections) | switch_off(imperfections)).items():
-        person, simulation = _simulate_person(seed, others)
+    full = preset.imperfections
+    for label, imperfections in (dict.fromkeys(CHAIN_PARTS, full) | switch_off(full)).items():
+        person, simulation = _simulate_person(seed, preset._replace(imperfections=imperfections))
         recording = simulation.recording()
         prior = person.prior if label == "mounts as stated" else set_exact_mounts(person.prior, simulation)
         if label == "orientations exact":

@@ -305,12 +305,16 @@ def make_overview_table(rows: Sequence[Row]) -> Table:
 
 
 def make_imperfections_table(presets: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Make the table of the imperfections of each preset; those that none of them has are left out."""
-    named = dict.fromkeys([*_IMPERFECTIONS, *(name for sizes in presets.values() for name in sizes)])
+    """Make the table of the imperfections of each preset; those that none of them has are left out.
+
+    `presets` as in `Document`.
+    """
+    by_preset = {label: preset.get("imperfections", {}) for label, preset in presets.items()}
+    named = dict.fromkeys([*_IMPERFECTIONS, *(name for imperfections in by_preset.values() for name in imperfections)])
     cells = []
     for name in named:
         words, factor, unit = _IMPERFECTIONS.get(name, (name.replace("_", " "), 1.0, ""))
-        sizes = [_size(sizes_of_preset.get(name), factor, unit) for sizes_of_preset in presets.values()]
+        sizes = [_size(imperfections.get(name), factor, unit) for imperfections in by_preset.values()]
         if any(size != "–" for size in sizes):
             cells.append([words, *sizes])
     return Table(["imperfection", *presets], cells)
@@ -333,12 +337,14 @@ def make_gains_table(gains: Mapping[str, Mapping[str, Any]]) -> Table:
     return Table(["setting", "ncf", "gdc"], cells)
 
 
-def describe_known(experiment: str, measured_std: float) -> str:
-    """Describe what was measured beforehand, or known, in an experiment; `measured_std` [m] of lengths."""
+def describe_known(experiment: str, presets: Mapping[str, Mapping[str, Any]]) -> str:
+    """Describe what was measured beforehand, or known, in an experiment; `presets` as in `Document`."""
+    off = presets.get(experiment.rpartition(", ")[2], {}).get("measured_std")
+    off_text = f", off by {1e3 * off:g} mm (one standard deviation)" if isinstance(off, int | float) else ""
     still = (
         "noise, gyroscope bias and tilt, from {} (default gains: their bias starts at zero); the heading, aligned there"
     )
-    lengths = f"the shoulder width, off by {1e3 * measured_std:g} mm (one standard deviation); stature to 1 cm, and sex"
+    lengths = f"the shoulder width{off_text}; stature to 1 cm, and sex"
     bias = (
         "noise, gyroscope bias and tilt of each sensor, from the start pose (default gains: their bias starts at zero)"
     )
