@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class ValidateJob:
     """Repeat the experiments of Lisini Baldi et al. 2019 on simulated subjects and compare with the published errors.
 
-    Prints a table of each experiment; without -o nothing is written. On two cores a quick run takes a minute, a full
-    one half an hour. The paper: doi 10.1109/JSEN.2019.2940612.
+    Prints a table of each experiment; without -o nothing is written. A quick run takes some minutes on two cores, a
+    full one an hour or two. The paper: doi 10.1109/JSEN.2019.2940612.
 
     Parameters
     ----------
