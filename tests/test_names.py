@@ -33,7 +33,7 @@ ALLOWED = {
     "simulation/motion.py": "a simulated activity",
     "simulation/subject.py": "a simulated activity",
     "simulation/tasks.py": "a simulated activity",
-    "validation/tables.py": "figures of simulated activities",
+    "validation/paper.py": "figures of simulated activities",
 }
 
 

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import run_filter
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import DETECTOR, StaticDetector, StaticTest
+from wepose_pin.simulation import simulate_paper_dynamic
 
 RATE = 100.0
-# The paper's conditions alone, without (5)
+# The paper's conditions alone, without (5) and (6)
 PaperTest = partial(StaticTest, rate_stds=np.inf)
 
 
@@ -235,6 +238,42 @@ def test_a_rotation_too_slow_to_tell_from_the_bias_is_in_the_standard_deviation(
         worst = max(worst, abs((error[-1] * error[:500].mean().inv()).as_rotvec()[2]) / std)
     print(f"{method}, sway {sway} deg/s: heading off by up to {worst:.1f} standard deviations")
     assert worst < 6.0
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 1000.0])
+def test_the_start_of_a_smooth_motion_is_not_static(rate_hz: float) -> None:
+    """Condition (6): sampled ten times as often the noise of a sample is √10 times as large, and hides no more."""
+    late = {}
+    for test in (StaticTest(), PaperTest()):
+        ends = []
+        for seed in range(4):
+            sensor = simulate_paper_dynamic(seed, rate_hz)
+            start = slice(round(0.5 * rate_hz), round(4.5 * rate_hz))
+            noise = estimate_noise(sensor.gyro_S[start], sensor.accel_S[start], rate_hz)
+            static = StaticDetector(noise, rate_hz, test).run(sensor.gyro_S, sensor.accel_S)
+            assert static[start].mean() > 0.98
+            ends.append(sensor.time[np.flatnonzero(static & (sensor.time < 10.0))[-1]] - sensor.moving[0])
+        late[test] = np.mean(ends)
+    assert late[StaticTest()] < 0.1  # [s]
+    assert late[PaperTest()] > (0.12 if rate_hz > 500.0 else 0.0)
+
+
+@pytest.mark.parametrize("sway", [None, 1e-7 * np.diag([1.0, 2.0, 0.5])])
+def test_condition_6_is_what_it_says(sway: np.ndarray | None) -> None:
+    gyro, accel = stop_and_go(np.random.default_rng(9))
+    noise = estimate_noise(gyro[:500], accel[:500], RATE)
+    # Condition (5) is left out by a bias without bounds.
+    unknown = replace(noise, gyro_bias_cov=1e6 * np.eye(3), gyro_half_second_cov=sway)
+    found = StaticDetector(unknown, RATE, StaticTest(bias_spread=1e3)).run(gyro, accel)
+    paper = by_the_book(gyro, accel, noise, PaperTest(), RATE)
+    inverse = np.linalg.inv(noise.gyro_cov * (1 / 5 - 1 / 50) + (0.0 if sway is None else sway))
+    bound = chi2.ppf(chi2.cdf(9.0, 1), 3)
+    steady = np.zeros(len(gyro), dtype=bool)
+    for k in range(49, len(gyro)):
+        change = gyro[k - 4 : k + 1].mean(axis=0) - gyro[k - 49 : k + 1].mean(axis=0)
+        steady[k] = change @ inverse @ change <= bound
+    assert (paper & ~steady).sum() > 5
+    np.testing.assert_array_equal(found, paper & steady)
 
 
 def test_a_bias_that_warms_up_is_followed() -> None:

@@ -347,7 +347,7 @@ def validation() -> bytes:
     hand = {key: {"mean": 17.0, "std": 2.0, "rmse": 18.0} for key in ("hand_mm", "hand_from_shoulders_mm")}
     series = {"time": [0.0, 1.0], "error_mm": [1.0, 2.0]}
     results = [Result("dynamic 100 Hz", "0", method, dynamic) for method in ("ncf", "gdc", "smekf")]
-    results += [Result("upper body, MTi-3 noise alone", "0", method, hand, series) for method in ("ncf", "smekf")]
+    results += [Result("upper body, ideal", "0", method, hand, series) for method in ("ncf", "smekf")]
     board = {"inclination_rmse": 0.6, "heading_rmse": 2.0, "total_rmse": 2.5}
     results += [Result("BROAD", trial, method, board) for trial in "12" for method in ("amekf", "smekf")]
     return format_document(results, True, {"wepose-pin": "0.1.0"}).encode()

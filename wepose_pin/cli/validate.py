@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 from ..jobs.validate import ValidateJob, run_validate
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from ..validation import Document
 
 LONGEST_HEADER = 12  # letters; a longer one goes in two lines, so that tables stay within 100 columns
+LINE = 100  # letters
 
 
 def run(job: ValidateJob) -> int:
@@ -30,7 +32,13 @@ def run(job: ValidateJob) -> int:
 def print_experiments(document: Document) -> None:
     """A table an experiment, and the targets."""
     from ..validation import summarize
-    from ..validation.tables import find_shared_unit, make_experiment_table, make_targets_table
+    from ..validation.tables import (
+        compare_with_paper,
+        describe_known,
+        find_shared_unit,
+        make_experiment_table,
+        make_targets_table,
+    )
 
     rows = summarize(document.results)
     for experiment in dict.fromkeys(row.experiment for row in rows):
@@ -41,14 +49,26 @@ def print_experiments(document: Document) -> None:
         header = [name if len(name) < LONGEST_HEADER else "\n".join(name.rsplit(" ", 1)) for name in header]
         title = f"{experiment}, {trials} trial{'s' * (trials != 1)}" + (f" [{unit}]" if unit else "")
         print_table(title + ", a quick run" * document.quick, header, [[str(cell) for cell in line] for line in lines])
+        known = describe_known(experiment, document.presets)
+        if known:
+            say(fill(f"Known beforehand: {known}", LINE))
         say("")
+    comparison = compare_with_paper(rows)
+    if comparison.larger.rows:
+        title = f"Larger than the paper's own: {len(comparison.larger.rows)} of {comparison.figures} figures"
+        print_table(
+            title, list(comparison.larger.header), [[str(cell) for cell in row] for row in comparison.larger.rows]
+        )
+    elif comparison.figures:
+        say(f"None of the {comparison.figures} figures that have one of the paper's beside them is larger than that.")
     targets = make_targets_table(rows)
     if targets.rows:
         cells = [[str(cell).replace("**", "") for cell in row] for row in targets.rows]
         print_table("Targets for the mean errors", list(targets.header), cells)
-    say("± is one standard deviation over time, averaged over the trials. The bias of the static phase is removed for")
-    say("every filter but those with default gains; the heading is aligned once, where nothing is scored, and never")
-    say("fitted to the truth afterwards.")
+    say(
+        "± is one standard deviation over time, averaged over the trials. The heading is aligned once, where nothing is"
+    )
+    say("scored, and never fitted to the truth afterwards.")
 
 
 COMMAND = Command(ValidateJob, run, example="validate --quick")

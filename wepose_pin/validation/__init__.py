@@ -31,9 +31,12 @@ __all__ = [
 ]
 
 
-def list_experiments(quick: bool = False, data: Path | None = None) -> dict[str, list[Job]]:
-    """List the trials of each experiment, one job a trial; `data` is the folder of the real recordings."""
-    jobs = paper.list_experiments(quick) | mounting.list_experiments(quick)
+def list_experiments(quick: bool = False, data: Path | None = None, trials: int | None = None) -> dict[str, list[Job]]:
+    """List the trials of each experiment, one job a trial.
+
+    `data` is the folder of the real recordings; `trials`: at most so many of each simulated experiment.
+    """
+    jobs = paper.list_experiments(quick, trials) | mounting.list_experiments(quick, trials)
     if data is not None:
         jobs |= real.list_experiments(data, quick)
     if not quick:

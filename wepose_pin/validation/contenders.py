@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import rotations
-from ..filters import METHODS, GdcParams, NcfParams, run_filter
+from ..filters import METHODS, GdcParams, NcfParams, SmekfParams, run_filter
 from ..filters.noise import SensorNoise
 from ..filters.static import StaticTest
 from .gains import make_gains
+from .tables import AS_PUBLISHED, OURS
 
 Orient = Callable[[np.ndarray, np.ndarray, float, SensorNoise], np.ndarray]
 
@@ -42,12 +43,13 @@ class Contender(NamedTuple):
 
 
 def list_contenders(setting: str, trial: str = "") -> list[Contender]:
-    """List the contenders: ours, then NCF and GDC, tuned and with default gains, then the installed peers.
+    """List the contenders: ours, smekf as published, NCF and GDC, tuned and with default gains, the installed peers.
 
     `setting`: "real" or a key of `gains.STATED`; `trial`: the name of a real one (see `make_gains`).
     """
     tuned = make_gains(setting, trial)._asdict()
     filters = [_make_ours(method) for method in METHODS if method not in tuned]
+    filters.append(Contender(AS_PUBLISHED, _run_as_published))
     filters += [_make_tuned(method, params) for method, params in tuned.items()]
     filters += [_make_default(method, params) for method, params in DEFAULT_GAINS.items()]
     return filters + [Contender(label, orient) for label, (module, orient) in _PEERS.items() if find_spec(module)]
@@ -58,6 +60,12 @@ def _make_ours(method: str) -> Contender:
         return run_filter(gyro_S, accel_S, rate_hz, noise, method, measured_start=True).quat_WS
 
     return Contender(method, orient, method)
+
+
+def _run_as_published(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
+    """Run the paper's own form: transition to the first order, initial covariance and static test of the paper's."""
+    params, test = SmekfParams(first_order=True), StaticTest(rate_stds=np.inf)
+    return run_filter(gyro_S, accel_S, rate_hz, noise, OURS, params, test).quat_WS
 
 
 def _make_tuned(method: str, params: Any) -> Contender:

@@ -13,7 +13,7 @@ from ..simulation import MTI_3
 from .contenders import DEFAULT_GAINS
 from .gains import STATED
 from .jobs import Result, Skipped
-from .paper import WORLDS
+from .presets import PRESETS
 
 
 class Document(NamedTuple):
@@ -22,14 +22,19 @@ class Document(NamedTuple):
     results: list[Result]
     quick: bool
     versions: dict[str, str]
-    worlds: dict[str, dict[str, Any]]  # name → mounts_known, and imperfections with their sizes
+    presets: dict[str, dict[str, Any]]  # name → "imperfections" with their sizes, "measured_std" [m] of lengths
     noise: dict[str, float]  # of the simulated sensors, in `ImuNoise`'s units
     gains: dict[str, dict[str, Any]]  # setting → "ncf", "gdc" → gains as stated
     skipped: list[Skipped] = []  # trials that could not be scored  # noqa: RUF012
+    trials: int = 0  # at most so many of a simulated experiment; 0: all
 
 
 def format_document(
-    results: Sequence[Result], quick: bool, versions: Mapping[str, str], skipped: Sequence[Skipped] = ()
+    results: Sequence[Result],
+    quick: bool,
+    versions: Mapping[str, str],
+    skipped: Sequence[Skipped] = (),
+    trials: int | None = None,
 ) -> str:
     """Format the file's text, one line a result, without a time stamp: two runs give the same file.
 
@@ -38,10 +43,11 @@ def format_document(
     head = {
         "versions": dict(versions),
         "quick": quick,
+        "trials": trials or 0,
         **({"skipped": [each._asdict() for each in skipped]} if skipped else {}),
-        "worlds": {
-            name: {"mounts_known": True, "imperfections": asdict(imperfections)}
-            for name, imperfections in WORLDS.items()
+        "presets": {
+            name: {"imperfections": asdict(preset.imperfections), "measured_std": preset.measured_std}
+            for name, preset in PRESETS.items()
         },
         "noise": asdict(MTI_3),
         "gains": {
@@ -108,13 +114,14 @@ def parse_document(content: Any, where: str) -> Document:
         results,
         read_value(content, "quick", bool, "", False),
         read_value(content, "versions", dict, "", {}),
-        read_value(content, "worlds", dict, "", {}),
+        read_value(content, "presets", dict, "", {}),
         read_value(content, "noise", dict, "", {}),
         read_value(content, "gains", dict, "", {}),
         [
             Skipped(*(read_value(item, key, str, f"skipped[{k}].") for key in Skipped._fields))
             for k, item in enumerate(read_value(content, "skipped", list, "", []))
         ],
+        read_value(content, "trials", int, "", 0),
     )
 
 

@@ -12,6 +12,8 @@ from ..report.words import capital, slug
 from .document import Document
 from .jobs import Result
 from .tables import (
+    AS_COMMANDED,
+    AS_PUBLISHED,
     AXES,
     DEFAULTS,
     ERROR_BUDGET,
@@ -23,6 +25,7 @@ from .tables import (
     PROTOCOL,
     SPLIT,
     TARGETS,
+    WITH_TRUNK,
     Row,
     collect_figures,
     compute_error_budget,
@@ -33,10 +36,13 @@ from .tables import (
 
 COLOURS = {
     "smekf": "#24618f",
+    AS_PUBLISHED: "#5b87ab",
+    WITH_TRUNK: "#3d7199",
     LENGTHS_ALONE: "#7a9fbe",
     OPEN_LOOP: "#a9c1d5",
     PROTOCOL: "#1b3a57",
     "amekf": "#3fa7c9",
+    AS_COMMANDED: "#8fcbe0",
     "smoother": "#2f4a66",
     "ncf": "#d9772b",
     "gdc": "#4b9a55",
@@ -75,10 +81,10 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Pi
     if len({result.trial for result in results}) == 1:
         quantities.append(tuple(name.replace("_", " ") for name in SPLIT[:3]))
     names = next((names for names in quantities if all(name in row.figures for row in rows for name in names)), None)
-    if names is None or experiment == ERROR_BUDGET:
+    if names is None or experiment.startswith(ERROR_BUDGET):
         return None
     paper = {row.method: find_paper_figures(experiment, row.method) for row in rows if row.method in COLOURS}
-    limits = TARGETS.get(experiment, ("", {}))[1]
+    limits = {target.name: target.most for target in TARGETS.get(experiment, ())}
     methods = [row.method for row in rows]
     panels: list[Panel] = []
     for name in names:
@@ -94,7 +100,7 @@ def _bars(experiment: str, rows: Sequence[Row], results: Sequence[Result]) -> Pi
                 panel.boxes((0.0, mean), (place - half, place + half), css, colour=colour)
                 panel.line(np.array([mean, mean + std]), np.full(2, place), "ink thin")
                 bars.append((place, mean, mean + std))
-        limit = limits.get(name, (0.0, 0.0))[1]
+        limit = limits.get(name, 0.0)
         panel.x = (
             0.0,
             _end_of_bars(bars, max([limit, *(sum(figures[name]) for figures in paper.values() if name in figures)])),
@@ -206,7 +212,7 @@ def _path(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pictu
 def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Picture | None:
     """Draw the error budget of the hand."""
     budget = compute_error_budget(results)
-    if experiment != ERROR_BUDGET or budget is None:
+    if budget is None:
         return None
     lines = [("all on", budget.full, "ink"), *((part.name, part.added, "accent") for part in budget.parts)]
     lines += [(f"more: {part.name}", part.added, "before") for part in budget.more]
@@ -225,8 +231,8 @@ def _budget(experiment: str, _: Sequence[Row], results: Sequence[Result]) -> Pic
         panel.rule("ink thin", x=0.0)
         panels.append(panel)
     caption = (
-        "The error budget: root mean square error of the hand with all imperfections on, and what each of them adds: "
-        "√(all on² − without it²). Parts that are independent add up in quadrature, not in a sum"
+        f"{capital(experiment)}: root mean square error of the hand with all imperfections on, and what each of them "
+        f"adds: √(all on² − without it²). Parts that are independent add up in quadrature, not in a sum"
     )
     if any(value < 0.0 for part in budget.parts for value in part.added.values()):
         caption += "; hatched, to the left: the error grows without it"

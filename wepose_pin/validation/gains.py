@@ -23,9 +23,11 @@ from ..filters import Gdc, GdcParams, Ncf, NcfParams
 from ..filters.noise import SensorNoise, estimate_noise
 from ..filters.static import StaticTest
 from ..readers.trials import read_broad
-from ..simulation import IDEAL_PRESET, MILD_PRESET, Imperfections, simulate, simulate_paper_dynamic, simulate_person
+from ..simulation import simulate, simulate_paper_dynamic
 from .jobs import Job, Result
+from .presets import PRESETS, Preset
 from .series import align_rotation
+from .tables import UPPER_BODY
 
 # The grid: zero, which leaves the term out, and steps of a quarter or half a decade.
 PROPORTIONAL = (0.0, *np.logspace(-3.0, 0.5, 15))  # [1/s] k_P
@@ -36,7 +38,7 @@ DYNAMIC_SEEDS = range(100, 106)  # the experiments have 0 to 11
 PERSON_SEEDS = range(100, 103)  # of five sensors each; the experiments have 0 to 9
 HALVES = ({"01", "05", "09", "14", "21", "27", "31", "35"}, {"03", "07", "11", "16", "25", "29", "33"})  # of BROAD
 RATES = {"simulated 100 Hz": 100.0, "simulated 1 kHz": 1000.0}
-WORLDS = {"upper body, MTi-3 noise alone": IDEAL_PRESET, "upper body, realistic": MILD_PRESET}
+PEOPLE = {f"{UPPER_BODY}, {label}": preset for label, preset in PRESETS.items()}
 BROAD = {"BROAD, first half": HALVES[0], "BROAD, second half": HALVES[1], "BROAD": HALVES[0] | HALVES[1]}
 
 _SCORED_HZ = 25.0  # [Hz] rate of the scored samples: errors are slow
@@ -63,8 +65,8 @@ def _grid_points(proportional: float, integral: float, descent: float) -> Gains:
 STATED = {
     "simulated 100 Hz": _grid_points(0.0032, 1e-4, 0.0),
     "simulated 1 kHz": _grid_points(0.0032, 3.2e-5, 0.0),
-    "upper body, MTi-3 noise alone": _grid_points(0.032, 1e-5, 5.6e-4),
-    "upper body, realistic": _grid_points(0.1, 0.0, 1.8e-3),
+    "upper body, ideal": _grid_points(0.032, 1e-5, 5.6e-4),
+    "upper body, mild": _grid_points(0.1, 0.0, 1.8e-3),
     "BROAD, first half": _grid_points(0.1, 1e-3, 0.018),
     "BROAD, second half": _grid_points(0.056, 3.2e-4, 0.01),
     "BROAD": _grid_points(0.1, 1e-3, 0.018),
@@ -132,8 +134,8 @@ def list_trials(setting: str, data: Path | None = None) -> list[TuningTrial]:
     """List the tuning trials of a key of `STATED`; `data` is the folder of the real recordings."""
     if setting in RATES:
         return [_make_dynamic_trial(seed, RATES[setting]) for seed in DYNAMIC_SEEDS]
-    if setting in WORLDS:
-        return [trial for seed in PERSON_SEEDS for trial in _make_person_trials(seed, WORLDS[setting])]
+    if setting in PEOPLE:
+        return [trial for seed in PERSON_SEEDS for trial in _make_person_trials(seed, PEOPLE[setting])]
     if data is None:
         raise BadOption(f"{setting}: its trials need the folder of the real recordings")
     paths = sorted((data / "broad").glob("*.mat"))
@@ -147,9 +149,9 @@ def _make_dynamic_trial(seed: int, rate_hz: float) -> TuningTrial:
     return _make_trial(sensor.gyro_S, sensor.accel_S, rate_hz, sensor.quat_WS, static, moving)
 
 
-def _make_person_trials(seed: int, imperfections: Imperfections) -> list[TuningTrial]:
+def _make_person_trials(seed: int, preset: Preset) -> list[TuningTrial]:
     """Make the trials of a person's sensors over clasp and circles; the truth is the sensors' own orientation."""
-    simulation = simulate(simulate_person(seed).lengths, seed=seed, imperfections=imperfections)
+    simulation = simulate(preset.sample_person(seed).lengths, seed=seed, imperfections=preset.imperfections)
     recording = simulation.recording()
     static, moving = (np.zeros(len(recording.time), dtype=bool) for _ in range(2))
     static[recording.span(recording.phases["start"][0])] = True
@@ -190,7 +192,7 @@ def _make_trial(
 
 def list_experiments(data: Path | None = None) -> dict[str, list[Job]]:
     """List the grid searches as jobs, one a setting: best gains, their score, and every grid point."""
-    settings = [*RATES, *WORLDS, *(BROAD if data is not None and any((data / "broad").glob("*.mat")) else ())]
+    settings = [*RATES, *PEOPLE, *(BROAD if data is not None and any((data / "broad").glob("*.mat")) else ())]
     return {"gains": [Job("gains", setting, _search_experiment, (data,)) for setting in settings]}
 
 

@@ -7,41 +7,42 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..calibration import calibrate_lengths
 from ..evaluation import evaluate
 from ..model import load_table
-from ..simulation import CIRCLING_POINT, MILD_PRESET, Person, Simulation, simulate, simulate_person
+from ..simulation import IDEAL_PRESET, Person, Simulation, simulate
 from ..subject import Subject, mount_rows
 from ..tracking import track
 from .jobs import Job, Result
-from .paper import list_closed_lengths
-from .tables import ARBITRARY_MOUNTING
+from .paper import MEASURED, MEASURED_WITH_TRUNK, calibrate_person, collect_hand_errors, list_closed_lengths
+from .presets import PRESETS, Preset
+from .tables import ARBITRARY_MOUNTING, DEFAULT, DEFAULT_WITH_TRUNK, OURS
 
-METHODS = ("amekf", "smekf")
-
-
-def list_experiments(quick: bool = False) -> dict[str, list[Job]]:
-    """List the jobs of each experiment; `quick`: one trial."""
-    trials = range(1 if quick else 10)
-    return {ARBITRARY_MOUNTING: [Job(ARBITRARY_MOUNTING, str(k), _arbitrary_mounting, (k,)) for k in trials]}
+TRIALS = 10
+ROWS = {DEFAULT: (DEFAULT, MEASURED), DEFAULT_WITH_TRUNK: (DEFAULT, MEASURED_WITH_TRUNK), OURS: (OURS, MEASURED)}
 
 
-def _arbitrary_mounting(experiment: str, trial: str, seed: int) -> list[Result]:
-    """Calibrate without stated mounts, with measured shoulder width and trunk, then track six circles."""
-    person = simulate_person(seed)
-    simulation = simulate(person.lengths, seed=seed, imperfections=replace(MILD_PRESET, mount="any"))
+def list_experiments(quick: bool = False, trials: int | None = None) -> dict[str, list[Job]]:
+    """List the jobs of each experiment; `quick`: one trial; `trials`: at most so many."""
+    count = 1 if quick else min(TRIALS, trials or TRIALS)
+    jobs = {}
+    for label, preset in PRESETS.items():
+        name = f"{ARBITRARY_MOUNTING}, {label}"
+        if preset.imperfections != IDEAL_PRESET:
+            jobs[name] = [Job(name, str(k), _arbitrary_mounting, (k, preset)) for k in range(count)]
+    return jobs
+
+
+def _arbitrary_mounting(experiment: str, trial: str, seed: int, preset: Preset) -> list[Result]:
+    """Calibrate without stated mounts, then track six circles."""
+    person = preset.sample_person(seed)
+    simulation = simulate(person.lengths, seed=seed, imperfections=replace(preset.imperfections, mount="any"))
     recording, truth = simulation.recording(), simulation.truth()
     results = []
-    for method in METHODS:
-        subject = calibrate_lengths(
-            recording, measured=person.measured, prior=person.prior, method=method, measured_std=person.measured_std
-        ).subject
+    for label, (method, measured) in ROWS.items():
+        subject = calibrate_person(recording, person, method, person.prior, measured=measured)
         errors = evaluate(track(recording, subject, method=method).pose, truth, simulation.phases["circles"][0])
-        figures = _compute_calibration_errors(subject, person, simulation) | {
-            "hand_mm": errors.position[CIRCLING_POINT]._asdict(),
-            "hand_from_shoulders_mm": errors.position_on_limb[CIRCLING_POINT]._asdict(),
-        }
-        results.append(Result(experiment, trial, method, figures))
+        figures = collect_hand_errors(errors) | _compute_calibration_errors(subject, person, simulation)
+        results.append(Result(experiment, trial, label, figures))
     return results
 
 

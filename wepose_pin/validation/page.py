@@ -14,6 +14,8 @@ from ..report.page import Page, load_template
 from .document import Document
 from .figures import draw_pictures
 from .tables import (
+    compare_with_paper,
+    describe_known,
     describe_table,
     make_experiment_table,
     make_gains_table,
@@ -58,6 +60,7 @@ def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str
         own_rows = [row for row in rows if row.experiment == name]
         experiments[name] = {
             "trials": len({result.trial for result in document.results if result.experiment == name}),
+            "known": describe_known(name, document.presets),
             "table": make_experiment_table(own_rows, True),
             "note": describe_table(own_rows),
             "pictures": [picture for experiment, picture in drawn if experiment == name],
@@ -69,8 +72,9 @@ def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str
         experiments=experiments,
         targets=make_targets_table(rows),
         overview=make_overview_table(rows),
+        beside_paper=compare_with_paper(rows),
         noise=make_noise_table(document.noise),
-        imperfections=make_imperfections_table(document.worlds),
+        imperfections=make_imperfections_table(document.presets),
         gains=make_gains_table(document.gains),
     )
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"

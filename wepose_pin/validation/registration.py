@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation, Slerp
 
 from .. import rotations
@@ -50,10 +50,14 @@ class Registration(NamedTuple):
         }
 
 
-def register_sensors(sensors: Sequence[Referenced], stretch: tuple[float, float]) -> list[Registration]:
+def register_sensors(
+    sensors: Sequence[Referenced], stretch: tuple[float, float], irregular: bool = False
+) -> list[Registration]:
     """Register sensors that share a clock and a reference, from the interval `stretch` [s] of the reference.
 
-    One offset of the clocks: where the correlations of ‖gyro‖ with the body's rate have their greatest sum. A mount
+    One offset of the clocks: where the correlations of ‖gyro‖ with the body's rate have their greatest sum;
+    `irregular`: the reference's times are not even, which rates do not survive, and the offset is that at which the
+    integrated gyroscope follows the body best. A mount
     each: the rotation that brings the sensor's turns over half a second to the body's (Wahba's problem, on rotation
     vectors), refined, together with the gyroscope's bias where there is no static phase, such that the integrated
     gyroscope follows the body over the whole stretch. One tilt of the reference's world: specific force, turned by the
@@ -74,6 +78,9 @@ def register_sensors(sensors: Sequence[Referenced], stretch: tuple[float, float]
         offset, within = float(offsets[best]), step
     if abs(offset) > LARGEST_OFFSET_S - 4e-3:
         raise BadData(f"{sensors[0].name}: no offset of the clocks within {LARGEST_OFFSET_S:g} s fits the reference")
+    if irregular:
+        offset = _fit_offset(spans)
+        correlations, best = np.array([[span.correlation(offset)] for span in spans]), 0
     fits = [span.fit(offset) for span in spans]
     up_V = np.array([span.up(offset, fit) for span, fit in zip(spans, fits, strict=True)])
     quat_WV = rotations.quat_from_gravity(np.array([fit.rms for fit in fits]) ** -2.0 @ up_V)
@@ -81,6 +88,17 @@ def register_sensors(sensors: Sequence[Referenced], stretch: tuple[float, float]
         Registration(offset, fit.R_BS.as_quat(), quat_WV, fit.bias, float(row[best]), float(np.degrees(fit.rms)))
         for fit, row in zip(fits, correlations, strict=True)
     ]
+
+
+def _fit_offset(spans: Sequence[_Span]) -> float:
+    """Find the offset [s] of the clocks at which the integrated gyroscopes follow their bodies best."""
+
+    def score(offset: float) -> float:
+        return sum(span.fit(offset).rms ** 2 for span in spans)
+
+    step = 0.02  # [s]
+    coarse = min(np.arange(-0.5 * LARGEST_OFFSET_S, 0.5 * LARGEST_OFFSET_S + step, step), key=score)
+    return float(minimize_scalar(score, bounds=(coarse - step, coarse + step), options={"xatol": 1e-4}).x)
 
 
 class _Fit(NamedTuple):
