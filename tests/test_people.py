@@ -528,7 +528,7 @@ def test_the_rate_does_not_change_the_motion(body: Simulation) -> None:
 
 @pytest.mark.parametrize("protocol", TASKS)
 def test_people_reach_in_every_protocol(protocol: str) -> None:
-    for seed in range(3):
+    for seed in (0, 2, 36):  # the last two came to grief once
         person, rngs = simulate_person(seed), spawn_streams(seed)
         lengths = {name: float(value) for name, value in person.lengths.items()}
         flaws = Flaws(PEOPLE_PRESET, rngs, lengths["shoulder_width"])

@@ -42,9 +42,10 @@ _PERSON_LEAST_FLEXION = np.deg2rad(15.0)  # the same where shoulders move: below
 # arms are long.
 _REACHES = [
     (rounds, slack)
-    for rounds, most in ((8, 0.08), (16, 0.08), (32, 0.2))
+    for rounds, most in ((10, 0.05), (20, 0.05), (40, 0.2))
     for slack in np.arange(0.02, most, 0.01).tolist()
 ]
+_RELAXATION = 0.75
 _MOST_MISSING = 5e-6  # [m] from a hand to its aim after these rounds
 _RATE_STEP_S = 0.02  # for the rate of elevation
 _TILT_S = 1.5  # correlation time of the slow part of the sway, assumption
@@ -422,7 +423,9 @@ class Motion(BodyMotion):
                 flexion = flexion + opening(palm_T) - opening(bend(flexion))
                 R_TU = _turn_to(R_TU.apply(bend(flexion)), palm_T) * R_TU
             along_T = Rotation.from_rotvec(blend * R_TU.as_rotvec()).apply(down_U)
-            shoulder_T = centre_T + flaws.girdle.displace(along_T, y, raising)
+            # A shoulder that rises lowers the arm, which lowers the shoulder: a part of the way settles sooner.
+            displaced_T = centre_T + flaws.girdle.displace(along_T, y, raising)
+            shoulder_T = shoulder_T + _RELAXATION * (displaced_T - shoulder_T)
         missing = np.linalg.norm(aim.palm_T[side] - shoulder_T - R_TU.apply(bend(flexion)), axis=1)
         worst = float(np.max(missing * (aim.lead[side] == 1.0), initial=0.0))
         if self.leads and worst > self.most_missing:
