@@ -1,7 +1,7 @@
 """Whether stated standard deviations hold on simulated people: root mean square of error over standard deviation.
 
-One person after another is drawn, calibrated with arbitrary mounts and tracked on six circles of the right hand after the
-clasp. A value of 1 is exact, above it the statement is too small, below it too large.
+One person after another is drawn, calibrated with arbitrary mounts and tracked on six circles of the right hand after
+the clasp. A value of 1 is exact, above it the statement is too small, below it too large.
 """
 
 from __future__ import annotations
@@ -17,7 +17,15 @@ from wepose_pin.calibration import assess, calibrate_lengths
 from wepose_pin.errors import WeposeError
 from wepose_pin.kinematics import compute_axis_std
 from wepose_pin.rotations import heading
-from wepose_pin.simulation import PRESETS, Person, Simulation, simulate, simulate_person
+from wepose_pin.simulation import (
+    MEASURED_STD,
+    PEOPLE_MEASURED_STD,
+    PRESETS,
+    Person,
+    Simulation,
+    simulate,
+    simulate_person,
+)
 from wepose_pin.subject import Subject, mount_rows
 from wepose_pin.tracking import TrackedRecording, track
 
@@ -25,11 +33,11 @@ FIRST_SEED = 5000  # of persons that no other measurement or test draws
 CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand")
 
 
-def measure_person(seed: int, preset: str, mount: str = "any", protocol: str = "clasp") -> dict[str, Any]:
+def measure_person(seed: int, preset: str, protocol: str = "clasp") -> dict[str, Any]:
     """Errors [m, rad] and standard deviations of a person, by quantity: lists of pairs."""
-    person = simulate_person(seed, 0.012 if preset == "people" else 0.003)
+    person = simulate_person(seed, PEOPLE_MEASURED_STD if preset == "people" else MEASURED_STD)
     simulation = simulate(
-        person.lengths, seed=seed, imperfections=replace(PRESETS[preset], mount=mount), protocol=protocol
+        person.lengths, seed=seed, imperfections=replace(PRESETS[preset], mount="any"), protocol=protocol
     )
     return {"seed": seed, **measure_simulation(person, simulation, protocol)}
 
@@ -146,7 +154,7 @@ def run(presets: list[str], persons: int, first: int = FIRST_SEED, workers: int 
     for preset in presets:
         with ProcessPoolExecutor(workers) as pool:
             seeds = range(first, first + persons)
-            results = list(pool.map(measure_person, seeds, [preset] * persons, ["any"] * persons, [protocol] * persons))
+            results = list(pool.map(measure_person, seeds, [preset] * persons, [protocol] * persons))
         print_summary(preset, results)
 
 

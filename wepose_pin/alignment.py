@@ -32,8 +32,8 @@ MAX_MOUNT_ERROR_DEG = 60.0
 MOUNT_WARNING_DEG = 35.0
 
 # Standard deviations per axis; assumptions. Those of start poses and soft tissue are the body's, in its table.
-# [rad] of a device's own orientation about each axis: segments against optical motion capture, walking and turning, have
-# 1.1 to 5.5 deg rms in all (Lebel et al. 2017, BioMed Eng OnLine 16:56), soft tissue included.
+# [rad] of a device's own orientation about each axis: segments against optical motion capture, walking and turning,
+# have 1.1 to 5.5 deg rms in all (Lebel et al. 2017, BioMed Eng OnLine 16:56), soft tissue included.
 MEASURED_ORIENTATION_STD = np.deg2rad(2.0)
 SEGMENT_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation in motion, mostly by soft tissue
 PALM_SLIP_STD = 0.005  # [m] by which joined palms slip
@@ -350,17 +350,20 @@ def compute_segment_covariance(
     cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
     # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
-    # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes off
-    # the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
+    # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes
+    # off the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
     R_WL = (R_WS * start_frames.to_world(segment, R_LS).inv()).as_matrix()
-    mount_cov, start_var = _find_start_mount_covariance(recording, segment, subject, start_frames), start_frames.std(segment) ** 2
+    mount_cov, start_var = (
+        _find_start_mount_covariance(recording, segment, subject, start_frames),
+        start_frames.std(segment) ** 2,
+    )
     vertical = np.array([0.0, 0.0, 1.0])
     if mount_cov is not None:
         error_jacobian = R_WL - np.outer(vertical, vertical)
         assert subject is not None  # it has the mount
         if segment not in subject.start_pose_offset:
-            # What is left after the start pose has corrected the tilt, as in `align_sensors`. A person repeats the offset
-            # of the calibration's own start pose: then the start pose tells nothing new.
+            # What is left after the start pose has corrected the tilt, as in `align_sensors`. A person repeats the
+            # offset of the calibration's own start pose: then the start pose tells nothing new.
             tilt = mount_cov[:2]
             mount_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + np.diag(start_var[:2]), tilt)
         if segment != start_frames.table.reference:

@@ -439,8 +439,8 @@ def compute_point_covariances(
 
     Only of points for which every segment between root and point has a covariance. A point is the sum of vectors v that
     rotate with segments: an error δ of a segment's orientation moves the point by δ × v, errors of different sensors
-    are independent, errors of the lengths act along the vectors. A girdle adds the errors of its parameters and what leaves its law. The
-    points of a mechanism move with the joints, which
+    are independent, errors of the lengths act along the vectors. A girdle adds the errors of its parameters and what
+    leaves its law. The points of a mechanism move with the joints, which
     the fit takes from all orientations.
 
     Parameters
@@ -486,7 +486,11 @@ def compute_point_covariances(
             shape_jacobian[:, :, : len(lengths)] += R_WK[link] @ part.by_length
         residual = np.zeros((n, 3, 3))
         for name in model.point_girdles[point]:
-            girdle, motion, first = model.table.girdles[name], motions[name], len(lengths) + len(PARAMETERS) * girdles.index(name)
+            girdle, motion, first = (
+                model.table.girdles[name],
+                motions[name],
+                len(lengths) + len(PARAMETERS) * girdles.index(name),
+            )
             R_on = known[girdle.on].as_matrix()
             vectors[girdle.on] = vectors.get(girdle.on, 0.0) + known[girdle.on].apply(motion.displacement)
             shape_jacobian[:, :, first : first + len(PARAMETERS)] += R_on @ motion.jacobian

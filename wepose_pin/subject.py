@@ -25,7 +25,9 @@ from .errors import BadData, BadModel, BadOption, BadSubject, one_of
 from .model import BodyModel, BodyTable, compute_population_lengths, load_table
 from .model.girdle import PARAMETERS
 
-_ROW = re.compile(r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law")  # of a covariance, other than lengths
+_ROW = re.compile(
+    r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law"
+)  # of a covariance, other than lengths
 LONGEST = 3.0  # [m] of a plausible length
 _LEARNED = ("mounts", "hinges", "girdles", "start_pose_offset", "heading_drift", "doubled")
 _TABLES = ("lengths", "lengths_std", *_LEARNED, "covariance")
@@ -160,7 +162,8 @@ class Subject:
         return covariance
 
     def shape_covariance(self, table: BodyTable) -> np.ndarray:
-        """Covariance (k + 7 g, k + 7 g) [m², or a share of the law] of a body's lengths and then its girdles' parameters.
+        """Covariance (k + 7 g, k + 7 g) [m², or a share of the law] of a body's lengths and then its girdles'
+        parameters.
 
         Parameters of which nothing is known have the spread that the table states.
         """
@@ -290,7 +293,10 @@ def subject_toml(subject: Subject) -> str:
         lines += [f"{key} = {value:.9f}" for key, value in zip("xyz", hinge.axis, strict=True)]
         lines.append(f"std_deg = {np.degrees(hinge.std):.3f}")
     for point, values in subject.girdles.items():
-        lines += ["", f"[girdles.{point}]   # m, off the law of the body's table: its place at rest, and what is added at 90 deg"]
+        lines += [
+            "",
+            f"[girdles.{point}]   # m, off the law of the body's table: its place at rest, and what is added at 90 deg",
+        ]
         lines += [f"{key} = {value:.6f}" for key, value in zip(PARAMETERS, values, strict=True)]
     for segment, start in subject.start_pose_offset.items():
         lines += ["", f"[start_pose_offset.{segment}]   # off the start pose in the calibration, about x and y of W"]

@@ -8,8 +8,8 @@ stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(st
 
 with ψ the heading, d its drift since the start, s its steps where samples were lost since (`losses`), and A the
 soft-tissue artefact: soft tissue rotates a sensor as the direction of gravity in the segment changes. A segment's
-points may move, as the shoulders do by collarbones and shoulder blades while the arms are raised (`model.girdle`). d, s, A
-and the hinges are nuisance parameters: the covariance of lengths and mounts includes their
+points may move, as the shoulders do by collarbones and shoulder blades while the arms are raised (`model.girdle`). d,
+s, A and the hinges are nuisance parameters: the covariance of lengths and mounts includes their
 effect.
 
 A sample is one of the protocol's condition that holds then. A closure gives the gap, whitened by the covariance that

@@ -192,7 +192,8 @@ def compare_measured(
 
 
 def project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names and covariance of the lengths, mount errors and girdles, from x's covariance: R_LS = exp(−ε) Rz(ψ) R_VS(start).
+    """Names and covariance of the lengths, mount errors and girdles, from x's covariance: R_LS = exp(−ε) Rz(ψ)
+    R_VS(start).
 
     Errors of mounts are turned from the frames that equal W in the start pose to those of the segments. By how much a
     person turns a segment about the vertical in the start pose is not in them: no closure shows it.

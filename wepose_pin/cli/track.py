@@ -75,9 +75,7 @@ def _print_error_budget(budget: Mapping[str, Mapping[str, float]]) -> None:
     print_table(
         "Error budget: one standard deviation of an axis [mm], root mean square over the recording",
         ("part", *budget),
-        [
-            (part, *(f"{point[part]:.1f}" if part in point else "" for point in budget.values())) for part in parts
-        ]
+        [(part, *(f"{point[part]:.1f}" if part in point else "" for point in budget.values())) for part in parts]
         + [("all", *(f"{sum(value**2 for value in point.values()) ** 0.5:.1f}" for point in budget.values()))],
     )
 

@@ -56,8 +56,8 @@ class TrackJob:
     covariance
         Write the covariance of each orientation and point too, not only the standard deviations.
     error_budget
-        Print what each part is worth in the standard deviation of each point: soft tissue, sensors with their mounts and
-        start poses, lengths, the shoulder girdle. summary.json and report.html have it in any case.
+        Print what each part is worth in the standard deviation of each point: soft tissue, sensors with their mounts
+        and start poses, lengths, the shoulder girdle. summary.json and report.html have it in any case.
     limits
         Keep joints with one or two axes within the limits of the model.
     torques

@@ -64,7 +64,9 @@ class BodyModel:
         """Point → the girdles that move it."""
         m = self.pin
         joints = {name: m.getJointId(girdle.joints[-1]) for name, girdle in self.table.girdles.items()}
-        supports = {point: m.supports[m.frames[m.getFrameId(at)].parentJoint] for point, at in self.point_frames.items()}
+        supports = {
+            point: m.supports[m.frames[m.getFrameId(at)].parentJoint] for point, at in self.point_frames.items()
+        }
         return {
             point: tuple(name for name, joint in joints.items() if joint in above) for point, above in supports.items()
         }

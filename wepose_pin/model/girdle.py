@@ -1,13 +1,13 @@
 """The shoulder girdle: the centre of the shoulder moves on the trunk as the arm is raised.
 
-A `Girdle` is a part of the body's table: three joints of the URDF that slide along x, y and z of the segment on which the
-limb hangs, and follow the direction of the limb by a law. With e the limb's angle off hanging (at most `MAX_ELEVATION`),
-s = e / 90° and cos φ the outward part of its direction over sin e:
+A `Girdle` is a part of the body's table: three joints of the URDF that slide along x, y and z of the segment on which
+the limb hangs, and follow the direction of the limb by a law. With e the limb's angle off hanging (at most
+`MAX_ELEVATION`), s = e / 90° and cos φ the outward part of its direction over sin e:
 
     up = (a + b cos φ) s        back = c s² + d (1 − exp(−e / ε)) cos φ        middle = (f + g cos φ) s
 
-A person differs from the law by seven parameters: the share by which the law is more or less, and along x, y and z of that
-segment [m] a place at rest, and a displacement at 90° that grows with s.
+A person differs from the law by seven parameters: the share by which the law is more or less, and along x, y and z of
+that segment [m] a place at rest, and a displacement at 90° that grows with s.
 """
 
 from __future__ import annotations

@@ -92,7 +92,14 @@ class Segment(NamedTuple):
     def of_mechanism(cls, link: str) -> Segment:
         """A link of a mechanism, on which nothing is soft; its start configuration is known well (assumption)."""
         rigid = SoftTissue()
-        return cls(link, rigid_without_sensor=True, soft_tissue_std=0.0, soft_tissue=rigid, start_std=_same(0.5), repeat_std=_same(0.5))
+        return cls(
+            link,
+            rigid_without_sensor=True,
+            soft_tissue_std=0.0,
+            soft_tissue=rigid,
+            start_std=_same(0.5),
+            repeat_std=_same(0.5),
+        )
 
 
 class Point(NamedTuple):
@@ -534,7 +541,10 @@ def _read_soft_tissue(entry: TomlTable, default: SoftTissue) -> SoftTissue:
         return default
     table = entry.table("soft_tissue")
     table.allow("std_deg", "relative_to", "per_tilt", "per_twist", "raised", "per_raised")
-    tilt, raised = (_read_triple(table, key, value) for key, value in (("per_tilt", default.per_tilt), ("per_raised", default.per_raised)))
+    tilt, raised = (
+        _read_triple(table, key, value)
+        for key, value in (("per_tilt", default.per_tilt), ("per_raised", default.per_raised))
+    )
     return SoftTissue(
         _read_angles(table, "std_deg", default.std),
         table.text("relative_to", default.relative_to or None) or "",
@@ -680,9 +690,21 @@ def _read_girdles(top: TomlTable, table: BodyTable) -> dict[str, Girdle]:
                 f"and 1 are needed"
             )
         girdles[name] = Girdle(
-            *(on, moves, (joints[0], joints[1], joints[2]), (x, y, z)),
-            *((up[0], up[1]), (middle[0], middle[1]), (back[0], back[1]), float(np.deg2rad(angle))),
-            *(scaled_by, scale or 1.0, law_std, stds[0], stds[1], alike, stds[2]),
+            on,
+            moves,
+            joints=(joints[0], joints[1], joints[2]),
+            outward=(x, y, z),
+            up=(up[0], up[1]),
+            middle=(middle[0], middle[1]),
+            back=(back[0], back[1]),
+            back_angle=float(np.deg2rad(angle)),
+            scaled_by=scaled_by,
+            scale=scale or 1.0,
+            law_std=law_std,
+            rest_std=stds[0],
+            raised_std=stds[1],
+            alike=alike,
+            residual_std=stds[2],
         )
     return girdles
 
@@ -830,7 +852,11 @@ def format_table(table: BodyTable, urdf: str) -> str:
         parts = [f"std_deg = {np.degrees(tissue.std).round(6).tolist()}", f"per_tilt = {list(tissue.per_tilt)}"]
         parts += [f"per_twist = {tissue.per_twist!r}"]
         parts += [f"relative_to = {toml_string(tissue.relative_to)}"] if tissue.relative_to else []
-        parts += [f"raised = {toml_strings(tissue.raised)}", f"per_raised = {list(tissue.per_raised)}"] if tissue.raised else []
+        parts += (
+            [f"raised = {toml_strings(tissue.raised)}", f"per_raised = {list(tissue.per_raised)}"]
+            if tissue.raised
+            else []
+        )
         lines.append(f"soft_tissue = {{ {', '.join(parts)} }}")
     lines += ["", "[points]"]
     for name, point in table.points.items():

@@ -20,8 +20,8 @@ from ..model.configurations import find_undetermined_joints
 from ..model.start_pose import compute_start_configuration
 from ..recording import Recording
 from ..subject import Subject, population_subject
-from .headings import HeadingCorrection
 from .error_budget import ErrorBudget
+from .headings import HeadingCorrection
 from .options import TrackOptions
 
 MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment
