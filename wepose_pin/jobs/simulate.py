@@ -175,6 +175,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
             person.prior,
             name="truth",
             lengths=person.lengths,
+            girdles=simulation.girdles,
             mounts=simulation.quat_LS,
             order=order,
             covariance=np.zeros((len(order), len(order))),

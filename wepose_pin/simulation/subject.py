@@ -14,6 +14,7 @@ from ..arguments import Count, NonNegative, Positive, check_arguments, check_nam
 from ..errors import BadOption
 from ..kinematics import Pose
 from ..model import DEFAULT_BODY, SEXES, load_table
+from ..model.girdle import PARAMETERS
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, mark_lost_samples
@@ -121,6 +122,16 @@ class Simulation:
             )
         phases = {phase: tuple(spans) for phase, spans in self.phases.items() if spans}
         return check_recording(Recording(name, self.time, self.rate_hz, sensors, phases))
+
+    @property
+    def girdles(self) -> dict[str, np.ndarray]:
+        """Girdle → (7,) what the person's shoulders differ by from the law of the body's table, as far as it is known.
+
+        Without `Imperfections.girdle` they do not move; what a person has beside de Groot's regression is not in it.
+        """
+        own = np.zeros(len(PARAMETERS))
+        own[PARAMETERS.index("law")] = min(self.imperfections.girdle, 1.0) - 1.0
+        return {name: own for name in load_table().girdles}
 
     def truth(self) -> Pose:
         """Return the exact pose."""
