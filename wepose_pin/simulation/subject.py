@@ -131,7 +131,7 @@ class Simulation:
         """
         own = np.zeros(len(PARAMETERS))
         own[PARAMETERS.index("law")] = min(self.imperfections.girdle, 1.0) - 1.0
-        return {name: own for name in load_table().girdles}
+        return dict.fromkeys(load_table().girdles, own)
 
     def truth(self) -> Pose:
         """Return the exact pose."""
