@@ -33,6 +33,23 @@ FIRST_SEED = 5000  # of persons that no other measurement or test draws
 CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand")
 
 
+def measure_sessions(seed: int, preset: str, sessions: int) -> list[dict[str, Any]]:
+    """As `measure_person`, of sessions one after another, each with new mounts and the last subject as its prior."""
+    person = simulate_person(seed, PEOPLE_MEASURED_STD if preset == "people" else MEASURED_STD)
+    results, prior, measured = [], person.prior, dict(person.measured)
+    for session in range(sessions):
+        simulation = simulate(
+            person.lengths, seed=seed, imperfections=replace(PRESETS[preset], mount="any"), session=session, circles=0
+        )
+        recording = replace(simulation.recording(), remounted=session > 0)
+        subject = calibrate_lengths(
+            recording, measured=measured, prior=prior, measured_std=person.measured_std
+        ).subject
+        results.append({"seed": seed, **_compare_subject(subject, person, simulation)})
+        prior, measured = subject, {}  # a length is measured once
+    return results
+
+
 def measure_person(seed: int, preset: str, protocol: str = "clasp") -> dict[str, Any]:
     """Errors [m, rad] and standard deviations of a person, by quantity: lists of pairs."""
     person = simulate_person(seed, PEOPLE_MEASURED_STD if preset == "people" else MEASURED_STD)
@@ -149,6 +166,16 @@ def print_summary(preset: str, results: list[dict[str, Any]]) -> None:
         )
 
 
+def run_sessions(presets: list[str], persons: int, first: int, workers: int, sessions: int) -> None:
+    """Measure and print what each later session of a person adds."""
+    for preset in presets:
+        with ProcessPoolExecutor(workers) as pool:
+            seeds = range(first, first + persons)
+            results = list(pool.map(measure_sessions, seeds, [preset] * persons, [sessions] * persons))
+        for session in range(sessions):
+            print_summary(f"{preset}, session {session + 1}", [person[session] for person in results])
+
+
 def run(presets: list[str], persons: int, first: int = FIRST_SEED, workers: int = 2, protocol: str = "clasp") -> None:
     """Measure and print."""
     for preset in presets:
@@ -166,6 +193,10 @@ if __name__ == "__main__":
     parser.add_argument("--persons", type=int, default=60, help="number of persons")
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="seed of the first person")
     parser.add_argument("--workers", type=int, default=2, help="processes")
-    parser.add_argument("--protocol", default="clasp", help="of the calibration")
+    parser.add_argument("--sessions", type=int, default=1, help="of each person, each with the last subject as prior") parser.add_argument("--protocol", default="clasp", help="of the calibration")
     options = parser.parse_args()
+    if options.sessions > 1:
+        chosen = options.preset or list(PRESETS)
+        run_sessions(chosen, options.persons, options.first, options.workers, options.sessions)
+        raise SystemExit
     run(options.preset or list(PRESETS), options.persons, options.first, options.workers, options.protocol)

@@ -32,6 +32,7 @@ LONGEST = 3.0  # [m] of a plausible length
 _LEARNED = ("mounts", "hinges", "girdles", "start_pose_offset", "heading_drift", "doubled")
 _TABLES = ("lengths", "lengths_std", *_LEARNED, "covariance")
 FORMAT = 2
+POPULATION = "population"  # name of the prior of a body's lengths
 MOST_OFFSET_DEG = 180.0  # of a file; the calibration checks whether it is plausible
 MOST_DRIFT_DEG_MIN = 6000.0  # of a heading: 100 deg/s, beyond any gyroscope's bias
 
@@ -87,6 +88,11 @@ class Subject:
     heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
     doubled: Mapping[str, str] = field(default_factory=dict)
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def is_population(self) -> bool:
+        """Whether it stands for the population, before any calibration."""
+        return self.name == POPULATION
 
     def check(self) -> Subject:
         """The same subject, if all its fields are valid.
@@ -271,7 +277,7 @@ def population_subject(
     rows = [order.index(name) for name in people.names]
     covariance[np.ix_(rows, rows)] += people.covariance
     note = people.note if people.names else f"lengths of the model {table.name}"
-    return Subject("population", {name: lengths[name] for name in order}, order, covariance, note=note)
+    return Subject(POPULATION, {name: lengths[name] for name in order}, order, covariance, note=note)
 
 
 def subject_toml(subject: Subject) -> str:

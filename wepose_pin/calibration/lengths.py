@@ -287,7 +287,7 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
     offsets = Rotation.from_rotvec(np.pad(fit.x[layout.tilt].reshape(-1, 2), ((0, 0), (0, 1)))).as_rotvec()[:, :2]
     subject = _make_subject(problem, solution, {joint: hinge for joint, (hinge, _) in hinges.items()}, offsets)
     scale_observed = fix_scale(problem.conditions)
-    scale = "of the population prior"
+    scale = "of the population prior" if prior.is_population else f"of {prior.name}"
     if scale_lengths or scale_observed:
         scale = f"measured: {', '.join(scale_lengths)}" if scale_lengths else "of the closure"
 
@@ -387,7 +387,8 @@ def _make_subject(
             for name, rate, rate_std in zip(layout.sensors, x[layout.drift], std[layout.drift], strict=True)
         },
         lengths=dict(zip(layout.lengths, x[layout.length].tolist(), strict=True)),
-        girdles={
+        girdles=dict(problem.prior.girdles)
+        | {
             term.name: values
             for term, values in zip(layout.girdles, x[layout.girdle].reshape(-1, len(PARAMETERS)), strict=True)
         },

@@ -36,12 +36,9 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     BadSubject
         The prior has no positive definite covariance of its lengths.
     """
-    layout, prior = observations.layout, problem.prior
+    layout = observations.layout
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
-    rows_of_lengths = layout.length
-    mean[rows_of_lengths], information[rows_of_lengths, rows_of_lengths] = combine_lengths(
-        prior, problem.measured, layout.lengths
-    )
+    _add_shape(mean, information, problem, layout)
     for name, row in zip(layout.distance_names, range(layout.size)[layout.distances], strict=True):
         stated = next(c for c in observations.conditions if isinstance(c, Loop) and c.closure.distance == name).closure
         mean[row], std = problem.measured.get(name, (stated.metres, stated.metres_std))
@@ -62,20 +59,35 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     segments = problem.model.table.segments
     soft_tissue = [segments[name].soft_tissue_std for name in layout.soft]
     information[layout.soft_tissue, layout.soft_tissue] = np.diag(np.repeat(soft_tissue, 9) ** -2.0)
-    mean[layout.girdle], information[layout.girdle, layout.girdle] = _girdle_prior(problem, layout)
     _add_hinges(information, layout, problem.model.table)
     return Gaussian(place_points(mean, observations), information)
 
 
-def _girdle_prior(problem: CalibrationProblem, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (7 g,) and information of the girdles' parameters: of the prior, else of the table."""
-    table, names = problem.model.table, [term.name for term in layout.girdles]
-    first = len(table.lengths)
-    all_names, size = list(table.girdles), len(PARAMETERS)
-    rows = [first + size * all_names.index(name) + k for name in names for k in range(size)]
-    covariance = problem.prior.shape_covariance(table)[np.ix_(rows, rows)]
-    mean = [problem.prior.girdles.get(name, np.zeros(size)) for name in names]
-    return np.concatenate([*mean, np.empty(0)]), np.linalg.inv(covariance + LEAST_GIRDLE_STD**2 * np.eye(len(rows)))
+def _add_shape(mean: np.ndarray, information: np.ndarray, problem: CalibrationProblem, layout: Layout) -> None:
+    """Lengths and girdles, jointly: of the prior, else of the table, with measured lengths.
+
+    Raises
+    ------
+    BadSubject
+        The prior has no positive definite covariance of its lengths.
+    """
+    prior, table, size = problem.prior, problem.model.table, len(PARAMETERS)
+    of_lengths, _ = combine_lengths(prior, {}, layout.lengths)
+    own = [prior.girdles.get(term.name, np.zeros(size)) for term in layout.girdles]
+    first, names = len(table.lengths), list(table.girdles)
+    chosen = [list(table.lengths).index(name) for name in layout.lengths]
+    chosen += [first + size * names.index(term.name) + k for term in layout.girdles for k in range(size)]
+    covariance = prior.shape_covariance(table)[np.ix_(chosen, chosen)]
+    covariance[len(layout.lengths) :, len(layout.lengths) :] += LEAST_GIRDLE_STD**2 * np.eye(size * len(own))
+    rows = np.concatenate((np.arange(layout.size)[layout.length], np.arange(layout.size)[layout.girdle]))
+    K, before = np.linalg.inv(covariance), np.concatenate((of_lengths, *own))
+    target = K @ before
+    for i, name in enumerate(layout.lengths):
+        if name in problem.measured:
+            metres, std = problem.measured[name]
+            K[i, i] += std**-2
+            target[i] += metres * std**-2
+    mean[rows], information[np.ix_(rows, rows)] = np.linalg.solve(K, target), K
 
 
 def _add_places(mean: np.ndarray, information: np.ndarray, observations: Observations) -> None:

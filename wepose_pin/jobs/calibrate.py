@@ -48,6 +48,10 @@ class CalibrateJob:
         Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
         priors) or paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the
         palms, with the mounts as the session states them and a measured length that fixes the scale).
+    prior : SUBJECT
+        Begin with this subject.toml, or the one in this folder, of an earlier calibration of the same person: lengths
+        and shoulders with their covariance, so that each session adds to what is known. Its mounts hold as long as the
+        sensors were not taken off; a session with remounted = true takes none of them.
     stature : METRES
         Narrow the population prior to people of this body height.
     sex
@@ -69,6 +73,7 @@ class CalibrateJob:
     protocol: str = "clasp"
     model: str | None = None
     measured: Mapping[str, float] = field(default_factory=dict)
+    prior: Path | None = None
     stature: float | None = None
     sex: Literal["f", "m"] | None = None
     formulation: Formulation = "full"
@@ -85,6 +90,10 @@ class CalibrateJob:
 
         load_protocol(self.protocol)
         check_stature(self.stature)
+        if self.prior is not None and (self.stature is not None or self.sex is not None):
+            raise WrongOption(
+                "prior", self.prior, "has the lengths of a person; --stature and --sex narrow those of the population"
+            )
         # A URDF without a table has the sensors' links as segments, and those are in the session.
         if self.model is not None and Path(self.model).suffix.lower() != ".urdf":
             _check_measured(self, load_model(self.model))
@@ -132,7 +141,7 @@ def run_calibrate(
     from ..model.body import load_sensed_model
     from ..readers import load_session
     from ..report import write_calibration_page
-    from ..subject import population_subject
+    from ..subject import load_subject, population_subject
     from ..writers.calibration import write_calibration
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance
@@ -145,7 +154,8 @@ def run_calibrate(
         recording = load_session(job.session, gaps=job.gaps)
         model = load_sensed_model(job.model or recording.model or None, recording.sensors, recording.where())
         _check_measured(job, model)
-        prior = population_subject(job.stature, job.sex, model)
+        prior = load_subject(job.prior) if job.prior is not None else None
+        prior = prior or population_subject(job.stature, job.sex, model)
         progress("calibrating", 1 / 3)
         calibration = calibrate_lengths(
             recording,

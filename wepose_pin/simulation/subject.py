@@ -68,6 +68,15 @@ _STREAMS = (
     "gyro_warm_up",
     "clock_drift",
 )
+# What stays with a person from session to session.
+_PERSON_STREAMS = (
+    "shoulder_wander",
+    "tissue_gain",
+    "girdle_person",
+    "girdle_rest",
+    "carrying_angle",
+    "elbow_abduction",
+)
 
 
 @dataclass(frozen=True)
@@ -244,6 +253,7 @@ def simulate(
     circles: Count = 6,
     protocol: str = "clasp",
     pose_deg: NonNegative = 0.0,
+    session: Count = 0,
 ) -> Simulation:
     """Simulate the paper's upper-body experiment with known truth.
 
@@ -266,6 +276,7 @@ def simulate(
     protocol : what is done in place of the clasp, one of `TASKS`; "handle": 0.4 m between the palms; "touch_left" and
         "touch_right": the palm on a fixed point while the trunk leans and turns; "poses": T-pose and bow, no circles.
     pose_deg : how far T-pose and bow are off, standard deviation of each axis [deg].
+    session : another session of the same person: sensors are mounted again, motion, start pose and noise are others.
 
     Returns
     -------
@@ -291,7 +302,7 @@ def simulate(
     if protocol not in TASKS or (protocol == "poses" and circles):
         raise BadOption(f"protocol {protocol!r} must be one of {', '.join(TASKS)}; with 'poses' circles must be 0")
     lengths = {name: float(lengths[name]) for name in names}
-    rngs = spawn_streams(seed)
+    rngs = spawn_streams(seed, session)
     motion = TASKS[protocol](
         lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs, lengths["shoulder_width"])
     )
@@ -299,9 +310,13 @@ def simulate(
     return measure_motion(motion, rngs, rate_hz, noise, imperfections)
 
 
-def spawn_streams(seed: int) -> dict[str, np.random.Generator]:
-    """Spawn the streams of random numbers by their names."""
-    return dict(zip(_STREAMS, np.random.default_rng(seed).spawn(len(_STREAMS)), strict=True))
+def spawn_streams(seed: int, session: int = 0) -> dict[str, np.random.Generator]:
+    """Spawn the streams of random numbers by their names; a later session of the person shares those of the person."""
+    streams = dict(zip(_STREAMS, np.random.default_rng(seed).spawn(len(_STREAMS)), strict=True))
+    if session:
+        again = zip(_STREAMS, np.random.default_rng([seed, session]).spawn(len(_STREAMS)), strict=True)
+        streams |= {name: stream for name, stream in again if name not in _PERSON_STREAMS}
+    return streams
 
 
 def measure_motion(
