@@ -71,13 +71,21 @@ def test_what_does_not_drift_stays(made: tuple[Simulation, Subject]) -> None:
         assert np.degrees(off.magnitude().max()) < 0.02
 
 
-def test_nothing_is_corrected_without_a_clasp_and_hinges(made: tuple[Simulation, Subject]) -> None:
+def test_without_a_clasp_the_hinges_of_each_arm_correct_it(made: tuple[Simulation, Subject]) -> None:
+    """Axes as the table has them where none is calibrated, and without the torso that the hands would need."""
     simulation, subject = made
     recording = drifting(simulation, {"right_forearm": 8.0})
     recording = replace(recording, phases={"start": recording.phases["start"]})
-    assert track(recording, replace(subject, hinges={})).correction is None
     fewer = replace(recording, sensors={n: s for n, s in recording.sensors.items() if n != "torso"})
-    assert track(fewer, subject).correction is None
+    alone = replace(recording, sensors={n: s for n, s in recording.sensors.items() if "forearm" not in n})
+    for of, person in ((recording, replace(subject, hinges={})), (fewer, subject)):
+        found = track(of, person).correction
+        assert found is not None
+        assert found.gap_rms_mm is None
+        before, after = found.hinge_residual_rms_deg["right_elbow"]
+        assert after < 0.7 * before
+    assert track(alone, subject).correction is None
+    assert track(recording, subject, open_loop=True).correction is None
 
 
 def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simulation, Subject]) -> None:
@@ -96,7 +104,9 @@ def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simula
     assert longer.correction.gap_rms_mm[0] > 300.0
     for name, quat in only.quat_WL.items():
         np.testing.assert_allclose(longer.quat_WL[name], quat, atol=1e-12)
-    assert alone.correction is None
+    never = track(replace(recording, phases={"start": start}), replace(subject, hinges={}))
+    for name, quat in never.quat_WL.items():
+        np.testing.assert_allclose(alone.quat_WL[name], quat, atol=1e-12)
 
 
 def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
@@ -162,5 +172,11 @@ def test_hinges_hold_for_the_strapping_in_which_they_were_found(made: tuple[Simu
     simulation, subject = made
     recording = drifting(simulation, {"right_forearm": 8.0})
     recording = replace(recording, phases={"start": recording.phases["start"]})
-    assert track(recording, subject).correction is not None
-    assert track(replace(recording, remounted=True), subject).correction is None
+    skew = Hinge(np.array([np.sin(0.2), np.cos(0.2), 0.0]), np.deg2rad(2.0))
+    subject = replace(subject, hinges=dict.fromkeys(HINGES, skew))
+    calibrated, remounted = (track(replace(recording, remounted=again), subject) for again in (False, True))
+    usual = track(recording, replace(subject, hinges={}))
+    assert calibrated.correction is not None
+    assert usual.correction is not None
+    assert not np.array_equal(calibrated.quat_WL["right_forearm"], usual.quat_WL["right_forearm"])
+    assert all(np.array_equal(remounted.quat_WL[name], quat) for name, quat in usual.quat_WL.items())
