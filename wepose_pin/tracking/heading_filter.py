@@ -32,13 +32,15 @@ from .joint_accelerations import JointPair, JointSums
 E_Z = np.array([0.0, 0.0, 1.0])
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
+LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance within so long [s], above which it leaps
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
-# A clasp that is found: the points are joined for this long [s], at most this far apart [m] rms and by so much [m] rms
-# around their mean, while each moves by at least this speed [m/s] rms and their distance by at most a share of it.
+# A clasp that is found: the points are joined for this long [s], at most this far apart [m] rms, by so much [m] rms around
+# their mean, and so far [m] in height, while each moves by at least this speed [m/s] rms and their distance by at most a
+# share of it. On simulated people with the lengths of the population joined hands seem up to 25 cm apart and are not found.
 CLASP_S = 2.0
-CLASP_GAP, CLASP_CHANGE = 0.06, 0.02
+CLASP_GAP, CLASP_CHANGE, CLASP_HEIGHT = 0.06, 0.03, 0.12
 CLASP_SPEED, CLASP_SPEED_RATIO = 0.08, 0.3
 
 
@@ -158,6 +160,7 @@ class Knot(NamedTuple):
     quat_WL: np.ndarray  # (m, k, 4) xyzw
     joints: tuple[JointSums | None, ...]
     heading_var: np.ndarray  # (k,) [rad²] of each orientation filter at the end; NaN: it has none
+    lost: np.ndarray  # (k,) bool, whether a sensor has lost a sample
 
 
 class Rows(NamedTuple):
@@ -208,7 +211,7 @@ class HeadingProblem:
     def find_segment_variance(self, index: int, variance: Any) -> Any:
         """Find the variance [rad²] of a segment's heading near the start pose, from that of its sensor's world.
 
-        δ begins at s − ε_z, by the start pose's error s and the mount's ε_z, and a segment that hangs is off by δ + ε_z.
+        δ begins at s − ε_z, by errors s of the start pose and ε_z of the mount; a segment that hangs is off by δ + ε_z.
         """
         start_var, mount_var = self.start_var[index], self.mount_var[index]
         share = mount_var / max(start_var + mount_var, 1e-12)
@@ -261,6 +264,7 @@ class HeadingFilter:
         self._decay, self._steady = decay, (1.0 - decay**2) * std**2
         self._misfit = np.full(len(problem.pairs), noise.acceleration_std**2)  # [m²/s⁴] recent mean of each axis
         self._last_var: np.ndarray | None = None
+        self._usual_gain = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, largest of late
         self._clasps = ClaspDetector(problem)
         self.clasps: list[tuple[float, float]] = []  # [s] when points were found to coincide
 
@@ -279,17 +283,22 @@ class HeadingFilter:
         return step_var
 
     def find_step_variance(self, knot: Knot) -> np.ndarray:
-        """Find the variance (k,) [rad²] that the orientation filters' headings have gained in a knot."""
-        knot_s = self.problem.knot_s
-        grown = UNKNOWN_DRIFT_PSD * knot_s * np.ones(len(self.problem.names))
-        if self._last_var is not None:
-            known = np.isfinite(knot.heading_var) & np.isfinite(self._last_var)
-            gained = np.minimum(knot.heading_var - self._last_var, self.problem.drift_psd * knot_s)
-            grown[known] = np.maximum(gained, MIN_DRIFT_PSD * knot_s)[known]
-        else:
-            grown[np.isfinite(knot.heading_var)] = MIN_DRIFT_PSD * knot_s
+        """Find the variance (k,) [rad²] that the headings have gained in a knot beside their rates.
+
+        That of the orientation filter includes its gyroscope's bias, which is a rate here: it counts up to `drift_psd`,
+        and as a whole where samples were lost or the rate was cut off, which make it leap.
+        """
+        knot_s, k = self.problem.knot_s, len(self.problem.names)
+        if self._last_var is None:
+            self._last_var = knot.heading_var
+        gained = np.maximum(knot.heading_var - self._last_var, MIN_DRIFT_PSD * knot_s)
         self._last_var = knot.heading_var
-        return grown
+        known = np.isfinite(gained)
+        leaps = known & (knot.lost | ((gained > LEAP * self._usual_gain) & (self._usual_gain > 0.0)))
+        usual = np.where(known & ~leaps, gained, 0.0)
+        self._usual_gain = np.maximum(self._usual_gain * np.exp(-knot_s / USUAL_S), usual)
+        limited = np.where(leaps, gained, np.minimum(gained, self.problem.drift_psd * knot_s))
+        return np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k))
 
     def transition(self) -> np.ndarray:
         """Return F (n, n) of one knot."""
@@ -472,7 +481,7 @@ class ClaspDetector:
             speed = min(float(np.sqrt(np.mean(np.sum(np.gradient(p, time, axis=0) ** 2, axis=1)))) for p in paths)
             v = closure.gap.vectors(R, problem.model)
             gap = v.sum(axis=0)
-            if speed < CLASP_SPEED or np.abs(gap[:, 2]).max() > 2.0 * CLASP_GAP:
+            if speed < CLASP_SPEED or np.abs(gap[:, 2]).max() > CLASP_HEIGHT:
                 continue
             H = np.zeros((len(time), 3, k))
             for part, link in zip(closure.gap.parts, v, strict=True):

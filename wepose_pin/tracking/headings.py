@@ -125,7 +125,8 @@ class KnotReader:
         quat_WL = np.stack(
             [(self._R_WV[i] * Rotation.from_quat(quat_VS[rows, i]) * self._R_SL[i]).as_quat() for i in range(k)], axis=1
         )
-        return Knot(float(self._time[n - 1]), self._time[rows].copy(), quat_WL, joints, heading_var)
+        lost = ~np.isfinite(self._accel_S[:n]).all(axis=(0, 2))
+        return Knot(float(self._time[n - 1]), self._time[rows].copy(), quat_WL, joints, heading_var, lost)
 
 
 def pose_problem(
@@ -407,7 +408,7 @@ class CausalHeadings:
     def reset(self, heading_offset: np.ndarray) -> None:
         """Set ψ (k,) [rad] as the start pose shows it."""
         error = heading_offset - self.offset
-        error = self.end + np.angle(np.exp(1j * (error - self.end)))
+        error = error + 2.0 * np.pi * np.round((self.end - error) / (2.0 * np.pi))
         self._filter.reset(error)
         self.begin = self.end = error
 
