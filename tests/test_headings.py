@@ -17,6 +17,8 @@ from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simul
 from wepose_pin.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.tracking import track
 
+# The simulated person's shoulders stay in place, against the law of the table.
+RIGID = {name: np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) for name in TABLE.girdles}
 HINGES = {joint: Hinge(np.array([0.0, 1.0, 0.0]), np.deg2rad(2.0)) for joint in ("left_elbow", "right_elbow")}
 
 
@@ -25,7 +27,7 @@ def made() -> tuple[Simulation, Subject]:
     person = simulate_person(4)
     simulation = simulate(person.lengths, seed=4, noise=NOISE_FREE, clasp_s=40.0, circles=4)
     mounts = dict.fromkeys(simulation.quat_WL, np.array([0.0, 0.0, 0.0, 1.0]))
-    return simulation, replace(person.prior, lengths=person.lengths, mounts=mounts, hinges=HINGES)
+    return simulation, replace(person.prior, lengths=person.lengths, mounts=mounts, hinges=HINGES, girdles=RIGID)
 
 
 def drifting(simulation: Simulation, deg_min: dict[str, float]) -> Recording:
@@ -71,13 +73,21 @@ def test_what_does_not_drift_stays(made: tuple[Simulation, Subject]) -> None:
         assert np.degrees(off.magnitude().max()) < 0.02
 
 
-def test_nothing_is_corrected_without_a_clasp_and_hinges(made: tuple[Simulation, Subject]) -> None:
+def test_without_a_clasp_the_hinges_of_each_arm_correct_it(made: tuple[Simulation, Subject]) -> None:
+    """Axes as the table has them where none is calibrated, and without the torso that the hands would need."""
     simulation, subject = made
     recording = drifting(simulation, {"right_forearm": 8.0})
     recording = replace(recording, phases={"start": recording.phases["start"]})
-    assert track(recording, replace(subject, hinges={})).correction is None
     fewer = replace(recording, sensors={n: s for n, s in recording.sensors.items() if n != "torso"})
-    assert track(fewer, subject).correction is None
+    alone = replace(recording, sensors={n: s for n, s in recording.sensors.items() if "forearm" not in n})
+    for of, person in ((recording, replace(subject, hinges={})), (fewer, subject)):
+        found = track(of, person).correction
+        assert found is not None
+        assert found.gap_rms_mm is None
+        before, after = found.hinge_residual_rms_deg["right_elbow"]
+        assert after < 0.7 * before
+    assert track(alone, subject).correction is None
+    assert track(recording, subject, open_loop=True).correction is None
 
 
 def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simulation, Subject]) -> None:
@@ -96,7 +106,9 @@ def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simula
     assert longer.correction.gap_rms_mm[0] > 300.0
     for name, quat in only.quat_WL.items():
         np.testing.assert_allclose(longer.quat_WL[name], quat, atol=1e-12)
-    assert alone.correction is None
+    never = track(replace(recording, phases={"start": start}), replace(subject, hinges={}))
+    for name, quat in never.quat_WL.items():
+        np.testing.assert_allclose(alone.quat_WL[name], quat, atol=1e-12)
 
 
 def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
@@ -118,7 +130,7 @@ def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     name = "right_forearm"
     brought = [of[1].pose.segment_cov[name] - of[0].pose.segment_cov[name] for of in (held, free)]
     assert brought[1][:, 2, 2].max() > np.deg2rad(3.0) ** 2
-    np.testing.assert_allclose(brought[0], brought[1], atol=1e-12)
+    assert brought[0][:, 2, 2].max() > 0.5 * brought[1][:, 2, 2].max()
     assert np.all(np.linalg.eigvalsh(held[1].pose.segment_cov[name]) > 0.0)
     end = [np.degrees(np.sqrt(of[0].pose.segment_cov[name][-1, 2, 2])) for of in (held, free)]
     assert end[0] < 0.9 * end[1]
@@ -154,7 +166,7 @@ def test_hands_with_sensors_of_their_own_bend_at_the_wrist(made: tuple[Simulatio
     assert pose.correction is not None
     assert pose.correction.gap_rms_mm is not None
     assert max(pose.correction.gap_rms_mm) < 2.0
-    assert max(pose.correction.max_correction_deg.values()) < 0.05
+    assert max(pose.correction.max_correction_deg.values()) < 0.1  # 1.3 mm over two arms, of people who stand ± 13 deg
     assert set(pose.correction.max_correction_deg) == set(sensors)
 
 
@@ -162,5 +174,11 @@ def test_hinges_hold_for_the_strapping_in_which_they_were_found(made: tuple[Simu
     simulation, subject = made
     recording = drifting(simulation, {"right_forearm": 8.0})
     recording = replace(recording, phases={"start": recording.phases["start"]})
-    assert track(recording, subject).correction is not None
-    assert track(replace(recording, remounted=True), subject).correction is None
+    skew = Hinge(np.array([np.sin(0.2), np.cos(0.2), 0.0]), np.deg2rad(2.0))
+    subject = replace(subject, hinges=dict.fromkeys(HINGES, skew))
+    calibrated, remounted = (track(replace(recording, remounted=again), subject) for again in (False, True))
+    usual = track(recording, replace(subject, hinges={}))
+    assert calibrated.correction is not None
+    assert usual.correction is not None
+    assert not np.array_equal(calibrated.quat_WL["right_forearm"], usual.quat_WL["right_forearm"])
+    assert all(np.array_equal(remounted.quat_WL[name], quat) for name, quat in usual.quat_WL.items())

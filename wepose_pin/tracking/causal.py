@@ -6,6 +6,7 @@ pose is filtered when it has ended; later samples change no earlier result.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 
@@ -23,6 +24,7 @@ from ..alignment import (
     compute_heading_variance,
     compute_segment_covariance,
     compute_soft_tissue_covariances,
+    compute_start_heading_var,
     orient_segments,
 )
 from ..compilation import kernel
@@ -35,8 +37,19 @@ from ..kinematics import compute_axis_std
 from ..recording import OrientationSensor, Recording, join_recordings
 from ..rotations import product
 from ..subject import Subject
+from .heading_filter import HeadingProblem
+from .headings import (
+    CausalHeadings,
+    compute_heading_covariance,
+    find_heading_variance,
+    find_specific_force,
+    replace_heading_variance,
+)
 from .segments import Oriented
 from .start_pose import START_POSE_HOLD_S, StartPoseDetector, cut_start_pose
+
+# What there is to observe headings by, from the recording of the start pose and its orientations; None: nothing.
+PoseProblem = Callable[[Recording, SegmentOrientations], HeadingProblem | None]
 
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
 
@@ -52,6 +65,7 @@ class CausalEstimator:
     ----------
     subject : lengths and mounts; None for the session's stated mounts
     start_frames : of the body; left out: the N-pose
+    pose_problem : what there is to observe headings by; None: they are not corrected
     """
 
     def __init__(
@@ -61,8 +75,10 @@ class CausalEstimator:
         start_frames: StartFrames = N_POSE,
         method: str = BEST,
         static_test: StaticTest | None = None,
+        pose_problem: PoseProblem | None = None,
     ) -> None:
         self._subject, self._start_frames, self._method, self._static_test = subject, start_frames, method, static_test
+        self._pose_problem = pose_problem
         self._received: Recording | None = None  # samples up to the end of the start pose
         self._start_detector: StartPoseDetector | None = None
         self._segment_estimator: CausalSegmentEstimator | None = None
@@ -80,6 +96,11 @@ class CausalEstimator:
         if self._segment_estimator is None:
             raise BadPhase("the start pose has not ended: push a recording that includes it")
         return self._segment_estimator
+
+    @property
+    def headings(self) -> CausalHeadings | None:
+        """What corrects the headings; None: nothing does, or the start pose has not ended."""
+        return None if self._segment_estimator is None else self._segment_estimator.headings
 
     def push(self, chunk: Recording) -> list[Oriented]:
         """Add a chunk; return its part after the start pose, and its segment orientations.
@@ -144,7 +165,12 @@ class CausalEstimator:
             last = self._start_detector.end + 1
         start = replace(cut_start_pose(received, interval), start_is_guessed=not received.phases.get("start"))
         self._segment_estimator = CausalSegmentEstimator(
-            start, self._subject, start_frames=self._start_frames, method=self._method, static_test=self._static_test
+            start,
+            self._subject,
+            start_frames=self._start_frames,
+            method=self._method,
+            static_test=self._static_test,
+            pose_problem=self._pose_problem,
         )
         return received.cut(slice(last, len(received)))
 
@@ -157,11 +183,13 @@ class CausalSegmentEstimator:
     start_recording : a recording that ends with its start pose, `phases.start`
     subject : lengths and mounts; None for the session's stated mounts
     start_frames : of the body; left out: the N-pose
+    pose_problem : what there is to observe headings by; None: they are not corrected
 
     Attributes
     ----------
     start : `SegmentOrientations` of the start pose: mounts, headings, diagnostics
-    heading_offset : (k,) ψ [rad], heading of each sensor's world V in W
+    heading_offset : (k,) ψ [rad], heading of each sensor's world V in W at the start or the last reset
+    headings : what corrects the headings; None: nothing does
     quat_WL, static, gyro_bias : (k, 4) xyzw, (k,), (k, 3) [rad/s] after the last step; overwritten by the next
     """
 
@@ -173,6 +201,7 @@ class CausalSegmentEstimator:
         start_frames: StartFrames = N_POSE,
         method: str = BEST,
         static_test: StaticTest | None = None,
+        pose_problem: PoseProblem | None = None,
     ) -> None:
         check_mounts(start_recording, subject, start_frames)
         self._filters = SensorFilters(start_recording, method=method, static_test=static_test, sways=start_frames.sways)
@@ -196,7 +225,17 @@ class CausalSegmentEstimator:
         ].copy()
         self._oldest = 0  # row of `_recent` with the oldest sample
         self.quat_WL = np.zeros((len(self.names), 4))
-        _place_segments(self._quat_WV, self._recent[-1:], self._quat_LS, self.quat_WL, self.quat_WL[None].copy())
+        self._uncorrected = np.zeros(len(self.names))
+        _place_segments(
+            self._quat_WV,
+            (self._uncorrected, self._uncorrected, 0, 1),
+            self._recent[-1:],
+            self._quat_LS,
+            self.quat_WL,
+            self.quat_WL[None].copy(),
+        )
+        problem = None if pose_problem is None else pose_problem(start_recording, self.start)
+        self.headings = None if problem is None else CausalHeadings(start_recording, self.start, problem)
         self._run_var = self.heading_var()  # (k,) [rad²] of each heading by its filter alone, after the last run
         self._var_at_reset: np.ndarray | None = None  # (k,) [rad²] of heading that a reset took away
 
@@ -212,9 +251,18 @@ class CausalSegmentEstimator:
         """Add one sample, (k, 3) [rad/s], (k, 3) [m/s²], NaN where a sensor is lost; return `quat_WL` (k, 4)."""
         self._recent[self._oldest] = self._bank.update(gyro_S, accel_S)
         newest = self._recent[self._oldest : self._oldest + 1]
-        _place_segments(self._quat_WV, newest, self._quat_LS, self.quat_WL, self.quat_WL[None])
+        _place_segments(self._quat_WV, self._correction(), newest, self._quat_LS, self.quat_WL, self.quat_WL[None])
         self._oldest = (self._oldest + 1) % len(self._recent)
+        if self.headings is not None and self.headings.push(newest, accel_S[None]):
+            var = self.heading_var()
+            self.headings.close(np.full(len(self.names), np.nan) if var is None else var)
         return self.quat_WL
+
+    def _correction(self) -> tuple[np.ndarray, np.ndarray, int, int]:
+        """Return what `_place_segments` fades in: from and to (k,) [rad], the next sample's number, their number."""
+        if self.headings is None:
+            return self._uncorrected, self._uncorrected, 0, 1
+        return self.headings.begin, self.headings.end, *self.headings.position
 
     def run(self, chunk: Recording) -> SegmentOrientations:
         """Return the segment orientations of a chunk, bit-identical with as many steps."""
@@ -231,7 +279,7 @@ class CausalSegmentEstimator:
         _, orientation = self._filters.push(chunk) or self._filters.finish()
         quat_VS = np.stack([orientation[name].quat_WS for name in self.names], axis=1)
         quat_WL = np.empty(quat_VS.shape)
-        _place_segments(self._quat_WV, quat_VS, self._quat_LS, self.quat_WL, quat_WL)
+        variance = self._place(chunk, orientation, quat_VS, quat_WL)
         self._recent = np.concatenate([self._order_recent(), quat_VS])[-len(self._recent) :].copy()
         self._oldest = 0
         covariance_W = {}
@@ -243,7 +291,8 @@ class CausalSegmentEstimator:
                 self._start_frames.table, {name: quat_WL[:, i] for i, name in enumerate(self.names)}
             )
             covariance_W = {
-                name: self._covariance_W(i, quat_VS[:, i], covs[name]) + soft[name] for i, name in enumerate(self.names)
+                name: self._covariance_W(i, quat_VS[:, i], covs[name], variance[:, i]) + soft[name]
+                for i, name in enumerate(self.names)
             }
         return replace(
             self.start,
@@ -253,6 +302,33 @@ class CausalSegmentEstimator:
             orientation=orientation,
             covariance_W=covariance_W,
         )
+
+    def _place(
+        self, chunk: Recording, orientation: Mapping[str, Orientation], quat_VS: np.ndarray, quat_WL: np.ndarray
+    ) -> np.ndarray:
+        """Fill `quat_WL` (n, k, 4), knot by knot; return the variance (n, k) [rad²] of the headings at its beginning.
+
+        It is NaN where headings are not corrected.
+        """
+        n = len(chunk)
+        variance = np.full((n, len(self.names)), np.nan)
+        if self.headings is None:
+            _place_segments(self._quat_WV, self._correction(), quat_VS, self._quat_LS, self.quat_WL, quat_WL)
+            return variance
+        accel_S = np.stack([find_specific_force(chunk, name) for name in self.names], axis=1)
+        begin = 0
+        while begin < n:
+            count, size = self.headings.position
+            end = min(n, begin + size - count)
+            rows = slice(begin, end)
+            _place_segments(
+                self._quat_WV, self._correction(), quat_VS[rows], self._quat_LS, self.quat_WL, quat_WL[rows]
+            )
+            variance[rows] = self.headings.excess_variance()
+            if self.headings.push(quat_VS[rows], accel_S[rows]):
+                self.headings.close(find_heading_variance(orientation, self.names, end - 1), record=True)
+            begin = end
+        return variance
 
     def reset_headings(self, heading_var: np.ndarray | None = None) -> None:
         """Reset the headings: the body has stood in the start pose again for `RESET_S`.
@@ -265,10 +341,16 @@ class CausalSegmentEstimator:
         same_sign = recent * np.sign(np.einsum("nki,ki->nk", recent, recent[-1]))[:, :, None]
         mean = same_sign.sum(axis=0)
         mean /= np.linalg.norm(mean, axis=1)[:, None]
+        offset = np.zeros(len(self.names))
         for i in range(len(self.names)):
             R_WS_start = self._start_frames.to_world(self.names[i], Rotation.from_quat(self._quat_LS[i]))
-            self.heading_offset[i] = compute_heading_offset(Rotation.from_quat(mean[i]), R_WS_start)
-        self._quat_WV = _quat_about_z(self.heading_offset)
+            offset[i] = compute_heading_offset(Rotation.from_quat(mean[i]), R_WS_start)
+        self.heading_offset = offset
+        if self.headings is not None:
+            self._quat_WV = _quat_about_z(self.headings.offset)
+            self.headings.reset(offset)
+            return
+        self._quat_WV = _quat_about_z(offset)
         self._var_at_reset = heading_var if heading_var is not None else self.heading_var()
 
     def heading_var(self) -> np.ndarray | None:
@@ -296,12 +378,20 @@ class CausalSegmentEstimator:
         soft = compute_soft_tissue_covariances(
             self._start_frames.table, {name: self.quat_WL[i : i + 1] for i, name in enumerate(self.names)}
         )
+        excess = np.full(len(cov), np.nan) if self.headings is None else self.headings.excess_variance()
         return np.concatenate(
-            [self._covariance_W(i, newest[i : i + 1], cov[i : i + 1]) + soft[name] for i, name in enumerate(self.names)]
+            [
+                self._covariance_W(i, newest[i : i + 1], cov[i : i + 1], excess[i : i + 1]) + soft[name]
+                for i, name in enumerate(self.names)
+            ]
         )
 
-    def _covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
+    def _covariance_W(
+        self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray, excess_var: np.ndarray
+    ) -> np.ndarray:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment, error on the left of `quat_WL`, in W.
+
+        `excess_var` (n,) [rad²] is by how much the variance of the corrected heading exceeds the filter's.
 
         As `alignment.compute_segment_covariance`; after a reset the heading's error is that of the start pose and the
         drift since.
@@ -311,6 +401,13 @@ class CausalSegmentEstimator:
         cov = compute_segment_covariance(
             self._start_recording, self.names[i], self._subject, R_WS, R_LS, attitude_cov, self._start_frames
         )
+        if self.headings is not None:
+            R_VS = Rotation.from_quat(quat_VS)
+            R_WV = Rotation.from_rotvec([0.0, 0.0, self.heading_offset[i]])
+            with_heading = compute_heading_covariance(R_VS, attitude_cov)
+            start = compute_start_heading_var(self._start_recording, self.names[i], self._subject, self._start_frames)
+            var = with_heading[:, 2]
+            cov = replace_heading_variance(cov, R_WV.apply(with_heading), var + start, var + excess_var)
         if self._var_at_reset is not None:
             var = compute_heading_variance(quat_VS, attitude_cov)
             grown = np.maximum(0.0, var - self._var_at_reset[i])
@@ -356,11 +453,19 @@ def _quat_about_z(angle: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _place_segments(quat_WV, quat_VS, quat_LS, last, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (n, k, 4) with ``quat_WV ⊗ quat_VS ⊗ quat_LS⁻¹`` of n ticks; signs continue those of `last` (k, 4)."""
+def _place_segments(quat_WV, correction, quat_VS, quat_LS, last, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (n, k, 4) with ``Rz(δ) ⊗ quat_WV ⊗ quat_VS ⊗ quat_LS⁻¹`` of n ticks; signs continue `last` (k, 4).
+
+    `correction` is δ before and after a knot, (k,) each, the first tick's number in it and its number of ticks.
+    """
+    begin, end, first, count = correction
     for n in range(len(quat_VS)):
         for k in range(len(quat_WV)):
             ax, ay, az, aw = quat_WV[k, 0], quat_WV[k, 1], quat_WV[k, 2], quat_WV[k, 3]
+            delta = begin[k] + (end[k] - begin[k]) * (first + n + 1) / count
+            if delta != 0.0:
+                s, c = np.sin(0.5 * delta), np.cos(0.5 * delta)
+                az, aw = az * c + aw * s, aw * c - az * s
             bx, by, bz, bw = quat_VS[n, k, 0], quat_VS[n, k, 1], quat_VS[n, k, 2], quat_VS[n, k, 3]
             x, y, z, w = product(ax, ay, az, aw, bx, by, bz, bw)
             rx, ry, rz, rw = product(x, y, z, w, -quat_LS[k, 0], -quat_LS[k, 1], -quat_LS[k, 2], quat_LS[k, 3])

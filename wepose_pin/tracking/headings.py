@@ -1,21 +1,13 @@
-"""Heading correction from points that coincide (as the palms in a clasp phase) and axes of hinges (as the elbows).
+"""Correction of headings by what neighbours share: accelerations, hinges, ranges of motion, joined hands.
 
-The filters' tilt is good and their headings drift. δ_i(t) is the heading error of segment i, on the left in W:
-R_WL,true = Rz(δ) R_WL. It is a random walk whose step variance is the growth of the filter's heading variance. Two
-measurements observe it, both linear in δ:
-
-- the gap in a later phase of a protocol's closure: g + Σ δ_i e_z × v_i = 0, with v_i the part of segment i in the way
-  between the two points;
-- the hinges of a calibrated subject: the segment below stays in the plane of its hinge, n · R_Oᵀ R_M e = 0, with e its
-  long axis.
-
-A forward pass and a Rauch-Tung-Striebel pass over knots of a few seconds give δ and its covariance. A heading error
-common to all segments is unobservable.
+The filters' tilt is good and their headings drift. `heading_filter` estimates their errors knot by knot; a heading error
+common to all segments is unobservable. Offline a forward pass learns where sensors sit, and a second one and a
+Rauch-Tung-Striebel pass give the errors. Causally the forward pass alone does, each knot's errors from the next one on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,40 +16,224 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..alignment import (
-    PALM_SLIP_STD,
-    SEGMENT_ATTITUDE_STD,
     SegmentOrientations,
     StartFrames,
+    compute_heading_variance,
     compute_start_heading_var,
+    find_mount_covariance,
 )
 from ..calibration import PROTOCOLS, load_protocol
-from ..calibration.conditions import Part, StartPose, find_girdle_signs, find_parts
+from ..calibration.conditions import StartPose, find_girdle_signs, find_parts
 from ..errors import BadSession
-from ..model import BodyModel, BodyTable, move_girdles
-from ..model.girdle import PARAMETERS
+from ..filters import Orientation
+from ..model import BodyModel
 from ..model.start_pose import orient_links
-from ..recording import Recording
+from ..recording import ImuSensor, OrientationSensor, Recording
 from ..subject import Subject
+from .heading_filter import (
+    MECHANISM_NOISE,
+    PERSON_NOISE,
+    Closure,
+    HeadingFilter,
+    HeadingProblem,
+    HingeAxis,
+    Knot,
+    Way,
+    linearize_hinge,
+    smooth,
+)
+from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, JointPair, find_pairs
 
-KNOT_S = 2.0  # [s] between knots of the random walk
-SAMPLE_RATE_HZ = 8.0
-# [s] Correlation time of residual errors other than those of headings: soft tissue and remaining errors of the mounts
-# recur in every pose, so that a minute of joined hands gives three effective samples. Chosen on simulated people: with
-# a shorter time, the headings of a good filter become worse.
-CORRELATION_S = 20.0
 REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
-UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
-MIN_STEP_VARIANCE = 1e-10  # [rad²] of the random walk between two knots
-OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
-HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
+KNOT_S = 1.0  # [s] between knots of the random walk
+SAMPLE_RATE_HZ = 8.0
 
 
 class HeadingCorrection(NamedTuple):
-    """The correction of headings: residuals before and after, and the largest correction."""
+    """The correction of headings: what was observed, residuals before and after, and the largest correction."""
 
     gap_rms_mm: tuple[float, float] | None  # in the phases of closures
     hinge_residual_rms_deg: Mapping[str, tuple[float, float]]  # joint → the segment below against its hinge's plane
     max_correction_deg: Mapping[str, float]  # segment → largest rotation about the vertical
+    joint_accelerations: tuple[str, ...] = ()  # segments whose joint to the one above two sensors measure
+    hinges: tuple[str, ...] = ()  # joints
+    found_clasps: tuple[tuple[float, float], ...] = ()  # [s] when the hands were found joined
+    segments: tuple[str, ...] = ()
+    time: np.ndarray | None = None  # (m,) [s] of the covariances
+    covariance: np.ndarray | None = None  # (m, k, k) [rad²] of the segments' heading errors
+
+    def relative_std(self, near: str, far: str, time: np.ndarray) -> np.ndarray:
+        """Return the standard deviation (n,) [rad] of the heading between two segments at these times [s]."""
+        assert self.time is not None
+        assert self.covariance is not None
+        i, j = self.segments.index(near), self.segments.index(far)
+        variance = self.covariance[:, i, i] + self.covariance[:, j, j] - 2.0 * self.covariance[:, i, j]
+        return np.asarray(np.sqrt(np.interp(time, self.time, variance)))
+
+
+class KnotReader:
+    """Cuts samples into knots of equal length, by their number, and forms the sums of each.
+
+    Parameters
+    ----------
+    names, quat_LS, heading_offset : segments, their mounts (k, 4) and ψ (k,) [rad]
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        quat_LS: np.ndarray,
+        heading_offset: np.ndarray,
+        rate_hz: float,
+        pairs: Sequence[JointPair],
+    ) -> None:
+        self._stride = max(1, round(rate_hz / SAMPLE_RATE_HZ))
+        self.samples_per_knot = max(1, round(KNOT_S * rate_hz / self._stride))
+        self.size = self._stride * self.samples_per_knot
+        self.knot_s = self.size / rate_hz
+        k = len(names)
+        self._R_SL = Rotation.from_quat(quat_LS).inv()
+        self._R_WV = Rotation.from_rotvec(heading_offset[:, None] * [0.0, 0.0, 1.0])
+        self._time, self._quat_VS, self._accel_S = (
+            np.zeros(self.size),
+            np.zeros((self.size, k, 4)),
+            np.zeros((self.size, k, 3)),
+        )
+        self.count = 0  # samples in the open knot
+        self._accelerations = JointAccelerationFilter(names, pairs, rate_hz)
+
+    @property
+    def remaining(self) -> int:
+        """Number of samples that the open knot lacks."""
+        return self.size - self.count
+
+    def push(self, time: np.ndarray, quat_VS: np.ndarray, accel_S: np.ndarray) -> None:
+        """Add at most `remaining` samples: (n,), (n, k, 4), (n, k, 3)."""
+        rows = slice(self.count, self.count + len(time))
+        self._time[rows], self._quat_VS[rows], self._accel_S[rows] = time, quat_VS, accel_S
+        self.count += len(time)
+
+    def close(self, heading_var: np.ndarray) -> Knot:
+        """Return the open knot; `heading_var` (k,) [rad²] of the filters at its last sample."""
+        n, k = self.count, self._quat_VS.shape[1]
+        self.count = 0
+        quat_VS = self._quat_VS[:n]
+        rows = np.arange(0, n, self._stride)
+        R_VS = Rotation.from_quat(quat_VS.reshape(-1, 4)).as_matrix().reshape(n, k, 3, 3)
+        R_WS = self._R_WV.as_matrix() @ R_VS
+        joints = self._accelerations.push(R_WS, self._accel_S[:n], rows)
+        quat_WL = np.stack(
+            [(self._R_WV[i] * Rotation.from_quat(quat_VS[rows, i]) * self._R_SL[i]).as_quat() for i in range(k)], axis=1
+        )
+        lost = ~np.isfinite(self._accel_S[:n]).all(axis=(0, 2))
+        return Knot(float(self._time[n - 1]), self._time[rows].copy(), quat_WL, joints, heading_var, lost)
+
+
+def pose_problem(
+    recording: Recording, orientations: SegmentOrientations, subject: Subject, model: BodyModel, *, phases: bool
+) -> HeadingProblem | None:
+    """Find what there is to observe headings by; None: nothing.
+
+    Parameters
+    ----------
+    phases : whether points coincide in the phases of closures
+    """
+    names = tuple(orientations.quat_WL)
+    raw = {name: orientations.quat_LS[name] for name in names if name in recording.imus}
+    pairs = find_pairs(model, raw) if recording.rate_hz >= LEAST_RATE_HZ else ()
+    hinges = _find_hinges(recording, names, subject, model)
+    closures = _find_closures(recording if phases else None, names, model)
+    closed = any(end >= orientations.start[1] for closure in closures for _, end in closure.intervals)
+    if not (pairs or hinges or closed):
+        return None
+    noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE
+    stride = max(1, round(recording.rate_hz / SAMPLE_RATE_HZ))
+    samples = max(1, round(KNOT_S * recording.rate_hz / stride))
+    knot_s = samples * stride / recording.rate_hz
+    drift_psd = np.full(len(names), noise.drift_psd)
+    for i, name in enumerate(names):
+        if name in orientations.orientation:  # a gyroscope's white noise may be more
+            white = float(np.trace(orientations.orientation[name].noise.gyro_cov)) / (3.0 * recording.rate_hz)
+            drift_psd[i] = max(noise.drift_psd, white)
+    start_var, mount_var = np.array([find_start_variances(recording, name, subject, model) for name in names]).T
+    return HeadingProblem(
+        names, model, subject, pairs, hinges, closures, noise, knot_s, samples, drift_psd, start_var, mount_var
+    )
+
+
+def find_start_variances(recording: Recording, segment: str, subject: Subject, model: BodyModel) -> tuple[float, float]:
+    """Find the variances [rad²] of a sensor's heading after the start pose: by the pose, and by the mount's heading."""
+    table = model.table
+    mount_cov = find_mount_covariance(recording, segment, subject)
+    mount_var = 0.0 if mount_cov is None else float(mount_cov[2, 2])
+    if segment == table.reference:
+        return float(REFERENCE_START_STD**2), mount_var
+    return compute_start_heading_var(recording, segment, subject, StartFrames(table=table)), mount_var
+
+
+def _find_hinges(
+    recording: Recording, names: Sequence[str], subject: Subject, model: BodyModel
+) -> tuple[HingeAxis, ...]:
+    """The hinges of two measured segments: calibrated, or as the table has them."""
+    table = model.table
+    noise = MECHANISM_NOISE if table.is_mechanism else PERSON_NOISE
+    # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
+    calibrated = {} if recording.remounted else subject.hinges
+    hinges = []
+    for joint, hinge in table.hinges.items():
+        if not {hinge.on, hinge.moves} <= set(names):
+            continue
+        axis, std, axis_std, tilt_std = np.array(hinge.axis), hinge.softness, 0.0, hinge.tilt_std
+        if joint in calibrated:
+            axis, std = calibrated[joint].axis, calibrated[joint].std
+            axis_std, tilt_std = noise.axis_std, noise.tilt_std
+        elif table.is_mechanism:
+            continue
+        else:
+            axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
+        along = np.array(table.segments[hinge.on].along)
+        hinges.append(
+            HingeAxis(
+                joint,
+                names.index(hinge.on),
+                names.index(hinge.moves),
+                axis,
+                along,
+                np.array(table.segments[hinge.moves].along),
+                hinge.range,
+                axis_std,
+                tilt_std,
+                max(std, noise.hinge_std),
+            )
+        )
+    return tuple(hinges)
+
+
+def _find_closures(recording: Recording | None, segments: Collection[str], model: BodyModel) -> tuple[Closure, ...]:
+    """The closures of points that coincide whose segments are all measured.
+
+    They are those of the protocols; each holds in the phase of its name, which the recording may lack. None: in none.
+    """
+    neutral = StartPose(orient_links(model, pin.neutral(model.pin)))
+    closures, seen = [], set[tuple[str, tuple[str, ...]]]()
+    for name in PROTOCOLS:
+        for closure in load_protocol(name).closures:
+            if closure.kind != "coincide" or not set(closure.points) <= set(model.table.points):
+                continue
+            if (closure.phase, closure.points) in seen:
+                continue
+            seen.add((closure.phase, closure.points))
+            first, last = closure.points
+            try:
+                gap, *ways = (
+                    Way(find_parts(model, neutral, segments, ends), find_girdle_signs(model, ends), neutral)
+                    for ends in ([(first, 1.0), (last, -1.0)], [(first, 1.0)], [(last, 1.0)])
+                )
+            except BadSession:
+                continue
+            intervals = () if recording is None else tuple(recording.phases.get(closure.phase, ()))
+            closures.append(Closure(closure.points, intervals, gap, tuple(ways)))
+    return tuple(closures)
 
 
 class HeadingCorrector:
@@ -68,113 +244,85 @@ class HeadingCorrector:
 
     Parameters
     ----------
-    chunk : the first chunk
-    segments : names of the measured segments
-    start_end : [s] end of the start pose, after which headings drift
-    model : the body with the subject's lengths
-
-    Attributes
-    ----------
-    is_chain_complete : whether all segments between the points of the body's closures are measured, or both segments of
-        a hinge where it has no closures; otherwise there is no correction
-    has_observations : whether there is a hinge, or a phase of a closure that ends after the start pose
+    chunk, orientations : the first chunk
+    problem : of `pose_problem`
     """
 
-    def __init__(
-        self, chunk: Recording, segments: Collection[str], start_end: float, subject: Subject, model: BodyModel
-    ) -> None:
-        self._subject, self._start_end, self._model = subject, start_end, model
-        self._start_frames = StartFrames(table=model.table)
-        self._closures, of_body = _find_closures(chunk, segments, model)
-        # A hinge axis is relative to the calibrated mounts and holds as long as they do.
-        hinges = subject.hinges if not chunk.remounted else {}
-        table = model.table
-        self._hinges = {name: hinge for name, hinge in hinges.items() if {*_hinged(table, name)} <= set(segments)}
-        self.is_chain_complete = bool(self._closures) or (not of_body and bool(self._hinges))
-        used = {part.sensor for closure in self._closures for part in closure.parts}
-        used |= {segment for name in self._hinges for segment in _hinged(table, name)}
-        self._chain = tuple(name for name in table.segments if name in used)
-        self.has_observations = bool(self._hinges) or any(
-            end >= start_end for closure in self._closures for _, end in closure.intervals
-        )
-        self._stride = max(1, round(chunk.rate_hz / SAMPLE_RATE_HZ))
-        self._information_weight = 1.0 / max(1.0, CORRELATION_S * chunk.rate_hz / self._stride)
-        self._first_time: float | None = None  # [s] of the first decimated sample
-        self._counts = [0, 0]  # samples so far in each pass
-        self._open_knot: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # samples of the last knot
-        self._sums: list[tuple[np.ndarray, np.ndarray]] = []  # information matrices and vectors of complete knots
-        self._has_rows = False
-        self._knot_variances: dict[str, list[np.ndarray]] = {}  # name → the filter's heading variance [rad²]
-        self._recorded_knots = 0  # number of these variances
-        self._last_variance: dict[str, tuple[float, float]] = {}  # name → time and variance of the last sample
+    def __init__(self, chunk: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
+        self._problem, self._start_end = problem, orientations.start[1]
+        self._start_frames = StartFrames(table=problem.model.table)
+        self._names = problem.names
+        mounts = np.array([orientations.quat_LS[name] for name in self._names])
+        offsets = np.array([orientations.heading_offset[name] for name in self._names])
+        self._reader = KnotReader(self._names, mounts, offsets, chunk.rate_hz, problem.pairs)
+        self._knots: list[Knot] = []
+        self._last_var = np.full(len(self._names), np.nan)
         self._gaps = {stage: _RmsAccumulator() for stage in ("before", "after")}
-        self._hinge_rms = {stage: {joint: _RmsAccumulator() for joint in self._hinges} for stage in ("before", "after")}
-        self._max_correction_deg = dict.fromkeys(self._chain, 0.0)
+        self._hinge_rms = {
+            stage: {hinge.joint: _RmsAccumulator() for hinge in problem.hinges} for stage in ("before", "after")
+        }
+        self._max_correction_deg = dict.fromkeys(self._names, 0.0)
 
     def add_observations(self, chunk: Recording, orientations: SegmentOrientations) -> None:
         """Add the observations of a chunk, in the first pass."""
-        time, quats = self._decimate(chunk, orientations, 0)
-        if len(time) and self._first_time is None:
-            self._first_time = float(time[0])
-        self._record_variances(chunk, orientations)
-        if self._open_knot is not None:
-            time = np.concatenate([self._open_knot[0], time])
-            quats = {name: np.concatenate([self._open_knot[1][name], quat]) for name, quat in quats.items()}
-        if not len(time):
+        first = int(np.searchsorted(chunk.time, self._start_end))
+        if first == len(chunk):
             return
-        knot = self._find_knots(time)
-        complete = int(np.searchsorted(knot, knot[-1]))
-        self._open_knot = time[complete:], {name: quat[complete:] for name, quat in quats.items()}
-        if complete:
-            self._sum_knots(time[:complete], {name: quat[:complete] for name, quat in quats.items()})
+        quat_VS, accel_S = _stack_samples(chunk, orientations, self._names)
+        begin = first
+        while begin < len(chunk):
+            end = min(len(chunk), begin + self._reader.remaining)
+            self._reader.push(chunk.time[begin:end], quat_VS[begin:end], accel_S[begin:end])
+            self._last_var = find_heading_variance(orientations.orientation, self._names, end - 1)
+            if not self._reader.remaining:
+                self._knots.append(self._reader.close(self._last_var))
+            begin = end
 
     def solve(self) -> bool:
         """Estimate the heading errors; return False where nothing observes them."""
-        if self._open_knot is None or self._first_time is None:
+        if self._reader.count:
+            self._knots.append(self._reader.close(self._last_var))
+        if not self._knots:
             return False
-        self._sum_knots(*self._open_knot)
-        if not self._has_rows:
-            return False
-        information, information_vector = (np.concatenate(parts) for parts in zip(*self._sums, strict=True))
-        knot_times = self._first_time + KNOT_S * (np.arange(len(information)) + 0.5)
-        step_variances = np.full((len(knot_times), len(self._chain)), UNKNOWN_DRIFT_PSD * KNOT_S)
-        for i, name in enumerate(self._chain):
-            if name in self._knot_variances:
-                variance_at_knots = np.concatenate(self._knot_variances[name])
-                missing = len(knot_times) + 1 - len(variance_at_knots)
-                variance_at_knots = np.concatenate([variance_at_knots, np.full(missing, self._last_variance[name][1])])
-                step_variances[:, i] = np.maximum(np.diff(variance_at_knots), MIN_STEP_VARIANCE)
-        start_stds = [
-            REFERENCE_START_STD
-            if name == self._model.table.reference
-            else self._model.table.segments[name].repeat_std[2]
-            for name in self._chain
-        ]
-        self._heading_errors, self._cov = _smooth_random_walk(
-            information, information_vector, step_variances, np.array(start_stds)
-        )
-        self._knot_times = knot_times  # the errors are constant before the first and after the last
+        problem = self._problem
+        if problem.pairs:
+            learn = HeadingFilter(problem)
+            for knot in self._knots:
+                learn.step(knot)
+            levers = np.array([learn.x[problem.lever_columns(i)] for i in range(len(problem.pairs))])
+            problem = replace(problem, levers_at=levers)
+        self._heading_errors, self._cov, self._clasps = smooth(problem, self._knots)
+        ends = np.array([knot.end for knot in self._knots])
+        begins = np.array([knot.time[0] for knot in self._knots])
+        self._knot_times = 0.5 * (begins + ends)  # the errors are constant before the first and after the last
+        for knot in self._knots:
+            self._add_residuals("before", knot.time, dict(zip(self._names, _rotations(knot), strict=True)))
+        self._knots = []
         return True
 
     def correct(self, chunk: Recording, orientations: SegmentOrientations) -> SegmentOrientations:
         """Return the chunk's orientations with corrected headings, in the second pass; adds its residuals."""
         corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
-        for i, name in enumerate(self._chain):
+        for i, name in enumerate(self._names):
             delta = np.interp(chunk.time, self._knot_times, self._heading_errors[:, i])
             R_delta = Rotation.from_rotvec(delta[:, None] * [0.0, 0.0, 1.0])
             corrected[name] = (R_delta * Rotation.from_quat(corrected[name])).as_quat()
             self._max_correction_deg[name] = max(self._max_correction_deg[name], float(np.degrees(np.abs(delta).max())))
-            filter_cov = _compute_heading_covariance(orientations, name)
+            filter_cov = _compute_filter_covariance(orientations, name)
             if filter_cov is not None:
-                variance = np.interp(chunk.time, self._knot_times, self._cov[:, i, i])
                 with_heading, filter_var = filter_cov
-                start = compute_start_heading_var(chunk, name, self._subject, self._start_frames)
-                covariance[name] = _reduce_heading_covariance(
+                variance = np.interp(chunk.time, self._knot_times, self._cov[:, i, i])
+                variance = self._problem.find_segment_variance(i, variance)
+                start = compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
+                covariance[name] = replace_heading_variance(
                     covariance[name], with_heading, filter_var + start, variance
                 )
         result = replace(orientations, quat_WL=corrected, covariance_W=covariance)
-        time, quats = self._decimate(chunk, result, 1)
-        self._add_residuals("after", time, {name: Rotation.from_quat(quat) for name, quat in quats.items()})
+        stride = max(1, round(chunk.rate_hz / SAMPLE_RATE_HZ))
+        rows = np.flatnonzero(chunk.time >= self._start_end)[::stride]
+        self._add_residuals(
+            "after", chunk.time[rows], {name: Rotation.from_quat(corrected[name][rows]) for name in self._names}
+        )
         return result
 
     def summarize(self) -> HeadingCorrection:
@@ -183,79 +331,143 @@ class HeadingCorrector:
         return HeadingCorrection(
             gap_rms_mm=(1e3 * gaps["before"].value, 1e3 * gaps["after"].value) if gaps["before"].count else None,
             hinge_residual_rms_deg={
-                joint: (
-                    float(np.degrees(hinge_rms["before"][joint].value)),
-                    float(np.degrees(hinge_rms["after"][joint].value)),
+                hinge.joint: (
+                    float(np.degrees(hinge_rms["before"][hinge.joint].value)),
+                    float(np.degrees(hinge_rms["after"][hinge.joint].value)),
                 )
-                for joint in self._hinges
+                for hinge in self._problem.hinges
             },
             max_correction_deg=dict(self._max_correction_deg),
+            joint_accelerations=tuple(pair.far for pair in self._problem.pairs),
+            hinges=tuple(hinge.joint for hinge in self._problem.hinges),
+            found_clasps=self._clasps,
+            segments=self._names,
+            time=self._knot_times,
+            covariance=self._cov,
         )
-
-    def _decimate(
-        self, chunk: Recording, orientations: SegmentOrientations, pass_index: int
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return times (m,) [s] and orientations (m, 4) at `SAMPLE_RATE_HZ` after the start pose."""
-        rows = np.arange(-self._counts[pass_index] % self._stride, len(chunk), self._stride)
-        self._counts[pass_index] += len(chunk)
-        rows = rows[chunk.time[rows] >= self._start_end]
-        return chunk.time[rows], {name: orientations.quat_WL[name][rows] for name in self._chain}
-
-    def _find_knots(self, time: np.ndarray) -> np.ndarray:
-        """Return the knot (m,) of each time [s]."""
-        return np.floor((time - self._first_time) / KNOT_S).astype(int)
-
-    def _sum_knots(self, time: np.ndarray, quats: Mapping[str, np.ndarray]) -> None:
-        """Add the information matrices and vectors of complete knots from their samples."""
-        R = {name: Rotation.from_quat(quat) for name, quat in quats.items()}
-        self._add_residuals("before", time, R)
-        complete_knots = sum(len(matrices) for matrices, _ in self._sums)
-        knot = self._find_knots(time) - complete_knots
-        count, size = int(knot[-1]) + 1, len(self._chain)
-        information, information_vector = np.zeros((count, size, size)), np.zeros((count, size))
-        for row in (
-            *(_build_gap_rows(R, self._model, self._subject, c, c.holds(time)) for c in self._closures),
-            *(_build_hinge_rows(R, self._model, self._subject, joint) for joint in self._hinges),
-        ):
-            weight = self._information_weight * row.weight[:, None]
-            np.add.at(information, knot[row.sample], np.einsum("na,nb->nab", weight * row.H, row.H))
-            np.add.at(information_vector, knot[row.sample], -weight * row.H * row.r[:, None])
-            self._has_rows |= len(row.sample) > 0
-        self._sums.append((information, information_vector))
 
     def _add_residuals(self, stage: str, time: np.ndarray, R: Mapping[str, Rotation]) -> None:
         """Add the residuals of closures and hinges before or after the correction."""
-        for closure in self._closures:
+        problem = self._problem
+        for closure in problem.closures:
             closed = closure.holds(time)
             if closed.any():
-                gap = closure.vectors(R, self._model).sum(axis=0)
+                gap = closure.gap.vectors(R, problem.model).sum(axis=0)
                 self._gaps[stage].add(np.sum(gap[closed] ** 2, axis=1))
         if len(time):
-            for joint in self._hinges:
-                self._hinge_rms[stage][joint].add(_compute_hinge_residual(R, self._model, self._subject, joint) ** 2)
+            for hinge in problem.hinges:
+                r, _ = linearize_hinge(R[self._names[hinge.on]], R[self._names[hinge.moves]], hinge)
+                self._hinge_rms[stage][hinge.joint].add(r**2)
 
-    def _record_variances(self, chunk: Recording, orientations: SegmentOrientations) -> None:
-        """Record the filters' heading variances at the end of the start pose and in the middles of the knots."""
-        # The start pose may end in a chunk whose first used sample is in the next one.
-        times = np.array([self._start_end] if self._recorded_knots == 0 else [])
-        if self._first_time is not None:
-            last = int(np.floor((chunk.time[-1] - self._first_time) / KNOT_S - 0.5))
-            times = np.append(
-                times, self._first_time + KNOT_S * (np.arange(max(0, self._recorded_knots - 1), last + 1) + 0.5)
-            )
-        times = times[times <= chunk.time[-1]]
-        self._recorded_knots += len(times)
-        for name in self._chain:
-            filter_cov = _compute_heading_covariance(orientations, name)
-            if filter_cov is None:
-                continue
-            variance = filter_cov[1]
-            variance_times = chunk.time
-            if name in self._last_variance:  # the interval between two chunks
-                variance_times = np.concatenate([[self._last_variance[name][0]], variance_times])
-                variance = np.concatenate([[self._last_variance[name][1]], variance])
-            self._knot_variances.setdefault(name, []).append(np.interp(times, variance_times, variance))
-            self._last_variance[name] = float(variance_times[-1]), float(variance[-1])
+
+class CausalHeadings:
+    """Corrects headings as samples come: what a knot observes holds from the next one on, over which it fades in.
+
+    Attributes
+    ----------
+    offset : (k,) ψ [rad] to which corrections are added
+    begin, end : (k,) [rad] the correction before the open knot and after it
+    """
+
+    def __init__(self, recording: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
+        self._problem = problem
+        mounts = np.array([orientations.quat_LS[name] for name in problem.names])
+        self.offset = np.array([orientations.heading_offset[name] for name in problem.names])
+        self._reader = KnotReader(problem.names, mounts, self.offset, recording.rate_hz, problem.pairs)
+        self._filter = HeadingFilter(problem)
+        self._rate_hz, self._samples = recording.rate_hz, 0
+        self._start_end = float(recording.time[-1])
+        self.begin, self.end = np.zeros(len(problem.names)), np.zeros(len(problem.names))
+        self._var_at_knot: np.ndarray | None = None
+        self._max_correction = np.zeros(len(problem.names))
+        self._history: list[tuple[float, np.ndarray]] = []
+
+    @property
+    def position(self) -> tuple[int, int]:
+        """The number of the next sample in its knot, and the samples of a knot."""
+        return self._reader.count, self._reader.size
+
+    def push(self, quat_VS: np.ndarray, accel_S: np.ndarray) -> bool:
+        """Add samples of one knot, (n, k, 4) and (n, k, 3), NaN where lost; return whether the knot is complete."""
+        time = (self._samples + np.arange(len(quat_VS))) / self._rate_hz
+        self._reader.push(time, quat_VS, accel_S)
+        self._samples += len(quat_VS)
+        return not self._reader.remaining
+
+    def close(self, heading_var: np.ndarray, *, record: bool = False) -> None:
+        """Close a complete knot; `heading_var` (k,) [rad²] of the filters now; `record` its covariance."""
+        knot = self._reader.close(heading_var)
+        self._filter.step(knot)
+        self.begin, self.end = self.end, self._filter.x[: len(heading_var)].copy()
+        self._max_correction = np.maximum(self._max_correction, np.abs(self.end))
+        self._var_at_knot = heading_var
+        if record:
+            k = len(heading_var)
+            self._history.append((self._start_end + knot.end, self._filter.P[:k, :k].copy()))
+
+    def reset(self, heading_offset: np.ndarray) -> None:
+        """Set ψ (k,) [rad] as the start pose shows it."""
+        error = heading_offset - self.offset
+        error = error + 2.0 * np.pi * np.round((self.end - error) / (2.0 * np.pi))
+        self._filter.reset(error)
+        self.begin = self.end = error
+
+    def excess_variance(self) -> np.ndarray:
+        """Return by how much (k,) [rad²] the variance of each heading exceeds its filter's, since the last knot."""
+        var = np.diag(self._filter.P)[: len(self.end)]
+        own = np.array([self._problem.find_segment_variance(i, value) for i, value in enumerate(var)])
+        return np.asarray(own - (0.0 if self._var_at_knot is None else np.nan_to_num(self._var_at_knot)))
+
+    def summarize(self) -> HeadingCorrection:
+        """Return what was observed and corrected so far; residuals are not known."""
+        names = self._problem.names
+        return HeadingCorrection(
+            gap_rms_mm=None,
+            hinge_residual_rms_deg={},
+            max_correction_deg=dict(zip(names, np.degrees(self._max_correction).tolist(), strict=True)),
+            joint_accelerations=tuple(pair.far for pair in self._problem.pairs),
+            hinges=tuple(hinge.joint for hinge in self._problem.hinges),
+            found_clasps=tuple((self._start_end + a, self._start_end + b) for a, b in self._filter.clasps),
+            segments=names,
+            time=np.array([time for time, _ in self._history]),
+            covariance=np.array([cov for _, cov in self._history]),
+        )
+
+
+def _rotations(knot: Knot) -> list[Rotation]:
+    return [Rotation.from_quat(knot.quat_WL[:, i]) for i in range(knot.quat_WL.shape[1])]
+
+
+def _stack_samples(
+    chunk: Recording, orientations: SegmentOrientations, names: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stack `quat_VS` (n, k, 4) and `accel_S` (n, k, 3) [m/s²], NaN where there is none."""
+    quats, accels = [], []
+    for name in names:
+        sensor = chunk.sensors[name]
+        filtered = sensor if isinstance(sensor, OrientationSensor) else orientations.orientation[name]
+        quats.append(filtered.quat_WS)
+        accels.append(find_specific_force(chunk, name))
+    return np.stack(quats, axis=1), np.stack(accels, axis=1)
+
+
+def find_specific_force(chunk: Recording, name: str) -> np.ndarray:
+    """Find `accel_S` (n, 3) [m/s²] of a sensor, NaN where it has none or has lost it."""
+    sensor = chunk.sensors[name]
+    if not isinstance(sensor, ImuSensor):
+        return np.full((len(chunk), 3), np.nan)
+    return sensor.accel_S if sensor.gap is None else np.where(sensor.gap[:, None], np.nan, sensor.accel_S)
+
+
+def find_heading_variance(orientation: Mapping[str, Orientation], names: Sequence[str], row: int) -> np.ndarray:
+    """Find the variance (k,) [rad²] of each filter's heading at a sample; NaN: it has none."""
+    variance = np.full(len(names), np.nan)
+    filtered = {i: orientation[name] for i, name in enumerate(names) if name in orientation}
+    covs = {i: each.attitude_cov[row] for i, each in filtered.items() if each.attitude_cov is not None}
+    if covs:
+        quat_VS = np.stack([filtered[i].quat_WS[row] for i in covs])
+        variance[list(covs)] = compute_heading_variance(quat_VS, np.stack(list(covs.values())))
+    return variance
 
 
 class _RmsAccumulator:
@@ -272,198 +484,35 @@ class _RmsAccumulator:
         return float(np.sqrt(self._sum / self.count)) if self.count else float("nan")
 
 
-class _Rows(NamedTuple):
-    """Scalar measurements 0 = r + H δ + e."""
-
-    sample: np.ndarray  # (m,) its index
-    r: np.ndarray  # (m,)
-    H: np.ndarray  # (m, k), δ of the chain in its order
-    weight: np.ndarray  # (m,) 1 / variance of e
-
-
-class _Closure(NamedTuple):
-    """Two points that coincide in some intervals [s]."""
-
-    intervals: tuple[tuple[float, float], ...]
-    parts: tuple[Part, ...]  # of the way from the second point to the first one, in frames that equal W at zero
-    girdles: tuple[tuple[str, float], ...]  # that move its points, each with its sign
-    neutral: StartPose
-
-    def holds(self, time: np.ndarray) -> np.ndarray:
-        """(n,) bool: which times [s] lie in an interval."""
-        closed = np.zeros(len(time), dtype=bool)
-        for begin, end in self.intervals:
-            closed |= (time >= begin) & (time <= end)
-        return closed
-
-    def rotations(self, R: Mapping[str, Rotation]) -> list[Rotation]:
-        """The orientation of each part."""
-        neutral = [self.neutral.R_WK[part.sensor] for part in self.parts]
-        return [
-            R[part.sensor] if np.array_equal(R_0, np.eye(3)) else R[part.sensor] * Rotation.from_matrix(R_0).inv()
-            for part, R_0 in zip(self.parts, neutral, strict=True)
-        ]
-
-    def vectors(self, R: Mapping[str, Rotation], model: BodyModel) -> np.ndarray:
-        """The vectors (k, n, 3) [m] in W of the parts; their sum is the gap."""
-        lengths = np.array(list(model.lengths.values()))
-        turned = zip(self.rotations(R), self.parts, strict=True)
-        vectors = np.array([rotation.apply(part.vector(lengths)) for rotation, part in turned])
-        sensors = [part.sensor for part in self.parts]
-        motions = move_girdles(model, R, [name for name, _ in self.girdles])
-        for name, sign in self.girdles:
-            on = model.table.girdles[name].on
-            vectors[sensors.index(on)] += sign * R[on].apply(motions[name].displacement)
-        return vectors
-
-
-def _find_closures(
-    recording: Recording, segments: Collection[str], model: BodyModel
-) -> tuple[tuple[_Closure, ...], bool]:
-    """The closures of points that coincide whose segments are all measured, and whether the body has any.
-
-    They are those of the protocols; each holds in the phase of its name, which the recording may lack.
-    """
-    neutral = StartPose(orient_links(model, pin.neutral(model.pin)))
-    closures, of_body, seen = [], False, set[tuple[str, tuple[str, ...]]]()
-    for name in PROTOCOLS:
-        for closure in load_protocol(name).closures:
-            if closure.kind != "coincide" or not set(closure.points) <= set(model.table.points):
-                continue
-            if (closure.phase, closure.points) in seen:
-                continue
-            seen.add((closure.phase, closure.points))
-            of_body = True
-            first, last = closure.points
-            try:
-                parts = find_parts(model, neutral, segments, [(first, 1.0), (last, -1.0)])
-            except BadSession:
-                continue
-            girdles = find_girdle_signs(model, [(first, 1.0), (last, -1.0)])
-            closures.append(_Closure(tuple(recording.phases.get(closure.phase, ())), parts, girdles, neutral))
-    return tuple(closures), of_body
-
-
-def _hinged(table: BodyTable, joint: str) -> tuple[str, str]:
-    """The two segments of a hinge."""
-    hinge = table.hinges[joint]
-    return hinge.on, hinge.moves
-
-
-def _build_gap_rows(
-    R: Mapping[str, Rotation], model: BodyModel, subject: Subject, closure: _Closure, closed: np.ndarray
-) -> _Rows:
-    """Build three whitened rows for each sample at which the points coincide, without outliers."""
-    v = closure.vectors(R, model)[:, closed]
-    n = v.shape[1]
-    eye = np.eye(3)
-    covariance = np.tile(PALM_SLIP_STD**2 * eye, (n, 1, 1))
-    for link in v:
-        covariance += SEGMENT_ATTITUDE_STD**2 * (
-            np.sum(link**2, axis=1)[:, None, None] * eye - np.einsum("na,nb->nab", link, link)
-        )
-    by_length = zip(closure.rotations(R), closure.parts, strict=True)
-    J = sum(rotation.as_matrix()[closed] @ np.array(part.by_length) for rotation, part in by_length)  # (n, 3, lengths)
-    shape_cov, k = subject.shape_covariance(model.table), len(model.lengths)
-    J = np.concatenate((J, np.zeros((n, 3, len(shape_cov) - k))), axis=2)
-    R_closed = {name: rotation[closed] for name, rotation in R.items()}
-    motions = move_girdles(model, R_closed, [name for name, _ in closure.girdles]) if n else {}
-    for name, sign in closure.girdles if n else ():
-        girdle, motion = model.table.girdles[name], motions[name]
-        R_on = R_closed[girdle.on].as_matrix()
-        columns = np.arange(len(PARAMETERS)) + k + len(PARAMETERS) * list(model.table.girdles).index(name)
-        J[:, :, columns] += sign * R_on @ motion.jacobian
-        covariance += (R_on * motion.residual_covariance(girdle)[:, None, :]) @ R_on.swapaxes(1, 2)
-    covariance += J @ shape_cov @ np.swapaxes(J, 1, 2)
-    names = list(R)
-    H = np.zeros((n, 3, len(names)))
-    for part, link in zip(closure.parts, v, strict=True):
-        H[:, :, names.index(part.sensor)] += np.cross([0.0, 0.0, 1.0], link)
-    r = v.sum(axis=0)
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance)) if n else covariance
-    r, H = np.einsum("nab,nb->na", whiten, r), whiten @ H
-    is_inlier = np.sum(r**2, axis=1) < OUTLIER_STDS**2 * 3.0  # three axes
-    sample = np.repeat(np.flatnonzero(closed)[is_inlier], 3)
-    return _Rows(sample, r[is_inlier].ravel(), H[is_inlier].reshape(-1, len(names)), np.ones(len(sample)))
-
-
-def _compute_hinge_residual(R: Mapping[str, Rotation], model: BodyModel, subject: Subject, joint: str) -> np.ndarray:
-    """Compute the angle (n,) [rad] of the segment below out of the plane of its hinge."""
-    on, moves = _hinged(model.table, joint)
-    along_O = R[on].inv().apply(R[moves].apply(model.table.segments[moves].along))
-    return along_O @ subject.hinges[joint].axis
-
-
-def _build_hinge_rows(R: Mapping[str, Rotation], model: BodyModel, subject: Subject, joint: str) -> _Rows:
-    """Build a row for each sample from a hinge, without outliers."""
-    on, moves = _hinged(model.table, joint)
-    r = _compute_hinge_residual(R, model, subject, joint)
-    heading_derivative_W = np.cross([0.0, 0.0, 1.0], R[moves].apply(model.table.segments[moves].along))
-    derivative = R[on].inv().apply(heading_derivative_W) @ subject.hinges[joint].axis
-    H, names = np.zeros((len(r), len(R))), list(R)
-    H[:, names.index(moves)], H[:, names.index(on)] = derivative, -derivative
-    std = subject.hinges[joint].std
-    is_inlier = np.abs(r) < OUTLIER_STDS * std + HINGE_HEADING_MARGIN
-    sample = np.flatnonzero(is_inlier)
-    return _Rows(sample, r[is_inlier], H[is_inlier], np.full(len(sample), std**-2))
-
-
-def _compute_heading_covariance(orientations: SegmentOrientations, name: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the filter's covariance of the heading with each axis of W (n, 3), and its variance (n,), both [rad²].
+def _compute_filter_covariance(orientations: SegmentOrientations, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Compute the filter's covariance of the heading with each axis of W (n, 3), and its variance (n,), both [rad²].
 
     None: the filter has no covariance.
     """
     orientation = orientations.orientation.get(name)
     if orientation is None or orientation.attitude_cov is None:
         return None
-    R_VS = Rotation.from_quat(orientation.quat_WS)  # its W is the sensor's own world V
-    with_heading_V = R_VS.apply(np.einsum("nab,nb->na", orientation.attitude_cov, R_VS.inv().apply([0.0, 0.0, 1.0])))
+    with_heading_V = compute_heading_covariance(Rotation.from_quat(orientation.quat_WS), orientation.attitude_cov)
     R_WV = Rotation.from_rotvec([0.0, 0.0, orientations.heading_offset[name]])
     return R_WV.apply(with_heading_V), with_heading_V[:, 2]
 
 
-def _smooth_random_walk(
-    information: np.ndarray, information_vector: np.ndarray, step_variances: np.ndarray, start_stds: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Smooth k random walks: return means (knots, k) and covariances (knots, k, k).
-
-    Parameters
-    ----------
-    information : (knots, k, k)
-    information_vector : (knots, k) information matrix times measured value
-    step_variances : (knots, k) [rad²] of the step that ends at a knot
-    start_stds : (k,) [rad] at the end of the start pose
-    """
-    n, size = information_vector.shape
-    x, P = np.zeros(size), np.diag(start_stds**2)
-    before, filtered = [], []
-    for k in range(n):
-        P = P + np.diag(step_variances[k])
-        before.append((x, P))
-        P = np.linalg.inv(np.linalg.inv(P) + information[k])
-        x = x + P @ (information_vector[k] - information[k] @ x)
-        filtered.append((x, P))
-    means, covs = [x], [P]
-    for k in range(n - 2, -1, -1):
-        gain = filtered[k][1] @ np.linalg.inv(before[k + 1][1])
-        x = filtered[k][0] + gain @ (x - before[k + 1][0])
-        P = filtered[k][1] + gain @ (P - before[k + 1][1]) @ gain.T
-        means.append(x)
-        covs.append(P)
-    return np.array(means[::-1]), np.array(covs[::-1])
+def compute_heading_covariance(R_VS: Rotation, attitude_cov: np.ndarray) -> np.ndarray:
+    """Compute the covariance (n, 3) [rad²] of the heading with each axis of V, from that in S (n, 3, 3)."""
+    return np.asarray(R_VS.apply(np.einsum("nab,nb->na", attitude_cov, R_VS.inv().apply([0.0, 0.0, 1.0]))))
 
 
-def _reduce_heading_covariance(
+def replace_heading_variance(
     cov_W: np.ndarray, filter_W: np.ndarray, filter_var: np.ndarray, heading_var: np.ndarray
 ) -> np.ndarray:
-    """Reduce the heading variance by filter and start pose in covariances (n, 3, 3) to at most `heading_var` (n,).
+    """Replace the heading variance by filter and start pose in covariances (n, 3, 3) by `heading_var` (n,).
 
-    Variance from other sources, such as a mount's heading, is not observed by joined hands and elbows: it stays.
+    Variance from other sources, such as a mount's heading, is not observed by what neighbours share: it stays.
     """
-    std_ratio = np.sqrt(np.minimum(1.0, heading_var / filter_var))
+    std_ratio = np.sqrt(heading_var / filter_var)
     removed = (1.0 - std_ratio)[:, None] * filter_W
-    reduced = cov_W.copy()
-    reduced[:, 2, :2] -= removed[:, :2]
-    reduced[:, :2, 2] -= removed[:, :2]
-    reduced[:, 2, 2] -= (1.0 - std_ratio**2) * filter_var
-    return reduced
+    replaced = cov_W.copy()
+    replaced[:, 2, :2] -= removed[:, :2]
+    replaced[:, :2, 2] -= removed[:, :2]
+    replaced[:, 2, 2] += heading_var - filter_var
+    return replaced

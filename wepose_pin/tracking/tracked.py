@@ -225,10 +225,13 @@ class SummaryAccumulator:
 
 
 def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | None:
-    """Residuals of clasp and elbows before and after, and the largest correction of each heading."""
+    """What was observed, residuals of clasp and elbows before and after, and the largest correction of each heading."""
     if correction is None:
         return None
     about: dict[str, Any] = {
+        "joint_accelerations": list(correction.joint_accelerations),
+        "hinges": list(correction.hinges),
+        "found_clasps": [[round(value, 2) for value in span] for span in correction.found_clasps],
         "hinge_rms_deg": {
             joint: [round(v, 3) for v in values] for joint, values in correction.hinge_residual_rms_deg.items()
         },

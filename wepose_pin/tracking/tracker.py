@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from ..alignment import StartFrames
+from ..alignment import SegmentOrientations
 from ..errors import BadOption, BadPhase
 from ..kinematics import KinematicsSolver, compute_point_covariances
 from ..model import BodyModel
@@ -14,7 +14,8 @@ from ..recording import Recording
 from ..subject import Subject
 from .causal import CausalEstimator, CausalSegmentEstimator
 from .doubled import DoubledEstimator
-from .headings import HeadingCorrector
+from .heading_filter import HeadingProblem
+from .headings import HeadingCorrector, pose_problem
 from .options import TrackOptions
 from .segments import Oriented, SegmentEstimator
 from .tracked import TrackedBody, TrackedRecording, make_body
@@ -83,7 +84,7 @@ class Tracker:
         """
         if self._estimator is None:
             self._body = make_body(self._subject, self._model, chunk)
-            self._estimator = _estimator(self._subject, self._body.start_frames, self.options, chunk)
+            self._estimator = _estimator(self._subject, self._body, self.options, chunk)
         if self.options.open_loop and chunk.resets:
             chunk = replace(chunk, resets=())
         return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented)]
@@ -104,7 +105,7 @@ class Tracker:
     def _process(self, oriented: Oriented) -> list[TrackedRecording]:
         assert self._body is not None  # made with the first chunk
         if self._headings is None and not self._solved:
-            self._headings = make_heading_corrector(oriented, self._subject, self._body.model, self.options)
+            self._headings = make_heading_corrector(oriented, self._body.subject, self._body.model, self.options)
             self._solved = self._headings is None
         if self._headings is not None and not self._solved:
             self._headings.add_observations(*oriented)
@@ -129,7 +130,8 @@ class Tracker:
             point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, shape_cov, pose.q),
             gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         )
-        correction = None if self._headings is None else self._headings.summarize()
+        headings = self._headings if not isinstance(self._estimator, CausalEstimator) else self._estimator.headings
+        correction = None if headings is None else headings.summarize()
         return TrackedRecording(pose, recording, person, body, segments, self.options, correction)
 
 
@@ -151,7 +153,7 @@ def observe_headings(
     options = options or TrackOptions()
     headings: HeadingCorrector | None = None
     for oriented, body in _estimate(chunks, subject, model, options):
-        headings = headings or make_heading_corrector(oriented, subject, body, options)
+        headings = headings or make_heading_corrector(oriented, body.subject, body.model, options)
         if headings is None:
             return None
         headings.add_observations(*oriented)
@@ -160,32 +162,30 @@ def observe_headings(
 
 def _estimate(
     chunks: Iterable[Recording], subject: Subject | None, model: BodyModel | str | Path | None, options: TrackOptions
-) -> Iterator[tuple[Oriented, BodyModel]]:
+) -> Iterator[tuple[Oriented, TrackedBody]]:
     """Iterate over the segment orientations of all chunks, each with the body."""
     body: TrackedBody | None = None
     estimator: SegmentEstimator | CausalEstimator | DoubledEstimator | None = None
     for chunk in chunks:
         if body is None or estimator is None:
             body = make_body(subject, model, chunk)
-            estimator = _estimator(subject, body.start_frames, options, chunk)
+            estimator = _estimator(subject, body, options, chunk)
         for oriented in estimator.push(chunk):
-            yield oriented, body.model
+            yield oriented, body
     if body is not None and estimator is not None:
         for oriented in estimator.finish():
-            yield oriented, body.model
+            yield oriented, body
 
 
 def make_heading_corrector(
-    oriented: Oriented, subject: Subject | None, body: BodyModel, options: TrackOptions
+    oriented: Oriented, subject: Subject, body: BodyModel, options: TrackOptions
 ) -> HeadingCorrector | None:
     """Return a heading corrector for a recording with this first chunk; None: its headings cannot be corrected."""
     recording, segments = oriented
-    if subject is None or not subject.mounts or options.causal or options.open_loop:
+    if options.causal or options.open_loop or any(sensor.aligned for sensor in recording.sensors.values()):
         return None
-    if recording.remounted or any(sensor.aligned for sensor in recording.sensors.values()):
-        return None  # the frames are not those of the calibration
-    headings = HeadingCorrector(recording, segments.quat_WL, segments.start[1], subject, body)
-    return headings if headings.is_chain_complete and headings.has_observations else None
+    problem = pose_problem(recording, segments, subject, body, phases=True)
+    return None if problem is None else HeadingCorrector(recording, segments, problem)
 
 
 def track_chunks(
@@ -213,7 +213,7 @@ def track_chunks(
             if progress is not None:
                 progress(task, chunk)
 
-    observed = subject is not None and bool(subject.mounts) and not options.open_loop and not options.causal
+    observed = not options.open_loop and not options.causal
     headings = observe_headings(counted("observing headings"), subject, options, model) if observed else None
     tracker = Tracker(subject, model=model, options=options, headings=headings, observed=observed)
     for chunk in counted(f"tracking by {options.method}"):
@@ -222,11 +222,22 @@ def track_chunks(
 
 
 def _estimator(
-    subject: Subject | None, start_frames: StartFrames, options: TrackOptions, chunk: Recording
+    subject: Subject | None, body: TrackedBody, options: TrackOptions, chunk: Recording
 ) -> SegmentEstimator | CausalEstimator | DoubledEstimator:
-    kind = CausalEstimator if options.causal else SegmentEstimator
+    def observe(recording: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
+        return pose_problem(recording, segments, body.subject, body.model, phases=False)
 
     def make(person: Subject | None) -> SegmentEstimator | CausalEstimator:
-        return kind(person, start_frames=start_frames, method=options.method, static_test=options.static_test)
+        if not options.causal:
+            return SegmentEstimator(
+                person, start_frames=body.start_frames, method=options.method, static_test=options.static_test
+            )
+        return CausalEstimator(
+            person,
+            start_frames=body.start_frames,
+            method=options.method,
+            static_test=options.static_test,
+            pose_problem=None if options.open_loop or chunk.doubled else observe,
+        )
 
     return DoubledEstimator(make, subject, chunk) if chunk.doubled else make(subject)
