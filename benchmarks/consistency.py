@@ -42,9 +42,7 @@ def measure_sessions(seed: int, preset: str, sessions: int) -> list[dict[str, An
             person.lengths, seed=seed, imperfections=replace(PRESETS[preset], mount="any"), session=session, circles=0
         )
         recording = replace(simulation.recording(), remounted=session > 0)
-        subject = calibrate_lengths(
-            recording, measured=measured, prior=prior, measured_std=person.measured_std
-        ).subject
+        subject = calibrate_lengths(recording, measured=measured, prior=prior, measured_std=person.measured_std).subject
         results.append({"seed": seed, **_compare_subject(subject, person, simulation)})
         prior, measured = subject, {}  # a length is measured once
     return results
@@ -193,7 +191,8 @@ if __name__ == "__main__":
     parser.add_argument("--persons", type=int, default=60, help="number of persons")
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="seed of the first person")
     parser.add_argument("--workers", type=int, default=2, help="processes")
-    parser.add_argument("--sessions", type=int, default=1, help="of each person, each with the last subject as prior") parser.add_argument("--protocol", default="clasp", help="of the calibration")
+    parser.add_argument("--sessions", type=int, default=1, help="of each person, each with the last subject as prior")
+    parser.add_argument("--protocol", default="clasp", help="of the calibration")
     options = parser.parse_args()
     if options.sessions > 1:
         chosen = options.preset or list(PRESETS)
