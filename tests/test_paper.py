@@ -61,16 +61,23 @@ def run(*words: object) -> int:
     return int(stop.value.code or 0)
 
 
-def links_in_world(made: tuple[Person, Simulation, Recording], time: np.ndarray) -> dict[str, np.ndarray]:
-    """Segment → direction (n, 3) of its link in W, from the orientations of `track`."""
+def gap_by_length(made: tuple[Person, Simulation, Recording], time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The gap by the shoulder width (3 n,), and by upper arm and forearm with hand of both sides (3 n, 4).
+
+    Of the orientations of `track` at times (n,) [s]: the gap is R_t e_y w + u_l a_l + f_l b_l − u_r a_r − f_r b_r.
+    """
     person, _, recording = made
     tracked = track(recording, person.prior, method="smekf")
     assert tracked.correction is None
     samples = np.searchsorted(tracked.time, time - 1e-6)
     np.testing.assert_allclose(tracked.time[samples], time, atol=1e-9)
-    along = {"torso": [0.0, 1.0, 0.0]}
     R = {name: Rotation.from_quat(tracked.quat_WL[name][samples]) for name in SENSORS}
-    return {name: R[name].apply(along.get(name, [0.0, 0.0, -1.0])) for name in SENSORS}
+    columns = [
+        sign * R[f"{side}_{part}"].apply([0.0, 0.0, -1.0])
+        for side, sign in (("left", 1.0), ("right", -1.0))
+        for part in ("upper_arm", "forearm")
+    ]
+    return R["torso"].apply([0.0, 1.0, 0.0]).reshape(-1), np.stack(columns, axis=2).reshape(-1, 4)
 
 
 # Calibration ----------------------------------------------------------------------------------------------------------
@@ -79,14 +86,11 @@ def links_in_world(made: tuple[Person, Simulation, Recording], time: np.ndarray)
 def test_lengths_are_those_of_numpys_least_squares(
     made: tuple[Person, Simulation, Recording], estimated: Calibration
 ) -> None:
-    """Shoulder width known: R_t e_y w + u_l a_l + f_l b_l − u_r a_r − f_r b_r = 0, in a, b of both sides."""
+    """With a known shoulder width."""
     person, _, _ = made
-    link = links_in_world(made, estimated.time)
-    left, right = ([link[f"{side}_{part}"] for part in ("upper_arm", "forearm")] for side in ("left", "right"))
-    columns = np.stack([*left, *(-v for v in right)], axis=2).reshape(-1, 4)
+    across, columns = gap_by_length(made, estimated.time)
     width = person.lengths["shoulder_width"]
-    target = -width * link["torso"].reshape(-1)
-    expected, squares, *_ = np.linalg.lstsq(columns, target)
+    expected, squares, *_ = np.linalg.lstsq(columns, -width * across)
     lengths = estimated.subject.lengths
     arms = [
         value
@@ -110,9 +114,7 @@ def test_the_covariance_is_that_of_the_same_least_squares(
     made: tuple[Person, Simulation, Recording], estimated: Calibration
 ) -> None:
     person, _, _ = made
-    link = links_in_world(made, estimated.time)
-    left, right = ([link[f"{side}_{part}"] for part in ("upper_arm", "forearm")] for side in ("left", "right"))
-    columns = np.stack([*left, *(-v for v in right)], axis=2).reshape(-1, 4)
+    _, columns = gap_by_length(made, estimated.time)
     variance = np.sum(estimated.gap**2) / (len(columns) - 4) * len(estimated.gap) / estimated.effective_sample_size
     expected = variance * np.linalg.inv(columns.T @ columns)
     # A measured length that is off by one standard deviation scales all that the gap shows.

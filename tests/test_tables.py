@@ -201,27 +201,23 @@ HUMAN = """like = "example_robot_data_human"
 up = "+y"
 root = ["left_upperleg", "right_upperleg"]
 """
-UR = """kind = "mechanism"
-segments = { upper_arm_link = "upper_arm_link", forearm_link = "forearm_link", wrist_3_link = "wrist_3_link" }
-points = { base = "upper_arm_link", elbow = "forearm_link", wrist = "wrist_1_link", tip = "tool0" }
+
+
+def format_arm_table(upper_arm: str, forearm: str, hand: str, wrist: str, tip: str) -> str:
+    """The table of a robot's arm by its links: three with sensors, and those at whose origins wrist and tip are."""
+    segments = ", ".join(f'{link} = "{link}"' for link in (upper_arm, forearm, hand))
+    return f"""kind = "mechanism"
+segments = {{ {segments} }}
+points = {{ shoulder = "{upper_arm}", elbow = "{forearm}", wrist = "{wrist}", tip = "{tip}" }}
 [lengths]
-upper_arm = { segment = "upper_arm_link", from = "base", to = "elbow" }
-forearm = { segment = "forearm_link", from = "elbow", to = "wrist" }
+upper_arm = {{ segment = "{upper_arm}", from = "shoulder", to = "elbow" }}
+forearm = {{ segment = "{forearm}", from = "elbow", to = "wrist" }}
 """
-PANDA = """kind = "mechanism"
-segments = { panda_link2 = "panda_link2", panda_link4 = "panda_link4", panda_link7 = "panda_link7" }
-points = { shoulder = "panda_link2", elbow = "panda_link4", wrist = "panda_link5", tip = "panda_hand" }
-[lengths]
-upper_arm = { segment = "panda_link2", from = "shoulder", to = "elbow" }
-forearm = { segment = "panda_link4", from = "elbow", to = "wrist" }
-"""
-Z1 = """kind = "mechanism"
-segments = { link02 = "link02", link03 = "link03", link06 = "link06" }
-points = { shoulder = "link02", elbow = "link03", wrist = "link04", tip = "link06" }
-[lengths]
-upper_arm = { segment = "link02", from = "shoulder", to = "elbow" }
-forearm = { segment = "link03", from = "elbow", to = "wrist" }
-"""
+
+
+UR = format_arm_table("upper_arm_link", "forearm_link", "wrist_3_link", wrist="wrist_1_link", tip="tool0")
+PANDA = format_arm_table("panda_link2", "panda_link4", "panda_link7", wrist="panda_link5", tip="panda_hand")
+Z1 = format_arm_table("link02", "link03", "link06", wrist="link04", tip="link06")
 # URDF, its table without the line that names it, and what the line says that asks for a table where none is needed.
 HUMANS = {
     "cosmik_human.urdf": (COSMIK, ("cosmik_human.urdf: no link", "upperarmL", "docs/models.md")),

@@ -92,7 +92,7 @@ def soak(out: Path, workers: int, pages: bool) -> tuple[int, list[dict[str, Any]
         )
         series = []
         while process.poll() is None:
-            done = sum(1 for _ in (out / "study").glob("**/done.json"))
+            done = sum(1 for _ in (out / "study").glob("items/*/done.json"))
             series.append({"seconds": round(time.monotonic() - begin, 1), "items": done} | measured(process.pid))
             time.sleep(EVERY_S)
     return process.returncode, series
@@ -118,9 +118,9 @@ def growth(series: list[dict[str, Any]], workers: int) -> list[str]:
     """Of each worker the memory that stays between its items, and its growth with each item [MB] with standard error.
 
     What stays is the least memory while `2 workers` items were done, in which each worker has finished one; the first
-    third of the items, in which caches fill, does not count.
+    half of the items, in which caches fill, does not count.
     """
-    lines, first = [], series[-1]["items"] // 3
+    lines, first = [], series[-1]["items"] // 2
     lifetimes = {pid: sum(pid in row["sizes"] for row in series) for row in series for pid in row["sizes"]}
     steady = [pid for pid, rows in lifetimes.items() if rows > len(series) / 2]
     largest = sorted(steady, key=lambda pid: -statistics.median(row["sizes"].get(pid, 0.0) for row in series))

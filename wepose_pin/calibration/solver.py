@@ -153,9 +153,7 @@ def solve(
         oracle = _Oracle(now, damping)
         now, multipliers = _minimise(oracle, min(left, SAME_SCALE_STEPS), tolerance / 2.0)
         damping, left = oracle.damping, left - max(oracle.steps, 1)
-    if remaining < LOOSE_TOLERANCE or not strict:
-        return now.fit()
-    raise _no_solution(remaining)
+    return _accept(now, remaining, strict)
 
 
 def _minimise(oracle: _Oracle, steps: int, tolerance: float) -> tuple[Evaluation, np.ndarray]:
@@ -321,14 +319,14 @@ def solve_without_bounds(
                 break
             damping *= DAMPING_FACTOR
         damping = max(damping / DAMPING_FACTOR, LEAST_DAMPING)
-    remaining = now.remaining()
+    return _accept(now, now.remaining(), strict)
+
+
+def _accept(now: Evaluation, remaining: float, strict: bool) -> Fit:
+    """The fit at the end; `NoSolution` where too many standard deviations remain, if `strict`."""
     if remaining < LOOSE_TOLERANCE or not strict:
         return now.fit()
-    raise _no_solution(remaining)
-
-
-def _no_solution(remaining: float) -> NoSolution:
-    return NoSolution(
+    raise NoSolution(
         f"the lengths did not converge ({remaining:.2g} standard deviations to go); check that the hands do in the "
         f"phase what the protocol says, and that every sensor sits where the session says"
     )

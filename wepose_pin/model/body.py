@@ -25,6 +25,7 @@ from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
 from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, parse_table, read_table
 from .tree import AxisLimits, build, find_bounds, find_impossible_inertia, parse_tree
+from .urdf_library import import_yourdfpy
 from .visuals import Visual
 
 # Standard deviations off the mean of adults (calibration/anthropometry.toml), above which a length is implausible.
@@ -150,10 +151,9 @@ class BodyModel:
 
     def urdf(self) -> str:
         """This body as the text of a URDF that any tool reads."""
-        import yourdfpy
         from lxml import etree
 
-        tree = yourdfpy.URDF(self.robot, build_scene_graph=False, load_meshes=False).write_xml()
+        tree = import_yourdfpy().URDF(self.robot, build_scene_graph=False, load_meshes=False).write_xml()
         return etree.tostring(tree, pretty_print=True, xml_declaration=True, encoding="utf-8").decode()
 
 
@@ -291,8 +291,6 @@ def read_urdf(path: Path) -> Any:
     MissingFile, BadModel
         Not there; not a URDF.
     """
-    import yourdfpy
-
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a URDF is wanted here")
     try:
@@ -302,7 +300,7 @@ def read_urdf(path: Path) -> Any:
     except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
         raise BadModel(f"{path}: is no complete XML file, as a URDF is: {error}") from error
     try:
-        robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+        robot = import_yourdfpy().URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # yourdfpy and lxml raise many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadModel(f"{path}: cannot be read as a URDF: {reason}") from error

@@ -19,6 +19,7 @@ from ..errors import BadModel, one_of
 from ..recording import compute_mount
 from .table import BodyTable, Point
 from .tree import Tree, parse_tree
+from .urdf_library import import_yourdfpy
 
 MOST_LINKS = 100  # that an error lists; a person's body has fewer
 
@@ -159,8 +160,7 @@ def _with_links(
 
     A link of theirs that bears such a name and stands elsewhere becomes ``<name>_link``.
     """
-    import yourdfpy
-
+    yourdfpy = import_yourdfpy()
     robot = copy.deepcopy(robot)
     added = {}
     for name, (link, R, p) in frames.items():
