@@ -357,7 +357,7 @@ def describe_known(experiment: str, presets: Mapping[str, Mapping[str, Any]]) ->
         f"paper's protocol); {bias}. {trunk}",
         ARBITRARY_MOUNTING: f"{lengths}; {bias}. Nothing of the mounts. {trunk}",
         ERROR_BUDGET: f"{lengths}; how each sensor is mounted, exactly, but in one row; {bias}. {trunk}",
-        "BROAD": still.format("the 26 to 47 s before the motion"),
+        "BROAD": still.format("the 25 to 44 s before the motion"),
         "the authors' trial": "clocks, frames and the heading, on the half that is not scored (5 to 11 s with 11 to "
         "17.3 s, and 11 to 17.3 s with all before); noise, gyroscope bias and tilt, from 0.05 to 0.9 s (default gains: "
         "their bias starts at zero)",
