@@ -283,7 +283,7 @@ def test_a_trial_that_cannot_be_scored_is_told_and_skipped(
     good = sorted((data / "broad").glob("*.mat"))[0]
     (tmp_path / "broad" / "00_damaged.mat").write_bytes(b"no trial")
     (tmp_path / "broad" / good.name).symlink_to(good)
-    monkeypatch.setattr("wepose_pin.validation.list_experiments", lambda _, folder, __: real.list_experiments(folder))
+    monkeypatch.setattr("wepose_pin.validation.list_experiments", lambda _, folder, *__: real.list_experiments(folder))
     out = tmp_path / "out"
     with pytest.raises(SystemExit) as stop:
         main(["validate", "--data", str(tmp_path), "-o", str(out)])

@@ -15,7 +15,8 @@ from wepose_pin.filters import METHODS
 from wepose_pin.jobs.validate import ValidateJob
 from wepose_pin.readers.trials import read_authors_trial, read_broad
 from wepose_pin.simulation import IDEAL_PRESET, simulate, simulate_person
-from wepose_pin.validation import Result, list_experiments, run_jobs, summarize
+from wepose_pin.validation import Result, format_document, list_experiments, read_document, run_jobs, summarize
+from wepose_pin.validation.document import check_same_settings, parse_document
 from wepose_pin.validation.paper import MEASURED, calibrate_person, set_exact_mounts, switch_off
 from wepose_pin.validation.presets import PRESETS
 from wepose_pin.validation.tables import describe_known
@@ -110,6 +111,33 @@ def test_each_half_of_the_authors_trial_is_scored_with_the_other(data: Path) -> 
             figures["smekf"]["total_rmse"] < figures["gdc"]["total_rmse"] < figures["gdc, default gains"]["total_rmse"]
         )
         assert figures["smekf"]["total_rmse"] < figures["ncf, default gains"]["total_rmse"]
+
+
+def test_a_run_of_some_experiments_keeps_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def validate(*words: object) -> int:
+        with pytest.raises(SystemExit) as stop:
+            main(["validate", "--quick", *map(str, words)])
+        return int(stop.value.code or 0)
+
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert validate("--experiment", "drift", "-o", first) == 0
+    assert validate("--experiment", "dynamic 100", "--keep", first / "validation.json", "-o", second) == 0
+    document = read_document(second / "validation.json")
+    assert list(dict.fromkeys(result.experiment for result in document.results)) == ["dynamic 100 Hz", "drift"]
+    assert [each for each in document.results if each.experiment == "drift"] == read_document(
+        first / "validation.json"
+    ).results
+    capsys.readouterr()
+    assert validate("--experiment", "nothing", "-o", tmp_path / "third") == 2
+    assert "no experiment begins so; there are: dynamic 100 Hz" in capsys.readouterr().err
+
+
+def test_results_of_other_settings_are_not_joined() -> None:
+    result = Result("drift", "0", "smekf", {"drift_deg_min": 0.1})
+    documents = [parse_document(json.loads(format_document([result], True, {"numpy": v})), "x") for v in ("1", "2")]
+    check_same_settings(documents[0], documents[0], "earlier")
+    with pytest.raises(BadData, match="earlier: versions: made with others"):
+        check_same_settings(*documents, "earlier")
 
 
 def test_fewer_trials() -> None:

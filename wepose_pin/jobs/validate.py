@@ -34,7 +34,12 @@ class ValidateJob:
         Run one trial of each experiment, and two of the BROAD data set, instead of all. The error budget and the tuning
         of the gains of ncf and gdc are left out.
     trials : NUMBER
-        Run at most this many trials of each simulated experiment, instead of ten or twelve. The page says so.
+        Run at most this many trials of each experiment of simulated people or sensors, instead of ten or twelve. The
+        page says so.
+    experiment : NAME
+        Run only the experiments whose names begin so, such as "upper body, mild" or BROAD.
+    keep : FILE
+        Take the experiments that are not run from the validation.json of an earlier run.
     from_ : FILE
         Make tables and pages from the validation.json of an earlier run, and run nothing.
     force
@@ -45,14 +50,18 @@ class ValidateJob:
     data: Path | None = None
     quick: bool = False
     trials: int | None = None
+    experiment: str | None = None
+    keep: Path | None = None
     from_: Path | None = None
     force: bool = False
 
     def check(self) -> None:
         """Raise `BadOption` where options contradict each other."""
-        if self.from_ is not None and (self.quick or self.data is not None or self.trials is not None):
+        others = (self.data, self.trials, self.experiment, self.keep)
+        if self.from_ is not None and (self.quick or any(other is not None for other in others)):
             raise BadOption(
-                f"--from {self.from_}: runs nothing, so that --quick, --trials and --data mean nothing beside it"
+                f"--from {self.from_}: runs nothing, so that --quick, --trials, --experiment, --keep and --data mean "
+                f"nothing beside it"
             )
         if self.trials is not None and not self.trials >= 1:
             raise BadOption(f"--trials {self.trials}: a whole number from 1 on")
@@ -78,8 +87,8 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
     from ..documents import whole_folder
     from ..errors import reason
     from ..report.page import page_incomplete
-    from ..validation import Skipped, format_document, list_experiments, read_document, run_jobs
-    from ..validation.document import parse_document
+    from ..validation import Skipped, format_document, join_results, list_experiments, read_document, run_jobs
+    from ..validation.document import check_same_settings, parse_document
     from ..validation.page import write_pages
     from ..writers.result import versions
 
@@ -91,11 +100,12 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
                 progress("drawing the figures", 0.0)
                 failures = [page_incomplete("validation.html", each) for each in write_pages(folder, document)]
         return ValidateOutcome(document, failures)
-    trials = [
-        trial
-        for trials_of_experiment in list_experiments(job.quick, job.data, job.trials).values()
-        for trial in trials_of_experiment
-    ]
+    experiments = list_experiments(job.quick, job.data, job.trials)
+    chosen = [name for name in experiments if name.startswith(job.experiment or "")]
+    if not chosen:
+        raise BadOption(f"--experiment {job.experiment}: no experiment begins so; there are: {', '.join(experiments)}")
+    kept = None if job.keep is None else read_document(job.keep)
+    trials = [trial for name in chosen for trial in experiments[name]]
     steps = len(trials) + (job.out is not None)
     with contextlib.ExitStack() as place:
         folder_or_none = place.enter_context(whole_folder(job.out, job.force)) if job.out is not None else None
@@ -108,7 +118,13 @@ def run_validate(job: ValidateJob, progress: Progress = no_progress) -> Validate
                 results += outcome
         if not results:
             raise BadData(f"nothing could be scored; {skipped[0].line()}")
-        text = format_document(results, job.quick, versions(), skipped, job.trials)
+        planned = {name: len(jobs) for name, jobs in list_experiments(False, job.data).items()}
+        if kept is not None:
+            results, skipped = join_results(kept, results, skipped, chosen, list(experiments))
+            planned = kept.planned | planned
+        text = format_document(results, job.quick, versions(), skipped, planned)
+        if kept is not None:
+            check_same_settings(kept, parse_document(json.loads(text), "this run"), str(job.keep))
         if folder_or_none is not None:
             (folder_or_none / "validation.json").write_text(text, encoding="utf-8")
     document, failures = parse_document(json.loads(text), "this run"), list[Diagnostic]()

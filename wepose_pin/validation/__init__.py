@@ -11,7 +11,7 @@ from pathlib import Path
 
 from . import gains, mounting, paper, real
 from .contenders import Contender, list_contenders
-from .document import Document, format_document, read_document
+from .document import Document, format_document, join_results, read_document
 from .jobs import Job, Result, Skipped, run_jobs
 from .tables import Row, summarize
 
@@ -23,6 +23,7 @@ __all__ = [
     "Row",
     "Skipped",
     "format_document",
+    "join_results",
     "list_contenders",
     "list_experiments",
     "read_document",

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from ..errors import BadData, MissingFile
@@ -26,7 +27,7 @@ class Document(NamedTuple):
     noise: dict[str, float]  # of the simulated sensors, in `ImuNoise`'s units
     gains: dict[str, dict[str, Any]]  # setting → "ncf", "gdc" → gains as stated
     skipped: list[Skipped] = []  # trials that could not be scored  # noqa: RUF012
-    trials: int = 0  # at most so many of a simulated experiment; 0: all
+    planned: dict[str, int] = {}  # experiment → trials of a full run  # noqa: RUF012
 
 
 def format_document(
@@ -34,7 +35,7 @@ def format_document(
     quick: bool,
     versions: Mapping[str, str],
     skipped: Sequence[Skipped] = (),
-    trials: int | None = None,
+    planned: Mapping[str, int] = MappingProxyType({}),
 ) -> str:
     """Format the file's text, one line a result, without a time stamp: two runs give the same file.
 
@@ -43,7 +44,7 @@ def format_document(
     head = {
         "versions": dict(versions),
         "quick": quick,
-        "trials": trials or 0,
+        "planned": dict(planned),
         **({"skipped": [each._asdict() for each in skipped]} if skipped else {}),
         "presets": {
             name: {"imperfections": asdict(preset.imperfections), "measured_std": preset.measured_std}
@@ -63,6 +64,34 @@ def format_document(
         "  " + json.dumps(_plain(result._asdict()), ensure_ascii=False, allow_nan=False) for result in results
     )
     return f'{text},\n "results": [\n{lines}\n ]\n}}\n'
+
+
+def join_results(
+    kept: Document, results: Sequence[Result], skipped: Sequence[Skipped], chosen: Sequence[str], order: Sequence[str]
+) -> tuple[list[Result], list[Skipped]]:
+    """Join the results of the `chosen` experiments with those that an earlier run has of others, in that order."""
+    place = {name: k for k, name in enumerate(order)}
+    joined = [each for each in kept.results if each.experiment not in chosen] + list(results)
+    missed = [each for each in kept.skipped if each.experiment not in chosen] + list(skipped)
+    joined.sort(key=lambda result: place.get(result.experiment, len(place)))
+    return joined, missed
+
+
+def check_same_settings(kept: Document, now: Document, where: str) -> None:
+    """Check that two runs have the same packages, noise, presets and gains.
+
+    Raises
+    ------
+    BadData
+        They differ: their results are not to be compared.
+    """
+    for name in ("quick", "versions", "noise", "presets", "gains"):
+        before, after = getattr(kept, name), getattr(now, name)
+        if isinstance(before, dict):
+            shared = before.keys() & after.keys()
+            before, after = ({key: each[key] for key in shared} for each in (before, after))
+        if before != after:
+            raise BadData(f"{where}: {name}: made with others than this run's; run these experiments again as well")
 
 
 def read_document(path: Path) -> Document:
@@ -121,7 +150,7 @@ def parse_document(content: Any, where: str) -> Document:
             Skipped(*(read_value(item, key, str, f"skipped[{k}].") for key in Skipped._fields))
             for k, item in enumerate(read_value(content, "skipped", list, "", []))
         ],
-        read_value(content, "trials", int, "", 0),
+        read_value(content, "planned", dict, "", {}),
     )
 
 

@@ -55,11 +55,16 @@ def write_pages(folder: Path, document: Document) -> list[str]:
 def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str:
     """Render the page as Markdown: the template's text with the document's tables and charts."""
     rows = summarize(document.results)
-    experiments = {}
+    experiments, shortened = {}, []
     for name in dict.fromkeys(row.experiment for row in rows):
         own_rows = [row for row in rows if row.experiment == name]
+        trials = len({result.trial for result in document.results if result.experiment == name})
+        planned = max(document.planned.get(name, 0), trials)
+        if trials < planned:
+            shortened.append(f"{name} {trials} of {planned}")
         experiments[name] = {
-            "trials": len({result.trial for result in document.results if result.experiment == name}),
+            "trials": trials,
+            "planned": planned,
             "known": describe_known(name, document.presets),
             "table": make_experiment_table(own_rows, True),
             "note": describe_table(own_rows),
@@ -70,6 +75,7 @@ def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str
         folder=FOLDER,
         document=document,
         experiments=experiments,
+        shortened=shortened,
         targets=make_targets_table(rows),
         overview=make_overview_table(rows),
         beside_paper=compare_with_paper(rows),

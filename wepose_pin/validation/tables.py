@@ -89,6 +89,8 @@ _IMPERFECTIONS = {
     "tissue_gain": ("soft tissue that follows the joints, of the literature's", 100.0, " %"),
     "tissue_random": ("soft tissue, its random part, of the literature's", 100.0, " %"),
     "wobble_deg": ("wobble of a sensor under acceleration", 1.0, "° per g"),
+    "upper_arm_place": ("the upper arm's sensor, from the shoulder; –: half-way", 100.0, " % of the length"),
+    "forearm_place": ("the forearm's sensor, from the elbow; –: half-way", 100.0, " % of the length"),
     "breath_deg": ("breath, pitch of the sensor on the sternum, rms", 1.0, "°"),
     "creep_deg": ("creep of a strap after 10 min, about each axis", 1.0, "°"),
     "strap_slip_deg": ("slip of a strap, once in 200 min", 1.0, "°"),
@@ -357,7 +359,7 @@ def describe_known(experiment: str, presets: Mapping[str, Mapping[str, Any]]) ->
         f"paper's protocol); {bias}. {trunk}",
         ARBITRARY_MOUNTING: f"{lengths}; {bias}. Nothing of the mounts. {trunk}",
         ERROR_BUDGET: f"{lengths}; how each sensor is mounted, exactly, but in one row; {bias}. {trunk}",
-        "BROAD": still.format("the 26 to 47 s before the motion"),
+        "BROAD": still.format("the 25 to 44 s before the motion"),
         "the authors' trial": "clocks, frames and the heading, on the half that is not scored (5 to 11 s with 11 to "
         "17.3 s, and 11 to 17.3 s with all before); noise, gyroscope bias and tilt, from 0.05 to 0.9 s (default gains: "
         "their bias starts at zero)",
@@ -383,8 +385,8 @@ def describe_table(rows: Sequence[Row]) -> str:
         notes.append("RMSE: root mean square error of a trial, averaged over the trials")
     if set(SHORT.values()) & set(keys):
         notes.append(
-            "nees: normalised squared error of the hand, right are 3; in 1σ, in 2σ: share of the hand's errors within "
-            "one and two stated standard deviations, right are 0.68 and 0.95"
+            "nees: normalised squared error of the hand from the root, right are 3; in 1σ, in 2σ: share of its errors "
+            "within one and two stated standard deviations, right are 0.68 and 0.95"
         )
     if any(key in ERRORS for key in keys) and len(rows) > 1 and not rows[0].experiment.startswith(ERROR_BUDGET):
         notes.append("bold: the smallest of a column")
