@@ -318,9 +318,7 @@ def _closure_residual(
         gap, covariance = ca.SX.zeros(3), loop.closure.slip**2 * ca.SX.eye(3)
         for name, sign in girdles:
             if name in names:
-                law = layout.girdles[names.index(name)].law
                 gap += sign * _displace_girdle(layout, x, quat_WL, names.index(name))
-                covariance += float(np.mean(np.square(law.residual_std))) * ca.SX.eye(3)
         for sensor, v in orient_parts(layout, x, quat_WL, way):
             gap += v
             # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ).

@@ -14,6 +14,7 @@ from ..alignment import MEASURED_ORIENTATION_STD, find_mount_covariance
 from ..errors import BadSubject
 from ..model import BodyTable
 from ..model.girdle import PARAMETERS
+from ..model.table import NEUTRAL_POSE
 from ..subject import Subject
 from .conditions import Loop
 from .initial_headings import estimate_headings
@@ -127,15 +128,19 @@ def _mount_prior(problem: CalibrationProblem, segment: str, heading: float | Non
     information = np.zeros((3, 3))
     information[:2, :2] = np.linalg.inv(start_cov[:2, :2])
     information[2, 2] = HEADING_STD**-2
+    mean = np.zeros(3)
+    if problem.recording.start_pose == NEUTRAL_POSE:
+        mean[:2] = problem.model.table.segments[segment].start_mean[:2]
     mount = problem.mount(segment)
     if mount is None or heading is None:
-        return np.zeros(3), information
+        return mean, information
     R_mount = Rotation.from_quat(mount)
     turn = Rotation.from_rotvec([0.0, 0.0, heading])
     misfit = (turn * problem.filtered.R_VS_start[segment] * R_mount.inv()).as_rotvec()
     of_mount, signs = _mount_information(problem, segment), np.diag([-1.0, -1.0, 1.0])
     offset = np.linalg.solve(
-        information + signs @ of_mount @ signs + 1e-9 * np.eye(3), -signs @ of_mount @ np.append(misfit[:2], 0.0)
+        information + signs @ of_mount @ signs + 1e-9 * np.eye(3),
+        information @ mean - signs @ of_mount @ np.append(misfit[:2], 0.0),
     )
     return offset, information + signs @ of_mount @ signs
 

@@ -71,6 +71,7 @@ class Segment(NamedTuple):
     joint : the name of the joint to the segment above, where no point is there to name it
     soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian, in a calibration
     soft_tissue : by how much it turns a sensor while the body is tracked
+    start_mean : (3,) [rad] by which people are off the neutral pose on average, as a turn about its axes
     start_std : (3,) [rad] between the segment and the start pose about its axes, one person to another
     repeat_std : (3,) [rad] the same between two start poses of one person
     """
@@ -85,6 +86,7 @@ class Segment(NamedTuple):
     joint: str = ""
     soft_tissue_std: float = float(np.deg2rad(0.6))
     soft_tissue: SoftTissue = SoftTissue(_same(1.5))
+    start_mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_std: tuple[float, float, float] = _same(4.0)
     repeat_std: tuple[float, float, float] = _same(2.0)
 
@@ -491,7 +493,7 @@ def _read_segments(top: TomlTable, base: BodyTable, kind: str) -> dict[str, Segm
     for name, entry in _read_links(top, "segments"):
         entry.allow(
             *("link", "up", "forward", "along", "spine", "without_sensor", "labels", "joint"),
-            *("soft_tissue_deg", "soft_tissue", "start_std_deg", "repeat_std_deg"),
+            *("soft_tissue_deg", "soft_tissue", "start_mean_deg", "start_std_deg", "repeat_std_deg"),
         )
         own = base.segments.get(name)
         if ("up" in entry) != ("forward" in entry):
@@ -522,6 +524,7 @@ def _read_segments(top: TomlTable, base: BodyTable, kind: str) -> dict[str, Segm
             joint=joint,
             soft_tissue_std=soft,
             soft_tissue=_read_soft_tissue(entry, segment.soft_tissue),
+            start_mean=_read_start_mean(entry, segment.start_mean),
             start_std=start,
             repeat_std=repeat,
         )
@@ -534,6 +537,11 @@ def _read_segments(top: TomlTable, base: BodyTable, kind: str) -> dict[str, Segm
             raise BadModel(f"{top.at('segments')}.{name}: did you mean '{close[0]}'? {base.name} has that")
     order = [*base.segments, *segments]
     return dict(sorted(segments.items(), key=lambda item: order.index(item[0])))
+
+
+def _read_start_mean(entry: TomlTable, default: tuple[float, float, float]) -> tuple[float, float, float]:
+    x, y, z = np.deg2rad(_read_numbers(entry, "start_mean_deg", 3, np.degrees(default).tolist())).tolist()
+    return x, y, z
 
 
 def _read_soft_tissue(entry: TomlTable, default: SoftTissue) -> SoftTissue:
@@ -846,6 +854,7 @@ def format_table(table: BodyTable, urdf: str) -> str:
         lines += [f"labels = {toml_string(segment.labels)}"] if segment.labels else []
         lines += [f"joint = {toml_string(segment.joint)}"] if segment.joint else []
         lines.append(f"soft_tissue_deg = {np.degrees(segment.soft_tissue_std):.6g}")
+        lines.append(f"start_mean_deg = {np.degrees(segment.start_mean).round(6).tolist()}")
         lines.append(f"start_std_deg = {np.degrees(segment.start_std).round(6).tolist()}")
         lines.append(f"repeat_std_deg = {np.degrees(segment.repeat_std).round(6).tolist()}")
         tissue = segment.soft_tissue

@@ -36,9 +36,10 @@ LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance with
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
-# A clasp that is found: the points are joined for this long [s], at most this far apart [m] rms, by so much [m] rms around
-# their mean, and so far [m] in height, while each moves by at least this speed [m/s] rms and their distance by at most a
-# share of it. On simulated people with the lengths of the population joined hands seem up to 25 cm apart and are not found.
+# A clasp that is found: the points are joined for this long [s], at most this far apart [m] rms, by so much [m] rms
+# around their mean, and so far [m] in height, while each moves by at least this speed [m/s] rms and their distance by
+# at most a share of it. On simulated people with the lengths of the population joined hands seem up to 25 cm apart and
+# are not found.
 CLASP_S = 2.0
 CLASP_GAP, CLASP_CHANGE, CLASP_HEIGHT = 0.06, 0.03, 0.12
 CLASP_SPEED, CLASP_SPEED_RATIO = 0.08, 0.3

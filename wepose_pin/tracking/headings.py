@@ -1,7 +1,7 @@
 """Correction of headings by what neighbours share: accelerations, hinges, ranges of motion, joined hands.
 
-The filters' tilt is good and their headings drift. `heading_filter` estimates their errors knot by knot; a heading error
-common to all segments is unobservable. Offline a forward pass learns where sensors sit, and a second one and a
+The filters' tilt is good and their headings drift. `heading_filter` estimates their errors knot by knot; a heading
+error common to all segments is unobservable. Offline a forward pass learns where sensors sit, and a second one and a
 Rauch-Tung-Striebel pass give the errors. Causally the forward pass alone does, each knot's errors from the next one on.
 """
 
