@@ -54,6 +54,7 @@ from .priors import build_prior, combine_lengths
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem
 from .protocols import Protocol, load_protocol
 from .result import Calibration
+from .sessions import fuse_subjects, separate_mounts
 from .solver import MIN_LENGTH
 from .weights import (
     MIN_CONTACT,
@@ -87,7 +88,8 @@ def calibrate_lengths(
     Parameters
     ----------
     measured : measured lengths, and distances that the protocol names, name → [m]; without one the scale is the prior's
-    prior : lengths before, with covariance, and mounts; None: `population_subject`
+    prior : lengths before, with covariance; None: `population_subject`. That of an earlier calibration, which has
+        mounts, is fused with the result (`sessions`)
     model : the body; None: that which the recording states, else the upper body
     protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave
     method : the orientation filter
@@ -132,10 +134,17 @@ def calibrate_lengths(
     for condition in protocol.conditions:
         recording.phase(condition.phase)
     filtered = filter_recording(recording, method=method, sways=not table.is_mechanism)
+    earlier = prior if prior.mounts and formulation == "full" else None
+    if earlier is not None:
+        prior = separate_mounts(earlier, population_subject(body=model))
     problem = CalibrationProblem(recording, filtered, protocol, prior, with_std, model)
     if formulation == "paper":
         return solve_paper_calibration(problem)
-    return add_second_mounts(_calibrate_checked(problem), recording, method)
+    calibration = _calibrate_checked(problem)
+    if earlier is not None and not calibration.labels.moved:
+        fused = fuse_subjects(earlier, calibration.subject, population_subject(body=model), table)
+        calibration = replace(calibration, subject=fused, prior=earlier)
+    return add_second_mounts(calibration, recording, method)
 
 
 def _check_measured(measured: Mapping[str, tuple[float, float]], protocol: Protocol, model: BodyModel) -> None:

@@ -125,7 +125,7 @@ class KnotReader:
         quat_WL = np.stack(
             [(self._R_WV[i] * Rotation.from_quat(quat_VS[rows, i]) * self._R_SL[i]).as_quat() for i in range(k)], axis=1
         )
-        lost = ~np.isfinite(self._accel_S[:n]).all(axis=(0, 2))
+        lost = np.asarray(~np.isfinite(self._accel_S[:n]).all(axis=(0, 2)))
         return Knot(float(self._time[n - 1]), self._time[rows].copy(), quat_WL, joints, heading_var, lost)
 
 
