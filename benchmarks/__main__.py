@@ -12,7 +12,7 @@ from wepose_pin.errors import BadOption, ExistingOutput, WeposeError
 
 from .tables import Section, document, print_table, read_document
 
-KINDS = ("filters", "calibration", "live", "batch", "long")
+KINDS = ("filters", "calibration", "live", "batch", "long", "headings")
 DEFAULT = ("filters", "calibration")
 
 
@@ -32,7 +32,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         help="filters: speed and accuracy beside VQF and imufusion, two minutes; calibration: nlpsol beside "
         "others; live: five sensors at 1 kHz for five minutes, and again with the page; batch: a study of 500 "
         "sessions on one worker, two, and two of which one is killed (stopped, the same command goes on from there); "
-        f"long: recordings of up to 24 hours in chunks. Without any: {' and '.join(DEFAULT)}",
+        "long: recordings of up to 24 hours in chunks; headings: relative headings of simulated people with and "
+        f"without their correction, half an hour. Without any: {' and '.join(DEFAULT)}",
     )
     add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 12 sessions, up to one hour")
     add("--sessions", type=int, metavar="N", help="number of sessions of batch")
@@ -70,6 +71,10 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
             from . import batch
 
             chosen |= batch.sections(options.quick, options.sessions)
+        elif kind == "headings":
+            from . import headings
+
+            chosen |= headings.sections(options.quick)
         else:
             from . import long_recordings
 

@@ -111,6 +111,23 @@ def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simula
         np.testing.assert_allclose(alone.quat_WL[name], quat, atol=1e-12)
 
 
+@pytest.mark.parametrize("causal", [False, True])
+def test_joined_hands_are_found_and_hands_apart_are_not(causal: bool) -> None:
+    person = simulate_person(4)
+    simulation = simulate(person.lengths, seed=4, clasp_s=30.0, circles=4)
+    subject = replace(person.prior, lengths=person.lengths, girdles=RIGID)
+    recording = simulation.recording()
+    recording = replace(recording, phases={"start": recording.phases["start"]})
+    found = track(recording, subject, causal=causal).correction
+    assert found is not None
+    begin, end = simulation.phases["clasp"][0]
+    assert sum(b - a for a, b in found.found_clasps) > 10.0
+    for a, b in found.found_clasps:
+        assert begin - 1.0 < a < b < end + 1.0
+    gap = np.linalg.norm(simulation.points["left_palm"] - simulation.points["right_palm"], axis=1)
+    assert all(gap[(simulation.time > a) & (simulation.time < b)].max() < 0.05 for a, b in found.found_clasps)
+
+
 def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     """Joined hands bound the drift; of a mount's heading that is off they say nothing."""
     noise = replace(MTI_3, gyro_density=40.0 * MTI_3.gyro_density)

@@ -48,7 +48,7 @@ class TrackJob:
     causal
         Use only past samples, as `wepose live` does. Poses begin at the end of the start pose.
     open_loop
-        Correct no headings: neither by the elbows and joined hands of a calibrated subject, nor by the resets of a live
+        Correct no headings: neither by accelerations of joints, elbows and joined hands, nor by the resets of a live
         session. Orientations are those of the filter from the start pose on.
     gaps
         Accept gaps of more than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap). Without it such a gap

@@ -186,7 +186,9 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
     worst_sample = int(np.argmax(stds[worst]))
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     fastest = max(growth, key=growth.__getitem__) if growth else None
-    has_clasp = tracked.correction is not None and tracked.correction.gap_rms_mm is not None
+    found = tracked.correction
+    has_clasp = found is not None and (found.gap_rms_mm is not None or bool(found.found_clasps))
+    has_accelerations = found is not None and bool(found.joint_accelerations)
     segments = [
         [
             plain(name),
@@ -226,7 +228,11 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
         if tracked.correction is not None
         else None,
         "correctors": listed(
-            [*(f"{name}' hinges" for name in _name_hinges(tracked.model.table)), *["the joined hands"] * has_clasp]
+            [
+                *["accelerations of the joints"] * has_accelerations,
+                *(f"{name}' hinges" for name in _name_hinges(tracked.model.table)),
+                *["the joined hands"] * has_clasp,
+            ]
         ),
         "segments_without_covariance": [plain(name) for name in recording.sensors if name not in budgets],
         "time_before_start": _format_time_before(tracked),

@@ -36,10 +36,10 @@ LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance with
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
-# A clasp that is found: the points are joined for this long [s], at most this far apart [m] rms, by so much [m] rms
-# around their mean, and so far [m] in height, while each moves by at least this speed [m/s] rms and their distance by
-# at most a share of it. On simulated people with the lengths of the population joined hands seem up to 25 cm apart and
-# are not found.
+# A clasp that is found: the points are joined for this long [s], at most so far apart [m] rms, so much [m] rms around
+# their mean and so far [m] in height, while each moves by at least this speed [m/s] rms and their distance by at most a
+# share of it. With the lengths of the population the joined hands of simulated people seem up to 25 cm apart, and are
+# not found.
 CLASP_S = 2.0
 CLASP_GAP, CLASP_CHANGE, CLASP_HEIGHT = 0.06, 0.03, 0.12
 CLASP_SPEED, CLASP_SPEED_RATIO = 0.08, 0.3
@@ -295,9 +295,8 @@ class HeadingFilter:
         gained = np.maximum(knot.heading_var - self._last_var, MIN_DRIFT_PSD * knot_s)
         self._last_var = knot.heading_var
         known = np.isfinite(gained)
-        leaps = known & (knot.lost | ((gained > LEAP * self._usual_gain) & (self._usual_gain > 0.0)))
-        usual = np.where(known & ~leaps, gained, 0.0)
-        self._usual_gain = np.maximum(self._usual_gain * np.exp(-knot_s / USUAL_S), usual)
+        leaps = known & (knot.lost | (gained > LEAP * np.maximum(self._usual_gain, self.problem.drift_psd * knot_s)))
+        self._usual_gain = np.maximum(self._usual_gain * np.exp(-knot_s / USUAL_S), np.where(known, gained, 0.0))
         limited = np.where(leaps, gained, np.minimum(gained, self.problem.drift_psd * knot_s))
         return np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k))
 

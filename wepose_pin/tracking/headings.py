@@ -1,7 +1,7 @@
 """Correction of headings by what neighbours share: accelerations, hinges, ranges of motion, joined hands.
 
-The filters' tilt is good and their headings drift. `heading_filter` estimates their errors knot by knot; a heading
-error common to all segments is unobservable. Offline a forward pass learns where sensors sit, and a second one and a
+The filters' tilt is good and their headings drift. `heading_filter` estimates their errors knot by knot; an error
+common to all segments is unobservable. Offline a forward pass learns where sensors sit, and a second one and a
 Rauch-Tung-Striebel pass give the errors. Causally the forward pass alone does, each knot's errors from the next one on.
 """
 
@@ -42,10 +42,11 @@ from .heading_filter import (
     linearize_hinge,
     smooth,
 )
-from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, JointPair, find_pairs
+from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, find_pairs
 
 REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
-KNOT_S = 1.0  # [s] between knots of the random walk
+# [s] between knots: causally a correction waits for the next one, offline each costs memory.
+CAUSAL_KNOT_S, OFFLINE_KNOT_S = 1.0, 2.0
 SAMPLE_RATE_HZ = 8.0
 
 
@@ -71,26 +72,29 @@ class HeadingCorrection(NamedTuple):
         return np.asarray(np.sqrt(np.interp(time, self.time, variance)))
 
 
+def find_stride(rate_hz: float) -> int:
+    """Find the number of samples from one that is used to the next."""
+    return max(1, round(rate_hz / SAMPLE_RATE_HZ))
+
+
 class KnotReader:
     """Cuts samples into knots of equal length, by their number, and forms the sums of each.
 
     Parameters
     ----------
-    names, quat_LS, heading_offset : segments, their mounts (k, 4) and ψ (k,) [rad]
+    quat_LS, heading_offset : mounts (k, 4) and ψ (k,) [rad] of the problem's segments
     """
 
     def __init__(
         self,
-        names: Sequence[str],
         quat_LS: np.ndarray,
         heading_offset: np.ndarray,
         rate_hz: float,
-        pairs: Sequence[JointPair],
+        problem: HeadingProblem,
     ) -> None:
-        self._stride = max(1, round(rate_hz / SAMPLE_RATE_HZ))
-        self.samples_per_knot = max(1, round(KNOT_S * rate_hz / self._stride))
-        self.size = self._stride * self.samples_per_knot
-        self.knot_s = self.size / rate_hz
+        names = problem.names
+        self._stride = find_stride(rate_hz)
+        self.size = self._stride * problem.samples_per_knot
         k = len(names)
         self._R_SL = Rotation.from_quat(quat_LS).inv()
         self._R_WV = Rotation.from_rotvec(heading_offset[:, None] * [0.0, 0.0, 1.0])
@@ -100,7 +104,7 @@ class KnotReader:
             np.zeros((self.size, k, 3)),
         )
         self.count = 0  # samples in the open knot
-        self._accelerations = JointAccelerationFilter(names, pairs, rate_hz)
+        self._accelerations = JointAccelerationFilter(names, problem.pairs, rate_hz)
 
     @property
     def remaining(self) -> int:
@@ -130,25 +134,25 @@ class KnotReader:
 
 
 def pose_problem(
-    recording: Recording, orientations: SegmentOrientations, subject: Subject, model: BodyModel, *, phases: bool
+    recording: Recording, orientations: SegmentOrientations, subject: Subject, model: BodyModel, *, causal: bool
 ) -> HeadingProblem | None:
     """Find what there is to observe headings by; None: nothing.
 
     Parameters
     ----------
-    phases : whether points coincide in the phases of closures
+    causal : as samples come: points coincide where they are found to, and not in the phases of closures
     """
     names = tuple(orientations.quat_WL)
     raw = {name: orientations.quat_LS[name] for name in names if name in recording.imus}
     pairs = find_pairs(model, raw) if recording.rate_hz >= LEAST_RATE_HZ else ()
     hinges = _find_hinges(recording, names, subject, model)
-    closures = _find_closures(recording if phases else None, names, model)
+    closures = _find_closures(None if causal else recording, names, model)
     closed = any(end >= orientations.start[1] for closure in closures for _, end in closure.intervals)
     if not (pairs or hinges or closed):
         return None
     noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE
-    stride = max(1, round(recording.rate_hz / SAMPLE_RATE_HZ))
-    samples = max(1, round(KNOT_S * recording.rate_hz / stride))
+    stride = find_stride(recording.rate_hz)
+    samples = max(1, round((CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S) * recording.rate_hz / stride))
     knot_s = samples * stride / recording.rate_hz
     drift_psd = np.full(len(names), noise.drift_psd)
     for i, name in enumerate(names):
@@ -254,7 +258,7 @@ class HeadingCorrector:
         self._names = problem.names
         mounts = np.array([orientations.quat_LS[name] for name in self._names])
         offsets = np.array([orientations.heading_offset[name] for name in self._names])
-        self._reader = KnotReader(self._names, mounts, offsets, chunk.rate_hz, problem.pairs)
+        self._reader = KnotReader(mounts, offsets, chunk.rate_hz, problem)
         self._knots: list[Knot] = []
         self._last_var = np.full(len(self._names), np.nan)
         self._gaps = {stage: _RmsAccumulator() for stage in ("before", "after")}
@@ -318,8 +322,7 @@ class HeadingCorrector:
                     covariance[name], with_heading, filter_var + start, variance
                 )
         result = replace(orientations, quat_WL=corrected, covariance_W=covariance)
-        stride = max(1, round(chunk.rate_hz / SAMPLE_RATE_HZ))
-        rows = np.flatnonzero(chunk.time >= self._start_end)[::stride]
+        rows = np.flatnonzero(chunk.time >= self._start_end)[:: find_stride(chunk.rate_hz)]
         self._add_residuals(
             "after", chunk.time[rows], {name: Rotation.from_quat(corrected[name][rows]) for name in self._names}
         )
@@ -373,7 +376,7 @@ class CausalHeadings:
         self._problem = problem
         mounts = np.array([orientations.quat_LS[name] for name in problem.names])
         self.offset = np.array([orientations.heading_offset[name] for name in problem.names])
-        self._reader = KnotReader(problem.names, mounts, self.offset, recording.rate_hz, problem.pairs)
+        self._reader = KnotReader(mounts, self.offset, recording.rate_hz, problem)
         self._filter = HeadingFilter(problem)
         self._rate_hz, self._samples = recording.rate_hz, 0
         self._start_end = float(recording.time[-1])

@@ -17,8 +17,8 @@ class TrackOptions:
     ----------
     method : the orientation filter, a key of `wepose_pin.filters.METHODS`
     static_test : when a sensor counts as static; None for the paper's values
-    open_loop : do not correct heading drift, neither by a calibrated subject's elbows, nor by joined hands in a phase
-        `clasp`, nor by the resets of a live session: orientations are the filter's from the start pose on
+    open_loop : do not correct heading drift, neither by joint accelerations, hinges and joined hands, nor by the resets
+        of a live session: orientations are the filter's from the start pose on
     causal : begin at the end of the start pose and look at nothing ahead, as a live session does
     limits : keep the limits of the model's joints of one axis
 

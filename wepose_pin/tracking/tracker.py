@@ -184,7 +184,7 @@ def make_heading_corrector(
     recording, segments = oriented
     if options.causal or options.open_loop or any(sensor.aligned for sensor in recording.sensors.values()):
         return None
-    problem = pose_problem(recording, segments, subject, body, phases=True)
+    problem = pose_problem(recording, segments, subject, body, causal=False)
     return None if problem is None else HeadingCorrector(recording, segments, problem)
 
 
@@ -225,7 +225,7 @@ def _estimator(
     subject: Subject | None, body: TrackedBody, options: TrackOptions, chunk: Recording
 ) -> SegmentEstimator | CausalEstimator | DoubledEstimator:
     def observe(recording: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
-        return pose_problem(recording, segments, body.subject, body.model, phases=False)
+        return pose_problem(recording, segments, body.subject, body.model, causal=True)
 
     def make(person: Subject | None) -> SegmentEstimator | CausalEstimator:
         if not options.causal:

@@ -1,0 +1,178 @@
+"""Headings of neighbours by the acceleration of the joint between them, in tracking."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.model import load_model
+from wepose_pin.recording import ImuSensor, Recording
+from wepose_pin.rotations import heading
+from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
+from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.tracking.heading_filter import HingeAxis, linearize_range
+from wepose_pin.tracking.joint_accelerations import JointAccelerationFilter, JointPair, _sum_products, find_pairs
+
+LIMB = ("torso", "right_upper_arm", "right_forearm")
+
+
+@pytest.fixture(scope="module")
+def moving() -> Simulation:
+    return simulate(simulate_person(3).lengths, seed=3, imperfections=MILD_PRESET, clasp_s=60.0, circles=2)
+
+
+def without_phases(recording: Recording) -> Recording:
+    return replace(recording, phases={"start": recording.phases["start"]})
+
+
+def biased(simulation: Simulation, deg_s: float) -> Recording:
+    """The gyroscope of the right forearm turns about the vertical of the start pose, from its end on."""
+    recording = without_phases(simulation.recording())
+    sensor = recording.imus["right_forearm"]
+    after = recording.time > recording.phases["start"][0][1]
+    up_S = Rotation.from_quat(simulation.quat_WS["right_forearm"]).inv().apply([0.0, 0.0, 1.0])
+    gyro_S = sensor.gyro_S + np.deg2rad(deg_s) * after[:, None] * up_S
+    return replace(recording, sensors={**recording.sensors, "right_forearm": replace(sensor, gyro_S=gyro_S)})
+
+
+def heading_errors(
+    simulation: Simulation, tracked: TrackedRecording, from_s: float
+) -> dict[tuple[str, str], np.ndarray]:
+    """Heading [deg] of each sensor's world of the right arm against its neighbour's."""
+    rows = np.flatnonzero(tracked.time > from_s)[::20]
+    at = np.searchsorted(simulation.time, tracked.time[rows] - 1e-9)
+    off = {}
+    for name in LIMB:
+        R_WS = Rotation.from_quat(tracked.quat_WL[name][rows]) * Rotation.from_quat(tracked.segments.quat_LS[name])
+        off[name] = heading((Rotation.from_quat(simulation.quat_WS[name][at]) * R_WS.inv()).as_quat())
+    return {(a, b): np.degrees(np.angle(np.exp(1j * (off[a] - off[b])))) for a, b in pairwise(LIMB)}
+
+
+def test_sums_give_the_misfit_and_its_slopes() -> None:
+    rng = np.random.default_rng(0)
+    near, far = rng.normal(size=(2, 50, 3, 4))
+    sums = _sum_products(near, far)
+
+    def misfit(values: np.ndarray) -> np.ndarray:
+        R = Rotation.from_rotvec([0.0, 0.0, values[0]]).as_matrix()
+        a, b = np.concatenate(([1.0], values[1:4])), np.concatenate(([1.0], values[4:]))
+        return (far @ b - (near @ a) @ R.T).ravel()
+
+    at = rng.normal(size=7)
+    J = np.stack([(misfit(at + d) - misfit(at - d)) / 2e-6 for d in 1e-6 * np.eye(7)], axis=1)
+    information, gradient, cost = sums.linearize(at[0], at[1:])
+    np.testing.assert_allclose(information, J.T @ J, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(gradient, J.T @ misfit(at), rtol=1e-6, atol=1e-6)
+    assert cost == pytest.approx(np.sum(misfit(at) ** 2))
+    assert sums.samples == 50
+
+
+def test_exact_motion_fits_with_the_true_levers() -> None:
+    simulation = simulate(simulate_person(2).lengths, seed=2, noise=NOISE_FREE, clasp_s=20.0, circles=0)
+    upper = simulation.lengths["left_upper_arm"]
+    levers_L = [simulation.p_LS["left_upper_arm"] + [0.0, 0.0, upper], simulation.p_LS["left_forearm"]]
+    names = ("left_upper_arm", "left_forearm")
+    R_LS = [Rotation.from_quat(simulation.quat_LS[name]) for name in names]
+    levers = np.concatenate([R.inv().apply(lever) for R, lever in zip(R_LS, levers_L, strict=True)])
+    pair = JointPair(*names, levers, 0.1, False)
+    R_WS = np.stack([Rotation.from_quat(simulation.quat_WS[name]).as_matrix() for name in names], axis=1)
+    accel_S = np.stack([simulation.accel_S[name] for name in names], axis=1)
+    n = len(simulation.time)
+    whole = JointAccelerationFilter(names, [pair], simulation.rate_hz)
+    [sums] = whole.push(R_WS, accel_S, np.arange(0, n, 12))
+    assert sums is not None
+    signal = np.sqrt(np.trace(sums.far[:1, :1]) / sums.samples)
+    for angle, least, most in ((0.0, 0.0, 0.02), (0.2, 0.05, 1.0)):
+        misfit = np.sqrt(sums.linearize(angle, levers)[2] / sums.samples)
+        assert least * signal <= misfit < most * signal
+    # Cut into pieces it is the same, and a piece with a lost sample has no sums.
+    pieces = JointAccelerationFilter(names, [pair], simulation.rate_hz)
+    cost = 0.0
+    for begin in range(0, n - n % 12, 12):
+        [part] = pieces.push(R_WS[begin : begin + 12], accel_S[begin : begin + 12], np.array([0]))
+        assert part is not None
+        cost += part.linearize(0.2, levers)[2]
+    assert cost == pytest.approx(sums.linearize(0.2, levers)[2], rel=1e-2)
+    accel_S[5, 1] = np.nan
+    assert JointAccelerationFilter(names, [pair], simulation.rate_hz).push(R_WS, accel_S, np.arange(9)) == (None,)
+
+
+def test_pairs_are_neighbours_with_nothing_between_that_moves() -> None:
+    model = load_model("upper_body")
+    quat = np.array([0.0, 0.0, 0.0, 1.0])
+    everything = find_pairs(model, dict.fromkeys(("torso", "left_upper_arm", "left_forearm"), quat))
+    assert [(pair.near, pair.far, pair.travels) for pair in everything] == [
+        ("torso", "left_upper_arm", True),
+        ("left_upper_arm", "left_forearm", False),
+    ]
+    elbow = everything[1]
+    half = 0.5 * model.lengths["left_upper_arm"]
+    np.testing.assert_allclose(elbow.levers[:3], [0.0, 0.0, half], atol=1e-6)  # from the elbow up to the sensor
+    assert elbow.levers[5] < -0.05
+    assert find_pairs(model, dict.fromkeys(("torso", "left_forearm"), quat)) == ()
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving: Simulation, causal: bool) -> None:
+    recording = biased(moving, 0.15)
+    rms = {}
+    for open_loop in (True, False):
+        tracked = track(recording, open_loop=open_loop, causal=causal)
+        errors = heading_errors(moving, tracked, 30.0)
+        rms[open_loop] = {pair: float(np.sqrt(np.mean(error**2))) for pair, error in errors.items()}
+    elbow = LIMB[1:]
+    print(rms)
+    assert rms[True][elbow] > 5.0
+    assert rms[False][elbow] < 2.0
+    found = tracked.correction
+    assert found is not None
+    assert set(found.joint_accelerations) == {
+        f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")
+    }
+    assert found.max_correction_deg["right_forearm"] > 5.0
+    rows = tracked.time[tracked.time > 30.0][::20]
+    for near, far in pairwise(LIMB):
+        by_std = heading_errors(moving, tracked, 30.0)[near, far] / np.degrees(found.relative_std(near, far, rows))
+        assert np.sqrt(np.mean(by_std**2)) < 1.6
+    summary = tracked.summary()["heading_correction"]
+    assert summary["hinges"] == ["left_elbow", "right_elbow"]
+    assert len(summary["joint_accelerations"]) == 4
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_arms_that_hang_still_stay_as_the_filter_has_them(moving: Simulation, causal: bool) -> None:
+    rng = np.random.default_rng(1)
+    n = 6000
+    sensors = {}
+    for name, sensor in moving.recording().imus.items():
+        accel_S = sensor.accel_S[200] + rng.normal(0.0, 0.02, (n, 3))
+        sensors[name] = ImuSensor(
+            gyro_S=rng.normal(0.0, 2e-3, (n, 3)), accel_S=accel_S, stated_quat_LS=sensor.stated_quat_LS
+        )
+    recording = Recording("still", np.arange(n) / 100.0, 100.0, sensors, {"start": ((0.5, 4.5),)})
+    corrected, alone = (track(recording, causal=causal, open_loop=open_loop) for open_loop in (False, True))
+    for name, quat in alone.quat_WL.items():
+        turned = Rotation.from_quat(corrected.quat_WL[name]) * Rotation.from_quat(quat).inv()
+        assert np.degrees(turned.magnitude().max()) < 3.0  # by the hinges, of arms whose start pose is known to 13 deg
+
+
+def test_a_hinge_is_brought_back_into_its_range() -> None:
+    n, a = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
+    hinge = HingeAxis("elbow", 0, 1, n, a, a, (np.deg2rad(-165.0), np.deg2rad(15.0)), 0.1, 0.1, 0.1)
+    above = Rotation.from_euler("xyz", [0.3, 0.9, 0.2])
+
+    def excess(flexion_deg: float, turned: float = 0.0) -> tuple[float, float]:
+        below = Rotation.from_rotvec([0.0, 0.0, turned]) * above * Rotation.from_rotvec(-np.deg2rad(flexion_deg) * n)
+        beyond, slope = linearize_range(*(Rotation.concatenate([R]) for R in (above, below)), hinge)
+        return float(beyond[0]), float(slope[0])
+
+    for flexion in (0.0, 60.0, 140.0):
+        assert excess(flexion)[0] == 0.0
+    assert np.degrees(excess(-40.0)[0]) == pytest.approx(25.0)
+    step = 1e-6
+    slope = (excess(-40.0, step)[0] - excess(-40.0, -step)[0]) / (2.0 * step)
+    assert excess(-40.0)[1] == pytest.approx(slope, rel=1e-3)
