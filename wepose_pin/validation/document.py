@@ -78,7 +78,7 @@ def join_results(
 
 
 def check_same_settings(kept: Document, now: Document, where: str) -> None:
-    """Check that two runs have the same packages, noise, presets and gains.
+    """Check that two runs have the same packages, noise, presets and gains, as far as both name them.
 
     Raises
     ------
@@ -86,12 +86,15 @@ def check_same_settings(kept: Document, now: Document, where: str) -> None:
         They differ: their results are not to be compared.
     """
     for name in ("quick", "versions", "noise", "presets", "gains"):
-        before, after = getattr(kept, name), getattr(now, name)
-        if isinstance(before, dict):
-            shared = before.keys() & after.keys()
-            before, after = ({key: each[key] for key in shared} for each in (before, after))
-        if before != after:
+        if _differ(getattr(kept, name), getattr(now, name)):
             raise BadData(f"{where}: {name}: made with others than this run's; run these experiments again as well")
+
+
+def _differ(before: Any, after: Any) -> bool:
+    """Tell whether two values differ, of dicts in the keys that both have."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        return any(_differ(before[key], after[key]) for key in before.keys() & after.keys())
+    return bool(before != after)
 
 
 def read_document(path: Path) -> Document:

@@ -67,6 +67,7 @@ STATED = {
     "simulated 1 kHz": _grid_points(0.0032, 3.2e-5, 0.0),
     "upper body, ideal": _grid_points(0.032, 1e-5, 5.6e-4),
     "upper body, mild": _grid_points(0.1, 0.0, 1.8e-3),
+    "upper body, people": _grid_points(0.32, 0.0, 0.01),
     "BROAD, first half": _grid_points(0.1, 1e-3, 0.018),
     "BROAD, second half": _grid_points(0.056, 3.2e-4, 0.01),
     "BROAD": _grid_points(0.1, 1e-3, 0.018),

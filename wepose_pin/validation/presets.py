@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 from .. import simulation
-from ..simulation import Imperfections, Person, simulate_person
+from ..simulation import MEASURED_STD, PEOPLE_MEASURED_STD, PEOPLE_PRESET, Imperfections, Person, simulate_person
 
 
 class Preset(NamedTuple):
@@ -18,5 +19,6 @@ class Preset(NamedTuple):
         return simulate_person(seed, self.measured_std)
 
 
-MEASURED_STD = 0.003  # [m] of a careful measurement between the centres of the joints themselves
 PRESETS = {name: Preset(imperfections, MEASURED_STD) for name, imperfections in simulation.PRESETS.items()}
+# W's x is where the torso faces in the start pose: one who faces elsewhere than the feet turns W and nothing else.
+PRESETS["people"] = Preset(replace(PEOPLE_PRESET, start_heading_deg=0.0), PEOPLE_MEASURED_STD)
