@@ -25,7 +25,8 @@ def made() -> tuple[Simulation, Subject]:
     person = simulate_person(4)
     simulation = simulate(person.lengths, seed=4, noise=NOISE_FREE, clasp_s=40.0, circles=4)
     mounts = dict.fromkeys(simulation.quat_WL, np.array([0.0, 0.0, 0.0, 1.0]))
-    return simulation, replace(person.prior, lengths=person.lengths, mounts=mounts, hinges=HINGES)
+    girdles = simulation.girdles
+    return simulation, replace(person.prior, lengths=person.lengths, mounts=mounts, hinges=HINGES, girdles=girdles)
 
 
 def drifting(simulation: Simulation, deg_min: dict[str, float]) -> Recording:
@@ -109,6 +110,7 @@ def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     covariance = np.zeros((len(order), len(order)))
     covariance[:8, :8] = average.covariance
     sure = replace(average, mounts=simulation.quat_LS, hinges=HINGES, order=order, covariance=covariance)
+    sure = replace(sure, girdles=simulation.girdles)
     loose = covariance.copy()
     loose[-1, -1] = np.deg2rad(5.0) ** 2
     held, free = (
