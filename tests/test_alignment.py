@@ -10,7 +10,14 @@ import pytest
 from bodies import SEGMENTS, TABLE
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import MOUNT_MOVED_STDS, check_mounts, compute_heading_offset, suggest_mounts
+from wepose_pin.alignment import (
+    MOUNT_MOVED_STDS,
+    N_POSE,
+    check_mounts,
+    compute_heading_offset,
+    compute_soft_tissue_covariances,
+    suggest_mounts,
+)
 from wepose_pin.calibration import load_protocol
 from wepose_pin.calibration.conditions import Loop, StartPose, resolve_conditions
 from wepose_pin.errors import BadPhase, BadSession
@@ -87,7 +94,8 @@ def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
     recording, true = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * mount})
     # Sensor orientation = bent pose times true mount: `true` of the helper is the segment, straight at the start.
     truth = true["left_forearm"] * bent.inv()
-    for std_deg, share in ((0.0, 0.0), (4.0, 0.5), (400.0, 1.0)):
+    as_sure_as_the_pose = np.degrees(N_POSE.std("left_forearm")[1])
+    for std_deg, share in ((0.0, 0.0), (as_sure_as_the_pose, 0.5), (100.0 * as_sure_as_the_pose, 1.0)):
         rows = mount_rows("left_forearm")
         subject = replace(
             population_subject(),
@@ -106,7 +114,7 @@ def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
     mount = Rotation.from_quat(compute_mount("+x", "-z"))
     bent = Rotation.from_rotvec([0.0, -np.deg2rad(5.0), 0.0])
     recording, _ = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * mount})
-    known = np.deg2rad(4.0) ** 2 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.9], [0.0, 0.9, 1.0]])
+    known = N_POSE.std("left_forearm")[1] ** 2 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.9], [0.0, 0.9, 1.0]])
     subject = replace(
         population_subject(),
         mounts={"left_forearm": mount.as_quat()},
@@ -295,3 +303,42 @@ def test_a_person_who_turns_in_the_start_pose_is_named(simulation: Simulation, r
     for segment, orientation in found.orientation.items():
         still = estimate_segments(recording).orientation[segment]
         assert np.trace(orientation.noise.gyro_bias_cov - still.noise.gyro_bias_cov) > 0.9 * np.deg2rad(rate_deg_s) ** 2
+
+
+def soft_tissue_deg(segment: str, **turned: list[float]) -> np.ndarray:
+    """Standard deviations (3,) [deg] about a segment's axes; segments that are not named stand in the N-pose."""
+    R_WL = {name: Rotation.from_rotvec(turned.get(name, [0.0, 0.0, 0.0]), degrees=True) for name in SEGMENTS}
+    cov_W = compute_soft_tissue_covariances(TABLE, {name: R.as_quat()[None] for name, R in R_WL.items()})[segment][0]
+    R = R_WL[segment].as_matrix()
+    cov_L = R.T @ cov_W @ R
+    np.testing.assert_allclose(cov_L, np.diag(np.diag(cov_L)), atol=1e-12)
+    return np.degrees(np.sqrt(np.diag(cov_L)))
+
+
+def test_soft_tissue_turns_a_sensor_the_more_the_further_the_segment_is_off_the_n_pose() -> None:
+    for name, tissue in ((name, segment.soft_tissue) for name, segment in TABLE.segments.items()):
+        np.testing.assert_allclose(soft_tissue_deg(name), np.degrees(tissue.std), atol=1e-9)
+    # An arm raised sideways by 90 deg: 0.05 of it across; the chest extends with the mean of both arms.
+    raised: dict[str, list[float]] = {"left_upper_arm": [90.0, 0.0, 0.0]}
+    across = np.hypot(2.0, 0.05 * 90.0)
+    np.testing.assert_allclose(soft_tissue_deg("left_upper_arm", **raised), [across, across, 2.5], rtol=1e-9)
+    chest = np.hypot(1.5, np.array([0.02, 0.04, 0.02]) * 45.0)
+    np.testing.assert_allclose(soft_tissue_deg("torso", **raised), chest, rtol=1e-9)
+    np.testing.assert_allclose(soft_tissue_deg("right_upper_arm", **raised), [2.0, 2.0, 2.5], rtol=1e-9)
+    # One that turns about its length by 40 deg against the torso, to either side: skin lags by part of it.
+    for angle in (40.0, -40.0):
+        twisted = soft_tissue_deg("left_upper_arm", left_upper_arm=[0.0, 0.0, angle])
+        np.testing.assert_allclose(twisted, [2.0, 2.0, np.hypot(2.5, 0.45 * 40.0)], rtol=1e-9)
+    # A person who faces elsewhere and takes the arm along turns nothing on the skin of the arm.
+    along = dict.fromkeys(SEGMENTS, [0.0, 0.0, 40.0])
+    np.testing.assert_allclose(soft_tissue_deg("left_upper_arm", **along), [2.0, 2.0, 2.5], rtol=1e-9)
+    # A bow by 50 deg: 0.12 of it about y of the torso.
+    bow = soft_tissue_deg("torso", **dict.fromkeys(SEGMENTS, [0.0, 50.0, 0.0]))
+    np.testing.assert_allclose(bow, [1.5, np.hypot(1.5, 0.12 * 50.0), 1.5], rtol=1e-9)
+
+
+def test_soft_tissue_without_the_segment_that_it_is_relative_to() -> None:
+    """No sensor on the torso: nobody knows how far the arm is turned about its length against it."""
+    quat_WL = {"left_upper_arm": Rotation.from_rotvec([0.0, 0.0, 40.0], degrees=True).as_quat()[None]}
+    cov = compute_soft_tissue_covariances(TABLE, quat_WL)["left_upper_arm"][0]
+    np.testing.assert_allclose(np.degrees(np.sqrt(np.diag(cov))), [2.0, 2.0, 2.5], rtol=1e-9)

@@ -2,62 +2,86 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
-from bodies import LENGTHS
+from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.cli import main
 from wepose_pin.kinematics import build_pose_table, compute_axis_std, compute_point_covariances, compute_pose
 from wepose_pin.model import load_model
+from wepose_pin.model.girdle import PARAMETERS
 from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
 from wepose_pin.subject import population_subject
 from wepose_pin.tracking import track
 
 ARMS = [f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")]
+EXACT = np.zeros_like(population_subject().shape_covariance(TABLE))  # lengths and girdles without errors
 
 
 @pytest.mark.parametrize("with_hands", [False, True])
 def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None:
-    """Draw orientations and lengths from their covariances, let Pinocchio place the points, and look at the cloud."""
+    """Draw orientations and shape from their covariances, let Pinocchio place the points, and look at the cloud."""
     rng = np.random.default_rng(0)
     n = 40000
     names = ["torso", *ARMS, *(["left_hand", "right_hand"] if with_hands else [])]
     mean = {name: Rotation.random(random_state=rng) for name in names}
     cov = {name: np.diag(rng.uniform(0.5, 2.0, 3) * 4e-4) for name in names}
-    body = population_subject()
-    lengths_cov = 0.04 * body.lengths_covariance()
+    own = {name: np.array([-0.3, *rng.normal(scale=0.01, size=6)]) for name in TABLE.girdles}
+    body = replace(population_subject(), girdles=own)
+    shape_cov = 0.04 * body.shape_covariance(TABLE)
     still = {name: rotation.as_quat()[None] for name, rotation in mean.items()}
-    model = load_model(lengths=body.lengths)
+    model = body.shape(load_model())
     points = compute_pose(model, np.zeros(1), still).points
-    found = compute_point_covariances(model, still, {name: c[None] for name, c in cov.items()}, lengths_cov)
+    found = compute_point_covariances(model, still, {name: c[None] for name, c in cov.items()}, shape_cov)
     assert set(found) == set(points)
 
     drawn = {
         name: (Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), cov[name], n)) * mean[name]).as_quat()
         for name in names
     }
+    R_torso = mean["torso"].as_matrix()
     for name, p in compute_pose(model, np.zeros(n), drawn).points.items():
         turned = np.cov(p.T)
-        # The lengths' share is linear: by finite differences of Pinocchio's points.
-        J = np.empty((3, len(LENGTHS)))
-        for k, length in enumerate(LENGTHS):
-            longer = model.with_lengths({length: body.lengths[length] + 1e-3})
-            J[:, k] = (compute_pose(longer, np.zeros(1), still).points[name] - points[name])[0] / 1e-3
-        expected = turned + J @ lengths_cov @ J.T
+        # The shape's share is linear: by finite differences of Pinocchio's points.
+        longer = [replace(body, lengths={**body.lengths, s: body.lengths[s] + 1e-3}) for s in LENGTHS]
+        for girdle, values in own.items():
+            longer += [replace(body, girdles={**own, girdle: values + step}) for step in 1e-3 * np.eye(len(PARAMETERS))]
+        moved = [compute_pose(other.shape(model), np.zeros(1), still).points[name][0] for other in longer]
+        J = (np.array(moved) - points[name]).T / 1e-3
+        # What leaves the law moves the shoulder of this side in the torso.
+        leaving = np.diag(np.square(TABLE.girdles[f"{name.partition('_')[0]}_shoulder"].residual_std))
+        expected = turned + J @ shape_cov @ J.T + R_torso @ leaving @ R_torso.T
         np.testing.assert_allclose(found[name][0], expected, atol=0.04 * np.trace(expected))
+
+
+def test_a_shoulder_whose_law_is_not_known_is_less_certain() -> None:
+    """Without a sensor on the upper arm nobody knows how far it is raised."""
+    still = {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in ("torso", *ARMS)}
+    model, shape_cov = load_model(), population_subject().shape_covariance(TABLE)
+    of = [
+        compute_point_covariances(model, {name: still[name] for name in names}, _certain(names), shape_cov)
+        for names in (["torso", *ARMS], ["torso"])
+    ]
+    for name in ("left_shoulder", "right_shoulder"):
+        assert np.all(np.diagonal(of[1][name][0]) > np.diagonal(of[0][name][0]) + 0.005**2)
+
+
+def _certain(names: list[str]) -> dict[str, np.ndarray]:
+    return {name: np.eye(3)[None] * 1e-8 for name in names}
 
 
 def test_points_beyond_a_segment_without_covariance_have_none() -> None:
     still = {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in ("torso", *ARMS)}
     model = load_model()
     cov = {name: np.eye(3)[None] * 1e-4 for name in ("torso", "left_upper_arm", "right_forearm")}
-    found = compute_point_covariances(model, still, cov, np.zeros((8, 8)))
+    found = compute_point_covariances(model, still, cov, EXACT)
     assert set(found) == {"left_shoulder", "left_elbow", "right_shoulder"}
-    assert compute_point_covariances(model, still, {}, np.zeros((8, 8))) == {}
+    assert compute_point_covariances(model, still, {}, EXACT) == {}
 
 
 @pytest.mark.monte_carlo
@@ -112,9 +136,7 @@ def test_a_hand_that_is_segment_and_point_has_a_column_each() -> None:
     still = {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in ("torso", *ARMS, "left_hand")}
     pose = compute_pose(load_model(), np.zeros(1), still)
     cov = {name: np.eye(3)[None] * 1e-4 for name in still}
-    from dataclasses import replace
-
-    points = compute_point_covariances(load_model(), still, cov, np.zeros((8, 8)))
+    points = compute_point_covariances(load_model(), still, cov, EXACT)
     table = build_pose_table(replace(pose, segment_cov=cov, point_cov=points))
     assert table["left_hand_std"][0] == pytest.approx(0.01)
     assert table["left_palm_std"][0] == pytest.approx(compute_axis_std(points["left_palm"])[0])

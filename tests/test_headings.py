@@ -138,6 +138,7 @@ def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     covariance = np.zeros((len(order), len(order)))
     covariance[:8, :8] = average.covariance
     sure = replace(average, mounts=simulation.quat_LS, hinges=HINGES, order=order, covariance=covariance)
+    sure = replace(sure, girdles=simulation.girdles)
     loose = covariance.copy()
     loose[-1, -1] = np.deg2rad(5.0) ** 2
     held, free = (

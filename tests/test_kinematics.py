@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from bodies import POINTS
+from bodies import POINTS, RIGID_SHOULDERS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadModel
 from wepose_pin.kinematics import (
+    KinematicsSolver,
     LiveKinematics,
     compute_link_placements,
     compute_link_poses,
@@ -23,6 +25,7 @@ from wepose_pin.kinematics import (
     solve_configuration,
 )
 from wepose_pin.model import BodyModel, load_model
+from wepose_pin.model.girdle import displace
 from wepose_pin.model.orientation_ik import OrientationIk
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track
@@ -52,7 +55,7 @@ def gazebo(data: Path, dof: int) -> BodyModel:
 @pytest.mark.parametrize("hands", [True, False])
 def test_points_are_the_sum_of_turned_lengths(hands: bool) -> None:
     lengths = {"trunk": 0.5, "shoulder_width": 0.4, "left_upper_arm": 0.31, "right_hand": 0.08}
-    body = load_model(lengths=lengths)
+    body = replace(load_model(lengths=lengths), girdles=RIGID_SHOULDERS)
     L = body.lengths
     quat_WL = orientations(SEGMENTS if hands else CORE)
     pose = compute_pose(body, np.arange(N) / 100.0, quat_WL)
@@ -67,12 +70,91 @@ def test_points_are_the_sum_of_turned_lengths(hands: bool) -> None:
     assert set(pose.points) == set(POINTS)
 
 
+GIRDLES = {
+    "left_shoulder": np.array([-0.3, 0.01, -0.005, 0.004, 0.006, 0.003, -0.008]),
+    "right_shoulder": np.array([0.2, -0.012, 0.004, 0.006, -0.005, 0.002, 0.009]),
+}
+
+
+def test_shoulders_slide_by_the_law() -> None:
+    """The joints of a girdle stand at what the law says of the arm's direction, and Pinocchio places the points."""
+    body = replace(load_model(lengths={"shoulder_width": 0.4}), girdles=GIRDLES)
+    quat_WL = orientations(CORE)
+    R = {segment: Rotation.from_quat(quat) for segment, quat in quat_WL.items()}
+    q = np.tile(pin.neutral(body.pin), (N, 1))
+    for name, (share, *own) in GIRDLES.items():
+        girdle = body.table.girdles[name]
+        along = (R[girdle.on].inv() * R[girdle.moves]).apply([0.0, 0.0, -1.0])
+        law, raised = displace(girdle, along.T, 0.4 / 0.34, np)
+        for k, joint in enumerate(girdle.joints):
+            at = body.pin.idx_qs[body.pin.getJointId(joint)]
+            q[:, at] = (1.0 + share) * law[k] + own[k] + raised * own[3 + k]
+    for segment in CORE:
+        above, first = body.parents[segment], body.pin.idx_qs[body.joints[segment]]
+        q[:, first : first + 4] = (R[segment] if above is None else R[above].inv() * R[segment]).as_quat()
+    _, expected = compute_link_poses(body, q, list(POINTS.values()), rotations=False)
+    pose = compute_pose(body, np.arange(N) / 100.0, quat_WL)
+    for k, point in enumerate(POINTS):
+        np.testing.assert_allclose(pose.points[point], expected[:, k], atol=1e-12)
+    rigid = compute_pose(replace(body, girdles=RIGID_SHOULDERS), np.arange(N) / 100.0, quat_WL)
+    moved = [np.linalg.norm(pose.points[name] - rigid.points[name], axis=1) for name in GIRDLES]
+    assert np.max(moved) > 0.03  # [m] of an arm that is raised
+
+
+def test_a_hanging_arm_leaves_the_shoulder_at_rest_and_a_raised_one_lifts_it() -> None:
+    """90 deg sideways: up 33.5 mm, 23 mm to the middle, and 21.5 mm back, of shoulders 0.34 m apart."""
+    body = load_model(lengths={"shoulder_width": 0.34})
+    neutral = np.array([[0.0, 0.0, 0.0, 1.0]] * 2)
+    quat_WL = {name: neutral.copy() for name in CORE}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        quat_WL[f"{side}_upper_arm"][1] = Rotation.from_rotvec([sign * np.pi / 2.0, 0.0, 0.0]).as_quat()
+    points = compute_pose(body, np.arange(2.0), quat_WL).points
+    back = 2.0 + 20.0 * (1.0 - np.exp(-90.0 / 25.0))
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        at_rest, raised = points[f"{side}_shoulder"]
+        np.testing.assert_allclose(at_rest, [0.0, sign * 0.17, body.lengths["trunk"]], atol=1e-4)
+        np.testing.assert_allclose(1e3 * (raised - at_rest), [-back, -sign * 23.0, 33.5], atol=0.05)
+
+
+def test_shoulders_of_single_poses_are_those_of_the_recording_bit_for_bit() -> None:
+    """In chunks of one and all at once; live but for the last bits of the rotations."""
+    body = replace(load_model(), girdles=GIRDLES)
+    quat_WL = orientations(SEGMENTS, 3)
+    pose = compute_pose(body, np.arange(N) / 100.0, quat_WL)
+    sliding = [body.pin.idx_qs[body.pin.getJointId(name)] for g in body.table.girdles.values() for name in g.joints]
+    live, chunks, views = LiveKinematics(body, SEGMENTS), KinematicsSolver(body, SEGMENTS), []
+    assert set(live.points) == set(pose.points)
+    for k in range(N):
+        chunk = chunks.solve_chunk(np.array([k / 100.0]), {name: quat[k : k + 1] for name, quat in quat_WL.items()})
+        np.testing.assert_array_equal(chunk.q[0, sliding], pose.q[k, sliding])
+        views.append(live.compute_points(np.array([quat_WL[name][k] for name in SEGMENTS])))
+        for side in ("left", "right"):
+            torso, upper_arm = (live.data.oMi[body.joints[name]] for name in ("torso", f"{side}_upper_arm"))
+            joints = [body.pin.idx_qs[body.pin.getJointId(f"{side}_girdle_{axis}")] for axis in "xyz"]
+            rest = body.pin.jointPlacements[body.pin.getJointId(f"{side}_girdle_x")].translation
+            moved = torso.actInv(upper_arm.translation) - rest
+            np.testing.assert_allclose(moved, pose.q[k, joints], atol=1e-14)
+    for name, points in zip(live.points, np.swapaxes(views, 0, 1), strict=True):
+        np.testing.assert_allclose(points, pose.points[name], atol=1e-14)  # rotations differ in their last bits
+
+
+def test_an_arm_without_a_sensor_leaves_its_shoulder_at_rest() -> None:
+    """What is beyond is not known, but the shoulder is: where the person holds it at rest."""
+    body = replace(load_model(), girdles=GIRDLES)
+    quat_WL = orientations(["torso"])
+    points = compute_pose(body, np.arange(N) / 100.0, quat_WL).points
+    for name, sign in (("left_shoulder", 0.5), ("right_shoulder", -0.5)):
+        at = np.array([0.0, sign * body.lengths["shoulder_width"], body.lengths["trunk"]]) + GIRDLES[name][1:4]
+        np.testing.assert_allclose(points[name], Rotation.from_quat(quat_WL["torso"]).apply(at), atol=1e-12)
+
+
 def test_links_have_the_orientations_given() -> None:
     body = load_model()
     quat_WL = orientations(SEGMENTS)
     q = solve_configuration(body, quat_WL)
-    assert q.shape == (N, 36)
-    np.testing.assert_allclose(np.linalg.norm(q.reshape(N, 9, 4), axis=2), 1.0, atol=1e-14)
+    assert q.shape == (N, body.pin.nq)
+    first = np.array([body.pin.idx_qs[joint] for joint in body.joints.values()])
+    np.testing.assert_allclose(np.linalg.norm(q[:, first[:, None] + range(4)], axis=2), 1.0, atol=1e-14)
     R, _ = compute_link_poses(body, q, SEGMENTS)
     for k, segment in enumerate(SEGMENTS):
         np.testing.assert_allclose(R[:, k], Rotation.from_quat(quat_WL[segment]).as_matrix(), atol=1e-12)

@@ -121,11 +121,20 @@ def xml_mass(text: str) -> float:
 # Ours -------------------------------------------------------------------------------------------------------------
 
 
-def test_our_model_has_nine_spherical_joints() -> None:
+def test_our_model_has_nine_spherical_joints_and_two_shoulders_that_slide() -> None:
     body = load_model()
     assert set(body.joints) == set(SEGMENTS) == set(body.limits)
-    assert (body.pin.nq, body.pin.nv) == (36, 27)
+    assert (body.pin.nq, body.pin.nv) == (9 * 4 + 6, 9 * 3 + 6)
     assert all(body.pin.joints[k].shortname() == "JointModelSpherical" for k in body.joints.values())
+    for girdle in body.table.girdles.values():
+        ids = [body.pin.getJointId(name) for name in girdle.joints]
+        assert {body.pin.joints[k].shortname() for k in ids} == {"JointModelPrismaticUnaligned"}
+        axes = {joint.name: joint.axis for joint in body.robot.joints}
+        np.testing.assert_array_equal([axes[name] for name in girdle.joints], np.eye(3))
+        # One on the other, between the torso and the upper arm.
+        assert [body.pin.parents[k] for k in ids] == [body.joints[girdle.on], *ids[:2]]
+        assert body.pin.parents[body.joints[girdle.moves]] == ids[2]
+        assert not any(body.pin.inertias[k].mass for k in ids)
     assert all(chain.exact for chain in body.chains.values())
 
 
@@ -245,6 +254,7 @@ def test_the_written_urdf_reads_the_same_everywhere(urdf: Path, tmp_path: Path) 
     file.write_text(text, encoding="utf-8")
     again = load_model(file)  # bears our names now: no table is needed
     assert again.pin.names.tolist() == body.pin.names.tolist()
+    assert again.table.girdles == body.table.girdles
     q = pin.randomConfiguration(body.pin, -np.ones(body.pin.nq), np.ones(body.pin.nq))
     ours, theirs = link_placements(body.pin, q), link_placements(again.pin, q)
     assert max(np.abs(ours[name] - theirs[name]).max() for name in ours) < 1e-12

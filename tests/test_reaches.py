@@ -42,10 +42,11 @@ def body(request: pytest.FixtureRequest, data: Path) -> BodyModel:
 
 
 def random_rotations(body: BodyModel, rng: np.random.Generator) -> tuple[pin.Data, dict[str, np.ndarray]]:
-    """Forward kinematics of a configuration drawn at random, and link → its `quat_WK`."""
+    """Forward kinematics of a configuration drawn at random, girdles at zero, and link → its `quat_WK`."""
     m = body.pin
     low, high = (np.clip(limit, -np.pi, np.pi) for limit in (m.lowerPositionLimit, m.upperPositionLimit))
     q = pin.normalize(m, rng.uniform(low, high))
+    q[[m.idx_qs[m.getJointId(joint)] for girdle in body.table.girdles.values() for joint in girdle.joints]] = 0.0
     kinematics = m.createData()
     pin.framesForwardKinematics(m, kinematics, q)
     R_WK = {m.names[joint]: kinematics.oMi[joint].rotation for joint in range(m.njoints)}

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from bodies import LENGTHS, TABLE
+from bodies import LENGTHS, RIGID_SHOULDERS, TABLE
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import SEGMENT_ATTITUDE_STD, START_POSE_STD
+from wepose_pin.alignment import SEGMENT_ATTITUDE_STD
 from wepose_pin.calibration import load_protocol, weights
 from wepose_pin.calibration.lengths import Calibration, solve_calibration
 from wepose_pin.calibration.priors import (
@@ -21,9 +21,10 @@ from wepose_pin.calibration.problem import CalibrationProblem
 from wepose_pin.calibration.weights import LEAST_CORRELATION_S
 from wepose_pin.filters.sensors import FilteredRecording
 from wepose_pin.model import load_model
+from wepose_pin.model.girdle import PARAMETERS
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import NOISE_FREE, Person, simulate, simulate_person
-from wepose_pin.subject import mount_rows
+from wepose_pin.subject import compute_girdle_prior, mount_rows
 
 UP = np.array([0.0, 0.0, 1.0])
 SENSORS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
@@ -41,6 +42,9 @@ GROUPS: dict[str, list[tuple[str, ...]]] = {
     "heading of the torso": [("mounts.torso.z",)],
     "headings of the upper arms": [("mounts.left_upper_arm.z",), ("mounts.right_upper_arm.z",)],
     "headings of the forearms": [("mounts.left_forearm.z",), ("mounts.right_forearm.z",)],
+    "laws of the girdles": [(f"girdles.{name}.law",) for name in RIGID_SHOULDERS],
+    "shoulders at rest": [(f"girdles.{name}.rest_{axis}",) for name in RIGID_SHOULDERS for axis in "xyz"],
+    "shoulders raised": [(f"girdles.{name}.raised_{axis}",) for name in RIGID_SHOULDERS for axis in "xyz"],
     "tilts": [(f"mounts.{name}.{axis}",) for name in SENSORS for axis in "xy"],
 }
 
@@ -57,7 +61,7 @@ class Draw(NamedTuple):
     """What a calibration made of one draw."""
 
     found: Calibration
-    error: np.ndarray  # (k,) of lengths [m] and mounts [rad], in the covariance's order
+    error: np.ndarray  # (k,) of lengths [m], mounts [rad] and girdles [m], in the covariance's order
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +82,9 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
     """Everything drawn as the calibration's priors and weights have it, and what it finds."""
     person, time, rng = motion.person, motion.time, np.random.default_rng(seed)
     protocol = load_protocol("clasp")
-    slip = protocol.closures[0].slip
+    # Palms slip, and both shoulders leave their law: in the weights of the gap that is one.
+    leaving = [np.mean(np.square(girdle.residual_std)) for girdle in TABLE.girdles.values()]
+    slip = float(np.sqrt(protocol.closures[0].slip ** 2 + sum(leaving)))
     start_time = np.arange(0.0, START[1] + 0.5, 1.0 / RATE_HZ)
     recording = Recording(
         name="drawn",
@@ -97,7 +103,12 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
     for _ in range(count):
         # The person stays and the prior is drawn: the same difference.
         drawn = rng.multivariate_normal(mean, person.prior.lengths_covariance())
-        prior = replace(person.prior, lengths=dict(zip(LENGTHS, drawn.tolist(), strict=True)))
+        own = rng.multivariate_normal(np.concatenate(list(RIGID_SHOULDERS.values())), compute_girdle_prior(TABLE))
+        prior = replace(
+            person.prior,
+            lengths=dict(zip(LENGTHS, drawn.tolist(), strict=True)),
+            girdles=dict(zip(RIGID_SHOULDERS, np.split(own, len(RIGID_SHOULDERS)), strict=True)),
+        )
         width = person.lengths["shoulder_width"] + rng.normal(scale=person.measured_std)
         measured = {"shoulder_width": (width, person.measured_std)}
         R_WL = _slipped(motion, slow(slip))
@@ -105,11 +116,10 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
         mirrored = rng.normal(scale=ELBOW.mirror_std)
         for side, x in (("left", common + mirrored), ("right", common - mirrored)):
             R_WL = _hinged(R_WL, side, np.array([x, 1.0, rng.normal(scale=ELBOW.tilt_std)]))
-        R_WL["torso"] = R_WL["torso"] * _about_z(rng.normal(scale=TABLE.segments["torso"].point_twist_std))
         R_VS, R_VS_start, mounts = {}, {}, {}
         for name in SENSORS:
             psi, drift = rng.uniform(-np.pi, np.pi), rng.normal(scale=DRIFT_STD)
-            tilt = Rotation.from_rotvec([*rng.normal(scale=START_POSE_STD, size=2), 0.0])
+            tilt = Rotation.from_rotvec([*rng.normal(scale=TABLE.segments[name].start_std[:2]), 0.0])
             tissue = rng.normal(scale=TABLE.segments[name].soft_tissue_std, size=(3, 3))
             turned = R_WL[name]
             for _ in range(8):
@@ -122,6 +132,9 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
         filtered = FilteredRecording(R_VS, R_VS_start, {}, START, START, [])
         found = solve_calibration(CalibrationProblem(recording, filtered, protocol, prior, measured, MODEL))
         error = dict(zip(LENGTHS, np.array([found.subject.lengths[s] for s in LENGTHS]) - mean, strict=True))
+        for name, rigid in RIGID_SHOULDERS.items():
+            rows = [f"girdles.{name}.{parameter}" for parameter in PARAMETERS]
+            error |= dict(zip(rows, found.subject.girdles[name] - rigid, strict=True))
         for name in SENSORS:
             off = (Rotation.from_quat(found.subject.mounts[name]) * mounts[name].inv()).as_rotvec()
             error |= dict(zip(mount_rows(name), off, strict=True))

@@ -11,11 +11,15 @@ import pytest
 from bodies import LENGTHS, SEGMENTS, TABLE
 
 from wepose_pin.errors import BadOption, BadSubject, MissingFile
+from wepose_pin.model import load_model
+from wepose_pin.model.girdle import PARAMETERS
 from wepose_pin.subject import (
     HeadingDrift,
     Hinge,
     StartPoseOffset,
     Subject,
+    compute_girdle_prior,
+    girdle_rows,
     load_subject,
     mount_rows,
     population_subject,
@@ -81,12 +85,70 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     assert np.isnan(again.std("left_palm"))
 
 
+def girdled(rng: np.random.Generator) -> Subject:
+    """A person whose lengths and girdles are known jointly."""
+    average = population_subject(1.8, "f")
+    order = (*LENGTHS, *girdle_rows(TABLE))
+    root = rng.normal(scale=0.01, size=(len(order), len(order)))
+    girdles = {name: rng.normal(scale=0.01, size=len(PARAMETERS)) for name in TABLE.girdles}
+    return replace(average, order=order, covariance=root @ root.T, girdles=girdles).check()
+
+
+def test_girdles_travel_in_the_file(tmp_path: Path) -> None:
+    subject = girdled(np.random.default_rng(2))
+    (tmp_path / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
+    again = load_subject(tmp_path)
+    again.check_body(TABLE)
+    assert again.order == subject.order
+    assert set(again.girdles) == set(TABLE.girdles) == {"left_shoulder", "right_shoulder"}
+    for name, values in subject.girdles.items():
+        np.testing.assert_allclose(again.girdles[name], values, atol=1e-6)
+    np.testing.assert_allclose(again.shape_covariance(TABLE), subject.shape_covariance(TABLE), rtol=1e-8)
+    assert again.std("girdles.left_shoulder.raised_z") == pytest.approx(subject.std("girdles.left_shoulder.raised_z"))
+    body = again.shape(load_model())
+    assert body.lengths == pytest.approx(dict(again.lengths))
+    for name in TABLE.girdles:
+        np.testing.assert_array_equal(body.girdle_parameters(name), again.girdles[name])
+    assert not population_subject().shape(load_model()).girdle_parameters("left_shoulder").any()
+
+
+def test_the_covariance_of_a_shape_has_lengths_first_and_then_girdles() -> None:
+    subject = girdled(np.random.default_rng(3))
+    np.testing.assert_array_equal(subject.shape_covariance(TABLE), subject.covariance)
+    # In any order of the file's rows, and beside mounts.
+    rows = np.random.default_rng(4).permutation(len(subject.order))
+    mixed = replace(
+        subject,
+        order=tuple(subject.order[k] for k in rows) + tuple(mount_rows("torso")),
+        covariance=np.pad(subject.covariance[np.ix_(rows, rows)], (0, 3)),
+    )
+    np.testing.assert_array_equal(mixed.shape_covariance(TABLE), subject.covariance)
+    # A subject of lengths alone has the girdles that the table expects of people.
+    average, k = population_subject(), len(LENGTHS)
+    cov = average.shape_covariance(TABLE)
+    np.testing.assert_array_equal(cov[:k, :k], average.lengths_covariance())
+    assert not cov[:k, k:].any()
+    np.testing.assert_array_equal(cov[k:, k:], compute_girdle_prior(TABLE))
+
+
+def test_what_people_differ_by_from_the_law_is_partly_alike_on_both_sides() -> None:
+    cov, girdle = compute_girdle_prior(TABLE), TABLE.girdles["left_shoulder"]
+    n = len(PARAMETERS)
+    np.testing.assert_allclose(np.sqrt(np.diag(cov)), [*girdle.parameter_std, *girdle.parameter_std])
+    correlation = np.diag(cov[:n, n:]) / np.diag(cov)[:n]
+    np.testing.assert_allclose(correlation, [girdle.alike] * 4 + [0.0] * 3)  # the law and the place at rest
+    assert np.linalg.eigvalsh(cov)[0] > 0.0
+
+
 def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
     lines = ["format = 2", "[lengths]", *(f"{name} = 0.3" for name in LENGTHS), "[lengths_std]", "trunk = 0.02"]
     (tmp_path / "subject.toml").write_text("\n".join(lines), encoding="utf-8")
     subject = load_subject(tmp_path)
     assert subject.std("trunk") == pytest.approx(0.02)
     assert subject.mounts == {}
+
+
+GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 0"  # without raised_z
 
 
 @pytest.mark.parametrize(
@@ -110,6 +172,16 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
         ),
         ("ALL\n[start_pose_offset.torso]\nx_deg = 1", "it needs x_deg, y_deg, std_deg"),
         ("ALL\n[heading_drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1", "it needs rate_deg_min, std_deg_min"),
+        (f"ALL\n[girdles.left_shoulder]\n{GIRDLE}", "girdles.left_shoulder has no raised_z; it needs law, rest_x"),
+        (f"ALL\n[girdles.left_shoulder]\n{GIRDLE}\nraised_z = 5.0", "girdles.left_shoulder"),
+        (
+            f"ALL\n[girdles.left_sholder]\n{GIRDLE}\nraised_z = 0",
+            "girdles: 'left_sholder' is not known; did you mean 'left_shoulder'",
+        ),
+        (
+            "ALL\n[covariance]\norder = ['girdles.left_shoulder.rest']\nmatrix = [[1.0]]",
+            "covariance.order: 'girdles.left_shoulder.rest' is not known",
+        ),
         ("ALL\n[heading_drift]\ntorso = 1", "heading_drift.torso = 1 is not a table"),
         (
             "ALL\n[covariance]\norder = ['trunk', 'left_hand']\nmatrix = [[1.0, 2.0], [2.0, 1.0]]",

@@ -22,6 +22,16 @@ GOOD = TABLE.format(segments="\n".join(f'{link} = "{link}"' for link in LINKS)).
 )
 UPPER_BODY = 'urdf = "upper_body.urdf"\nlike = "upper_body"\n'
 HINGE = '[hinges.bend]\non = "upper_arm_link"\nmoves = "forearm_link"\naxis = [0.0, 1.0, 0.0]\n'
+GIRDLE = """[girdles.elbow]
+on = "upper_arm_link"
+moves = "forearm_link"
+joints = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"]
+outward = "+y"
+up_mm = [20.0, 10.0]
+middle_mm = [8.0, 15.0]
+back_mm = [2.0, 20.0]
+back_angle_deg = 25.0
+"""
 LENGTH = '{ segment = "upper_arm_link", from = "base", to = "elbow" }'
 
 # What is wrong, the table, and what the line names.
@@ -63,6 +73,51 @@ TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
         GOOD + HINGE.replace('on = "upper_arm_link"', 'on = "uper_arm_link"'),
         ("hinges.bend.on", "uper_arm_link", "did you mean 'upper_arm_link'"),
     ),
+    "a girdle of a point that is none": (
+        GOOD + GIRDLE.replace("girdles.elbow", "girdles.elbov"),
+        ("girdles.elbov", "'elbov' is no point", "did you mean 'elbow'"),
+    ),
+    "a girdle with two joints": (
+        GOOD + GIRDLE.replace(', "elbow_joint"', ""),
+        ("girdles.elbow", "['shoulder_pan_joint', 'shoulder_lift_joint']", "three joints"),
+    ),
+    "a girdle of a segment on itself": (
+        GOOD + GIRDLE.replace('moves = "forearm_link"', 'moves = "upper_arm_link"'),
+        ("girdles.elbow", "moves = 'upper_arm_link'", "two different segments"),
+    ),
+    "a girdle with a joint that is none": (
+        GOOD + GIRDLE.replace("shoulder_pan_joint", "shoulder_pan"),
+        ("girdles.elbow", "shoulder_pan", "did you mean 'shoulder_pan_joint'"),
+    ),
+    "a girdle with joints that turn": (GOOD + GIRDLE, ("girdles.elbow", "shoulder_pan_joint", "does not slide")),
+    "a girdle whose sides are more than alike": (
+        GOOD + GIRDLE + "alike = 1.5\n",
+        ("girdles.elbow", "alike = 1.5", "between -1 and 1"),
+    ),
+    "a girdle whose law is less than certain": (
+        GOOD + GIRDLE + "law_std = -0.5\n",
+        ("girdles.elbow", "law_std = -0.5", "from 0 on"),
+    ),
+    "a girdle with a spread below zero": (
+        GOOD + GIRDLE + "rest_std_mm = [1.0, -2.0, 3.0]\n",
+        ("girdles.elbow.rest_std_mm", "-2", "at least 0 mm"),
+    ),
+    "a girdle with two spreads": (
+        GOOD + GIRDLE + "raised_std_mm = [1.0, 2.0]\n",
+        ("girdles.elbow.raised_std_mm", "[1.0, 2.0]", "3 numbers"),
+    ),
+    "soft tissue with an unknown key": (
+        GOOD.replace(
+            'forearm_link = "forearm_link"', 'forearm_link = { link = "forearm_link", soft_tissue = { pertwist = 1 } }'
+        ),
+        ("segments.forearm_link.soft_tissue", "pertwist", "did you mean 'per_twist'"),
+    ),
+    "a start pose with two angles": (
+        GOOD.replace(
+            'forearm_link = "forearm_link"', 'forearm_link = { link = "forearm_link", start_std_deg = [1, 2] }'
+        ),
+        ("segments.forearm_link.start_std_deg", "[1, 2]"),
+    ),
     "a pose outside its limits": (
         GOOD + "[poses.folded]\nelbow_joint = 9.0\n",
         ("poses.folded.elbow_joint", "9", "-6.3 to 6.3"),
@@ -85,7 +140,7 @@ TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
         ("points.wrist", "wrist_link", "did you mean"),
     ),
     "an unknown kind": (GOOD.replace('"mechanism"', '"robot"'), ("kind", "robot", "mechanism")),
-    "an unknown key": ("colour = 3\n" + GOOD, ("colour", "segments")),
+    "an unknown key": ("colour = 3\n" + GOOD, ("colour is not a known key", "14 in all")),
     "no URDF": (GOOD.replace("arm.urdf", "leg.urdf"), ("leg.urdf", "no such file")),
     "a tree with a fixed arm": (
         UPPER_BODY,

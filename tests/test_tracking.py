@@ -22,7 +22,7 @@ from wepose_pin.tracking import SummaryAccumulator, Tracker, track
 def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
     """1 kHz, no noise, the true lengths: what is left is the filter's and the alignment's own error."""
     simulation = simulate(person.lengths, seed=5, rate_hz=1000.0, noise=NOISE_FREE, clasp_s=10.0, circles=1)
-    subject = replace(population_subject(), lengths=person.lengths)
+    subject = replace(population_subject(), lengths=person.lengths, girdles=simulation.girdles)
     errors = evaluate(track(simulation.recording(), subject).pose, simulation.truth())
     for name, error in errors.position.items():
         assert error.worst < 1.0, name
@@ -32,7 +32,7 @@ def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_noisy_world_is_tracked_by_every_filter(simulation: Simulation, person: Person, method: str) -> None:
-    subject = replace(population_subject(), lengths=person.lengths)
+    subject = replace(population_subject(), lengths=person.lengths, girdles=simulation.girdles)
     pose = track(simulation.recording(), subject, method=method)
     errors = evaluate(pose.pose, simulation.truth(), simulation.phases["circles"][0])
     assert errors.position["right_palm"].mean < 20.0

@@ -69,14 +69,18 @@ def solve_reweighted(
     """
     n, closed = len(observations), observations.closed
     rounds, steps = (range(QUICK_ROUNDS), QUICK_STEPS) if quick else (range(ROUNDS), STEPS)
-    if n >= 2 * MANY_SAMPLES and closed.any() and not quick:
-        rows = np.concatenate([np.arange(n)[span][:: n // MANY_SAMPLES] for _, span in observations.spans()])
-        thinned = solve_reweighted(observations.take(rows), prior, start, contact[rows])
-        start, contact, rounds = thinned.fit.x, np.interp(np.arange(n), rows, thinned.contact), rounds[-1:]
-    x: np.ndarray | Fit = start
     contact, correlation = contact.copy(), min_correlation(observations)
     weights = np.full((n, observations.layout.residuals), 1.0 / correlation)
     weights[:, :3] *= contact[:, None]
+    if n >= 2 * MANY_SAMPLES and closed.any() and not quick:
+        rows = np.concatenate([np.arange(n)[span][:: n // MANY_SAMPLES] for _, span in observations.spans()])
+        thinned = solve_reweighted(observations.take(rows), prior, start, contact[rows])
+        start, rounds = thinned.fit.x, rounds[-1:]
+        contact, *columns = (
+            np.interp(np.arange(n), rows, column) for column in (thinned.contact, *thinned.weights.T)
+        )
+        weights = np.column_stack(columns) * (len(rows) / n)  # all together weigh what the few did
+    x: np.ndarray | Fit = start
     if quick:
         weights[:, GAP_ROWS:] = 0.0
     for condition, span in observations.spans():

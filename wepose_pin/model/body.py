@@ -219,6 +219,7 @@ def load_model(
     girdles = {name: girdle for name, girdle in table.girdles.items() if joints.issuperset(girdle.joints)}
     if own:
         _check_poses(robot, table)
+        _check_girdles(robot, table)
     else:  # the names fit; joints may have others
         table = replace(table, poses={name: pose for name, pose in table.poses.items() if joints.issuperset(pose)})
     table = replace(table, girdles=girdles)
@@ -281,6 +282,22 @@ def _check_poses(robot: Any, table: BodyTable) -> None:
             low, high = find_bounds(joints[name], np.inf)
             if not low - 1e-6 <= value <= high + 1e-6:
                 raise BadModel(f"{place} = {value:g} is outside its limits, {low:g} to {high:g}")
+
+
+def _check_girdles(robot: Any, table: BodyTable) -> None:
+    """Raise `BadModel` where a girdle has a joint that is none, or does not slide.
+
+    A body that is like ours need not have the joints of our girdles.
+    """
+    joints, ours = {joint.name: joint.type for joint in robot.joints}, load_table().girdles
+    for girdle_name, girdle in table.girdles.items():
+        place = f"{table.where}: girdles.{girdle_name}.joints"
+        missing = [name for name in girdle.joints if name not in joints]
+        if missing and girdle != ours.get(girdle_name):
+            raise BadModel(f"{place}: '{missing[0]}' is no joint of the URDF; {one_of(joints, missing[0])}")
+        turning = [name for name in girdle.joints if joints.get(name, "prismatic") != "prismatic"]
+        if turning:
+            raise BadModel(f"{place}: '{turning[0]}' does not slide; it is {joints[turning[0]]}, not prismatic")
 
 
 def read_urdf(path: Path) -> Any:

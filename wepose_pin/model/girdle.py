@@ -144,8 +144,11 @@ def move_girdles(
             raised = np.full(n, MEAN_RAISED)
             motions[name] = GirdleMotion(np.tile(parameters[1:4], (n, 1)), np.zeros((n, 3)), raised, False)
             continue
-        along = R_WL[girdle.on].inv().apply(R_WL[girdle.moves].apply(model.table.segments[girdle.moves].along))
-        law, s = displace(girdle, along.T, find_girdle_scale(girdle, model.lengths), np)
+        # Sums of columns: `Rotation.apply` has other last bits for one orientation than for many.
+        columns = (R_WL[girdle.on].inv() * R_WL[girdle.moves]).as_matrix().transpose(2, 1, 0)
+        x, y, z = model.table.segments[girdle.moves].along
+        along = x * columns[0] + y * columns[1] + z * columns[2]
+        law, s = displace(girdle, along, find_girdle_scale(girdle, model.lengths), np)
         by_law = np.column_stack(law)
         displacement = (1.0 + parameters[0]) * by_law + parameters[1:4] + s[:, None] * parameters[4:]
         motions[name] = GirdleMotion(displacement, by_law, np.asarray(s), True)

@@ -692,10 +692,10 @@ def _read_girdles(top: TomlTable, table: BodyTable) -> dict[str, Girdle]:
         scaled_by = entry.choice("scaled_by", table.lengths) if "scaled_by" in entry else ""
         scale, angle = entry.number("scale", 1.0, positive=True), entry.number("back_angle_deg", None, positive=True)
         alike, law_std = entry.number("alike", 0.0) or 0.0, entry.number("law_std", 0.0) or 0.0
-        if angle is None or not -1.0 < alike < 1.0:
+        if angle is None or not -1.0 < alike < 1.0 or law_std < 0.0:
             raise BadModel(
-                f"{entry.where}: back_angle_deg = {angle}, alike = {alike:g}; an angle, and a correlation between -1 "
-                f"and 1 are needed"
+                f"{entry.where}: back_angle_deg = {angle}, alike = {alike:g}, law_std = {law_std:g}; an angle, a "
+                f"correlation between -1 and 1, and a share from 0 on are needed"
             )
         girdles[name] = Girdle(
             on,
