@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from bodies import LENGTHS
+from bodies import LENGTHS, RIGID_SHOULDERS, TABLE
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +18,7 @@ from wepose_pin.errors import BadOption, BadPhase, BadSession
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.simulation.motion import Motion, Wander
-from wepose_pin.subject import mount_rows, population_subject
+from wepose_pin.subject import Subject, girdle_rows, mount_rows, population_subject
 
 
 def codes(found: Calibration) -> set[str]:
@@ -29,6 +29,17 @@ def ready(simulation: Simulation) -> Recording:
     """The simulated person with exact orientations in place of sensors: what is left is the calibration alone."""
     sensors = {segment: OrientationSensor(quat_WS=quat) for segment, quat in simulation.quat_WL.items()}
     return replace(simulation.recording("exact"), sensors=sensors)
+
+
+def with_rigid_shoulders(subject: Subject) -> Subject:
+    """The same of a person whose shoulders are known not to move on the torso."""
+    rows = girdle_rows(TABLE)
+    return replace(
+        subject,
+        girdles=RIGID_SHOULDERS,
+        order=(*subject.order, *rows),
+        covariance=block_diag(subject.covariance, np.zeros((len(rows), len(rows)))),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +92,8 @@ def test_mounts_at_any_rotation_come_from_the_closure_alone() -> None:
 def test_exact_orientations_and_a_gauge_give_the_lengths_back(exact: tuple[Person, Recording]) -> None:
     person, recording = exact
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
-    found = calibrate_lengths(recording, measured=measured, measured_std=1e-5)
+    prior = with_rigid_shoulders(population_subject())
+    found = calibrate_lengths(recording, measured=measured, prior=prior, measured_std=1e-5)
     for name in ("shoulder_width", "left_upper_arm", "right_upper_arm"):
         assert found.subject.lengths[name] == pytest.approx(person.lengths[name], abs=2e-4)
     for side in ("left", "right"):
@@ -129,7 +141,8 @@ def test_noise_in_the_orientations_does_not_shrink_the_person(exact: tuple[Perso
         for name, s in recording.sensors.items()
     }
     tight = {"shoulder_width": person.lengths["shoulder_width"]}
-    found = calibrate_lengths(replace(recording, sensors=noisy), measured=tight, measured_std=1e-4)
+    prior = with_rigid_shoulders(population_subject())
+    found = calibrate_lengths(replace(recording, sensors=noisy), measured=tight, prior=prior, measured_std=1e-4)
     arm = np.mean([found.subject.lengths[n] / person.lengths[n] for n in ("left_upper_arm", "right_upper_arm")])
     assert arm == pytest.approx(1.0, abs=0.02)
 

@@ -214,6 +214,22 @@ def test_outputs_get_the_newest_pose_with_its_points(recording: Recording, tmp_p
             np.testing.assert_allclose(pose.points[i], causal.points[name][k], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "segments",
+    [("torso", "left_upper_arm", "right_forearm", "right_upper_arm"), ("right_upper_arm", "torso"), ("torso",)],
+)
+def test_shoulders_move_live_as_in_a_recording(segments: tuple[str, ...]) -> None:
+    """Pose after pose the law is computed of numbers, in a recording of arrays."""
+    rng, body = np.random.default_rng(4), load_model()
+    body = replace(body, girdles={name: 0.02 * rng.standard_normal(7) for name in body.table.girdles})
+    quat = Rotation.random(50 * len(segments), rng).as_quat().reshape(50, -1, 4)
+    whole = compute_pose(body, np.arange(50.0), {name: quat[:, i] for i, name in enumerate(segments)})
+    live = LiveKinematics(body, segments)
+    points = np.stack([live.compute_points(row) for row in quat])
+    for i, name in enumerate(live.points):
+        np.testing.assert_allclose(points[:, i], whole.points[name], rtol=0, atol=1e-13)
+
+
 def chaos(recording: Recording, seed: int, hurt: str) -> tuple[list[tuple[float, Samples]], int]:
     """Arrivals in which one sensor loses, delays, repeats, corrupts samples and dies for four seconds; and how many."""
     rng = np.random.default_rng(seed)

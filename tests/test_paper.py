@@ -13,6 +13,7 @@ import polars as pl
 import pytest
 from bodies import LENGTHS, SEGMENTS
 from scipy.spatial.transform import Rotation
+from test_calibration import with_rigid_shoulders
 
 from wepose_pin.calibration import Calibration, assess, calibrate_lengths, load_protocol
 from wepose_pin.calibration.paper import check_paper_formulation
@@ -24,7 +25,7 @@ from wepose_pin.model.table import NEUTRAL_POSE
 from wepose_pin.recording import CONFIGURATION, OrientationSensor, Recording
 from wepose_pin.report.track_diagnostics import describe_heading_remedy
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
-from wepose_pin.subject import load_subject
+from wepose_pin.subject import load_subject, population_subject
 from wepose_pin.tracking import TrackOptions, track, track_chunks
 from wepose_pin.validation import contenders, list_experiments, summarize
 from wepose_pin.validation.tables import (
@@ -184,7 +185,13 @@ def test_noise_in_the_orientations_makes_arms_short() -> None:
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
     ratio = {}
     for formulation in ("full", "paper"):
-        lengths = calibrate_lengths(recording, measured=measured, measured_std=1e-4, formulation=formulation).subject
+        lengths = calibrate_lengths(
+            recording,
+            measured=measured,
+            prior=with_rigid_shoulders(population_subject()),
+            measured_std=1e-4,
+            formulation=formulation,
+        ).subject
         ratio[formulation] = np.mean(
             [lengths.lengths[n] / person.lengths[n] for n in ("left_upper_arm", "right_upper_arm")]
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +18,7 @@ from .errors import BadData, BadModel, one_of
 from .model import BodyModel
 from .model.configurations import find_determined_frames, joint_values
 from .model.fit import Fit
-from .model.girdle import PARAMETERS, move_girdles
+from .model.girdle import PARAMETERS, SCALARS, Girdle, displace, find_girdle_scale, move_girdles
 from .model.orientation_ik import OrientationIk, find_groups
 from .model.reaches import UNIVERSE
 from .recording import EACH_TIME, check_time
@@ -358,6 +359,11 @@ class LiveKinematics:
         self._spherical_joints = None if model.table.is_mechanism else self._match_spherical_joints()
         self._ik = None if self._spherical_joints is not None else _make_ik(model, self.segments, start=start)
         self._previous_q: np.ndarray | None = None
+        self._girdles = [
+            _LiveGirdle.of(model, name, self.segments)
+            for name, girdle in model.table.girdles.items()
+            if girdle.on in self.segments
+        ]
 
     def _match_spherical_joints(self) -> list[tuple[int, int, int]] | None:
         """Return for each measured segment its index in q, its row, and the row of its measured parent (−1: W).
@@ -390,7 +396,8 @@ class LiveKinematics:
             self._q = self._previous_q = self._ik.run(rows, self._previous_q)[0]
         for q_index, row, parent_row in self._spherical_joints or ():
             set_relative_rotation(quat_WL, row, parent_row, self._q, q_index)
-        _write_girdles(self._model, self._q[None], {name: quat_WL[i : i + 1] for i, name in enumerate(self.segments)})
+        for girdle in self._girdles:
+            girdle.place(quat_WL, self._q)
         pin.framesForwardKinematics(self._model.pin, self.data, self._q)
         return np.array(self._views)
 
@@ -401,6 +408,54 @@ class LiveKinematics:
         frames = [self.data.oMf[self._model.pin.getFrameId(segment)] for segment in self.segments]
         fitted = Rotation.from_matrix([frame.rotation for frame in frames]).as_quat()
         return np.where(np.einsum("ki,ki->k", fitted, quat_WL)[:, None] < 0.0, -fitted, fitted)
+
+
+class _LiveGirdle(NamedTuple):
+    """A girdle whose joints are set for one pose after another."""
+
+    girdle: Girdle
+    on: int  # rows of its segments; of the limb −1: it has no sensor
+    moves: int
+    along: np.ndarray  # (3,) of the limb
+    scale: float
+    parameters: tuple[float, ...]  # (7,)
+    at: tuple[int, ...]  # of its joints in q
+
+    @classmethod
+    def of(cls, model: BodyModel, name: str, segments: Sequence[str]) -> _LiveGirdle:
+        girdle = model.table.girdles[name]
+        moves = segments.index(girdle.moves) if girdle.moves in segments else -1
+        return cls(
+            girdle,
+            segments.index(girdle.on),
+            moves,
+            np.array(model.table.segments[girdle.moves].along),
+            find_girdle_scale(girdle, model.lengths),
+            tuple(model.girdle_parameters(name).tolist()),
+            tuple(model.pin.idx_qs[model.pin.getJointId(joint)] for joint in girdle.joints),
+        )
+
+    def place(self, quat_WL: np.ndarray, q: np.ndarray) -> None:
+        """Set the joints in `q` (nq,) as `_write_girdles`, from `quat_WL` (k, 4) xyzw."""
+        law, s = (0.0, 0.0, 0.0), 0.0
+        if self.moves >= 0:
+            along = turn_relatively(quat_WL, self.moves, self.on, self.along)
+            law, s = displace(self.girdle, along, self.scale, SCALARS)
+        share, rest, raised = 1.0 + self.parameters[0], self.parameters[1:4], self.parameters[4:]
+        for i, by_law, at_rest, at_raised in zip(self.at, law, rest, raised, strict=True):
+            q[i] = share * by_law + at_rest + s * at_raised
+
+
+@kernel
+def turn_relatively(quat, row, parent_row, v):  # type: ignore[no-untyped-def]
+    """A vector `v` (3,) of row `row` of `quat` (k, 4) xyzw in the frame of row `parent_row`, as three floats."""
+    bx, by, bz, bw = quat[row, 0], quat[row, 1], quat[row, 2], quat[row, 3]
+    ax, ay, az, aw = -quat[parent_row, 0], -quat[parent_row, 1], -quat[parent_row, 2], quat[parent_row, 3]
+    x, y, z, w = product(ax, ay, az, aw, bx, by, bz, bw)
+    tx, ty, tz, tw = product(x, y, z, w, v[0], v[1], v[2], 0.0)
+    rx, ry, rz, _ = product(tx, ty, tz, tw, -x, -y, -z, w)
+    scale = 1.0 / (x * x + y * y + z * z + w * w)
+    return rx * scale, ry * scale, rz * scale
 
 
 @kernel

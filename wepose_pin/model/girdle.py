@@ -12,7 +12,9 @@ that segment [m] a place at rest, and a displacement at 90° that grows with s.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -27,6 +29,8 @@ PARAMETERS = ("law", "rest_x", "rest_y", "rest_z", "raised_x", "raised_y", "rais
 # s that stands for the limb's elevation where it has no sensor: arms at 50 ± 35° in mixed planes.
 MEAN_RAISED = 0.55
 _LEAST_SINE = 1e-9
+# The functions of `displace` for numbers, some ten times as fast as NumPy's.
+SCALARS = SimpleNamespace(sqrt=math.sqrt, arctan2=math.atan2, fmin=min, exp=math.exp)
 
 
 class Girdle(NamedTuple):
@@ -76,7 +80,7 @@ def displace(girdle: Girdle, along: Any, scale: Any, math: Any) -> tuple[tuple[A
     Parameters
     ----------
     along : (x, y, z) of the limb's unit direction, from its first point on, in the frame of `on`
-    math : `numpy`, or `casadi` for symbols
+    math : `numpy`, `casadi` for symbols, or `SCALARS`
     """
     x, y, z = along
     outward = sum(part * axis for part, axis in zip(along, girdle.outward, strict=True) if axis)

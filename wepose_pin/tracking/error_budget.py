@@ -17,7 +17,7 @@ from ..kinematics import compute_point_covariances
 if TYPE_CHECKING:
     from .tracked import TrackedRecording
 
-SAMPLES = 100  # of a chunk
+PERIOD_S = 1.0  # [s] from one sample to the next
 SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES = "soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle"
 
 
@@ -26,13 +26,15 @@ class ErrorBudget:
 
     def __init__(self) -> None:
         self._variances: dict[str, dict[str, float]] = {}  # point → part → sum over samples [m²], mean of the axes
-        self._samples = 0
+        self._samples = self._received = 0
 
     def add(self, tracked: TrackedRecording) -> None:
-        """Add a chunk."""
-        rows = np.unique(np.linspace(0, len(tracked.time) - 1, SAMPLES).astype(int))
+        """Add a chunk; whatever the chunks, the samples are the same."""
+        stride = max(1, round(PERIOD_S * tracked.recording.rate_hz))
+        rows = np.arange(-self._received % stride, len(tracked.time), stride)
+        self._received += len(tracked.time)
         pose, body = tracked.pose, tracked.model
-        if body.table.is_mechanism or not pose.point_cov:
+        if body.table.is_mechanism or not pose.point_cov or not len(rows):
             return
         quat_WL = {name: quat[rows] for name, quat in pose.quat_WL.items()}
         total = {name: cov[rows] for name, cov in pose.segment_cov.items()}
@@ -42,9 +44,9 @@ class ErrorBudget:
         k = len(body.lengths)
         of_girdles[:k], of_girdles[:, :k] = 0.0, 0.0
 
-        def variances(segment_cov: Mapping[str, np.ndarray], shape: np.ndarray) -> dict[str, float]:
+        def variances(segment_cov: Mapping[str, np.ndarray], shape: np.ndarray) -> dict[str, np.ndarray]:
             covs = compute_point_covariances(body, quat_WL, segment_cov, shape)
-            return {point: float(np.sum(np.trace(cov, axis1=1, axis2=2))) / 3.0 for point, cov in covs.items()}
+            return {point: np.trace(cov, axis1=1, axis2=2) / 3.0 for point, cov in covs.items()}
 
         exact = variances(zero, 0.0 * shape_cov)  # what leaves the law of the girdles
         with_girdles = variances(zero, of_girdles)
@@ -56,9 +58,10 @@ class ErrorBudget:
             parts[f"{name}: {SOFT_TISSUE}"] = _subtract(own_soft, exact)
             parts[f"{name}: {SENSOR}"] = _subtract(both, own_soft)
         for part, by_point in parts.items():
-            for point, value in by_point.items():
+            for point, values in by_point.items():
                 sums = self._variances.setdefault(point, {})
-                sums[part] = sums.get(part, 0.0) + max(value, 0.0)
+                for value in values.tolist():  # one by one: a sum of sums would depend on the chunks
+                    sums[part] = sums.get(part, 0.0) + value
         self._samples += len(rows)
 
     def summarize(self) -> dict[str, dict[str, float]]:
@@ -68,11 +71,11 @@ class ErrorBudget:
         """
         budget = {}
         for point, parts in self._variances.items():
-            std = {part: float(np.sqrt(value / self._samples)) for part, value in parts.items()}
+            std = {part: float(np.sqrt(max(value, 0.0) / self._samples)) for part, value in parts.items()}
             ordered = sorted(std.items(), key=lambda item: -item[1])
             budget[point] = {part: value for part, value in ordered if value >= 1e-4}
         return budget
 
 
-def _subtract(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float]:
+def _subtract(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {point: value - b[point] for point, value in a.items()}
