@@ -330,10 +330,10 @@ def test_soft_tissue_turns_a_sensor_the_more_the_further_the_segment_is_off_the_
         twisted = soft_tissue_deg("left_upper_arm", left_upper_arm=[0.0, 0.0, angle])
         np.testing.assert_allclose(twisted, [2.0, 2.0, np.hypot(2.5, 0.45 * 40.0)], rtol=1e-9)
     # A person who faces elsewhere and takes the arm along turns nothing on the skin of the arm.
-    along = dict.fromkeys(SEGMENTS, [0.0, 0.0, 40.0])
+    along = {key: [0.0, 0.0, 40.0] for key in SEGMENTS}
     np.testing.assert_allclose(soft_tissue_deg("left_upper_arm", **along), [2.0, 2.0, 2.5], rtol=1e-9)
     # A bow by 50 deg: 0.12 of it about y of the torso.
-    bow = soft_tissue_deg("torso", **dict.fromkeys(SEGMENTS, [0.0, 50.0, 0.0]))
+    bow = soft_tissue_deg("torso", **{key: [0.0, 50.0, 0.0] for key in SEGMENTS})
     np.testing.assert_allclose(bow, [1.5, np.hypot(1.5, 0.12 * 50.0), 1.5], rtol=1e-9)
 
 
