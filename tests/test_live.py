@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation
 from test_causal import first
 
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
+from wepose_pin.kinematics import LiveKinematics, compute_pose
 from wepose_pin.live.loop import Latencies, LiveLoop, SessionSummary
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, Status, StreamInfo
+from wepose_pin.model import load_model
 from wepose_pin.readers.live_log import SAMPLES, read_blocks, read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
