@@ -71,12 +71,13 @@ def _print_joints(summary: Mapping[str, Any]) -> None:
 
 
 def _print_error_budget(budget: Mapping[str, Mapping[str, float]]) -> None:
-    parts = list(dict.fromkeys(part for point in budget.values() for part in point))
+    from ..tracking.error_budget import group_by_source
+
+    rows = {point: group_by_source(parts) for point, parts in budget.items()}
     print_table(
-        "Error budget: one standard deviation of an axis [mm], root mean square over the recording",
-        ("part", *budget),
-        [(part, *(f"{point[part]:.1f}" if part in point else "" for point in budget.values())) for part in parts]
-        + [("all", *(f"{sum(value**2 for value in point.values()) ** 0.5:.1f}" for point in budget.values()))],
+        "Error budget: one standard deviation of an axis [mm], root mean square; by segment in summary.json",
+        ("point", *next(iter(rows.values()), ())),
+        [(point, *(f"{value:.1f}" for value in row.values())) for point, row in rows.items()],
     )
 
 

@@ -12,6 +12,7 @@ from ..kinematics import compute_axis_std, compute_orientation_residuals
 from ..model import BodyTable
 from ..recording import Recording, Sensor
 from ..tracking import TrackedRecording
+from ..tracking.error_budget import ErrorBudget, group_by_source
 from .decimation import Totals, compute_totals
 from .joints import build_joint_angles_section
 from .measures import (
@@ -91,6 +92,7 @@ def render_track_report(
     page.add("noise", lambda: _build_noise_section(signals), "Noise and bias")
     page.add("drift", lambda: _build_drift_section(tracked, budgets), "Drift of the headings")
     page.add("tips", lambda: _build_tips_section(tracked, tips), f"The {_name_tips(table)}")
+    page.add("budget", lambda: _build_error_budget_section(tracked), "What the ± of the points is made of")
     page.add("angles", lambda: build_joint_angles_section(tracked), "Joint angles")
     page.add("view", lambda: _build_view_section(tracked, view), "The motion in 3D")
     page.add("run", lambda: _build_run_section(tracked), "What was run")
@@ -288,6 +290,20 @@ def _build_tips_section(tracked: TrackedRecording, tips: Mapping[str, TipMotion]
         "rigid": [f"{text}: {listed(names)}." for text, names in rigid.items()],
         "root": _name_root(table),
         "time_before_start": _format_time_before(tracked),
+    }
+
+
+def _build_error_budget_section(tracked: TrackedRecording) -> dict[str, Any] | None:
+    budget = ErrorBudget()
+    budget.add(tracked)
+    rows = {point: group_by_source(parts) for point, parts in budget.summarize().items()}
+    if not rows:
+        return None
+    header = ["", *(f"{source} [mm]" for source in next(iter(rows.values())))]
+    return {
+        "points": Table(
+            header, [[plain(point), *(whole(1e3 * v) for v in row.values())] for point, row in rows.items()]
+        )
     }
 
 

@@ -79,3 +79,11 @@ class ErrorBudget:
 
 def _subtract(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {point: value - b[point] for point, value in a.items()}
+
+
+def group_by_source(parts: Mapping[str, float]) -> dict[str, float]:
+    """Source → its share of a point's standard deviation, of all segments together, and of all sources as "all"."""
+    groups = dict.fromkeys((SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES), 0.0)
+    for part, std in parts.items():
+        groups[part.rpartition(": ")[2]] += std**2
+    return {source: float(np.sqrt(value)) for source, value in {**groups, "all": sum(groups.values())}.items()}
