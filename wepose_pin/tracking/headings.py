@@ -261,6 +261,7 @@ class HeadingCorrector:
         self._reader = KnotReader(mounts, offsets, chunk.rate_hz, problem)
         self._knots: list[Knot] = []
         self._last_var = np.full(len(self._names), np.nan)
+        self._corrected_samples = 0  # of the second pass so far
         self._gaps = {stage: _RmsAccumulator() for stage in ("before", "after")}
         self._hinge_rms = {
             stage: {hinge.joint: _RmsAccumulator() for hinge in problem.hinges} for stage in ("before", "after")
@@ -322,7 +323,10 @@ class HeadingCorrector:
                     covariance[name], with_heading, filter_var + start, variance
                 )
         result = replace(orientations, quat_WL=corrected, covariance_W=covariance)
-        rows = np.flatnonzero(chunk.time >= self._start_end)[:: find_stride(chunk.rate_hz)]
+        stride = find_stride(chunk.rate_hz)
+        rows = np.arange(-self._corrected_samples % stride, len(chunk), stride)
+        rows = rows[chunk.time[rows] >= self._start_end]
+        self._corrected_samples += len(chunk)
         self._add_residuals(
             "after", chunk.time[rows], {name: Rotation.from_quat(corrected[name][rows]) for name in self._names}
         )
