@@ -76,9 +76,7 @@ def solve_reweighted(
         rows = np.concatenate([np.arange(n)[span][:: n // MANY_SAMPLES] for _, span in observations.spans()])
         thinned = solve_reweighted(observations.take(rows), prior, start, contact[rows])
         start, rounds = thinned.fit.x, rounds[-1:]
-        contact, *columns = (
-            np.interp(np.arange(n), rows, column) for column in (thinned.contact, *thinned.weights.T)
-        )
+        contact, *columns = (np.interp(np.arange(n), rows, column) for column in (thinned.contact, *thinned.weights.T))
         weights = np.column_stack(columns) * (len(rows) / n)  # all together weigh what the few did
     x: np.ndarray | Fit = start
     if quick:
