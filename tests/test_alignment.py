@@ -305,9 +305,9 @@ def test_a_person_who_turns_in_the_start_pose_is_named(simulation: Simulation, r
         assert np.trace(orientation.noise.gyro_bias_cov - still.noise.gyro_bias_cov) > 0.9 * np.deg2rad(rate_deg_s) ** 2
 
 
-def soft_tissue_deg(segment: str, **turned: list[float]) -> np.ndarray:
+def soft_tissue_deg(segment: str, **turned: tuple[float, ...]) -> np.ndarray:
     """Standard deviations (3,) [deg] about a segment's axes; segments that are not named stand in the N-pose."""
-    R_WL = {name: Rotation.from_rotvec(turned.get(name, [0.0, 0.0, 0.0]), degrees=True) for name in SEGMENTS}
+    R_WL = {name: Rotation.from_rotvec(turned.get(name, (0.0, 0.0, 0.0)), degrees=True) for name in SEGMENTS}
     cov_W = compute_soft_tissue_covariances(TABLE, {name: R.as_quat()[None] for name, R in R_WL.items()})[segment][0]
     R = R_WL[segment].as_matrix()
     cov_L = R.T @ cov_W @ R
@@ -319,7 +319,7 @@ def test_soft_tissue_turns_a_sensor_the_more_the_further_the_segment_is_off_the_
     for name, tissue in ((name, segment.soft_tissue) for name, segment in TABLE.segments.items()):
         np.testing.assert_allclose(soft_tissue_deg(name), np.degrees(tissue.std), atol=1e-9)
     # An arm raised sideways by 90 deg: 0.05 of it across; the chest extends with the mean of both arms.
-    raised: dict[str, list[float]] = {"left_upper_arm": [90.0, 0.0, 0.0]}
+    raised = {"left_upper_arm": (90.0, 0.0, 0.0)}
     across = np.hypot(2.0, 0.05 * 90.0)
     np.testing.assert_allclose(soft_tissue_deg("left_upper_arm", **raised), [across, across, 2.5], rtol=1e-9)
     chest = np.hypot(1.5, np.array([0.02, 0.04, 0.02]) * 45.0)
@@ -327,13 +327,13 @@ def test_soft_tissue_turns_a_sensor_the_more_the_further_the_segment_is_off_the_
     np.testing.assert_allclose(soft_tissue_deg("right_upper_arm", **raised), [2.0, 2.0, 2.5], rtol=1e-9)
     # One that turns about its length by 40 deg against the torso, to either side: skin lags by part of it.
     for angle in (40.0, -40.0):
-        twisted = soft_tissue_deg("left_upper_arm", left_upper_arm=[0.0, 0.0, angle])
+        twisted = soft_tissue_deg("left_upper_arm", left_upper_arm=(0.0, 0.0, angle))
         np.testing.assert_allclose(twisted, [2.0, 2.0, np.hypot(2.5, 0.45 * 40.0)], rtol=1e-9)
     # A person who faces elsewhere and takes the arm along turns nothing on the skin of the arm.
-    along = {key: [0.0, 0.0, 40.0] for key in SEGMENTS}
+    along = dict.fromkeys(SEGMENTS, (0.0, 0.0, 40.0))
     np.testing.assert_allclose(soft_tissue_deg("left_upper_arm", **along), [2.0, 2.0, 2.5], rtol=1e-9)
     # A bow by 50 deg: 0.12 of it about y of the torso.
-    bow = soft_tissue_deg("torso", **{key: [0.0, 50.0, 0.0] for key in SEGMENTS})
+    bow = soft_tissue_deg("torso", **dict.fromkeys(SEGMENTS, (0.0, 50.0, 0.0)))
     np.testing.assert_allclose(bow, [1.5, np.hypot(1.5, 0.12 * 50.0), 1.5], rtol=1e-9)
 
 

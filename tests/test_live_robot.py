@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from arms import FORE, HAND, UPPER, person, write_arm
-from bodies import LENGTHS
+from bodies import LENGTHS, RIGID_SHOULDERS
 from scipy.spatial.transform import Rotation
 from test_causal import first
 from test_retargeting import far_away
@@ -33,6 +33,7 @@ from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.state import LivePose, Status, StreamInfo
 from wepose_pin.model import load_model
+from wepose_pin.model.girdle import PARAMETERS
 from wepose_pin.readers import load_session
 from wepose_pin.retargeting import Robot, compute_arm_targets, find_map, load_robot
 from wepose_pin.retargeting.limits import read_joint_limits
@@ -198,7 +199,11 @@ def test_the_hands_uncertainty_is_that_of_the_pose(arm: Robot) -> None:
     cov[np.ix_(at, at)] = population_subject().lengths_covariance()[np.ix_(at, at)]
     segment_cov = {name: np.tile(s**2 * np.eye(3), (50, 1, 1)) for name, s in zip(pose.quat_WL, std, strict=True)}
     body = load_model(lengths={"right_upper_arm": UPPER, "right_forearm": FORE, "right_hand": HAND})
-    true = compute_axis_std(compute_point_covariances(body, pose.quat_WL, segment_cov, cov)["right_palm"])
+    # Shoulders that do not move on the torso, and about which nothing is uncertain: that is no part of it.
+    still = {name: girdle._replace(residual_std=(0.0, 0.0, 0.0)) for name, girdle in body.table.girdles.items()}
+    body = replace(body, girdles=RIGID_SHOULDERS, table=replace(body.table, girdles=still))
+    shape_cov = np.pad(cov, (0, len(PARAMETERS) * len(still)))
+    true = compute_axis_std(compute_point_covariances(body, pose.quat_WL, segment_cov, shape_cov)["right_palm"])
     seer = ArmObserver(arm, stream_info(pose).segments, stream_info(pose).points, cov)
     for k, one in enumerate(live_poses(pose)):
         seen = seer.observe(one.quat_WL, one.points, std, one.lost)
@@ -608,7 +613,10 @@ def test_r_goes_on_and_the_person_is_told(robot_out, arm: Robot, receiver: Recei
 def test_the_same_recording_gives_the_same_commands(
     simulation: Simulation, arm: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A session as fast as possible and what it recorded: bit-identical, without this machine's clock."""
+    """A session as fast as possible and what it recorded: bit-identical, without this machine's clock.
+
+    Mounts are stated by eye: the hand is uncertain, and the robot follows slowly.
+    """
     sent: list[bytes] = []
     monkeypatch.setattr("wepose_pin.live.robot.UdpSender.send", lambda _, data: sent.append(data))
     recording = first(simulation.recording("bits"), 1500)
@@ -627,7 +635,7 @@ def test_the_same_recording_gives_the_same_commands(
     strip: Callable[[bytes], dict[str, Any]] = lambda line: json.loads(line) | {"t": None}  # noqa: E731
     assert [strip(line) for line in again] == [strip(line) for line in once]
     states = {json.loads(line)["state"] for line in once}
-    assert {"approach", "follow", "stopped"} <= states
+    assert {"approach", "slow", "stopped"} <= states
     keeps_its_limits([json.loads(line) for line in once], arm)
 
 
@@ -715,4 +723,5 @@ def test_a_map_may_lie_elsewhere(session: Path, tmp_path: Path, capsys: pytest.C
         )
     assert stop.value.code == 0
     out = capsys.readouterr().out
-    assert re.search(r"mine: \d+ commands, .*% follow.*; each took \d+\.\d\d ms \(p50\)", out.replace("\n", " "))
+    # Mounts are stated by eye: the hand is uncertain, and the robot follows slowly.
+    assert re.search(r"mine: \d+ commands, .*% slow.*; each took \d+\.\d\d ms \(p50\)", out.replace("\n", " "))

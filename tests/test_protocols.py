@@ -15,10 +15,10 @@ from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate_len
 from wepose_pin.calibration.conditions import (
     Loop,
     StartPose,
+    find_girdles,
     find_hinges,
     find_measured_lengths,
     find_segments,
-    find_twists,
     resolve_conditions,
 )
 from wepose_pin.calibration.least_squares import Layout, Observations, residuals
@@ -143,13 +143,15 @@ def test_jacobians_are_those_of_differences(name: str) -> None:
         LENGTHS,
         sensors,
         find_hinges(model, start, sensors),
-        find_twists(model, start, sensors),
+        find_girdles(model, start, sensors),
         fixed=sum(c.kind == "fixed_point" for c in closures),
         planes=sum(c.kind == "plane" for c in closures),
         distance_names=protocol.distances,
         recorded=recorded,
         rigid=sensors[:1] if recorded else (),
+        attitude_std=tuple(rng.uniform(0.01, 0.05, len(sensors))),
     )
+    assert len(layout.girdles) == (1 if protocol.name == "touch_right" else 2)
     n = 2 * len(protocol.conditions)
     turns = [Rotation.random(n, random_state=rng).as_quat().T for _ in sensors]
     places = rng.normal(size=(3 if recorded else 0, n))
