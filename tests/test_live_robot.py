@@ -277,7 +277,7 @@ def test_a_lost_sensor_slows_it_and_its_return_is_no_jump(arm: Robot) -> None:
 def test_an_uncertain_hand_is_slow(arm: Robot) -> None:
     pose = person(10.0, swing=45.0)
     poses = live_poses(pose)
-    poses[500:800] = live_poses(pose, std=0.3)[500:800]
+    poses[500:800] = live_poses(pose, std=0.5)[500:800]
     found = Session(arm, stream_info(pose)).run(poses)
     assert found.states(4.9, 7.9) == ["follow", "slow"]
     assert re.fullmatch(r"the right hand is uncertain by \d{3} mm", found.commands[600].reason)
@@ -613,10 +613,7 @@ def test_r_goes_on_and_the_person_is_told(robot_out, arm: Robot, receiver: Recei
 def test_the_same_recording_gives_the_same_commands(
     simulation: Simulation, arm: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A session as fast as possible and what it recorded: bit-identical, without this machine's clock.
-
-    Mounts are stated by eye: the hand is uncertain, and the robot follows slowly.
-    """
+    """A session as fast as possible and what it recorded: bit-identical, without this machine's clock."""
     sent: list[bytes] = []
     monkeypatch.setattr("wepose_pin.live.robot.UdpSender.send", lambda _, data: sent.append(data))
     recording = first(simulation.recording("bits"), 1500)
@@ -635,7 +632,7 @@ def test_the_same_recording_gives_the_same_commands(
     strip: Callable[[bytes], dict[str, Any]] = lambda line: json.loads(line) | {"t": None}  # noqa: E731
     assert [strip(line) for line in again] == [strip(line) for line in once]
     states = {json.loads(line)["state"] for line in once}
-    assert {"approach", "slow", "stopped"} <= states
+    assert {"approach", "follow", "stopped"} <= states
     keeps_its_limits([json.loads(line) for line in once], arm)
 
 
@@ -723,5 +720,4 @@ def test_a_map_may_lie_elsewhere(session: Path, tmp_path: Path, capsys: pytest.C
         )
     assert stop.value.code == 0
     out = capsys.readouterr().out
-    # Mounts are stated by eye: the hand is uncertain, and the robot follows slowly.
-    assert re.search(r"mine: \d+ commands, .*% slow.*; each took \d+\.\d\d ms \(p50\)", out.replace("\n", " "))
+    assert re.search(r"mine: \d+ commands, .*% follow.*; each took \d+\.\d\d ms \(p50\)", out.replace("\n", " "))

@@ -20,7 +20,9 @@ from .robot import Arm, Robot
 REACH_SHARE = 0.95  # of the robot's reach for a straight arm: its elbow stays flexed, far from the singularity
 CLAMP_FROM, CLAMP_TO = 0.95, 0.99  # of the reach: between them a target is clamped smoothly
 SMOOTHING_HZ = 6.0  # voluntary motion of an arm is slower (Winter 2009, 2.2.3)
-STD_GOOD, STD_POOR = 0.04, 0.12  # [m] of the hand: full speed up to the first, slowest from the second
+# [m] of the hand: full speed up to the first, slowest from the second. With mounts stated in the N-pose it is uncertain
+# by some 0.09 m, with calibrated ones by 0.04; beyond that headings drift or sensors are lost.
+STD_GOOD, STD_POOR = 0.10, 0.25
 MAX_SLOWDOWN = 3.0  # times longer, where tracking is poor
 WEIGHT_POOR = 0.1  # of the hand's tasks, where tracking is poor
 JUMP_SPEED = 12.0  # [m/s] in the person's size: no hand is faster, so the tracking has jumped
