@@ -350,7 +350,7 @@ def describe_known(experiment: str, presets: Mapping[str, Mapping[str, Any]]) ->
     bias = (
         "noise, gyroscope bias and tilt of each sensor, from the start pose (default gains: their bias starts at zero)"
     )
-    trunk = "The trunk is measured, as well as the shoulder width, in the row that says so, and in no other"
+    trunk = "The trunk is measured too, off by as much, in the row that says so, and in no other"
     ten = "clocks, frames, tilt of the truth's world and the heading, on the first 10 s, which are not scored"
     for name, text in {
         "dynamic": still.format("the 5 s before the motion"),
