@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,11 +16,14 @@ from wepose_pin.cli import main
 from wepose_pin.kinematics import build_pose_table, compute_axis_std, compute_point_covariances, compute_pose
 from wepose_pin.model import load_model
 from wepose_pin.model.girdle import PARAMETERS
-from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
-from wepose_pin.subject import population_subject
+from wepose_pin.simulation import MTI_3, PEOPLE_MEASURED_STD, PEOPLE_PRESET, simulate, simulate_person
+from wepose_pin.subject import girdle_rows, population_subject
 from wepose_pin.tracking import track
+from wepose_pin.tracking.error_budget import SAMPLES, ErrorBudget
+from wepose_pin.writers import write_session
 
 ARMS = [f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")]
+PARTS = ("shoulder girdle", "lengths", "torso: soft tissue", "torso: sensor, mount, start pose")
 EXACT = np.zeros_like(population_subject().shape_covariance(TABLE))  # lengths and girdles without errors
 
 
@@ -86,18 +90,19 @@ def test_points_beyond_a_segment_without_covariance_have_none() -> None:
 
 @pytest.mark.monte_carlo
 def test_the_whole_chain_is_honest() -> None:
-    """Realistic people, calibrated and tracked through six circles: the normalised error averages to about three.
+    """People, calibrated and tracked through six circles: the normalised error averages to about three.
 
-    The priors are those of real people and sensors: of a perfect one (no sway, no soft tissue) they say too much.
+    The priors are those of real people and sensors: of a careful one (rigid shoulders, less soft tissue) they say more.
     """
     from wepose_pin.calibration import calibrate
 
     hand, segments = [], []
     for seed in range(5):
-        person = simulate_person(200 + seed)
-        simulation = simulate(person.lengths, seed=seed, imperfections=MILD_PRESET)
+        person = simulate_person(200 + seed, PEOPLE_MEASURED_STD)
+        simulation = simulate(person.lengths, seed=seed, imperfections=PEOPLE_PRESET)
         recording = simulation.recording()
-        pose = track(recording, calibrate(recording, measured=person.measured, prior=person.prior)).pose
+        known = {"measured": person.measured, "measured_std": PEOPLE_MEASURED_STD, "prior": person.prior}
+        pose = track(recording, calibrate(recording, **known)).pose
         during = recording.span(simulation.phases["circles"][0])
         for name in simulation.quat_WL:
             true, found = (Rotation.from_quat(p.quat_WL[name][during]) for p in (simulation.truth(), pose))
@@ -114,8 +119,6 @@ def test_the_whole_chain_is_honest() -> None:
 def test_the_columns_of_the_result(tmp_path: Path) -> None:
     person = simulate_person(1)
     simulation = simulate(person.lengths, seed=1, clasp_s=5.0, circles=1)
-    from wepose_pin.writers import write_session
-
     write_session(tmp_path, simulation.recording())
     for words in (["-o", "a"], ["-o", "b", "--covariance"], ["-o", "c", "--method", "ncf"]):
         with pytest.raises(SystemExit) as stop:
@@ -140,3 +143,55 @@ def test_a_hand_that_is_segment_and_point_has_a_column_each() -> None:
     table = build_pose_table(replace(pose, segment_cov=cov, point_cov=points))
     assert table["left_hand_std"][0] == pytest.approx(0.01)
     assert table["left_palm_std"][0] == pytest.approx(compute_axis_std(points["left_palm"])[0])
+
+
+def test_the_parts_of_the_error_budget_add_up_in_variance() -> None:
+    recording = simulate(simulate_person(1).lengths, seed=1, clasp_s=5.0, circles=1, noise=MTI_3).recording()
+    tracked = track(recording)
+    budget = ErrorBudget()
+    budget.add(tracked)
+    found = budget.summarize()
+    assert set(found) == set(tracked.points)
+    rows = np.unique(np.linspace(0, len(tracked.time) - 1, SAMPLES).astype(int))
+    for point, parts in found.items():
+        total = np.sqrt(np.mean(np.square(compute_axis_std(tracked.pose.point_cov[point][rows]))))
+        assert np.sqrt(sum(std**2 for std in parts.values())) == pytest.approx(total, rel=1e-4)
+        assert list(parts.values()) == sorted(parts.values(), reverse=True)
+        assert min(parts.values()) >= 1e-4
+        side = point.partition("_")[0]
+        of = {part.partition(": ")[0] for part in parts} - {"shoulder girdle", "lengths"}
+        assert {"shoulder girdle", "lengths"} < set(parts)
+        # A segment matters for what it carries, with its sensor and with the soft tissue below that.
+        carrying = ["torso", *(f"{side}_{part}" for part in ("upper_arm", "forearm"))]
+        assert of == set(carrying[: {"shoulder": 1, "elbow": 2}.get(point.partition("_")[2], 3)])
+    assert found["left_palm"]["shoulder girdle"] == pytest.approx(found["left_shoulder"]["shoulder girdle"], rel=1e-9)
+    # Two chunks are the recording, and a person who is known exactly has no share of lengths and girdles.
+    budget.add(tracked)
+    assert budget.summarize()["right_palm"] == pytest.approx(found["right_palm"])
+    order = (*LENGTHS, *girdle_rows(TABLE))
+    exact = replace(population_subject(), order=order, covariance=np.zeros((len(order), len(order))))
+    known = ErrorBudget()
+    known.add(track(recording, exact))
+    parts = known.summarize()["right_palm"]
+    assert "lengths" not in parts
+    leaving = np.sqrt(np.mean(np.square(TABLE.girdles["right_shoulder"].residual_std)))
+    assert parts["shoulder girdle"] == pytest.approx(leaving, rel=1e-9)  # what leaves the law is nobody's parameter
+
+
+def test_the_command_prints_the_error_budget(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    simulation = simulate(simulate_person(1).lengths, seed=1, clasp_s=5.0, circles=1)
+    write_session(tmp_path, simulation.recording())
+    printed = {}
+    for name, switch in (("with", ["--error-budget"]), ("without", [])):
+        with pytest.raises(SystemExit) as stop:
+            main(["track", str(tmp_path), "-o", str(tmp_path / name), *switch, "--no-view", "--no-report"])
+        assert not stop.value.code
+        printed[name] = capsys.readouterr().out
+    assert "Error budget" not in printed["without"]
+    table = printed["with"].partition("Error budget")[2]
+    summary = json.loads((tmp_path / "without" / "summary.json").read_text())["error_budget_mm"]
+    assert set(summary) == set(simulation.points)
+    lines = {part: next(line for line in table.splitlines() if line.strip().startswith(part)) for part in PARTS}
+    for part, line in lines.items():
+        values = [float(word) for word in line.replace(part, "").split()]
+        assert values == pytest.approx([parts[part] for parts in summary.values() if part in parts])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from bodies import LENGTHS, TABLE
+from bodies import LENGTHS, RIGID_SHOULDERS, TABLE
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate_lengths, load_protocol
@@ -22,7 +22,7 @@ from wepose_pin.calibration.conditions import (
     resolve_conditions,
 )
 from wepose_pin.calibration.least_squares import Layout, Observations, residuals
-from wepose_pin.calibration.protocols import Closure
+from wepose_pin.calibration.protocols import Closure, Direction
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, render, render_all
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
@@ -41,6 +41,7 @@ from wepose_pin.simulation import (
     simulate_person,
 )
 from wepose_pin.simulation.tasks import TASKS, Touch
+from wepose_pin.subject import girdle_rows
 from wepose_pin.writers.session import write_session
 
 CALIBRATION = Path(__file__).resolve().parent.parent / "calibration"
@@ -281,7 +282,16 @@ def test_a_fixed_point_says_that_it_has_no_scale_and_which_gauge_would_serve() -
     upper = {"right_upper_arm": person.lengths["right_upper_arm"]}
     good = calibrate_lengths(recording, measured=upper, prior=person.prior, protocol="touch_right")
     assert not measured_instead(good)
-    assert good.subject.std("trunk") < 0.7 * person.prior.std("trunk")  # seen beside the arm
+    # The trunk is seen beside the arm, the better the better one knows how the shoulder moves on it.
+    k = len(girdle_rows(TABLE))
+    sure = replace(
+        person.prior,
+        girdles=RIGID_SHOULDERS,
+        order=(*person.prior.order, *girdle_rows(TABLE)),
+        covariance=np.pad(person.prior.covariance, (0, k)),
+    )
+    best = calibrate_lengths(recording, measured=upper, prior=sure, protocol="touch_right")
+    assert best.subject.std("trunk") < good.subject.std("trunk") < 0.75 * person.prior.std("trunk")
 
 
 class StillTrunk(Touch):
@@ -349,8 +359,14 @@ def test_poses_tell_headings_and_no_length() -> None:
     for name in LENGTHS:
         assert found.subject.std(name) == pytest.approx(person.prior.std(name))
     assert "lengths-not-observed" in codes(found)
-    _, std = mount_errors(found, simulation)
-    assert np.all((std[:, 2] > 5.0) & (std[:, 2] < 9.0))  # as well as the poses are held
+    # As well as the poses are held, the T-pose and the N-pose of bent elbows, against a torso that bowed.
+    heading = dict(zip(found.heading_drift, mount_errors(found, simulation)[1][:, 2], strict=True))
+    torso = heading.pop("torso")
+    assert 5.0 < torso < 10.0
+    (t_pose,) = {np.degrees(c.std) for c in load_protocol("poses").conditions if isinstance(c, Direction)}
+    for name, std in heading.items():
+        n_pose = np.degrees(np.linalg.norm(TABLE.segments[name].start_std[:2]))
+        assert np.hypot(t_pose, 5.0) < std < np.linalg.norm([t_pose, n_pose, torso])
     measured = calibrate_lengths(recording, prior=person.prior, protocol="poses", measured={"trunk": 0.47})
     assert measured.subject.lengths["trunk"] == pytest.approx(0.47, abs=2e-3)
 
