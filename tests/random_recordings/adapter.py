@@ -83,6 +83,7 @@ class Result:
     gap: dict[str, np.ndarray]
     table: pl.DataFrame
     lengths: dict[str, float]
+    girdles: dict[str, np.ndarray]  # shoulder → (7,) what the subject differs by from the law of the shoulders
     start: tuple[float, float]
     diagnostics: list[Diagnosed]
     calibrated: set[str]
@@ -295,6 +296,10 @@ def read_result(folder: Path) -> Result:
         gap={name[:-4]: values[name] for name in values if name.endswith("_gap")},
         table=table,
         lengths={name: float(value) for name, value in lengths.items()},
+        girdles={
+            point: np.array([float(value) for value in re.findall(r"= ([-0-9.e]+)$", rows, re.MULTILINE)])
+            for point, rows in re.findall(r"^\[girdles\.(\w+)\][^\n]*\n([^\[]*)", subject, re.MULTILINE)
+        },
         start=_first_span(summary["phases"]["start"]),
         diagnostics=diagnosed(summary),
         calibrated=set(re.findall(r"^\[mounts\.(\w+)\][^\[]*?^std_deg", subject, re.MULTILINE | re.DOTALL)),

@@ -117,6 +117,10 @@ def of_result(result: Result, shown: str) -> list[Failure]:
             off = float(np.max(np.abs(apart - length)))
             if off > RIGID:
                 found.append(Failure("lengths hold", shown, f"{one} to {other}: {1e3 * off:.3g} mm off {length:.4f} m"))
+    for name, wanted in _shoulders(result).items():
+        off = float(np.max(np.linalg.norm(result.points[name] - wanted, axis=1)))
+        if off > RIGID:
+            found.append(Failure("shoulders follow the arms", shown, f"{name}: {1e3 * off:.3g} mm off"))
     for name, std in [*result.quat_std.items(), *result.points_std.items()]:
         if (std < 0.0).any():
             found.append(Failure("± is a number", shown, f"{name}: {std.min():.3g}"))
@@ -125,12 +129,37 @@ def of_result(result: Result, shown: str) -> list[Failure]:
 
 def _rigid(result: Result) -> dict[tuple[str, str], float]:
     of = result.lengths
-    pairs = {("left_shoulder", "right_shoulder"): of["shoulder_width"]}
+    pairs: dict[tuple[str, str], float] = {}  # shoulders move on the torso: `_shoulders`
     for side in SIDES:
         pairs[f"{side}_shoulder", f"{side}_elbow"] = of[f"{side}_upper_arm"]
         pairs[f"{side}_elbow", f"{side}_wrist"] = of[f"{side}_forearm"]
         pairs[f"{side}_wrist", f"{side}_palm"] = of[f"{side}_hand"]
     return pairs
+
+
+def _shoulders(result: Result) -> dict[str, np.ndarray]:
+    """Shoulder → where it is (n, 3) [m] by the law that urdf/upper_body.toml states, and what the subject differs by."""
+    wanted = {}
+    for side, sign in zip(("left", "right"), (1.0, -1.0), strict=True):
+        point, arm = f"{side}_shoulder", f"{side}_upper_arm"
+        if point not in result.points:
+            continue
+        share, *own = result.girdles.get(point, np.zeros(7))
+        at = np.array([0.0, sign * result.lengths["shoulder_width"] / 2.0, result.lengths["trunk"]]) + own[:3]
+        R_torso = Rotation.from_quat(result.quat["torso"])
+        if arm in result.quat:
+            along = (R_torso.inv() * Rotation.from_quat(result.quat[arm])).apply([0.0, 0.0, -1.0])
+            sine = np.sqrt(along[:, 0] ** 2 + along[:, 1] ** 2 + 1e-9)
+            e, out = np.minimum(np.arctan2(sine, -along[:, 2]), np.deg2rad(130.0)), sign * along[:, 1] / sine
+            s = e / np.deg2rad(90.0)
+            up, middle = (0.021 + 0.0125 * out) * s, (0.008 + 0.015 * out) * s
+            back = 0.002 * s**2 + 0.020 * (1.0 - np.exp(-e / np.deg2rad(25.0))) * out
+            law = np.column_stack((-back, -sign * middle, up)) * result.lengths["shoulder_width"] / 0.34
+            at = at + (1.0 + share) * law + s[:, None] * own[3:]
+        else:
+            at = np.tile(at, (len(result.time), 1))
+        wanted[point] = R_torso.apply(at)
+    return wanted
 
 
 def of_errors(result: Result, case: Case, recorded: Recorded, shown: str) -> tuple[Accuracy, Truth]:

@@ -3,6 +3,7 @@
 The skeleton with the subject's lengths, and its motion.
 
 y is up, the person faces z with x on the left; centimetres and degrees. At zero the skeleton stands in the N-pose.
+Offsets are constant: by how much the shoulders move on the torso is lost.
 
 Source: M. Meredith, S. Maddock 2001, "Motion Capture File Formats Explained", University of Sheffield CS-01-11, 3.3: a
 joint turns by its channels in their order, each about an axis as turned so far.
@@ -22,6 +23,7 @@ from ..angles import NEAR_LOCK, euler
 from ..diagnostics import Diagnostic
 from ..errors import BadData
 from ..kinematics import compute_link_poses, find_known_points, solve_configuration
+from ..model import move_girdles
 from ..rotations import conjugate, multiply
 from .motion import Motion, check_complete, diagnose_gaps, resample_evenly
 
@@ -154,7 +156,10 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
 
 
 def _root_position(motion: Motion, root: Bone) -> np.ndarray:
-    """Where the hips are (n, 3) [m], so that the shoulders are where they were found; a spine of many joints bends."""
+    """Where the hips are (n, 3) [m], so that the shoulders are where they were found; a spine of many joints bends.
+
+    The shoulders without their motion on the torso, which does not lift the hips.
+    """
     pose, anchors = motion.pose, _find_anchors(motion)
     if root.segment is None or not anchors:
         return np.zeros((len(pose.time), 3))
@@ -163,8 +168,19 @@ def _root_position(motion: Motion, root: Bone) -> np.ndarray:
             raise BadData(
                 f"{motion.where}: no columns {point}_x … in pose.parquet; a .bvh needs {' and '.join(anchors)}"
             )
-    middle = np.mean([pose.points[point] for point in anchors], axis=0)
+    middle = np.mean([pose.points[point] - _girdle_motion(motion, point) for point in anchors], axis=0)
     return np.asarray(middle - Rotation.from_quat(pose.quat_WL[motion.model.table.reference]).apply(root.end))
+
+
+def _girdle_motion(motion: Motion, point: str) -> np.ndarray:
+    """By how much girdles have moved a point (n, 3) [m] in W, from where it is at rest."""
+    model = motion.model
+    R_WL = {segment: Rotation.from_quat(quat) for segment, quat in motion.pose.quat_WL.items()}
+    moved = np.zeros((len(motion.pose.time), 3))
+    for name, girdle_motion in move_girdles(model, R_WL, model.point_girdles[point]).items():
+        at_rest = model.girdle_parameters(name)[1:4]
+        moved += R_WL[model.table.girdles[name].on].apply(girdle_motion.displacement - at_rest)
+    return moved
 
 
 def _orientation(motion: Motion, segment: str | None) -> np.ndarray:

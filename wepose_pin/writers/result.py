@@ -25,7 +25,7 @@ from ..kinematics import Pose, build_pose_table, parse_pose_table
 from ..model import BodyModel, BodyTable, load_model, load_table
 from ..model.table import MODEL_TABLE, format_table
 from ..readers.tables import read_table
-from ..subject import Subject, subject_toml
+from ..subject import Subject, load_subject, subject_toml
 from ..tracking import TrackedRecording
 
 JOINTS = "joints.parquet"
@@ -114,7 +114,7 @@ def _strip_origin(table: BodyTable) -> BodyTable:
 
 
 def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
-    """Pose, body and summary of a result folder.
+    """Pose, body and summary of a result folder; the body with the subject's lengths and girdles.
 
     Raises
     ------
@@ -133,7 +133,10 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
         raise BadData(f"{summary_file}: is damaged, no JSON: {error}") from error
     if not isinstance(summary, dict):
         raise BadData(f"{summary_file}: is damaged: {str(summary)[:40]!r} in place of an object")
-    return pose, load_model(folder / SUBJECT_URDF), summary
+    model, subject_file = load_model(folder / SUBJECT_URDF), folder / "subject.toml"
+    if model.table.girdles and subject_file.is_file():
+        model = replace(model, girdles=load_subject(subject_file).girdles)
+    return pose, model, summary
 
 
 def _read_joints(file: Path, samples: int) -> dict[str, np.ndarray]:
