@@ -57,7 +57,7 @@ class TrackJob:
         Write the covariance of each orientation and point too, not only the standard deviations.
     error_budget
         Print what each part is worth in the standard deviation of each point: soft tissue, sensors with their mounts
-        and start poses, lengths, the shoulder girdle. summary.json has it in any case.
+        and start poses, lengths, the shoulder girdle. summary.json and report.html have it in any case.
     limits
         Keep joints with one or two axes within the limits of the model.
     torques
