@@ -16,7 +16,7 @@ from .protocols import PROTOCOLS, load_protocol
 from .weights import MIN_CONTACT
 
 LOOSE_SCALE = 0.6  # of the prior's relative standard deviation, above which a measured length shows little
-LEAST_LOOSE_SCALE = 0.025  # ... but not below this: a measured shoulder width leaves about 2 %
+LEAST_LOOSE_SCALE = 0.03  # ... but not below this: a measured shoulder width leaves 2.7 %, for shoulders move
 MOST_OPEN = 0.10  # share of a phase in which the closure may be open
 MOST_INTERVALS = 3  # of an open closure that are named, the longest
 

@@ -185,6 +185,8 @@ def _reasons(checks: list[Check]) -> tuple[Diagnostic, ...]:
     reasons: list[Diagnostic] = []
     failing = [check for check in checks if check.quality != "pass"]
     for check in sorted(failing, key=lambda check: (check.quality != "fail", -check.excess)):
+        if check.diagnostic.code in {check.cause.code for check in failing if check.cause is not None}:
+            continue  # it is the cause of another
         reasons.append(check.diagnostic)
         if check.cause is not None and check.cause.code not in {each.code for each in reasons}:
             reasons.append(check.cause)
