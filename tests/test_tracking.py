@@ -23,11 +23,14 @@ def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
     """1 kHz, no noise, the true lengths: what is left is the filter's and the alignment's own error."""
     simulation = simulate(person.lengths, seed=5, rate_hz=1000.0, noise=NOISE_FREE, clasp_s=10.0, circles=1)
     subject = replace(population_subject(), lengths=person.lengths, girdles=simulation.girdles)
-    errors = evaluate(track(simulation.recording(), subject).pose, simulation.truth())
-    for name, error in errors.position.items():
-        assert error.worst < 1.0, name
-    for name, attitude in errors.attitude.items():
-        assert attitude.total_rmse < 0.05, name
+    # What observes headings in motion allows for people's errors: it is not as exact as this world, 0.1 deg.
+    for open_loop, most_deg in ((True, 0.05), (False, 0.1)):
+        pose = track(simulation.recording(), subject, open_loop=open_loop).pose
+        errors = evaluate(pose, simulation.truth())
+        for name, error in errors.position.items():
+            assert error.worst < 1.0, name
+        for name, attitude in errors.attitude.items():
+            assert attitude.total_rmse < most_deg, name
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -95,10 +98,11 @@ def test_diagnostics_of_later_chunks_are_listed_once_and_not_without_end(simulat
     recording = simulation.recording()
     cut = [Diagnostic("signal-saturated", WARNING, "torso", 0.01 * k) for k in range(30)]
     accumulator = SummaryAccumulator()
-    tracker = Tracker()
+    tracker, done = Tracker(), []
     for k, chunk in enumerate(recording.chunks(2.0)):
-        for tracked in tracker.push(replace(chunk, diagnostics=(cut[0], cut[min(k, 14)]))):
-            accumulator.add(tracked)
+        done += tracker.push(replace(chunk, diagnostics=(cut[0], cut[min(k, 14)])))
+    for tracked in [*done, *tracker.finish()]:
+        accumulator.add(tracked)
     found = accumulator.diagnostics()
     assert list(found[:12]) == [cut[0], *cut[:11]]
     assert (found[12].code, found[12].value) == ("diagnostics-omitted", 4)
