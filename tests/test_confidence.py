@@ -12,6 +12,7 @@ import pytest
 from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.calibration import calibrate_lengths
 from wepose_pin.cli import main
 from wepose_pin.kinematics import build_pose_table, compute_axis_std, compute_point_covariances, compute_pose
 from wepose_pin.model import load_model
@@ -93,19 +94,19 @@ def test_the_whole_chain_is_honest() -> None:
 
     The priors are those of real people and sensors: of a careful one (rigid shoulders, less soft tissue) they say more.
     """
-    from wepose_pin.calibration import calibrate
-
     hand, segments = [], []
     for seed in range(5):
         person = simulate_person(200 + seed, PEOPLE_MEASURED_STD)
         simulation = simulate(person.lengths, seed=seed, imperfections=PEOPLE_PRESET)
         recording = simulation.recording()
-        known = {"measured": person.measured, "measured_std": PEOPLE_MEASURED_STD, "prior": person.prior}
-        pose = track(recording, calibrate(recording, **known)).pose
+        found = calibrate_lengths(
+            recording, measured=person.measured, measured_std=PEOPLE_MEASURED_STD, prior=person.prior
+        )
+        pose = track(recording, found.subject).pose
         during = recording.span(simulation.phases["circles"][0])
         for name in simulation.quat_WL:
-            true, found = (Rotation.from_quat(p.quat_WL[name][during]) for p in (simulation.truth(), pose))
-            turn = (true * found.inv()).as_rotvec()
+            true, tracked = (Rotation.from_quat(p.quat_WL[name][during]) for p in (simulation.truth(), pose))
+            turn = (true * tracked.inv()).as_rotvec()
             segments.append(np.einsum("ni,nij,nj->n", turn, np.linalg.inv(pose.segment_cov[name][during]), turn).mean())
         error = (simulation.points["right_palm"] - pose.points["right_palm"])[during]
         hand.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(pose.point_cov["right_palm"][during]), error).mean())

@@ -138,7 +138,7 @@ def _rigid(result: Result) -> dict[tuple[str, str], float]:
 
 
 def _shoulders(result: Result) -> dict[str, np.ndarray]:
-    """Shoulder → where it is (n, 3) [m] by the law that urdf/upper_body.toml states, and what the subject differs by."""
+    """Shoulder → where it is (n, 3) [m] by the law of urdf/upper_body.toml, and what the subject differs by."""
     wanted = {}
     for side, sign in zip(("left", "right"), (1.0, -1.0), strict=True):
         point, arm = f"{side}_shoulder", f"{side}_upper_arm"
