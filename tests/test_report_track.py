@@ -46,6 +46,7 @@ SECTIONS = [
     "Noise and bias",
     "Drift of the headings",
     "The hands",
+    "What the ± of the points is made of",
     "Joint angles",
     "The motion in 3D",
     "What was run",

@@ -121,11 +121,11 @@ class Budget(NamedTuple):
 
 
 def compute_heading_uncertainties(tracked: TrackedRecording) -> dict[str, Budget]:
-    """Segment → its budget, from the covariances; none where the filter has none."""
+    """Segment → its budget, from the covariances; none where there is no filter, or it has none."""
     budgets = {}
     for name, cov_W in tracked.pose.segment_cov.items():
-        orientation = tracked.segments.orientation[name]
-        if orientation.attitude_cov is None:
+        orientation = tracked.segments.orientation.get(name)
+        if orientation is None or orientation.attitude_cov is None:
             continue
         ends = np.array([0, -1])
         up_S = Rotation.from_quat(orientation.quat_WS[ends]).inv().apply([0.0, 0.0, 1.0])

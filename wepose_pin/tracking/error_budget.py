@@ -34,6 +34,8 @@ class ErrorBudget:
         rows = np.arange(-self._received % stride, len(tracked.time), stride)
         self._received += len(tracked.time)
         pose, body = tracked.pose, tracked.model
+        for known in (*pose.quat_WL.values(), *pose.segment_cov.values()):
+            rows = rows[np.isfinite(known[rows]).reshape(len(rows), -1).all(axis=1)]
         if body.table.is_mechanism or not pose.point_cov or not len(rows):
             return
         quat_WL = {name: quat[rows] for name, quat in pose.quat_WL.items()}

@@ -466,6 +466,8 @@ class ClaspDetector:
         k, rate = len(names), problem.samples_per_knot / problem.knot_s
         quats = np.concatenate([each.quat_WL for each in self._recent])
         time = np.concatenate([each.time for each in self._recent])
+        if len(time) < 2:
+            return []
         R = {
             name: Rotation.from_rotvec(state.x[i] * E_Z) * Rotation.from_quat(quats[:, i])
             for i, name in enumerate(names)
