@@ -41,12 +41,13 @@ from wepose_pin.subject import Hinge, Subject, population_subject
 from wepose_pin.tracking import TrackedRecording, TrackOptions, track
 from wepose_pin.writers import write_session
 
+BUDGET = "What the ± of the points is made of"
 SECTIONS = [
     "What was recorded",
     "Noise and bias",
     "Drift of the headings",
     "The hands",
-    "What the ± of the points is made of",
+    BUDGET,
     "Joint angles",
     "The motion in 3D",
     "What was run",
@@ -168,7 +169,7 @@ def test_it_does_not_grow_with_the_recording() -> None:
 
 def test_without_a_covariance_it_says_so(simulation: Simulation) -> None:
     page = render_track_report(track(simulation.recording("ncf"), method="ncf"))
-    assert headings(page) == SECTIONS
+    assert headings(page) == [name for name in SECTIONS if name != BUDGET]
     assert "The filter ncf has no covariance: the uncertainty of the headings is not known" in text_of(page)
     assert "± nan" not in page
 
@@ -195,7 +196,7 @@ def test_a_torso_alone_has_no_hands(simulation: Simulation) -> None:
     head = render_track_report(
         track(replace(recording, sensors={"head": recording.sensors["torso"]}, phases={"start": ((0.5, 4.5),)}))
     )
-    assert headings(head) == [name for name in SECTIONS if name not in ("The hands", "Joint angles")]
+    assert headings(head) == [name for name in SECTIONS if name not in ("The hands", "Joint angles", BUDGET)]
 
 
 # What it warns of -----------------------------------------------------------------------------------------------------
@@ -270,11 +271,14 @@ def test_a_late_start_pose(pose: TrackedRecording) -> None:
 
 
 def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
-    wide = with_pose(pose, segment_cov={name: 100.0 * cov for name, cov in pose.pose.segment_cov.items()})
+    drifting = {
+        name: of._replace(attitude_cov=100.0 * of.attitude_cov) for name, of in pose.segments.orientation.items()
+    }
+    wide = replace(pose, correction=None, segments=replace(pose.segments, orientation=drifting))
     uncertain = [d for d in looked_at(wide) if d.code == "heading-uncertain"]
     assert {d.place for d in uncertain} == {"left_shoulder", "left_elbow", "right_shoulder", "right_elbow"}
     assert {d.severity for d in uncertain} == {WARNING}
-    assert "calibrate the person" in render(uncertain[0]).do
+    assert "correct their headings as the joint between them moves" in render(uncertain[0]).do
     assert [d.value for d in uncertain] == sorted((d.value for d in uncertain), reverse=True)  # type: ignore[type-var]
     assert len(compute_joint_heading_stds(compute_heading_uncertainties(wide), wide.model)) == 4
     assert the("method-needs-static", replace(wide, options=TrackOptions("smekf"))).severity == WARNING
@@ -372,14 +376,17 @@ def test_the_elbows_uncertainty_against_draws() -> None:
 
 
 def test_heading_budgets_are_those_of_the_covariance(pose: TrackedRecording) -> None:
-    for name, budget in compute_heading_uncertainties(pose).items():
+    for name, budget in compute_heading_uncertainties(replace(pose, correction=None)).items():
         of = pose.segments.orientation[name]
         assert of.attitude_cov is not None
         R = Rotation.from_quat(of.quat_WS).as_matrix()
         cov = R @ of.attitude_cov @ R.swapaxes(1, 2)
         std = np.sqrt(cov[:, 2, 2])
         assert budget.filter_end == pytest.approx(std[-1], rel=1e-9)
-        np.testing.assert_allclose(budget.std, std, rtol=1e-6)  # a stated mount adds nothing to the heading
+        np.testing.assert_allclose(budget.drift, std, rtol=1e-6)
+        np.testing.assert_allclose(budget.std, np.sqrt(pose.pose.segment_cov[name][:, 2, 2]), rtol=1e-12)
+        held = compute_heading_uncertainties(pose)[name].drift  # by the other sensors
+        assert np.all(held <= budget.drift)
         minutes = np.count_nonzero(~of.static) / pose.recording.rate_hz / 60.0
         assert budget.growth * minutes == pytest.approx(std[-1] - std[0], rel=1e-6)
 

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from test_bad_input import refused
 
 from wepose_pin import estimate_orientation, load_session, rotations
-from wepose_pin.alignment import START_POSE_STD
 from wepose_pin.diagnostics import Diagnostic, render
 from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.filters.noise import find_static_window
@@ -69,9 +68,7 @@ def off_by(recording: Recording, made: Simulation, method: str) -> np.ndarray:
     """Angle to the truth of the broken sensor's segment over its standard deviation, for each sample."""
     pose, truth = track(recording, method=method).pose, made.truth()
     off = Rotation.from_quat(truth.quat_WL[BROKEN]).inv() * Rotation.from_quat(pose.quat_WL[BROKEN])
-    # A stated mount counts as exact, and the start pose is held to some degrees.
-    std = np.sqrt(np.linalg.eigvalsh(pose.segment_cov[BROKEN])[:, -1])
-    return off.magnitude() / np.hypot(std, START_POSE_STD)
+    return off.magnitude() / np.sqrt(np.linalg.eigvalsh(pose.segment_cov[BROKEN])[:, -1])
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..alignment import compute_heading_variance
 from ..kinematics import Pose, compute_axis_std
 from ..model import BodyModel, BodyTable, HingeJoint
 from ..recording import OrientationSensor, Recording
@@ -115,7 +116,8 @@ class Measures:
 class Budget(NamedTuple):
     """The uncertainty of a segment's heading, one standard deviation [rad]."""
 
-    std: np.ndarray  # (n,) with the start pose and the heading correction
+    std: np.ndarray  # (n,) with start pose, soft tissue and the heading correction
+    drift: np.ndarray  # (n,) of the filter alone; with a heading correction at most what that leaves
     filter_end: float  # of the filter alone, at the end
     growth: float  # of the filter's, a minute of motion; NaN where it was never in motion
 
@@ -127,26 +129,33 @@ def compute_heading_uncertainties(tracked: TrackedRecording) -> dict[str, Budget
         orientation = tracked.segments.orientation.get(name)
         if orientation is None or orientation.attitude_cov is None:
             continue
-        ends = np.array([0, -1])
-        up_S = Rotation.from_quat(orientation.quat_WS[ends]).inv().apply([0.0, 0.0, 1.0])
-        variance = np.einsum("na,nab,nb->n", up_S, orientation.attitude_cov[ends], up_S)
-        first, last = np.sqrt(np.maximum(variance, 0.0))
+        drift = np.sqrt(np.maximum(compute_heading_variance(orientation.quat_WS, orientation.attitude_cov), 0.0))
+        first, last = float(drift[0]), float(drift[-1])
         minutes = float(np.count_nonzero(~orientation.static)) / tracked.recording.rate_hz / 60.0
-        growth = max(float(last - first), 0.0) / minutes if minutes > 0.0 else float("nan")
-        budgets[name] = Budget(np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), float(last), growth)
+        growth = max(last - first, 0.0) / minutes if minutes > 0.0 else float("nan")
+        correction = tracked.correction
+        if correction is not None and correction.covariance is not None and name in correction.segments:
+            assert correction.time is not None  # it is that of the covariances
+            i = correction.segments.index(name)
+            drift = np.minimum(drift, np.sqrt(np.interp(tracked.time, correction.time, correction.covariance[:, i, i])))
+        budgets[name] = Budget(np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), drift, last, growth)
     return budgets
 
 
-def compute_joint_heading_stds(budgets: Mapping[str, Budget], model: BodyModel) -> dict[str, np.ndarray]:
+def compute_joint_heading_stds(
+    budgets: Mapping[str, Budget], model: BodyModel, part: Literal["std", "drift"] = "std"
+) -> dict[str, np.ndarray]:
     """Joint → (n,) [rad], one standard deviation of the heading between its segments, as if they were independent.
 
-    From the body outwards: all of a limb before the next.
+    From the body outwards: all of a limb before the next. `part` "drift": without start pose and soft tissue.
     """
     stds = {}
     for segment in _list_outwards(model.parents, None):
         above = model.parents[segment]
         if above is not None and {above, segment} <= set(budgets):
-            stds[model.table.joint_name(segment)] = np.hypot(budgets[above].std, budgets[segment].std)
+            stds[model.table.joint_name(segment)] = np.hypot(
+                getattr(budgets[above], part), getattr(budgets[segment], part)
+            )
     return stds
 
 

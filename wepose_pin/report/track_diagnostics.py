@@ -32,7 +32,7 @@ LITTLE_STATIC, LONG_MOTION_S = 0.02, 120.0
 LATE_START_S = 10.0
 LOST = 0.01  # share of samples
 JITTER = 0.2  # of a step, one standard deviation
-HEADING = np.deg2rad(10.0)  # one standard deviation, between the segments of a joint
+HEADING = np.deg2rad(10.0)  # one standard deviation of the drift between the segments of a joint
 PLACE = 0.1  # [m], one standard deviation of a tip: what 10 deg of heading do at the end of an arm
 TURNED = np.deg2rad(10.0)  # by which hinges and joined hands corrected a heading
 # Beyond the range of a hinge while it extends, and before its end while it flexes, where flesh meets flesh. Of an elbow
@@ -121,11 +121,11 @@ def _diagnose_method(
 
 
 def _find_uncertain_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, float]:
-    """Joint → uncertainty [rad] of the heading between its segments, of those beyond the limit."""
+    """Joint → uncertainty [rad] of the heading between its segments by drift, of those beyond the limit."""
     since = find_samples_after_start(tracked)
     return {
         joint: most
-        for joint, std in compute_joint_heading_stds(budgets, tracked.model).items()
+        for joint, std in compute_joint_heading_stds(budgets, tracked.model, "drift").items()
         if (most := finite_max(std[since])) > HEADING
     }
 
@@ -149,7 +149,7 @@ def _diagnose_time_before_start(
         wide = [std[before & (std > max(limit, finite_max(std[since])))] for std in stds]
         return max((finite_max(std) for std in wide if len(std) / rate_hz > LASTING_S), default=0.0)
 
-    heading = widest(list(compute_joint_heading_stds(budgets, tracked.model).values()), HEADING)
+    heading = widest(list(compute_joint_heading_stds(budgets, tracked.model, "drift").values()), HEADING)
     if heading:
         yield Diagnostic("heading-uncertain-before-start", INFO, "", heading, HEADING, facts)
     position = widest([tip.std for tip in tips.values() if tip.std is not None], PLACE)

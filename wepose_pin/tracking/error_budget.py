@@ -35,7 +35,7 @@ class ErrorBudget:
         self._received += len(tracked.time)
         pose, body = tracked.pose, tracked.model
         for known in (*pose.quat_WL.values(), *pose.segment_cov.values()):
-            rows = rows[np.isfinite(known[rows]).reshape(len(rows), -1).all(axis=1)]
+            rows = rows[np.isfinite(known[rows].sum(axis=tuple(range(1, known.ndim))))]
         if body.table.is_mechanism or not pose.point_cov or not len(rows):
             return
         quat_WL = {name: quat[rows] for name, quat in pose.quat_WL.items()}
