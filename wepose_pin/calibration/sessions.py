@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from ..model import BodyTable
@@ -20,6 +19,7 @@ from ..subject import Subject, girdle_rows
 
 # Share of a calibration's variance that recurs: on simulated people nearly all of it does.
 RECURRING = 0.9
+SHARES = np.linspace(0.0, 1.0, 21).tolist()  # of the earlier one, of which the best is taken
 LEAST_STD = 1e-6  # [m] keeps covariances of what is known exactly invertible
 
 
@@ -42,7 +42,7 @@ def fuse_subjects(earlier: Subject, new: Subject, population: Subject, table: Bo
     def spread(share: float) -> float:
         return float(np.trace(intersect(share)[: len(lengths), : len(lengths)]))
 
-    share = float(minimize_scalar(spread, bounds=(0.0, 1.0), method="bounded").x)
+    share = min(SHARES, key=spread)
     C = intersect(share)
     x = C @ (share * K1 @ x1 + (1.0 - share) * K2 @ x2)
     # If nothing recurred: what the new one adds to its prior, which counts once.

@@ -1,6 +1,6 @@
-"""Butterworth filters of second order, run forwards and backwards over a signal, so that nothing is delayed.
+"""Butterworth filters of second order, forwards and backwards over a signal, so that nothing is delayed, or as it comes.
 
-The same as `butter` and `sosfiltfilt` of SciPy, whose `scipy.signal` takes half a second to load.
+The same as `butter`, `sosfiltfilt` and `sosfilt` of SciPy, whose `scipy.signal` takes half a second to load.
 """
 
 from __future__ import annotations
@@ -100,3 +100,31 @@ def _filter(sections: np.ndarray, settled: np.ndarray, signals: np.ndarray) -> N
                 one = b1 * x - a1 * y + two
                 two = b2 * x - a2 * y
                 signal[i] = y
+
+
+class BandPass:
+    """A band-pass filter of signals that come in chunks, from the state settled at `first` (c,)."""
+
+    def __init__(self, band_hz: tuple[float, float], rate_hz: float, first: np.ndarray) -> None:
+        self._sections = _design_band_pass(band_hz, rate_hz)
+        self._state = _find_settled_state(self._sections)[:, None] * first[:, None]  # (k, c, 2)
+
+    def push(self, values: np.ndarray) -> np.ndarray:
+        """Return the filtered chunk (n, c)."""
+        signals = np.array(values, dtype=float)
+        _filter_on(self._sections, self._state, signals)
+        return signals
+
+
+@kernel
+def _filter_on(sections: np.ndarray, state: np.ndarray, signals: np.ndarray) -> None:
+    """Filter signals (n, c) in place and keep the state (k, c, 2); direct form II transposed."""
+    for k in range(len(sections)):
+        b0, b1, b2, _, a1, a2 = sections[k]
+        for i in range(signals.shape[0]):
+            for c in range(signals.shape[1]):
+                x = signals[i, c]
+                y = b0 * x + state[k, c, 0]
+                state[k, c, 0] = b1 * x - a1 * y + state[k, c, 1]
+                state[k, c, 1] = b2 * x - a2 * y
+                signals[i, c] = y

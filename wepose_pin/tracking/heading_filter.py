@@ -265,6 +265,7 @@ class HeadingFilter:
         self._decay, self._steady = decay, (1.0 - decay**2) * std**2
         self._misfit = np.full(len(problem.pairs), noise.acceleration_std**2)  # [m²/s⁴] recent mean of each axis
         self._last_var: np.ndarray | None = None
+        self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
         self._usual_gain = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, largest of late
         self._clasps = ClaspDetector(problem)
         self.clasps: list[tuple[float, float]] = []  # [s] when points were found to coincide
@@ -326,7 +327,10 @@ class HeadingFilter:
             x = self._fuse(x, information, vector)
         self.x = x
         self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + P @ information, P))
-        for rows in self._clasps.find(knot, self):
+        found = self._clasps.find(knot, self)
+        unsure = knot.lost | self._lost_before
+        self._lost_before = knot.lost
+        for rows in () if unsure.any() else found:
             k = len(self.problem.names)
             information, vector = np.zeros_like(P), np.zeros(len(x))
             information[:k, :k] = rows.H.T @ (rows.weight[:, None] * rows.H)
@@ -377,7 +381,11 @@ class HeadingFilter:
         k, noise = len(problem.names), problem.noise
         rate = problem.samples_per_knot / problem.knot_s
         R = self.correct(knot, x)
+        # While a sensor is lost, and while its tilt comes back, its segment is where nobody knows.
+        unsure = knot.lost | self._lost_before
         for i, hinge in enumerate(problem.hinges):
+            if unsure[hinge.on] or unsure[hinge.moves]:
+                continue
             self._add_range(R, hinge, information, vector)
             columns = [hinge.moves, hinge.on] + [problem.column(part, i) for part in ("axis", "twist", "tilt")]
             r, H = linearize_hinge(R[hinge.on], R[hinge.moves], hinge)
@@ -389,7 +397,8 @@ class HeadingFilter:
         named = dict(zip(problem.names, R, strict=True))
         for closure in problem.closures:
             closed = closure.holds(knot.time)
-            if closed.any():
+            used = [problem.names.index(part.sensor) for part in closure.gap.parts if part.sensor in problem.names]
+            if closed.any() and not unsure[used].any():
                 rows = build_gap_rows(named, problem.model, problem.subject, closure, closed)
                 weight = rows.weight / max(1.0, noise.closure_correlation_s * rate)
                 information[:k, :k] += rows.H.T @ (weight[:, None] * rows.H)

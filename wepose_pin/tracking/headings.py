@@ -318,10 +318,11 @@ class HeadingCorrector:
                 with_heading, filter_var = filter_cov
                 variance = np.interp(chunk.time, self._knot_times, self._cov[:, i, i])
                 variance = self._problem.find_segment_variance(i, variance)
-                start = compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
-                covariance[name] = replace_heading_variance(
-                    covariance[name], with_heading, filter_var + start, variance
-                )
+                before = filter_var + compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
+                gap = chunk.sensors[name].gap
+                if gap is not None:  # where the sensor is lost, neighbours do not tell where its segment is
+                    variance = np.where(gap, np.maximum(variance, before), variance)
+                covariance[name] = replace_heading_variance(covariance[name], with_heading, before, variance)
         result = replace(orientations, quat_WL=corrected, covariance_W=covariance)
         stride = find_stride(chunk.rate_hz)
         rows = np.arange(-self._corrected_samples % stride, len(chunk), stride)

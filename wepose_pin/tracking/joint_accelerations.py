@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.spatial.transform import Rotation
 
+from ..filters.butterworth import BandPass
 from ..kinematics import find_carrier
 from ..model import BodyModel
 
@@ -146,8 +146,7 @@ class JointAccelerationFilter:
         self._columns = [(names.index(pair.near), names.index(pair.far)) for pair in pairs]
         self._used = sorted({i for columns in self._columns for i in columns})
         self._rate_hz = rate_hz
-        self._band = butter(2, BAND_HZ, "band", fs=rate_hz, output="sos") if pairs else np.zeros((0, 6))
-        self._state: np.ndarray | None = None  # of the filter
+        self._band: BandPass | None = None
         self._last: np.ndarray | None = None  # (3, k, 3, 4) the last three samples: force, rotation
         self._force = np.zeros((len(names), 3))  # last valid one
 
@@ -170,16 +169,15 @@ class JointAccelerationFilter:
             force[:, i] = filled[last][1:]
         self._force[used] = force[-1]
         signal = np.concatenate([force[..., None], R_WS[:, used]], axis=3)  # (n, used, 3, 4)
-        if self._last is None:
+        if self._last is None or self._band is None:
             self._last = np.repeat(signal[:1], 2, axis=0)
             steady = np.concatenate([signal[0, ..., :1], np.zeros((len(used), 3, 3))], axis=2)
-            self._state = sosfilt_zi(self._band)[..., None] * steady.ravel()
+            self._band = BandPass(BAND_HZ, self._rate_hz, steady.ravel())
         long = np.concatenate([self._last, signal])
         self._last = long[-2:]
         second = self._rate_hz**2 * (long[2:, ..., 1:] - 2.0 * long[1:-1, ..., 1:] + long[:-2, ..., 1:])
         sides = np.concatenate([long[1:-1, ..., :1], -second], axis=3)  # B, one sample late
-        flat, self._state = sosfilt(self._band, sides.reshape(len(sides), -1), axis=0, zi=self._state)
-        B = flat.reshape(sides.shape)[rows]
+        B = self._band.push(sides.reshape(len(sides), -1)).reshape(sides.shape)[rows]
         return tuple(
             None
             if lost[:, used.index(near)].any() or lost[:, used.index(far)].any()
