@@ -145,8 +145,9 @@ def test_the_page_claims_no_more_than_the_figures(document: Document) -> None:
     assert "is larger than that" not in text_of(document)
     better = document._replace(results=[dynamic("smekf", 1.0, 1.0, 1.0)])
     assert "None of the 3 mean errors" in text_of(better)
-    shortened = text_of(document._replace(quick=False, planned={"dynamic 100 Hz": 12, "BROAD": 2}))
-    assert "A shortened run (`--trials`), with fewer trials than a full one has: dynamic 100 Hz 2 of 12." in shortened
+    shortened = text_of(document._replace(quick=False, planned={"dynamic 100 Hz": 12, "BROAD": 2, "drift": 10}))
+    assert "A shortened run (`--trials`, `--experiment`), with fewer trials than a full one has" in shortened
+    assert ": dynamic 100 Hz 2 of 12; drift 0 of 10.**" in shortened
     assert "2 of 12 trials" in shortened
     assert "was not checked on a cohort" in " ".join(text_of(document).split()).replace("It was not", "was not")
 

@@ -70,6 +70,7 @@ def render_markdown(document: Document, drawn: list[tuple[str, Picture]]) -> str
             "note": describe_table(own_rows),
             "pictures": [picture for experiment, picture in drawn if experiment == name],
         }
+    shortened += [f"{name} 0 of {number}" for name, number in document.planned.items() if name not in experiments]
     text = load_template(TEMPLATE).render(
         title=TITLE,
         folder=FOLDER,

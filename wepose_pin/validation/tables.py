@@ -366,7 +366,7 @@ def describe_known(experiment: str, presets: Mapping[str, Mapping[str, Any]]) ->
         "RING, link lengths": f"the optical path of the tip, to which the lengths are fitted; {ten}, as is the bias",
         "RING": f"{ten}" + (", as is the gyroscope's bias" if "bias unknown" not in experiment else "; no bias"),
         "UR5": f"{ten}; noise, gyroscope bias and tilt, from the 0.6 to 4 s before the motion",
-        "gains": "the truth of the trials on which the gains are searched, which are scored nowhere else",
+        "gains": "the truth of the trials on which the gains are searched, which are not scored with them",
     }.items():
         if experiment.startswith(name):
             return f"{text}."
