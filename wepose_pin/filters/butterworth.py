@@ -1,4 +1,4 @@
-"""Butterworth filters of second order, forwards and backwards over a signal, so that nothing is delayed, or as it comes.
+"""Butterworth filters of second order: forwards and backwards, so that nothing is delayed, or as samples come.
 
 The same as `butter`, `sosfiltfilt` and `sosfilt` of SciPy, whose `scipy.signal` takes half a second to load.
 """
