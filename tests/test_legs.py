@@ -194,7 +194,8 @@ def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, mo
     assert (
         run("simulate", "-o", made, "--seed", "5", "--activity", activity, "--preset", preset, "--rate-hz", "60") == 0
     )
-    assert run("track", made, "--model", "whole_body", "--no-view", "--no-report", "-o", result) == 0
+    # Open loop: what neighbours tell of headings has an error of its own, of half a degree and more.
+    assert run("track", made, "--model", "whole_body", "--open-loop", "--no-view", "--no-report", "-o", result) == 0
     assert run("evaluate", result, made) == 0
     errors = run_evaluate(EvaluateJob(result, made))
     for joint in LEG_JOINTS:

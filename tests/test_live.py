@@ -27,7 +27,7 @@ from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import mount_rows, parse_subject, population_subject
-from wepose_pin.tracking import track
+from wepose_pin.tracking import TrackedRecording, track
 from wepose_pin.writers.live_log import LiveLog
 
 
@@ -232,6 +232,17 @@ def test_shoulders_move_live_as_in_a_recording(segments: tuple[str, ...]) -> Non
         np.testing.assert_allclose(points[:, i], whole.points[name], rtol=0, atol=1e-13)
 
 
+def is_told_by_a_neighbour(found: np.ndarray, clean: TrackedRecording, name: str) -> bool:
+    """Whether orientations (n, 4) have the tilt of the clean ones, and a heading within three of its deviations.
+
+    Neighbours tell each other their headings, so a hurt one tells the others less.
+    """
+    R, R_clean = Rotation.from_quat(found), Rotation.from_quat(clean.quat_WL[name][: len(found)])
+    up, up_clean = (each.inv().apply([0.0, 0.0, 1.0]) for each in (R, R_clean))
+    std = np.sqrt(clean.pose.segment_cov[name][: len(found), 2, 2])
+    return bool(np.abs(up - up_clean).max() < 1e-9 and np.all((R * R_clean.inv()).magnitude() < 3.0 * std))
+
+
 def chaos(recording: Recording, seed: int, hurt: str) -> tuple[list[tuple[float, Samples]], int]:
     """Arrivals in which one sensor loses, delays, repeats, corrupts samples and dies for four seconds; and how many."""
     rng = np.random.default_rng(seed)
@@ -269,7 +280,7 @@ def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recordin
     for i, name in enumerate(recording.sensors):
         assert np.array_equal(found.quat_WL[:, i], again.quat_WL[name])  # the file decides it all
         if name != hurt:
-            assert np.array_equal(found.quat_WL[:, i], clean.quat_WL[name][:n])
+            assert is_told_by_a_neighbour(found.quat_WL[:, i], clean, name)
     i = list(recording.sensors).index(hurt)
     off = (Rotation.from_quat(clean.quat_WL[hurt][:n]).inv() * Rotation.from_quat(found.quat_WL[:, i])).magnitude()
     assert np.degrees(off[: 1150 - found.first].max()) < 8.0  # a tenth of the samples lost, some for 50 ms and more
@@ -324,7 +335,7 @@ def test_a_sensor_that_freezes_is_lost_and_said_to_be(
     for k, name in enumerate(recording.sensors):
         assert np.array_equal(found.quat_WL[:, k], again.quat_WL[name])
         if name != hurt:
-            assert np.array_equal(found.quat_WL[:, k], whole.quat_WL[name][: len(found.quat_WL)])
+            assert is_told_by_a_neighbour(found.quat_WL[:, k], whole, name)
     off = Rotation.from_quat(whole.quat_WL[hurt]).inv() * Rotation.from_quat(again.quat_WL[hurt])
     since = begin - found.first
     turned = np.degrees(off[since : since + end - begin].magnitude())

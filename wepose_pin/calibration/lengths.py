@@ -88,8 +88,8 @@ def calibrate_lengths(
     Parameters
     ----------
     measured : measured lengths, and distances that the protocol names, name → [m]; without one the scale is the prior's
-    prior : lengths before, with covariance; None: `population_subject`. That of an earlier calibration, which has
-        mounts, is fused with the result (`sessions`)
+    prior : lengths before, with covariance, and mounts; None: `population_subject`. The subject of an earlier
+        calibration is fused with the result (`sessions`)
     model : the body; None: that which the recording states, else the upper body
     protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave
     method : the orientation filter
@@ -134,7 +134,7 @@ def calibrate_lengths(
     for condition in protocol.conditions:
         recording.phase(condition.phase)
     filtered = filter_recording(recording, method=method, sways=not table.is_mechanism)
-    earlier = prior if prior.mounts and formulation == "full" else None
+    earlier = prior if prior.start_pose_offset and formulation == "full" else None
     if earlier is not None:
         prior = separate_mounts(earlier, population_subject(body=model))
     problem = CalibrationProblem(recording, filtered, protocol, prior, with_std, model)
