@@ -382,8 +382,9 @@ def as_segments(recording: Recording) -> Recording:
 
 def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Path) -> None:
     recording, q = made(urdf, LINKS_WITH_SENSORS, 12.0)
-    tracked = track(replace(as_segments(recording), model=str(table)))
-    bare = track(recording, model=urdf)
+    # Open loop: a table may name points between which sensors sit, which tell of headings.
+    tracked = track(replace(as_segments(recording), model=str(table)), open_loop=True)
+    bare = track(recording, model=urdf, open_loop=True)
     for name, values in bare.joints.items():
         np.testing.assert_allclose(tracked.joints[name], values, atol=1e-9)
     model, body = load_model(table), load(urdf).pin

@@ -58,7 +58,7 @@ def test_a_loss_before_the_hands_are_joined_needs_the_mount(simulation: Simulati
     with pytest.raises(BadPhase, match=r"left_upper_arm is lost from .* and its heading with it: .* state its mount"):
         calibrate_lengths(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",)))
     found = calibrate_lengths(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",), stated=True))
-    assert found.rms_gap < 0.003
+    assert found.rms_gap < 0.004  # arms that hang exactly contradict how people stand
     assert worst_mount(found, simulation) < 4.0
 
 

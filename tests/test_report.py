@@ -83,7 +83,7 @@ def test_the_quality_with_its_checks(made: Made) -> None:
     assert "Behind the quality" in headings(page)
     for diagnostic in quality.reasons:
         assert render(diagnostic).what in unescape(page)
-    assert "<td>up to 10 mm</td><td>up to 20 mm</td>" in page  # limits of the lengths
+    assert "<td>up to 12 mm</td><td>up to 20 mm</td>" in page  # limits of the lengths
     assert " rad<" not in page
 
 

@@ -368,7 +368,7 @@ def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
 
 def test_uncertain_hands_weigh_less_and_slow_the_robot(arm) -> None:
     pose = person(4.0)
-    std = np.where((pose.time > 1.5) & (pose.time < 2.5), 0.2, 0.02)
+    std = np.where((pose.time > 1.5) & (pose.time < 2.5), 0.4, 0.04)
     unsure = replace(pose, point_cov={"right_palm": std[:, None, None] ** 2 * np.eye(3)})
     asked = compute_arm_targets(unsure, arm)
     assert asked.hands[0].weight[200] < 0.2

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..arguments import Count, Positive, check_arguments
 from ..errors import BadOption, one_of
 from ..kinematics import compute_link_poses, solve_configuration
 from ..model import BodyModel, load_model
+from ..model.girdle import PARAMETERS
 from .arm_tasks import ArmTasks
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
@@ -317,6 +319,9 @@ def simulate_activity(
         raise BadOption(f"activity {activity!r} is not known; {one_of(ACTIVITIES, activity)}")
     rngs = spawn_streams(seed)
     model = load_model(ACTIVITIES[activity].body, lengths)
+    # Shoulders that do not move: those of people that do are placed by `girdle`, not by the law that is tracked with.
+    rigid = -np.eye(len(PARAMETERS))[PARAMETERS.index("law")]
+    model = replace(model, girdles=dict.fromkeys(model.table.girdles, rigid))
     flaws = Flaws(imperfections, rngs, model.lengths["shoulder_width"])
     motion = ACTIVITIES[activity](model, rngs["motion"], seconds, flaws)
     return measure_motion(motion, rngs, rate_hz, noise, imperfections)

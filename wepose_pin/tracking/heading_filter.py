@@ -328,7 +328,7 @@ class HeadingFilter:
         self.x = x
         self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + P @ information, P))
         found = self._clasps.find(knot, self)
-        unsure = knot.lost | self._lost_before
+        unsure = self._find_unsure(knot)
         self._lost_before = knot.lost
         for rows in () if unsure.any() else found:
             k = len(self.problem.names)
@@ -341,6 +341,10 @@ class HeadingFilter:
             if self.clasps and begin - self.clasps[-1][1] < 1.5 * self.problem.knot_s:
                 begin = self.clasps.pop()[0]
             self.clasps.append((begin, knot.end))
+
+    def _find_unsure(self, knot: Knot) -> np.ndarray:
+        """Find (k,) bool the sensors that are lost or were in the last knot; measured orientations are not filtered."""
+        return (knot.lost | self._lost_before) & np.isfinite(knot.heading_var)
 
     def _fuse(self, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """Minimize (y − before)ᵀ P⁻¹ (y − before) + (y − x)ᵀ Λ (y − x) + 2 vectorᵀ (y − x) over y."""
@@ -382,7 +386,7 @@ class HeadingFilter:
         rate = problem.samples_per_knot / problem.knot_s
         R = self.correct(knot, x)
         # While a sensor is lost, and while its tilt comes back, its segment is where nobody knows.
-        unsure = knot.lost | self._lost_before
+        unsure = self._find_unsure(knot)
         for i, hinge in enumerate(problem.hinges):
             if unsure[hinge.on] or unsure[hinge.moves]:
                 continue

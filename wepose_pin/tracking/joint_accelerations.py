@@ -122,7 +122,9 @@ def _find_joints(model: BodyModel, segment: str, placement: Mapping[str, pin.SE3
     if segment in _spine(model) and ends:
         return np.array(ends)  # at the height of the shoulders, or of the hips
     if not ends:
-        reached = [point for point, links in model.reaches.items() if segment in links]
+        at = model.pin.frames[model.pin.getFrameId(segment)].parentJoint
+        frames = {point: model.pin.frames[model.pin.getFrameId(link)] for point, link in model.point_frames.items()}
+        reached = [point for point, frame in frames.items() if at in model.pin.supports[frame.parentJoint]]
         ends = [sum_reach(model, point) for point in reached]
     return np.array([placement[segment].translation, *ends])
 
