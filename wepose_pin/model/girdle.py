@@ -28,8 +28,7 @@ MAX_ELEVATION = np.deg2rad(130.0)  # [rad] up to which the law holds; it stays t
 PARAMETERS = ("law", "rest_x", "rest_y", "rest_z", "raised_x", "raised_y", "raised_z")
 # s that stands for the limb's elevation where it has no sensor: arms at 50 ± 35° in mixed planes.
 MEAN_RAISED = 0.55
-_LEAST_SINE = 1e-9  # squared; keeps the slope finite at rest, where the law is exactly zero
-_ELEVATION_AT_REST = float(np.arctan2(np.sqrt(_LEAST_SINE), 1.0))
+_LEAST_SINE = 1e-9  # squared; keeps the slope finite at rest, where the law is below a micrometre
 # The functions of `displace` for numbers, some ten times as fast as NumPy's.
 SCALARS = SimpleNamespace(sqrt=math.sqrt, arctan2=math.atan2, fmin=min, exp=math.exp)
 
@@ -86,7 +85,7 @@ def displace(girdle: Girdle, along: Any, scale: Any, math: Any) -> tuple[tuple[A
     x, y, z = along
     outward = sum(part * axis for part, axis in zip(along, girdle.outward, strict=True) if axis)
     sine = math.sqrt(x * x + y * y + _LEAST_SINE)
-    e = math.fmin(math.arctan2(sine, -z) - _ELEVATION_AT_REST, MAX_ELEVATION)
+    e = math.fmin(math.arctan2(sine, -z), MAX_ELEVATION)
     s, cos_phi = e / (0.5 * np.pi), outward / sine
     up = (girdle.up[0] + girdle.up[1] * cos_phi) * s
     middle = (girdle.middle[0] + girdle.middle[1] * cos_phi) * s
