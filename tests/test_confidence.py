@@ -180,12 +180,17 @@ def test_the_command_prints_the_error_budget(tmp_path: Path, capsys: pytest.Capt
     simulation = simulate(simulate_person(1).lengths, seed=1, clasp_s=5.0, circles=1)
     write_session(tmp_path, simulation.recording())
     printed = {}
-    for name, switch in (("with", ["--error-budget"]), ("without", [])):
+    for name, switch in (
+        ("with", ["--error-budget"]),
+        ("without", []),
+        ("ncf", ["--error-budget", "--method", "ncf"]),
+    ):
         with pytest.raises(SystemExit) as stop:
             main(["track", str(tmp_path), "-o", str(tmp_path / name), *switch, "--no-view", "--no-report"])
         assert not stop.value.code
         printed[name] = capsys.readouterr().out
     assert "Error budget" not in printed["without"]
+    assert "the filter states no uncertainty" in printed["ncf"].replace("\n", " ")
     table = printed["with"].partition("Error budget")[2]
     summary = json.loads((tmp_path / "without" / "summary.json").read_text())["error_budget_mm"]
     assert set(summary) == set(simulation.points)

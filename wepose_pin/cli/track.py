@@ -74,9 +74,12 @@ def _print_error_budget(budget: Mapping[str, Mapping[str, float]]) -> None:
     from ..tracking.error_budget import group_by_source
 
     rows = {point: group_by_source(parts) for point, parts in budget.items()}
+    if not rows:
+        say("Error budget: none, since the filter states no uncertainty, or no point of a person is known")
+        return
     print_table(
         "Error budget: one standard deviation of an axis [mm], root mean square; by segment in summary.json",
-        ("point", *next(iter(rows.values()), ())),
+        ("point", *next(iter(rows.values()))),
         [(point, *(f"{value:.1f}" for value in row.values())) for point, row in rows.items()],
     )
 
