@@ -1,6 +1,6 @@
 """Calibrate a subject: the lengths of the arms from a minute with the hands held together.
 
-    python examples/calibrate_subject.py session.toml 0.385      # the measured shoulder width [m]
+    python examples/calibrate_subject.py session.toml 0.41      # the breadth over the acromions [m]
 
 Without arguments it makes a recording of its own, of a person whose lengths are known.
 """
@@ -10,14 +10,15 @@ import sys
 import wepose_pin as wp
 
 if len(sys.argv) == 2:
-    sys.exit("the measured shoulder width in metres is missing, as in: calibrate_subject.py session.toml 0.385")
+    sys.exit("the breadth over the acromions in metres is missing, as in: calibrate_subject.py session.toml 0.41")
 if len(sys.argv) > 2:
-    recording, width, true = wp.load_session(sys.argv[1]), float(sys.argv[2]), None
+    recording, measured, true = wp.load_session(sys.argv[1]), {"biacromial": float(sys.argv[2])}, None
 else:
     true = wp.population_subject(1.68, "f").lengths
-    recording, width = wp.simulate(true, seed=2, circles=0).recording(), true["shoulder_width"]
+    recording = wp.simulate(true, seed=2, circles=0).recording()
+    measured = {"shoulder_width": true["shoulder_width"]}
 
-subject = wp.calibrate(recording, measured={"shoulder_width": width})
+subject = wp.calibrate(recording, measured=measured)
 
 for name, length in subject.lengths.items():
     known = f"   true {1e3 * true[name]:6.1f}" if true else ""

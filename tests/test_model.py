@@ -17,7 +17,7 @@ from wepose_pin.assets import asset
 from wepose_pin.diagnostics import from_json, render
 from wepose_pin.errors import BadModel, BadOption, MissingFile
 from wepose_pin.kinematics import compute_link_poses, compute_pose
-from wepose_pin.model import BodyModel, load_model
+from wepose_pin.model import BodyModel, convert_breadths, load_model, load_table
 from wepose_pin.tracking import track
 
 OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"
@@ -139,7 +139,7 @@ def test_our_model_has_nine_spherical_joints_and_two_shoulders_that_slide() -> N
 
 
 def test_our_lengths_are_those_that_the_urdf_states() -> None:
-    stated = {"trunk": 0.518, "shoulder_width": 0.385, "upper_arm": 0.283, "forearm": 0.270, "hand": 0.068}
+    stated = {"trunk": 0.518, "shoulder_width": 0.344, "upper_arm": 0.283, "forearm": 0.270, "hand": 0.068}
     for name, length in load_model().lengths.items():
         assert length == pytest.approx(stated[name.removeprefix("left_").removeprefix("right_")], abs=1e-12)
 
@@ -821,3 +821,13 @@ def test_half_a_file_is_no_body(tmp_path: Path) -> None:
     (tmp_path / "half.urdf").write_bytes(text[: int(0.9 * len(text))])
     with pytest.raises(BadModel, match="is no complete XML file"):
         load_model(tmp_path / "half.urdf")
+
+
+def test_a_breadth_gives_the_length_between_joint_centres() -> None:
+    converted = convert_breadths({"biacromial": 0.4, "left_forearm": 0.27}, load_table(), 0.003)
+    assert converted["left_forearm"] == (0.27, 0.003)
+    metres, std = converted["shoulder_width"]
+    assert metres == pytest.approx(0.332)
+    assert std == pytest.approx(np.hypot(0.03 * 0.4, 0.83 * 0.003))
+    with pytest.raises(BadOption, match="one follows from the other"):
+        convert_breadths({"biacromial": 0.4, "shoulder_width": 0.33}, load_table(), 0.003)

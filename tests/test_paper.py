@@ -347,6 +347,7 @@ def test_the_commands(
     assert "lengths-alone-estimated" in {each["code"] for each in content["diagnostics"]}
     assert "page-incomplete" not in {each["code"] for each in content["diagnostics"]}
     assert load_subject(tmp_path / "anna").mounts == {}
+    assert {values[0] for values in load_subject(tmp_path / "anna").girdles.values()} == {-1.0}  # fixed shoulders
     page = (tmp_path / "anna" / "report.html").read_text(encoding="utf-8")
     assert "Lengths alone estimated" in page
     assert run("reproduce", tmp_path / "anna") == 0

@@ -707,7 +707,7 @@ def test_the_command_has_people(tmp_path: Path, capsys: pytest.CaptureFixture[st
     words = ["simulate", "-o", str(out), "--preset", "people", "--seed", "4", "--rate-hz", "20", "--seconds", "5"]
     run(*words, "--imperfection", "girdle_wander=0")
     person = simulate_person(4, PEOPLE_MEASURED_STD)
-    assert f"shoulder_width={person.measured['shoulder_width']:.4f}" in capsys.readouterr().out
+    assert f"(measured: biacromial={person.measured['shoulder_width'] / 0.83:.4f}, stature" in capsys.readouterr().out
     session = load_session(out)
     (clasp,) = session.phases["clasp"]
     assert clasp[1] - clasp[0] == pytest.approx(4.8)

@@ -151,6 +151,12 @@ class Subject:
         body = body.with_lengths({name: self.lengths[name] for name in body.lengths if name in self.lengths})
         return replace(body, girdles=self.girdles)
 
+    def fix_girdles(self, table: BodyTable) -> Subject:
+        """The subject with shoulders fixed on the trunk, which no girdle moves."""
+        fixed = np.zeros(len(PARAMETERS))
+        fixed[PARAMETERS.index("law")] = -1.0
+        return replace(self, girdles=dict.fromkeys(table.girdles, fixed))
+
     def std(self, name: str) -> float:
         """One standard deviation of a length [m], or of a mount's axis [rad]; NaN where nothing is known."""
         if name not in self.order:

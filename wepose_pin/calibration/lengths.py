@@ -23,7 +23,7 @@ a length of the chain is known as it is on a robot, which decides the form of th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -36,7 +36,7 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
-from ..model import BodyModel
+from ..model import BodyModel, convert_breadths, list_breadths
 from ..model.body import load_sensed_model
 from ..model.girdle import PARAMETERS
 from ..recording import Recording
@@ -87,13 +87,14 @@ def calibrate_lengths(
 
     Parameters
     ----------
-    measured : measured lengths, and distances that the protocol names, name → [m]; without one the scale is the prior's
+    measured : measured lengths, breadths that give one (`model.list_breadths`, as biacromial), and distances that the
+        protocol names, name → [m]; without one the scale is the prior's
     prior : lengths before, with covariance, and mounts; None: `population_subject`. The subject of an earlier
         calibration is fused with the result (`sessions`)
     model : the body; None: that which the recording states, else the upper body
     protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave
     method : the orientation filter
-    measured_std : standard deviation [m] of each measured length
+    measured_std : standard deviation [m] of what was measured
     formulation : "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone,
         by plain least squares with one measured length at least (`paper`)
 
@@ -110,7 +111,6 @@ def calibrate_lengths(
     check_method(method)
     if not isinstance(protocol, Protocol):
         protocol = load_protocol(protocol)
-    with_std = {name: (metres, measured_std) for name, metres in (measured or {}).items()}
     model = model or load_sensed_model(recording.model or None, recording.sensors, recording.where())
     table = model.table
     table.check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
@@ -120,6 +120,8 @@ def calibrate_lengths(
             f"docs/models.md shows"
         )
     protocol.check_body(table)
+    _check_measured(measured or {}, protocol, model)
+    with_std = convert_breadths(measured or {}, table, measured_std)
     for segment in protocol.needs:
         if segment not in recording.sensors:
             raise BadSession(
@@ -128,7 +130,7 @@ def calibrate_lengths(
             )
     prior = prior or population_subject(body=model)
     prior.check_body(table)
-    _check_measured(with_std, protocol, model)
+    _check_fixed_scale(with_std, protocol, model)
     if formulation == "paper":
         check_paper_formulation(protocol, model, with_std, recording.sensors, recording.start_pose)
     for condition in protocol.conditions:
@@ -147,14 +149,18 @@ def calibrate_lengths(
     return add_second_mounts(calibration, recording, method)
 
 
-def _check_measured(measured: Mapping[str, tuple[float, float]], protocol: Protocol, model: BodyModel) -> None:
-    """Raises `BadOption` where a measured length is none of the protocol's, not plausible, or missing."""
-    names, (low, high) = (*model.lengths, *protocol.distances), MEASURED_RANGE
-    for name, (metres, _) in measured.items():
+def _check_measured(measured: Mapping[str, float], protocol: Protocol, model: BodyModel) -> None:
+    """Raises `BadOption` where what is measured is no length, breadth or distance, or not plausible."""
+    names, (low, high) = (*model.lengths, *list_breadths(model.table), *protocol.distances), MEASURED_RANGE
+    for name, metres in measured.items():
         if name not in names:
             raise BadOption(f"measured {name}: not a length; {one_of(names, name)}")
         if not low < metres < high:
             raise BadOption(f"measured {name}={metres:g}: a length in metres is needed, between {low} and {high}")
+
+
+def _check_fixed_scale(measured: Collection[str], protocol: Protocol, model: BodyModel) -> None:
+    """Raises `BadOption` where the protocol needs a measured length and none is of its chain."""
     chain = find_measured_lengths(protocol, model)
     if len(set(measured) & set(chain)) < protocol.min_measured:
         raise BadOption(

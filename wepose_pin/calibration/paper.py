@@ -12,6 +12,8 @@ a quadratic program, which CasADi's `qpsol` solves. There is no prior, so E and 
   proportions are those of the population.
 - Lengths outside the chain, as the trunk: those of the population.
 
+The shoulders are fixed on the trunk: no girdle moves them, in the subject neither.
+
 The covariance follows from the scatter of the gap and from the errors of d. It does not contain the errors of what is
 not estimated: mounts, headings and their drift, soft tissue. `full` (see `lengths`) estimates these.
 """
@@ -120,7 +122,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
             prior, lengths, covariance,
             name=recording.name,
             note=f"{protocol.title}, lengths alone as in the paper; scale measured: {', '.join(scale_lengths)}",
-        ),
+        ).fix_girdles(problem.model.table),
         prior=prior,
         rms_gap=float(np.sqrt(np.mean(gap**2))),
         prior_rms_gap=float(np.sqrt(np.mean(prior_gap**2))),

@@ -25,7 +25,7 @@ from ..alignment import PALM_SLIP_STD
 from ..assets import asset
 from ..documents import is_number, read_toml
 from ..errors import BadOption, one_of
-from ..model import BodyTable
+from ..model import BodyTable, list_breadths
 
 PROTOCOLS = ("clasp", "clasp_measured", "handle", "poses", "table", "tip", "touch_left", "touch_right")
 # How many points each kind takes, and the keys that are its own.
@@ -161,7 +161,7 @@ class Protocol:
         named += [closure.in_front_of for closure in self.closures if closure.in_front_of]
         table.check_segments((*named, *self.needs), where, BadOption)
         measured = self.measured_example.partition("=")[0]
-        if measured and measured not in (*table.lengths, *self.distances):
+        if measured and measured not in (*table.lengths, *list_breadths(table), *self.distances):
             raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
 
 

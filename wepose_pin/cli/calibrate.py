@@ -30,7 +30,7 @@ def run(job: CalibrateJob) -> int:
         outcome = run_calibrate(job, progress)
     calibration, quality, protocol = outcome.calibration, outcome.quality, outcome.protocol
     print_diagnostics([*quality.further, *outcome.page_failures])
-    print_lengths(f"Lengths, by {protocol.title}", calibration.subject, outcome.prior, job.measured)
+    print_lengths(f"Lengths, by {protocol.title}", calibration.subject, outcome.prior, calibration.measured)
     _print_mounts(calibration)
     if protocol.closures:
         points = " and ".join(point.replace("_", " ") for point in protocol.closures[0].points)
@@ -77,7 +77,7 @@ def _print_quality(quality: CalibrationQuality) -> None:
 COMMAND = Command(
     CalibrateJob,
     run,
-    example="calibrate session.toml --measured shoulder_width=0.385 --stature 1.78 --sex f -o anna",
+    example="calibrate session.toml --measured biacromial=0.41 --stature 1.78 --sex f -o anna",
     arguments=("session",),
     exit_codes="0 quality pass, 3 poor, 4 fail, by the limits in the README; the files are written in all three cases; "
     "2 invalid input, nothing is written.",

@@ -42,8 +42,10 @@ class CalibrateJob:
         Calibrate this body: a name (upper_body, whole_body), a table of a body (.toml), or a URDF beside its table
         (docs/models.md). Without it that which the session states, else upper_body.
     measured : NAME=METRES
-        Use this measured length, such as shoulder_width=0.385; may be given several times. With --protocol handle also
-        handle=0.42, the distance of the palms on the bar.
+        Use this measured length; may be given several times. biacromial=0.41 is the breadth over the acromions, the
+        bony edges on top of the shoulders, which a tape reaches: the shoulder joints are 0.83 ± 0.03 of it apart. A
+        name of [lengths] is from joint centre to joint centre, as shoulder_width or left_forearm. With --protocol
+        handle also handle=0.42, the distance of the palms on the bar.
     formulation
         Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
         priors) or paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the
@@ -102,8 +104,9 @@ class CalibrateJob:
 def _check_measured(job: CalibrateJob, model: BodyModel) -> None:
     """Raise `WrongOption` where a length is measured that neither the body nor the protocol has."""
     from ..calibration import PROTOCOLS, load_protocol
+    from ..model import list_breadths
 
-    known = (*model.lengths, *load_protocol(job.protocol).distances)
+    known = (*model.lengths, *list_breadths(model.table), *load_protocol(job.protocol).distances)
     for name, metres in job.measured.items():
         stated = f"{name}={metres:g}"
         others = [each for each in PROTOCOLS if name in load_protocol(each).distances]

@@ -14,7 +14,7 @@ for them, fixed to its own.
 way from the root to each point, `girdle` moves shoulders on the trunk, `visuals` reads the shapes of the links.
 """
 
-from .anthropometry import SEXES, LengthPrior, compute_population_lengths
+from .anthropometry import SEXES, LengthPrior, compute_population_lengths, convert_breadths, list_breadths
 from .body import BodyModel, load_model
 from .chains import Chain
 from .girdle import Girdle, GirdleMotion, move_girdles
@@ -40,7 +40,9 @@ __all__ = [
     "Segment",
     "Visual",
     "compute_population_lengths",
+    "convert_breadths",
     "find_table",
+    "list_breadths",
     "load_model",
     "load_table",
     "measure_reaches",

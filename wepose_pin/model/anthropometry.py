@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,7 +51,7 @@ def compute_population_lengths(table: BodyTable, stature: float | None = None, s
     check_stature(stature)
     if sex is not None and sex not in SEXES:
         raise BadOption(f"sex '{sex}' is not known; {one_of(SEXES)}")
-    numbers = read_toml(asset("calibration", "anthropometry.toml"), "the anthropometric prior")
+    numbers = _read_numbers()
     height = stature if stature is not None else numbers["stature"]["mean"]
     height_std = 0.0 if stature is not None else numbers["stature"]["std"] / numbers["stature"]["mean"]
     shares = [numbers[{"f": "female", "m": "male"}[s]] for s in ([sex] if sex else SEXES)]
@@ -71,3 +72,53 @@ def compute_population_lengths(table: BodyTable, stature: float | None = None, s
     known = ", ".join([f"stature {height:g} m" + ("" if stature else " assumed"), f"sex {sex or 'not given'}"])
     covariance = np.outer(mean, mean) * relative
     return LengthPrior(tuple(names), mean, covariance, f"population prior ({known})")
+
+
+class Breadth(NamedTuple):
+    """What a tape reaches in place of a length between joint centres: the length is a ratio of it."""
+
+    length: str
+    ratio: float
+    std: float  # of the ratio
+
+
+def list_breadths(table: BodyTable) -> dict[str, Breadth]:
+    """The breadths that give lengths of a body, name → breadth; sources in ``calibration/anthropometry.toml``."""
+    of_share = {length.share: name for name, length in table.lengths.items()}
+    return {
+        name: Breadth(of_share[entry["share"]], entry["ratio"], entry["std"])
+        for name, entry in _read_numbers()["breadths"].items()
+        if entry["share"] in of_share
+    }
+
+
+def convert_breadths(
+    measured: Mapping[str, float], table: BodyTable, measured_std: float
+) -> dict[str, tuple[float, float]]:
+    """Measured lengths and distances with one standard deviation each [m], those given as a breadth converted.
+
+    Parameters
+    ----------
+    measured : length, breadth or distance → [m]
+    measured_std : of what was measured [m]
+
+    Raises
+    ------
+    BadOption
+        A breadth and the length that it gives are both measured.
+    """
+    breadths, converted = list_breadths(table), {}
+    for name, metres in measured.items():
+        breadth = breadths.get(name)
+        if breadth is None:
+            converted[name] = (metres, measured_std)
+        elif breadth.length in measured:
+            raise BadOption(f"measured {name} and {breadth.length}: one follows from the other; give one of them")
+        else:
+            std = float(np.hypot(breadth.std * metres, breadth.ratio * measured_std))
+            converted[breadth.length] = (breadth.ratio * metres, std)
+    return converted
+
+
+def _read_numbers() -> dict[str, Any]:
+    return read_toml(asset("calibration", "anthropometry.toml"), "the anthropometric prior")

@@ -29,8 +29,8 @@ from .tasks import TASKS
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
 MEASURED_STD = 0.003  # [m] of shoulder width and trunk
-# [m] Shoulder width as 0.83 of the biacromial breadth (ANSUR II against the arm model of Holzbaur 2005); the factor has
-# ± 0.03: 12 mm of 400 mm.
+# [m] Shoulder width as 0.83 ± 0.03 of the biacromial breadth (`breadths` in calibration/anthropometry.toml): 12 mm of
+# 400 mm.
 PEOPLE_MEASURED_STD = 0.012
 _STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
 _GAIN_RATE_HZ = 20.0  # at which soft-tissue motion is scaled to its rms

@@ -19,7 +19,6 @@ from ..calibration import Formulation, calibrate_lengths
 from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
 from ..filters.noise import estimate_noise
 from ..model import ROOT, BodyTable, load_table
-from ..model.girdle import PARAMETERS
 from ..recording import OrientationSensor, Recording
 from ..simulation import (
     CIRCLING_POINT,
@@ -202,10 +201,10 @@ def _upper_body(experiment: str, trial: str, seed: int, preset: Preset) -> list[
             with_trunk = calibrate_person(recording, person, OURS, exact, measured=MEASURED_WITH_TRUNK)
             score(WITH_TRUNK, recording, with_trunk, OURS)
             lengths_alone = calibrate_person(recording, person, OURS, exact, formulation="paper")
-            score(LENGTHS_ALONE, recording, fix_shoulders(lengths_alone), OURS)
+            score(LENGTHS_ALONE, recording, lengths_alone, OURS)
             score(OPEN_LOOP, recording, subject, OURS, open_loop=True)
             as_in_paper = calibrate_person(recording, person, OURS, stated, formulation="paper")
-            score(PROTOCOL, recording, fix_shoulders(as_in_paper), OURS, open_loop=True)
+            score(PROTOCOL, recording, as_in_paper, OURS, open_loop=True)
     return results
 
 
@@ -275,13 +274,6 @@ def _compute_lengths_rms(subject: Subject, person: Person) -> float:
 def list_closed_lengths(table: BodyTable) -> list[str]:
     """List the lengths that joined hands observe: all but those from the root, as the trunk's."""
     return [name for name, length in table.lengths.items() if all(ROOT not in part.start for part in length.stretches)]
-
-
-def fix_shoulders(subject: Subject) -> Subject:
-    """Return the subject with shoulders that do not move on the trunk, as the paper's body has them."""
-    fixed = np.zeros(len(PARAMETERS))
-    fixed[PARAMETERS.index("law")] = -1.0
-    return replace(subject, girdles=dict.fromkeys(load_table().girdles, fixed))
 
 
 def set_exact_mounts(subject: Subject, simulation: Simulation) -> Subject:
