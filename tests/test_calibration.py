@@ -225,7 +225,7 @@ def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     assert alone.subject.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
     assert "scale-from-prior" in codes(alone)
     assert alone.subject.note.endswith("of the population prior")
-    measured = calibrate(recording, prior=person.prior, measured={"trunk": 0.5, "shoulder_width": 0.38})
+    measured = calibrate(recording, prior=person.prior, measured={"trunk": 0.5, "shoulder_width": 0.33})
     assert measured.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
 
 
@@ -244,7 +244,7 @@ def test_wrong_requests_are_named(exact: tuple[Person, Recording]) -> None:
         calibrate(replace(recording, sensors=fewer))
 
 
-@pytest.mark.parametrize(("seed", "several"), [(1, True), (3, False), (4, True)])
+@pytest.mark.parametrize(("seed", "several"), [(1, True), (6, False), (4, True)])
 def test_hands_that_hardly_move_leave_the_headings_open(
     seed: int, several: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

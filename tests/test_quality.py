@@ -162,7 +162,7 @@ def test_without_a_measured_length_the_scale_is_the_priors(anywhere: Simulation,
     quality = assess(solved(anywhere.recording(), person, measured=False))
     assert quality.quality == "poor"
     assert codes(quality) == ["scale-from-prior"]
-    assert "--measured shoulder_width" in render(quality.reasons[0]).do
+    assert "--measured biacromial" in render(quality.reasons[0]).do
     assert "scale-from-prior" not in {each.code for each in quality.further}  # not twice
 
 
