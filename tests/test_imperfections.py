@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
+from simulated import SIDES, SUBJECT, G, check_accel, check_gyro, check_lengths, in_torso, multiply, within
 
 from wepose_pin.errors import BadSession
 from wepose_pin.readers import load_session
@@ -36,18 +37,6 @@ from wepose_pin.subject import population_subject
 from wepose_pin.tracking import track
 from wepose_pin.writers import write_session
 
-G = 9.81
-SIDES = ("left", "right")
-LENGTHS = {
-    "trunk": 0.50,
-    "shoulder_width": 0.385,
-    "left_upper_arm": 0.301,
-    "left_forearm": 0.252,
-    "left_hand": 0.081,
-    "right_upper_arm": 0.309,
-    "right_forearm": 0.247,
-    "right_hand": 0.078,
-}
 # The subject's own imperfections, with perfect sensors.
 BODY = Imperfections(
     soft_tissue_deg=1.5,
@@ -64,39 +53,21 @@ SHORT = {"rate_hz": 50.0, "clasp_s": 5.0, "circles": 0, "noise": NOISE_FREE}
 
 @pytest.fixture(scope="module")
 def body() -> Simulation:
-    return simulate(LENGTHS, seed=3, noise=NOISE_FREE, imperfections=BODY)
+    return simulate(SUBJECT, seed=3, noise=NOISE_FREE, imperfections=BODY)
 
 
 @pytest.fixture(scope="module")
 def fast() -> Simulation:
-    return simulate(LENGTHS, seed=4, rate_hz=1000.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=10.0, circles=1)
+    return simulate(SUBJECT, seed=4, rate_hz=1000.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=10.0, circles=1)
 
 
 @pytest.fixture(scope="module")
 def realistic() -> Simulation:
-    return simulate(LENGTHS, seed=5, imperfections=MILD_PRESET, clasp_s=20.0, circles=2)
-
-
-def within(sim: Simulation, phase: str) -> np.ndarray:
-    return np.any([(sim.time >= a) & (sim.time <= b) for a, b in sim.phases[phase]], axis=0)
+    return simulate(SUBJECT, seed=5, imperfections=MILD_PRESET, clasp_s=20.0, circles=2)
 
 
 def rms(vectors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=-1))))
-
-
-def product(rotvecs: np.ndarray) -> Rotation:
-    """exp of the first times exp of the second …, of rotation vectors (n, 3), pair by pair."""
-    R = Rotation.from_rotvec(rotvecs)
-    while len(R) > 1:
-        if len(R) % 2:
-            R = Rotation.concatenate((R, Rotation.identity(1)))
-        R = R[0::2] * R[1::2]
-    return R[0]
-
-
-def in_torso(sim: Simulation, vectors: np.ndarray) -> np.ndarray:
-    return Rotation.from_quat(sim.quat_WL["torso"]).inv().apply(vectors)
 
 
 # Presets and the perfect world -----------------------------------------------------------------------------------
@@ -113,7 +84,7 @@ def test_presets() -> None:
 
 
 def test_the_perfect_world_is_the_default_and_what_it_was() -> None:
-    one, same = (simulate(LENGTHS, seed=1, clasp_s=5.0, circles=1, **k) for k in ({}, {"imperfections": IDEAL_PRESET}))
+    one, same = (simulate(SUBJECT, seed=1, clasp_s=5.0, circles=1, **k) for k in ({}, {"imperfections": IDEAL_PRESET}))
     for segment in SEGMENTS:
         assert np.array_equal(one.gyro_S[segment], same.gyro_S[segment])
         assert not one.soft_tissue[segment].any()
@@ -148,7 +119,7 @@ def test_wrong_sizes_are_named(wrong: dict, text: str) -> None:
 
 def test_too_much_jitter_is_named() -> None:
     with pytest.raises(ValueError, match="clock_jitter"):
-        simulate(LENGTHS, seed=0, imperfections=Imperfections(clock_jitter=0.01), clasp_s=5.0, circles=0)
+        simulate(SUBJECT, seed=0, imperfections=Imperfections(clock_jitter=0.01), clasp_s=5.0, circles=0)
 
 
 # Physics stays whole ---------------------------------------------------------------------------------------------
@@ -157,10 +128,7 @@ def test_too_much_jitter_is_named() -> None:
 @pytest.mark.parametrize("segment", SEGMENTS)
 def test_gyro_integrates_to_the_sensors_own_orientation(body: Simulation, segment: str) -> None:
     truth = Rotation.from_quat(body.quat_WS[segment])
-    q = truth[0]
-    for k in range(1, 6001):  # 60 s
-        q = q * Rotation.from_rotvec(body.gyro_S[segment][k] / body.rate_hz)
-    assert (q.inv() * truth[6000]).magnitude() < 1e-6
+    check_gyro(body, segment, truth, 60.0)
     skeleton = Rotation.from_quat(body.quat_WL[segment]) * Rotation.from_quat(body.quat_LS[segment])
     assert np.rad2deg((truth.inv() * skeleton).magnitude()).max() > 2.5  # which is not the segment's
     # The first rate is that of the sway as well, not a step.
@@ -169,35 +137,17 @@ def test_gyro_integrates_to_the_sensors_own_orientation(body: Simulation, segmen
 
 @pytest.mark.parametrize("segment", SEGMENTS)
 def test_accel_integrates_to_the_position(fast: Simulation, segment: str) -> None:
-    side, _, part = segment.partition("_")
-    origin = {"": 0.0, "upper_arm": fast.points.get(f"{side}_shoulder"), "forearm": fast.points.get(f"{side}_elbow")}
-    position = origin[part] + Rotation.from_quat(fast.quat_WL[segment]).apply(fast.p_LS[segment])
-    truth = CubicSpline(fast.time, position)
-    k = (fast.time >= 4.5) & (fast.time <= 14.5)
-    t = fast.time[k]
-    accel_W = Rotation.from_quat(fast.quat_WS[segment]).apply(fast.accel_S[segment])[k] - [0.0, 0.0, G]
-    found = truth(t[0]) + truth(t[0], 1) * (t - t[0])[:, None] + CubicSpline(t, accel_W).antiderivative(2)(t)
-    assert np.abs(found - position[k]).max() < 1e-3
-    assert np.ptp(position[k], axis=0).max() > 0.1
+    assert check_accel(fast, segment, Rotation.from_quat(fast.quat_WS[segment]), 4.5, 14.5).max() > 0.1
 
 
 def test_segments_keep_their_length(body: Simulation) -> None:
-    for side in SIDES:
-        for part, a, b in (
-            ("upper_arm", "shoulder", "elbow"),
-            ("forearm", "elbow", "wrist"),
-            ("hand", "wrist", "palm"),
-        ):
-            p_W = body.points[f"{side}_{b}"] - body.points[f"{side}_{a}"]
-            segment = f"{side}_{'forearm' if part == 'hand' else part}"
-            along = Rotation.from_quat(body.quat_WL[segment]).apply([0.0, 0.0, -LENGTHS[f"{side}_{part}"]])
-            np.testing.assert_allclose(p_W, along, atol=1e-12)
+    check_lengths(body, rigid_hands=True)
 
 
 @pytest.mark.parametrize("scale", [0.6, 0.85, 1.2])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_arms_reach_also_when_imperfect(seed: int, scale: float) -> None:
-    lengths = {k: scale * v for k, v in LENGTHS.items()}
+    lengths = {k: scale * v for k, v in SUBJECT.items()}
     sim = simulate(lengths, seed=seed, rate_hz=50.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=30.0, circles=2)
     for segment in SEGMENTS:  # of human size still
         assert np.linalg.norm(sim.gyro_S[segment], axis=1).max() < 15
@@ -222,7 +172,7 @@ def test_soft_tissue_has_its_rms(body: Simulation) -> None:
 
 def test_soft_tissue_follows_the_movement_and_is_still_at_rest() -> None:
     """Half of it is a fixed mixture of force and rate: a regression on them finds that half and no more."""
-    sim = simulate(LENGTHS, seed=6, noise=NOISE_FREE, imperfections=Imperfections(soft_tissue_deg=1.5))
+    sim = simulate(SUBJECT, seed=6, noise=NOISE_FREE, imperfections=Imperfections(soft_tissue_deg=1.5))
     moving = sim.time >= sim.phases["clasp"][0][0]
     explained = []
     for segment in SEGMENTS:
@@ -237,7 +187,7 @@ def test_soft_tissue_follows_the_movement_and_is_still_at_rest() -> None:
             assert np.abs(sim.gyro_S[segment][within(sim, phase)]).max() < 1e-9
     assert 0.4 < np.mean(explained) < 0.75
     # The same at another rate: it is a function of time.
-    slow = simulate(LENGTHS, seed=6, rate_hz=50.0, noise=NOISE_FREE, imperfections=Imperfections(soft_tissue_deg=1.5))
+    slow = simulate(SUBJECT, seed=6, rate_hz=50.0, noise=NOISE_FREE, imperfections=Imperfections(soft_tissue_deg=1.5))
     for segment in SEGMENTS:
         n = len(slow.time)
         np.testing.assert_allclose(slow.soft_tissue[segment], sim.soft_tissue[segment][::2][:n], atol=1e-9)
@@ -254,10 +204,10 @@ def test_palms_slip_by_as_much_as_stated(body: Simulation) -> None:
 
 def test_shoulders_wander_with_elevation(body: Simulation) -> None:
     for side, y in (("left", 1.0), ("right", -1.0)):
-        mean_T = np.array((0.0, y * LENGTHS["shoulder_width"] / 2, LENGTHS["trunk"]))
+        mean_T = np.array((0.0, y * SUBJECT["shoulder_width"] / 2, SUBJECT["trunk"]))
         off_T = in_torso(body, body.points[f"{side}_shoulder"]) - mean_T
         along_T = in_torso(body, body.points[f"{side}_elbow"] - body.points[f"{side}_shoulder"])
-        one_less_cos = 1.0 + along_T[:, 2] / LENGTHS[f"{side}_upper_arm"]
+        one_less_cos = 1.0 + along_T[:, 2] / SUBJECT[f"{side}_upper_arm"]
         np.testing.assert_allclose(np.linalg.norm(off_T, axis=1), 0.004 * one_less_cos, atol=2e-4)
         raised = one_less_cos > 0.5
         assert raised.sum() > 500
@@ -269,7 +219,7 @@ def test_start_pose_is_off_as_stated() -> None:
     sizes = Imperfections(start_elbow_deg=5.0)
     elbows = []
     for seed in range(20):
-        sim = simulate(LENGTHS, seed=seed, imperfections=sizes, **SHORT)
+        sim = simulate(SUBJECT, seed=seed, imperfections=sizes, **SHORT)
         for side in SIDES:
             bend = Rotation.from_quat(sim.quat_WL[f"{side}_forearm"][100]).as_rotvec(degrees=True)
             np.testing.assert_allclose(bend[[0, 2]], 0.0, atol=1e-9)
@@ -280,7 +230,7 @@ def test_start_pose_is_off_as_stated() -> None:
 
     turns = []
     for seed in range(40):
-        sim = simulate(LENGTHS, seed=seed, imperfections=Imperfections(start_segment_deg=1.5), **SHORT)
+        sim = simulate(SUBJECT, seed=seed, imperfections=Imperfections(start_segment_deg=1.5), **SHORT)
         at = {name: Rotation.from_quat(quat[100]) for name, quat in sim.quat_WL.items()}
         assert at["torso"].magnitude() < 1e-12
         for side in SIDES:
@@ -299,7 +249,7 @@ def test_a_standing_person_sways() -> None:
     sizes = Imperfections(sway_deg_s=0.1)
     torso, arms = [], []
     for seed in range(25):
-        sim = simulate(LENGTHS, seed=seed, imperfections=sizes, **SHORT)
+        sim = simulate(SUBJECT, seed=seed, imperfections=sizes, **SHORT)
         start = within(sim, "start")
         R_WT = Rotation.from_quat(sim.quat_WL["torso"][start])
         torso.append((R_WT[:-1].inv() * R_WT[1:]).as_rotvec() * sim.rate_hz)
@@ -329,9 +279,9 @@ def test_devices_err_as_stated() -> None:
 
 def test_data_are_the_device_times_the_truth() -> None:
     options = {"seed": 2, "noise": NOISE_FREE, "clasp_s": 10.0, "circles": 1}
-    clean = simulate(LENGTHS, **options)
+    clean = simulate(SUBJECT, **options)
     sizes = replace(IDEAL_PRESET, gyro_scale=0.01, accel_scale=0.02, misalignment_deg=1.0, g_sensitivity_deg_s=0.1)
-    sim = simulate(LENGTHS, imperfections=sizes, **options)
+    sim = simulate(SUBJECT, imperfections=sizes, **options)
     for segment, device in sim.device.items():
         accel_S = clean.accel_S[segment]
         gyro_S = clean.gyro_S[segment] @ device.gyro_matrix.T + accel_S @ device.g_matrix.T
@@ -342,11 +292,11 @@ def test_data_are_the_device_times_the_truth() -> None:
 
 def test_quantisation_and_range() -> None:
     options = {"seed": 2, "clasp_s": 10.0, "circles": 1}
-    clean = simulate(LENGTHS, **options)
+    clean = simulate(SUBJECT, **options)
     digital = simulate(
-        LENGTHS, imperfections=Imperfections(gyro_range_deg_s=2000.0, accel_range_g=16.0, bits=16), **options
+        SUBJECT, imperfections=Imperfections(gyro_range_deg_s=2000.0, accel_range_g=16.0, bits=16), **options
     )
-    cut = simulate(LENGTHS, imperfections=Imperfections(gyro_range_deg_s=90.0, accel_range_g=1.05), **options)
+    cut = simulate(SUBJECT, imperfections=Imperfections(gyro_range_deg_s=90.0, accel_range_g=1.05), **options)
     gyro_step, accel_step = np.deg2rad(2000.0) / 2**15, 16.0 * G / 2**15
     for segment in SEGMENTS:
         for name, step in (("gyro_S", gyro_step), ("accel_S", accel_step)):
@@ -368,9 +318,9 @@ def test_quantisation_and_range() -> None:
 
 def test_clocks_shift_the_samples_in_the_data() -> None:
     options = {"seed": 2, "noise": NOISE_FREE, "clasp_s": 10.0, "circles": 1, "rate_hz": 200.0}
-    clean = simulate(LENGTHS, **options)
+    clean = simulate(SUBJECT, **options)
     sizes = Imperfections(clock_jitter=2e-4, clock_offset=5e-3)
-    sim = simulate(LENGTHS, imperfections=sizes, **options)
+    sim = simulate(SUBJECT, imperfections=sizes, **options)
     offsets = []
     for segment in SEGMENTS:
         late = sim.sample_time[segment] - sim.time
@@ -424,15 +374,15 @@ def test_mounts_at_any_rotation_need_a_subject() -> None:
     sizes = Imperfections(mount="any")
     mounts = []
     for seed in range(30):
-        sim = simulate(LENGTHS, seed=seed, imperfections=sizes, **SHORT)
+        sim = simulate(SUBJECT, seed=seed, imperfections=sizes, **SHORT)
         assert set(sim.stated_mount.values()) == {None}
         mounts += list(sim.quat_LS.values())
     # 150 uniform rotations: each entry of the mean matrix has the standard deviation sqrt(1/3/150)
     assert np.abs(Rotation.from_quat(mounts).as_matrix().mean(axis=0)).max() < 4 * np.sqrt(1 / 450)
     with pytest.raises(BadSession, match="mount is not known"):
         track(sim.recording())
-    sim = simulate(LENGTHS, seed=1, imperfections=sizes, clasp_s=5.0, circles=1)
-    pose = track(sim.recording(), replace(population_subject(), lengths=LENGTHS, mounts=sim.quat_LS))
+    sim = simulate(SUBJECT, seed=1, imperfections=sizes, clasp_s=5.0, circles=1)
+    pose = track(sim.recording(), replace(population_subject(), lengths=SUBJECT, mounts=sim.quat_LS))
     assert np.linalg.norm(pose.points["right_palm"] - sim.points["right_palm"], axis=1).mean() < 0.02
 
 
@@ -447,7 +397,7 @@ def allan_deviation(rates: np.ndarray, rate_hz: float, m: int) -> np.ndarray:
 
 
 def test_allan_deviation_gives_the_densities_back() -> None:
-    noisy, clean = (simulate(LENGTHS, seed=2, noise=noise) for noise in (ImuNoise(), NOISE_FREE))
+    noisy, clean = (simulate(SUBJECT, seed=2, noise=noise) for noise in (ImuNoise(), NOISE_FREE))
     for name, density in (("gyro_S", np.deg2rad(0.007)), ("accel_S", 120e-6 * G)):
         noise = np.hstack([getattr(noisy, name)[s] - getattr(clean, name)[s] for s in SEGMENTS])
         for tau in (0.05, 0.2, 1.0):
@@ -495,7 +445,7 @@ def sensor_draws(sim: Simulation) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("name", IN_MILD)
 def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, name: str) -> None:
-    without = simulate(LENGTHS, seed=5, imperfections=off(name), clasp_s=20.0, circles=2)
+    without = simulate(SUBJECT, seed=5, imperfections=off(name), clasp_s=20.0, circles=2)
     for draws, less in (
         (sensor_draws(realistic), sensor_draws(without)),
         (subject_draws(MILD_PRESET), subject_draws(off(name))),
@@ -524,7 +474,7 @@ def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, 
 
 
 def test_mount_is_a_stream_of_its_own(realistic: Simulation) -> None:
-    loose = simulate(LENGTHS, seed=5, imperfections=replace(MILD_PRESET, mount="any"), clasp_s=20.0, circles=2)
+    loose = simulate(SUBJECT, seed=5, imperfections=replace(MILD_PRESET, mount="any"), clasp_s=20.0, circles=2)
     for name, values in sensor_draws(loose).items():
         assert np.array_equal(values, sensor_draws(realistic)[name]) == (name != "mount")
     assert np.array_equal(loose.points["left_palm"], realistic.points["left_palm"])
@@ -547,7 +497,7 @@ def test_single_sensor(make: Callable[..., SingleSensor], moving: tuple, rate_pe
         assert one.time[-1] == 60.0
         R_WS = Rotation.from_quat(one.quat_WS)
         for end in (30000, 60000):
-            assert (product(one.gyro_S[1 : end + 1] / 1000.0).inv() * R_WS[0].inv() * R_WS[end]).magnitude() < 1e-6
+            assert (multiply(one.gyro_S[1 : end + 1] / 1000.0).inv() * R_WS[0].inv() * R_WS[end]).magnitude() < 1e-6
         accel_W = R_WS.apply(one.accel_S) - [0.0, 0.0, G]
         k = slice(int(moving[0] * 1000) - 1000, int(moving[0] * 1000) + 9001)  # 10 s from before the motion
         found = one.p_WS[k][0] + CubicSpline(one.time[k], accel_W[k]).antiderivative(2)(one.time[k])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
+from simulated import SUBJECT, G, check_accel, check_gyro, check_lengths, in_torso, within
 
 from wepose_pin.cli import main
 from wepose_pin.errors import BadOption
@@ -36,17 +37,6 @@ from wepose_pin.simulation.soft_tissue import GAINS, RANDOM_DEG, JointRotations,
 from wepose_pin.simulation.subject import spawn_streams
 from wepose_pin.simulation.tasks import TASKS
 
-G = 9.81
-LENGTHS = {
-    "trunk": 0.50,
-    "shoulder_width": 0.385,
-    "left_upper_arm": 0.301,
-    "left_forearm": 0.252,
-    "left_hand": 0.081,
-    "right_upper_arm": 0.309,
-    "right_forearm": 0.247,
-    "right_hand": 0.078,
-}
 MILD_GYRO = [-2.522546184523055, 0.08628641931856733, -0.49321743388267497]
 MILD_ACCEL = [-9.551337890625, 1.59029296875, -0.0622705078125]
 MILD_PALM = [0.2253376495869239, 0.11791698291767774, 0.6444541212989523]
@@ -71,7 +61,7 @@ SENSORS = (*TISSUE, "upper_arm_place", "forearm_place", "gyro_warm_up_deg_s", "c
 
 @pytest.fixture(scope="module")
 def body() -> Simulation:
-    return simulate(LENGTHS, seed=3, noise=NOISE_FREE, imperfections=BODY, clasp_s=30.0, circles=1)
+    return simulate(SUBJECT, seed=3, noise=NOISE_FREE, imperfections=BODY, clasp_s=30.0, circles=1)
 
 
 def only(name: str) -> Imperfections:
@@ -80,14 +70,6 @@ def only(name: str) -> Imperfections:
 
 def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def within(sim: Simulation, phase: str) -> np.ndarray:
-    return np.any([(sim.time >= a) & (sim.time <= b) for a, b in sim.phases[phase]], axis=0)
-
-
-def in_torso(sim: Simulation, vectors: np.ndarray) -> np.ndarray:
-    return Rotation.from_quat(sim.quat_WL["torso"]).inv().apply(vectors)
 
 
 def shoulder_offset(sim: Simulation, side: str) -> np.ndarray:
@@ -103,7 +85,7 @@ def test_the_mild_preset_is_what_it_was() -> None:
     assert PRESETS == {"ideal": IDEAL_PRESET, "mild": MILD_PRESET, "people": PEOPLE_PRESET}
     assert all(getattr(MILD_PRESET, name) == 0.0 for name in NEW)
     assert len(NEW) == 23
-    sim = simulate(LENGTHS, seed=1, imperfections=MILD_PRESET, clasp_s=5.0, circles=1)
+    sim = simulate(SUBJECT, seed=1, imperfections=MILD_PRESET, clasp_s=5.0, circles=1)
     # Figures of the version before the people preset.
     np.testing.assert_allclose(sim.gyro_S["left_forearm"][1000], MILD_GYRO, rtol=1e-9)
     np.testing.assert_allclose(sim.accel_S["left_forearm"][1000], MILD_ACCEL, rtol=1e-9)
@@ -187,9 +169,9 @@ def test_girdle_is_smooth_around_the_hanging_arm() -> None:
 
 def test_girdle_of_a_person(body: Simulation) -> None:
     sim = simulate(
-        LENGTHS, seed=2, imperfections=only("girdle"), rate_hz=50.0, clasp_s=20.0, circles=0, noise=NOISE_FREE
+        SUBJECT, seed=2, imperfections=only("girdle"), rate_hz=50.0, clasp_s=20.0, circles=0, noise=NOISE_FREE
     )
-    scale = LENGTHS["shoulder_width"] / 0.340
+    scale = SUBJECT["shoulder_width"] / 0.340
     for side, y in SIDES.items():
         along_T = in_torso(sim, sim.points[f"{side}_elbow"] - sim.points[f"{side}_shoulder"])
         expected = scale * compute_girdle(along_T / np.linalg.norm(along_T, axis=1, keepdims=True), y)
@@ -212,10 +194,10 @@ def test_rest_places_of_the_shoulders() -> None:
     assert np.corrcoef(left[:, 0], right[:, 0])[0, 1] == pytest.approx(0.7, abs=0.06)
     assert rms(left[:, 1]) == pytest.approx(0.012 * np.sqrt(0.15), rel=0.1)
     assert rms(left[:, 2]) == pytest.approx(0.013 * np.sqrt(0.15), rel=0.1)
-    sim = simulate(LENGTHS, seed=2, imperfections=only("girdle_rest"), **SHORT)
+    sim = simulate(SUBJECT, seed=2, imperfections=only("girdle_rest"), **SHORT)
     left, right = (in_torso(sim, sim.points[f"{side}_shoulder"]) for side in SIDES)
-    np.testing.assert_allclose((left - right)[:, 1], LENGTHS["shoulder_width"], atol=1e-12)
-    np.testing.assert_allclose((left + right)[:, 2] / 2.0, LENGTHS["trunk"], atol=1e-12)
+    np.testing.assert_allclose((left - right)[:, 1], SUBJECT["shoulder_width"], atol=1e-12)
+    np.testing.assert_allclose((left + right)[:, 2] / 2.0, SUBJECT["trunk"], atol=1e-12)
 
 
 def test_what_one_shoulder_does_differently() -> None:
@@ -300,7 +282,7 @@ def test_palms_close_but_for_slip(protocol: str) -> None:
 
 def test_touching_palm_stays_but_for_slip() -> None:
     sim = simulate(
-        LENGTHS, seed=4, imperfections=replace(BODY, palm_slip=0.0), protocol="touch_left", rate_hz=20.0, circles=0
+        SUBJECT, seed=4, imperfections=replace(BODY, palm_slip=0.0), protocol="touch_left", rate_hz=20.0, circles=0
     )
     touching = sim.points["left_palm"][within(sim, "touch")]
     assert 1e3 * np.ptp(touching, axis=0).max() < 0.01
@@ -313,13 +295,13 @@ def test_wrists_bend(body: Simulation) -> None:
         hand_F = Rotation.from_quat(body.quat_WL[f"{side}_forearm"]).inv().apply(hand_W)[clasp]
         flexion, deviation = (
             np.rad2deg(np.arctan2(hand_F[:, 0], -hand_F[:, 2])),
-            np.rad2deg(np.arcsin(hand_F[:, 1] / LENGTHS[f"{side}_hand"])),
+            np.rad2deg(np.arcsin(hand_F[:, 1] / SUBJECT[f"{side}_hand"])),
         )
         assert rms(flexion) == pytest.approx(12.0, rel=0.1)
         assert rms(deviation) == pytest.approx(8.0, rel=0.1)
         # tied to the distance of the hands from the chest
         distance = np.linalg.norm(
-            in_torso(body, body.points[f"{side}_palm"])[clasp] - (0.0, 0.0, LENGTHS["trunk"]), axis=1
+            in_torso(body, body.points[f"{side}_palm"])[clasp] - (0.0, 0.0, SUBJECT["trunk"]), axis=1
         )
         assert abs(np.corrcoef(flexion, distance)[0, 1]) > 0.5
 
@@ -337,7 +319,7 @@ def test_start_poses() -> None:
     np.testing.assert_allclose(torso.std(axis=0), (1.5, 3.0, 4.0), rtol=0.1)
     assert set(START_POSE) >= {"head_pitch", "forearm_inward_twist"}
     # both arms are held outwards, elbows bent forwards
-    sim = simulate(LENGTHS, seed=1, imperfections=only("start_pose"), **SHORT)
+    sim = simulate(SUBJECT, seed=1, imperfections=only("start_pose"), **SHORT)
     for side, y in SIDES.items():
         upper = in_torso(sim, sim.points[f"{side}_elbow"] - sim.points[f"{side}_shoulder"])[100]
         wrist = in_torso(sim, sim.points[f"{side}_wrist"] - sim.points[f"{side}_elbow"])[100]
@@ -401,11 +383,11 @@ def test_bulging_muscles_turn_the_sensor_either_way() -> None:
 def test_twist_is_lost_by_place() -> None:
     assert [lost_twist("upper_arm", p) for p in (0.3, 0.5, 0.8)] == pytest.approx([0.43, 0.35, 0.23])
     assert [lost_twist("forearm", p) for p in (0.5, 1.0)] == pytest.approx([0.50, 0.05])
-    middle = simulate(LENGTHS, seed=2, imperfections=only("tissue_gain"), **SHORT)
-    distal = simulate(LENGTHS, seed=2, imperfections=replace(only("tissue_gain"), forearm_place=0.85), **SHORT)
+    middle = simulate(SUBJECT, seed=2, imperfections=only("tissue_gain"), **SHORT)
+    distal = simulate(SUBJECT, seed=2, imperfections=replace(only("tissue_gain"), forearm_place=0.85), **SHORT)
     for side in SIDES:
         name = f"{side}_forearm"
-        assert distal.p_LS[name][2] == pytest.approx(-0.85 * LENGTHS[name])
+        assert distal.p_LS[name][2] == pytest.approx(-0.85 * SUBJECT[name])
         assert rms(distal.soft_tissue[name][:, 2]) < 0.8 * rms(middle.soft_tissue[name][:, 2])
 
 
@@ -465,7 +447,7 @@ def test_turns_of_the_sensors_over_a_clasp(body: Simulation) -> None:
 
 def test_sensors_stand_where_the_segments_do() -> None:
     sizes = replace(BODY, sway_deg_s=0.0, sway_tilt_deg=0.0, breath_deg=0.0, creep_deg=0.0)
-    sim = simulate(LENGTHS, seed=5, imperfections=sizes, noise=NOISE_FREE, clasp_s=8.0, circles=1)
+    sim = simulate(SUBJECT, seed=5, imperfections=sizes, noise=NOISE_FREE, clasp_s=8.0, circles=1)
     for segment in SEGMENTS:
         for phase in ("start", "rest"):
             assert np.abs(sim.gyro_S[segment][within(sim, phase)]).max() < 1e-9
@@ -477,49 +459,26 @@ def test_sensors_stand_where_the_segments_do() -> None:
 
 @pytest.mark.parametrize("segment", SEGMENTS)
 def test_gyro_integrates_to_the_sensors_own_orientation(body: Simulation, segment: str) -> None:
-    truth = Rotation.from_quat(body.quat_WS[segment])
-    q = truth[0]
-    for k in range(1, 3001):
-        q = q * Rotation.from_rotvec(body.gyro_S[segment][k] / body.rate_hz)
-    assert (q.inv() * truth[3000]).magnitude() < 1e-6
+    check_gyro(body, segment, Rotation.from_quat(body.quat_WS[segment]), 30.0)
 
 
-def check_accel(sim: Simulation, start: float, stop: float) -> None:
-    """Specific force, integrated twice, is the path of the sensor."""
+def check_path(sim: Simulation, start: float, stop: float) -> None:
     for segment in SEGMENTS:
-        side, _, part = segment.partition("_")
-        origin = {"": 0.0, "upper_arm": sim.points.get(f"{side}_shoulder"), "forearm": sim.points.get(f"{side}_elbow")}
-        position = origin[part] + Rotation.from_quat(sim.quat_WL[segment]).apply(sim.p_LS[segment])
-        k = (sim.time >= start) & (sim.time <= stop)
-        t = sim.time[k]
-        accel_W = Rotation.from_quat(sim.quat_WS[segment]).apply(sim.accel_S[segment])[k] - [0.0, 0.0, G]
-        truth = CubicSpline(sim.time, position)
-        found = truth(t[0]) + truth(t[0], 1) * (t - t[0])[:, None] + CubicSpline(t, accel_W).antiderivative(2)(t)
-        assert np.abs(found - position[k]).max() < 1e-3
-        assert segment == "torso" or np.ptp(position[k], axis=0).max() > 0.05
+        moved = check_accel(sim, segment, Rotation.from_quat(sim.quat_WS[segment]), start, stop)
+        assert segment == "torso" or moved.max() > 0.05
 
 
 def test_accel_integrates_to_the_position() -> None:
-    sim = simulate(LENGTHS, seed=4, rate_hz=500.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=8.0, circles=0)
-    check_accel(sim, 4.5, 14.0)
+    sim = simulate(SUBJECT, seed=4, rate_hz=500.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=8.0, circles=0)
+    check_path(sim, 4.5, 14.0)
 
 
 def test_segments_keep_their_length(body: Simulation) -> None:
-    for side in SIDES:
-        for part, a, b in (
-            ("upper_arm", "shoulder", "elbow"),
-            ("forearm", "elbow", "wrist"),
-            ("hand", "wrist", "palm"),
-        ):
-            p_W = body.points[f"{side}_{b}"] - body.points[f"{side}_{a}"]
-            np.testing.assert_allclose(np.linalg.norm(p_W, axis=1), LENGTHS[f"{side}_{part}"], atol=1e-12)
-            if part != "hand":
-                along = Rotation.from_quat(body.quat_WL[f"{side}_{part}"]).apply([0.0, 0.0, -LENGTHS[f"{side}_{part}"]])
-                np.testing.assert_allclose(p_W, along, atol=1e-12)
+    check_lengths(body, rigid_hands=False)
 
 
 def test_the_rate_does_not_change_the_motion(body: Simulation) -> None:
-    slow = simulate(LENGTHS, seed=3, rate_hz=20.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=30.0, circles=1)
+    slow = simulate(SUBJECT, seed=3, rate_hz=20.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=30.0, circles=1)
     n = len(slow.time)
     for segment in SEGMENTS:
         np.testing.assert_allclose(slow.soft_tissue[segment], body.soft_tissue[segment][::5][:n], atol=1e-9)
@@ -548,7 +507,7 @@ def test_gyroscopes_warm_up() -> None:
     changes = []
     for seed in range(60):
         clean, warm = (
-            simulate(LENGTHS, seed=seed, imperfections=sizes, rate_hz=20.0, clasp_s=5.0, circles=0)
+            simulate(SUBJECT, seed=seed, imperfections=sizes, rate_hz=20.0, clasp_s=5.0, circles=0)
             for sizes in (IDEAL_PRESET, only("gyro_warm_up_deg_s"))
         )
         for segment in SEGMENTS:
@@ -566,7 +525,7 @@ def test_gyroscopes_warm_up() -> None:
 def test_clocks_drift() -> None:
     rates = []
     for seed in range(30):
-        sim = simulate(LENGTHS, seed=seed, imperfections=only("clock_drift_ppm"), rate_hz=20.0, clasp_s=5.0, circles=0)
+        sim = simulate(SUBJECT, seed=seed, imperfections=only("clock_drift_ppm"), rate_hz=20.0, clasp_s=5.0, circles=0)
         rates += [(sim.sample_time[segment][-1] / sim.time[-1] - 1.0) * 1e6 for segment in SEGMENTS]
     assert np.std(rates) == pytest.approx(5.0, rel=0.15)
 
@@ -630,8 +589,8 @@ def test_switching_one_on_changes_only_it(name: str) -> None:
     options = {"seed": 5, "rate_hz": 20.0, "clasp_s": 8.0, "circles": 0}
     options["protocol"] = "handle" if name == "handle_slip" else "clasp"
     without = only("girdle") if name == "girdle_hysteresis" else IDEAL_PRESET  # it is one of the girdle
-    ideal = simulate(LENGTHS, imperfections=without, **options)
-    one = simulate(LENGTHS, imperfections=replace(without, **{name: getattr(PEOPLE_PRESET, name)}), **options)
+    ideal = simulate(SUBJECT, imperfections=without, **options)
+    one = simulate(SUBJECT, imperfections=replace(without, **{name: getattr(PEOPLE_PRESET, name)}), **options)
     skeleton = all(np.array_equal(one.quat_WL[segment], ideal.quat_WL[segment]) for segment in SEGMENTS)
     assert skeleton == (name in SENSORS)
     assert any(values.any() for values in one.soft_tissue.values()) == (name in TISSUE and name != "strap_slip_deg")
@@ -672,7 +631,7 @@ def test_arms_do_tasks_as_people_do() -> None:
 
 def test_tasks_keep_the_physics() -> None:
     sim = simulate_activity("tasks", seed=2, imperfections=BODY, noise=NOISE_FREE, seconds=8.0, rate_hz=500.0)
-    check_accel(sim, 4.0, 13.0)
+    check_path(sim, 4.0, 13.0)
     again = simulate_activity("tasks", seed=2, imperfections=BODY, noise=NOISE_FREE, seconds=8.0, rate_hz=50.0)
     np.testing.assert_allclose(again.points["left_palm"], sim.points["left_palm"][::10][: len(again.time)], atol=1e-9)
 

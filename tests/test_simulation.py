@@ -8,22 +8,9 @@ import pytest
 from bodies import LENGTHS
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
+from simulated import SIDES, SUBJECT, G, check_accel, check_gyro, check_lengths, position_WS, within
 
 from wepose_pin.simulation import NOISE_FREE, SEGMENTS, ImuNoise, Simulation, simulate
-
-G = 9.81
-SIDES = ("left", "right")
-# Left and right differ, so that a swap shows.
-SUBJECT = {
-    "trunk": 0.50,
-    "shoulder_width": 0.385,
-    "left_upper_arm": 0.301,
-    "left_forearm": 0.252,
-    "left_hand": 0.081,
-    "right_upper_arm": 0.309,
-    "right_forearm": 0.247,
-    "right_hand": 0.078,
-}
 
 
 @pytest.fixture(scope="module")
@@ -40,22 +27,6 @@ def rotation_WS(sim: Simulation, segment: str) -> Rotation:
     return Rotation.from_quat(sim.quat_WL[segment]) * Rotation.from_quat(sim.quat_LS[segment])
 
 
-def position_WS(sim: Simulation, segment: str) -> np.ndarray:
-    """Where the sensor is in W, from the recorded points."""
-    side, _, part = segment.partition("_")
-    origin = {
-        "": 0.0,
-        "upper_arm": sim.points.get(f"{side}_shoulder"),
-        "forearm": sim.points.get(f"{side}_elbow"),
-    }
-    return origin[part] + Rotation.from_quat(sim.quat_WL[segment]).apply(sim.p_LS[segment])
-
-
-def within(sim: Simulation, *phases: str) -> np.ndarray:
-    spans = [span for phase in phases for span in sim.phases[phase]]
-    return np.any([(sim.time >= a) & (sim.time <= b) for a, b in spans], axis=0)
-
-
 def flexion(sim: Simulation, side: str) -> np.ndarray:
     """Angle between upper arm and forearm, from the points [rad]."""
     shoulder, elbow, wrist = (sim.points[f"{side}_{p}"] for p in ("shoulder", "elbow", "wrist"))
@@ -66,24 +37,14 @@ def flexion(sim: Simulation, side: str) -> np.ndarray:
 
 @pytest.mark.parametrize("segment", SEGMENTS)
 def test_gyro_integrates_to_the_orientation(perfect: Simulation, segment: str) -> None:
-    n = 6001  # 60 s
-    truth = rotation_WS(perfect, segment)
-    q = truth[0]
-    for k in range(1, n):
-        q = q * Rotation.from_rotvec(perfect.gyro_S[segment][k] / perfect.rate_hz)
-        if k % 500 == 0:
-            assert (q.inv() * truth[k]).magnitude() < 1e-6
+    check_gyro(perfect, segment, rotation_WS(perfect, segment), 60.0)
 
 
 @pytest.mark.parametrize("segment", SEGMENTS)
 def test_accel_integrates_to_the_position(fast: Simulation, segment: str) -> None:
-    k = (fast.time >= 4.5) & (fast.time <= 14.5)  # from rest through the transition into the clasp
-    t = fast.time[k]
-    accel_W = rotation_WS(fast, segment)[k].apply(fast.accel_S[segment][k]) - [0.0, 0.0, G]
-    truth = position_WS(fast, segment)[k]
-    position = truth[0] + CubicSpline(t, accel_W).antiderivative(2)(t)
-    assert np.abs(position - truth).max() < 1e-3
-    assert np.ptp(truth, axis=0).max() > 0.1  # it did move
+    # from rest through the transition into the clasp
+    moved = check_accel(fast, segment, rotation_WS(fast, segment), 4.5, 14.5)
+    assert moved.max() > 0.1
 
 
 @pytest.mark.parametrize("segment", SEGMENTS)
@@ -94,18 +55,8 @@ def test_accel_is_the_second_derivative_of_the_position(fast: Simulation, segmen
     assert np.abs(accel_W - spline)[10:-10].max() < 2e-3
 
 
-@pytest.mark.parametrize("side", SIDES)
-@pytest.mark.parametrize(
-    ("part", "start", "end"),
-    [("upper_arm", "shoulder", "elbow"), ("forearm", "elbow", "wrist"), ("hand", "wrist", "palm")],
-)
-def test_segments_keep_their_length(perfect: Simulation, side: str, part: str, start: str, end: str) -> None:
-    p_W = perfect.points[f"{side}_{end}"] - perfect.points[f"{side}_{start}"]
-    np.testing.assert_allclose(np.linalg.norm(p_W, axis=1), SUBJECT[f"{side}_{part}"], rtol=0, atol=1e-12)
-    # and lie along -z of their segment; the hand is rigid with the forearm
-    segment = f"{side}_{'forearm' if part == 'hand' else part}"
-    p_L = Rotation.from_quat(perfect.quat_WL[segment]).inv().apply(p_W)
-    assert np.abs(p_L - [0.0, 0.0, -SUBJECT[f"{side}_{part}"]]).max() < 1e-12
+def test_segments_keep_their_length(perfect: Simulation) -> None:
+    check_lengths(perfect, rigid_hands=True)
 
 
 def test_shoulders_are_carried_by_the_torso(perfect: Simulation) -> None:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -40,8 +40,9 @@ HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the
 GAP_ROWS = 3  # residuals of a sample's condition
 
 
-class Layout(NamedTuple):
-    """The places of the unknowns in x.
+@dataclass(frozen=True)
+class Layout:
+    """The places of the unknowns in x; each follows the one before, so it is computed once.
 
     Parameters
     ----------
@@ -69,86 +70,86 @@ class Layout(NamedTuple):
     rigid: tuple[str, ...] = ()
     attitude_std: tuple[float, ...] = ()
 
-    @property
+    @cached_property
     def soft(self) -> tuple[str, ...]:
         """Sensors with a soft-tissue artefact."""
         return tuple(name for name in self.sensors if name not in self.rigid)
 
-    @property
+    @cached_property
     def length(self) -> slice:
         """The lengths [m]."""
         return slice(0, len(self.lengths))
 
-    @property
+    @cached_property
     def heading(self) -> slice:
         """ψ [rad] of each sensor."""
         return slice(self.length.stop, self.length.stop + len(self.sensors))
 
-    @property
+    @cached_property
     def tilt(self) -> slice:
         """ε about x, y of L [rad] of each sensor: how far its segment is off the start pose."""
         return slice(self.heading.stop, self.heading.stop + 2 * len(self.sensors))
 
-    @property
+    @cached_property
     def drift(self) -> slice:
         """d [rad/s] of each sensor's heading."""
         return slice(self.tilt.stop, self.tilt.stop + len(self.sensors))
 
-    @property
+    @cached_property
     def hinge(self) -> slice:
         """Of each hinge's axis, by how much it is turned across and tilted."""
         return slice(self.drift.stop, self.drift.stop + 2 * len(self.hinges))
 
-    @property
+    @cached_property
     def soft_tissue(self) -> slice:
         """A (3, 3) of each of the `soft` sensors, column by column [rad]."""
         return slice(self.hinge.stop, self.hinge.stop + 9 * len(self.soft))
 
-    @property
+    @cached_property
     def girdle(self) -> slice:
         """`model.girdle.PARAMETERS` of each girdle [m]."""
         return slice(self.soft_tissue.stop, self.soft_tissue.stop + len(PARAMETERS) * len(self.girdles))
 
-    @property
+    @cached_property
     def points(self) -> slice:
         """Unknown points of W (3,) each [m]."""
         return slice(self.girdle.stop, self.girdle.stop + 3 * self.fixed)
 
-    @property
+    @cached_property
     def heights(self) -> slice:
         """Heights of level planes in W [m]."""
         return slice(self.points.stop, self.points.stop + self.planes)
 
-    @property
+    @cached_property
     def distances(self) -> slice:
         """Distances outside the body [m]."""
         return slice(self.heights.stop, self.heights.stop + len(self.distance_names))
 
-    @property
+    @cached_property
     def step(self) -> slice:
         """Steps of headings [rad]."""
         return slice(self.distances.stop, self.distances.stop + len(self.steps))
 
-    @property
+    @cached_property
     def size(self) -> int:
         return self.step.stop
 
-    @property
+    @cached_property
     def rows(self) -> int:
         """Length of a sample's data."""
         return self.place.stop + 1
 
-    @property
+    @cached_property
     def beyond(self) -> slice:
         """Of a sample's data: whether it is beyond each heading step."""
         return slice(4 * len(self.sensors), 4 * len(self.sensors) + len(self.steps))
 
-    @property
+    @cached_property
     def place(self) -> slice:
         """Of a sample's data: the recorded place (3,) [m] in W."""
         return slice(self.beyond.stop, self.beyond.stop + 3 * self.recorded)
 
-    @property
+    @cached_property
     def residuals(self) -> int:
         """How many residuals a sample has."""
         return GAP_ROWS + len(self.hinges)
@@ -191,7 +192,7 @@ class Observations:
             Q = Rotation.from_quat(data[i : i + 4, beyond].T)
             data[i : i + 4, beyond] = (Rotation.from_rotvec([0.0, 0.0, step]) * Q).as_quat().T
         data = np.delete(data, self.layout.beyond, axis=0)
-        return replace(self, layout=self.layout._replace(steps=()), data=data, step_std=np.empty(0))
+        return replace(self, layout=replace(self.layout, steps=()), data=data, step_std=np.empty(0))
 
     def spans(self) -> list[tuple[Constraint, slice]]:
         """Each condition with its samples; none may be empty."""

@@ -250,7 +250,7 @@ class CalibrationProblem:
                 )
         samples = np.concatenate(parts)
         steps, step_std, beyond = group_steps(losses, samples)
-        layout = layout._replace(steps=steps)
+        layout = replace(layout, steps=steps)
         turns = [
             (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
         ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from ..errors import BadModel
 from .table import ROOT, BodyTable, Stretch
-from .tree import Tree, parse_tree
+from .tree import Tree, copy_robot, parse_tree
 
 _TOLERANCE = 1e-13  # [m]
 _MOST_ROUNDS = 50  # one is enough where every point lies on its joint
@@ -31,7 +30,7 @@ def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> 
 
     A segment stretches along the line of its length, all joints at zero; one of several lengths along each of them.
     """
-    robot = copy.deepcopy(robot)
+    robot = copy_robot(robot)
     for _ in range(_MOST_ROUNDS):
         own = measure_lengths(robot, table)
         ratio = {name: value / own[name] for name, value in targets.items() if abs(own[name] - value) > _TOLERANCE}
@@ -48,7 +47,7 @@ def check_lengths_scale(robot: Any, table: BodyTable) -> None:
         if value < _LEAST:
             raise BadModel(f"{table.where}: lengths.{name}: its points lie in one place; it scales nothing")
     for name, value in own.items():
-        changed = copy.deepcopy(robot)
+        changed = copy_robot(robot)
         _stretch(changed, table, {name: 1.1})
         if abs(measure_lengths(changed, table)[name] - 1.1 * value) > 0.05 * value:
             segments = " and ".join(part.segment for part in table.lengths[name].stretches)

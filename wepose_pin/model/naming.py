@@ -6,7 +6,6 @@ finds the segments by their names.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from difflib import get_close_matches
@@ -18,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadModel, one_of
 from ..recording import compute_mount
 from .table import BodyTable, Point
-from .tree import Tree, parse_tree
+from .tree import Tree, copy_robot, parse_tree
 from .urdf_library import import_yourdfpy
 
 MOST_LINKS = 100  # that an error lists; a person's body has fewer
@@ -161,7 +160,7 @@ def _with_links(
     A link of theirs that bears such a name and stands elsewhere becomes ``<name>_link``.
     """
     yourdfpy = import_yourdfpy()
-    robot = copy.deepcopy(robot)
+    robot = copy_robot(robot)
     added = {}
     for name, (link, R, p) in frames.items():
         M_WL = np.eye(4)

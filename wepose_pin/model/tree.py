@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -64,6 +65,11 @@ class Built(NamedTuple):
     pin: pin.Model
     joints: dict[str, int]
     limits: dict[str, AxisLimits]
+
+
+def copy_robot(robot: Any) -> Any:
+    """A deep copy of `robot` (yourdfpy), by pickle: several times as fast as `copy.deepcopy`."""
+    return pickle.loads(pickle.dumps(robot, pickle.HIGHEST_PROTOCOL))
 
 
 def parse_tree(robot: Any, where: str) -> Tree:
