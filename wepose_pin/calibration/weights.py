@@ -14,7 +14,7 @@ import numpy as np
 
 from ..model.girdle import PARAMETERS
 from ..subject import mount_rows
-from .conditions import Loop, StartPose
+from .conditions import Loop, Moving, StartPose
 from .least_squares import GAP_ROWS, Gaussian, Layout, Observations
 from .solver import STEPS, Fit, LeastSquares, solve
 
@@ -67,7 +67,7 @@ def solve_reweighted(
     start, contact : x (m,) to begin with, and the weight (n,) of each sample's gap in it
     quick : one round with few steps and without hinges
     """
-    n, closed = len(observations), observations.closed
+    n, closed, bending = len(observations), observations.closed, observations.bending
     rounds, steps = (range(QUICK_ROUNDS), QUICK_STEPS) if quick else (range(ROUNDS), STEPS)
     contact, correlation = contact.copy(), min_correlation(observations)
     weights = np.full((n, observations.layout.residuals), 1.0 / correlation)
@@ -82,10 +82,10 @@ def solve_reweighted(
     if quick:
         weights[:, GAP_ROWS:] = 0.0
     for condition, span in observations.spans():
-        if not isinstance(condition, Loop):
+        if not isinstance(condition, Loop | Moving):
             weights[span] = 1.0 / (span.stop - span.start)  # the error of a pose is constant: one effective sample
     effective = float(closed.sum())
-    if not closed.any():
+    if not bending.any():
         fit = solve(LeastSquares(observations, prior, weights), x, steps, not quick)
         return WeightedFit(fit, weights, contact, effective)
     for k in rounds:
@@ -100,7 +100,7 @@ def solve_reweighted(
                 weights[span, :3] = _weigh(r, contact[span], correlation)
                 effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], correlation)
         if observations.layout.hinges and not quick:
-            weights[closed, GAP_ROWS:] = _weigh(fit.hinge[closed], np.ones(int(closed.sum())), correlation)
+            weights[bending, GAP_ROWS:] = _weigh(fit.hinge[bending], np.ones(int(bending.sum())), correlation)
     fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, not quick)
     return WeightedFit(fit, weights, contact, effective)
 
@@ -154,13 +154,13 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
     hinges = list(range(GAP_ROWS, observations.layout.residuals))
     gradient = prior_information.copy()
     for condition, span in observations.spans():
-        parts = [(list(range(condition.rows)), contact[span])]
-        if isinstance(condition, Loop):
+        parts = [(list(range(condition.rows)), contact[span])] if condition.rows else []
+        if isinstance(condition, Loop | Moving):
             parts += [(hinges, np.ones(span.stop - span.start))] if hinges else []
         for rows, share in parts:
             slope, w = J[span][:, rows], weights[span][:, rows]
             pull = w[:, :, None] * slope
-            if not isinstance(condition, Loop):
+            if not isinstance(condition, Loop | Moving):
                 gradient += np.einsum("nki,nkj->ij", pull, slope)
                 continue
             if not share.sum() > 0.0:
