@@ -329,17 +329,18 @@ def _see_from(gap: np.ndarray, J: np.ndarray, Q: np.ndarray, psi: np.ndarray, k:
 def estimate_joint_headings(
     observations: Observations, couplings: Sequence[Coupling], stated: Mapping[str, float]
 ) -> np.ndarray:
-    """ψ [rad] of each sensor where there is no closure: neighbours by their couplings, all by how hinges bend.
+    """ψ [rad] of each sensor where there is no closure: by poses, neighbours by their couplings, all by how hinges bend.
 
-    Where no heading is stated, all are turned together until the segments that hinges move lie on the side to which
-    they bend.
+    Where neither a mount nor a pose shows a heading, all are turned together until the segments that hinges move lie on
+    the side to which they bend.
 
     Parameters
     ----------
     stated : sensor → ψ [rad] of its stated mount
     """
     layout, Q = observations.layout, _rotations(observations)
-    headings = dict(stated) or {layout.sensors[0]: 0.0}
+    shown = {**_solve_poses(observations, stated), **stated}
+    headings = shown or {layout.sensors[0]: 0.0}
     while True:
         known = {c.near: headings[c.far] + c.heading for c in couplings if c.far in headings}
         known |= {c.far: headings[c.near] - c.heading for c in couplings if c.near in headings}
@@ -348,7 +349,7 @@ def estimate_joint_headings(
         headings = known | headings
     bent = 0.0j
     for hinge in layout.hinges:
-        if not stated and {hinge.on, hinge.moves} <= set(headings):
+        if not shown and {hinge.on, hinge.moves} <= set(headings):
             R_on, R_moves = (
                 Rotation.from_rotvec([0.0, 0.0, headings[name]])
                 * Q[name]

@@ -43,7 +43,7 @@ from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
 from .anatomy import BETTER, LabelCheck, check_labels
-from .conditions import find_hinges, find_measured_lengths, fix_scale, group_lengths
+from .conditions import Level, Pointing, find_hinges, find_measured_lengths, fix_scale, group_lengths
 from .contact import find_contact_start
 from .doubled import add_second_mounts
 from .initial_headings import Coupling, estimate_joint_headings
@@ -297,7 +297,8 @@ def _check_free_motion(problem: CalibrationProblem) -> None:
         return
     stated = set(problem.stated_headings(problem.sensors))
     couplings = _estimate_couplings(problem, problem.sensors)
-    known = stated or {problem.model.table.reference}
+    shown = {c.segment for c in problem.conditions if isinstance(c, Pointing | Level)}
+    known = stated | shown or {problem.model.table.reference}
     for _ in couplings:
         known |= {name for c in couplings for name in (c.near, c.far) if {c.near, c.far} & known}
     unknown = [name for name in problem.sensors if name not in known]
