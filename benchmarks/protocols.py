@@ -1,8 +1,9 @@
 """What each calibration protocol is worth on simulated people: errors, stated standard deviations and seconds.
 
-Each person of the preset `people` does each protocol with arbitrary mounts, a measured shoulder width and trunk, and then
-draws circles with the right hand, on which the palm is compared. Results are appended to a file, so that a run that was
-stopped goes on.
+Each person of the preset `people` does each protocol with arbitrary mounts, a measured shoulder width and trunk, and
+then draws a circle with the right hand, on which the palm is compared. Clocks are exact, which makes the simulation
+twice as fast and changes no angle by more than 0.2 deg. Results are appended to a file, so that a run goes on where it
+was stopped.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from wepose_pin.simulation import PEOPLE_MEASURED_STD, PRESETS, simulate, simula
 from .consistency import measure_simulation, summarize
 
 FIRST_SEED = 300  # of persons; none of them was looked at while sizes were chosen
-CIRCLES = 2
+CIRCLES = 1
+CLOCKS = {"clock_jitter": 0.0, "clock_offset": 0.0, "clock_drift_ppm": 0.0}
 QUANTITIES = {
     "lengths": ("lengths", 1e3, "mm"),
     "whole arms": ("whole arm", 1e3, "mm"),
@@ -40,27 +42,27 @@ class Cell(NamedTuple):
 # In the order in which they are measured. `free` is the activity "tasks": reaches, rests and typing.
 CELLS = (
     Cell("clasp", 60.0),
-    Cell("clasp+elbows", 60.0),
     Cell("clasp+t_pose", 60.0),
-    Cell("clasp+swing", 60.0),
     Cell("free", 60.0),
-    Cell("clasp+touch_body", 60.0),
-    Cell("handle", 60.0),
+    Cell("clasp+elbows", 60.0),
     Cell("clasp", 30.0),
     Cell("clasp+t_pose", 30.0),
-    Cell("clasp+elbows", 30.0),
-    Cell("clasp+elbows+t_pose", 60.0),
+    Cell("clasp+swing", 60.0),
+    Cell("clasp+touch_body", 60.0),
+    Cell("handle", 60.0),
     Cell("elbows+swing+t_pose", 60.0),
+    Cell("poses", 14.5),
     Cell("touch_body", 60.0),
     Cell("handle", 30.0),
-    Cell("poses", 14.5),
+    Cell("clasp+elbows", 30.0),
+    Cell("clasp+elbows+t_pose", 60.0),
 )
 
 
 def measure(cell: Cell, seed: int) -> dict[str, Any]:
     """Errors and standard deviations of a person, as `consistency.measure_person`."""
     person = simulate_person(seed, PEOPLE_MEASURED_STD)
-    imperfections = replace(PRESETS["people"], mount="any")
+    imperfections = replace(PRESETS["people"], mount="any", **CLOCKS)
     if cell.protocol == "free":
         simulation = simulate_activity(
             "tasks", seed=seed, imperfections=imperfections, seconds=cell.seconds, lengths=person.lengths
@@ -117,11 +119,8 @@ def make_table(results: dict[tuple[Cell, int], dict[str, Any]]) -> str:
         for quantity, (_, factor, _) in QUANTITIES.items():
             row = rows.get(quantity)
             digits = ".0f" if quantity in ("whole arms", "point right_palm") else ".1f"
-            cells.append(
-                f"{factor * row['error']:{digits}} (± {factor * row['std']:{digits}}, {row['by_std']:.2f})"
-                if row
-                else "–"
-            )
+            values = [f"{factor * row[key]:{digits}}" for key in ("error", "std")] if row else []
+            cells.append(f"{values[0]} (± {values[1]}, {row['by_std']:.2f})" if row else "–")
         palm = rows.get("palm from shoulders")
         cells.append(f"{1e3 * palm['error']:.0f}" if palm else "–")
         lines.append(f"| {' | '.join(cells)} |")

@@ -329,7 +329,7 @@ def _see_from(gap: np.ndarray, J: np.ndarray, Q: np.ndarray, psi: np.ndarray, k:
 def estimate_joint_headings(
     observations: Observations, couplings: Sequence[Coupling], stated: Mapping[str, float]
 ) -> np.ndarray:
-    """ψ [rad] of each sensor where there is no closure: by poses, neighbours by their couplings, all by how hinges bend.
+    """ψ [rad] of each sensor where there is no closure: by poses, couplings of neighbours, and how hinges bend.
 
     Where neither a mount nor a pose shows a heading, all are turned together until the segments that hinges move lie on
     the side to which they bend.

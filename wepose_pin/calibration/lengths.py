@@ -55,7 +55,7 @@ from .priors import build_prior, combine_lengths
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem
 from .protocols import Protocol, load_protocol
 from .result import Calibration
-from .sessions import fuse_subjects, separate_mounts
+from .sessions import fuse_sessions, separate_mounts
 from .solver import MIN_LENGTH
 from .weights import (
     MIN_CONTACT,
@@ -144,7 +144,7 @@ def calibrate_lengths(
         return solve_paper_calibration(problem)
     calibration = _calibrate_checked(problem)
     if earlier is not None and not calibration.labels.moved:
-        fused = fuse_subjects(earlier, calibration.subject, population_subject(body=model), table)
+        fused = fuse_sessions([earlier, calibration.subject], prior, problem.measured, table)
         calibration = replace(calibration, subject=fused, prior=earlier)
     return add_second_mounts(calibration, recording, method)
 
