@@ -37,8 +37,9 @@ class SimulateJob:
         Sample the person and the motion by this seed.
     rate_hz : HZ
         Sample the sensors at this rate, 20 to 2000 Hz.
-    protocol
-        Simulate the motion of this calibration protocol (see `wepose calibrate --help`).
+    protocol : NAME
+        Simulate the motion of this calibration protocol (see `wepose calibrate --help`): clasp, handle, touch_left,
+        touch_right, poses; or clasp, elbows, swing, t_pose, touch_body, one or several joined by +.
     activity
         Simulate an activity in place of a protocol. Of the whole body, with sensors on pelvis, head, hands and legs
         too: walking on the spot (walk), or sitting down and standing up (sit). Of the upper body: reaches, rests and
@@ -71,7 +72,7 @@ class SimulateJob:
     out: Path
     seed: int = 1
     rate_hz: float = 100.0
-    protocol: Literal["clasp", "handle", "touch_left", "touch_right", "poses"] = "clasp"
+    protocol: str = "clasp"
     activity: Literal["walk", "sit", "tasks"] | None = None
     seconds: float | None = None
     preset: Literal["ideal", "mild", "people"] = "ideal"
@@ -80,7 +81,10 @@ class SimulateJob:
 
     def check(self) -> None:
         """Raise `BadOption` where a number is out of its range, or an imperfection is none."""
+        from ..simulation.tasks import find_task
+
         check_seed(self.seed)
+        find_task(self.protocol)
         if not 20.0 <= self.rate_hz <= 2000.0:
             raise BadOption(f"--rate-hz {self.rate_hz:g}: between 20 and 2000 samples a second")
         if self.activity is not None and self.protocol != "clasp":
