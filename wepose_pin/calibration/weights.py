@@ -15,7 +15,7 @@ import numpy as np
 from ..model.girdle import PARAMETERS
 from ..subject import mount_rows
 from .conditions import Loop, Moving, StartPose
-from .least_squares import GAP_ROWS, Gaussian, Layout, Observations
+from .least_squares import GAP_ROWS, HINGE_STD, Gaussian, Layout, Observations
 from .solver import STEPS, Fit, LeastSquares, solve
 
 # Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
@@ -31,6 +31,8 @@ MANY_SAMPLES = 1000  # from twice as many on, all rounds but the last take every
 OUTLIER = 5.0  # times the usual gap, at which the palms are apart
 MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
 MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about right
+# [rad] by which people's elbows leave a hinge (calibration/people.md): an oblique axis, and one that wanders.
+ELBOW_STD = np.deg2rad(4.0)
 CONTRADICTED = 3.0  # standard deviations between a measured length and what is known without it
 
 
@@ -67,7 +69,7 @@ def solve_reweighted(
     start, contact : x (m,) to begin with, and the weight (n,) of each sample's gap in it
     quick : one round with few steps and without hinges
     """
-    n, closed, bending = len(observations), observations.closed, observations.bending
+    n, closed = len(observations), observations.closed
     rounds, steps = (range(QUICK_ROUNDS), QUICK_STEPS) if quick else (range(ROUNDS), STEPS)
     contact, correlation = contact.copy(), min_correlation(observations)
     weights = np.full((n, observations.layout.residuals), 1.0 / correlation)
@@ -82,10 +84,12 @@ def solve_reweighted(
     if quick:
         weights[:, GAP_ROWS:] = 0.0
     for condition, span in observations.spans():
-        if not isinstance(condition, Loop | Moving):
-            weights[span] = 1.0 / (span.stop - span.start)  # the error of a pose is constant: one effective sample
+        # The error of a pose is constant, and how an elbow leaves its hinge follows its angles: one effective sample.
+        if not isinstance(condition, Loop):
+            size = ELBOW_STD / HINGE_STD if isinstance(condition, Moving) else 1.0
+            weights[span] = size**-2 / (span.stop - span.start)
     effective = float(closed.sum())
-    if not bending.any():
+    if not closed.any():
         fit = solve(LeastSquares(observations, prior, weights), x, steps, not quick)
         return WeightedFit(fit, weights, contact, effective)
     for k in rounds:
@@ -100,7 +104,7 @@ def solve_reweighted(
                 weights[span, :3] = _weigh(r, contact[span], correlation)
                 effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], correlation)
         if observations.layout.hinges and not quick:
-            weights[bending, GAP_ROWS:] = _weigh(fit.hinge[bending], np.ones(int(bending.sum())), correlation)
+            weights[closed, GAP_ROWS:] = _weigh(fit.hinge[closed], np.ones(int(closed.sum())), correlation)
     fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, not quick)
     return WeightedFit(fit, weights, contact, effective)
 
@@ -155,12 +159,12 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
     gradient = prior_information.copy()
     for condition, span in observations.spans():
         parts = [(list(range(condition.rows)), contact[span])] if condition.rows else []
-        if isinstance(condition, Loop | Moving):
-            parts += [(hinges, np.ones(span.stop - span.start))] if hinges else []
+        if isinstance(condition, Loop | Moving) and hinges:
+            parts.append((hinges, np.ones(span.stop - span.start)))
         for rows, share in parts:
             slope, w = J[span][:, rows], weights[span][:, rows]
             pull = w[:, :, None] * slope
-            if not isinstance(condition, Loop | Moving):
+            if not isinstance(condition, Loop):
                 gradient += np.einsum("nki,nkj->ij", pull, slope)
                 continue
             if not share.sum() > 0.0:
