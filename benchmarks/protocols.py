@@ -22,7 +22,7 @@ from .consistency import measure_simulation, summarize
 
 FIRST_SEED = 300  # of persons; none of them was looked at while sizes were chosen
 CIRCLES = 1
-CLOCKS = {"clock_jitter": 0.0, "clock_offset": 0.0, "clock_drift_ppm": 0.0}
+CLOCKS: dict[str, Any] = {"clock_jitter": 0.0, "clock_offset": 0.0, "clock_drift_ppm": 0.0}
 QUANTITIES = {
     "lengths": ("lengths", 1e3, "mm"),
     "whole arms": ("whole arm", 1e3, "mm"),

@@ -53,7 +53,7 @@ from .observability import diagnose_closures, diagnose_distances, diagnose_lengt
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .priors import build_prior, combine_lengths
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem
-from .protocols import Protocol, load_protocol
+from .protocols import Protocol, choose_protocol, load_protocol
 from .result import Calibration
 from .sessions import fuse_sessions, separate_mounts
 from .solver import MIN_LENGTH
@@ -79,7 +79,7 @@ def calibrate_lengths(
     measured: Mapping[str, float] | None = None,
     prior: Subject | None = None,
     model: BodyModel | None = None,
-    protocol: str | Protocol = "clasp",
+    protocol: str | Protocol | None = None,
     method: str = BEST,
     measured_std: Positive = MEASURED_STD,
     formulation: Formulation = "full",
@@ -92,7 +92,8 @@ def calibrate_lengths(
     prior : lengths before, with covariance, and mounts; None: `population_subject`. The subject of an earlier
         calibration is fused with the result (`sessions`)
     model : the body; None: that which the recording states, else the upper body
-    protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave
+    protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave; None: by the
+        recording's phases (`protocols.choose_protocol`)
     method : the orientation filter
     measured_std : standard deviation [m] of each measured length
     formulation : "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone,
@@ -110,7 +111,7 @@ def calibrate_lengths(
     check_arguments(calibrate_lengths, locals())
     check_method(method)
     if not isinstance(protocol, Protocol):
-        protocol = load_protocol(protocol)
+        protocol = load_protocol(protocol or choose_protocol(recording.phases))
     with_std = {name: (metres, measured_std) for name, metres in (measured or {}).items()}
     model = model or load_sensed_model(recording.model or None, recording.sensors, recording.where())
     table = model.table

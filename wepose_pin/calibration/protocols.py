@@ -19,6 +19,7 @@ The residual of a pose does not show how exactly it was taken, so its weight is 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,8 @@ PROTOCOLS = (
     "touch_left",
     "touch_right",
 )
+DEFAULT = "clasp"
+ALSO = ("t_pose",)  # what makes it better within the same minute (calibration/people.md), by phases of their names
 # How many points each kind takes, and the keys that are its own.
 KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}
 _KEYS = ("phase", "kind", "points", "slip", "in_front_of")
@@ -202,6 +205,11 @@ class Protocol:
         measured = self.measured_example.partition("=")[0]
         if measured and measured not in (*table.lengths, *self.distances):
             raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
+
+
+def choose_protocol(phases: Collection[str]) -> str:
+    """The protocol of a recording with these phases where none is named: `DEFAULT`, with the T-pose if it was held."""
+    return "+".join([DEFAULT, *(name for name in ALSO if name in phases)])
 
 
 def load_protocol(name: str | Path) -> Protocol:

@@ -17,7 +17,7 @@ from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject, population_subject
 from .lengths import MEASURED_STD, calibrate_lengths
-from .protocols import Protocol, load_protocol
+from .protocols import Protocol
 from .result import Calibration
 from .sessions import fuse_sessions, separate_mounts
 
@@ -32,7 +32,7 @@ def calibrate_sessions(
     measured: Mapping[str, float] | None = None,
     prior: Subject | None = None,
     model: BodyModel | None = None,
-    protocol: str | Protocol = "clasp",
+    protocol: str | Protocol | None = None,
     method: str = BEST,
     measured_std: float = MEASURED_STD,
 ) -> list[Calibration]:
@@ -47,7 +47,6 @@ def calibrate_sessions(
     WeposeError
         As `calibrate_lengths`.
     """
-    protocol = protocol if isinstance(protocol, Protocol) else load_protocol(protocol)
     earlier = prior if prior is not None and prior.start_pose_offset else None
     if earlier is not None:
         prior = separate_mounts(earlier, population_subject(body=model))

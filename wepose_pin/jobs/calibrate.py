@@ -37,12 +37,13 @@ class CalibrateJob:
     out : DIR
         Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     protocol : NAME|FILE.toml
-        Calibrate by this protocol: clasp (hands together), clasp_measured (the same with a measured length), handle
-        (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), table (both palms on a
-        table), tip (of a robot's arm or another chain: its point "tip" on a fixed point), touch_body (palms on hips,
-        shoulders, head), poses (T-pose and bow: determines headings and no lengths), t_pose, elbows (elbows bend),
-        swing (arms swing), free (any motion, no protocol: headings and mounts alone), or a file of your own, made like
-        those in calibration/. Several in one session are joined by +, as in clasp+t_pose.
+        Calibrate by this protocol. Without it clasp, and t_pose as well where the session has that phase. Known are
+        clasp (hands together), clasp_measured (the same with a measured length), handle (hands on a bar of known
+        length), touch_left or touch_right (one palm on a fixed point), table (both palms on a table), tip (of a robot's
+        arm or another chain: its point "tip" on a fixed point), touch_body (palms on hips, shoulders, head), poses
+        (T-pose and bow: determines headings and no lengths), t_pose, elbows (elbows bend), swing (arms swing), free
+        (any motion, no protocol: headings and mounts alone), or a file of your own, made like those in calibration/.
+        Several in one session are joined by +, as in clasp+t_pose.
     model : NAME|FILE
         Calibrate this body: a name (upper_body, whole_body), a table of a body (.toml), or a URDF beside its table
         (docs/models.md). Without it that which the session states, else upper_body.
@@ -76,7 +77,7 @@ class CalibrateJob:
     session: Path
     out: Path
     further: tuple[Path, ...] = ()
-    protocol: str = "clasp"
+    protocol: str | None = None
     model: str | None = None
     measured: Mapping[str, float] = field(default_factory=dict)
     prior: Path | None = None
@@ -91,10 +92,11 @@ class CalibrateJob:
     def check(self) -> None:
         """Raise `WeposeError` where an option is wrong whatever the session holds."""
         from ..calibration import load_protocol
+        from ..calibration.protocols import DEFAULT
         from ..model import load_model
         from ..model.anthropometry import check_stature
 
-        load_protocol(self.protocol)
+        load_protocol(self.protocol or DEFAULT)
         check_stature(self.stature)
         if self.further and self.formulation != "full":
             raise WrongOption(
@@ -112,8 +114,9 @@ class CalibrateJob:
 def _check_measured(job: CalibrateJob, model: BodyModel) -> None:
     """Raise `WrongOption` where a length is measured that neither the body nor the protocol has."""
     from ..calibration import PROTOCOLS, load_protocol
+    from ..calibration.protocols import DEFAULT
 
-    known = (*model.lengths, *load_protocol(job.protocol).distances)
+    known = (*model.lengths, *load_protocol(job.protocol or DEFAULT).distances)
     for name, metres in job.measured.items():
         stated = f"{name}={metres:g}"
         others = [each for each in PROTOCOLS if name in load_protocol(each).distances]
@@ -149,6 +152,7 @@ def run_calibrate(
         What the session, the protocol or an option lacks.
     """
     from ..calibration import assess, calibrate_lengths, calibrate_sessions, load_protocol
+    from ..calibration.protocols import choose_protocol
     from ..model.body import load_sensed_model
     from ..readers import load_session
     from ..report import write_calibration_page
@@ -159,11 +163,11 @@ def run_calibrate(
     from ..writers.result import write_subject
 
     job.check()
-    protocol = load_protocol(job.protocol)
     with result_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
         recordings = [load_session(session, gaps=job.gaps) for session in (job.session, *job.further)]
         recording = recordings[-1]
+        protocol = load_protocol(job.protocol or choose_protocol(recording.phases))
         model = load_sensed_model(job.model or recording.model or None, recording.sensors, recording.where())
         _check_measured(job, model)
         prior = load_subject(job.prior) if job.prior is not None else None
@@ -173,7 +177,7 @@ def run_calibrate(
             "measured": dict(job.measured),
             "prior": prior,
             "model": model,
-            "protocol": protocol,
+            "protocol": job.protocol,
             "method": job.method,
         }
         if job.further:

@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..errors import BadOption
 from .motion import LIFT_S, MARGIN_S, SIDES, FreeArm, Motion
 from .people import Offset
 from .signals import Process, Wander, integrate_pulse, make_pulse, make_step
 
 _LONG_S = 45.0  # [s] of a session, from which on parts have their full length
 _PART_S = {"elbows": (7.0, 10.0), "swing": (7.0, 10.0), "t_pose": (4.0, 5.0), "touch_body": (4.0, 6.0)}  # short, full
+_LEAST_CLASP_S = 5.0
 _BLEND_S = 1.5  # between hanging arms and hands that are led, or arms held sideways
 _RAMP_S, _CLASP_RAMP_S = 1.0, 2.0  # in which a part's motion grows and dies away
 _BEND = np.deg2rad(45.0)  # half the range of the elbow
@@ -87,6 +89,11 @@ class Sequence(Motion):
         first, last = _BLEND_S * (pieces[0][0] == "t_pose"), _BLEND_S * (pieces[-1][0] == "t_pose")
         left = end - begin - sum(seconds) - sum(changes) - first - last
         shares = [kind == "clasp" for kind, _ in pieces]
+        least = _LEAST_CLASP_S if any(shares) else 0.0
+        if left < least:
+            raise BadOption(
+                f"protocol '{'+'.join(self.parts)}' needs {end - begin + least - left:.0f} s, {end - begin:g} are given"
+            )
         self.schedule: list[_Part] = []
         at = begin + first
         for (kind, phase), fixed, change in zip(pieces, seconds, [*changes, last], strict=True):
