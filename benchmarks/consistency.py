@@ -66,12 +66,13 @@ def measure_simulation(person: Person, simulation: Simulation, protocol: str = "
         )
     except WeposeError as error:
         return {"error": str(error)}
-    tracked = track(recording, calibration.subject)
-    return {
+    compared = {
         "quality": assess(calibration).quality,
         **_compare_subject(calibration.subject, person, simulation),
-        **_compare_pose(tracked, simulation),
     }
+    if not {"circles", "tasks"} & set(recording.phases):
+        return compared
+    return compared | _compare_pose(track(recording, calibration.subject), simulation)
 
 
 def _compare_subject(subject: Subject, person: Person, simulation: Simulation) -> dict[str, Any]:
@@ -106,7 +107,7 @@ def _compare_pose(tracked: TrackedRecording, simulation: Simulation) -> dict[str
     _, turn = _face_forward(simulation)
     quat_WL = {name: (turn * Rotation.from_quat(quat)).as_quat() for name, quat in simulation.quat_WL.items()}
     true_points = {name: turn.apply(p) for name, p in simulation.points.items()}
-    begin, end = simulation.phases["circles"][0]
+    begin, end = simulation.phases["tasks" if "tasks" in simulation.phases else "circles"][0]
     rows = np.flatnonzero((tracked.time >= begin) & (tracked.time <= end))[::10]
     segments, points, out = [], {}, {}
     for name, quat in quat_WL.items():

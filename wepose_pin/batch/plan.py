@@ -34,7 +34,15 @@ STEPS: dict[str, type] = {
     "evaluate": EvaluateJob,
 }
 _PATHS = ("session", "out", "result", "truth")
-_ITEM_OPTIONS = (*_PATHS, "subject", "measured", "stature", "sex", "force")  # follow from an item's session and subject
+_ITEM_OPTIONS = (
+    *_PATHS,
+    "subject",
+    "further",
+    "measured",
+    "stature",
+    "sex",
+    "force",
+)  # follow from an item's session and subject
 _NAMES_OR_FILES = ("protocol", "robot")
 _FORMATS = "formats"  # of export: a list, in place of --format
 _COLUMNS = ("session", "name", "subject", "truth", "stature", "sex")
@@ -217,9 +225,9 @@ def _list_protocol_lengths(steps: Mapping[str, Mapping[str, Any]]) -> tuple[str,
     """Lengths besides those of the body that the protocol measures, such as a bar between the palms."""
     if "calibrate" not in steps:
         return ()
-    from ..calibration.protocols import load_protocol
+    from ..calibration.protocols import DEFAULT, load_protocol
 
-    return tuple(load_protocol(steps["calibrate"]["protocol"]).distances)
+    return tuple(load_protocol(steps["calibrate"]["protocol"] or DEFAULT).distances)
 
 
 # Subjects ------------------------------------------------------------------------------------------------------------

@@ -91,7 +91,10 @@ def _reproduce(result: Path) -> Reproduction:
 
 def _build_job(result: Path, kind: type, provenance: Mapping[str, Any], out: Path) -> Any:
     """The job that made a result, with output `out` and without pages."""
-    inputs = {name: entry["path"] for name, entry in provenance["inputs"].items()}
+    inputs: dict[str, Any] = {}
+    for name, entry in provenance["inputs"].items():
+        field, dot, _ = name.partition(".")  # several of a field are numbered
+        inputs[field] = [*inputs.get(field, []), entry["path"]] if dot else entry["path"]
     values = {**provenance["options"], **inputs, "out": out}
     values |= {name: False for name in _PAGES if name in field_types(kind)}
     try:

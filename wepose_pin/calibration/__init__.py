@@ -5,7 +5,8 @@ inputs and samples, `chain` is the model's chains in CasADi, `least_squares` unk
 problem and its solution by `nlpsol`, `priors` what is known before. `initial_headings` and `contact` give the start,
 `joints` adds what accelerations show of headings, `losses` what lost samples change, `weights` weighs the samples,
 `alternatives` searches other minima, `anatomy` checks sensors and mounts. `paper` is the published calibration of the
-lengths alone. `result` is the outcome, `observability` and `quality` assess it, `outcome` gives a subject that passed.
+lengths alone. `series` calibrates several sessions of one person. `result` is the outcome, `observability` and
+`quality` assess it, `outcome` gives a subject that passed.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from .protocols import PROTOCOLS, Protocol, load_protocol
     from .quality import CalibrationQuality, Check, assess, document
     from .result import Calibration
+    from .series import calibrate_sessions
 
 # Loaded on first use: tracking takes protocols and conditions from here, and does not need CasADi.
 _WHERE = {
@@ -33,6 +35,7 @@ _WHERE = {
     "assess": "quality",
     "calibrate": "outcome",
     "calibrate_lengths": "lengths",
+    "calibrate_sessions": "series",
     "document": "quality",
     "load_protocol": "protocols",
 }
@@ -47,6 +50,7 @@ __all__ = [
     "assess",
     "calibrate",
     "calibrate_lengths",
+    "calibrate_sessions",
     "document",
     "load_protocol",
 ]

@@ -8,7 +8,7 @@ segment that equals W in the start pose: of a person in the N-pose the segment's
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -86,7 +86,15 @@ class Level:
     rows: int = 1
 
 
-Constraint = Loop | Pointing | Level
+@dataclass(frozen=True)
+class Moving:
+    """Limbs with sensors on these segments move freely: only hinges hold."""
+
+    segments: tuple[str, ...]
+    rows: int = 0
+
+
+Constraint = Loop | Pointing | Level | Moving
 
 
 class HingeUnknown(NamedTuple):
@@ -96,6 +104,7 @@ class HingeUnknown(NamedTuple):
     ----------
     on, moves : sensors
     along : (3,) the long axis of `moves`, in its S'
+    side : (3,) to which it bends
     """
 
     name: str
@@ -105,6 +114,7 @@ class HingeUnknown(NamedTuple):
     across: Vector
     tilted: Vector
     along: Vector
+    side: Vector
 
 
 class GirdleTerm(NamedTuple):
@@ -168,6 +178,8 @@ def resolve_conditions(
             table.check_segments((condition.segment,), f"protocol '{protocol.name}': ", BadOption)
             axis = start.turn(condition.segment, (0.0, 1.0, 0.0))
             constraints.append(Level(condition.segment, axis, condition.std))
+        else:
+            constraints.append(Moving(tuple(s for s in condition.segments or table.segments if s in sensors)))
     return tuple(constraints)
 
 
@@ -180,6 +192,10 @@ def _resolve_closure(
             f"protocol '{protocol.name}': no sensor moves {' and '.join(closure.points)}; a point that moves is needed"
         )
     girdles = tuple(find_girdle_signs(model, points) for points in closure.ways)
+    if closure.on and closure.on not in sensors:
+        raise BadSession(f"protocol '{protocol.name}': no sensor on {closure.on}, on which a point stays; add it")
+    if closure.on and closure.at is not None:
+        closure = replace(closure, at=start.turn(closure.on, closure.at))
     return Loop(closure, ways, girdles)
 
 
@@ -247,6 +263,7 @@ def find_hinges(model: BodyModel, start: StartPose, sensors: Collection[str]) ->
                     start.turn(hinge.on, np.cross(along_on, hinge.axis)),
                     start.turn(hinge.on, -along_on),
                     start.turn(hinge.moves, model.table.segments[hinge.moves].along),
+                    start.turn(hinge.on, np.sign(sum(hinge.range)) * np.cross(hinge.axis, along_on)),
                 )
             )
     return tuple(hinges)
@@ -284,7 +301,10 @@ def _moved(model: BodyModel, by_length: np.ndarray) -> list[str]:
 
 def find_segments(protocol: Protocol, model: BodyModel) -> frozenset[str]:
     """The segments whose orientation some condition of a protocol uses where all of them have sensors."""
-    used = {condition.segment for condition in protocol.conditions if not isinstance(condition, Closure)}
+    used = {condition.segment for condition in protocol.conditions if isinstance(condition, Direction | Axis)}
+    for motion in protocol.free_motions:
+        used |= set(motion.segments or model.table.needed)
+    used |= {closure.on for closure in protocol.closures if closure.on}
     if any(isinstance(condition, Direction) for condition in protocol.conditions):
         used.add(model.table.reference)
     for closure in protocol.closures:
@@ -298,7 +318,9 @@ def fix_scale(constraints: Collection[Constraint]) -> bool:
     """Whether the closures have a scale of their own: a recorded or known place, or a link of known size."""
     loops = [constraint for constraint in constraints if isinstance(constraint, Loop)]
     return any(
-        loop.kind == "recorded" or loop.closure.at is not None or any(np.any(part.constant) for part in loop.parts)
+        loop.kind == "recorded"
+        or (loop.closure.at is not None and not loop.closure.on)
+        or any(np.any(part.constant) for part in loop.parts)
         for loop in loops
     )
 

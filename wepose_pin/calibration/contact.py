@@ -32,7 +32,10 @@ def find_contact_start(
     """
     n, spans = len(observations), [span for _, span in observations.spans()]
     window = max(5, round(WINDOW_S / max(float(np.median(np.diff(observations.data[-1]))), 1e-3)))
-    few = observations.take(np.linspace(0, n - 1, min(n, SCORED)).astype(int))
+    # Where points of the body are joined, those show whether they touch; places elsewhere may be hardly known.
+    joined = np.array([isinstance(c, Loop) and c.kind == "coincide" for c in observations.conditions])
+    scored = np.flatnonzero(joined[observations.condition_index]) if joined.any() else np.arange(n)
+    few = observations.take(scored[np.linspace(0, len(scored) - 1, min(len(scored), SCORED)).astype(int)])
 
     def gap_ratios(x: np.ndarray, some: Observations) -> np.ndarray:
         return np.sum(residuals(x, some)[2] ** 2, axis=1) / WIDE**2

@@ -16,6 +16,7 @@ the size of each sensor's part of the chain, with the prior's few per cent of un
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,10 +29,20 @@ STARTS, NEARER = 256, 24  # starts, and how many of the best continue after some
 MINIMA, MOST_DISTINCT = 64, 12  # as `NEARER` for a search of all minima, and how many of these at most
 DISTINCT = np.deg2rad(15.0)  # [rad] of one heading, by which two minima differ
 FIRST_ROUNDS, MORE_ROUNDS = 6, 16
-SEARCH_SAMPLES = 48  # of each closure
+SEARCH_SAMPLES, LEAST_SEARCH_SAMPLES = 48, 8  # of all closures together, of each
 GAP_STD = 0.03  # [m] of a closure in the search; includes all that the search leaves out
 SIZE_STD = 0.08  # of a part of the chain, relative
 KNOWN_STD = np.deg2rad(10.0)  # [rad] of a heading from a mount or a pose
+
+
+class Coupling(NamedTuple):
+    """The heading of one sensor's world relative to that of its neighbour."""
+
+    near: str
+    far: str
+    heading: float  # [rad] ψ of the near one less ψ of the far one, mean over the samples
+    std: float  # [rad]
+    elapsed_s: float  # from the start pose to the mean time of the samples
 
 
 def estimate_headings(observations: Observations, x: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
@@ -45,8 +56,10 @@ def estimate_headings(observations: Observations, x: np.ndarray, stated: Mapping
     stated : sensor → ψ [rad] of its stated mount
     """
     sensors = observations.layout.sensors
-    if is_linear(observations.conditions):
-        return _solve_linear(observations.take(observations.closed), x, stated)
+    linear = find_linear(observations.conditions)
+    if linear is not None:
+        held = np.array([c is linear for c in observations.conditions])[observations.condition_index]
+        return _solve_linear(observations.take(held), linear, x, stated)
     known, steps = {**_solve_poses(observations, stated), **stated}, np.zeros(len(observations.layout.steps))
     if observations.closed.any() and not set(sensors) <= set(known):
         minima = _find_minima(observations, x, known, NEARER)
@@ -56,11 +69,18 @@ def estimate_headings(observations: Observations, x: np.ndarray, stated: Mapping
 
 def is_linear(conditions: Sequence[Constraint]) -> bool:
     """Whether headings come from one closure of points that coincide, with all parts but the first vertical."""
+    return find_linear(conditions) is not None
+
+
+def find_linear(conditions: Sequence[Constraint]) -> Loop | None:
+    """The one closure of points that coincide, with all parts but the first vertical, that shows all headings."""
     loops = [c for c in conditions if isinstance(c, Loop)]
-    if len(loops) != 1 or loops[0].kind != "coincide":
-        return False
-    first, *others = loops[0].parts
-    return first.sensor != UNIVERSE and not _is_vertical(first) and all(map(_is_vertical, others))
+    joined = [loop for loop in loops if loop.kind == "coincide"]
+    if len(joined) != 1 or not {p.sensor for c in loops for p in c.parts} <= {p.sensor for p in joined[0].parts}:
+        return None
+    first, *others = joined[0].parts
+    linear = first.sensor != UNIVERSE and not _is_vertical(first) and all(map(_is_vertical, others))
+    return joined[0] if linear else None
 
 
 def _is_vertical(part: Part) -> bool:
@@ -95,10 +115,9 @@ def _solve_poses(observations: Observations, stated: Mapping[str, float]) -> dic
     return headings
 
 
-def _solve_linear(observations: Observations, x: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
+def _solve_linear(observations: Observations, loop: Loop, x: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
     """ψ of each sensor and each heading step [rad], from the smallest singular vector of the closure."""
     layout = observations.layout
-    [loop] = [c for c in observations.conditions if isinstance(c, Loop)]
     lengths, (first, *others) = x[layout.length], loop.parts
     rotations = _rotations(observations)
     columns, parts = [rotations[first.sensor].as_matrix()], []
@@ -201,10 +220,12 @@ def _find_minima(
     # Of each way of a closure: it, Q (m, n, 3, 3), u (m, 3) each sensor's part, what does not move (3,), or less the
     # recorded places (n, 3).
     parts = []
+    loops = sum(isinstance(condition, Loop) for condition in observations.conditions)
+    count = max(SEARCH_SAMPLES // loops, LEAST_SEARCH_SAMPLES)
     for loop, span in observations.spans():
         if not isinstance(loop, Loop):
             continue
-        few = np.unique(np.linspace(span.start, span.stop - 1, SEARCH_SAMPLES).astype(int))
+        few = np.unique(np.linspace(span.start, span.stop - 1, count).astype(int))
         Q = np.stack([R.as_matrix() for R in _rotations(observations.take(few)).values()])
         places = observations.data[layout.place][:, few].T if loop.kind == "recorded" else np.zeros(3)
         for way in loop.ways:
@@ -259,7 +280,7 @@ def _closure_residuals(
     x: np.ndarray, parts: list, observations: Observations, distances: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (starts, r) of the closures and their Jacobian (starts, r, 2 sensors), for `x` (starts, 2 sensors)."""
-    m = x.shape[1] // 2
+    m, sensors = x.shape[1] // 2, observations.layout.sensors
     psi, size = x[:, :m], np.exp(x[:, m:])
     rs, Js = [], []
     for loop, Q, u, still in parts:
@@ -276,7 +297,9 @@ def _closure_residuals(
 
         parts_W, J = turned(Qb), np.concatenate([turned(slope), turned(Qb)], axis=1)  # (B, m, n, 3), (B, 2m, n, 3)
         gap = parts_W.sum(axis=1) + still
-        if loop.kind == "fixed_point" and loop.closure.at is not None:
+        if loop.closure.on:
+            gap, J = _see_from(gap, J, Q, psi, sensors.index(loop.closure.on))
+        if loop.kind == "fixed_point" and loop.closure.at is not None and not loop.closure.on:
             gap = gap - np.array(loop.closure.at)
         elif loop.kind in ("fixed_point", "plane"):
             gap, J = gap - gap.mean(axis=1, keepdims=True), J - J.mean(axis=2, keepdims=True)
@@ -289,3 +312,51 @@ def _closure_residuals(
         rs.append(gap.reshape(len(x), -1) / GAP_STD)
         Js.append(J.reshape(len(x), 2 * m, -1).swapaxes(1, 2) / GAP_STD)
     return np.concatenate(rs, axis=1), np.concatenate(Js, axis=1)
+
+
+def _see_from(gap: np.ndarray, J: np.ndarray, Q: np.ndarray, psi: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gaps (B, n, 3) and their Jacobian (B, 2m, n, 3) in W, seen from the k-th sensor's segment, M = Rz(ψ) Q Rz(−ψ)."""
+    turn = Rotation.from_rotvec(psi[:, k, None] * [0.0, 0.0, 1.0]).as_matrix()
+    M = np.einsum("bij,njk,blk->bnil", turn, Q[k], turn)
+    inner, slope = np.einsum("bnji,bnj->bni", M, gap), np.einsum("bnji,bsnj->bsni", M, J)
+    # dMᵀ/dψ g = e_z × Mᵀ g − Mᵀ (e_z × g)
+    across = np.stack([-gap[..., 1], gap[..., 0], 0.0 * gap[..., 2]], axis=-1)
+    turned = np.stack([-inner[..., 1], inner[..., 0], 0.0 * inner[..., 2]], axis=-1)
+    slope[:, k] += turned - np.einsum("bnji,bnj->bni", M, across)
+    return inner, slope
+
+
+def estimate_joint_headings(
+    observations: Observations, couplings: Sequence[Coupling], stated: Mapping[str, float]
+) -> np.ndarray:
+    """ψ [rad] of each sensor where there is no closure: by poses, couplings of neighbours, and how hinges bend.
+
+    Where neither a mount nor a pose shows a heading, all are turned together until the segments that hinges move lie on
+    the side to which they bend.
+
+    Parameters
+    ----------
+    stated : sensor → ψ [rad] of its stated mount
+    """
+    layout, Q = observations.layout, _rotations(observations)
+    shown = {**_solve_poses(observations, stated), **stated}
+    headings = shown or {layout.sensors[0]: 0.0}
+    while True:
+        known = {c.near: headings[c.far] + c.heading for c in couplings if c.far in headings}
+        known |= {c.far: headings[c.near] - c.heading for c in couplings if c.near in headings}
+        if set(known) <= set(headings):
+            break
+        headings = known | headings
+    bent = 0.0j
+    for hinge in layout.hinges:
+        if not shown and {hinge.on, hinge.moves} <= set(headings):
+            R_on, R_moves = (
+                Rotation.from_rotvec([0.0, 0.0, headings[name]])
+                * Q[name]
+                * Rotation.from_rotvec([0.0, 0.0, -headings[name]])
+                for name in (hinge.on, hinge.moves)
+            )
+            along = (R_on.inv() * R_moves).apply(hinge.along)
+            bent += np.sum(along[:, 0] + 1j * along[:, 1]) * complex(hinge.side[0], -hinge.side[1])
+    turn = -float(np.angle(bent)) if bent else 0.0
+    return np.array([headings.get(name, 0.0) + turn for name in layout.sensors])

@@ -13,13 +13,13 @@ on the closure as a heading, but none on a joint's acceleration, since orientati
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from ..filters.butterworth import band_pass, low_pass
 from ..filters.sensors import FilteredRecording
 from ..recording import Recording
+from .initial_headings import Coupling
 from .least_squares import Gaussian, Layout
 from .losses import find_losses, mask_connected
 from .weights import LEAST_CORRELATION_S
@@ -36,16 +36,6 @@ DISTANT = np.deg2rad(30.0)  # [rad] from the best heading, from where on others 
 # is 1.1 deg at elbows and 1.6 at shoulders, where the residual alone gives half of it.
 SYSTEMATIC_STD = np.deg2rad(1.5)
 MAX_STD = np.deg2rad(20.0)  # above it the problem is not linear
-
-
-class Coupling(NamedTuple):
-    """The heading of one sensor's world relative to that of its neighbour."""
-
-    near: str
-    far: str
-    heading: float  # [rad] ψ of the near one less ψ of the far one, mean over the samples
-    std: float  # [rad]
-    elapsed_s: float  # from the start pose to the mean time of the samples
 
 
 def estimate_couplings(

@@ -34,7 +34,7 @@ from ..model.girdle import PARAMETERS, displace
 from ..model.reaches import UNIVERSE
 from .blocks import Program, evaluate, make_program
 from .chain import about_z, inverse, product, rotate, small_turn
-from .conditions import Constraint, GirdleTerm, HingeUnknown, Loop, Part, Pointing
+from .conditions import Constraint, GirdleTerm, HingeUnknown, Loop, Moving, Part, Pointing
 
 HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
 GAP_ROWS = 3  # residuals of a sample's condition
@@ -204,6 +204,11 @@ class Observations:
         """(n,) bool: samples of a closure."""
         return np.array([isinstance(c, Loop) for c in self.conditions], dtype=bool)[self.condition_index]
 
+    @property
+    def bending(self) -> np.ndarray:
+        """(n,) bool: samples of a closure or of free motion, at which hinges are looked at."""
+        return np.array([isinstance(c, Loop | Moving) for c in self.conditions], dtype=bool)[self.condition_index]
+
 
 def residuals(x: np.ndarray, observations: Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Residuals (n, k), their Jacobian (n, k, len(x)), gaps (n, 3) [m], which are zero without a closure."""
@@ -235,11 +240,12 @@ def place_points(x: np.ndarray, observations: Observations) -> np.ndarray:
     if not layout.fixed and not layout.planes:
         return x
     x, gaps = x.copy(), residuals(x, observations)[2]
+    points, heights = layout.points, layout.heights
     for (condition, span), place in zip(observations.spans(), _unknown_places(observations.conditions), strict=True):
         if isinstance(condition, Loop) and condition.kind == "fixed_point" and condition.closure.at is None:
-            x[layout.points][3 * place : 3 * place + 3] += gaps[span].mean(axis=0)
+            x[points][3 * place : 3 * place + 3] += gaps[span].mean(axis=0)
         elif isinstance(condition, Loop) and condition.kind == "plane":
-            x[layout.heights][place] += gaps[span, : condition.rows].mean()
+            x[heights][place] += gaps[span, : condition.rows].mean()
     return x
 
 
@@ -271,6 +277,8 @@ def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any
     if isinstance(condition, Loop):
         whitened, gap = _closure_residual(layout, condition, x, quat_WL, place, data[layout.place])
         hinges = _hinge_residuals(layout, x, quat_WL)
+    elif isinstance(condition, Moving):
+        whitened, hinges = ca.SX.zeros(3), _hinge_residuals(layout, x, quat_WL)
     elif isinstance(condition, Pointing):
         along = rotate(
             inverse(quat_WL[condition.reference]), rotate(quat_WL[condition.segment], ca.DM(condition.along))
@@ -314,19 +322,22 @@ def _closure_residual(
 ) -> tuple[Any, Any]:
     """Whitened residual (3) and gap (3) [m] of a closure; `recorded` (3) [m] is the sample's recorded place."""
     gaps, covariances = [], []
-    names = [term.name for term in layout.girdles]
+    names, on = [term.name for term in layout.girdles], loop.closure.on
     for way, girdles in zip(loop.ways, loop.girdles, strict=True):
         gap, covariance = ca.SX.zeros(3), loop.closure.slip**2 * ca.SX.eye(3)
         for name, sign in girdles:
             if name in names:
                 gap += sign * _displace_girdle(layout, x, quat_WL, names.index(name))
+        others = ca.SX.zeros(3)
         for sensor, v in orient_parts(layout, x, quat_WL, way):
             gap += v
-            # An error of variance σ² about each axis moves the end of v by a vector of covariance σ² (‖v‖² 1 − v vᵀ).
-            # Only the ratios of these weights matter here.
-            if sensor != UNIVERSE:
-                std = layout.attitude_std[layout.sensors.index(sensor)]
-                covariance += std**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
+            if sensor not in (UNIVERSE, on):
+                others += v
+                covariance += _spread(layout, sensor, v)
+        if on:  # seen from the segment, an error of its sensor turns all the others
+            inward = inverse(quat_WL[on])
+            R = ca.horzcat(*(rotate(inward, ca.DM(axis)) for axis in np.eye(3)))
+            gap, covariance = R @ gap, R @ (covariance + _spread(layout, on, others)) @ R.T
         gaps.append(gap)
         covariances.append(covariance)
     if loop.kind == "plane":
@@ -345,6 +356,16 @@ def _closure_residual(
     elif loop.kind == "recorded":
         gap -= recorded
     return ca.solve(ca.chol(covariance).T, gap), gap
+
+
+def _spread(layout: Layout, sensor: str, v: Any) -> Any:
+    """The covariance (3, 3) [m²] of the end of a part v (3,) by errors of its sensor, in CasADi.
+
+    An error of variance σ² about each axis moves the end by a vector of covariance σ² (‖v‖² 1 − v vᵀ). Only the ratios
+    of these weights matter.
+    """
+    std = layout.attitude_std[layout.sensors.index(sensor)]
+    return std**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
 
 
 def _hinge_residuals(layout: Layout, x: Any, quat_WL: Mapping[str, Any]) -> Any:

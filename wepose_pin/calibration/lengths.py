@@ -23,7 +23,7 @@ a length of the chain is known as it is on a robot, which decides the form of th
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG
 from ..arguments import Positive, check_arguments
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
+from ..errors import BadModel, BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
 from ..model import BodyModel, convert_breadths, list_breadths
@@ -43,18 +43,19 @@ from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
 from .anatomy import BETTER, LabelCheck, check_labels
-from .conditions import find_hinges, find_measured_lengths, fix_scale, group_lengths
+from .conditions import Level, Pointing, find_hinges, find_measured_lengths, fix_scale, group_lengths
 from .contact import find_contact_start
 from .doubled import add_second_mounts
+from .initial_headings import Coupling, estimate_joint_headings
 from .joints import add_couplings, estimate_couplings
 from .least_squares import HINGE_STD, Gaussian, Observations, place_points, residuals
 from .observability import diagnose_closures, diagnose_distances, diagnose_lengths, diagnose_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .priors import build_prior, combine_lengths
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem
-from .protocols import Protocol, load_protocol
+from .protocols import Protocol, choose_protocol, load_protocol
 from .result import Calibration
-from .sessions import fuse_subjects, separate_mounts
+from .sessions import fuse_sessions, separate_mounts
 from .solver import MIN_LENGTH
 from .weights import (
     MIN_CONTACT,
@@ -78,7 +79,7 @@ def calibrate_lengths(
     measured: Mapping[str, float] | None = None,
     prior: Subject | None = None,
     model: BodyModel | None = None,
-    protocol: str | Protocol = "clasp",
+    protocol: str | Protocol | None = None,
     method: str = BEST,
     measured_std: Positive = MEASURED_STD,
     formulation: Formulation = "full",
@@ -92,7 +93,8 @@ def calibrate_lengths(
     prior : lengths before, with covariance, and mounts; None: `population_subject`. The subject of an earlier
         calibration is fused with the result (`sessions`)
     model : the body; None: that which the recording states, else the upper body
-    protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave
+    protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave; None: by the
+        recording's phases (`protocols.choose_protocol`)
     method : the orientation filter
     measured_std : standard deviation [m] of what was measured
     formulation : "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone,
@@ -110,7 +112,7 @@ def calibrate_lengths(
     check_arguments(calibrate_lengths, locals())
     check_method(method)
     if not isinstance(protocol, Protocol):
-        protocol = load_protocol(protocol)
+        protocol = load_protocol(protocol or choose_protocol(recording.phases))
     model = model or load_sensed_model(recording.model or None, recording.sensors, recording.where())
     table = model.table
     table.check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
@@ -134,7 +136,8 @@ def calibrate_lengths(
     if formulation == "paper":
         check_paper_formulation(protocol, model, with_std, recording.sensors, recording.start_pose)
     for condition in protocol.conditions:
-        recording.phase(condition.phase)
+        if condition.phase:
+            recording.phase(condition.phase)
     filtered = filter_recording(recording, method=method, sways=not table.is_mechanism)
     earlier = prior if prior.start_pose_offset and formulation == "full" else None
     if earlier is not None:
@@ -144,7 +147,7 @@ def calibrate_lengths(
         return solve_paper_calibration(problem)
     calibration = _calibrate_checked(problem)
     if earlier is not None and not calibration.labels.moved:
-        fused = fuse_subjects(earlier, calibration.subject, population_subject(body=model), table)
+        fused = fuse_sessions([earlier, calibration.subject], prior, problem.measured, table)
         calibration = replace(calibration, subject=fused, prior=earlier)
     return add_second_mounts(calibration, recording, method)
 
@@ -175,6 +178,7 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
     unused = [_diagnose_unused_mount(name, angle, MAX_MOUNT_ERROR_DEG) for name, angle in wrong.items()]
     problem = problem.remove_mounts(wrong)
     problem.check_start_pose()
+    _check_free_motion(problem)
     stated = solve_calibration(problem, quick=True)
     doubt = stated.limbs().doubt()
     if doubt > 1.0 or problem.mounts_against_motion(stated.subject.mounts):
@@ -184,7 +188,7 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
             unused += [_diagnose_unused_mount(n, angle, MOUNT_WARNING_DEG, "motion") for n, angle in wrong.items()]
             problem = problem.remove_mounts(wrong)
             doubt = 0.0 if wrong else doubt
-    if doubt > 1.0:
+    if doubt > 1.0 and problem.protocol.closures:  # other labels close other chains
         labels = check_labels(
             stated.limbs(),
             lambda moved: solve_calibration(problem.relabel(moved), quick=True).limbs(),
@@ -242,13 +246,10 @@ class _Solution(NamedTuple):
 def _solve(problem: CalibrationProblem) -> _Solution:
     """The least squares solved with all that is known."""
     observations, samples = problem.observe(SAMPLE_RATE_HZ)
-    layout, recording = observations.layout, problem.recording
-    prior = build_prior(problem, observations)
+    layout = observations.layout
+    prior, couplings = build_prior(problem, observations), _estimate_couplings(problem, layout.sensors)
+    prior = _start_without_closure(problem, observations, prior, couplings)
     start, contact = find_contact_start(observations, prior.mean, lambda some: build_prior(problem, some).mean)
-    spans = [span for closure in problem.protocol.closures for span in recording.phase(closure.phase)]
-    neighbours = [(problem.model.parents[name], name) for name in layout.sensors]
-    pairs = [(above, name) for above, name in neighbours if above is not None and above in layout.sensors]
-    couplings = estimate_couplings(recording, problem.filtered, pairs, spans)
     coupled = add_couplings(prior, layout, couplings, start)
     result = solve_reweighted(observations, coupled, start, contact)
 
@@ -275,10 +276,55 @@ def _solve(problem: CalibrationProblem) -> _Solution:
     return _Solution(observations, samples, prior, result, covariance, shares, alternatives)
 
 
+def _estimate_couplings(problem: CalibrationProblem, sensors: Sequence[str]) -> list[Coupling]:
+    """The relative headings of these neighbours by the acceleration of the joint between them."""
+    neighbours = [(problem.model.parents[name], name) for name in sensors]
+    pairs = [(above, name) for above, name in neighbours if above is not None and above in sensors]
+    return estimate_couplings(problem.recording, problem.filtered, pairs, problem.moving_intervals)
+
+
+def _start_without_closure(
+    problem: CalibrationProblem, observations: Observations, prior: Gaussian, couplings: Sequence[Coupling]
+) -> Gaussian:
+    """The prior with unknown headings as couplings and hinges show them, where limbs move and no closure holds."""
+    if problem.protocol.closures or not problem.protocol.free_motions:
+        return prior
+    layout, mean = observations.layout, prior.mean.copy()
+    stated = problem.stated_headings(layout.sensors)
+    headings = estimate_joint_headings(observations, couplings, stated)
+    for i, name in enumerate(layout.sensors):
+        if name not in stated:
+            mean[layout.heading.start + i] = headings[i]
+    return Gaussian(mean, prior.information)
+
+
+def _check_free_motion(problem: CalibrationProblem) -> None:
+    """Raises `BadPhase` where no closure holds and joints do not show the heading of a sensor without a mount."""
+    if problem.protocol.closures or not problem.protocol.free_motions:
+        return
+    stated = set(problem.stated_headings(problem.sensors))
+    couplings = _estimate_couplings(problem, problem.sensors)
+    shown = {c.segment for c in problem.conditions if isinstance(c, Pointing | Level)}
+    known = stated | shown or {problem.model.table.reference}
+    for _ in couplings:
+        known |= {name for c in couplings for name in (c.near, c.far) if {c.near, c.far} & known}
+    unknown = [name for name in problem.sensors if name not in known]
+    if unknown:
+        raise BadPhase(
+            f"{problem.recording.where()}: the motion does not show how {', '.join(f'sensors.{n}' for n in unknown)} "
+            f"turned against {'its neighbour' if len(unknown) == 1 else 'their neighbours'}: too little of it, or no "
+            f"accelerometer; state the mount, move both arms for a minute, or use a protocol with a closure"
+        )
+
+
 def _solve_quickly(problem: CalibrationProblem) -> _Solution:
     """The least squares solved at fewer samples, by the closure alone."""
     observations, samples = problem.observe(QUICK_RATE_HZ)
     prior = build_prior(problem, observations)
+    if not problem.protocol.closures and problem.protocol.free_motions:
+        couplings = _estimate_couplings(problem, observations.layout.sensors)
+        prior = _start_without_closure(problem, observations, prior, couplings)
+        prior = add_couplings(prior, observations.layout, couplings, prior.mean)
     result = solve_reweighted(observations, prior, prior.mean, np.ones(len(samples)), quick=True)
     return _Solution(observations, samples, prior, result, np.linalg.inv(result.fit.information), {}, [])
 
@@ -298,7 +344,8 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
     measured |= {
         c.distance: (c.metres, c.metres_std) for c in protocol.closures if c.distance and c.distance not in measured
     }
-    hinges = _hinges(fit.hinge[observations.closed], fit.x[layout.hinge], problem) if observations.closed.any() else {}
+    bending = observations.bending
+    hinges = _hinges(fit.hinge[bending], fit.x[layout.hinge], problem) if bending.any() else {}
     offsets = Rotation.from_rotvec(np.pad(fit.x[layout.tilt].reshape(-1, 2), ((0, 0), (0, 1)))).as_rotvec()[:, :2]
     subject = _make_subject(problem, solution, {joint: hinge for joint, (hinge, _) in hinges.items()}, offsets)
     scale_observed = fix_scale(problem.conditions)

@@ -23,7 +23,7 @@ def calibrate(
     measured: Mapping[str, float] | None = None,
     prior: Subject | None = None,
     model: BodyModel | None = None,
-    protocol: str | Protocol = "clasp",
+    protocol: str | Protocol | None = None,
     method: str = BEST,
     measured_std: float = MEASURED_STD,
     formulation: Formulation = "full",

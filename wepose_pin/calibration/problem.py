@@ -15,11 +15,13 @@ from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
 from ..model import BodyModel, Segment
 from ..model.start_pose import compute_start_configuration, orient_links
-from ..recording import Recording
+from ..recording import Intervals, Recording
 from ..subject import Subject
 from .conditions import (
     Constraint,
+    Level,
     Loop,
+    Moving,
     Pointing,
     StartPose,
     find_girdles,
@@ -27,15 +29,16 @@ from .conditions import (
     find_measured_lengths,
     resolve_conditions,
 )
-from .initial_headings import is_linear
+from .initial_headings import find_linear
 from .least_squares import Layout, Observations
 from .losses import check_start_pose, find_losses, find_unknown_tilt, group_steps, mask_connected
-from .protocols import Protocol
+from .protocols import Closure, Condition, FreeMotion, Protocol
 from .recorded import read_recorded_places
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
 MIN_SAMPLES = 10  # of each condition
+FREE_S = 120.0  # [s] of free motion without a phase; headings drift beyond
 USUAL_ELEVATION = np.deg2rad(60.0)  # [rad] of arms, hands joined before the chest
 RIGID_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a link's orientation where nothing is soft; only ratios matter
 
@@ -88,6 +91,25 @@ class CalibrationProblem:
         """The lengths in some closure."""
         return find_measured_lengths(self.protocol, self.model)
 
+    def intervals(self, condition: Condition) -> Intervals:
+        """The intervals [s] in which a condition holds.
+
+        Raises
+        ------
+        BadPhase
+            The recording lacks the phase.
+        """
+        if condition.phase:
+            return self.recording.phase(condition.phase)
+        begin = self.filtered.start[1]
+        return ((begin, min(begin + FREE_S, float(self.recording.time[-1]))),)
+
+    @property
+    def moving_intervals(self) -> list[tuple[float, float]]:
+        """The intervals [s] of closures and of free motion."""
+        moving = [c for c in self.protocol.conditions if isinstance(c, Closure | FreeMotion)]
+        return [span for condition in moving for span in self.intervals(condition)]
+
     @property
     def measured_example(self) -> str:
         """The length that fixes the scale best, as ``name=metres``: the protocol's, else the longest in a closure."""
@@ -103,7 +125,9 @@ class CalibrationProblem:
         used = set[str]()
         for condition in self.conditions:
             if isinstance(condition, Loop):
-                used |= {part.sensor for part in condition.parts}
+                used |= {part.sensor for part in condition.parts} | {condition.closure.on}
+            elif isinstance(condition, Moving):
+                used |= set(condition.segments)
             else:
                 used |= {condition.segment}
                 used |= {condition.reference} if isinstance(condition, Pointing) else set()
@@ -212,11 +236,12 @@ class CalibrationProblem:
         )
         losses = find_losses(recording, filtered.start, layout.sensors)
         # Only the linear start can estimate a heading step of any size.
-        separate = [] if is_linear(self.conditions) else [loss for loss in losses if loss.free]
+        linear, free = find_linear(self.conditions), [loss for loss in losses if loss.free]
         parts, places = [], []
         gaps = {name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None}
         for condition, constraint in zip(protocol.conditions, self.conditions, strict=True):
-            spans = [recording.span(interval) for interval in recording.phase(condition.phase)]
+            spans = [recording.span(interval) for interval in self.intervals(condition)]
+            separate = [] if constraint is linear else free
             # Intervals may overlap: each sample counts once.
             phase = np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride]
             missing = {name: gap[phase] for name, gap in gaps.items()}
@@ -236,10 +261,11 @@ class CalibrationProblem:
             places.append(place)
             if len(parts[-1]) < MIN_SAMPLES * rate_hz / SAMPLE_RATE_HZ:
                 lost += [loss.sensor for loss in separate if loss.beyond(measured).any()]
+                place_name = f"phases.{condition.phase}" if condition.phase else "the motion"
                 raise BadPhase(
-                    f"{recording.where()}: phases.{condition.phase} holds {len(parts[-1])} samples at "
+                    f"{recording.where()}: {place_name} holds {len(parts[-1])} samples at "
                     f"{SAMPLE_RATE_HZ:g} Hz; at least {MIN_SAMPLES} are needed"
-                    + (", better a minute" if isinstance(constraint, Loop) else ", better five seconds")
+                    + (", better five seconds" if isinstance(constraint, Pointing | Level) else ", better a minute")
                     + (
                         f"; lost in the others: {', '.join(f'sensors.{n}' for n in dict.fromkeys(lost))}"
                         if lost

@@ -1,20 +1,25 @@
 """Protocols as data: what a person does in which phase, and the conditions that hold for the body meanwhile.
 
 A ``calibration/<name>.toml`` lists steps for the person and conditions for the solver. Points, segments and lengths are
-those of the body's table (`wepose_pin.model.BodyTable`). There are three kinds of conditions:
+those of the body's table (`wepose_pin.model.BodyTable`). There are four kinds of conditions:
 
 - ``[[closure]]``: two points coincide (``kind = "coincide"``) or keep a distance (``"distance"``), one stays at a point
-  of W (``"fixed_point"``), unknown or stated by ``at``, points move on a level plane of unknown height
+  of W or of a segment (``"fixed_point"``), unknown or stated by ``at``, points move on a level plane of unknown height
   (``"plane"``), or a point is where the session's truth recorded it (``"recorded"``). All of them show lengths and
   headings by motion.
+- ``[[motion]]``: limbs move freely. Hinges show headings and mounts, accelerations that two sensors share at a joint
+  show headings; nothing shows lengths.
 - ``[[pose]]``: segments point in given directions of the body's first segment; `std_deg` is how well a person does it.
 - ``[[axis]]``: a segment turns forwards about its own y, as the torso in a bow.
+
+Names joined by "+", as in ``clasp+elbows``, are one protocol after another in the same session.
 
 The residual of a pose does not show how exactly it was taken, so its weight is stated; that of a closure is measured.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,13 +32,29 @@ from ..documents import is_number, read_toml
 from ..errors import BadOption, one_of
 from ..model import BodyTable, list_breadths
 
-PROTOCOLS = ("clasp", "clasp_measured", "handle", "poses", "table", "tip", "touch_left", "touch_right")
+PROTOCOLS = (
+    "clasp",
+    "clasp_measured",
+    "elbows",
+    "free",
+    "handle",
+    "poses",
+    "swing",
+    "t_pose",
+    "table",
+    "tip",
+    "touch_body",
+    "touch_left",
+    "touch_right",
+)
+DEFAULT = "clasp"
+ALSO = ("t_pose",)  # what makes it better within the same minute (calibration/people.md), by phases of their names
 # How many points each kind takes, and the keys that are its own.
 KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}
 _KEYS = ("phase", "kind", "points", "slip", "in_front_of")
 _OWN_KEYS: dict[str, tuple[str, ...]] = {
     "distance": ("distance", "metres", "metres_std"),
-    "fixed_point": ("at", "at_std"),
+    "fixed_point": ("at", "at_std", "on", "origin"),
     "recorded": ("origin",),
 }
 
@@ -50,8 +71,9 @@ class Closure:
     slip : [m] one standard deviation, each axis, of what holds only nearly; sets the weights' shape, not their size
     distance : its name, as in ``--measured handle=0.4``; empty for other kinds
     metres, metres_std : the distance where the user gives none, and one standard deviation [m]
-    at, at_std : (3,) [m] the fixed point in W and its standard deviation, where it is known
-    origin : the point from which a recorded place is counted; empty: the root
+    at, at_std : (3,) [m] the fixed point in W, or in the segment `on`, and its standard deviation, where it is known
+    on : the segment to which the fixed point belongs; empty: W
+    origin : the point from which a recorded place or the fixed point is counted; empty: the root
     in_front_of : segment behind which a person does not bring the points; empty: they may be anywhere
     """
 
@@ -64,6 +86,7 @@ class Closure:
     metres_std: float = 0.003
     at: tuple[float, float, float] | None = None
     at_std: float = 0.005
+    on: str = ""
     origin: str = ""
     in_front_of: str = ""
 
@@ -101,7 +124,21 @@ class Axis:
     std: float
 
 
-Condition = Closure | Direction | Axis
+@dataclass(frozen=True)
+class FreeMotion:
+    """Limbs move freely.
+
+    Parameters
+    ----------
+    phase : of the session; empty: from the start pose on
+    segments : whose sensors take part; empty: all
+    """
+
+    phase: str
+    segments: tuple[str, ...] = ()
+
+
+Condition = Closure | Direction | Axis | FreeMotion
 
 
 @dataclass(frozen=True)
@@ -141,6 +178,10 @@ class Protocol:
         return tuple(c for c in self.conditions if isinstance(c, Closure))
 
     @property
+    def free_motions(self) -> tuple[FreeMotion, ...]:
+        return tuple(c for c in self.conditions if isinstance(c, FreeMotion))
+
+    @property
     def distances(self) -> tuple[str, ...]:
         """Names of distances outside the body that the user can measure."""
         return tuple(dict.fromkeys(c.distance for c in self.closures if c.distance))
@@ -157,22 +198,31 @@ class Protocol:
             for point in (*closure.points, *filter(None, [closure.origin])):
                 if point not in table.points:
                     raise BadOption(f"{where}'{point}' is no point of {table.name}; {one_of(table.points, point)}")
-        named = [c.segment for c in self.conditions if not isinstance(c, Closure)]
-        named += [closure.in_front_of for closure in self.closures if closure.in_front_of]
+        named = [c.segment for c in self.conditions if isinstance(c, Direction | Axis)]
+        named += [segment for motion in self.free_motions for segment in motion.segments]
+        named += [segment for c in self.closures for segment in (c.in_front_of, c.on) if segment]
         table.check_segments((*named, *self.needs), where, BadOption)
         measured = self.measured_example.partition("=")[0]
         if measured and measured not in (*table.lengths, *list_breadths(table), *self.distances):
             raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
 
 
+def choose_protocol(phases: Collection[str]) -> str:
+    """The protocol of a recording with these phases where none is named: `DEFAULT`, with the T-pose if it was held."""
+    return "+".join([DEFAULT, *(name for name in ALSO if name in phases)])
+
+
 def load_protocol(name: str | Path) -> Protocol:
-    """A protocol by its name, or from a TOML file of one's own.
+    """A protocol by its name, from a TOML file of one's own, or several of them joined by "+".
 
     Raises
     ------
     BadOption
         There is no such protocol, or its file has a key or value that is none.
     """
+    names = str(name).split("+")
+    if len(names) > 1:
+        return _join_protocols(str(name), [load_protocol(each) for each in names])
     own = str(name).endswith(".toml")
     if not own and name not in PROTOCOLS:
         raise BadOption(
@@ -182,13 +232,28 @@ def load_protocol(name: str | Path) -> Protocol:
     return _protocol(read_toml(path, "a protocol", BadOption), path)
 
 
+def _join_protocols(name: str, protocols: list[Protocol]) -> Protocol:
+    """One protocol after another; the start pose is held once."""
+    steps = [protocols[0].steps, *([s for s in p.steps if s.phase != "start"] for p in protocols[1:])]
+    return Protocol(
+        name,
+        ", ".join(protocol.title for protocol in protocols),
+        tuple(dict.fromkeys(segment for protocol in protocols for segment in protocol.needs)),
+        tuple(step for each in steps for step in each),
+        tuple(condition for protocol in protocols for condition in protocol.conditions),
+        max(protocol.min_measured for protocol in protocols),
+        next((protocol.measured_example for protocol in protocols if protocol.measured_example), ""),
+    )
+
+
 def _protocol(table: dict[str, Any], path: Path) -> Protocol:
-    known = ("name", "title", "needs", "min_measured", "measured_example", "step", "closure", "pose", "axis")
+    lists = ("step", "closure", "pose", "axis", "motion")
+    known = ("name", "title", "needs", "min_measured", "measured_example", *lists)
     for key, value in table.items():
         if key not in known:
             raise BadOption(f"{path}: '{key}' is no key of a protocol; {one_of(known, key)}")
         tables = isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
-        if key in ("step", "closure", "pose", "axis") and not tables:
+        if key in lists and not tables:
             raise BadOption(f"{path}: {key} = {value!r} is no list of tables; write [[{key}]]")
     conditions: list[Condition] = []
     for i, entry in enumerate(table.get("closure", [])):
@@ -211,8 +276,15 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
         segment = str(_get(entry, "segment", place))
         std = np.deg2rad(_number(entry, "std_deg", place, 0.1, 45.0))
         conditions.append(Axis(str(_get(entry, "phase", place)), segment, std))
+    for i, entry in enumerate(table.get("motion", [])):
+        place = f"{path}: motion {i + 1}"
+        for key in entry:
+            if key not in ("phase", "segments"):
+                raise BadOption(f"{place}: '{key}' is no key of a motion; {one_of(('phase', 'segments'), key)}")
+        segments = tuple(str(segment) for segment in _list({"segments": [], **entry}, "segments", place))
+        conditions.append(FreeMotion(str(entry.get("phase", "")), segments))
     if not conditions:
-        raise BadOption(f"{path}: no [[closure]], [[pose]] or [[axis]]; a protocol needs one at least")
+        raise BadOption(f"{path}: no [[closure]], [[pose]], [[axis]] or [[motion]]; a protocol needs one at least")
     needs = tuple(str(segment) for segment in _list({"needs": [], **table}, "needs", str(path)))
     steps = []
     for i, entry in enumerate(table.get("step", [])):
@@ -237,14 +309,16 @@ def _closure(entry: dict[str, Any], place: str) -> Closure:
         if key not in known:
             raise BadOption(f"{place}: '{key}' is no key of kind '{kind}'; {one_of(known, key)}")
     more: dict[str, Any] = {"in_front_of": str(entry.get("in_front_of", ""))}
-    if kind == "recorded":
+    if kind == "fixed_point":
+        more["on"] = str(entry.get("on", ""))
+    if kind in ("recorded", "fixed_point"):
         more["origin"] = str(entry.get("origin", ""))
         if more["origin"] in points:
             raise BadOption(f"{place}: origin = {more['origin']!r} is the point itself; another one is needed")
     if kind == "fixed_point" and "at" in entry:
         at = entry["at"]
         if not isinstance(at, list) or len(at) != 3 or not all(is_number(v, 100.0) for v in at):
-            raise BadOption(f"{place}: at = {at!r}; three numbers [m] in W are needed")
+            raise BadOption(f"{place}: at = {at!r}; three numbers [m] are needed")
         more["at"] = (float(at[0]), float(at[1]), float(at[2]))
         more["at_std"] = _number({"at_std": Closure.at_std, **entry}, "at_std", place, 1e-5, 1.0)
     if "slip" in entry:

@@ -1,13 +1,14 @@
 """Several calibrations of one person: what an earlier one knew of lengths and shoulders, fused with a new one.
 
 Most of a calibration's error comes again in the next one: soft tissue follows the joints, and the shoulders leave the
-law in the same way. So the new one is solved on the population prior, and the two are fused by covariance intersection,
-which holds whatever their errors have in common (Julier and Uhlmann 1997), but for the share of the errors that does
-not recur.
+law in the same way. So each is solved on the population prior, and they are fused by covariance intersection, which
+holds whatever their errors have in common (Julier and Uhlmann 1997), but for the share of the errors that does not
+recur.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,37 +20,52 @@ from ..subject import Subject, girdle_rows
 
 # Share of a calibration's variance that recurs: on simulated people nearly all of it does.
 RECURRING = 0.9
-SHARES = np.linspace(0.0, 1.0, 21).tolist()  # of the earlier one, of which the best is taken
+ROUNDS = 300  # in which the shares of the sessions are found
 LEAST_STD = 1e-6  # [m] keeps covariances of what is known exactly invertible
 
 
-def fuse_subjects(earlier: Subject, new: Subject, population: Subject, table: BodyTable) -> Subject:
-    """The new subject with lengths and girdles of both; its mounts follow by their correlation.
+def fuse_sessions(
+    subjects: Sequence[Subject], population: Subject, measured: Mapping[str, tuple[float, float]], table: BodyTable
+) -> Subject:
+    """The last subject with lengths and girdles of all of them; its mounts follow by their correlation.
 
     Parameters
     ----------
-    population : the prior with which both were found
+    population : the prior with which each was found
+    measured : lengths that were measured beside it, name → value and standard deviation [m]
     """
     lengths = tuple(table.lengths)
-    x1, x2 = (_shape(subject, table) for subject in (earlier, new))
-    least = LEAST_STD**2 * np.eye(len(x1))
-    C1, C2, C0 = (subject.shape_covariance(table) + least for subject in (earlier, new, population))
-    K1, K2, K0 = (np.linalg.inv(C) for C in (C1, C2, C0))
+    x = [_shape(subject, table) for subject in subjects]
+    least = LEAST_STD**2 * np.eye(len(x[0]))
+    C = [subject.shape_covariance(table) + least for subject in subjects]
+    K, K0 = [np.linalg.inv(each) for each in C], np.linalg.inv(population.shape_covariance(table) + least)
+    for name, (_, std) in measured.items():
+        if name in lengths:
+            K0[lengths.index(name), lengths.index(name)] += std**-2
+    shares = _find_shares(K, len(lengths))
+    intersection = np.linalg.inv(sum(share * each for share, each in zip(shares, K, strict=True)))
+    mean = intersection @ sum(share * each @ own for share, each, own in zip(shares, K, x, strict=True))
+    # If nothing recurred: what each adds to their prior, which counts once.
+    information = K0.copy()
+    for each in K:
+        value, vector = np.linalg.eigh(each - K0)
+        information += (vector * np.maximum(value, 0.0)) @ vector.T
+    fused = RECURRING * intersection + (1.0 - RECURRING) * np.linalg.inv(information)
+    return _replace_shape(subjects[-1], mean, fused, x[-1], C[-1], table)
 
-    def intersect(share: float) -> np.ndarray:
-        return np.linalg.inv(share * K1 + (1.0 - share) * K2)
 
-    def spread(share: float) -> float:
-        return float(np.trace(intersect(share)[: len(lengths), : len(lengths)]))
+def _find_shares(K: Sequence[np.ndarray], lengths: int) -> np.ndarray:
+    """The shares (k,) with which the weighted sum of the informations leaves the least variance of the lengths.
 
-    share = min(SHARES, key=spread)
-    C = intersect(share)
-    x = C @ (share * K1 @ x1 + (1.0 - share) * K2 @ x2)
-    # If nothing recurred: what the new one adds to its prior, which counts once.
-    value, vector = np.linalg.eigh(K2 - K0)
-    independent = np.linalg.inv(K1 + (vector * np.maximum(value, 0.0)) @ vector.T)
-    C = RECURRING * C + (1.0 - RECURRING) * independent
-    return _replace_shape(new, x, C, x2, C2, table)
+    The variance is convex in the shares. They are multiplied by the root of its slope, which lowers it in each round
+    (Silvey, Titterington and Torsney 1978).
+    """
+    shares = np.full(len(K), 1.0 / len(K))
+    for _ in range(ROUNDS):
+        C = np.linalg.inv(sum(share * each for share, each in zip(shares, K, strict=True)))[:, :lengths]
+        shares = shares * np.sqrt([np.sum(C * (each @ C)) for each in K])
+        shares /= shares.sum()
+    return np.asarray(shares)
 
 
 def separate_mounts(earlier: Subject, population: Subject) -> Subject:

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..model.girdle import PARAMETERS
 from ..subject import mount_rows
-from .conditions import Loop, StartPose
-from .least_squares import GAP_ROWS, Gaussian, Layout, Observations
+from .conditions import Loop, Moving, StartPose
+from .least_squares import GAP_ROWS, HINGE_STD, Gaussian, Layout, Observations
 from .solver import STEPS, Fit, LeastSquares, solve
 
 # Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
@@ -31,6 +31,8 @@ MANY_SAMPLES = 1000  # from twice as many on, all rounds but the last take every
 OUTLIER = 5.0  # times the usual gap, at which the palms are apart
 MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
 MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about right
+# [rad] by which people's elbows leave a hinge (calibration/people.md): an oblique axis, and one that wanders.
+ELBOW_STD = np.deg2rad(4.0)
 CONTRADICTED = 3.0  # standard deviations between a measured length and what is known without it
 
 
@@ -82,8 +84,10 @@ def solve_reweighted(
     if quick:
         weights[:, GAP_ROWS:] = 0.0
     for condition, span in observations.spans():
+        # The error of a pose is constant, and how an elbow leaves its hinge follows its angles: one effective sample.
         if not isinstance(condition, Loop):
-            weights[span] = 1.0 / (span.stop - span.start)  # the error of a pose is constant: one effective sample
+            size = ELBOW_STD / HINGE_STD if isinstance(condition, Moving) else 1.0
+            weights[span] = size**-2 / (span.stop - span.start)
     effective = float(closed.sum())
     if not closed.any():
         fit = solve(LeastSquares(observations, prior, weights), x, steps, not quick)
@@ -154,9 +158,9 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
     hinges = list(range(GAP_ROWS, observations.layout.residuals))
     gradient = prior_information.copy()
     for condition, span in observations.spans():
-        parts = [(list(range(condition.rows)), contact[span])]
-        if isinstance(condition, Loop):
-            parts += [(hinges, np.ones(span.stop - span.start))] if hinges else []
+        parts = [(list(range(condition.rows)), contact[span])] if condition.rows else []
+        if isinstance(condition, Loop | Moving) and hinges:
+            parts.append((hinges, np.ones(span.stop - span.start)))
         for rows, share in parts:
             slope, w = J[span][:, rows], weights[span][:, rows]
             pull = w[:, :, None] * slope

@@ -30,6 +30,8 @@ def run(job: CalibrateJob) -> int:
         outcome = run_calibrate(job, progress)
     calibration, quality, protocol = outcome.calibration, outcome.quality, outcome.protocol
     print_diagnostics([*quality.further, *outcome.page_failures])
+    for path, each in outcome.others:
+        say(f"{path}: quality {each.quality}")
     print_lengths(f"Lengths, by {protocol.title}", calibration.subject, outcome.prior, calibration.measured)
     _print_mounts(calibration)
     if protocol.closures:
@@ -42,7 +44,7 @@ def run(job: CalibrateJob) -> int:
         say_pages(job.out, {"Report": "report.html"})
     say(f"Subject: {job.out / 'subject.toml'}  {job.out / 'subject.urdf'}  {job.out / 'calibration.json'}")
     _print_quality(quality)
-    return EXIT_CODES[quality.quality]
+    return max(EXIT_CODES[each.quality] for each in (quality, *(each for _, each in outcome.others)))
 
 
 def _print_mounts(calibration: Calibration) -> None:
@@ -78,7 +80,7 @@ COMMAND = Command(
     CalibrateJob,
     run,
     example="calibrate session.toml --measured biacromial=0.41 --stature 1.78 --sex f -o anna",
-    arguments=("session",),
+    arguments=("session", "further"),
     exit_codes="0 quality pass, 3 poor, 4 fail, by the limits in the README; the files are written in all three cases; "
     "2 invalid input, nothing is written.",
 )

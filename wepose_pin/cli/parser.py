@@ -96,7 +96,8 @@ class _Option:
     def add_to(self, group: argparse._ArgumentGroup) -> None:
         """Add it to a group of argparse's; where it is not given its value is None."""
         if not self.switch:
-            group.add_argument(self.field, nargs="?", help=self._help(), **self._value())
+            several = {"nargs": "*"} if get_origin(self.kinds[0]) is tuple else {"nargs": "?"}
+            group.add_argument(self.field, help=self._help(), **self._value() | several)
             return
         value = self._value() if bool not in self.kinds else {}
         action = "store_false" if self.default is True else "store_true" if self.default is False else None
@@ -136,6 +137,8 @@ class _Option:
     def _value(self) -> dict[str, Any]:
         """How argparse reads the value."""
         kind, parts = get_origin(self.kinds[0]), get_args(self.kinds[0])
+        if kind is tuple and parts[-1] is Ellipsis:
+            return {"type": _CONVERTERS[parts[0]], "metavar": self.metavar}
         if kind is tuple:
             return {"type": _number, "nargs": len(parts), "metavar": tuple(self.metavar.split())}
         if kind is Mapping:

@@ -31,13 +31,19 @@ class CalibrateJob:
     session : SESSION
         The recording: session.toml, or the folder that holds it. It names the phases of the protocol, such as clasp, in
         which the palms are held together.
+    further : SESSION
+        Further sessions of the same person, of the same protocol. Lengths and shoulders come from all of them, mounts
+        from the last one.
     out : DIR
         Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     protocol : NAME|FILE.toml
-        Calibrate by this protocol: clasp (hands together), clasp_measured (the same with a measured length), handle
-        (hands on a bar of known length), touch_left or touch_right (one palm on a fixed point), table (both palms on a
-        table), tip (of a robot's arm or another chain: its point "tip" on a fixed point), poses (T-pose and bow:
-        determines headings and no lengths), or a file of your own, made like those in calibration/.
+        Calibrate by this protocol. Without it clasp, and t_pose as well where the session has that phase. Known are
+        clasp (hands together), clasp_measured (the same with a measured length), handle (hands on a bar of known
+        length), touch_left or touch_right (one palm on a fixed point), table (both palms on a table), tip (of a robot's
+        arm or another chain: its point "tip" on a fixed point), touch_body (palms on hips, shoulders, head), poses
+        (T-pose and bow: determines headings and no lengths), t_pose, elbows (elbows bend), swing (arms swing), free
+        (any motion, no protocol: headings and mounts alone), or a file of your own, made like those in calibration/.
+        Several in one session are joined by +, as in clasp+t_pose.
     model : NAME|FILE
         Calibrate this body: a name (upper_body, whole_body), a table of a body (.toml), or a URDF beside its table
         (docs/models.md). Without it that which the session states, else upper_body.
@@ -72,7 +78,8 @@ class CalibrateJob:
 
     session: Path
     out: Path
-    protocol: str = "clasp"
+    further: tuple[Path, ...] = ()
+    protocol: str | None = None
     model: str | None = None
     measured: Mapping[str, float] = field(default_factory=dict)
     prior: Path | None = None
@@ -87,11 +94,16 @@ class CalibrateJob:
     def check(self) -> None:
         """Raise `WeposeError` where an option is wrong whatever the session holds."""
         from ..calibration import load_protocol
+        from ..calibration.protocols import DEFAULT
         from ..model import load_model
         from ..model.anthropometry import check_stature
 
-        load_protocol(self.protocol)
+        load_protocol(self.protocol or DEFAULT)
         check_stature(self.stature)
+        if self.further and self.formulation != "full":
+            raise WrongOption(
+                "formulation", self.formulation, "takes one session; several are calibrated together by full alone"
+            )
         if self.prior is not None and (self.stature is not None or self.sex is not None):
             raise WrongOption(
                 "prior", self.prior, "has the lengths of a person; --stature and --sex narrow those of the population"
@@ -104,9 +116,10 @@ class CalibrateJob:
 def _check_measured(job: CalibrateJob, model: BodyModel) -> None:
     """Raise `WrongOption` where a length is measured that neither the body nor the protocol has."""
     from ..calibration import PROTOCOLS, load_protocol
+    from ..calibration.protocols import DEFAULT
     from ..model import list_breadths
 
-    known = (*model.lengths, *list_breadths(model.table), *load_protocol(job.protocol).distances)
+    known = (*model.lengths, *list_breadths(model.table), *load_protocol(job.protocol or DEFAULT).distances)
     for name, metres in job.measured.items():
         stated = f"{name}={metres:g}"
         others = [each for each in PROTOCOLS if name in load_protocol(each).distances]
@@ -120,10 +133,11 @@ class CalibrateOutcome(NamedTuple):
     """What came of a `CalibrateJob`."""
 
     calibration: Calibration
-    quality: CalibrationQuality
+    quality: CalibrationQuality  # of the last session
     protocol: Protocol
     prior: Subject
     page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
+    others: tuple[tuple[Path, CalibrationQuality], ...] = ()  # the sessions before the last one
 
 
 def run_calibrate(
@@ -140,7 +154,8 @@ def run_calibrate(
     WeposeError
         What the session, the protocol or an option lacks.
     """
-    from ..calibration import assess, calibrate_lengths, load_protocol
+    from ..calibration import assess, calibrate_lengths, calibrate_sessions, load_protocol
+    from ..calibration.protocols import choose_protocol
     from ..model.body import load_sensed_model
     from ..readers import load_session
     from ..report import write_calibration_page
@@ -151,25 +166,29 @@ def run_calibrate(
     from ..writers.result import write_subject
 
     job.check()
-    protocol = load_protocol(job.protocol)
     with result_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
-        recording = load_session(job.session, gaps=job.gaps)
+        recordings = [load_session(session, gaps=job.gaps) for session in (job.session, *job.further)]
+        recording = recordings[-1]
+        protocol = load_protocol(job.protocol or choose_protocol(recording.phases))
         model = load_sensed_model(job.model or recording.model or None, recording.sensors, recording.where())
         _check_measured(job, model)
         prior = load_subject(job.prior) if job.prior is not None else None
         prior = prior or population_subject(job.stature, job.sex, model)
         progress("calibrating", 1 / 3)
-        calibration = calibrate_lengths(
-            recording,
-            measured=dict(job.measured),
-            prior=prior,
-            model=model,
-            protocol=protocol,
-            method=job.method,
-            formulation=job.formulation,
-        )
+        options: dict[str, Any] = {
+            "measured": dict(job.measured),
+            "prior": prior,
+            "model": model,
+            "protocol": job.protocol,
+            "method": job.method,
+        }
+        if job.further:
+            *before, calibration = calibrate_sessions(recordings, **options)
+        else:
+            before, calibration = [], calibrate_lengths(recording, formulation=job.formulation, **options)
         quality = assess(calibration)
+        others = tuple((path, assess(each)) for path, each in zip((job.session, *job.further), before, strict=False))
         write_subject(folder, calibration.subject, calibration.body)
         if provenance is None:
             provenance = collect_provenance("calibrate", field_values(job))
@@ -180,4 +199,4 @@ def run_calibrate(
         failures = write_calibration_page(
             job.out, calibration, recording, method=job.method, protocol=protocol, quality=quality
         )
-    return CalibrateOutcome(calibration, quality, protocol, prior, failures)
+    return CalibrateOutcome(calibration, quality, protocol, prior, failures, others)

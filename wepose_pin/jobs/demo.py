@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ..diagnostics import Diagnostic
 from . import Progress, no_progress
 from .fields import field_values
-from .simulate import check_seed
+from .simulate import PROTOCOL, check_seed
 
 if TYPE_CHECKING:
     from ..calibration import Calibration
@@ -23,9 +23,9 @@ class DemoJob:
     """Run the whole chain on a simulated recording: simulate, calibrate, track, evaluate, view.
 
     A person of random size wears five Xsens MTi-3, stands in the N-pose (upright, arms hanging, palms to the thighs),
-    moves the joined hands for a minute, then draws six circles in the air with the right hand and rests it on a table
-    in between. All of it is simulated, so the truth is known. Printed are lengths and errors of each filter beside the
-    truth.
+    moves the joined hands and holds the T-pose, a minute in all, then draws six circles in the air with the right hand
+    and rests it on a table in between. All of it is simulated, so the truth is known. Printed are lengths and errors of
+    each filter beside the truth.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
     with whole_folder(job.out, job.force) as folder:
         progress("simulating a person", 0.0)
         person = simulate_person(job.seed)
-        simulation = simulate(person.lengths, seed=job.seed)
+        simulation = simulate(person.lengths, seed=job.seed, protocol=PROTOCOL)
         recording, truth = simulation.recording(f"demo-{job.seed}"), simulation.truth()
         for name in ("session", "subject", "result"):
             (folder / name).mkdir()

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from ..simulation import Imperfections, Person
 
 ACTIVITY_S = 40.0
-PROTOCOL_S = 60.0  # of the clasp, or what is done in its place
+PROTOCOL, SHORT_PROTOCOL = "clasp+t_pose", "clasp"
+LEAST_S = 30.0  # from which on there is time for the T-pose
+PROTOCOL_S = 60.0  # of what is done between start pose and circles
 LONGEST_S = 7200.0
 CIRCLES = 6  # drawn by the right hand after the protocol
 
@@ -37,8 +39,10 @@ class SimulateJob:
         Sample the person and the motion by this seed.
     rate_hz : HZ
         Sample the sensors at this rate, 20 to 2000 Hz.
-    protocol
-        Simulate the motion of this calibration protocol (see `wepose calibrate --help`).
+    protocol : NAME
+        Simulate the motion of this calibration protocol (see `wepose calibrate --help`): clasp, handle, touch_left,
+        touch_right, poses; or clasp, elbows, swing, t_pose, touch_body, one or several joined by +. Without it
+        clasp+t_pose, or clasp alone for less than 30 s.
     activity
         Simulate an activity in place of a protocol. Of the whole body, with sensors on pelvis, head, hands and legs
         too: walking on the spot (walk), or sitting down and standing up (sit). Of the upper body: reaches, rests and
@@ -71,7 +75,7 @@ class SimulateJob:
     out: Path
     seed: int = 1
     rate_hz: float = 100.0
-    protocol: Literal["clasp", "handle", "touch_left", "touch_right", "poses"] = "clasp"
+    protocol: str | None = None
     activity: Literal["walk", "sit", "tasks"] | None = None
     seconds: float | None = None
     preset: Literal["ideal", "mild", "people"] = "ideal"
@@ -80,10 +84,13 @@ class SimulateJob:
 
     def check(self) -> None:
         """Raise `BadOption` where a number is out of its range, or an imperfection is none."""
+        from ..simulation.tasks import find_task
+
         check_seed(self.seed)
+        find_task(self.protocol or PROTOCOL)
         if not 20.0 <= self.rate_hz <= 2000.0:
             raise BadOption(f"--rate-hz {self.rate_hz:g}: between 20 and 2000 samples a second")
-        if self.activity is not None and self.protocol != "clasp":
+        if self.activity is not None and self.protocol is not None:
             raise BadOption(f"--activity {self.activity} with --protocol {self.protocol}: one of them; leave one out")
         if self.seconds is not None and not 5.0 <= self.seconds <= LONGEST_S:
             raise BadOption(f"--seconds {self.seconds:g}: between 5 and {LONGEST_S:g}")
@@ -160,13 +167,14 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
                 lengths=person.lengths,
             )
         else:
+            seconds = PROTOCOL_S if job.seconds is None else job.seconds
             simulation = simulate(
                 person.lengths,
                 seed=job.seed,
                 rate_hz=job.rate_hz,
                 imperfections=job.imperfections(),
-                clasp_s=PROTOCOL_S if job.seconds is None else job.seconds,
-                protocol=job.protocol,
+                clasp_s=seconds,
+                protocol=job.protocol or (PROTOCOL if seconds >= LEAST_S else SHORT_PROTOCOL),
                 circles=0 if job.protocol == "poses" else CIRCLES,
             )
         write_session(folder, simulation.recording(f"simulated-{job.seed}"), simulation.truth())

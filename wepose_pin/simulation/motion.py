@@ -33,7 +33,7 @@ STAND_S = 5.0  # N-pose at the start
 _BLEND_S = 2.5  # N-pose to clasp, clasp to table
 _RAMP_S = 2.0  # the clasp motion grows and dies away over this time
 _REST_S = (2.5, 2.0)  # first rest on the table, each later one
-_LIFT_S = 1.5  # table to circle, circle to table
+LIFT_S = 1.5  # table to circle, circle to table
 MARGIN_S = 0.1  # the stated phases keep this distance from the motion beside them
 _FLEXION = np.deg2rad((8.0, 140.0))  # of the elbow while the hand is led to a point
 _LEAST_FLEXION = np.deg2rad(3.0)  # at which a hand is out of reach
@@ -142,13 +142,13 @@ class _Circle:
     @property
     def stop(self) -> float:
         """Time [s] at which the hand is back on the table."""
-        return self.start + self.duration + 2.0 * _LIFT_S - 1.0  # turn, lift and return overlap by 0.5 s each
+        return self.start + self.duration + 2.0 * LIFT_S - 1.0  # turn, lift and return overlap by 0.5 s each
 
     def offset_W(self, t: np.ndarray, table_W: np.ndarray) -> np.ndarray:
         """Return the vector from the table point to the hand (n, 3) [m]."""
-        angle = 2.0 * np.pi * self.sense * make_step(t, self.start + _LIFT_S - 0.5, self.duration)
+        angle = 2.0 * np.pi * self.sense * make_step(t, self.start + LIFT_S - 0.5, self.duration)
         circle_W = self.centre_W + np.cos(angle)[:, None] * self.axes_W[0] + np.sin(angle)[:, None] * self.axes_W[1]
-        return make_pulse(t, self.start, self.stop, _LIFT_S)[:, None] * (circle_W - table_W)
+        return make_pulse(t, self.start, self.stop, LIFT_S)[:, None] * (circle_W - table_W)
 
 
 class _Aim(NamedTuple):
@@ -160,6 +160,14 @@ class _Aim(NamedTuple):
     swivel: dict[str, np.ndarray]  # (n,) [rad]
     pronation: dict[str, np.ndarray]  # (n,) [rad] about z of the forearm
     hand_F: dict[str, Rotation]  # hand in the forearm; empty: straight
+
+
+class FreeArm(NamedTuple):
+    """What an arm does beside hanging while its palm is led nowhere, at n times."""
+
+    turn: np.ndarray  # (n, 3) [rad] rotation vector of the upper arm in T
+    bend: np.ndarray  # (n, 2) [rad] of the elbow: less its flexion, and pronation about z of the forearm
+    start: np.ndarray  # (n,) share of the offsets of the start pose
 
 
 def _turn_to(vectors: np.ndarray, directions: np.ndarray) -> Rotation:
@@ -265,11 +273,11 @@ class Motion(BodyMotion):
 
     def activity(self, t: np.ndarray) -> np.ndarray:
         moving = make_pulse(t, *self.clasp, _RAMP_S)
-        return moving + sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
+        return moving + sum((make_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
 
     def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
         moving = integrate_pulse(t, *self.clasp, _RAMP_S)
-        return moving + sum((integrate_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
+        return moving + sum((integrate_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
 
     def _clasp_point(self, t: np.ndarray, moving: np.ndarray) -> np.ndarray:
         """Return the point where the palms meet (n, 3) [m] in T, from midway between the shoulders, in reach."""
@@ -309,6 +317,14 @@ class Motion(BodyMotion):
         """Return the share (n,) by which each palm leads its arm; 0: the arm hangs."""
         return {"left": led * (1.0 - table), "right": led}  # the left arm returns to hanging
 
+    def _free(self, _t: np.ndarray, _side: str) -> FreeArm | None:
+        """Return what an arm does while its palm is led nowhere; None: it hangs."""
+        return None
+
+    def _aim_swivel(self, _t: np.ndarray, _side: str, swivel: np.ndarray) -> np.ndarray:
+        """Return the swivel (n,) [rad] of an elbow; `swivel` is that of the clasp."""
+        return swivel
+
     def _arm(self, side: str, palm_T: np.ndarray, swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:
         """Upper arm in T and elbow flexion [rad] to bring the palm to `palm_T` (n, 3) [m], from the shoulder.
 
@@ -337,7 +353,7 @@ class Motion(BodyMotion):
     def _aim(self, t: np.ndarray) -> _Aim:
         """Compute what torso and hands do at the times `t` (n,) [s]."""
         moving = self._motion_share(t)
-        circling = sum((make_pulse(t, c.start, c.stop, _LIFT_S) for c in self.circles), np.zeros_like(t))
+        circling = sum((make_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
         led = make_step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
         table = make_step(t, self.clasp[1], _BLEND_S)  # from the clasp to the table
 
@@ -365,7 +381,7 @@ class Motion(BodyMotion):
         swivel, pronation = {}, {}
         for side in SIDES:
             wander = self.wander[f"{side}_swivel"](t)
-            swivel[side] = np.deg2rad(35.0 + 30.0 * (moving + 0.3 * circling) * wander)
+            swivel[side] = self._aim_swivel(t, side, np.deg2rad(35.0 + 30.0 * (moving + 0.3 * circling) * wander))
             palm_down = np.deg2rad(40.0) * table if side == "right" else 0.0 * t
             wander = np.deg2rad(55.0 * moving + 15.0 * circling) * self.wander[f"{side}_pronation"](t)
             pronation[side] = wander + palm_down
@@ -385,7 +401,9 @@ class Motion(BodyMotion):
         for step in (-_RATE_STEP_S, _RATE_STEP_S):
             aim = self._aim(t + step)
             R_TU, _ = self._arm(side, aim.palm_T[side] - self._shoulder(side), aim.swivel[side])
-            along_T = Rotation.from_rotvec(aim.lead[side][:, None] * R_TU.as_rotvec()).apply(-E_Z)
+            free, lead = self._free(t + step, side), aim.lead[side][:, None]
+            down = -E_Z if free is None else Rotation.from_rotvec((1.0 - lead) * free.turn).apply(-E_Z)
+            along_T = Rotation.from_rotvec(lead * R_TU.as_rotvec()).apply(down)
             elevation.append(np.rad2deg(np.arctan2(np.hypot(along_T[:, 0], along_T[:, 1]), -along_T[:, 2])))
         return (elevation[1] - elevation[0]) / (2.0 * _RATE_STEP_S)
 
@@ -447,14 +465,15 @@ class Motion(BodyMotion):
         points: dict[str, np.ndarray] = {}
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
             y, blend = SIDES[side], aim.lead[side]
-            hanging = (1.0 - blend)[:, None]
-            turns = []  # of a hanging arm
+            hanging, free = (1.0 - blend)[:, None], self._free(t, side)
+            turns = [] if free is None else [hanging * free.turn]  # of a hanging arm
+            starting = hanging if free is None else hanging * free.start[:, None]
             if sway:
                 turns.append(hanging * sway * np.pad(flaws.sway[side](t), ((0, 0), (0, 1))))
             if flaws.sizes.start_segment_deg:
                 turns.append(hanging * flaws.start[f"{side}_upper_arm"])
             if flaws.sizes.start_pose:
-                turns.append(hanging * flaws.start_pose.upper_arm[side])
+                turns.append(starting * flaws.start_pose.upper_arm[side])
             if flaws.iterates:
                 hang = reduce(mul, (Rotation.from_rotvec(turn) for turn in turns), Rotation.identity(len(t)))
                 shoulder_T, R_TU, flexion = self._reach(t, side, aim, hang)
@@ -470,7 +489,9 @@ class Motion(BodyMotion):
             if flaws.sizes.start_elbow_deg:
                 bend[:, 0] -= (1.0 - blend) * flaws.elbow[side]
             if flaws.sizes.start_pose:
-                bend -= hanging * np.array((flaws.start_pose.flexion[side], -flaws.start_pose.pronation[side]))
+                bend -= starting * np.array((flaws.start_pose.flexion[side], -flaws.start_pose.pronation[side]))
+            if free is not None:
+                bend += hanging * free.bend
             R_WU = R_WT * Rotation.from_rotvec(blend[:, None] * R_TU.as_rotvec())
             for turn in turns:
                 R_WU = R_WU * Rotation.from_rotvec(turn)

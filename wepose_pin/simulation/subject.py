@@ -24,7 +24,7 @@ from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
 from .motion import E_Z, SEGMENTS, STAND_S, BodyMotion, BodyPose, Flaws, locate_sensor
 from .signals import Wander
 from .soft_tissue import JointRotations, SoftTissue, is_on, read_joints
-from .tasks import TASKS
+from .tasks import find_task
 
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
@@ -273,8 +273,9 @@ def simulate(
         `PEOPLE_PRESET` for what the literature has.
     clasp_s : [s] duration of the clasp, palms together, at least 5.
     circles : number of circles, 0 or more.
-    protocol : what is done in place of the clasp, one of `TASKS`; "handle": 0.4 m between the palms; "touch_left" and
-        "touch_right": the palm on a fixed point while the trunk leans and turns; "poses": T-pose and bow, no circles.
+    protocol : what is done in place of the clasp, one of `TASKS`, or several joined by "+"; "handle": 0.4 m between the
+        palms; "touch_left" and "touch_right": the palm on a fixed point while the trunk leans and turns; "poses":
+        T-pose and bow, no circles.
     pose_deg : how far T-pose and bow are off, standard deviation of each axis [deg].
     session : another session of the same person: sensors are mounted again, motion, start pose and noise are others.
 
@@ -299,13 +300,12 @@ def simulate(
         raise BadOption(f"lengths: {', '.join(missing)} is missing; each is needed, in metres")
     if not (clasp_s >= 5.0 and circles >= 0 and rate_hz > 0.0):
         raise BadOption(f"clasp_s {clasp_s} must be >= 5, circles {circles} >= 0, rate_hz {rate_hz} > 0")
-    if protocol not in TASKS or (protocol == "poses" and circles):
-        raise BadOption(f"protocol {protocol!r} must be one of {', '.join(TASKS)}; with 'poses' circles must be 0")
+    task = find_task(protocol)
+    if protocol == "poses" and circles:
+        raise BadOption("protocol 'poses': circles must be 0")
     lengths = {name: float(lengths[name]) for name in names}
     rngs = spawn_streams(seed, session)
-    motion = TASKS[protocol](
-        lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs, lengths["shoulder_width"])
-    )
+    motion = task(lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs, lengths["shoulder_width"]))
     motion.fit_to_person(rngs["task"], pose_deg)
     return measure_motion(motion, rngs, rate_hz, noise, imperfections)
 

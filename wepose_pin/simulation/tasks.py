@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..errors import BadOption, one_of
 from .imperfections import Imperfections
 from .motion import MARGIN_S, SIDES, Motion
+from .sequence import make_sequence
 from .signals import Wander, make_pulse, make_step
 
 _T_POSE_S = (7.5, 12.5)
@@ -130,10 +132,31 @@ class Poses(Motion):
         return Rotation.from_rotvec(np.tile(raised.as_rotvec(), (n, 1))), np.full(n, self.elbow[side])
 
 
+SEQUENCE_PARTS = ("clasp", "elbows", "swing", "t_pose", "touch_body")  # what a sequence may have
 TASKS: dict[str, type[Motion]] = {
     "clasp": Motion,
     "handle": Handle,
     "touch_left": TouchLeft,
     "touch_right": Touch,
     "poses": Poses,
+    **{part: make_sequence((part,)) for part in SEQUENCE_PARTS if part != "clasp"},
 }
+
+
+def find_task(protocol: str) -> type[Motion]:
+    """Find the motion of a protocol, or of several that are joined by "+".
+
+    Raises
+    ------
+    BadOption
+        There is none.
+    """
+    parts = tuple(protocol.split("+"))
+    if len(parts) > 1 and set(parts) <= set(SEQUENCE_PARTS) and len(set(parts)) == len(parts):
+        return make_sequence(parts)
+    if protocol not in TASKS:
+        raise BadOption(
+            f"protocol {protocol!r} is not simulated; {one_of(TASKS, protocol)}; or several of "
+            f"{', '.join(SEQUENCE_PARTS)} joined by +"
+        )
+    return TASKS[protocol]

@@ -78,7 +78,10 @@ def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any
         An input cannot be read.
     """
     inputs = {name: path for name, value in values.items() if (path := _input_path(name, value)) is not None}
-    options = {name: value for name, value in values.items() if name not in (*inputs, *_NOT_OPTIONS)}
+    several = {name: value for name, value in values.items() if isinstance(value, tuple) and value}
+    several = {name: value for name, value in several.items() if all(isinstance(each, Path) for each in value)}
+    inputs |= {f"{name}.{i}": path for name, paths in several.items() for i, path in enumerate(paths)}
+    options = {name: value for name, value in values.items() if name not in (*inputs, *several, *_NOT_OPTIONS)}
     return {
         "format": FORMAT,
         "command": command,
