@@ -7,10 +7,12 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import polars as pl
 
 from ..diagnostics import ERROR, WARNING, Diagnostic
 from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
@@ -36,6 +38,7 @@ BLOCK_S, STATIC_GYRO, STATIC_ACCEL = 0.25, np.deg2rad(3.0), 0.4
 SHORTEST_STATIC_S = 1.0
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
+_YEAR_2000, _YEAR_2100 = 946_684_800.0, 4_102_444_800.0  # [s] since 1970
 
 
 class Description(NamedTuple):
@@ -121,10 +124,11 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         proposal = _propose_from_names(path, folder, guess, list(arrays.shapes), arrays)
         return _propose_session(path, folder, proposal, wearer)
     if path.suffix.lower() in TABLES:
-        names = Rows(path).names
+        rows = Rows(path)
+        names = rows.names
         if any(f"{point}_x" in names for point in table.points):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
-        proposal = _propose_from_names(path, folder, guess_columns(names, table), names, None)
+        proposal = _propose_from_names(path, folder, guess_columns(names, table, rows.units), names, None)
         return _propose_session(path, folder, proposal, wearer)
     known = (
         ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose; a result's folder, an "
@@ -413,8 +417,8 @@ def _propose_from_names(
     head = [f"file = {_relative(path, folder)}", *time]
     if raw:
         head += [
-            f'gyro_unit = "{"deg/s" if guess.degrees else "rad/s"}"',
-            f'accel_unit = "{"g" if guess.g else "m/s^2"}"',
+            f"gyro_unit = {toml_string(guess.units.get('gyro', 'rad/s'))}",
+            f"accel_unit = {toml_string(guess.units.get('accel', 'm/s^2'))}",
         ]
     tables = {}
     for segment, signals in guess.sensors.items():
@@ -432,24 +436,38 @@ def _propose_from_names(
 
 def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str], list[str]]:
     """Propose the lines of the time, `time` and its unit or `rate_hz`; with facts about it."""
-    name = guess.time
-    if name is None:
+    if not guess.times:
         return [f"rate_hz = 100.0{CHECK}no column looks like time"], ["no column looks like time: state the rate"]
-    table = arrays.table({name: str(path)}) if arrays else read_table(path)
-    try:
-        time = read_columns(table, [name], str(path), "time")[:, 0]
-    except BadData as error:  # dates, say
-        return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {error}"]
+    table = arrays.table({name: str(path) for name in guess.times}) if arrays else read_table(path)
+    for name in guess.times:
+        try:
+            time = read_columns(table, [name], str(path), "time")[:, 0]
+            break
+        except BadData as error:  # dates, or another column of this name
+            refused = error
+    else:
+        name = guess.times[0]
+        dates = table[name].cast(pl.String).str.to_datetime(time_unit="us", strict=False).drop_nulls().to_physical()
+        span = 1e-6 * float(np.ptp(dates.to_numpy())) if len(dates) else 0.0
+        if not span:
+            return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {refused}"]
+        rate_hz = float(f"{(len(dates) - 1) / span:.6g}")
+        return [f"rate_hz = {rate_hz}"], [f"'{name}' holds dates; by the first and the last of them: {rate_hz:g} Hz"]
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
-    named = guess.time_unit
+    named = guess.units.get(name)
     unit = named if named is not None and 0.0 < step * TIME_UNITS[named] < LONGEST_STEP_S else guess_time_unit(step)
-    line = f"time = {toml_string(name)}"
-    if unit in (None, "s"):
-        return [line], []
-    reason = "its name says" if unit == named else f"it grows by {step:g} from row to row"
-    fact = f"'{name}' is in {unit}, as {reason}: {1.0 / (step * TIME_UNITS[unit]):g} Hz"
-    return [line, f'time_unit = "{unit}"' + ("" if unit == named else f"{CHECK}{reason}")], [fact]
+    line, facts = f"time = {toml_string(name)}", []
+    if unit not in (None, "s"):
+        reason = "its name says" if unit == named else f"it grows by {step:g} from row to row"
+        facts = [f"'{name}' is in {unit}, as {reason}: {1.0 / (step * TIME_UNITS[unit]):.4g} Hz"]
+    first = float(np.nanmin(time)) * TIME_UNITS[unit or "s"] if np.isfinite(time).any() else 0.0
+    if _YEAR_2000 < first < _YEAR_2100:
+        facts.append(
+            f"'{name}' counts from 1970: the recording begins at {datetime.fromtimestamp(first, UTC):%F %T} UTC"
+        )
+    unit_line = [] if unit in (None, "s") else [f'time_unit = "{unit}"' + ("" if unit == named else f"{CHECK}{reason}")]
+    return [line, *unit_line], facts
 
 
 # Contents of a recording -------------------------------------------------------------------------------------------

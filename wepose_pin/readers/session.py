@@ -50,7 +50,7 @@ from .tables import FORMATS as TABLES
 from .tables import Rows, read_column, read_columns, read_table
 
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
-ACCEL_UNITS = {"m/s^2": 1.0, "g": STANDARD_GRAVITY}
+ACCEL_UNITS = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}
 # Allowed error of a quaternion's norm, from rounded decimals.
 NORM_ERROR = 1e-2
 SI = {"gyro": 1.0, "accel": 1.0}
