@@ -25,7 +25,7 @@ from ..recording.limits import LONGEST_STEP_S
 from ..recording.sensors import compute_rate
 from .arrays import ArrayFile, is_array_file
 from .device import Device
-from .formats import TITLES, detect_format, read_device
+from .formats import TITLES, WHOLE, detect_format, read_device
 from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
 from .session import SessionReader
@@ -107,8 +107,8 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
         if named is None:
             raise MissingFile(
-                f"{path}: a folder without session.toml, subject.toml, pose.parquet or an x-IMU3's Inertial.csv; name "
-                f"a file"
+                f"{path}: a folder without session.toml, subject.toml or pose.parquet, none of an x-IMU3, a phone or a "
+                f"ROS bag; name a file"
             )
         path = named
     if path.suffix.lower() == ".toml":
@@ -131,8 +131,8 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         proposal = _propose_from_names(path, folder, guess_columns(names, table, rows.units), names, None)
         return _propose_session(path, folder, proposal, wearer)
     known = (
-        ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose; a result's folder, an "
-        "x-IMU3's folder"
+        ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose, .xdf, .db3, .mcap, .bag, "
+        ".zip and .json of phones; folders of a result, an x-IMU3, a phone, a ROS bag"
     )
     raise BadData(f"{path}: is nothing that is known here; there is: {known}")
 
@@ -302,7 +302,7 @@ def _propose_from_device(path: Path, folder: Path, format: str, table: BodyTable
         facts, phases = _describe_live(path)
         worn = {str(segment): list[str]() for segment in device.labels.values()}
         return _Proposal(title, [f"file = {_relative(path, folder)}", *phases], worn, facts=facts)
-    if len(device.labels) > 1 or format in ("mvnx", "opensim", "apdm"):
+    if len(device.labels) > 1 or format in WHOLE:
         tables: dict[str, list[str]] = {}
         for label, segment in device.labels.items():
             where = segment if segment and segment not in tables else f"?{label}"
@@ -329,7 +329,7 @@ def _propose_from_device(path: Path, folder: Path, format: str, table: BodyTable
     else:
         rate = []
     unknown = [name.removeprefix("?") for name in tables if name.startswith("?")]
-    if format not in ("mvnx", "opensim") and len(tables) - len(unknown) > 1:
+    if len(tables) - len(unknown) > 1:
         title += f", {len(tables) - len(unknown)} files"
     diagnostics += _unknown_segments(path.parent, unknown)
     return _Proposal(title, [f'format = "{format}"', *rate], tables, labels, diagnostics=diagnostics)

@@ -63,8 +63,14 @@ def guess_columns(
     table : of the body whose segments carry the sensors; None: the upper body
     units : of the columns, where a line after the names has them
     """
-    names, table = list(names), table or load_table()
-    own_units = {name: (units or {}).get(name, "") or _split_unit(name)[1] for name in names}
+    names = list(names)
+    own_units = {name: (units or {}).get(name, "") or split_unit(name)[1] for name in names}
+    return _make_guess(names, group_columns(names, table), own_units)
+
+
+def group_columns(names: Sequence[str], table: BodyTable | None = None) -> dict[str, dict[str, list[str]]]:
+    """Group columns: segment, or ?name where it is not known → signal → the columns of its axes; `table` as above."""
+    table = table or load_table()
     # ROS calls the specific force of sensor_msgs/Imu linear_acceleration; elsewhere this is without gravity.
     ros = any("angular_velocity" in name for name in names)
     groups: dict[tuple[str, str], dict[str, str]] = {}
@@ -72,7 +78,7 @@ def guess_columns(
     for find_axes in (_find_letters, _find_number):  # numbers may be those of sensors
         owned = {name for axes in groups.values() if len(axes) > 2 for name in axes.values()}
         for name in names:
-            for stem, axis in find_axes(_split_unit(name)[0]) if name not in owned else ():
+            for stem, axis in find_axes(split_unit(name)[0]) if name not in owned else ():
                 signal = guess_signal(stem.replace("linear_acc", "acc") if ros else stem)
                 if signal:
                     groups.setdefault((stem, signal), {})[axis] = name
@@ -84,10 +90,10 @@ def guess_columns(
             order = "012"
         if set(order) <= set(axes):
             by_sensor.setdefault(_find_owner(stem, table), {}).setdefault(signal, [axes[axis] for axis in order])
-    return _make_guess(names, by_sensor, own_units)
+    return by_sensor
 
 
-def _split_unit(name: str) -> tuple[str, str]:
+def split_unit(name: str) -> tuple[str, str]:
     """Split a column's name into what stands before its unit, and the unit; an axis in brackets is none."""
     match = _BRACKETS.fullmatch(name)
     if match and match[1] and not re.fullmatch("[xyzw0-3]", match[2], re.IGNORECASE):
@@ -186,7 +192,7 @@ def _make_guess(
         }
         for name, signals in complete.items()
     }
-    times = [name for name in names if _is_time(_split_unit(name)[0]) or _is_time(name)]
+    times = [name for name in names if _is_time(split_unit(name)[0]) or _is_time(name)]
     units = {}
     for name in times:
         words = [own_units.get(name, "").lower(), *_split_words(name)]
