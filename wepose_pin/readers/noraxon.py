@@ -26,8 +26,6 @@ _SIGNAL = re.compile(
     r"(?P<axis>[xyz])(?P<side> [LR]T)? ?\((?P<unit>.+)\)",
     re.IGNORECASE,
 )
-# What the maker calls a segment where our words for it do not say so.
-SEGMENTS = {"Upper spine": "torso"}
 
 
 def is_noraxon(names: list[str]) -> bool:
@@ -79,5 +77,5 @@ def read_noraxon(path: Path, use: str | None = None, rate_hz: float | None = Non
     left_out = [label for label in columns if label not in values]
     facts = {"devices": ", ".join(left_out), "signals": "gyro and accel"}
     missing = (Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts),) if left_out else ()
-    labels = {label: SEGMENTS.get(label) or load_table().guess_segment(label) for label in values}
+    labels = {label: load_table().guess_segment(label) for label in values}
     return make_device("noraxon", "raw", dict.fromkeys(values, time), values, labels, missing)
