@@ -325,7 +325,7 @@ def test_wepose_evaluate_says_what_was_fitted(
     aligned = run(capsys, result, tmp_path / "laboratory.parquet", "--align", "world", "--interval", "20", "40")
     assert "The reference was aligned by 2 to 16." in aligned
     assert "s, which are not scored:" in aligned
-    assert "its clock -3.217 s (speeds correlate by 0.99" in aligned
+    assert "its clock -3.217 s (speeds correlate by " in aligned
     assert "its world: +y is up, rotated by +" in aligned
     assert "Agreement of joint angles [deg]: Bland-Altman" in aligned
     plain = run(capsys, result, tmp_path / "truth.parquet", "--interval", "20", "40")
