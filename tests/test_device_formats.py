@@ -49,7 +49,7 @@ def apdm_hdf5(path: Path, version: int = 4) -> Path:
             accel = own(ACCEL, Path(name)) if k else ACCEL
             if version < 5:
                 raw, turned = file.create_group(f"{number}/Calibrated"), "Orientation"
-                raw["Accelerometers"], raw["Gyroscopes"], raw[turned] = accel, GYRO, WXYZ
+                raw["Accelerometers"], raw["Gyroscopes"], raw[turned], raw["Magnetometers"] = accel, GYRO, WXYZ, accel
                 file[number].attrs["SampleRate"] = RATE
                 file[f"{number}/Time"] = stamps
             else:
@@ -189,6 +189,15 @@ def emgworks(path: Path) -> Path:
     return path
 
 
+def emgworks_with_labels(path: Path) -> Path:
+    """Units in a line for each channel, before the names; as emgio describes it."""
+    names = [f"{kind}1.{a}" for kind in ("ACC", "GYRO") for a in AXES]
+    lines = [f"Label: {n}  Sampling frequency: 100 Unit: {'g' if 'ACC' in n else 'deg/s'}  Domain: Time" for n in names]
+    columns = [column for values in (ACCEL / G, np.degrees(GYRO)) for v in values.T for column in (TIME, v)]
+    path.write_text("\n".join(lines) + "\n\n" + text(columns, [x for name in names for x in ("X[s]", f'"{name}"')]))
+    return path
+
+
 @pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", ",")])
 def test_delsys(separator: str, decimal: str, tmp_path: Path) -> None:
     assert detect_format(delsys(tmp_path / "a.csv", separator, decimal)) == "delsys"
@@ -197,8 +206,9 @@ def test_delsys(separator: str, decimal: str, tmp_path: Path) -> None:
     check_raw(recording, "left_forearm")
 
 
-def test_emgworks(tmp_path: Path) -> None:
-    assert detect_format(emgworks(tmp_path / "a.csv")) == "delsys"
+@pytest.mark.parametrize("write", [emgworks, emgworks_with_labels])
+def test_emgworks(write: Callable[[Path], Path], tmp_path: Path) -> None:
+    assert detect_format(write(tmp_path / "a.csv")) == "delsys"
     check_raw(load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.torso]'))
 
 

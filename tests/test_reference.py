@@ -457,6 +457,56 @@ def test_a_spoiled_c3d_is_one_line(
     assert "\n" not in str(error.value)
 
 
+# Peers -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
+    """The markers of the file that was read last, name → (n, 3) [m], before joints are made of them."""
+    found: dict[str, np.ndarray] = {}
+
+    def keep(_path: Path, time: np.ndarray, markers: dict[str, np.ndarray], _table: object) -> Reference:
+        found.clear()
+        found.update(markers)
+        return Reference(time, {}, {})
+
+    for reader in ("c3d", "trc"):
+        monkeypatch.setattr(f"wepose_pin.readers.{reader}.locate", keep)
+    return found
+
+
+@pytest.mark.peer
+def test_ezc3d_reads_the_same(pose: Pose, seen: dict[str, np.ndarray], tmp_path: Path) -> None:
+    """Bit-identical: both read the file's single precision."""
+    ezc3d = pytest.importorskip("ezc3d")
+    read_reference(c3d(tmp_path / "a.c3d", pose))
+    file = ezc3d.c3d(str(tmp_path / "a.c3d"))
+    for k, label in enumerate(file["parameters"]["POINT"]["LABELS"]["value"]):
+        theirs = 1e-3 * file["data"]["points"][:3, k].T
+        np.testing.assert_allclose(seen[label.removeprefix("Anna:")], theirs, atol=1e-15)
+    rotations = ezc3d.c3d(str(theia(tmp_path / "b.c3d", pose)))["data"]["rotations"]
+    reference = read_reference(tmp_path / "b.c3d")
+    theirs = Rotation.from_matrix(rotations[:3, :3, 1].transpose(2, 0, 1))
+    assert (theirs.inv() * Rotation.from_quat(reference.quat_VT["torso"])).magnitude().max() < 1e-7
+
+
+@pytest.mark.peer
+def test_opensim_reads_and_writes_the_same(pose: Pose, seen: dict[str, np.ndarray], tmp_path: Path) -> None:
+    opensim = pytest.importorskip("opensim")
+    time = read_reference(trc(tmp_path / "a.trc", pose)).time
+    ours = dict(seen)
+    table = opensim.TimeSeriesTableVec3(str(tmp_path / "a.trc"))
+    np.testing.assert_allclose(table.getIndependentColumn(), time, atol=1e-12)
+    for name in ("C7", "LELB", "RWRB"):
+        column = table.getDependentColumn(name)
+        for k in (0, 100, 330, len(time) - 1):
+            np.testing.assert_allclose([1e-3 * column[k][axis] for axis in range(3)], ours[name][k], atol=1e-15)
+    opensim.TRCFileAdapter.write(table, str(tmp_path / "b.trc"))
+    np.testing.assert_allclose(read_reference(tmp_path / "b.trc").time, time, atol=1e-9)
+    for name, p in ours.items():
+        np.testing.assert_allclose(seen[name], p, atol=1e-12)
+
+
 # Agreement ----------------------------------------------------------------------------------------------------------
 
 

@@ -2,9 +2,9 @@
 
 Trigno Discover: lines on the recording, a line of sensors (the name above the first of its columns, the serial number
 in parentheses), one of their modes, one of channels (``ACC X Time Series (s)``, ``ACC X (G)``, ``GYRO X (deg/s)``),
-their rates and periods. EMGworks: one line of names, ``X[s]`` and ``Trigno IM sensor 1: Acc 1.X (IM) [g]`` in turn. A
-channel that is sampled less often ends before the others. In countries with decimal commas semicolons separate the
-columns.
+their rates and periods. EMGworks: one line of names, ``X[s]`` and ``Trigno IM sensor 1: Acc 1.X (IM) [g]`` in turn, or
+``ACC1.X`` after lines ``Label: ACC1.X Sampling frequency: 148.148 Unit: g``. A channel that is sampled less often ends
+before the others. In countries with decimal commas semicolons separate the columns.
 
 Source: programs that read such files (emgio and others).
 """
@@ -25,15 +25,18 @@ from .device import Device, Text, convert, join_signals, make_device, parse_rows
 
 _DISCOVER = re.compile(r"(?P<kind>ACC|GYRO) (?P<axis>[XYZ]) \((?P<unit>.+)\)", re.IGNORECASE)
 _EMGWORKS = re.compile(
-    r"(?P<label>.+?): (?P<kind>acc|gyro) ?\d*\.(?P<axis>[xyz]) ?(\(.*\))? ?\[(?P<unit>.+)\]", re.IGNORECASE
+    r"((?P<label>.+?): )?(?P<kind>acc|gyro) ?(?P<number>\d*)\.(?P<axis>[xyz]) ?(\(.*\))? ?(\[(?P<unit>.+)\])?",
+    re.IGNORECASE,
 )
+_LABEL = re.compile(r"Label: *(?P<name>.+?) +Sampling frequency:.* Unit: *(?P<unit>\S+)", re.IGNORECASE)
+MOST_LINES = 2000  # before the channels, one for each of them
 _TIME = re.compile(r".*time series \(s\)|x ?\[s\]", re.IGNORECASE)
 SIGNALS = {"acc": "accel", "gyro": "gyro"}
 
 
 def is_delsys(lines: Sequence[str]) -> bool:
     """Return whether a file that begins with these lines is one of Delsys's."""
-    return _find_channels(lines) is not None
+    return any(map(_LABEL.match, lines)) or _find_channels(lines) is not None
 
 
 def read_delsys(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
@@ -46,7 +49,8 @@ def read_delsys(path: Path, use: str | None = None, rate_hz: float | None = None
     """
     if use == "orientation":
         raise BadData(f"{path}: orientations of Delsys are not read; leave out data.use")
-    lines = read_first_lines(path)
+    lines = read_first_lines(path, MOST_LINES)
+    units = {match["name"].strip(): match["unit"] for match in map(_LABEL.match, lines) if match}
     found = _find_channels(lines)
     if found is None:
         raise BadData(f"{path}: is no CSV of Delsys: no line of channels such as 'ACC X Time Series (s), ACC X (G)'")
@@ -63,9 +67,13 @@ def read_delsys(path: Path, use: str | None = None, rate_hz: float | None = None
     for k, channel in enumerate(channels):
         match = _DISCOVER.fullmatch(channel) or _EMGWORKS.fullmatch(channel)
         if match:
-            label = match["label"].strip() if "label" in match.re.groupindex else owners[k] if owners else ""
-            signals = columns.setdefault(label or "sensor", {})
-            signals.setdefault(SIGNALS[match["kind"].lower()], {})[match["axis"].lower()] = k, match["unit"]
+            about = match.groupdict()
+            label = about.get("label") or (
+                f"sensor {about['number']}" if "number" in about else owners[k] if owners else ""
+            )
+            signals = columns.setdefault(label.strip() or "sensor", {})
+            unit = match["unit"] or units.get(channel, "")
+            signals.setdefault(SIGNALS[match["kind"].lower()], {})[match["axis"].lower()] = k, unit
     clocks, values, diagnostics = {}, {}, list[Diagnostic]()
     for label, signals in columns.items():
         if not all(len(signals.get(signal, {})) == 3 for signal in SIGNALS.values()):
