@@ -204,10 +204,13 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     "an empty file": (lambda f: f.raw(lambda _: ""), "arm.csv: is empty"),
     "a table without rows": (lambda f: setattr(f, "table", f.table.head(0)), "arm.csv: 0 samples; a recording has at"),
     "a single sample": (lambda f: setattr(f, "table", f.table.head(1)), "arm.csv: 1 samples; a recording has at least"),
-    "semicolons": (lambda f: f.raw(lambda t: t.replace(",", ";")), "arm.csv: columns are separated by semicolons"),
-    "semicolons and decimal commas": (
-        lambda f: f.raw(lambda t: t.replace(",", ";").replace(".", ",")),
-        "arm.csv: columns are separated by semicolons; commas, and points in decimals, are needed",
+    "text after semicolons": (
+        lambda f: (f.put("gy", slice(40, 41), "n.v."), f.raw(lambda t: t.replace(",", ";"))),
+        "arm.csv: column 'gy' holds text in row 41: 'n.v.'; it must be a number",
+    ),
+    "a row that is short after semicolons": (
+        lambda f: f.raw(lambda t: t.replace("\n0.02,", "\n").replace(",", ";")),
+        "arm.csv: row 3 has 10 fields, the line of names has 11; mend the row",
     ),
     "decimal commas": (
         lambda f: f.put("gy", slice(40, 41), "0,125"),
@@ -304,7 +307,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
         'data.accel_unit = "g" would fit',
     ),
     "accel not in g": (lambda f: f.say('"m/s^2"', '"g"'), "norm 96.2 m/s^2 in phases.start (0.5 to 2.5 s), where grav"),
-    "accel in mg": (lambda f: f.scale("ax ay az", 1000 / 9.81), "the values look like thousandths of g"),
+    "accel in mg": (lambda f: f.scale("ax ay az", 1000 / 9.81), 'data.accel_unit = "mg" would fit'),
     "accel without gravity": (lambda f: f.scale("ax ay az", 0.001), "gravity seems to have been taken out"),
     "accel in g without phases": (
         lambda f: (f.scale("ax ay az", 1 / 9.81), f.say("start = [[0.5, 2.5]]", "")),

@@ -687,8 +687,8 @@ def test_columns_by_their_names() -> None:
         "Time (s),chest_gyro_x [deg/s],chest_gyro_y [deg/s],chest_gyro_z [deg/s],chest_acc_x,chest_acc_y,chest_acc_z"
     )
     found = guess_columns([*names.split(","), "chest_mag_x", "chest_mag_y", "chest_mag_z", "left_wrist_qw"])
-    assert found.time == "Time (s)"
-    assert found.degrees
+    assert found.times == ["Time (s)"]
+    assert found.units == {"Time (s)": "s", "gyro": "deg/s"}
     assert list(found.sensors) == ["torso"]
     assert found.sensors["torso"]["accel"] == ["chest_acc_x", "chest_acc_y", "chest_acc_z"]
     found = guess_columns(["t", "gx", "gy", "gz", "ax", "ay", "az"])

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ..jobs.evaluate import EvaluateJob, run_evaluate
 from .output import print_table, progress_bar, say
 from .parser import Command
 from .tables import mean_std
+
+if TYPE_CHECKING:
+    from ..evaluation import Registration
 
 
 def run(job: EvaluateJob) -> int:
@@ -15,6 +20,8 @@ def run(job: EvaluateJob) -> int:
     from ..recording import format_span
 
     say(f"{errors.samples} samples from {format_span(errors.interval)}")
+    if errors.registration is not None:
+        _say_registration(errors.registration)
     if errors.attitude:
         print_table(
             "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
@@ -39,6 +46,24 @@ def run(job: EvaluateJob) -> int:
                 for angle, error in angles.items()
             ],
         )
+    if errors.registration is not None and errors.agreement:
+        print_table(
+            "Agreement of joint angles [deg]: Bland-Altman bias and 95 % limits; root mean square; ICC(A,1); range",
+            ("joint", "angle", "bias", "limits of agreement", "rms", "ICC", "range"),
+            [
+                (
+                    joint,
+                    angle,
+                    f"{each.bias:+.2f}",
+                    f"{each.lower:+.2f} to {each.upper:+.2f}",
+                    f"{each.rmse:.2f}",
+                    f"{each.icc:.3f}",
+                    f"{each.range:.0f}",
+                )
+                for joint, angles in errors.agreement.items()
+                for angle, each in angles.items()
+            ],
+        )
     if errors.position:
         on_limb = errors.position_on_limb
         print_table(
@@ -60,6 +85,23 @@ def run(job: EvaluateJob) -> int:
             ],
         )
     return 0
+
+
+def _say_registration(registration: Registration) -> None:
+    """Say how the reference was brought to the result, and by which seconds."""
+    from ..recording import format_span
+
+    fitted = registration.correlation == registration.correlation  # NaN where the offset was stated
+    clock = "stated" if not fitted else f"speeds correlate by {registration.correlation:.3f}"
+    say(f"The reference was aligned by {format_span(registration.fitted)}, which are not scored:")
+    say(f"  its clock {registration.offset_s:+.3f} s ({clock})")
+    say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+.1f} deg about the vertical")
+    if registration.shift_m.any():
+        x, y, z = registration.shift_m
+        say(f"  its points moved by {x:+.3f} {y:+.3f} {z:+.3f} m")
+    if registration.frames_deg:
+        listed = ", ".join(f"{segment} {angle:.1f}" for segment, angle in registration.frames_deg.items())
+        say(f"  its segments' frames rotated [deg], so that no constant error of these is left: {listed}")
 
 
 COMMAND = Command(

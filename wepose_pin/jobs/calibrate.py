@@ -59,7 +59,7 @@ class CalibrateJob:
     prior : SUBJECT
         Begin with this subject.toml, or the one in this folder, of an earlier calibration of the same person: lengths
         and shoulders with their covariance, so that each session adds to what is known. Its mounts hold as long as the
-        sensors were not taken off; a session with remounted = true takes none of them.
+        sensors were not taken off; a session with remounted = true takes none of them. Of an Xsens .mvnx the lengths.
     stature : METRES
         Narrow the population prior to people of this body height.
     sex
@@ -158,8 +158,9 @@ def run_calibrate(
     from ..calibration.protocols import choose_protocol
     from ..model.body import load_sensed_model
     from ..readers import load_session
+    from ..readers.subject import read_subject
     from ..report import write_calibration_page
-    from ..subject import load_subject, population_subject
+    from ..subject import population_subject
     from ..writers.calibration import write_calibration
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance
@@ -173,7 +174,7 @@ def run_calibrate(
         protocol = load_protocol(job.protocol or choose_protocol(recording.phases))
         model = load_sensed_model(job.model or recording.model or None, recording.sensors, recording.where())
         _check_measured(job, model)
-        prior = load_subject(job.prior) if job.prior is not None else None
+        prior = read_subject(job.prior) if job.prior is not None else None
         prior = prior or population_subject(job.stature, job.sex, model)
         progress("calibrating", 1 / 3)
         options: dict[str, Any] = {

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from ..errors import BadOption, WrongOption
 from . import Progress, no_progress
@@ -21,25 +21,44 @@ class EvaluateJob:
     Prints for each segment the attitude error (roll, pitch, yaw about the axes of W), inclination, heading and total
     RMSE [deg] and the drift of the heading [deg/min]; for each joint the error of its angles [deg]; for each point the
     position error [mm], relative to the root and to where its limb hangs, as the middle of the shoulders; and whether
-    the stated standard deviations are consistent with the errors. Headings are compared as they are, without alignment.
-    Nothing is written.
+    the stated standard deviations are consistent with the errors. Nothing is written.
+
+    A table with the columns of pose.parquet is compared as it is, without alignment. A file of another system (.c3d,
+    .trc, .mvnx) is brought to the clock and the heading of the result first, by the first third of the result, which
+    is then not scored; both are printed, and the agreement of joint angles (Bland-Altman, ICC) with them.
 
     Parameters
     ----------
     result : RESULT
         Folder that `wepose track` wrote.
     truth : TRUTH
-        Table (.parquet or .csv) with the columns of pose.parquet, or a session that names one (data.truth).
+        Table (.parquet or .csv) with the columns of pose.parquet, or a session that names one (data.truth); markers or
+        rotations (.c3d), markers (.trc), an Xsens MVNX.
     interval : FROM TO
         Compare only from this to this time, in seconds.
+    align : world|segments
+        Align a table too. world: its clock, heading and place; segments: besides a constant rotation of each segment's
+        frame, where frames are not those of docs/glossary.md.
+    no_align
+        Compare times and worlds as they are.
+    time_offset : SECONDS
+        Add this to the times of the reference, in place of an offset that is fitted.
+    markers : TOML
+        Table of markers, which goes before the shipped one (docs/formats/reference.md).
     """
 
     result: Path
     truth: Path
     interval: tuple[float, float] | None = None
+    align: Literal["world", "segments"] | None = None
+    no_align: bool = False
+    time_offset: float | None = None
+    markers: Path | None = None
 
     def check(self) -> None:
-        """Raise `BadOption` where the interval is none."""
+        """Raise `BadOption` where the interval is none, or options contradict each other."""
+        if self.no_align and self.align is not None:
+            raise WrongOption("no-align", "true", f"left out beside --align {self.align}")
         if self.interval is not None and not self.interval[0] < self.interval[1]:
             begin, end = self.interval
             needed = "two times in seconds are needed, the earlier one first"
@@ -60,9 +79,10 @@ def run_evaluate(
     WeposeError
         No result, no reference, or nothing that both have.
     """
-    from ..evaluation import evaluate
-    from ..kinematics import parse_pose_table
+    from ..evaluation import evaluate, register
+    from ..kinematics import Pose, parse_pose_table
     from ..readers import load_session
+    from ..readers.reference import is_reference, read_reference
     from ..readers.tables import read_table
     from ..writers import read_result
 
@@ -78,6 +98,29 @@ def run_evaluate(
         truth = load_session(job.truth, gaps=True).truth
     if truth is None:
         raise BadOption(f"{job.truth}: data.truth is missing; the session names no reference to compare with")
-    reference = parse_pose_table(read_table(truth), str(truth))
+    foreign = is_reference(truth)
+    if job.markers is not None and not foreign:
+        raise WrongOption("markers", str(job.markers), f"a .c3d or .trc as TRUTH; {truth.name} has no markers")
+    if foreign:
+        measured = read_reference(truth, job.markers)
+        reference, up = Pose(measured.time, measured.quat_VT, measured.points), measured.up
+        align: str | None = job.align or ("segments" if measured.own_frames else "world")
+    else:
+        reference, up, align = parse_pose_table(read_table(truth), str(truth)), None, job.align
     progress("comparing", 0.5)
-    return evaluate(pose, reference, job.interval, table)
+    if job.no_align or align is None:
+        if job.time_offset:
+            reference = replace(reference, time=reference.time + job.time_offset)
+        return evaluate(pose, reference, job.interval, table)
+    reference, registration = register(pose, reference, up=up, frames=align == "segments", offset_s=job.time_offset)
+    first, last = registration.scored
+    interval = job.interval or registration.scored
+    scored = max(first, interval[0]), min(last, interval[1])
+    if not scored[0] < scored[1]:
+        raise WrongOption(
+            "interval",
+            f"{interval[0]:g} {interval[1]:g}",
+            f"seconds after {first:.1f}, as those before align the reference; or --no-align",
+        )
+    errors = evaluate(pose, reference, scored, table)
+    return replace(errors, registration=replace(registration, scored=scored))

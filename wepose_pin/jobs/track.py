@@ -34,8 +34,9 @@ class TrackJob:
         Write pose.parquet, subject.toml, subject.urdf, summary.json, view.html and report.html to this folder; of a
         mechanism joints.parquet too.
     subject : SUBJECT
-        Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
-        Without it lengths are those of the population prior, and mounts those that the session states.
+        Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it;
+        or the lengths in an Xsens .mvnx. Without it lengths are those of the population prior, and mounts those that
+        the session states.
     model : URDF|TOML|NAME
         Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package, such as
         whole_body (docs/models.md). A URDF without a table, a robot's say, is a mechanism whose links bear the
@@ -144,8 +145,9 @@ def run_track(
 def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
+    from ..readers.subject import read_subject
     from ..report import write_track_pages
-    from ..subject import load_subject, parse_subject
+    from ..subject import parse_subject
     from ..tracking import track
     from ..writers import write_result
     from ..writers.folder import result_folder
@@ -153,7 +155,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
     method, causal = job.method or BEST, job.causal
     with result_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
-        subject = load_subject(job.subject) if job.subject else None
+        subject = read_subject(job.subject) if job.subject else None
         if is_live_log(job.session):
             log = read_live_log(job.session)
             recording, causal = log.recording, causal or (job.method is None and subject is None)
@@ -189,17 +191,17 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
     """In a memory that does not grow with the recording."""
     from ..filters import BEST
     from ..readers.session import SessionReader
+    from ..readers.subject import read_subject
     from ..report import write_decimated_pages
     from ..report.decimation import Decimator
     from ..report.track import MOST_FRAMES
-    from ..subject import load_subject
     from ..tracking import TrackOptions, track_session
     from ..writers.chunks import ChunkWriter
     from ..writers.folder import result_folder
 
     with result_folder(job.out, job.force) as folder:
         progress("reading the times", 0.0)
-        subject = load_subject(job.subject) if job.subject else None
+        subject = read_subject(job.subject) if job.subject else None
         reader = SessionReader(job.session, gaps=job.gaps, in_memory=False)
         writer, decimator = ChunkWriter(folder, job.covariance), Decimator(len(reader.time))
         options = TrackOptions(job.method or BEST, causal=job.causal, open_loop=job.open_loop, limits=job.limits)

@@ -28,6 +28,8 @@ ROOT = "root"  # the origin of W, as the end of a length
 MODEL_TABLE = "model.toml"
 PERSON, MECHANISM = "person", "mechanism"
 NEUTRAL_POSE = "n_pose"
+# What says the side in a sensor's name, in English and German.
+_SIDES = {"left": "left|lt?|link(s|e[rsmn]?)", "right": "right|rt?|recht(s|e[rsmn]?)"}
 _KEYS = ("segments", "points", "lengths", "hinges", "girdles", "poses", "pairs", "sensors", "draw")
 _SETTINGS = ("kind", "up", "forward", "root")
 
@@ -325,8 +327,8 @@ class BodyTable:
         words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+|(?<=[a-z])(?=\d)", " ", label).lower()
         sides = {
             side
-            for side in ("left", "right")
-            if re.search(rf"\b({side}|{side[0]})(?=\b|hand|fore|upper|foot|low)", words)
+            for side, written in _SIDES.items()
+            if re.search(rf"\b({written})(?=\b|hand|fore|upper|foot|low|wrist|arm|thigh|shank)", words)
         }
         matches = set()
         for name, segment in self.segments.items():

@@ -7,7 +7,8 @@ MATLAB's v7.3, needs h5py, which is optional. Arrays in other files, by links or
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,7 @@ class ArrayFile:
     def _read_column(self, name: str, place: str) -> np.ndarray:
         part = re.fullmatch(r"(.*)\[(\d+)\]", name)
         path = self._find(part[1] if part else name, place)
-        values = self._read_array(path)
+        values = self.read_array(path)
         if values.ndim == 2 and (values.shape[1] > MOST_COLUMNS or values.shape[0] == 1):
             values = values.T  # MATLAB's v7.3 transposes arrays
         if part is None:
@@ -106,17 +107,18 @@ class ArrayFile:
             raise UnknownColumn(f"{place}: no array '{name}' in {self.path.name}; {one_of(self.shapes, path)}")
         return path
 
-    def _read_array(self, path: str) -> np.ndarray:
+    def read_array(self, path: str) -> np.ndarray:
+        """Read an array, a key of `shapes`."""
         if path not in self._loaded:
             self._most -= 8 * int(np.prod(self.shapes[path], dtype=object))
             if self._most < 0:
                 raise BadData(f"{self.path}: {path} is {self.shapes[path]}, {explain_size(self.path)}")
-            with _reading(self.path), _import_h5py(self.path).File(self.path) as file:
+            with _reading(self.path), import_h5py(self.path).File(self.path) as file:
                 self._loaded[path] = np.asarray(file[path], dtype=float)
         return self._loaded[path]
 
     def _read_hdf5_shapes(self) -> dict[str, tuple[int, ...]]:
-        h5py = _import_h5py(self.path)
+        h5py = import_h5py(self.path)
         shapes: dict[str, tuple[int, ...]] = {}
 
         def visit(name: str, node: Any) -> None:
@@ -138,7 +140,7 @@ class ArrayFile:
         return {name: values.shape for name, values in self._loaded.items()}
 
 
-def _import_h5py(path: Path) -> Any:
+def import_h5py(path: Path) -> Any:
     try:
         import h5py
     except ImportError:
@@ -146,6 +148,20 @@ def _import_h5py(path: Path) -> Any:
             f"{path}: is HDF5 (MATLAB's v7.3 is too), which h5py reads: pip install 'wepose-pin[hdf5]'"
         ) from None
     return h5py
+
+
+@contextmanager
+def open_hdf5(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file to read.
+
+    Raises
+    ------
+    BadData
+        It is damaged; h5py is not installed.
+    """
+    h5py = import_h5py(path)
+    with _reading(path), h5py.File(path) as file:
+        yield file
 
 
 class _reading:

@@ -7,10 +7,12 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import polars as pl
 
 from ..diagnostics import ERROR, WARNING, Diagnostic
 from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
@@ -23,7 +25,7 @@ from ..recording.limits import LONGEST_STEP_S
 from ..recording.sensors import compute_rate
 from .arrays import ArrayFile, is_array_file
 from .device import Device
-from .formats import TITLES, detect_format, read_device
+from .formats import TITLES, WHOLE, detect_format, read_device
 from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
 from .session import SessionReader
@@ -36,6 +38,7 @@ BLOCK_S, STATIC_GYRO, STATIC_ACCEL = 0.25, np.deg2rad(3.0), 0.4
 SHORTEST_STATIC_S = 1.0
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
+_YEAR_2000, _YEAR_2100 = 946_684_800.0, 4_102_444_800.0  # [s] since 1970
 
 
 class Description(NamedTuple):
@@ -104,8 +107,8 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
         if named is None:
             raise MissingFile(
-                f"{path}: a folder without session.toml, subject.toml, pose.parquet or an x-IMU3's Inertial.csv; name "
-                f"a file"
+                f"{path}: a folder without session.toml, subject.toml or pose.parquet, none of an x-IMU3, a phone or a "
+                f"ROS bag; name a file"
             )
         path = named
     if path.suffix.lower() == ".toml":
@@ -121,14 +124,15 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         proposal = _propose_from_names(path, folder, guess, list(arrays.shapes), arrays)
         return _propose_session(path, folder, proposal, wearer)
     if path.suffix.lower() in TABLES:
-        names = Rows(path).names
+        rows = Rows(path)
+        names = rows.names
         if any(f"{point}_x" in names for point in table.points):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
-        proposal = _propose_from_names(path, folder, guess_columns(names, table), names, None)
+        proposal = _propose_from_names(path, folder, guess_columns(names, table, rows.units), names, None)
         return _propose_session(path, folder, proposal, wearer)
     known = (
-        ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose; a result's folder, an "
-        "x-IMU3's folder"
+        ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose, .xdf, .db3, .mcap, .bag, "
+        ".zip and .json of phones; folders of a result, an x-IMU3, a phone, a ROS bag"
     )
     raise BadData(f"{path}: is nothing that is known here; there is: {known}")
 
@@ -298,7 +302,7 @@ def _propose_from_device(path: Path, folder: Path, format: str, table: BodyTable
         facts, phases = _describe_live(path)
         worn = {str(segment): list[str]() for segment in device.labels.values()}
         return _Proposal(title, [f"file = {_relative(path, folder)}", *phases], worn, facts=facts)
-    if len(device.labels) > 1 or format in ("mvnx", "opensim", "apdm"):
+    if len(device.labels) > 1 or format in WHOLE:
         tables: dict[str, list[str]] = {}
         for label, segment in device.labels.items():
             where = segment if segment and segment not in tables else f"?{label}"
@@ -325,7 +329,7 @@ def _propose_from_device(path: Path, folder: Path, format: str, table: BodyTable
     else:
         rate = []
     unknown = [name.removeprefix("?") for name in tables if name.startswith("?")]
-    if format not in ("mvnx", "opensim") and len(tables) - len(unknown) > 1:
+    if len(tables) - len(unknown) > 1:
         title += f", {len(tables) - len(unknown)} files"
     diagnostics += _unknown_segments(path.parent, unknown)
     return _Proposal(title, [f'format = "{format}"', *rate], tables, labels, diagnostics=diagnostics)
@@ -413,8 +417,8 @@ def _propose_from_names(
     head = [f"file = {_relative(path, folder)}", *time]
     if raw:
         head += [
-            f'gyro_unit = "{"deg/s" if guess.degrees else "rad/s"}"',
-            f'accel_unit = "{"g" if guess.g else "m/s^2"}"',
+            f"gyro_unit = {toml_string(guess.units.get('gyro', 'rad/s'))}",
+            f"accel_unit = {toml_string(guess.units.get('accel', 'm/s^2'))}",
         ]
     tables = {}
     for segment, signals in guess.sensors.items():
@@ -432,24 +436,38 @@ def _propose_from_names(
 
 def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str], list[str]]:
     """Propose the lines of the time, `time` and its unit or `rate_hz`; with facts about it."""
-    name = guess.time
-    if name is None:
+    if not guess.times:
         return [f"rate_hz = 100.0{CHECK}no column looks like time"], ["no column looks like time: state the rate"]
-    table = arrays.table({name: str(path)}) if arrays else read_table(path)
-    try:
-        time = read_columns(table, [name], str(path), "time")[:, 0]
-    except BadData as error:  # dates, say
-        return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {error}"]
+    table = arrays.table({name: str(path) for name in guess.times}) if arrays else read_table(path)
+    for name in guess.times:
+        try:
+            time = read_columns(table, [name], str(path), "time")[:, 0]
+            break
+        except BadData as error:  # dates, or another column of this name
+            refused = error
+    else:
+        name = guess.times[0]
+        dates = table[name].cast(pl.String).str.to_datetime(time_unit="us", strict=False).drop_nulls().to_physical()
+        span = 1e-6 * float(np.ptp(dates.to_numpy())) if len(dates) else 0.0
+        if not span:
+            return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {refused}"]
+        rate_hz = float(f"{(len(dates) - 1) / span:.6g}")
+        return [f"rate_hz = {rate_hz}"], [f"'{name}' holds dates; by the first and the last of them: {rate_hz:g} Hz"]
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
-    named = guess.time_unit
+    named = guess.units.get(name)
     unit = named if named is not None and 0.0 < step * TIME_UNITS[named] < LONGEST_STEP_S else guess_time_unit(step)
-    line = f"time = {toml_string(name)}"
-    if unit in (None, "s"):
-        return [line], []
-    reason = "its name says" if unit == named else f"it grows by {step:g} from row to row"
-    fact = f"'{name}' is in {unit}, as {reason}: {1.0 / (step * TIME_UNITS[unit]):g} Hz"
-    return [line, f'time_unit = "{unit}"' + ("" if unit == named else f"{CHECK}{reason}")], [fact]
+    line, facts = f"time = {toml_string(name)}", []
+    if unit not in (None, "s"):
+        reason = "its name says" if unit == named else f"it grows by {step:g} from row to row"
+        facts = [f"'{name}' is in {unit}, as {reason}: {1.0 / (step * TIME_UNITS[unit]):.4g} Hz"]
+    first = float(np.nanmin(time)) * TIME_UNITS[unit or "s"] if np.isfinite(time).any() else 0.0
+    if _YEAR_2000 < first < _YEAR_2100:
+        facts.append(
+            f"'{name}' counts from 1970: the recording begins at {datetime.fromtimestamp(first, UTC):%F %T} UTC"
+        )
+    unit_line = [] if unit in (None, "s") else [f'time_unit = "{unit}"' + ("" if unit == named else f"{CHECK}{reason}")]
+    return [line, *unit_line], facts
 
 
 # Contents of a recording -------------------------------------------------------------------------------------------

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from ..errors import MissingFile
+from ..errors import MissingFile, WeposeError
 from .apdm import is_apdm, read_apdm
+from .apdm_hdf5 import is_apdm_hdf5, read_apdm_hdf5
+from .delsys import is_delsys, read_delsys
 from .device import Device, read_first_lines
 from .dot import read_dot
 from .live_log import is_live_log, read_live_device
 from .mt_manager import read_mt_manager
 from .mvnx import read_mvnx
+from .noraxon import is_noraxon, read_noraxon
 from .opensim import read_opensim
+from .phyphox import is_phyphox, read_phyphox
+from .rosbag import SUFFIXES as ROSBAGS
+from .rosbag import is_rosbag, read_rosbag
+from .sensor_logger import is_sensor_logger, read_sensor_logger
+from .shimmer import is_shimmer, read_shimmer
+from .tables import read_layout
+from .xdf import is_xdf, read_xdf
 from .ximu3 import INERTIAL, QUATERNION, read_ximu3
 
 FORMATS: Mapping[str, Callable[[Path, str | None, float | None], Device]] = {
@@ -21,6 +31,14 @@ FORMATS: Mapping[str, Callable[[Path, str | None, float | None], Device]] = {
     "dot": read_dot,
     "ximu3": read_ximu3,
     "apdm": read_apdm,
+    "apdm_hdf5": read_apdm_hdf5,
+    "shimmer": read_shimmer,
+    "delsys": read_delsys,
+    "noraxon": read_noraxon,
+    "sensor_logger": read_sensor_logger,
+    "phyphox": read_phyphox,
+    "rosbag": read_rosbag,
+    "xdf": read_xdf,
     "opensim": read_opensim,
     "wepose_live": read_live_device,
 }
@@ -30,9 +48,20 @@ TITLES = {
     "dot": "CSV of a Movella (Xsens) DOT",
     "ximu3": "CSV of an x-io x-IMU3",
     "apdm": "CSV of APDM",
+    "apdm_hdf5": "HDF5 of APDM",
+    "shimmer": "CSV of Shimmer Consensys",
+    "delsys": "CSV of Delsys",
+    "noraxon": "CSV of Noraxon MR3",
+    "sensor_logger": "recording of Sensor Logger",
+    "phyphox": "recording of phyphox",
+    "rosbag": "ROS bag",
+    "xdf": "XDF",
     "opensim": "OpenSim table of IMU orientations",
     "wepose_live": "recording of wepose live",
 }
+# Formats with all sensors of a recording in one file, and those that may be a folder.
+WHOLE = ("mvnx", "opensim", "apdm", "apdm_hdf5", "delsys", "noraxon", "rosbag", "xdf")
+FOLDERS = {"ximu3": "x-IMU3", "sensor_logger": "Sensor Logger", "phyphox": "phyphox", "rosbag": "ROS"}
 USES = ("raw", "orientation")
 
 
@@ -44,15 +73,21 @@ def detect_format(path: Path) -> str | None:
     MissingFile
         The file is not readable.
     """
-    if path.is_dir():
-        return "ximu3" if any((path / name).is_file() for name in (INERTIAL, QUATERNION)) else None
-    if path.exists() and not path.is_file():
+    if path.exists() and not (path.is_file() or path.is_dir()):
         return None
+    suffix = path.suffix.lower()
+    if path.is_dir() or suffix in (".zip", ".json"):
+        if path.is_dir() and any((path / name).is_file() for name in (INERTIAL, QUATERNION)):
+            return "ximu3"
+        tests = {"rosbag": is_rosbag, "sensor_logger": is_sensor_logger, "phyphox": is_phyphox}
+        return next((format for format, test in tests.items() if test(path)), None)
     if is_live_log(path):
         return "wepose_live"
-    suffix = path.suffix.lower()
-    if suffix in (".mvnx", ".sto"):
-        return {".mvnx": "mvnx", ".sto": "opensim"}[suffix]
+    by_suffix = {".mvnx": "mvnx", ".sto": "opensim", **dict.fromkeys(ROSBAGS, "rosbag")}
+    if suffix in by_suffix or is_xdf(path):
+        return by_suffix.get(suffix, "xdf")
+    if suffix in (".h5", ".hdf5"):
+        return "apdm_hdf5" if is_apdm_hdf5(path) else None
     if suffix not in (".csv", ".txt", ".xml"):
         return None
     lines = read_first_lines(path, 40)
@@ -61,6 +96,8 @@ def detect_format(path: Path) -> str | None:
         return "mvnx"
     if is_apdm(lines):
         return "apdm"
+    if suffix == ".csv" and (found := _detect_csv(path, lines)):
+        return found
     if lines[0].startswith(("Timestamp (us),", "Time (s),")) and (
         "(deg/s)" in lines[0] or lines[0].endswith("W,X,Y,Z")
     ):
@@ -73,6 +110,21 @@ def detect_format(path: Path) -> str | None:
         return "mt_manager"
     # Rates without another hint could be in deg/s (DOT) or rad/s (MT Manager): data.format must be stated.
     return "dot" if any(name in start for name in ("dq_W", "Quat_W", "FreeAcc_X")) and suffix == ".csv" else None
+
+
+def _detect_csv(path: Path, lines: Sequence[str]) -> str | None:
+    """Detect the formats that are tables with names of their own."""
+    if is_delsys(lines):
+        return "delsys"
+    try:
+        names = list(read_layout(path).names)
+    except WeposeError:
+        return None
+    tests = {"shimmer": is_shimmer(names), "noraxon": is_noraxon(names)}
+    phones = {"sensor_logger": is_sensor_logger, "phyphox": is_phyphox}
+    return next((format for format, fits in tests.items() if fits), None) or next(
+        (format for format, test in phones.items() if test(path)), None
+    )
 
 
 def read_device(path: Path, format: str, use: str | None = None, rate_hz: float | None = None) -> Device:
@@ -89,6 +141,6 @@ def read_device(path: Path, format: str, use: str | None = None, rate_hz: float 
         raise MissingFile(f"{path}: no such file or folder; a {TITLES[format]} is wanted here")
     if not (path.is_file() or path.is_dir()):
         raise MissingFile(f"{path}: is no regular file; a {TITLES[format]} is wanted here")
-    if path.is_dir() and format != "ximu3":
+    if path.is_dir() and format not in FOLDERS:
         raise MissingFile(f"{path}: is a folder; a {TITLES[format]} is wanted here")
     return FORMATS[format](path, use, rate_hz)

@@ -3,21 +3,38 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from ..model import BodyTable, load_table
 
-AXIS = re.compile(r"(?P<stem>.*?)[ _.\-\[(]*(?P<axis>[xyzw0-3])[\])]?\s*(?P<unit>[\[(].*[\])])?", re.IGNORECASE)
-# Signals in the order of the search; (?![a-z]) for names such as gx, ax.
+# The place of the axis in a name without it.
+HOLE = "\0"
+# Signals in the order of the search; a lone letter stands right before the axis, as in gx, ax.
+_ALONE = rf"(?=[^a-z]*({HOLE}|$))"
 SIGNALS = (
-    ("gyro", r"gyr|ang(ular)?[ _]?vel|omega|rot(ation)?[ _]?rate|(^|[^a-z])[gw]$"),
-    ("accel", r"acc|(^|[^a-z])a$"),
-    ("orientation", r"quat|ori(entation)?|rotation|(^|[^a-z])q$"),
+    ("gyro", rf"gyr|ang(ular)?[ _]?vel|omega|rot(ation)?[ _]?rate|winkelgeschw|drehrate|(^|[^a-z])[gw]{_ALONE}"),
+    ("accel", rf"acc|beschl|specific[ _]?force|(^|[^a-z])a{_ALONE}"),
+    ("orientation", rf"quat|ori(entation)?|rotation|attitude|(^|[^a-z])q{_ALONE}"),
 )
-NOT = r"mag|free|linear|lin[ _]?acc|earth|std|cov"  # no raw data, whatever else the name says
+NOT = r"mag|free|linear|lin[ _]?acc|user|earth|std|cov"  # no raw data, whatever else the name says
+_BEFORE_AXIS = re.compile(r"(acc|accel|gyr|gyro|omega|vel|rate|quat|(^|[^a-z])[agwq])$")
+_NUMBERED = re.compile(r"(.*?)[ _.\-\[(]*([0-3])[\])]?\s*")
+_BRACKETS = re.compile(r"(.*?)\s*[\[({]\s*([^\[\]{}]*?)\s*[\])}]\s*")
+# Units as they are written → as a session states them.
+UNITS = {
+    "gyro": {
+        "rad/s": r"rad ?[/_p] ?s(ec)?|rads|rps|rad s-1",
+        "deg/s": r"(deg(rees)?|°|º) ?[/_p] ?s(ec(onds?)?)?|degrees per second|degs|dps|°s",
+    },
+    "accel": {
+        "m/s^2": r"m ?[/_p] ?\(?s(\^?2|²|\*\*2|/s)?\)?(\^2|²)?|m/s\*s|ms-2|m s-2|m\.s-2",
+        "g": r"g'?s?|g-?force|units of g",
+        "mg": r"mg|milli ?-?g",
+    },
+}
 # Words of a name that make it a column of times, units of it, and words that may stand beside them.
-TIME = {"time", "times", "timestamp", "timestamps", "t", "ts", "clock", "elapsed", "epoch"}
+TIME = {"time", "times", "timestamp", "timestamps", "t", "ts", "clock", "elapsed", "epoch", "zeit", "zeitstempel"}
 TIME_UNIT = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
     **dict.fromkeys(("ms", "msec", "milli", "millis", "millisec", "millisecond", "milliseconds"), "ms"),
@@ -31,26 +48,40 @@ ORDER = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 class Guess(NamedTuple):
     """The guess from the names of columns."""
 
-    time: str | None
-    time_unit: str | None  # "s", "ms", "us" or "ns", where the name has it
+    times: Sequence[str]  # columns that may be the time, the likeliest first
     sensors: Mapping[str, Mapping[str, list[str]]]  # segment, or ?name where it is not known → signal → columns
-    degrees: bool  # a name has deg/s
-    g: bool  # a name has g
+    units: Mapping[str, str]  # "gyro", "accel" or a column of times → unit, where the names say it
 
 
-def guess_columns(names: Iterable[str], table: BodyTable | None = None) -> Guess:
-    """Guess signals from groups of three or four columns that differ only in the axis.
+def guess_columns(
+    names: Iterable[str], table: BodyTable | None = None, units: Mapping[str, str] | None = None
+) -> Guess:
+    """Guess signals from groups of three or four columns that differ only in the axis, wherever it stands in the name.
 
-    `table` : of the body whose segments carry the sensors; None: the upper body
+    Parameters
+    ----------
+    table : of the body whose segments carry the sensors; None: the upper body
+    units : of the columns, where a line after the names has them
     """
     names = list(names)
+    own_units = {name: (units or {}).get(name, "") or split_unit(name)[1] for name in names}
+    return _make_guess(names, group_columns(names, table), own_units)
+
+
+def group_columns(names: Sequence[str], table: BodyTable | None = None) -> dict[str, dict[str, list[str]]]:
+    """Group columns: segment, or ?name where it is not known → signal → the columns of its axes; `table` as above."""
+    table = table or load_table()
+    # ROS calls the specific force of sensor_msgs/Imu linear_acceleration; elsewhere this is without gravity.
+    ros = any("angular_velocity" in name for name in names)
     groups: dict[tuple[str, str], dict[str, str]] = {}
-    for name in names:
-        match = AXIS.fullmatch(name)
-        signal = guess_signal(match["stem"]) if match else None
-        if match and signal:
-            groups.setdefault((match["stem"], signal), {})[match["axis"].lower()] = name
     by_sensor: dict[str, dict[str, list[str]]] = {}
+    for find_axes in (_find_letters, _find_number):  # numbers may be those of sensors
+        owned = {name for axes in groups.values() if len(axes) > 2 for name in axes.values()}
+        for name in names:
+            for stem, axis in find_axes(split_unit(name)[0]) if name not in owned else ():
+                signal = guess_signal(stem.replace("linear_acc", "acc") if ros else stem)
+                if signal:
+                    groups.setdefault((stem, signal), {})[axis] = name
     for (stem, signal), axes in groups.items():
         order = ORDER[signal]
         if set("0123") <= set(axes) and signal == "orientation":
@@ -58,10 +89,43 @@ def guess_columns(names: Iterable[str], table: BodyTable | None = None) -> Guess
         elif not set(order) <= set(axes) and set("012") <= set(axes) and signal != "orientation":
             order = "012"
         if set(order) <= set(axes):
-            by_sensor.setdefault(_find_owner(stem, table or load_table()), {}).setdefault(
-                signal, [axes[axis] for axis in order]
-            )
-    return _make_guess(names, by_sensor)
+            by_sensor.setdefault(_find_owner(stem, table), {}).setdefault(signal, [axes[axis] for axis in order])
+    return by_sensor
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Split a column's name into what stands before its unit, and the unit; an axis in brackets is none."""
+    match = _BRACKETS.fullmatch(name)
+    if match and match[1] and not re.fullmatch("[xyzw0-3]", match[2], re.IGNORECASE):
+        return match[1], match[2]
+    for patterns in UNITS.values():
+        for pattern in patterns.values():
+            match = re.fullmatch(rf"(.*[xyz].*)[ _,]+({pattern})", name, re.IGNORECASE)
+            if match:
+                return match[1], match[2]
+    return name, ""
+
+
+def _find_letters(name: str) -> Iterator[tuple[str, str]]:
+    """Find the letters of a name that may be its axis: x, y, z and w on their own, or after a signal's word."""
+    for k, letter in enumerate(name):
+        before, after = name[:k], name[k + 1 : k + 2]
+        begins = not before[-1:].isalpha() or (letter.isupper() and before[-1:].islower())
+        ends = not after.isalpha() or (after.isupper() and not letter.isupper())
+        if letter.lower() in "xyzw" and ends and (begins or _BEFORE_AXIS.search(before.lower())):
+            yield before + HOLE + name[k + 1 :], letter.lower()
+
+
+def _find_number(name: str) -> Iterator[tuple[str, str]]:
+    """Find the number at the end of a name that may be its axis."""
+    if match := _NUMBERED.fullmatch(name):
+        yield match[1] + HOLE, match[2]
+
+
+def guess_unit(signal: str, text: str) -> str | None:
+    """Guess the unit of a signal, as a session states it, from what a file calls it."""
+    matches = (unit for unit, pattern in UNITS.get(signal, {}).items() if re.fullmatch(pattern, text, re.IGNORECASE))
+    return next(matches, None)
 
 
 def guess_arrays(shapes: Mapping[str, tuple[int, ...]], table: BodyTable | None = None) -> Guess:
@@ -74,8 +138,9 @@ def guess_arrays(shapes: Mapping[str, tuple[int, ...]], table: BodyTable | None 
     times = {
         path.rpartition("/")[2]: path for path, shape in shapes.items() if max(shape, default=0) == _compute_size(shape)
     }
-    guess = _make_guess(list(times), by_sensor)
-    return guess._replace(time=times.get(guess.time or ""))
+    guess = _make_guess(list(times), by_sensor, {})
+    units = {times.get(name, name): unit for name, unit in guess.units.items()}
+    return guess._replace(times=[times[name] for name in guess.times], units=units)
 
 
 def guess_signal(stem: str) -> str | None:
@@ -106,17 +171,18 @@ def _compute_size(shape: tuple[int, ...]) -> int:
 
 def _find_owner(stem: str, table: BodyTable) -> str:
     """Return the segment, or the name without its signal, which one sensor's signals have in common."""
-    segment = table.guess_segment(stem)
+    segment = table.guess_segment(stem.replace(HOLE, " "))
     if segment:
         return segment
     text = stem.lower()
     for _, pattern in SIGNALS:
-        text = re.sub(pattern + r"[a-z]*", "", text)
-    return f"?{text.strip(' _./-')}"
+        text = re.sub(f"({pattern})[a-z]*", "", text)
+    return f"?{re.sub(f'[ _./:{HOLE}-]+', ' ', text).strip()}"
 
 
-def _make_guess(names: list[str], by_sensor: dict[str, dict[str, list[str]]]) -> Guess:
-    time = next((name for name in names if _is_time(name)), None)
+def _make_guess(
+    names: Sequence[str], by_sensor: Mapping[str, Mapping[str, list[str]]], own_units: Mapping[str, str]
+) -> Guess:
     complete = {name: signals for name, signals in by_sensor.items() if "orientation" in signals or len(signals) == 2}
     sensors = {
         name: {
@@ -126,11 +192,14 @@ def _make_guess(names: list[str], by_sensor: dict[str, dict[str, list[str]]]) ->
         }
         for name, signals in complete.items()
     }
-    text = " ".join(names).lower()
-    return Guess(
-        time,
-        next((TIME_UNIT[word] for word in _split_words(time or "") if word in TIME_UNIT), None),
-        sensors,
-        bool(re.search(r"dps|deg ?/ ?s|deg_s|deg/s", text)),
-        bool(re.search(r"[\[( ]g[\]) ]", f"{text} ")),
-    )
+    times = [name for name in names if _is_time(split_unit(name)[0]) or _is_time(name)]
+    units = {}
+    for name in times:
+        words = [own_units.get(name, "").lower(), *_split_words(name)]
+        if unit := next((TIME_UNIT[word] for word in words if word in TIME_UNIT), None):
+            units[name] = unit
+    for signals in sensors.values():
+        for signal, columns in signals.items():
+            if unit := guess_unit(signal, own_units.get(columns[0], "")):
+                units[signal] = unit
+    return Guess(times, sensors, units)

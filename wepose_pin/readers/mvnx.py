@@ -21,6 +21,7 @@ from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, MissingFile
 from .device import Device, check_measured, make_table
+from .markers import Reference
 
 SEGMENT_OF = {
     "T8": "torso",
@@ -42,8 +43,18 @@ ARM = {
     for side in ("Left", "Right")
     for part, end in (("UpperArm", "ForeArm"), ("ForeArm", "Hand"))
 }
+# The joint in which a segment begins.
+JOINT_OF = {
+    f"{side}{part}": f"{side.lower()}_{joint}"
+    for side in ("Left", "Right")
+    for part, joint in (("UpperArm", "shoulder"), ("ForeArm", "elbow"), ("Hand", "wrist"), ("UpperLeg", "hip"))
+}
 # MVN draws its joints on the axis, to 0.03 deg: what is off by more than this is of another convention.
 ALONG_DEG = 5.0
+
+
+# Of its lengths [m]: MVN scales a body to the subject's height and a few measures.
+LENGTH_STD = 0.01
 
 
 class Frames(NamedTuple):
@@ -101,6 +112,60 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         aligned=not raw or use == "orientation",
         diagnostics=assumed,
     )
+
+
+def read_mvnx_reference(path: Path) -> Reference:
+    """Read the segments' orientations and joints as a reference; its world has z up.
+
+    Raises
+    ------
+    MissingFile, BadData
+        As `read_mvnx`.
+    """
+    frames = read_frames(path)
+    pose = _reference_pose(path, frames) or "T"
+    quats = {
+        SEGMENT_OF[label]: _segment_quat(label, frames.values["orientation"][:, k], pose)
+        for k, label in enumerate(frames.segments)
+        if label in SEGMENT_OF
+    }
+    return Reference(frames.time, quats, _find_joints(frames), "+z")
+
+
+def read_mvnx_lengths(path: Path) -> dict[str, float]:
+    """Read the lengths [m] between the joints of MVN's body: shoulder width, trunk, upper arms and forearms.
+
+    Raises
+    ------
+    MissingFile, BadData
+        As `read_mvnx`; no positions of the arms in it.
+    """
+    joints = _find_joints(read_frames(path))
+
+    def measure(*ends: tuple[str, ...]) -> float | None:
+        if not {name for end in ends for name in end} <= set(joints):
+            return None
+        first, last = (np.mean([joints[name] for name in end], axis=0) for end in ends)
+        return float(np.nanmedian(np.linalg.norm(last - first, axis=1)))
+
+    shoulders, hips = ("left_shoulder", "right_shoulder"), ("left_hip", "right_hip")
+    lengths = {"shoulder_width": measure(*((name,) for name in shoulders)), "trunk": measure(hips, shoulders)}
+    for side in ("left", "right"):
+        lengths[f"{side}_upper_arm"] = measure((f"{side}_shoulder",), (f"{side}_elbow",))
+        lengths[f"{side}_forearm"] = measure((f"{side}_elbow",), (f"{side}_wrist",))
+    known = {name: length for name, length in lengths.items() if length is not None}
+    if not known:
+        raise BadData(f"{path}: no positions of the arms' segments in it; export it with <position>")
+    return known
+
+
+def _find_joints(frames: Frames) -> dict[str, np.ndarray]:
+    """Find the joints, name → (n, 3) [m], as far as the file has positions."""
+    if "position" not in frames.values:
+        return {}
+    return {
+        JOINT_OF[label]: frames.values["position"][:, k] for k, label in enumerate(frames.segments) if label in JOINT_OF
+    }
 
 
 def _reference_pose(path: Path, frames: Frames) -> str | None:

@@ -28,11 +28,11 @@ from ..recording import (
 from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time
 from ..recording.faults import ROWS, Scan
 from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples
-from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
+from ..recording.limits import LARGEST_NUMBER
 from ..recording.plausibility import check_signals
 from ..recording.resampling import resample
 from .arrays import ArrayFile, is_array_file
-from .device import Device
+from .device import ACCEL_UNITS, GYRO_UNITS, Device
 from .formats import FORMATS, USES, detect_format, read_device
 from .session_file import (
     WIDTHS,
@@ -49,8 +49,6 @@ from .session_file import (
 from .tables import FORMATS as TABLES
 from .tables import Rows, read_column, read_columns, read_table
 
-GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
-ACCEL_UNITS = {"m/s^2": 1.0, "g": STANDARD_GRAVITY}
 # Allowed error of a quaternion's norm, from rounded decimals.
 NORM_ERROR = 1e-2
 SI = {"gyro": 1.0, "accel": 1.0}
@@ -280,18 +278,19 @@ class SessionReader:
     def _synchronize_devices(self) -> None:
         """Shift the times of devices whose clocks start at power-on, so that the earliest one begins at zero."""
         running = {path: device for path, device in self.devices.items() if device.since_power_on}
-        first = {path: float(np.nanmin(device.table["time"].to_numpy())) for path, device in running.items()}
+        first = {path: min(map(_find_begin, _list_tables(device))) for path, device in running.items()}
         for path, device in running.items():
             if device.wraps_s:  # one device's counter wrapped before the recording, the other's did not
                 reference = next(iter(first.values()))
                 first[path] += device.wraps_s * round((reference - first[path]) / device.wraps_s)
         origin = min(first.values(), default=0.0)
         for path, device in self.devices.items():
-            table = device.table
-            if path in first:
-                time = table["time"].to_numpy()
-                table = table.with_columns(time=time - np.nanmin(time) + (first[path] - origin))
-            self._tables[str(path)] = table
+            begin = min(map(_find_begin, _list_tables(device)))
+            for label in (None, *device.own_tables):
+                table = device.table if label is None else device.own_tables[label]
+                if path in first:
+                    table = table.with_columns(time=table["time"].to_numpy() - begin + (first[path] - origin))
+                self._tables[_name_table(path, label)] = table
 
     def _make_plan(self, keys: TomlTable, data: TomlTable, stated: SensorKeys) -> _Plan:
         path, segment = self._find_file(keys, data), keys.place.removeprefix("sensors.")[:-1]
@@ -318,6 +317,7 @@ class SessionReader:
         which = str(path)
         if device is not None:
             label = choose_label(keys, device, segment, path)
+            which = _name_table(path, label if label in device.own_tables else None)
             signals: Mapping[str, list[str]] = device.signals(label)
         else:
             signals = stated.signals
@@ -539,6 +539,19 @@ class SessionReader:
                 f"{clock.row[not_unit[0]] + 1}; a unit quaternion is needed, columns in the order x, y, z, w"
             )
         return values / np.where(good, norm, np.nan)[:, None], good
+
+
+def _list_tables(device: Device) -> list[pl.DataFrame]:
+    return list(device.own_tables.values()) or [device.table]
+
+
+def _find_begin(table: pl.DataFrame) -> float:
+    return float(np.nanmin(table["time"].to_numpy()))
+
+
+def _name_table(path: Path, label: str | None) -> str:
+    """Name the table of a device, or of its sensor with a clock of its own, among those of a session."""
+    return str(path) if label is None else f"{path} {label}"
 
 
 def _explain_unused(key: str) -> str:

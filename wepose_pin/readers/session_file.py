@@ -15,7 +15,10 @@ from ..recording.sensors import read_axes
 from .device import Device
 
 # Suffixes of data files.
-DATA = (".csv", ".parquet", ".txt", ".mat", ".h5", ".hdf5", ".mvnx", ".sto", ".wepose")
+DATA = (
+    *(".csv", ".parquet", ".txt", ".mat", ".h5", ".hdf5", ".mvnx", ".sto", ".wepose"),
+    *(".xdf", ".db3", ".mcap", ".bag", ".zip", ".json", ".c3d", ".trc"),
+)
 SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "sensors", "joints")
 # Keys of earlier versions, with their replacements.
 _RENAMED_PHASES = {

@@ -1,4 +1,8 @@
-"""Tables of numbers: CSV and Parquet into polars, whole or by rows, and their columns into float arrays."""
+"""Tables of numbers: CSV and Parquet into polars, whole or by rows, and their columns into float arrays.
+
+A CSV has its columns separated by commas, semicolons or tabs; beside the last two decimals may have commas. Lines
+before the names, a line of units after them, and names in two lines are read too: `read_layout` finds them.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,8 @@ import csv
 import io
 import itertools
 import os
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +32,16 @@ COLUMN_ROWS = 1_000_000
 # A compressed file has at most so many bytes of numbers, or so many times its own size: sensor noise packs to a tenth.
 MOST_BYTES, MOST_GROWTH = 1 << 28, 50
 # Characters of a line without values.
-EMPTY = b", \t\r\n"
+EMPTY = b",; \t\r\n"
+# The names of a CSV stand within its first lines, or bytes.
+MOST_PREAMBLE, PREAMBLE_BYTES = 100, 1 << 20
+_NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?nan", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_UNITS = re.compile(
+    r"[\[(]?(s|ms|[uµμ]s|ns|sec(onds?)?|m/\(?s(\^2|²|/s|\^2\))\)?|m/s\*\*2|m?g|deg(rees)?|rad|(deg|rad|°|dps)(/s(ec)?)?|"
+    r"[unµμ]?T|gauss|°c|degrees celsius|k?pa|hz|m?v|%|n/?a|no_units|local_flux|-|1)[\])]?",
+    re.IGNORECASE,
+)
 
 
 def read_table(path: Path) -> pl.DataFrame:
@@ -38,14 +52,21 @@ def read_table(path: Path) -> pl.DataFrame:
     MissingFile
         The file is missing, a folder, or of another format.
     BadData
-        The file is damaged, has another separator than commas, or rows of different lengths.
+        The file is damaged, or has rows of different lengths.
     """
     _check_table(path)
     if _is_parquet(path):
         _check_parquet(path)
         with _polars_errors(path):
             return pl.read_parquet(_open_source(path))
-    table = _parse_csv(path, _read_header(path))
+    layout = read_layout(path)
+    if layout.is_plain:
+        table = _parse_csv(path, layout)
+    else:
+        with path.open("rb") as file:
+            for _ in range(layout.head_lines):
+                file.readline()
+            table = _parse_csv(path, layout, layout.head + file.read())
     return table.head(table.height - _count_empty_end(path)) if table.height else table
 
 
@@ -110,11 +131,17 @@ class Rows:
 
     def __post_init__(self) -> None:
         _check_table(self.path)
-        self.names = list(_check_parquet(self.path).sizes) if _is_parquet(self.path) else _read_header(self.path)
+        self._layout = None if _is_parquet(self.path) else read_layout(self.path)
+        self.names = list(_check_parquet(self.path).sizes if self._layout is None else self._layout.names)
         self._restart()
 
+    @property
+    def units(self) -> Mapping[str, str]:
+        """The units by column, where a line of a CSV has them."""
+        return dict(zip(self.names, self._layout.units, strict=False)) if self._layout is not None else {}
+
     def _restart(self) -> None:
-        self._blocks = iter(()) if _is_parquet(self.path) else _iterate_csv_blocks(self.path, self.names)
+        self._blocks = iter(()) if self._layout is None else _iterate_csv_blocks(self.path, self._layout)
         self._rows, self._first = pl.DataFrame(), 0
 
     def __getitem__(self, rows: slice) -> pl.DataFrame:
@@ -148,17 +175,18 @@ def read_column(path: Path, name: str | None, file: str, place: str) -> tuple[np
                 values[first : first + part.height] = read_columns(part, [name], file, place, first)[:, 0]
         return values, height
     parts, height = [np.empty(0)], 0
-    for block in _iterate_csv_blocks(path, _read_header(path)):
+    for block in _iterate_csv_blocks(path, read_layout(path)):
         if name is not None:
             parts.append(read_columns(block, [name], file, place, height)[:, 0])
         height += block.height
     return np.concatenate(parts), height
 
 
-def _iterate_csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
+def _iterate_csv_blocks(path: Path, layout: CsvLayout) -> Iterator[pl.DataFrame]:
     with path.open("rb") as lines:
+        for _ in range(layout.head_lines):
+            lines.readline()
         rows = (line for line in lines if not line.startswith(b"#"))
-        header = next(line for line in rows if line.strip())
         done = 0
         empty: list[bytes] = []  # empty lines, which count only if a row follows
         while new := list(itertools.islice(rows, BLOCK_ROWS)):
@@ -167,7 +195,7 @@ def _iterate_csv_blocks(path: Path, names: list[str]) -> Iterator[pl.DataFrame]:
                 empty.append(block.pop())
             if not block:
                 continue
-            table = _parse_csv(path, names, b"".join([header, *block]), done)
+            table = _parse_csv(path, layout, b"".join([layout.head, *block]), done)
             done += table.height
             # A column may have whole numbers in one block and decimals in the next.
             yield table.with_columns(pl.col(pl.Int64, pl.Null).cast(pl.Float64))
@@ -238,31 +266,136 @@ class _polars_errors:
             raise BadData(f"{self.path}: cannot be read as a {what}: {reason}") from error
 
 
-def _read_header(path: Path) -> list[str]:
-    """Read the column names of a CSV."""
+@dataclass(frozen=True)
+class CsvLayout:
+    """How a CSV is written.
+
+    Parameters
+    ----------
+    names : of the columns
+    separator : of the columns
+    decimal_comma : decimals have a comma
+    head_lines : lines up to the first row of values
+    units : of the columns, where a line of them follows the names; empty: there is none
+    is_plain : commas, points, and nothing but comments before one line of names
+    """
+
+    names: tuple[str, ...]
+    separator: str
+    decimal_comma: bool
+    head_lines: int
+    units: tuple[str, ...] = ()
+    is_plain: bool = True
+
+    @property
+    def head(self) -> bytes:
+        """The line of names as polars reads it before any rows."""
+        cells = ('"' + name.replace('"', '""') + '"' for name in self.names)
+        return (self.separator.join(cells) + "\n").encode()
+
+
+def read_layout(path: Path) -> CsvLayout:
+    """Find the separator, the decimal sign and the line of names of a CSV.
+
+    The names are in the first line that is no comment. Where the first row of numbers has another number of cells,
+    they are in the line right above that row, or above a line of units.
+
+    Raises
+    ------
+    MissingFile, BadData
+        The file is not readable; empty; not text.
+    """
     try:
-        with path.open("rb") as lines:
-            first = next((line for line in lines if line.strip() and not line.startswith(b"#")), b"")
-        if b"\0" in first:
-            raise BadData(f"{path}: is not a CSV in UTF-8: there are zero bytes in its first line; save it as UTF-8")
-        header = first.decode("utf-8-sig", errors="replace").rstrip("\r\n")
+        with path.open("rb") as file:
+            start = file.read(PREAMBLE_BYTES)
+            raw = start.split(b"\n")[: -1 if file.read(1) else None] or [start]
     except OSError as error:
         raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
-    if not header:
+    lines = [(k, line) for k, line in enumerate(raw) if line.strip() and not line.startswith(b"#")][:MOST_PREAMBLE]
+    if not lines:
         raise BadData(f"{path}: is empty; a line with the names of the columns and then numbers are needed")
-    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
-        if header.count(separator) > header.count(","):
-            raise BadData(f"{path}: columns are separated by {name}; commas, and points in decimals, are needed")
+    if b"\0" in lines[0][1]:
+        raise BadData(f"{path}: is not a CSV in UTF-8: there are zero bytes in its first line; save it as UTF-8")
     try:
-        return next(csv.reader([header]))
+        text, unicode = [(k, line.decode("utf-8-sig").rstrip("\r\n")) for k, line in lines], True
+    except UnicodeDecodeError:  # as spreadsheets of Windows write it
+        text, unicode = [(k, line.decode("cp1252", errors="replace").rstrip("\r\n")) for k, line in lines], False
+    stated = re.fullmatch(r'"?sep=(.|\\t)"?[;,\t]*', text[0][1])  # a hint for spreadsheets
+    text = text[1:] if stated and len(text) > 1 else text
+    separator = stated[1].replace("\\t", "\t") if stated else _find_separator([line for _, line in text])
+    try:
+        rows = [(k, next(csv.reader([line], delimiter=separator), [])) for k, line in text]
     except csv.Error as error:
         raise BadData(f"{path}: its line of names cannot be read: {error}; save it as CSV in UTF-8") from error
+    names_at, units = _find_names([cells for _, cells in rows])
+    names = _join_names([cells for _, cells in rows[slice(*names_at)]])
+    first = rows[names_at[1]][0] + 1 if units else rows[names_at[1] - 1][0] + 1
+    cells = [cell.strip() for _, row in rows[names_at[1] :] for cell in row]
+    comma = separator != "," and any(_DECIMAL_COMMA.fullmatch(cell) for cell in cells)
+    plain = separator == "," and unicode and not stated and names_at == (0, 1) and not units
+    plain = plain and all(line.strip() for line in raw[:first])
+    return CsvLayout(tuple(names), separator, comma, first, tuple(units), plain)
 
 
-def _parse_csv(path: Path, names: list[str], part: bytes = b"", first_row: int = 0) -> pl.DataFrame:
-    """Parse a CSV, or a `part` of it with the header and the rows from `first_row` on."""
+def _find_separator(lines: Sequence[str]) -> str:
+    """Find the separator: semicolons or tabs where most lines have them, else commas."""
+    return next((sign for sign in ";\t" if 2 * sum(sign in line for line in lines) > len(lines)), ",")
+
+
+def _find_names(rows: Sequence[Sequence[str]]) -> tuple[tuple[int, int], list[str]]:
+    """Find the lines of names, from and to, and the cells of the line of units after them."""
+    numeric = next((k for k, cells in enumerate(rows) if k and _is_numeric(cells)), None)
+    if numeric is None:
+        return (0, 1), []
+    width = len(rows[numeric])
+    units = list(rows[numeric - 1]) if numeric > 1 and _is_units(rows[numeric - 1], width) else []
+    last = numeric - 1 if units else numeric
+    first = last - 1
+    if first and len(rows[first]) == width == len(rows[first - 1]) and _repeats(rows[first]):
+        first -= 1  # names in two lines: sensors above, their axes below
+    if first and not units and first + 1 == last and len(rows[0]) == width <= 2 * sum(map(bool, rows[0])):
+        return (0, 1), []  # text in the first rows
+    return (first, last), units
+
+
+def _repeats(cells: Sequence[str]) -> bool:
+    """Whether names occur more than once: a line above says of which sensor they are."""
+    filled = [cell.strip() for cell in cells if cell.strip()]
+    return len(set(filled)) < len(filled)
+
+
+def _is_numeric(cells: Sequence[str]) -> bool:
+    filled = [cell.strip() for cell in cells if cell.strip()]
+    return len(filled) > 1 and 2 * sum(_NUMBER.fullmatch(cell) is not None for cell in filled) > len(filled)
+
+
+def _is_units(cells: Sequence[str], width: int) -> bool:
+    filled = [cell.strip() for cell in cells if cell.strip()]
+    return len(cells) == width and bool(filled) and 2 * sum(map(bool, map(_UNITS.fullmatch, filled))) >= len(filled)
+
+
+def _join_names(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Join the names of two lines, the upper one of which may name a sensor in the first of its columns alone."""
+    if len(lines) == 1:
+        return list(lines[0])
+    upper, owners = "", []
+    for cell in lines[0]:
+        upper = cell.strip() or upper
+        owners.append(upper)
+    return [f"{owner} {name.strip()}".strip() for owner, name in zip(owners, lines[1], strict=True)]
+
+
+def _parse_csv(path: Path, layout: CsvLayout, part: bytes = b"", first_row: int = 0) -> pl.DataFrame:
+    """Parse a CSV, or a `part` of it with the line of names and the rows from `first_row` on."""
     source: Path | bytes = part or _open_source(path)
-    options: dict[str, Any] = {"null_values": NO_VALUE, "comment_prefix": "#"}
+    options: dict[str, Any] = {
+        "null_values": NO_VALUE,
+        "comment_prefix": "#",
+        "separator": layout.separator,
+        "decimal_comma": layout.decimal_comma,
+        "encoding": "utf8" if layout.is_plain else "utf8-lossy",
+    }
+    names = layout.names
     numbers: dict[str, Any] = dict.fromkeys(names, pl.Float64)
     table = None
     if len(numbers) == len(names):
@@ -275,14 +408,14 @@ def _parse_csv(path: Path, names: list[str], part: bytes = b"", first_row: int =
             table = pl.read_csv(source, infer_schema_length=None, **options)
     except (pl.exceptions.PolarsError, OSError) as error:
         if "more fields" in str(error):
-            _find_ragged(path, len(names), part, first_row)
+            _find_ragged(path, layout, part, first_row)
         if "utf-8" in str(error):
             raise BadData(f"{path}: is not UTF-8 text; save it as CSV in UTF-8") from error
         with _polars_errors(path):
             raise
     # polars fills short rows silently.
     if table.width > 1 and table[table.columns[-1]].null_count():
-        _find_ragged(path, len(names), part, first_row)
+        _find_ragged(path, layout, part, first_row)
     return table
 
 
@@ -294,11 +427,12 @@ def _count_empty_end(path: Path) -> int:
     return len(lines) - next((k for k in range(len(lines), 0, -1) if lines[k - 1].strip(EMPTY)), 0)
 
 
-def _find_ragged(path: Path, width: int, part: bytes, first_row: int) -> None:
-    """Raise an error on the first row of a CSV without `width` fields; empty lines are rows without values."""
+def _find_ragged(path: Path, layout: CsvLayout, part: bytes, first_row: int) -> None:
+    """Raise an error on the first row of a CSV with other fields than its names; empty lines have no values."""
+    width = len(layout.names)
     with io.BytesIO(part) if part else path.open("rb") as lines:
         text = io.TextIOWrapper(lines, encoding="utf-8-sig", errors="replace", newline="")
-        rows = csv.reader(line for line in text if not line.startswith("#"))
+        rows = csv.reader((line for line in text if not line.startswith("#")), delimiter=layout.separator)
         for k, fields in enumerate(rows, first_row):
             if fields and len(fields) != width:
                 raise BadData(f"{path}: row {k} has {len(fields)} fields, the line of names has {width}; mend the row")

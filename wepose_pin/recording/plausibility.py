@@ -108,7 +108,12 @@ def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place:
 
 def _make_gravity_error(text: str, norm: float) -> BadData:
     """Make the error about a norm [m/s²] that is not gravity's, with the unit in which it would be."""
-    for factor, unit in ((STANDARD_GRAVITY, "g"), (1.0 / STANDARD_GRAVITY, "m/s^2")):
+    for factor, unit in (
+        (STANDARD_GRAVITY, "g"),
+        (1.0 / STANDARD_GRAVITY, "m/s^2"),
+        (1e-3 * STANDARD_GRAVITY, "mg"),
+        (1e-3, "mg"),  # stated in g
+    ):
         if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
             return WrongUnit(f'{text}; data.accel_unit = "{unit}" would fit', "accel_unit", unit)
     return BadData(f"{text}; {_explain_norm(norm)}")
@@ -116,9 +121,6 @@ def _make_gravity_error(text: str, norm: float) -> BadData:
 
 def _explain_norm(norm: float) -> str:
     """Explain a norm [m/s²] that is not gravity's in any unit."""
-    for factor in (1e-3, 1e-3 * STANDARD_GRAVITY):
-        if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
-            return 'the values look like thousandths of g (mg); divide them by 1000 and state accel_unit = "g"'
     if norm < 0.5:
         return "gravity seems to have been taken out; specific force is needed, +g up of a static sensor"
     return "check data.accel_unit and the sensor's calibration, and that it is static there"

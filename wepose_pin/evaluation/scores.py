@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from . import rotations
-from .angles import euler, joint_angles
-from .arguments import check_arguments
-from .errors import BadData, BadOption
-from .kinematics import Pose
-from .model import BodyTable, load_table
-from .recording import format_span
+from .. import rotations
+from ..angles import euler, joint_angles
+from ..arguments import check_arguments
+from ..errors import BadData, BadOption
+from ..kinematics import Pose
+from ..model import BodyTable, load_table
+from ..recording import format_span
+from .agreement import Agreement, compute_agreement
+from .registration import Registration
 
 SINGULAR = 1e-12  # ratio of a covariance's least variance to its largest, below which it states no error in a direction
 
@@ -75,6 +77,8 @@ class Evaluation:
     position_uncertainty: dict[str, Uncertainty]
     interval: tuple[float, float]
     samples: int
+    agreement: dict[str, dict[str, Agreement]] = field(default_factory=dict)  # joint → angle → of both measurements
+    registration: Registration | None = None  # how the reference was brought to the pose; None: it is taken as it is
 
 
 def evaluate(
@@ -149,30 +153,37 @@ def evaluate(
         raise BadData(
             "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
         )
+    joints, agreement = _joint_errors(pose, inside, true_WL)
     return Evaluation(
         attitude,
-        _joint_errors(pose, inside, true_WL),
+        joints,
         position,
         on_limb,
         attitude_uncertainty,
         position_uncertainty,
         (float(time[0]), float(time[-1])),
         int(inside.sum()),
+        agreement,
     )
 
 
-def _joint_errors(pose: Pose, inside: np.ndarray, true_WL: dict[str, np.ndarray]) -> dict[str, dict[str, AngleError]]:
-    """Joint → angle → its error, over the samples `inside`, on which `true_WL` (segment → (m, 4) xyzw) are."""
+def _joint_errors(
+    pose: Pose, inside: np.ndarray, true_WL: dict[str, np.ndarray]
+) -> tuple[dict[str, dict[str, AngleError]], dict[str, dict[str, Agreement]]]:
+    """Joint → angle → its error, and its agreement, over the samples `inside`.
+
+    `true_WL`: segment → (m, 4) xyzw on these samples
+    """
     if not true_WL:
-        return {}
+        return {}, {}
     time = pose.time[inside]
     gap = {segment: gap[inside] for segment, gap in pose.gap.items() if segment in true_WL}
     estimated = Pose(time, {segment: pose.quat_WL[segment][inside] for segment in true_WL}, {}, gap=gap)
     try:
         found, true = joint_angles(estimated), joint_angles(Pose(time, true_WL, {}))
     except BadData:  # no joint has both of its segments
-        return {}
-    errors = {}
+        return {}, {}
+    errors, agreement = {}, {}
     for name, joint in found.joints.items():
         sound = ~(joint.gap | joint.near_lock | true[name].gap | true[name].near_lock)
         if not sound.any():
@@ -184,7 +195,12 @@ def _joint_errors(pose: Pose, inside: np.ndarray, true_WL: dict[str, np.ndarray]
             angle: AngleError(float(error[:, k].mean()), _rms(error[:, k]), float(np.abs(error[:, k]).max()))
             for k, angle in enumerate(joint.names)
         }
-    return errors
+        measured = np.degrees(values[1])
+        agreement[name] = {
+            angle: compute_agreement(measured[:, k] + error[:, k], measured[:, k])
+            for k, angle in enumerate(joint.names)
+        }
+    return errors, agreement
 
 
 def _find_middle(pose: Pose, points: tuple[str, ...]) -> np.ndarray | None:

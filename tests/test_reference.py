@@ -1,0 +1,527 @@
+"""C3D, TRC and MVNX as references: joints from markers, and their clock, world and frames brought to a result's."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+from test_mvnx import mvnx, turning
+
+import wepose_pin as wp
+from wepose_pin.cli import main
+from wepose_pin.errors import BadData, WeposeError
+from wepose_pin.evaluation import compute_agreement, compute_icc, evaluate, register
+from wepose_pin.kinematics import Pose, build_pose_table
+from wepose_pin.readers.markers import read_marker_table
+from wepose_pin.readers.reference import Reference, read_reference
+from wepose_pin.simulation import Person, Simulation
+from wepose_pin.writers import write_result
+
+# The laboratory: y is up, turned by 70 deg, its origin somewhere, its clock late.
+R_VW = Rotation.from_euler("x", -90, degrees=True) * Rotation.from_euler("z", -70, degrees=True)
+PLACE_V = np.array([1.2, 0.93, -0.4])
+LATE_S = 3.217
+SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+
+
+@pytest.fixture(scope="module")
+def pose(simulation: Simulation) -> Pose:
+    """A minute of circles, at 50 Hz, as the truth has it."""
+    truth = simulation.truth()
+    rows = slice(6000, 12000, 2)
+    return Pose(
+        truth.time[rows],
+        {name: truth.quat_WL[name][rows] for name in SEGMENTS},
+        {name: p[rows] for name, p in truth.points.items()},
+    )
+
+
+def in_laboratory(
+    pose: Pose, rate_hz: float = 120.0
+) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Times, orientations and points as the laboratory's system samples them; it saw less of the beginning."""
+    time = np.arange(pose.time[0] + 2.0, pose.time[-1], 1.0 / rate_hz)
+    quats = {
+        name: (R_VW * Slerp(pose.time, Rotation.from_quat(quat))(time)).as_quat() for name, quat in pose.quat_WL.items()
+    }
+    points = {
+        name: R_VW.apply(np.column_stack([np.interp(time, pose.time, axis) for axis in p.T])) + PLACE_V
+        for name, p in pose.points.items()
+    }
+    return time, quats, points
+
+
+def markers(pose: Pose) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Markers of Plug-in Gait with medial ones on the elbows, about the joints of the pose."""
+    time, quats, points = in_laboratory(pose)
+    R = {name: Rotation.from_quat(quat) for name, quat in quats.items()}
+    middle = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
+    found = {
+        name: middle + R["torso"].apply(at)
+        for name, at in {
+            "C7": [-0.06, 0.0, 0.05],
+            "CLAV": [0.06, 0.0, 0.05],
+            "T10": [-0.06, 0.0, -0.2],
+            "STRN": [0.06, 0.0, -0.2],
+        }.items()
+    }
+    for side, letter, out in (("left", "L", 0.04), ("right", "R", -0.04)):
+        found[f"{letter}SHO"] = points[f"{side}_shoulder"]
+        arm, forearm = R[f"{side}_upper_arm"], R[f"{side}_forearm"]
+        found[f"{letter}ELB"] = points[f"{side}_elbow"] + arm.apply([0.0, out, 0.0])
+        found[f"{letter}MELB"] = points[f"{side}_elbow"] - arm.apply([0.0, out, 0.0])
+        found[f"{letter}WRA"] = points[f"{side}_wrist"] + forearm.apply([0.03, 0.0, 0.0])
+        found[f"{letter}WRB"] = points[f"{side}_wrist"] - forearm.apply([0.03, 0.0, 0.0])
+    return time, found
+
+
+def c3d(path: Path, pose: Pose, unit: str = "mm", **parameters: list[object]) -> Path:
+    """As Nexus writes it, by ezc3d: names with the subject's; some markers are lost for a while."""
+    ezc3d = pytest.importorskip("ezc3d")
+    _, found = markers(pose)
+    file = ezc3d.c3d()
+    group = file["parameters"]["POINT"]
+    group["UNITS"]["value"] = [unit]
+    group["RATE"]["value"] = [120.0]
+    group["LABELS"]["value"] = [f"Anna:{name}" for name in found]
+    for name, value in parameters.items():
+        group[name]["value"] = value
+    p = np.stack([each.T for each in found.values()], axis=1) * {"mm": 1e3, "m": 1.0}.get(unit, 1.0)
+    p[:, 5, 300:360] = np.nan
+    file["data"]["points"] = np.concatenate([p, np.ones((1, *p.shape[1:]))])
+    file["data"]["meta_points"]["residuals"] = np.where(np.isfinite(p).all(axis=0), 0.0, -1.0)[None]
+    file.write(str(path))
+    return path
+
+
+def theia(path: Path, pose: Pose) -> Path:
+    """Rotations without points, by ezc3d; frames as another model has them."""
+    ezc3d = pytest.importorskip("ezc3d")
+    _, quats, _ = in_laboratory(pose)
+    names = {
+        "torso": "torso",
+        **{
+            f"{s}_{p}": f"{s[0]}_{n}"
+            for s in ("left", "right")
+            for p, n in (("upper_arm", "uarm"), ("forearm", "larm"))
+        },
+    }
+    file = ezc3d.c3d()
+    transforms = np.zeros((4, 4, len(names) + 1, len(quats["torso"])))
+    transforms[3, 3] = 1.0
+    transforms[:3, :3, 0] = np.eye(3)[:, :, None]  # worldbody
+    for k, segment in enumerate(names, 1):
+        other = Rotation.from_rotvec([0.3 * k, 1.0, -0.5 * k])
+        transforms[:3, :3, k] = (Rotation.from_quat(quats[segment]) * other).as_matrix().transpose(1, 2, 0)
+    file["parameters"]["POINT"]["RATE"]["value"] = [120.0]
+    file.add_parameter("ROTATION", "RATE", [120.0])
+    file.add_parameter("ROTATION", "LABELS", [f"{name}_4X4" for name in ("worldbody", *names.values())])
+    file["data"]["points"] = np.ones((4, 0, transforms.shape[3]))
+    file["data"]["rotations"] = transforms
+    file.write(str(path))
+    return path
+
+
+def trc(path: Path, pose: Pose) -> Path:
+    """As OpenSim's own writer has it, by lines: y is up."""
+    time, found = markers(pose)
+    n = len(time)
+    head = ["PathFileType\t4\t(X/Y/Z)\ta.trc"]
+    head += ["DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"]
+    head += [f"120\t120\t{n}\t{len(found)}\tmm\t120\t1\t{n}"]
+    head += ["Frame#\tTime\t" + "\t\t\t".join(found) + "\t\t"]
+    head += ["\t\t" + "\t".join(f"{a}{k}" for k in range(1, len(found) + 1) for a in "XYZ"), ""]
+    rows = []
+    for k in range(n):
+        cells = [f"{1e3 * v:.5f}" for p in found.values() for v in p[k]]
+        if 300 <= k < 360:
+            cells[15:18] = ["", "", ""]
+        rows.append("\t".join([str(k + 1), f"{k / 120.0:.6f}", *cells]) + "\t")
+    path.write_text("\n".join(head + rows) + "\n")
+    return path
+
+
+def to_pose(reference: Reference) -> Pose:
+    return Pose(reference.time, reference.quat_VT, reference.points)
+
+
+@pytest.mark.parametrize("processor", [84, 85, 86])
+@pytest.mark.parametrize("whole", [False, True])
+def test_numbers_of_each_processor(processor: int, whole: bool, tmp_path: Path) -> None:
+    """A file of three frames and one point, byte by byte as the user guide has it; ``whole``: as scaled integers."""
+    order = ">" if processor == 86 else "<"
+
+    def real(value: float) -> bytes:
+        if processor != 85:
+            return struct.pack(f"{order}f", value)
+        ieee = struct.unpack("<I", struct.pack("<f", 4.0 * value))[0]
+        return struct.pack("<HH", ieee >> 16, ieee & 0xFFFF)
+
+    def record(group: int, name: str, kind: int, shape: list[int], data: bytes) -> bytes:
+        rest = struct.pack("bB", kind, len(shape)) + bytes(shape) + data + b"\0"
+        return struct.pack("bb", len(name), group) + name.encode() + struct.pack(f"{order}h", len(rest) + 2) + rest
+
+    scale = 0.1 if whole else -1.0
+    parameters = struct.pack("bb", 5, -1) + b"POINT" + struct.pack(f"{order}h", 3) + b"\0"
+    parameters += record(1, "USED", 2, [], struct.pack(f"{order}h", 1)) + record(1, "RATE", 4, [], real(50.0))
+    parameters += record(1, "SCALE", 4, [], real(scale)) + record(1, "UNITS", -1, [2, 1], b"mm")
+    parameters += record(1, "LABELS", -1, [10, 1], b"A:LSHO    ")
+    head = bytes([2, 0x50]) + struct.pack(f"{order}HHHHH", 1, 0, 1, 3, 0) + real(scale)
+    head += struct.pack(f"{order}HH", 3, 0) + real(50.0)
+    data = b""
+    for x, y, z, residual in ((12.5, -30.0, 1000.0, 0.0), (0.0, 0.0, 0.0, -1.0), (-2.0, 4.5, 99.0, 1.0)):
+        if whole:
+            data += struct.pack(f"{order}hhhh", round(10 * x), round(10 * y), round(10 * z), int(residual))
+        else:
+            data += b"".join(map(real, (x, y, z, residual)))
+    raw = head.ljust(512, b"\0") + (bytes([0, 0, 1, processor]) + parameters).ljust(512, b"\0") + data
+    (tmp_path / "a.c3d").write_bytes(raw)
+    reference = read_reference(tmp_path / "a.c3d")
+    np.testing.assert_allclose(reference.time, [0.0, 0.02, 0.04])
+    wanted = [[0.0125, -0.03, 1.0], [np.nan] * 3, [-0.002, 0.0045, 0.099]]
+    np.testing.assert_allclose(reference.points["left_shoulder"], wanted, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("write", "name"), [(c3d, "a.c3d"), (trc, "a.trc")])
+def test_joints_and_segments_follow_from_markers(
+    write: Callable[[Path, Pose], Path], name: str, pose: Pose, tmp_path: Path
+) -> None:
+    reference = read_reference(write(tmp_path / name, pose))
+    time, quats, points = in_laboratory(pose)
+    np.testing.assert_allclose(reference.time, time - time[0], atol=1e-5)
+    for segment in SEGMENTS:
+        known = np.isfinite(reference.quat_VT[segment]).all(axis=1)
+        off = Rotation.from_quat(reference.quat_VT[segment][known]).inv() * Rotation.from_quat(quats[segment][known])
+        assert np.degrees(off.magnitude().max()) < 0.1, segment
+    assert np.isfinite(reference.quat_VT["torso"]).all()
+    lost = ~np.isfinite(reference.points["left_elbow"]).all(axis=1)
+    assert np.flatnonzero(lost).tolist() == list(range(300, 360))
+    for point in ("left_shoulder", "left_elbow", "right_wrist"):
+        difference = reference.points[point] - points[point]
+        assert np.nanmax(np.abs(difference)) < 1e-4
+
+
+@pytest.mark.parametrize(("write", "name", "up"), [(c3d, "a.c3d", "+y"), (trc, "a.trc", "+y"), (theia, "b.c3d", "+y")])
+def test_clock_and_world_are_found_on_seconds_that_are_not_scored(
+    write: Callable[[Path, Pose], Path], name: str, up: str, pose: Pose, tmp_path: Path
+) -> None:
+    """Nothing is left but the rounding of files; the offset to a millisecond, the heading to a few hundredths."""
+    reference = read_reference(write(tmp_path / name, pose))
+    truth, registration = register(pose, to_pose(reference), up=reference.up, frames=reference.own_frames)
+    assert registration.offset_s == pytest.approx(pose.time[0] + 2.0, abs=1e-3)
+    assert registration.correlation > 0.99
+    assert registration.up == up
+    assert registration.heading_deg % 360.0 == pytest.approx(70.0, abs=0.2)
+    assert registration.scored[0] >= registration.fitted[1] == pytest.approx(pose.time[0] + 20.0, abs=1.5)
+    errors = evaluate(pose, truth, registration.scored)
+    assert max(each.total_rmse for each in errors.attitude.values()) < 0.3
+    if reference.points:
+        assert max(each.rmse for each in errors.position.values()) < 2.0  # [mm]
+        np.testing.assert_allclose(
+            registration.shift_m,
+            -Rotation.from_euler("z", 70, degrees=True).apply(
+                Rotation.from_euler("x", 90, degrees=True).apply(PLACE_V)
+            ),
+            atol=5e-3,
+        )
+    most = max((each for joint in errors.agreement.values() for each in joint.values()), key=lambda each: each.range)
+    assert most.range > 60.0
+    assert abs(most.bias) < 0.2
+    assert most.icc > 0.999
+
+
+def test_what_is_wrong_in_the_scored_seconds_is_not_fitted_away(pose: Pose, tmp_path: Path) -> None:
+    """A heading that is off by 5 deg after the fit stays, one that is off throughout goes: it cannot be known."""
+    reference = to_pose(read_reference(c3d(tmp_path / "a.c3d", pose)))
+    late = pose.time > pose.time[0] + 21.0
+    drifted = Rotation.from_rotvec(np.outer(late, [0.0, 0.0, np.radians(5.0)])) * Rotation.from_quat(
+        pose.quat_WL["torso"]
+    )
+    off = replace(pose, quat_WL={**pose.quat_WL, "torso": drifted.as_quat()})
+    truth, registration = register(off, reference)
+    error = evaluate(off, truth, (pose.time[0] + 22.0, registration.scored[1])).attitude["torso"]
+    assert error.heading_rmse == pytest.approx(5.0, abs=0.2)
+    turned = Rotation.from_euler("z", 33.0, degrees=True)
+    all_off = replace(
+        pose, quat_WL={name: (turned * Rotation.from_quat(q)).as_quat() for name, q in pose.quat_WL.items()}
+    )
+    truth, registration = register(all_off, reference)
+    assert registration.heading_deg % 360.0 == pytest.approx(103.0, abs=0.2)
+
+
+def test_points_alone_are_enough(pose: Pose) -> None:
+    time, _, points = in_laboratory(pose)
+    truth, registration = register(replace(pose, quat_WL={}), Pose(time - time[0] + 40.0, {}, points))
+    assert registration.offset_s == pytest.approx(time[0] - 40.0, abs=1e-3)
+    assert registration.heading_deg % 360.0 == pytest.approx(70.0, abs=0.2)
+    assert max(e.rmse for e in evaluate(pose, truth, registration.scored).position.values()) < 2.0
+
+
+def test_a_stated_offset_is_kept(pose: Pose) -> None:
+    time, quats, points = in_laboratory(pose)
+    _, registration = register(pose, Pose(time, quats, points), offset_s=0.25)
+    assert registration.offset_s == 0.25
+    assert np.isnan(registration.correlation)
+
+
+def test_what_cannot_be_aligned_is_said(pose: Pose) -> None:
+    time, quats, points = in_laboratory(pose)
+    still = {name: np.tile(quat[:1], (len(time), 1)) for name, quat in quats.items()}
+    with pytest.raises(BadData, match=r"no offset of the clocks fits .* --time-offset"):
+        register(pose, Pose(time, still, {}))
+    with pytest.raises(BadData, match="a segment with its orientation, or three points, are needed"):
+        register(pose, Pose(time, {}, {"left_palm": points["left_palm"]}))
+    short = slice(0, 100)
+    brief = Pose(pose.time[short], {name: q[short] for name, q in pose.quat_WL.items()}, {})
+    with pytest.raises(BadData, match=r"the pose lasts 2\.0 s; .* 6 s are needed"):
+        register(brief, Pose(time, quats, {}))
+    tilted = Rotation.from_rotvec([0.7, 0.0, 0.7])
+    leaning = {name: (tilted * Rotation.from_quat(q)).as_quat() for name, q in quats.items()}
+    with pytest.raises(BadData, match=r"no axis of the reference's world is up: .* --align segments"):
+        register(pose, Pose(time, leaning, {}))
+
+
+# The command ------------------------------------------------------------------------------------------------------
+
+
+def run(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", *map(str, argv)])
+    out, err = capsys.readouterr()
+    assert stop.value.code == code, err
+    return out if code == 0 else err
+
+
+@pytest.fixture(scope="module")
+def result(person: Person, simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What is tracked of the first 45 s."""
+    folder = tmp_path_factory.mktemp("tracked") / "result"
+    folder.mkdir()
+    recording = simulation.recording("made").cut(slice(0, 4500))
+    recording = replace(recording, phases={"start": recording.phases["start"]})
+    write_result(folder, wp.track(recording, person.prior), phases=recording.phases)
+    return folder
+
+
+def test_wepose_evaluate_says_what_was_fitted(
+    result: Path, simulation: Simulation, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """The laboratory's file gives the errors that the truth gives in the same seconds, but for its heading."""
+    truth = simulation.truth()
+    rows = slice(0, 5000, 2)
+    whole = Pose(
+        truth.time[rows],
+        {name: truth.quat_WL[name][rows] for name in SEGMENTS},
+        {name: p[rows] for name, p in truth.points.items()},
+    )
+    time, quats, points = in_laboratory(whole)
+    build_pose_table(Pose(time + LATE_S, quats, points)).write_parquet(tmp_path / "laboratory.parquet")
+    build_pose_table(whole).write_parquet(tmp_path / "truth.parquet")
+    aligned = run(capsys, result, tmp_path / "laboratory.parquet", "--align", "world", "--interval", "20", "40")
+    assert "The reference was aligned by 2 to 16." in aligned
+    assert "s, which are not scored:" in aligned
+    assert "its clock -3.217 s (speeds correlate by " in aligned
+    assert "its world: +y is up, rotated by +" in aligned
+    assert "Agreement of joint angles [deg]: Bland-Altman" in aligned
+    plain = run(capsys, result, tmp_path / "truth.parquet", "--interval", "20", "40")
+    assert "aligned" not in plain
+    assert "Agreement" not in plain
+    rows_of = [
+        next(line for line in out.splitlines() if line.strip("│ ").startswith("left_elbow "))
+        for out in (aligned, plain)
+    ]
+    assert rows_of[0].split()[-4:] == rows_of[1].split()[-4:]
+    stated = run(capsys, result, tmp_path / "laboratory.parquet", "--align", "world", "--time-offset", f"{-LATE_S}")
+    assert "its clock -3.217 s (stated)" in stated
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--no-align", "--align", "world"), "--no-align"),
+        (("--align", "world", "--interval", "1", "5"), "seconds after"),
+        (("--markers", "m.toml"), "has no markers"),
+    ],
+)
+def test_options_that_do_not_go_together(
+    options: tuple[str, ...], says: str, result: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert says in run(capsys, result, result / "pose.parquet", *options, code=2)
+
+
+def test_a_table_of_markers_of_ones_own(pose: Pose, tmp_path: Path) -> None:
+    path = trc(tmp_path / "a.trc", pose)
+    path.write_text(path.read_text().replace("LSHO", "Schulter li"))
+    assert "left_shoulder" not in read_reference(path).points
+    (tmp_path / "m.toml").write_text('[points]\nleft_shoulder = [["Schulter li"]]\n')
+    assert "left_shoulder" in read_reference(path, tmp_path / "m.toml").points
+    for text, says in (
+        ("[points]\nleft_shoulder = 'A'\n", "points.left_shoulder = A"),
+        ("[segments]\ntorso = [{ up = [['A'], ['B']] }]\n", "each of two directions"),
+        ("[punkte]\n", "punkte"),
+    ):
+        (tmp_path / "m.toml").write_text(text)
+        with pytest.raises(WeposeError, match=says):
+            read_reference(path, tmp_path / "m.toml")
+    shipped = read_marker_table()
+    assert {"left_shoulder", "right_wrist", "left_hip"} <= set(shipped.points)
+
+
+def test_an_mvnx_is_a_reference(tmp_path: Path) -> None:
+    """Its segments are brought to our frames; its world has z up."""
+    reference = read_reference(mvnx(tmp_path, turning(100)))
+    assert reference.up == "+z"
+    assert {"torso", "left_forearm"} <= set(reference.quat_VT)
+
+
+def test_a_real_mvnx_agrees_with_what_is_tracked_of_it(
+    data: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = data / "mvnx" / "test_mocap.mvnx"
+    labels = {
+        "T8": "torso",
+        "LeftUpperArm": "left_upper_arm",
+        "RightForeArm": "right_forearm",
+        "RightUpperArm": "right_upper_arm",
+        "LeftForeArm": "left_forearm",
+    }
+    sensors = "".join(f'[sensors.{segment}]\nlabel = "{label}"\n' for label, segment in labels.items())
+    (tmp_path / "session.toml").write_text(f"[data]\nfile = '{file}'\nuse = 'orientation'\n{sensors}")
+    with pytest.raises(SystemExit) as stop:
+        main(["track", str(tmp_path / "session.toml"), "--subject", str(file), "-o", str(tmp_path / "result")])
+    assert stop.value.code == 0, capsys.readouterr().err
+    capsys.readouterr()
+    out = run(capsys, tmp_path / "result", file, "--no-align")
+    assert "right_elbow" in out
+    assert "6 s are needed, or --no-align" in run(capsys, tmp_path / "result", file, code=2)
+
+
+# Files that are wrong -----------------------------------------------------------------------------------------------
+
+SPOILED_TRC = {
+    "no TRC": (("PathFileType", "Path"), "does not begin with PathFileType"),
+    "an unknown unit": (("\tmm\t", "\tinch\t"), "Units 'inch'; there is: mm, cm, m"),
+    "text": (("2\t0.008333\t", "2\tnow\t"), "line 8 holds something else than numbers"),
+    "a marker twice": (("\tCLAV\t", "\tC7\t"), "names a marker twice"),
+    "a cell too many": (("3\t0.016667\t", "3\t0.016667\t1\t"), "line 9 has 45 cells; 44 are needed for 14 markers"),
+    "time that goes back": (("3\t0.016667\t", "3\t0.000001\t"), "times of its rows do not increase"),
+    "markers of nobody": (("\t" + "C7", "\tA"), ""),
+}
+
+
+@pytest.mark.parametrize("spoil", [name for name in SPOILED_TRC if SPOILED_TRC[name][1]])
+def test_a_spoiled_trc_is_one_line(spoil: str, pose: Pose, tmp_path: Path) -> None:
+    change, says = SPOILED_TRC[spoil]
+    path = trc(tmp_path / "a.trc", pose)
+    text = path.read_text()
+    assert change[0] in text
+    path.write_text(text.replace(*change, 1))
+    with pytest.raises(WeposeError, match=says) as error:
+        read_reference(path)
+    assert "\n" not in str(error.value)
+
+
+def spoil_bytes(path: Path, old: bytes, new: bytes) -> None:
+    assert old in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda path, pose: spoil_bytes(c3d(path, pose), struct.pack("<f", 120.0), bytes(4)), "POINT:RATE is 0"),
+        (lambda path, pose: c3d(path, pose, unit="furlong"), "POINT:UNITS is furlong; there is: mm, cm, m"),
+        (lambda path, pose: c3d(path, pose, LABELS=[f"M{k}" for k in range(14)]), "no joint follows from its markers"),
+        (lambda path, _: path.write_bytes(b"\x02\x50" + bytes(2000)), "is a damaged C3D: .* no processor's number"),
+        (lambda path, pose: path.write_bytes(c3d(path, pose).read_bytes()[:90000]), r"is cut off: \d+ of \d+ bytes"),
+        (lambda path, pose: path.write_bytes(theia(path, pose).read_bytes()[:90000]), r"is cut off: \d+ of \d+ bytes"),
+        (lambda path, pose: spoil_bytes(theia(path, pose), b"_4X4", b"_9X9"), "its rotations are of no known segment"),
+        (lambda path, _pose: path.write_bytes(b"hello"), "is no C3D: it is too short"),
+        (
+            lambda path, pose: path.write_bytes(b"\x02\x51" + c3d(path, pose).read_bytes()[2:]),
+            "second byte is not 0x50",
+        ),
+    ],
+)
+def test_a_spoiled_c3d_is_one_line(
+    spoil: Callable[[Path, Pose], object], says: str, pose: Pose, tmp_path: Path
+) -> None:
+    spoil(tmp_path / "a.c3d", pose)
+    with pytest.raises(WeposeError, match=says) as error:
+        read_reference(tmp_path / "a.c3d")
+    assert "\n" not in str(error.value)
+
+
+# Peers -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
+    """The markers of the file that was read last, name → (n, 3) [m], before joints are made of them."""
+    found: dict[str, np.ndarray] = {}
+
+    def keep(_path: Path, time: np.ndarray, markers: dict[str, np.ndarray], _table: object) -> Reference:
+        found.clear()
+        found.update(markers)
+        return Reference(time, {}, {})
+
+    for reader in ("c3d", "trc"):
+        monkeypatch.setattr(f"wepose_pin.readers.{reader}.locate", keep)
+    return found
+
+
+@pytest.mark.peer
+def test_ezc3d_reads_the_same(pose: Pose, seen: dict[str, np.ndarray], tmp_path: Path) -> None:
+    """Bit-identical: both read the file's single precision."""
+    ezc3d = pytest.importorskip("ezc3d")
+    read_reference(c3d(tmp_path / "a.c3d", pose))
+    file = ezc3d.c3d(str(tmp_path / "a.c3d"))
+    for k, label in enumerate(file["parameters"]["POINT"]["LABELS"]["value"]):
+        theirs = 1e-3 * file["data"]["points"][:3, k].T
+        np.testing.assert_allclose(seen[label.removeprefix("Anna:")], theirs, atol=1e-15)
+    rotations = ezc3d.c3d(str(theia(tmp_path / "b.c3d", pose)))["data"]["rotations"]
+    reference = read_reference(tmp_path / "b.c3d")
+    theirs = Rotation.from_matrix(rotations[:3, :3, 1].transpose(2, 0, 1))
+    assert (theirs.inv() * Rotation.from_quat(reference.quat_VT["torso"])).magnitude().max() < 1e-7
+
+
+@pytest.mark.peer
+def test_opensim_reads_and_writes_the_same(pose: Pose, seen: dict[str, np.ndarray], tmp_path: Path) -> None:
+    opensim = pytest.importorskip("opensim")
+    time = read_reference(trc(tmp_path / "a.trc", pose)).time
+    ours = dict(seen)
+    table = opensim.TimeSeriesTableVec3(str(tmp_path / "a.trc"))
+    np.testing.assert_allclose(table.getIndependentColumn(), time, atol=1e-12)
+    for name in ("C7", "LELB", "RWRB"):
+        column = table.getDependentColumn(name)
+        for k in (0, 100, 330, len(time) - 1):
+            np.testing.assert_allclose([1e-3 * column[k][axis] for axis in range(3)], ours[name][k], atol=1e-15)
+    opensim.TRCFileAdapter.write(table, str(tmp_path / "b.trc"))
+    np.testing.assert_allclose(read_reference(tmp_path / "b.trc").time, time, atol=1e-9)
+    for name, p in ours.items():
+        np.testing.assert_allclose(seen[name], p, atol=1e-12)
+
+
+# Agreement ----------------------------------------------------------------------------------------------------------
+
+
+def test_icc_is_that_of_shrout_and_fleiss() -> None:
+    """Their table 2: six targets and four judges; ICC(2,1) = 0.29 (table 4)."""
+    ratings = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]
+    assert compute_icc(np.array(ratings, dtype=float)) == pytest.approx(0.29, abs=0.005)
+    assert np.isnan(compute_icc(np.ones((5, 2))))
+
+
+def test_limits_of_agreement() -> None:
+    true = np.linspace(-40.0, 60.0, 101)
+    noise = np.where(np.arange(101) % 2, 1.0, -1.0)
+    found = compute_agreement(true + 3.0 + noise, true)
+    assert (found.bias, found.rmse) == (pytest.approx(3.0, abs=0.02), pytest.approx(np.sqrt(10.0), abs=0.02))
+    assert (found.lower, found.upper) == (pytest.approx(3.0 - 1.96, abs=0.03), pytest.approx(3.0 + 1.96, abs=0.03))
+    assert found.range == pytest.approx(100.0)
+    assert 0.99 < found.icc < 1.0

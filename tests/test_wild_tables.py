@@ -1,0 +1,168 @@
+"""CSV files as loggers and spreadsheets write them: `wepose info --write` finds their columns, units and clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_formats import ACCEL, GYRO, TIME, N
+from test_info import info
+
+import wepose_pin as wp
+from wepose_pin.errors import BadData
+from wepose_pin.readers import iter_session
+from wepose_pin.readers.guess import guess_columns
+from wepose_pin.readers.tables import read_layout, read_table
+from wepose_pin.recording import Recording
+
+G = 9.80665
+EPOCH = 1_700_000_000
+
+
+def values(sensor: int, gyro: float = 1.0, accel: float = 1.0) -> np.ndarray:
+    """Accel and gyro (n, 6) of a sensor in other units than SI by these factors; each has noise of its own."""
+    noise = np.random.default_rng(sensor).normal(scale=1e-3, size=(N, 6))
+    return np.column_stack([accel * ACCEL, gyro * GYRO]) + noise
+
+
+def lines(time: list[str], columns: np.ndarray, separator: str, decimal: str = ".") -> str:
+    rows = zip(time, columns, strict=True)
+    return "".join(separator.join([t, *(f"{v:.6f}".replace(".", decimal) for v in row)]) + "\n" for t, row in rows)
+
+
+def german(path: Path) -> None:
+    """A byte-order mark, semicolons, decimal commas; milliseconds; g and °/s; lines of remarks before the names."""
+    where = ("Brust", "Unterarm links")
+    names = [f"{s} {k} {a} {u}" for s in where for k, u in KINDS_DE for a in "XYZ"]
+    table = np.column_stack([values(k, 180.0 / np.pi, 1.0 / G) for k in range(2)])
+    text = "Messung vom;12.03.2026\nProband;7\n\n" + ";".join(["Zeit (ms)", *names]) + "\n"
+    path.write_bytes(("\ufeff" + text + lines([str(10 * k) for k in range(N)], table, ";", ",")).encode())
+
+
+KINDS_DE = (("Beschleunigung", "(g)"), ("Winkelgeschwindigkeit", "(°/s)"))
+
+
+def windows(path: Path) -> None:
+    """As `german`, in the encoding of Windows and with its line ends."""
+    german(path)
+    path.write_bytes(path.read_text("utf-8-sig").replace("\n", "\r\n").encode("cp1252"))
+
+
+def epoch_ms(path: Path) -> None:
+    """Whole milliseconds since 1970; the sensor between the signal and the axis, and after the axis."""
+    names = [f"acc_chest_{a}" for a in "xyz"] + [f"gyr_chest_{a}" for a in "xyz"]
+    names += [f"a{a}_left_wrist" for a in "xyz"] + [f"g{a}_left_wrist" for a in "xyz"]
+    table = np.column_stack([values(k) for k in range(2)])
+    time = [str(1000 * EPOCH + 10 * k) for k in range(N)]
+    path.write_text(",".join(["unix", *names]).replace("unix", "unix_timestamp") + "\n" + lines(time, table, ","))
+
+
+def epoch_ns(path: Path) -> None:
+    """Nanoseconds since 1970, tabs; units in a line of their own, the columns in another order."""
+    names = [f"{a}.gyr.{s}" for s in ("Sternum", "L_ForeArm") for a in "zyx"]
+    names += [f"{a}.acc.{s}" for s in ("Sternum", "L_ForeArm") for a in "zyx"]
+    table = [values(k, 180.0 / np.pi, 1000.0 / G) for k in range(2)]
+    columns = np.column_stack([t[:, [5, 4, 3]] for t in table] + [t[:, [2, 1, 0]] for t in table])
+    units = ["ns", *["deg/s"] * 6, *["mG"] * 6]
+    time = [str(10**9 * EPOCH + 10**7 * k) for k in range(N)]
+    path.write_text("\t".join(["timestamp", *names]) + "\n" + "\t".join(units) + "\n" + lines(time, columns, "\t"))
+
+
+def two_lines(path: Path) -> None:
+    """Sensors in one line, each above the first of its columns, and signals in the next; units in the names."""
+    upper = ["", "chest", *[""] * 5, "left wrist", *[""] * 5]
+    lower = ["time [us]", *[f"Acc {a} [m/s²]" for a in "xyz"], *[f"Gyro {a} [rad/s]" for a in "xyz"]]
+    table = np.column_stack([values(k) for k in range(2)])
+    text = ",".join(upper) + "\n" + ",".join(lower + lower[1:]) + "\n"
+    path.write_text(text + lines([str(10_000 * k) for k in range(N)], table, ","), encoding="utf-8")
+
+
+def dates(path: Path) -> None:
+    """Dates in place of times, and what a robot's messages call their fields."""
+    fields = ("linear_acceleration", "angular_velocity")
+    names = [f"/{s}/imu/{field}.{a}" for s in ("torso", "left_forearm") for field in fields for a in "xyz"]
+    time = [f"2026-03-12 08:00:{0.01 * k:09.6f}" for k in range(N)]
+    table = np.column_stack([values(k) for k in range(2)])
+    path.write_text(",".join(["stamp", *names]).replace("stamp", "timestamp") + "\n" + lines(time, table, ","))
+
+
+@pytest.mark.parametrize(
+    ("write", "start", "fact"),
+    [
+        (german, 0.0, "'Zeit (ms)' is in ms, as its name says: 100 Hz"),
+        (windows, 0.0, "'Zeit (ms)' is in ms, as its name says: 100 Hz"),
+        (epoch_ms, EPOCH, "'unix_timestamp' counts from 1970: the recording begins at 2023-11-14 22:13:20 UTC"),
+        (epoch_ns, EPOCH, "'timestamp' is in ns, as its name says: 100 Hz"),
+        (two_lines, 0.0, "'time [us]' is in us, as its name says: 100 Hz"),
+        (dates, 0.0, "'timestamp' holds dates; by the first and the last of them: 100 Hz"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_the_session_that_is_proposed_needs_no_editing(
+    write: Callable[[Path], None], start: float, fact: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    write(tmp_path / "a.csv")
+    assert fact in info(capsys, tmp_path / "a.csv", "--write")
+    recording = wp.load_session(tmp_path / "session.toml")
+    assert set(recording.sensors) == {"torso", "left_forearm"}
+    np.testing.assert_allclose(recording.time - recording.time[0], TIME, atol=2e-6)
+    assert recording.time[0] == pytest.approx(start, abs=1e-6)
+    for k, segment in enumerate(("torso", "left_forearm")):
+        sensor = recording.sensors[segment]
+        np.testing.assert_allclose(sensor.gyro_S, GYRO, atol=0.006)
+        np.testing.assert_allclose(sensor.accel_S, ACCEL, atol=0.05)
+        assert not np.array_equal(sensor.gyro_S, recording.sensors["torso"].gyro_S) or k == 0
+    pieces = list(iter_session(tmp_path / "session.toml", 1.0))
+    whole = np.concatenate([piece.sensors["left_forearm"].gyro_S for piece in pieces])
+    np.testing.assert_array_equal(whole, recording.sensors["left_forearm"].gyro_S)
+
+
+def test_a_jump_of_microseconds_is_a_gap_of_its_length(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Half a second is lost; and the counter never runs backwards."""
+    names = ",".join(["t_us", *(f"torso_{k}_{a}" for k in ("acc", "gyr") for a in "xyz")])
+    time = [str(1_700_000_000_000_000 + 10_000 * k + 500_000 * (k >= 200)) for k in range(N)]
+    (tmp_path / "a.csv").write_text(names + "\n" + lines(time, values(0), ","))
+    assert "1, up to 0.50 s" in info(capsys, tmp_path / "a.csv", "--write")
+    recording: Recording = wp.load_session(tmp_path / "session.toml", gaps=True)
+    assert len(recording) == N + 50
+    assert recording.sensors["torso"].gap is not None
+    assert np.flatnonzero(recording.sensors["torso"].gap).tolist() == list(range(200, 250))
+    back = time[:200] + [str(int(t) - 3_000_000) for t in time[200:]]
+    (tmp_path / "a.csv").write_text(names + "\n" + lines(back, values(0), ","))
+    assert "mend what cannot be read" in info(capsys, tmp_path / "a.csv", "--write", "--force")
+    with pytest.raises(BadData, match=r"time .* in row 201"):
+        wp.load_session(tmp_path / "session.toml", gaps=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "separator", "names", "rows"),
+    [
+        ('"sep=;"\na;b;\nms;m/(s^2);\n1;2;\n2;3;\n', ";", ("a", "b", ""), [(1.0, 2.0, None), (2.0, 3.0, None)]),
+        ("t\tx\n0\t1,5\n1\t2\n", "\t", ("t", "x"), [(0.0, 1.5), (1.0, 2.0)]),
+        ("Export;;\nDate;2024;\nt;x;y\n1;2;3\n", ";", ("t", "x", "y"), [(1.0, 2.0, 3.0)]),
+        ("# a\n\n# b\nt,x\n1,2\n", ",", ("t", "x"), [(1.0, 2.0)]),
+        ("a,b\nx,y\n1,2\n", ",", ("a", "b"), [("x", "y"), ("1", "2")]),  # text is an error in the place that reads it
+        ("t;x\n1;-1,5e-3\n2;3,\n", ";", ("t", "x"), [(1.0, -0.0015), (2.0, 3.0)]),
+    ],
+)
+def test_layouts(
+    text: str, separator: str, names: tuple[str, ...], rows: list[tuple[object, ...]], tmp_path: Path
+) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    layout = read_layout(tmp_path / "a.csv")
+    assert (layout.separator, layout.names) == (separator, names)
+    assert read_table(tmp_path / "a.csv").rows() == rows
+
+
+def test_axes_anywhere_in_a_name() -> None:
+    """Numbers are those of sensors while letters are axes."""
+    imus = [f"imu{s}_{k}_{a}" for s in range(3) for k in ("acc", "gyro") for a in "xyz"]
+    assert list(guess_columns(imus).sensors) == ["?imu0", "?imu1", "?imu2"]
+    found = guess_columns([f"{k}[{a}]" for k in ("ACC", "GYR") for a in range(3)])
+    assert found.sensors == {"?": {"accel": [f"ACC[{a}]" for a in range(3)], "gyro": [f"GYR[{a}]" for a in range(3)]}}
+    noraxon = [f"Forearm RT {k} Sensor {a} (mG)" for k in ("Accel", "Gyro") for a in "XYZ"]
+    assert list(guess_columns(noraxon).sensors) == ["right_forearm"]
+    phone = ["Linear Acceleration x", "Linear Acceleration y", "Linear Acceleration z"]
+    assert guess_columns([*phone, "gx", "gy", "gz"]).sensors == {}

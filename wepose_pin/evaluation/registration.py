@@ -1,0 +1,315 @@
+"""Registration of a reference to a pose: clock, world and frames, from seconds that are not scored.
+
+The first third of the pose's time is for that, the rest is scored. The offset of the clocks is where the speeds of what
+both have correlate best: rates of segments, or of points about one of them, which no choice of world or frame changes.
+The reference's world is upright, so only its heading is fitted; which of its axes is up, where its format does not say
+so, is what the fit comes nearest to. Frames of segments are a constant rotation each, fitted where it is asked for:
+what is scored is then without any constant error of mounts and frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.signal import correlate
+from scipy.spatial.transform import Rotation, Slerp
+
+from ..errors import BadData
+from ..kinematics import Pose
+from ..recording import AXES, format_span
+
+FITTED = 1.0 / 3.0  # share of the time that is not scored
+SHORTEST_S = 2.0  # [s] of it
+STEP_S = 0.02  # [s] of the speeds that are correlated
+TURN_S = 0.1  # [s] over which a speed is taken
+LEAST_CORRELATION = 0.5
+UPRIGHT = np.cos(np.radians(30.0))  # of the axis that is up to the vertical
+LONGEST_GAP_S = 0.2  # [s] between known samples of the reference, beyond which it is not interpolated
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How a reference was brought to a pose.
+
+    Parameters
+    ----------
+    offset_s : added to the reference's times
+    correlation : of the speeds at that offset; NaN: the offset was stated
+    up : the axis of the reference's world that is up
+    heading_deg : by which its world was then rotated about the vertical
+    shift_m : (3,) by which its points were moved
+    frames_deg : segment → angle of the constant rotation of its frame; empty: frames are as the reference has them
+    fitted, scored : from, to [s], of the pose
+    """
+
+    offset_s: float
+    correlation: float
+    up: str
+    heading_deg: float
+    shift_m: np.ndarray
+    fitted: tuple[float, float]
+    scored: tuple[float, float]
+    frames_deg: Mapping[str, float] = field(default_factory=dict)
+
+
+class _Common(NamedTuple):
+    """What pose and reference have in common."""
+
+    segments: list[str]
+    points: list[str]
+
+
+def register(
+    pose: Pose, truth: Pose, *, up: str | None = None, frames: bool = False, offset_s: float | None = None
+) -> tuple[Pose, Registration]:
+    """Bring a reference to the clock and world of a pose; with what was fitted.
+
+    Parameters
+    ----------
+    up : the axis of the reference's world that is up, as "+z"; None: found
+    frames : fit a constant rotation of each segment's frame
+    offset_s : to add to the reference's times; None: found
+
+    Raises
+    ------
+    BadData
+        Nothing in common; too little time or motion; no axis of the reference's world is up.
+    """
+    common = _Common(
+        [name for name in pose.quat_WL if _is_known(truth.quat_WL.get(name))],
+        [name for name in pose.points if _is_known(truth.points.get(name))],
+    )
+    if not common.segments and len(common.points) < 3:
+        raise BadData(
+            f"pose and reference have {', '.join(common.points) or 'nothing'} in common; a segment with its "
+            f"orientation, or three points, are needed to align them"
+        )
+    begin, end = float(pose.time[0]), float(pose.time[-1])
+    fit_end = begin + FITTED * (end - begin)
+    correlation = float("nan")
+    if offset_s is None:
+        offset_s, correlation = _find_offset(pose, truth, common, (begin, fit_end))
+    truth = replace(truth, time=truth.time + offset_s)
+    first, last = max(begin, float(truth.time[0])), min(end, float(truth.time[-1]))
+    fit_end = max(fit_end, first + FITTED * (last - first))
+    if fit_end - first < SHORTEST_S or last - fit_end < SHORTEST_S:
+        raise BadData(
+            f"pose ({format_span((begin, end))}) and reference share {max(0.0, last - first):.1f} s; a third of them "
+            f"aligns the reference and is not scored: {3.0 * SHORTEST_S:g} s are needed, or --no-align"
+        )
+    time = pose.time[(pose.time >= first) & (pose.time <= fit_end)]
+    A_WV, axis, heading = _find_world(pose, truth, common, time, up, frames)
+    quat = {name: _turn(A_WV, quat_VT) for name, quat_VT in truth.quat_WL.items()}
+    turned: dict[str, float] = {}
+    if frames:
+        for name in common.segments:
+            estimated, true = _sample(pose, name, time), _sample(replace(truth, quat_WL=quat), name, time)
+            both = np.isfinite(estimated).all(axis=1) & np.isfinite(true).all(axis=1)
+            if both.any():
+                R_TL = (Rotation.from_quat(true[both]).inv() * Rotation.from_quat(estimated[both])).mean()
+                quat[name] = _turn(Rotation.identity(), quat[name], R_TL)
+                turned[name] = float(np.degrees(R_TL.magnitude()))
+    points = {name: p_V @ A_WV.as_matrix().T for name, p_V in truth.points.items()}
+    shift = np.zeros(3)
+    if common.points:
+        off = [
+            _interpolate(pose.time, pose.points[name], time) - _interpolate(truth.time, points[name], time)
+            for name in common.points
+        ]
+        seen = np.isfinite(off).all(axis=(0, 2))
+        shift = np.median(np.mean(off, axis=0)[seen], axis=0) if seen.any() else shift
+    registration = Registration(
+        offset_s, correlation, axis, heading, shift, (first, float(fit_end)), (float(fit_end), last), turned
+    )
+    return replace(truth, quat_WL=quat, points={name: p + shift for name, p in points.items()}), registration
+
+
+def _is_known(values: np.ndarray | None) -> bool:
+    return values is not None and bool(np.isfinite(values).all(axis=1).sum() > 1)
+
+
+def _turn(R_WV: Rotation, quat_VT: np.ndarray, R_TL: Rotation | None = None) -> np.ndarray:
+    """Rotate orientations (n, 4) in their world, and their frames; NaN stay."""
+    good = np.isfinite(quat_VT).all(axis=1)
+    turned = np.full(quat_VT.shape, np.nan)
+    R_WT = R_WV * Rotation.from_quat(quat_VT[good])
+    turned[good] = (R_WT if R_TL is None else R_WT * R_TL).as_quat()
+    return turned
+
+
+# Clock -------------------------------------------------------------------------------------------------------------
+
+
+def _find_offset(pose: Pose, truth: Pose, common: _Common, fitted: tuple[float, float]) -> tuple[float, float]:
+    """Find the offset [s] to add to the reference's times, and the correlation of the speeds at it."""
+    ours = _compute_speeds(pose, common, *fitted)
+    theirs = _compute_speeds(truth, common, float(truth.time[0]), float(truth.time[-1]))
+    least = max(SHORTEST_S / STEP_S, 0.5 * ours.shape[1])
+    if ours.shape[1] * STEP_S < SHORTEST_S:
+        raise BadData(
+            f"the pose lasts {pose.time[-1] - pose.time[0]:.1f} s; a third of it aligns the reference and is not "
+            f"scored: {3.0 * SHORTEST_S:g} s are needed, or --no-align"
+        )
+    scores = np.array([_correlate(a, b, least) for a, b in zip(ours, theirs, strict=True)])
+    weights = np.isfinite(scores)
+    score = np.where(weights, scores, 0.0).sum(axis=0) / np.maximum(weights.sum(axis=0), 1)
+    best = int(np.argmax(score))
+    if score[best] < LEAST_CORRELATION:
+        raise BadData(
+            f"no offset of the clocks fits in the first {fitted[1] - fitted[0]:.0f} s of the pose: speeds correlate "
+            f"by {score[best]:.2f} at best, {LEAST_CORRELATION:g} are needed; state it as --time-offset, or is it "
+            f"another recording?"
+        )
+    lag = (best - (ours.shape[1] - 1)) * STEP_S  # of ours in theirs
+    coarse = fitted[0] - (float(truth.time[0]) + lag)
+
+    def compute_loss(offset: float) -> float:
+        """1 less the mean correlation, without the samples' steps."""
+        shifted = _compute_speeds(truth, common, fitted[0] - offset, fitted[1] - offset)
+        return 1.0 - float(np.mean([_compare(a, b) for a, b in zip(ours, shifted[:, : ours.shape[1]], strict=True)]))
+
+    found = minimize_scalar(
+        compute_loss, bounds=(coarse - STEP_S, coarse + STEP_S), method="bounded", options={"xatol": 1e-4}
+    )
+    return float(found.x), 1.0 - float(found.fun)
+
+
+def _compute_speeds(pose: Pose, common: _Common, begin: float, end: float) -> np.ndarray:
+    """Compute speeds (k, n) every `STEP_S`: of segments [rad/s], or of points about the first [m/s]; NaN: unknown."""
+    grid = begin + STEP_S * np.arange(int((end - begin) / STEP_S) + 1)
+    ends = grid - 0.5 * TURN_S, grid + 0.5 * TURN_S
+    speeds = []
+    for name in common.segments:
+        quats = [_sample(pose, name, time) for time in ends]
+        good = np.isfinite(quats).all(axis=(0, 2))
+        speed = np.full(len(grid), np.nan)
+        if good.any():
+            turn = Rotation.from_quat(quats[0][good]).inv() * Rotation.from_quat(quats[1][good])
+            speed[good] = turn.magnitude() / TURN_S
+        speeds.append(speed)
+    if not speeds:
+        first, *others = common.points
+        for name in others:
+            about = pose.points[name] - pose.points[first]
+            moved = _interpolate(pose.time, about, ends[1]) - _interpolate(pose.time, about, ends[0])
+            speeds.append(np.linalg.norm(moved, axis=1) / TURN_S)
+    return np.array(speeds)
+
+
+def _correlate(a: np.ndarray, b: np.ndarray, least: float) -> np.ndarray:
+    """Correlate a (n,) with b (m,) at all lags (n + m − 1,), over what both know; NaN where that is too little."""
+    masks = [np.isfinite(x).astype(float) for x in (a, b)]
+    centred = [
+        np.where(mask > 0.0, x - np.nanmean(x) if mask.any() else 0.0, 0.0)
+        for x, mask in zip((a, b), masks, strict=True)
+    ]
+
+    def at_lags(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.asarray(correlate(y, x, mode="full", method="fft"))
+
+    count = at_lags(masks[0], masks[1])
+    power = np.sqrt(np.maximum(at_lags(centred[0] ** 2, masks[1]) * at_lags(masks[0], centred[1] ** 2), 0.0))
+    known = (count >= least - 0.5) & (power > 1e-9 * max(float(power.max()), 1e-300))
+    return np.where(known, at_lags(*centred) / np.where(known, power, 1.0), np.nan)
+
+
+def _compare(a: np.ndarray, b: np.ndarray) -> float:
+    """Correlate two series (n,) over what both know; 0 where that is too little."""
+    n = min(len(a), len(b))
+    both = np.isfinite(a[:n]) & np.isfinite(b[:n])
+    if both.sum() < 3 or a[:n][both].std() == 0.0 or b[:n][both].std() == 0.0:
+        return 0.0
+    return float(np.corrcoef(a[:n][both], b[:n][both])[0, 1])
+
+
+# World -------------------------------------------------------------------------------------------------------------
+
+
+def _find_world(
+    pose: Pose, truth: Pose, common: _Common, time: np.ndarray, up: str | None, frames: bool
+) -> tuple[Rotation, str, float]:
+    """Find the rotation of the reference's world to W, the axis that is up, and the heading [deg]."""
+    cross = np.zeros((3, 3))  # the sum of (what W sees) (what V sees)ᵀ
+    for name in common.segments:
+        ours, theirs = _sample(pose, name, time), _sample(truth, name, time)
+        good = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
+        if good.sum() < 2:
+            continue
+        R_WL, R_VT = Rotation.from_quat(ours[good]), Rotation.from_quat(theirs[good])
+        if frames:  # turns in the world do not depend on the frame
+            n = max(1, round(0.5 / float(np.median(np.diff(time)))))
+            turns = [(R[n:] * R[:-n].inv()).as_rotvec() for R in (R_WL, R_VT)]
+            cross += turns[0].T @ turns[1] / len(time)
+        else:
+            cross += np.einsum("nij,nkj->ik", R_WL.as_matrix(), R_VT.as_matrix()) / len(time)
+    if not common.segments:
+        ours_p, theirs_p = (
+            np.stack([_interpolate(each.time, each.points[name], time) for name in common.points])
+            for each in (pose, truth)
+        )
+        seen = np.isfinite(ours_p).all(axis=(0, 2)) & np.isfinite(theirs_p).all(axis=(0, 2))
+        about = [p[:, seen] - p[:, seen].mean(axis=0) for p in (ours_p, theirs_p)]
+        cross = np.einsum("pni,pnj->ij", *about)
+    left, sizes, right = np.linalg.svd(cross)
+    if sizes[1] < 1e-6 * max(sizes[0], 1e-300):
+        raise BadData(
+            "the reference cannot be aligned: what both have moves about one axis alone in the seconds for that"
+        )
+    full = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    if up is None:
+        up = max(AXES, key=lambda axis: float(full[2] @ AXES[axis]))
+        if full[2] @ AXES[up] < UPRIGHT:
+            off = np.degrees(np.arccos(np.clip(full[2] @ AXES[up], -1.0, 1.0)))
+            raise BadData(
+                f"no axis of the reference's world is up: {up} is nearest, {off:.0f} deg off; where its segments' "
+                f"frames are not ours, --align segments fits them too"
+            )
+    R_UV = _raise_axis(np.asarray(AXES[up]))
+    level = cross @ R_UV.as_matrix().T
+    heading = float(np.arctan2(level[1, 0] - level[0, 1], level[0, 0] + level[1, 1]))
+    return Rotation.from_euler("z", heading) * R_UV, up, float(np.degrees(heading))
+
+
+def _raise_axis(up: np.ndarray) -> Rotation:
+    """Return the rotation that brings an axis (3,) to z by the shortest way."""
+    z = np.array([0.0, 0.0, 1.0])
+    across = np.cross(up, z)
+    if not across.any():
+        return Rotation.from_rotvec([0.0 if up[2] > 0.0 else np.pi, 0.0, 0.0])
+    return Rotation.from_rotvec(0.5 * np.pi * across)
+
+
+# Samples -----------------------------------------------------------------------------------------------------------
+
+
+def _sample(pose: Pose, segment: str, time: np.ndarray) -> np.ndarray:
+    """Sample the orientation (n, 4) of a segment on the rotation; NaN beyond what is known, and in long gaps."""
+    good = np.isfinite(pose.quat_WL[segment]).all(axis=1)
+    known, sampled = pose.time[good], np.full((len(time), 4), np.nan)
+    inside = _is_spanned(known, time)
+    if inside.any():
+        sampled[inside] = Slerp(known, Rotation.from_quat(pose.quat_WL[segment][good]))(time[inside]).as_quat()
+    return sampled
+
+
+def _interpolate(own: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Interpolate values (m, 3) at `own` to `time` (n,); NaN beyond what is known, and in long gaps."""
+    good = np.isfinite(values).all(axis=1)
+    inside = _is_spanned(own[good], time)
+    sampled = np.full((len(time), 3), np.nan)
+    if inside.any():
+        sampled[inside] = np.column_stack([np.interp(time[inside], own[good], axis) for axis in values[good].T])
+    return sampled
+
+
+def _is_spanned(known: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Mask of the times between two known ones that are not far apart."""
+    if len(known) < 2:
+        return np.zeros(len(time), dtype=bool)
+    after = np.clip(np.searchsorted(known, time), 1, len(known) - 1)
+    near = known[after] - known[after - 1] <= max(LONGEST_GAP_S, 2.0 * float(np.median(np.diff(known))))
+    return (time >= known[0]) & (time <= known[-1]) & near

@@ -1,0 +1,167 @@
+"""Joint centres and segment orientations from markers, by a small table (``markers.toml``, or one of the user's)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..documents import TomlTable, read_toml
+from ..errors import BadData, one_of
+
+SHIPPED = Path(__file__).parent / "markers.toml"
+SIDES = ({"side": "left", "S": "L", "s": "l"}, {"side": "right", "S": "R", "s": "r"})
+# The axes of a segment's frame (x forward, y left, z up in the N-pose) that a direction is of.
+DIRECTIONS = {"up": "z", "left": "y", "forward": "x", "lateral": "y"}
+
+
+class Reference(NamedTuple):
+    """What another system measured, on its own clock and in its own world V."""
+
+    time: np.ndarray  # (n,) [s]
+    quat_VT: Mapping[str, np.ndarray]  # segment → (n, 4) xyzw, its frame to V; NaN: missing
+    points: Mapping[str, np.ndarray]  # point → (n, 3) [m] in V; NaN: missing
+    up: str | None = None  # the axis of V that is up; None: not known
+    own_frames: bool = False  # frames are of another convention than ours
+
+
+class MarkerTable(NamedTuple):
+    """How points and segments follow from markers, with sides written out."""
+
+    points: Mapping[str, Sequence[Sequence[str]]]
+    segments: Mapping[str, Sequence[Mapping[str, Sequence[Sequence[str]]]]]
+    rotations: Mapping[str, str]
+
+
+def read_marker_table(path: Path | None = None) -> MarkerTable:
+    """Read a table of markers; None: the shipped one. What a user's table has goes before that.
+
+    Raises
+    ------
+    MissingFile, BadSession, BadData
+        No such file; no TOML; an unknown key; an entry that is none.
+    """
+    table = _parse(TomlTable(read_toml(SHIPPED, "a table of markers"), str(SHIPPED)))
+    if path is None:
+        return table
+    own = _parse(TomlTable(read_toml(path, "a table of markers"), str(path)))
+    return MarkerTable(
+        {name: [*own.points.get(name, ()), *table.points.get(name, ())] for name in {**table.points, **own.points}},
+        {
+            name: [*own.segments.get(name, ()), *table.segments.get(name, ())]
+            for name in {**table.segments, **own.segments}
+        },
+        {**table.rotations, **own.rotations},
+    )
+
+
+def _parse(top: TomlTable) -> MarkerTable:
+    top.allow("points", "segments", "rotations")
+    points: dict[str, list[list[str]]] = {}
+    segments: dict[str, list[dict[str, list[list[str]]]]] = {}
+    names: dict[str, str] = {}
+    for key, target in (("points", points), ("segments", segments), ("rotations", names)):
+        for name, value in top.table(key, {}).values.items():
+            for side in SIDES if "{" in name else SIDES[:1]:
+                written = _write_side(value, side)
+                _check(top, key, name, written)
+                target[name.format(**side)] = written
+    return MarkerTable(points, segments, names)
+
+
+def _write_side(value: Any, side: Mapping[str, str]) -> Any:
+    if isinstance(value, str):
+        for key, text in side.items():
+            value = value.replace(f"{{{key}}}", text)
+        return value
+    if isinstance(value, list):
+        return [_write_side(each, side) for each in value]
+    return {key: _write_side(each, side) for key, each in value.items()} if isinstance(value, dict) else value
+
+
+def _check(top: TomlTable, key: str, name: str, value: Any) -> None:
+    """Raise an error where an entry is not of its kind."""
+
+    def is_names(each: Any) -> bool:
+        return isinstance(each, list) and bool(each) and all(isinstance(text, str) for text in each)
+
+    if key == "points":
+        good, wanted = (
+            isinstance(value, list) and all(map(is_names, value)),
+            '[["A", "B"], ["C"]], ways, each of markers',
+        )
+    elif key == "rotations":
+        good, wanted = isinstance(value, str), "the name of a rotation"
+    else:
+        wanted = (
+            '[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions from markers to markers'
+        )
+        good = isinstance(value, list) and all(
+            isinstance(way, dict)
+            and len(way) == 2
+            and len({DIRECTIONS.get(direction) for direction in way} - {None}) == 2
+            and all(isinstance(ends, list) and len(ends) == 2 and all(map(is_names, ends)) for ends in way.values())
+            for way in value
+        )
+    if not good:
+        raise BadData(f"{top.at(key)}.{name} = {str(value)[:60]}; {wanted} is needed")
+
+
+def locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], table: MarkerTable) -> Reference:
+    """Locate the joints and orient the segments of a body by its markers, name → (n, 3) [m].
+
+    Raises
+    ------
+    BadData
+        The table knows none of the markers.
+    """
+    known = dict(markers)
+    points: dict[str, np.ndarray] = {}
+    for name, ways in table.points.items():
+        way = next((way for way in ways if set(way) <= set(known)), None)
+        if way is not None:
+            points[name] = np.mean([known[each] for each in way], axis=0)
+            known.setdefault(name, points[name])
+    quats = {}
+    for segment, frames in table.segments.items():
+        for frame in frames:
+            if {each for ends in frame.values() for end in ends for each in end} <= set(known):
+                quats[segment] = _orient(segment, frame, known)
+                break
+    if not points and not quats:
+        wanted = sorted({each for ways in table.points.values() for way in ways for each in way} - set(table.points))
+        raise BadData(
+            f"{path}: no joint follows from its markers ({', '.join(list(markers)[:8]) or 'none'}, …); "
+            f"{one_of(wanted, most=12)}. Name yours in a table of markers (--markers)"
+        )
+    return Reference(time, quats, points)
+
+
+def _orient(segment: str, frame: Mapping[str, Sequence[Sequence[str]]], known: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Orient a segment (n, 4) xyzw by two directions, the first of which is kept; NaN where markers are missing."""
+    axes: dict[str, np.ndarray] = {}
+    for direction, (begin, end) in frame.items():
+        sign = -1.0 if direction == "lateral" and segment.startswith("right") else 1.0
+        along = np.mean([known[each] for each in end], axis=0) - np.mean([known[each] for each in begin], axis=0)
+        axes[DIRECTIONS[direction]] = sign * along
+    (first, kept), (second, near) = axes.items()
+    third = ({"x", "y", "z"} - {first, second}).pop()
+    order = "xyz".index(second) - "xyz".index(first)
+    across = np.cross(kept, near) * (1.0 if order in (1, -2) else -1.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        axes = {
+            first: kept / np.linalg.norm(kept, axis=1)[:, None],
+            third: across / np.linalg.norm(across, axis=1)[:, None],
+        }
+    axes[second] = np.cross(axes[third], axes[first]) * (
+        1.0 if "xyz".index(first) - "xyz".index(third) in (1, -2) else -1.0
+    )
+    R = np.stack([axes[axis] for axis in "xyz"], axis=2)
+    quat = np.full((len(R), 4), np.nan)
+    good = np.isfinite(R).all(axis=(1, 2))
+    if good.any():
+        quat[good] = Rotation.from_matrix(R[good]).as_quat()
+    return quat

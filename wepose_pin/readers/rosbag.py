@@ -1,0 +1,96 @@
+"""ROS bags with messages sensor_msgs/Imu: of ROS 2 (a folder, or a lone .db3 or .mcap) and of ROS 1 (.bag), by rosbags.
+
+angular_velocity [rad/s], linear_acceleration [m/s²] with gravity, orientation of the sensor to a world with z up. A
+quantity whose covariance begins with −1 is not provided. Times are the headers' stamps, or the bag's where these are
+zero. A sensor is a topic; where one topic has several frames, each of these.
+
+Source: sensor_msgs/Imu and REP 145; rosbags' documentation.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import BadData
+from ..model import load_table
+from .device import Device, check_measured, make_device
+
+SUFFIXES = (".db3", ".mcap", ".bag")
+MESSAGE = "sensor_msgs/msg/Imu"
+NS = 1e-9
+
+
+def is_rosbag(path: Path) -> bool:
+    """Return whether a file or folder is a ROS bag by its name."""
+    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix.lower() in SUFFIXES
+
+
+def read_rosbag(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
+    """Read the sensors' raw data where they have them, else their orientations; `use` selects one of the two.
+
+    `rate_hz` replaces the stamps.
+
+    Raises
+    ------
+    BadData
+        No bag, or damaged; no messages of an IMU; not what `use` asks for; rosbags is not installed.
+    """
+    frames = _read_messages(path)
+    if not frames:
+        raise BadData(f"{path}: no messages of type {MESSAGE} in it; record the topics of the IMUs")
+    numbers = {key: np.array(rows) for key, rows in frames.items()}
+    topics = [topic for topic, _ in numbers]
+    # Columns: time, whether it has raw data and an orientation, 3 + 3 + 4 values.
+    kind = use or ("raw" if any(rows[:, 1].all() for rows in numbers.values()) else "orientation")
+    flag, signals = (1, {"gyro": slice(3, 6), "accel": slice(6, 9)}) if kind == "raw" else (2, {kind: slice(9, 13)})
+    clocks, values, labels = {}, {}, {}
+    for (topic, frame), rows in numbers.items():
+        if not rows[:, flag].all():
+            continue
+        check_measured(path, np.nan_to_num(rows[:, 3:]), topic)
+        label = topic if topics.count(topic) == 1 else f"{topic} {frame}"
+        clocks[label] = np.arange(len(rows)) / rate_hz if rate_hz else NS * rows[:, 0]
+        values[label] = {name: rows[:, columns] for name, columns in signals.items()}
+        labels[label] = load_table().guess_segment(label) or load_table().guess_segment(frame)
+    if not values:
+        what = "angular_velocity and linear_acceleration" if kind == "raw" else "orientation"
+        raise BadData(
+            f"{path}: no sensor provides {what} (its covariance begins with -1){'; leave out use' if use else ''}"
+        )
+    return make_device("rosbag", kind, clocks, values, labels)
+
+
+def _read_messages(path: Path) -> dict[tuple[str, str], list[list[float]]]:
+    """Read rows of numbers by topic and frame; times count from the first message, in ns."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise BadData(f"{path}: is a ROS bag, which rosbags reads: pip install 'wepose-pin[ros]'") from None
+    frames: dict[tuple[str, str], list[list[float]]] = {}
+    first = 0
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            wanted = [each for each in reader.connections if each.msgtype == MESSAGE]
+            for connection, bag_time, raw in reader.messages(connections=wanted) if wanted else ():
+                message: Any = reader.deserialize(raw, connection.msgtype)
+                stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec or bag_time
+                first = first or stamp
+                row = [float(stamp - first), *_read_values(message)]
+                frames.setdefault((connection.topic, message.header.frame_id), []).append(row)
+    except Exception as error:  # rosbags, sqlite, zstd and others raise errors of many kinds
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise BadData(f"{path}: is no ROS bag, damaged or cut off: {reason}") from error
+    return frames
+
+
+def _read_values(message: Any) -> list[float]:
+    """Read whether raw data and an orientation are provided, and the values."""
+    rate, force, quat = message.angular_velocity, message.linear_acceleration, message.orientation
+    raw = message.angular_velocity_covariance[0] != -1.0 and message.linear_acceleration_covariance[0] != -1.0
+    turned = message.orientation_covariance[0] != -1.0 and any((quat.x, quat.y, quat.z, quat.w))
+    values = [rate.x, rate.y, rate.z, force.x, force.y, force.z, quat.x, quat.y, quat.z, quat.w]
+    return [float(raw), float(turned), *map(float, values)]
