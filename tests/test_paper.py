@@ -211,7 +211,7 @@ def test_mounts_of_the_prior_are_used_and_stay(made: tuple[Person, Simulation, R
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({}, "needs one measured length that fixes the scale, as in --measured shoulder_width=0.385; there is: shoul"),
+        ({}, "needs one measured length that fixes the scale, as in --measured biacromial=0.41; there is: shoul"),
         ({"measured": {"trunk": 0.5, "left_hand": 0.07}}, "needs one measured length that fixes the scale"),
         ({"measured": {"handle": 0.4}, "protocol": "handle"}, "points of the body coincide .* not 'handle'"),
         ({"measured": {"shoulder_width": 0.4}, "protocol": "poses"}, "points of the body coincide .* not 'poses'"),
@@ -336,7 +336,7 @@ def test_the_commands(
     assert run(*words) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "--measured shoulder_width=0.385" in said
+    assert "--measured biacromial=0.41" in said
     assert not (tmp_path / "anna").exists()
     assert run(*words, "--measured", f"shoulder_width={person.lengths['shoulder_width']:.4f}") in (0, 3)
     said = capsys.readouterr()
