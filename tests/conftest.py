@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -11,7 +12,9 @@ import time
 import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,6 +29,10 @@ _STATE = hashlib.sha256(
 ).hexdigest()
 os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"wepose-pin-numba-{_STATE[:16]}")
 
+from numba.core.compiler_lock import global_compiler_lock  # noqa: E402
+from numba.core.dispatcher import Dispatcher  # noqa: E402
+
+from wepose_pin.recording import Recording  # noqa: E402
 from wepose_pin.simulation import Person, Simulation, simulate, simulate_person  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -50,6 +57,34 @@ def person() -> Person:
 def simulation(person: Person) -> Simulation:
     """Two minutes of clasp and circles with the noise of an MTi-3."""
     return simulate(person.lengths, seed=3)
+
+
+@pytest.fixture(scope="session")
+def half_minute(simulation: Simulation) -> Recording:
+    """The recording of its first half minute, start pose and clasp, for what does not depend on the length."""
+    whole = simulation.recording("half a minute")
+    start, ((begin, _),) = whole.phases["start"], whole.phases["clasp"]
+    return replace(whole.cut(whole.span((0.0, 30.0))), phases={"start": start, "clasp": ((begin, 29.9),)})
+
+
+# Kernels are compiled once -------------------------------------------------------------------------------------------
+
+_compile = Dispatcher.compile
+
+
+def _compile_in_one_process(dispatcher: Any, signature: Any) -> Any:
+    """Compile a kernel while the other workers wait for it: then they find it in the cache."""
+    if not dispatcher.py_func.__module__.startswith("wepose_pin.") or dispatcher.overloads.get(signature):
+        return _compile(dispatcher, signature)
+    folder = Path(os.environ["NUMBA_CACHE_DIR"])
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"{dispatcher.py_func.__module__}.{dispatcher.py_func.__qualname__}"
+    with global_compiler_lock, open(folder / f"{name}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return _compile(dispatcher, signature)
+
+
+Dispatcher.compile = _compile_in_one_process
 
 
 # What the suite costs ------------------------------------------------------------------------------------------------

@@ -68,6 +68,7 @@ def test_scipy_solves_the_same_calibration() -> None:
     assert len({name.partition(":")[0] for name in rows}) == 1
 
 
+@pytest.mark.slow
 def test_nlpsol_and_the_loop_are_compared_on_every_kind_of_calibration() -> None:
     rows = calibration.solvers_by_case(15.0, 1).rows
     assert {

@@ -61,6 +61,7 @@ def errors_deg(path: Path) -> dict[str, tuple[float, float, float]]:
     }
 
 
+@pytest.mark.slow
 def test_the_filters_on_real_motion(data: Path) -> None:
     paths = sorted((data / "broad").glob("*.mat"))
     if not paths:

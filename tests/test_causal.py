@@ -16,7 +16,7 @@ from wepose_pin.kinematics import build_pose_table
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import Subject, mount_rows, population_subject
-from wepose_pin.tracking import Tracker, TrackOptions, track
+from wepose_pin.tracking import TrackedRecording, Tracker, TrackOptions, track
 from wepose_pin.tracking.causal import CausalSegmentEstimator
 from wepose_pin.tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 
@@ -30,6 +30,11 @@ def recording(simulation: Simulation) -> Recording:
 def first(recording: Recording, n: int, begin: int = 0) -> Recording:
     """Some samples of it, with the start pose alone for a phase."""
     return replace(recording.cut(slice(begin, n)), phases={"start": recording.phases["start"]})
+
+
+@pytest.fixture(scope="module")
+def whole(recording: Recording) -> TrackedRecording:
+    return track(recording, causal=True)
 
 
 def started(
@@ -110,17 +115,17 @@ def test_causal_chunks_put_together_are_the_whole(recording: Recording) -> None:
         assert table.equals(build_pose_table(whole.pose, covariance=True))
 
 
-def test_what_comes_later_changes_nothing(recording: Recording) -> None:
-    whole, part = track(recording, causal=True), track(first(recording, 2500), causal=True)
+def test_what_comes_later_changes_nothing(recording: Recording, whole: TrackedRecording) -> None:
+    part = track(first(recording, 2500), causal=True)
     for name, quat in part.quat_WL.items():
         assert np.array_equal(quat, whole.quat_WL[name][: len(quat)])
         assert np.array_equal(part.pose.segment_cov[name], whole.pose.segment_cov[name][: len(quat)])
 
 
-def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording) -> None:
+def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording, whole: TrackedRecording) -> None:
     begin = recording.span(recording.phases["start"][0]).start
     assert begin > 0
-    whole, part = track(recording, causal=True), track(first(recording, len(recording), begin), causal=True)
+    part = track(first(recording, len(recording), begin), causal=True)
     assert all(np.array_equal(part.quat_WL[name], quat) for name, quat in whole.quat_WL.items())
 
 
@@ -192,9 +197,9 @@ def test_a_slow_steady_turn_is_no_stillness() -> None:
     assert all(detector.push(tick) != "ready" for tick in gyro)
 
 
-def test_without_a_named_start_pose_it_is_found(recording: Recording) -> None:
+def test_without_a_named_start_pose_it_is_found(recording: Recording, whole: TrackedRecording) -> None:
     found = track(replace(recording, phases={}), causal=True)
-    named = track(recording, causal=True)
+    named = whole
     assert found.time[0] == pytest.approx(recording.time[0] + START_POSE_HOLD_S, abs=0.5)
     for name, quat in named.quat_WL.items():
         both = found.quat_WL[name][-len(quat) :]

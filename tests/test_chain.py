@@ -183,7 +183,7 @@ def ur5_session(data: Path, run: str, folder: Path) -> dict[str, Rotation]:
     return truth
 
 
-@pytest.mark.parametrize("method", ["smekf", "amekf"])
+@pytest.mark.parametrize("method", [pytest.param("smekf", marks=pytest.mark.slow), "amekf"])
 def test_a_ur5_beside_its_encoders(data: Path, urdf: Path, tmp_path: Path, method: str) -> None:
     """Nothing is fitted to the encoders: neither clock nor frames nor heading. Printed with -s."""
     errors: dict[str, list[float]] = {"sensor alone": [], "chain": []}

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,8 @@ import pytest
 from wepose_pin import __version__
 from wepose_pin.cli import COMMANDS, find_command, main
 from wepose_pin.jobs.fields import field_types
-from wepose_pin.simulation import Imperfections, Simulation
+from wepose_pin.recording import Recording
+from wepose_pin.simulation import Imperfections, Simulation, simulate
 from wepose_pin.writers import write_session
 
 
@@ -30,6 +32,12 @@ def run(*words: object) -> int:
 @pytest.fixture
 def session(simulation: Simulation, tmp_path: Path) -> Path:
     write_session(tmp_path, simulation.recording("made"), simulation.truth())
+    return tmp_path / "session.toml"
+
+
+@pytest.fixture
+def short(half_minute: Recording, tmp_path: Path) -> Path:
+    write_session(tmp_path, half_minute)
     return tmp_path / "session.toml"
 
 
@@ -68,7 +76,11 @@ def test_help_names_each_imperfection(capsys: pytest.CaptureFixture[str]) -> Non
         assert field.name in text
 
 
-def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demo_makes_all_of_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On half a minute of clasp and two circles in place of a minute and six, as .ci/run runs it."""
+    monkeypatch.setattr("wepose_pin.simulation.simulate", partial(simulate, clasp_s=30.0, circles=2))
     assert run("demo", "-o", tmp_path / "demo", "--seed", 2) == 0
     text = capsys.readouterr().out
     for word in ("left_forearm", "smekf", "ncf", "gdc", "measured", "view.html"):
@@ -108,9 +120,9 @@ def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: py
 
 
 def test_without_a_gauge_it_says_whose_scale_it_is(
-    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("calibrate", session, "-o", tmp_path / "subject") == 3
+    assert run("calibrate", short, "-o", tmp_path / "subject") == 3
     said = capsys.readouterr()
     assert "Quality: poor" in said.out
     assert "No length was measured." in said.out
@@ -119,7 +131,7 @@ def test_without_a_gauge_it_says_whose_scale_it_is(
 
 def test_simulate_is_seeded(tmp_path: Path) -> None:
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        assert run("simulate", "-o", tmp_path / name, "--seed", seed) == 0
+        assert run("simulate", "-o", tmp_path / name, "--seed", seed, "--seconds", 5) == 0
     a, b, c = (pl.read_parquet(tmp_path / name / "recording.parquet") for name in "abc")
     assert a.equals(b)
     assert not a.equals(c)
@@ -127,12 +139,10 @@ def test_simulate_is_seeded(tmp_path: Path) -> None:
 
 def test_simulate_with_mounts_anywhere_is_tracked_with_its_subject(tmp_path: Path) -> None:
     made = tmp_path / "made"
-    assert (
-        run("simulate", "-o", made, "--preset", "mild", "--imperfection", "mount=any", "--imperfection", "dropped=0")
-        == 0
-    )
+    simulate_it = ("simulate", "-o", made, "--preset", "mild", "--rate-hz", 50)
+    assert run(*simulate_it, "--imperfection", "mount=any", "--imperfection", "dropped=0") == 0
     assert "mount =" not in (made / "session.toml").read_text()
-    track_it = ("track", made / "session.toml", "-o", tmp_path / "result")
+    track_it = ("track", made / "session.toml", "--no-view", "--no-report", "-o", tmp_path / "result")
     assert run(*track_it) == 2
     assert run(*track_it, "--subject", made / "subject.toml") == 0
     pose, truth = (pl.read_parquet(p) for p in (tmp_path / "result" / "pose.parquet", made / "truth.parquet"))
@@ -140,32 +150,28 @@ def test_simulate_with_mounts_anywhere_is_tracked_with_its_subject(tmp_path: Pat
     assert off.mean() < 0.03
 
 
-def test_nothing_is_overwritten_without_force(
-    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("track", session, "-o", tmp_path / "result") == 0
+def test_nothing_is_overwritten_without_force(short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("track", short, "-o", tmp_path / "result") == 0
     before = {path.name: path.read_bytes() for path in (tmp_path / "result").iterdir()}
     capsys.readouterr()
-    assert run("track", session, "-o", tmp_path / "result") == 2
+    assert run("track", short, "-o", tmp_path / "result") == 2
     assert "--force" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in (tmp_path / "result").iterdir()} == before
-    assert run("track", session, "-o", tmp_path / "result", "--force") == 0
+    assert run("track", short, "-o", tmp_path / "result", "--force") == 0
 
 
-def test_gauges_add_up_and_none_is_given_twice(
-    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_gauges_add_up_and_none_is_given_twice(short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     two = ["--measured", "shoulder_width=0.39", "--measured", "trunk=0.51"]
-    assert run("calibrate", session, *two, "-o", tmp_path / "subject") == 0
+    assert run("calibrate", short, *two, "-o", tmp_path / "subject") == 0
     subject = (tmp_path / "subject" / "subject.toml").read_text()
     assert "measured: shoulder_width" in subject
     assert "trunk = 0.510" in subject  # the prior gives way to the tape
-    assert run("calibrate", session, *two, "--measured", "trunk=0.6", "-o", tmp_path / "again") == 2
+    assert run("calibrate", short, *two, "--measured", "trunk=0.6", "-o", tmp_path / "again") == 2
     assert "'trunk' is given twice" in capsys.readouterr().err
 
 
-def test_view_replaces_nothing_that_is_there(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("track", session, "-o", tmp_path / "result") == 0
+def test_view_replaces_nothing_that_is_there(short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("track", short, "-o", tmp_path / "result") == 0
     mine = tmp_path / "mine.html"
     mine.write_text("keep")
     assert run("view", tmp_path / "result", "-o", mine, "--no-open") == 2
@@ -173,15 +179,14 @@ def test_view_replaces_nothing_that_is_there(session: Path, tmp_path: Path, caps
     assert mine.read_text() == "keep"
     assert run("view", tmp_path / "result", "-o", mine, "--no-open", "--force") == 0
     assert mine.read_text().startswith("<!")
-    assert '"circles"' in mine.read_text()  # the phases of the recording, as on the page that track made
+    assert '"clasp"' in mine.read_text()  # the phases of the recording, as on the page that track made
 
 
 def test_a_session_that_lacks_sensors_says_what_is_not_known(
-    simulation: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    half_minute: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recording = simulation.recording()
-    fewer = {name: sensor for name, sensor in recording.sensors.items() if name != "right_forearm"}
-    write_session(tmp_path, replace(recording, sensors=fewer))
+    fewer = {name: sensor for name, sensor in half_minute.sensors.items() if name != "right_forearm"}
+    write_session(tmp_path, replace(half_minute, sensors=fewer))
     assert run("track", tmp_path, "-o", tmp_path / "result") == 0
     summary = json.loads((tmp_path / "result" / "summary.json").read_text())
     (unknown,) = [each for each in summary["diagnostics"] if each["code"] == "points-unknown"]

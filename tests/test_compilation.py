@@ -16,7 +16,7 @@ from wepose_pin import compilation
 _FIRST_USE = """
 import numpy as np
 from wepose_pin import rotations
-print(rotations.integrate(np.zeros((3, 3)))[-1].tolist())
+print(rotations.up_in_sensor(np.array([0.0, 0.0, 0.0, 1.0])))
 """
 _FULL_DISK = """
 import resource, signal
@@ -34,15 +34,15 @@ def _fresh(code: str, **environment: str) -> str:
 
 
 def test_compiled_once_and_kept(tmp_path: Path) -> None:
-    assert _fresh(_FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "[0.0, 0.0, 0.0, 1.0]\n"
+    assert _fresh(_FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "(0.0, 0.0, 1.0)\n"
     kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb*")}
     assert kept
-    assert _fresh(_FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "[0.0, 0.0, 0.0, 1.0]\n"
+    assert _fresh(_FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "(0.0, 0.0, 1.0)\n"
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb*")} == kept
 
 
 def test_a_full_disk_is_no_error(tmp_path: Path) -> None:
-    assert _fresh(_FULL_DISK + _FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "[0.0, 0.0, 0.0, 1.0]\n"
+    assert _fresh(_FULL_DISK + _FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "(0.0, 0.0, 1.0)\n"
 
 
 def test_nowhere_to_keep_what_is_compiled_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -49,14 +49,14 @@ def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None
         for name in names
     }
     R_torso = mean["torso"].as_matrix()
+    longer = [replace(body, lengths={**body.lengths, s: body.lengths[s] + 1e-3}) for s in LENGTHS]
+    for girdle, values in own.items():
+        longer += [replace(body, girdles={**own, girdle: values + step}) for step in 1e-3 * np.eye(len(PARAMETERS))]
+    moved = [compute_pose(other.shape(model), np.zeros(1), still).points for other in longer]
     for name, p in compute_pose(model, np.zeros(n), drawn).points.items():
         turned = np.cov(p.T)
         # The shape's share is linear: by finite differences of Pinocchio's points.
-        longer = [replace(body, lengths={**body.lengths, s: body.lengths[s] + 1e-3}) for s in LENGTHS]
-        for girdle, values in own.items():
-            longer += [replace(body, girdles={**own, girdle: values + step}) for step in 1e-3 * np.eye(len(PARAMETERS))]
-        moved = [compute_pose(other.shape(model), np.zeros(1), still).points[name][0] for other in longer]
-        J = (np.array(moved) - points[name]).T / 1e-3
+        J = (np.array([of[name][0] for of in moved]) - points[name]).T / 1e-3
         # What leaves the law moves the shoulder of this side in the torso.
         leaving = np.diag(np.square(TABLE.girdles[f"{name.partition('_')[0]}_shoulder"].residual_std))
         expected = turned + J @ shape_cov @ J.T + R_torso @ leaving @ R_torso.T

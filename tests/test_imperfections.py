@@ -48,7 +48,8 @@ BODY = Imperfections(
 )
 IN_MILD = [f.name for f in fields(Imperfections) if getattr(MILD_PRESET, f.name) != getattr(IDEAL_PRESET, f.name)]
 IN_BODY = ("soft_tissue_deg", "palm_slip", "shoulder_wander", "start_elbow_deg", "start_segment_deg", "sway_deg_s")
-SHORT = {"rate_hz": 50.0, "clasp_s": 5.0, "circles": 0, "noise": NOISE_FREE}
+SHORT = {"rate_hz": 20.0, "clasp_s": 5.0, "circles": 0, "noise": NOISE_FREE}
+SHORTER = {"clasp_s": 8.0, "circles": 1}
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def fast() -> Simulation:
 
 @pytest.fixture(scope="module")
 def realistic() -> Simulation:
-    return simulate(SUBJECT, seed=5, imperfections=MILD_PRESET, clasp_s=20.0, circles=2)
+    return simulate(SUBJECT, seed=5, imperfections=MILD_PRESET, **SHORTER)
 
 
 def rms(vectors: np.ndarray) -> float:
@@ -221,7 +222,7 @@ def test_start_pose_is_off_as_stated() -> None:
     for seed in range(20):
         sim = simulate(SUBJECT, seed=seed, imperfections=sizes, **SHORT)
         for side in SIDES:
-            bend = Rotation.from_quat(sim.quat_WL[f"{side}_forearm"][100]).as_rotvec(degrees=True)
+            bend = Rotation.from_quat(sim.quat_WL[f"{side}_forearm"][40]).as_rotvec(degrees=True)
             np.testing.assert_allclose(bend[[0, 2]], 0.0, atol=1e-9)
             elbows.append(-bend[1])
     assert np.mean(elbows) == pytest.approx(5.0, rel=0.1)
@@ -231,7 +232,7 @@ def test_start_pose_is_off_as_stated() -> None:
     turns = []
     for seed in range(40):
         sim = simulate(SUBJECT, seed=seed, imperfections=Imperfections(start_segment_deg=1.5), **SHORT)
-        at = {name: Rotation.from_quat(quat[100]) for name, quat in sim.quat_WL.items()}
+        at = {name: Rotation.from_quat(quat[40]) for name, quat in sim.quat_WL.items()}
         assert at["torso"].magnitude() < 1e-12
         for side in SIDES:
             upper = at[f"{side}_upper_arm"]
@@ -445,7 +446,7 @@ def sensor_draws(sim: Simulation) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("name", IN_MILD)
 def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, name: str) -> None:
-    without = simulate(SUBJECT, seed=5, imperfections=off(name), clasp_s=20.0, circles=2)
+    without = simulate(SUBJECT, seed=5, imperfections=off(name), **SHORTER)
     for draws, less in (
         (sensor_draws(realistic), sensor_draws(without)),
         (subject_draws(MILD_PRESET), subject_draws(off(name))),
@@ -474,7 +475,7 @@ def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, 
 
 
 def test_mount_is_a_stream_of_its_own(realistic: Simulation) -> None:
-    loose = simulate(SUBJECT, seed=5, imperfections=replace(MILD_PRESET, mount="any"), clasp_s=20.0, circles=2)
+    loose = simulate(SUBJECT, seed=5, imperfections=replace(MILD_PRESET, mount="any"), **SHORTER)
     for name, values in sensor_draws(loose).items():
         assert np.array_equal(values, sensor_draws(realistic)[name]) == (name != "mount")
     assert np.array_equal(loose.points["left_palm"], realistic.points["left_palm"])

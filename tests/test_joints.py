@@ -130,24 +130,23 @@ def test_a_coupling_keeps_whole_turns_and_shares_with_the_drift() -> None:
     assert add_couplings(prior, layout, [], start) is prior
 
 
-def test_soft_tissue_of_the_torso_is_no_heading(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("seed", [0, pytest.param(6, marks=pytest.mark.monte_carlo)])
+def test_soft_tissue_of_the_torso_is_no_heading(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The closure alone is off by 3 to 5 deg on these people, whose tissue turns the sensor as they lean."""
-    off: dict[bool, list[float]] = {False: [], True: []}
-    for seed in (0, 6):
-        person = simulate_person(seed)
-        simulation = simulate(person.lengths, seed=seed, imperfections=replace(MILD_PRESET, mount="any"), circles=0)
-        measured = {"shoulder_width": person.measured["shoulder_width"]}
-        for coupled in (True, False):
-            with monkeypatch.context() as patch:
-                if not coupled:
-                    patch.setattr(lengths, "estimate_couplings", lambda *_: [])
-                found = calibrate_lengths(simulation.recording(), measured=measured, prior=person.prior).subject
-            error = Rotation.from_quat(found.mounts["torso"]) * Rotation.from_quat(simulation.quat_LS["torso"]).inv()
-            off[coupled].append(abs(float(np.degrees(error.as_rotvec()[2]))))
-            assert off[coupled][-1] < 2.0 * np.degrees(found.std("mounts.torso.z"))
+    person, off = simulate_person(seed), {}
+    simulation = simulate(person.lengths, seed=seed, imperfections=replace(MILD_PRESET, mount="any"), circles=0)
+    measured = {"shoulder_width": person.measured["shoulder_width"]}
+    for coupled in (True, False):
+        with monkeypatch.context() as patch:
+            if not coupled:
+                patch.setattr(lengths, "estimate_couplings", lambda *_: [])
+            found = calibrate_lengths(simulation.recording(), measured=measured, prior=person.prior).subject
+        error = Rotation.from_quat(found.mounts["torso"]) * Rotation.from_quat(simulation.quat_LS["torso"]).inv()
+        off[coupled] = abs(float(np.degrees(error.as_rotvec()[2])))
+        assert off[coupled] < 2.0 * np.degrees(found.std("mounts.torso.z"))
     print(off)
-    assert min(off[False]) > 3.0
-    assert max(off[True]) < 2.5
+    assert off[False] > 3.0
+    assert off[True] < 2.5
 
 
 def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> None:

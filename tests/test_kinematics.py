@@ -27,7 +27,7 @@ from wepose_pin.kinematics import (
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.girdle import displace
 from wepose_pin.model.orientation_ik import OrientationIk
-from wepose_pin.simulation import Simulation
+from wepose_pin.recording import Recording
 from wepose_pin.tracking import track
 
 CORE = ["torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"]
@@ -336,16 +336,15 @@ def test_a_pelvis_that_cannot_move_says_by_how_much(data: Path) -> None:
     np.testing.assert_allclose(missed["pelvis"], 0.3)
 
 
-def test_the_summary_says_what_was_not_followed(data: Path, simulation: Simulation) -> None:
-    recording = simulation.recording()
-    summary = track(recording, model=gazebo(data, 48)).summary()
+def test_the_summary_says_what_was_not_followed(data: Path, half_minute: Recording) -> None:
+    summary = track(half_minute, model=gazebo(data, 48)).summary()
     assert summary["orientation_residual_rms_deg"]["left_forearm"] > 1.0
     residual = {d["place"]: d["value"] for d in summary["diagnostics"] if d["code"] == "orientation-residual"}
     rms_deg = summary["orientation_residual_rms_deg"]
     assert set(residual) == {name for name, angle in rms_deg.items() if angle > 1.0}
     assert np.degrees(residual["left_forearm"]) == pytest.approx(rms_deg["left_forearm"], abs=1e-3)
-    assert track(recording, model=gazebo(data, 66)).summary()["orientation_residual_rms_deg"] == {}
-    assert track(recording).summary()["orientation_residual_rms_deg"] == {}
+    assert track(half_minute, model=gazebo(data, 66)).summary()["orientation_residual_rms_deg"] == {}
+    assert track(half_minute).summary()["orientation_residual_rms_deg"] == {}
 
 
 def arm(elbow: list[tuple[str, str]]) -> str:
@@ -425,10 +424,10 @@ def test_one_hinge_takes_its_twist_and_a_continuous_one_has_no_end(tmp_path: Pat
     np.testing.assert_allclose(q[:, first + 1], np.sin(2.0 * turned), atol=1e-9)
 
 
-def test_a_body_with_hinges_is_followed_live_as_in_a_recording(data: Path, simulation: Simulation) -> None:
+def test_a_body_with_hinges_is_followed_live_as_in_a_recording(data: Path, half_minute: Recording) -> None:
     """Pose after pose, each fit from the one before."""
     body = gazebo(data, 48)
-    pose = track(simulation.recording("live"), model=body, causal=True)
+    pose = track(half_minute, model=body, causal=True)
     live = LiveKinematics(body, list(pose.quat_WL))
     rows = range(2000, 2100)
     points = np.stack([live.compute_points(np.array([quat[k] for quat in pose.quat_WL.values()])) for k in rows])

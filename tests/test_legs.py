@@ -177,6 +177,7 @@ def test_an_activity_that_is_none_or_too_short_is_named() -> None:
 
 # The commands -----------------------------------------------------------------------------------------------------
 
+SHORT = ("--seconds", "15")
 LEG_JOINTS = [f"{side}_{joint}" for side in SIDES for joint in ("hip", "knee", "ankle")]
 
 
@@ -192,7 +193,10 @@ def run(*arguments: str | Path) -> int:
 def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, most_deg: float, tmp_path: Path) -> None:
     made, result = tmp_path / "made", tmp_path / "result"
     assert (
-        run("simulate", "-o", made, "--seed", "5", "--activity", activity, "--preset", preset, "--rate-hz", "60") == 0
+        run(
+            "simulate", "-o", made, "--seed", "5", "--activity", activity, "--preset", preset, *SHORT, "--rate-hz", "60"
+        )
+        == 0
     )
     # Open loop: what neighbours tell of headings has an error of its own, of half a degree and more.
     assert run("track", made, "--model", "whole_body", "--open-loop", "--no-view", "--no-report", "-o", result) == 0
@@ -241,7 +245,7 @@ def test_legs_on_the_upper_body_are_refused_with_the_body_that_has_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = tmp_path / "made"
-    assert run("simulate", "-o", made, "--activity", "sit") == 0
+    assert run("simulate", "-o", made, "--activity", "sit", *SHORT) == 0
     assert run("track", made, "-o", tmp_path / "result") == 2
     error = capsys.readouterr().err
     assert "sensors.left_thigh is no segment of upper_body; the body whole_body has it" in error

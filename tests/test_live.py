@@ -267,7 +267,7 @@ def chaos(recording: Recording, seed: int, hurt: str) -> tuple[list[tuple[float,
     return came, sum(len(sample.time) for _, sample in came)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.monte_carlo) for seed in (1, 2))])
 def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recording, tmp_path: Path, seed: int) -> None:
     hurt = list(recording.sensors)[seed + 1]
     came, count = chaos(recording, seed, hurt)
@@ -308,6 +308,7 @@ def test_a_sensor_that_freezes_is_lost_and_said_to_be(
     """It repeats itself for three seconds in motion; what is stated of it grows, as while it sends nothing."""
     monkeypatch.setattr("wepose_pin.live.loop.STATUS_PERIOD_S", 1e-3)
     hurt, begin, end = "right_forearm", 1200, 1500
+    recording = recording.cut(slice(0, 2000))
     sensor = recording.sensors[hurt]
     assert sensor.gyro_S is not None
     assert sensor.accel_S is not None
@@ -365,7 +366,7 @@ def test_what_turned_beyond_its_range_is_uncertain(recording: Recording, tmp_pat
 
 
 def test_a_file_that_breaks_off_anywhere_is_read_up_to_there(recording: Recording, tmp_path: Path) -> None:
-    whole = tmp_path / "a.wepose"
+    whole, recording = tmp_path / "a.wepose", first(recording, 1500)
     live(recording, whole)
     full = read_live_log(whole)
     data = whole.read_bytes()

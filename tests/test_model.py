@@ -18,6 +18,7 @@ from wepose_pin.diagnostics import from_json, render
 from wepose_pin.errors import BadModel, BadOption, MissingFile
 from wepose_pin.kinematics import compute_link_poses, compute_pose
 from wepose_pin.model import BodyModel, convert_breadths, load_model, load_table
+from wepose_pin.recording import Recording
 from wepose_pin.tracking import track
 
 OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"
@@ -620,10 +621,9 @@ def test_a_torso_that_cannot_move_is_warned_of(tmp_path: Path) -> None:
     assert fixed_torso.facts["joints"] == "torso_fixed"
 
 
-def test_warnings_of_the_body_reach_the_summary(simulation) -> None:
-    recording = simulation.recording("long arm")
+def test_warnings_of_the_body_reach_the_summary(half_minute: Recording) -> None:
     body = load_model(lengths={"left_upper_arm": 1.1})
-    found = map(from_json, track(recording, model=body).summary()["diagnostics"])
+    found = map(from_json, track(half_minute, model=body).summary()["diagnostics"])
     assert [d.place for d in found if d.code == "model-length-implausible"] == ["left_upper_arm"]
 
 

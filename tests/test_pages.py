@@ -20,7 +20,6 @@ from wepose_pin.diagnostics import as_json
 from wepose_pin.recording import ImuSensor, Recording, check_recording, compute_mount
 from wepose_pin.report import render_track_report, write_decimated_pages
 from wepose_pin.report.decimation import Decimator
-from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import TrackedRecording, track
 from wepose_pin.writers import write_session
 
@@ -214,12 +213,12 @@ def test_the_result_is_there_when_the_page_is_stopped(
 def test_a_calibration_outlasts_its_report(
     broken: str,
     left: set[str],
-    simulation: Simulation,
+    half_minute: Recording,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    write_session(tmp_path, simulation.recording())
+    write_session(tmp_path, half_minute)
     monkeypatch.setattr(broken, fails)
     assert run("calibrate", tmp_path, "-o", tmp_path / "anna") in (0, 3)
     assert names(tmp_path / "anna") == {"subject.toml", "subject.urdf", "calibration.json"} | left

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -370,6 +371,7 @@ def test_the_commands(
 def test_the_validation_has_rows_of_the_papers_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     smekf = [each for each in contenders.list_contenders("upper body, mild") if each.label == "smekf"]
     monkeypatch.setattr("wepose_pin.validation.paper.list_contenders", lambda _: smekf)
+    monkeypatch.setattr("wepose_pin.validation.paper.simulate", partial(simulate, clasp_s=30.0, circles=2))
     (job,) = list_experiments(True)["upper body, mild"]
     rows = {row.method: row for row in summarize(job())}
     assert list(rows) == ["smekf", WITH_TRUNK, LENGTHS_ALONE, OPEN_LOOP, PROTOCOL]

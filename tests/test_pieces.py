@@ -174,6 +174,7 @@ def test_filters_in_pieces(made: Simulation, method: str) -> None:
     np.testing.assert_array_equal(np.concatenate([of.static for of in found]), whole.static)
 
 
+@pytest.mark.slow
 def test_the_smoother_looks_one_piece_ahead(session: Path) -> None:
     """It is nearer to the smoother of the whole, the longer the pieces are; and nearer than the filter by itself."""
     whole = track(load_session(session), method="smoother")

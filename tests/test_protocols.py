@@ -26,7 +26,7 @@ from wepose_pin.calibration.protocols import Closure, Direction
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, render, render_all
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
-from wepose_pin.model import load_model
+from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.start_pose import orient_links
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
@@ -49,9 +49,9 @@ POSE_DEG = 4.0
 MADE: dict[tuple, tuple[Person, Simulation]] = {}
 
 
-def made(protocol: str, seed: int, real: bool) -> tuple[Person, Simulation]:
+def made(protocol: str, seed: int, real: bool, seconds: float = 60.0) -> tuple[Person, Simulation]:
     """A minute of a protocol with mounts at any rotation, exact or with usual imperfections."""
-    key = (protocol, seed, real)
+    key = (protocol, seed, real, seconds)
     if key not in MADE:
         person = simulate_person(seed)
         MADE[key] = (
@@ -62,6 +62,7 @@ def made(protocol: str, seed: int, real: bool) -> tuple[Person, Simulation]:
                 rate_hz=100.0 if real else 50.0,
                 noise=MTI_3 if real else NOISE_FREE,
                 imperfections=replace(MILD_PRESET if real else IDEAL_PRESET, mount="any"),
+                clasp_s=seconds,
                 circles=0,
                 protocol=protocol,
                 pose_deg=POSE_DEG if real else 0.0,
@@ -175,6 +176,14 @@ def test_jacobians_are_those_of_differences(name: str) -> None:
 
 # -------------------------------------------------------------------------------------------------------------- exact
 
+
+def straight_model() -> BodyModel:
+    """People hang their arms outwards and bend their elbows; the exact ones stand straight."""
+    model = load_model()
+    straight = {name: segment._replace(start_mean=(0.0, 0.0, 0.0)) for name, segment in model.table.segments.items()}
+    return replace(model, table=replace(model.table, segments=straight))
+
+
 GAUGE = {"handle": None, "touch_left": "left_upper_arm", "touch_right": "right_upper_arm", "poses": None}
 
 
@@ -183,16 +192,13 @@ GAUGE = {"handle": None, "touch_left": "left_upper_arm", "touch_right": "right_u
 def test_exact_motion_gives_headings_and_lengths_back(protocol: str, seed: int) -> None:
     person, simulation = made(protocol, seed, real=False)
     measured = {name: person.lengths[name] for name in (GAUGE[protocol],) if name}
-    # People hang their arms outwards and bend their elbows; this one stands straight.
-    model = load_model()
-    straight = {name: segment._replace(start_mean=(0.0, 0.0, 0.0)) for name, segment in model.table.segments.items()}
     found = calibrate_lengths(
         simulation.recording(),
         measured=measured,
         prior=person.prior,
         protocol=protocol,
         measured_std=1e-4,
-        model=replace(model, table=replace(model.table, segments=straight)),
+        model=straight_model(),
     )
     error, _ = mount_errors(found, simulation)
     assert np.abs(error[:, 2]).max() < 0.3
@@ -238,7 +244,7 @@ def test_usual_imperfections_stay_within_the_stated_deviations(protocol: str) ->
 
 
 def test_a_handle_fixes_the_scale_by_itself() -> None:
-    person, simulation = made("handle", 4, real=True)
+    person, simulation = made("handle", 4, real=True, seconds=20.0)
     recording = simulation.recording()
     found = calibrate_lengths(recording, prior=person.prior, protocol="handle")
     given = calibrate_lengths(recording, prior=person.prior, protocol="handle", measured={"handle": 0.40})
@@ -255,7 +261,12 @@ def test_a_handle_fixes_the_scale_by_itself() -> None:
     scale = []
     for bar in (0.40, 0.42):
         exact = calibrate_lengths(
-            simulation.recording(), prior=person.prior, protocol="handle", measured={"handle": bar}, measured_std=1e-4
+            simulation.recording(),
+            prior=person.prior,
+            protocol="handle",
+            measured={"handle": bar},
+            measured_std=1e-4,
+            model=straight_model(),
         )
         scale.append(np.mean([exact.subject.lengths[name] / person.lengths[name] for name in arms]))
     assert scale[0] == pytest.approx(1.0, abs=0.01)
@@ -455,7 +466,7 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
     protocol = load_protocol(own)
     assert protocol.name == "rope"
     assert "left_hand" not in find_measured_lengths(protocol, load_model())
-    person, simulation = made("handle", 1, real=False)
+    person, simulation = made("handle", 1, real=False, seconds=20.0)
     found = calibrate_lengths(simulation.recording(), prior=person.prior, protocol=protocol)
     assert "rope" in found.subject.note
     for old, new, match in (
@@ -492,14 +503,14 @@ def command(*argv: str) -> int:
 
 def test_a_protocol_is_simulated_and_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = tmp_path / "made"
-    assert command("simulate", "-o", str(made), "--protocol", "poses") == 0
+    assert command("simulate", "-o", str(made), "--protocol", "poses", "--seconds", "20") == 0
     assert set(load_session(made).phases) >= {"start", "t_pose", "bow"}
     assert command("calibrate", str(made), "--protocol", "poses", "--gaps", "-o", str(tmp_path / "out")) == 3
     assert "determines headings and no length" in capsys.readouterr().err
 
 
 def test_the_command_takes_protocols(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_session(tmp_path, made("handle", 1, real=False)[1].recording())
+    write_session(tmp_path, made("handle", 1, real=False, seconds=20.0)[1].recording())
     asked = ["calibrate", str(tmp_path / "session.toml"), "--protocol", "handle", "-o", str(tmp_path / "out")]
     assert command(*asked, "--measured", "handle=0.4") in (0, 3)  # pass or poor
     assert "scale measured: handle" in (tmp_path / "out" / "subject.toml").read_text()

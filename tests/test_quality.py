@@ -71,6 +71,16 @@ def solved(recording: Recording, person: Person, measured: bool = True) -> Calib
     return calibrate_lengths(recording, measured=lengths, prior=person.prior, measured_std=person.measured_std)
 
 
+@pytest.fixture(scope="module")
+def good(anywhere: Simulation, person: Person) -> Calibration:
+    return solved(anywhere.recording(), person)
+
+
+@pytest.fixture(scope="module")
+def unmeasured(anywhere: Simulation, person: Person) -> Calibration:
+    return solved(anywhere.recording(), person, measured=False)
+
+
 def exchanged(recording: Recording, *pairs: tuple[str, str]) -> Recording:
     """Sensors under each other's name, with the mount that their place has."""
     names = {a: b for pair in pairs for a, b in (pair, pair[::-1])}
@@ -158,20 +168,20 @@ def test_what_goes_wrong_is_diagnosed(case: str, anywhere: Simulation, person: P
     assert {d.severity for d in quality.reasons} <= {{"pass": INFO, "poor": WARNING, "fail": ERROR}[wanted]}
 
 
-def test_without_a_measured_length_the_scale_is_the_priors(anywhere: Simulation, person: Person) -> None:
-    quality = assess(solved(anywhere.recording(), person, measured=False))
+def test_without_a_measured_length_the_scale_is_the_priors(unmeasured: Calibration) -> None:
+    quality = assess(unmeasured)
     assert quality.quality == "poor"
     assert codes(quality) == ["scale-from-prior"]
     assert "--measured biacromial" in render(quality.reasons[0]).do
     assert "scale-from-prior" not in {each.code for each in quality.further}  # not twice
 
 
-def test_a_measured_length_that_contradicts_all_else_is_named_once(anywhere: Simulation, person: Person) -> None:
-    recording = anywhere.recording()
-    good = solved(recording, person)
+def test_a_measured_length_that_contradicts_all_else_is_named_once(
+    anywhere: Simulation, person: Person, good: Calibration, unmeasured: Calibration
+) -> None:
     assert good.measured_lengths["shoulder_width"].deviation < 2.0
     assert good.measured_lengths["shoulder_width"].expected == pytest.approx(person.lengths["shoulder_width"], rel=0.1)
-    wrong = calibrate_lengths(recording, measured={"shoulder_width": 0.20}, prior=person.prior)
+    wrong = calibrate_lengths(anywhere.recording(), measured={"shoulder_width": 0.20}, prior=person.prior)
     quality = assess(wrong)
     assert quality.quality == "fail"
     (contradicted,) = quality.reasons
@@ -180,7 +190,7 @@ def test_a_measured_length_that_contradicts_all_else_is_named_once(anywhere: Sim
     assert (contradicted.code, contradicted.place) == ("measured-length-contradicted", "shoulder_width")
     assert "Shoulder width was measured as 200 mm." in render(contradicted).what
     # Without the tape the solution finds what it said that it would; palms that slip tell a smaller person less.
-    tape, free = wrong.measured_lengths["shoulder_width"], solved(recording, person, measured=False).subject
+    tape, free = wrong.measured_lengths["shoulder_width"], unmeasured.subject
     assert tape.expected == pytest.approx(free.lengths["shoulder_width"], abs=1.5 * free.std("shoulder_width"))
     assert tape.std == pytest.approx(free.std("shoulder_width"), rel=0.3)
 
@@ -228,9 +238,9 @@ def test_too_little_motion_is_named(share: dict[str, float], wanted: str, causes
     assert quality.determined < quality.unknowns
 
 
-def test_hands_apart_for_half_of_the_time_are_found_and_left_out(person: Person, anywhere: Simulation) -> None:
+def test_hands_apart_for_half_of_the_time_are_found_and_left_out(person: Person, good: Calibration) -> None:
     simulation = moved_otherwise(person, {"hands": 1.0}, replace(ANY, palm_slip=0.15))
-    found, good = solved(simulation.recording(), person), solved(anywhere.recording(), person)
+    found = solved(simulation.recording(), person)
     quality = assess(found)
     print(codes(quality), 1e3 * arm_errors(found, person), 1e3 * arm_errors(good, person))
     assert quality.quality == "poor"
@@ -247,10 +257,9 @@ def test_hands_apart_for_half_of_the_time_are_found_and_left_out(person: Person,
 
 
 def test_a_sensor_upside_down_is_another_mount_or_said_and_solved(
-    person: Person, anywhere: Simulation, stated: Simulation
+    person: Person, anywhere: Simulation, stated: Simulation, good: Calibration
 ) -> None:
     over = Rotation.from_rotvec([0.0, 0.0, np.pi])
-    good = solved(anywhere.recording(), person)
     found = solved(turned(anywhere.recording(), "left_forearm", over), person)
     assert assess(found).quality == "pass"
     np.testing.assert_allclose(list(found.subject.lengths.values()), list(good.subject.lengths.values()), atol=2e-3)

@@ -26,7 +26,7 @@ from wepose_pin.writers.result import write_subject
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("session")
     person = simulate_person(5)
-    write_session(folder, simulate(person.lengths, seed=5, clasp_s=10.0, circles=0).recording("session"))
+    write_session(folder, simulate(person.lengths, seed=5, rate_hz=50.0, clasp_s=6.0, circles=0).recording("session"))
     return folder
 
 

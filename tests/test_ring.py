@@ -24,7 +24,7 @@ def run(*arguments: str | Path) -> int:
     return int(stopped.value.code or 0)
 
 
-@pytest.mark.parametrize("mount", ["rigid", "loose"])
+@pytest.mark.parametrize("mount", ["rigid", pytest.param("loose", marks=pytest.mark.slow)])
 def test_ring_by_the_commands_alone(data: Path, mount: str, tmp_path: Path) -> None:
     [files] = find_ring(data)
     ring = write_ring_session(files, mount, tmp_path)

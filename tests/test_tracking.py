@@ -13,7 +13,7 @@ from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, as_json
 from wepose_pin.evaluation import evaluate
 from wepose_pin.filters import METHODS
 from wepose_pin.readers import load_session
-from wepose_pin.recording import join_recordings
+from wepose_pin.recording import Recording, join_recordings
 from wepose_pin.simulation import NOISE_FREE, Person, Simulation, simulate
 from wepose_pin.subject import population_subject
 from wepose_pin.tracking import SummaryAccumulator, Tracker, track
@@ -44,8 +44,8 @@ def test_a_noisy_world_is_tracked_by_every_filter(simulation: Simulation, person
     assert set(summary["sensors"]) == set(simulation.gyro_S)
 
 
-def test_sensors_that_are_missing_leave_out_what_cannot_be_known(simulation: Simulation) -> None:
-    recording = simulation.recording()
+def test_sensors_that_are_missing_leave_out_what_cannot_be_known(half_minute: Recording) -> None:
+    recording = half_minute
     fewer = {name: s for name, s in recording.sensors.items() if name not in ("left_forearm", "right_upper_arm")}
     pose = track(replace(recording, sensors=fewer))
     assert set(pose.quat_WL) == set(fewer)
@@ -55,9 +55,9 @@ def test_sensors_that_are_missing_leave_out_what_cannot_be_known(simulation: Sim
     assert track(replace(recording, sensors=only_arm)).points == {}
 
 
-def test_the_subject_gives_the_lengths(simulation: Simulation, person: Person) -> None:
+def test_the_subject_gives_the_lengths(half_minute: Recording, person: Person) -> None:
     subject = replace(population_subject(), lengths=person.lengths)
-    pose = track(simulation.recording(), subject)
+    pose = track(half_minute, subject)
     upper_arm = np.linalg.norm(pose.points["left_elbow"] - pose.points["left_shoulder"], axis=1)
     np.testing.assert_allclose(upper_arm, person.lengths["left_upper_arm"], atol=1e-12)
 
@@ -86,20 +86,19 @@ def test_the_real_person_hangs_the_arms_again(data: Path) -> None:
         assert shoulder[2] - hand[2] > 0.55
 
 
-def test_what_reading_finds_reaches_the_result(simulation: Simulation) -> None:
+def test_what_reading_finds_reaches_the_result(half_minute: Recording) -> None:
     gaps = Diagnostic("short-gaps-bridged", INFO, "torso", 2, 0.05, {"samples": 3, "longest": 0.02})
-    tracked = track(replace(simulation.recording(), phases={}, diagnostics=(gaps,)))
+    tracked = track(replace(half_minute, phases={}, diagnostics=(gaps,)))
     assert tracked.diagnostics[0] == gaps
     assert tracked.diagnostics[1].code == "start-pose-guessed"
     assert tracked.summary()["diagnostics"] == [as_json(each) for each in tracked.diagnostics]
 
 
-def test_diagnostics_of_later_chunks_are_listed_once_and_not_without_end(simulation: Simulation) -> None:
-    recording = simulation.recording()
+def test_diagnostics_of_later_chunks_are_listed_once_and_not_without_end(half_minute: Recording) -> None:
     cut = [Diagnostic("signal-saturated", WARNING, "torso", 0.01 * k) for k in range(30)]
     accumulator = SummaryAccumulator()
     tracker, done = Tracker(), []
-    for k, chunk in enumerate(recording.chunks(2.0)):
+    for k, chunk in enumerate(half_minute.chunks(1.0)):
         done += tracker.push(replace(chunk, diagnostics=(cut[0], cut[min(k, 14)])))
     for tracked in [*done, *tracker.finish()]:
         accumulator.add(tracked)
