@@ -23,7 +23,7 @@ from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.configurations import find_undetermined_joints
 from wepose_pin.model.fit import fit, joint_limits
 from wepose_pin.readers import load_session
-from wepose_pin.recording import Recording
+from wepose_pin.simulation import Person, simulate
 from wepose_pin.tracking import track
 from wepose_pin.writers import write_result
 
@@ -159,9 +159,10 @@ def test_a_person_on_48_degrees_of_freedom(data: Path, body: BodyModel) -> None:
 
 
 def test_limits_can_be_let_go_and_torques_are_written_as_estimates(
-    body: BodyModel, half_minute: Recording, tmp_path: Path
+    body: BodyModel, person: Person, tmp_path: Path
 ) -> None:
-    pose = track(half_minute, model=body, limits=False)
+    simulation = simulate(person.lengths, seed=3, rate_hz=25.0)
+    pose = track(simulation.recording(), model=body, limits=False)
     assert pose.q is not None
     at, lower, upper = joint_limits(body.pin, [body.pin.getJointId(name) for name in HINGES])
     assert np.any((pose.q[:, at] < lower - 0.01) | (pose.q[:, at] > upper + 0.01))
