@@ -15,7 +15,6 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-import distributed
 import numpy as np
 import polars as pl
 import pytest
@@ -148,6 +147,8 @@ def test_an_item_that_is_too_much_for_a_worker_is_given_up_by_name(
     table, rows = pl.read_parquet(file), 3_000_000
     columns = {name: np.resize(table[name].to_numpy(), rows) for name in table.columns}
     pl.DataFrame(columns | {"time": 0.01 * np.arange(rows)}).write_parquet(file, compression="snappy")
+    import distributed  # takes a second, which runs of the first tier need not wait for
+
     monkeypatch.setattr(distributed, "LocalCluster", partial(distributed.LocalCluster, memory_limit="600MB"))
     told = run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1)).table
     assert told["item"].to_list() == ["data-one", "data-three", "data-two"]

@@ -15,13 +15,16 @@ SAYS = {
     "live_consumer.py": "no pose for 3 s",
     "track_recording.py": "right hand from its shoulder",
 }
+LONGEST = ("calibrate_subject.py", "track_recording.py")
 
 
 def test_there_are_examples() -> None:
     assert set(SAYS) <= {path.name for path in EXAMPLES}
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, marks=[pytest.mark.slow] * (path.name in LONGEST), id=path.name) for path in EXAMPLES]
+)
 def test_it_runs(path: Path, tmp_path: Path) -> None:
     run = subprocess.run(
         [sys.executable, "-W", "error", str(path)], cwd=tmp_path, capture_output=True, text=True, timeout=300

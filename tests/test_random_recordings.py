@@ -17,10 +17,11 @@ from random_recordings.trial import try_seed
 FOLDER = Path(__file__).parent / "random_recordings"
 # Short ones that hold between them every method, most activities, clocks, faults and invariances.
 TEN = (3, 18, 175, 193, 233, 415, 1021, 1110, 1167, 1168)
+LONGEST = (3, 18, 1021, 1110)
 FAILED_ONCE = tomllib.loads((FOLDER / "regressions.toml").read_text(encoding="utf-8")).get("seed", [])
 
 
-@pytest.mark.parametrize("seed", TEN)
+@pytest.mark.parametrize("seed", [pytest.param(k, marks=[pytest.mark.seeds] * (k in LONGEST)) for k in TEN])
 def test_what_must_hold_of_every_recording(seed: int) -> None:
     report = try_seed(seed)
     assert not report.failures, f"{report.about}\n" + "\n".join(f"{f.oracle}: {f.message}" for f in report.failures)
